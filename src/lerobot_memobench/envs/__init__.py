@@ -1,0 +1,1 @@
+"""How LeRobot steps the benchmark: configuration, gym environment, episode, log."""

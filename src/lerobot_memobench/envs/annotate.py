@@ -1,0 +1,68 @@
+"""What evaluation videos show: both cameras, the task, the checkpoint being worked on, a tick for each one done."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from lerobot_memobench.envs.episode import PROMPT, Episode
+
+BAND = 64
+"""Height of the text over the pictures, pixels."""
+_BACKGROUND, _TEXT, _FAINT = (24, 26, 30), (240, 240, 240), (150, 155, 165)
+OPERATION_COLOURS = {"S": (86, 180, 233), "U": (230, 159, 0), "C": (0, 158, 115)}
+"""Storage, Update, Compression: Okabe and Ito's palette, apart for the colour-blind too."""
+_PROMPT_COLOUR = (204, 121, 167)
+
+
+@lru_cache(maxsize=4)
+def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    return ImageFont.load_default(size=size)
+
+
+def _fit(draw: ImageDraw.ImageDraw, text: str, size: int, width: int) -> tuple[str, object]:
+    """Shrink a text until it fits, then cut it."""
+    for points in range(size, 8, -1):
+        if draw.textlength(text, font=_font(points)) <= width:
+            return text, _font(points)
+    while text and draw.textlength(text + "…", font=_font(9)) > width:
+        text = text[:-1]
+    return text + "…", _font(9)
+
+
+def annotate(images: dict[str, NDArray[np.uint8]], episode: Episode) -> NDArray[np.uint8]:
+    """Return a frame (BAND + height, 2 · width, 3) uint8 of the present step."""
+    pictures = np.hstack(list(images.values()))
+    height, width = pictures.shape[:2]
+    band = Image.new("RGB", (width, BAND), _BACKGROUND)
+    draw = ImageDraw.Draw(band)
+    prompt = episode.phase == PROMPT
+    task = episode.task
+    text, font = _fit(draw, task.language, 14, width - 96)
+    draw.text((8, 5), text, fill=_TEXT, font=font)
+    clock = f"prompt {episode.step_index}" if prompt else f"step {episode.exec_steps}"
+    draw.text((width - 8, 5), clock, fill=_PROMPT_COLOUR if prompt else _FAINT, font=_font(13), anchor="ra")
+
+    x = 8
+    for index, checkpoint in enumerate(task.checkpoints):
+        colour = OPERATION_COLOURS[checkpoint.operation]
+        done = index < episode.progress.index and not prompt
+        box = (x, 34, x + 20, 54)
+        draw.rounded_rectangle(box, 4, fill=colour if done else None, outline=colour, width=2)
+        if done:
+            draw.line([(x + 5, 44), (x + 9, 49), (x + 16, 39)], fill=_BACKGROUND, width=3)
+        else:
+            draw.text((x + 10, 44), checkpoint.operation, fill=colour, font=_font(12), anchor="mm")
+        x += 26
+    if prompt:
+        subgoal = "watch the prompt"
+    elif episode.success:
+        subgoal = "done"
+    else:
+        subgoal = episode.subgoal()
+    text, font = _fit(draw, subgoal, 14, width - x - 14)
+    draw.text((x + 6, 44), text, fill=_PROMPT_COLOUR if prompt else _TEXT, font=font, anchor="lm")
+    return np.vstack([np.asarray(band), pictures])

@@ -1,0 +1,157 @@
+"""LeRobot's name for the benchmark: `--env.type=memobench`.
+
+Importing this module registers the environment and nothing more: no simulator, no GL. Both open in the process that
+steps the environment, at its first reset.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs.configs import EnvConfig
+from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+
+from lerobot_memobench.errors import MemobenchError, nearest
+
+IMAGE_SIZE = 256
+SEED_BASE = 7
+"""Seed of evaluation episode 0 (paper, section 5.1)."""
+
+
+def _features() -> dict[str, PolicyFeature]:
+    image = PolicyFeature(type=FeatureType.VISUAL, shape=(IMAGE_SIZE, IMAGE_SIZE, 3))
+    return {
+        ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(7,)),
+        "pixels/image": image,
+        "pixels/wrist_image": image,
+        "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(8,)),
+    }
+
+
+def _features_map() -> dict[str, str]:
+    return {
+        ACTION: ACTION,
+        "pixels/image": f"{OBS_IMAGES}.image",
+        "pixels/wrist_image": f"{OBS_IMAGES}.wrist_image",
+        "agent_pos": OBS_STATE,
+    }
+
+
+@EnvConfig.register_subclass("memobench")
+@dataclass
+class MemobenchEnvConfig(EnvConfig):
+    """The benchmark's 30 tasks, as LeRobot's suites: temporal, spatial, object, procedural.
+
+    Args:
+        tasks: `all`, memory types or task names, separated by commas.
+        task: the same, for those used to LeRobot's field.
+        task_dir: a folder in the published format to run instead of the catalogue (one task, or a tree of them).
+        referent: `fixed`, the published goals, or `random`: by seed another admissible referent or order.
+        prompt_video: whether object and procedural tasks begin with their prompt video.
+        horizon: execution steps per episode.
+        render: `fast`, `default` or `high`.
+        render_every: draw images every so many execution steps and repeat the last in between. Set it to the number
+            of actions a policy executes per prediction: it looks at nothing else.
+        replan_steps: that number, noted in the episode log.
+        expert_action: offer the scripted expert's action as `observation.expert_action`.
+        log_dir: where the episode log goes; LeRobot's output folder when left out.
+        seed_base: the seed that counts as episode 0.
+    """
+
+    task: str | None = None
+    tasks: str = "all"
+    task_dir: str | None = None
+    fps: int = 20
+    referent: str = "fixed"
+    prompt_video: bool = True
+    horizon: int = 1200
+    render: str = "default"
+    render_every: int = 1
+    replan_steps: int | None = None
+    expert_action: bool = False
+    log_dir: str | None = None
+    seed_base: int = SEED_BASE
+    features: dict[str, PolicyFeature] = field(default_factory=_features)
+    features_map: dict[str, str] = field(default_factory=_features_map)
+
+    def __post_init__(self) -> None:
+        if self.fps != 20:
+            raise MemobenchError(f"fps is {self.fps}; the benchmark's control rate is 20, leave it out")
+        for name, value, known in (
+            ("referent", self.referent, ("fixed", "random")),
+            ("render", self.render, ("fast", "default", "high")),
+        ):
+            if value not in known:
+                raise MemobenchError(f"env.{name} is {value!r}; {nearest(value, known)}")
+        for name, number in (("horizon", self.horizon), ("render_every", self.render_every)):
+            if number < 1:
+                raise MemobenchError(f"env.{name} is {number}; expected a whole number from 1 on")
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """What every sub-environment is made with."""
+        return {
+            "referent": self.referent,
+            "prompt_video": self.prompt_video,
+            "horizon": self.horizon,
+            "render": self.render,
+            "render_every": self.render_every,
+            "replan_steps": self.replan_steps,
+            "expert_action": self.expert_action,
+            "seed_base": self.seed_base,
+        }
+
+    def selected(self) -> list[tuple[str, int, Path]]:
+        """Return memory type, task id and folder of each chosen task; unknown names raise `MemobenchError`."""
+        from lerobot_memobench.tasks.catalogue import find_tasks, get_task, resolve_tasks, task_index
+        from lerobot_memobench.tasks.task import load_task
+
+        if self.task_dir is not None:
+            return [
+                (load_task(folder).memory_type, index, folder)
+                for index, folder in enumerate(find_tasks(self.task_dir))
+            ]
+        spec = self.task if self.task is not None else self.tasks
+        tasks = [get_task(name) for name in resolve_tasks(spec)]
+        return [(task.memory_type, task_index(task.name), task.folder) for task in tasks]
+
+    def create_envs(
+        self, n_envs: int, use_async_envs: bool = False
+    ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+        """Return `{memory type: {task id: vector env}}`; nothing is simulated before an env's first reset."""
+        from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
+
+        from lerobot_memobench.envs.memobench_env import MemobenchEnv, spaces_and_metadata
+
+        chosen = self.selected()  # before anything is written: a wrong name leaves nothing behind
+        log_dir = self.resolved_log_dir()
+        spaces = spaces_and_metadata(self.expert_action)
+        suites: dict[str, dict[int, gym.vector.VectorEnv]] = {}
+        for memory_type, task_id, folder in chosen:
+            make = partial(MemobenchEnv, str(folder), log_dir=str(log_dir), **self.gym_kwargs)
+            if use_async_envs and n_envs > 1:
+                vector = _LazyAsyncVectorEnv([make] * n_envs, *spaces)
+            else:
+                # LeRobot freezes finished rows of its own async envs only; a sync row would be reset and go on.
+                vector = gym.vector.SyncVectorEnv(
+                    [freeze_after_episode_end(make)] * n_envs, autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP
+                )
+            suites.setdefault(memory_type, {})[task_id] = vector
+        return suites
+
+    def resolved_log_dir(self) -> Path:
+        """Return the folder of the episode log: given, else the run's output folder, else a dated one."""
+        if self.log_dir is not None:
+            return Path(self.log_dir)
+        from datetime import datetime
+
+        from lerobot.configs import parser
+
+        # The configuration of an environment does not hold the run's output folder; LeRobot's parser tells it.
+        output = parser.parse_arg("output_dir")
+        return Path(output) if output else Path("outputs/eval") / f"{datetime.now():%Y-%m-%d/%H-%M-%S}_memobench"

@@ -1,0 +1,191 @@
+"""One episode of one seed: settle, show the prompt, let the policy act, keep the books.
+
+The gym environment and the recorder of demonstrations both run on this class, so what a dataset holds and what a
+policy sees at evaluation cannot drift apart.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.experts.expert import Expert
+from lerobot_memobench.experts.prompts import PromptDemonstrator
+from lerobot_memobench.sim.rendering import Image, RenderSettings
+from lerobot_memobench.sim.simulation import Simulation
+from lerobot_memobench.tasks.formula import Atom, atoms
+from lerobot_memobench.tasks.progress import Progress
+from lerobot_memobench.tasks.task import Task
+
+PROMPT, EXECUTION = 0, 1
+HORIZON = 1200
+"""Execution steps before an episode is cut off (paper, section 5.1)."""
+PROMPT_LIMIT = 1000
+"""Control steps after which a prompt video ends, whatever it still had to show."""
+REFERENTS = ("fixed", "random")
+
+IMAGE_KEYS = {"image": "agentview", "wrist_image": "wrist"}
+"""Observation name → camera; `observation.images.<name>` in datasets and at the policy."""
+
+
+class Episode:
+    """An episode of one task; `reset` starts it for a seed.
+
+    Args:
+        task: the published task.
+        referent: `fixed`, the catalogue's goal, or `random`, one of the task's variants by seed.
+        prompt_video: whether object and procedural tasks begin with their prompt.
+        horizon: execution steps before truncation.
+        render: size and quality of frames.
+
+    Attributes:
+        task: the task of this episode: a variant of the given one when the referent is random.
+        phase: `PROMPT` or `EXECUTION`, of the present frame.
+        step_index: control steps since the episode began, prompt included.
+        exec_start: the frame at which execution began; None during the prompt.
+        progress: checkpoints and goal, counted in execution steps.
+        applied_action: the action (7,) float32 that really moved the arm in the last step.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        *,
+        referent: str = "fixed",
+        prompt_video: bool = True,
+        horizon: int = HORIZON,
+        render: RenderSettings | None = None,
+    ) -> None:
+        if referent not in REFERENTS:
+            raise MemobenchError(f"referent is {referent!r}; {nearest(referent, REFERENTS)}")
+        self.published = task
+        self.referent, self.horizon = referent, horizon
+        self.prompt_video = prompt_video and task.prompt is not None
+        self.sim = Simulation(task, render)
+        self.task = task
+        self.seed = -1
+
+    @property
+    def max_steps(self) -> int:
+        """Upper bound of control steps in an episode, prompt included."""
+        return self.horizon + (PROMPT_LIMIT if self.prompt_video else 0)
+
+    def _rng(self, stream: int) -> np.random.Generator:
+        """A generator of its own for each use, so that one cannot shift the other's draws."""
+        return np.random.default_rng([self.seed, zlib.crc32(self.published.name.encode()), stream])
+
+    def reset(self, seed: int) -> None:
+        """Start the episode of a seed. Everything that follows is a function of task, settings, seed and actions."""
+        self.seed = int(seed)
+        task = self.published
+        if self.referent == "random" and task.num_variants > 1:
+            choices = task.random_variants
+            task = task.variant(choices[int(self._rng(1).integers(len(choices)))])
+        self.task = task
+        self.sim.reset(self.seed)
+        self.scene_hash = self.sim.scene_hash()
+        self._start = self.sim.snapshot()
+        self.progress = Progress(task)
+        self.step_index = 0
+        self.exec_start: int | None = None
+        self.applied_action = np.zeros(7, dtype=np.float32)
+        self.prompt_shown: bool | None = None
+        self.drifted = False
+        self._siblings = list(_wrong_atoms(task))
+        self._expert: Expert | None = None
+        self._demonstrator: Iterator[NDArray[np.float32]] | None = None
+        if self.prompt_video:
+            self._prompt = PromptDemonstrator(task, self.sim, self._rng(2))
+            self._demonstrator = self._prompt.actions()
+            self._next_prompt_action = next(self._demonstrator, None)
+            if self._next_prompt_action is None:
+                self._begin_execution()
+        else:
+            self._begin_execution()
+
+    def _begin_execution(self) -> None:
+        """Put the scene back exactly as it was and hand over to the policy."""
+        if self.step_index:
+            self.prompt_shown = self._prompt.shown
+            self.sim.highlights = ()
+            self.sim.restore(self._start)
+        self._demonstrator = None
+        self.exec_start = self.step_index
+        self.progress.reset()
+
+    @property
+    def phase(self) -> int:
+        return PROMPT if self.exec_start is None else EXECUTION
+
+    @property
+    def exec_steps(self) -> int:
+        """Execution steps taken so far."""
+        return self.progress.steps
+
+    @property
+    def success(self) -> bool:
+        """The goal holds now, and the policy has acted."""
+        return self.phase == EXECUTION and self.progress.success
+
+    @property
+    def done(self) -> bool:
+        """Ended by success or horizon; satisfied checkpoints alone end nothing."""
+        return self.success or self.exec_steps >= self.horizon
+
+    def step(self, action: NDArray[np.floating]) -> None:
+        """Advance by one control step; during the prompt the given action has no effect."""
+        if self.phase == PROMPT:
+            assert self._demonstrator is not None and self._next_prompt_action is not None
+            self.applied_action = np.asarray(self._next_prompt_action, dtype=np.float32)
+            self.sim.step(self.applied_action)
+            self.step_index += 1
+            self._next_prompt_action = next(self._demonstrator, None)
+            if self._next_prompt_action is None or self.step_index >= PROMPT_LIMIT:
+                self._begin_execution()
+            return
+        self.applied_action = np.clip(np.asarray(action, dtype=np.float32), -1.0, 1.0)
+        self.sim.step(self.applied_action)
+        self.step_index += 1
+        self.progress.step(self.sim.holds)
+        self.drifted = self.drifted or any(self.sim.holds(atom) for atom in self._siblings)
+
+    def expert_action(self) -> NDArray[np.float32]:
+        """Return what the scripted expert does now, (7,); zeros during the prompt. Ask once per step."""
+        if self.phase == PROMPT:
+            return np.zeros(7, dtype=np.float32)
+        if self._expert is None:
+            self._expert = Expert(self.task, self.sim, self._rng(3))
+        return self._expert.act()
+
+    def images(self) -> dict[str, Image]:
+        """Return what both cameras see now, (256, 256, 3) uint8 each, upright."""
+        return {key: self.sim.render(camera) for key, camera in IMAGE_KEYS.items()}
+
+    def subgoal(self, level: int = 1) -> str:
+        """Return the text of the checkpoint being worked on, at a language level (0 coarse, 1 intermediate, 2 fine)."""
+        if not self.task.checkpoints:
+            return self.task.language
+        index = min(self.progress.index, len(self.task.checkpoints) - 1)
+        return self.task.checkpoints[index].language[level]
+
+
+def _wrong_atoms(task: Task) -> Iterator[Atom]:
+    """Atoms that say the referent was mistaken: a sibling of an object or of its target satisfies a checkpoint.
+
+    Only object tasks have referents; a sibling is another instance of the same class.
+    """
+    if task.memory_type != "object":
+        return
+    for checkpoint in task.checkpoints:
+        for atom in atoms(checkpoint.goal):
+            if atom.predicate not in ("on", "in"):
+                continue
+            for position, name in enumerate(atom.args):
+                class_name = task.objects.get(name)
+                for other, other_class in task.objects.items():
+                    if class_name is not None and other_class == class_name and other not in atom.args:
+                        yield Atom(atom.predicate, (*atom.args[:position], other, *atom.args[position + 1 :]))

@@ -1,0 +1,167 @@
+"""The episode log: one JSON line per finished rollout, written when it ends (spec: benchmark.md).
+
+Each process appends to files of its own, ``<dir>/episodes/<task>.<pid>.jsonl``, so workers never wait for one
+another and a killed run loses at most the line being written. ``read_episodes`` merges them.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from lerobot_memobench.errors import MemobenchError
+
+logger = logging.getLogger(__name__)
+
+EPISODES_FOLDER = "episodes"
+MERGED_FILE = "episodes.jsonl"
+
+#: In the workers' files only: when the line was written (seconds since 1970). It decides which of two lines
+#: is newer.
+WRITTEN_AT = "written_at"
+
+#: What a line must hold to count as a rollout.
+REQUIRED = ("task", "memory_type", "episode", "success", "checkpoints")
+
+
+class EpisodeLog:
+    """Appends finished rollouts of this process to ``directory``, which is made when the first one ends."""
+
+    def __init__(self, directory: str | Path) -> None:
+        self.directory = Path(directory)
+
+    def append(self, record: Mapping[str, Any]) -> Path:
+        """Write one rollout to disk, for good when this returns; return the file it went to.
+
+        The process is looked up here, not at construction: a log made before a fork is used after it.
+
+        Raises:
+            MemobenchError: the folder cannot be written, or the record is no JSON.
+        """
+        path = self.directory / EPISODES_FOLDER / f"{record['task']}.{os.getpid()}.jsonl"
+        try:
+            line = json.dumps({**record, WRITTEN_AT: time.time()}, allow_nan=False).encode() + b"\n"
+        except (TypeError, ValueError) as error:
+            raise MemobenchError(
+                f"the record of {record['task']!r} cannot be written as JSON ({error}); expected plain "
+                "numbers, strings, lists and None"
+            ) from error
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with path.open("ab+") as file:
+                if _ends_torn(file):  # a killed process with the same number was here before
+                    line = b"\n" + line
+                file.write(line)
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise MemobenchError(
+                f"the episode log {path} cannot be written ({error.strerror or error}); choose another "
+                "folder with --env.log_dir"
+            ) from error
+        return path
+
+
+def _ends_torn(file: Any) -> bool:
+    if file.seek(0, os.SEEK_END) == 0:
+        return False
+    file.seek(-1, os.SEEK_END)
+    return bool(file.read(1) != b"\n")
+
+
+def read_episodes(directory: str | Path, problems: list[str] | None = None) -> list[dict[str, Any]]:
+    """Return the rollouts logged under ``directory``, sorted by task, episode and referent.
+
+    Reads the workers' files and a plain ``episodes.jsonl``; of several lines about the same task, episode and
+    referent the newest counts. Lines that cannot be read, such as the last one of a killed run, are left out,
+    named in ``problems`` (file, line, reason) and logged as warnings.
+
+    Raises:
+        MemobenchError: there is no such folder, or no log in it.
+    """
+    directory = Path(directory)
+    if not directory.is_dir():
+        raise MemobenchError(f"{directory} is not a folder; expected one that an evaluation has written")
+    files = _log_files(directory)
+    if not files:
+        raise MemobenchError(
+            f"{directory} holds no episode log; expected {MERGED_FILE} or {EPISODES_FOLDER}/*.jsonl, as an "
+            "evaluation writes them"
+        )
+    found: list[str] = []
+    newest: dict[tuple[str, int, str], tuple[float, dict[str, Any]]] = {}
+    for file in files:
+        for record in _read_lines(file, found):
+            written = float(record.pop(WRITTEN_AT, 0.0))
+            key = (record["task"], record["episode"], record.get("referent", "fixed"))
+            if key not in newest or written >= newest[key][0]:
+                newest[key] = (written, record)
+    for problem in found:
+        logger.warning("%s", problem)
+    if problems is not None:
+        problems += found
+    return [newest[key][1] for key in sorted(newest)]
+
+
+def has_log(directory: Path) -> bool:
+    """Return whether ``directory`` holds rollouts of an evaluation."""
+    return bool(_log_files(directory))
+
+
+def _log_files(directory: Path) -> list[Path]:
+    """The merged file first: its lines carry no time, and those of the workers' files that do are newer."""
+    merged = directory / MERGED_FILE
+    return [merged] * merged.is_file() + sorted((directory / EPISODES_FOLDER).glob("*.jsonl"))
+
+
+def write_episodes(directory: str | Path, records: list[dict[str, Any]]) -> Path:
+    """Write ``records`` as ``<directory>/episodes.jsonl``, whole or not at all, and return its path."""
+    path = Path(directory) / MERGED_FILE
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_suffix(".jsonl.part")
+    draft.write_text("".join(json.dumps(record) + "\n" for record in records))
+    os.replace(draft, path)
+    return path
+
+
+def _read_lines(file: Path, problems: list[str]) -> Iterator[dict[str, Any]]:
+    for number, line in enumerate(file.read_bytes().split(b"\n"), start=1):
+        if not line.strip():
+            continue
+        try:
+            record = json.loads(line)
+        except ValueError:  # also for bytes that are no UTF-8
+            problems.append(f"{file}, line {number}: not a whole JSON line (was the run killed?); left out")
+            continue
+        problem = _problem(record)
+        if problem:
+            problems.append(f"{file}, line {number}: {problem}; left out")
+        else:
+            yield record
+
+
+def _problem(record: Any) -> str | None:
+    """Return what keeps a parsed line from being a rollout."""
+    if not isinstance(record, dict):
+        return f"found {type(record).__name__}, expected an object"
+    missing = [key for key in REQUIRED if key not in record]
+    if missing:
+        return f"found no {', '.join(missing)}"
+    if not isinstance(record["task"], str) or not isinstance(record["memory_type"], str):
+        return "task and memory_type must be text"
+    if not isinstance(record["episode"], int):
+        return f"found the episode {record['episode']!r}, expected an integer"
+    if not isinstance(record["success"], bool):
+        return f"found success {record['success']!r}, expected true or false"
+    checkpoints = record["checkpoints"]
+    if not isinstance(checkpoints, list) or not all(
+        isinstance(item, dict) and item.get("operation") in ("S", "U", "C") and "first_step" in item
+        for item in checkpoints
+    ):
+        return "expected checkpoints to be a list of {operation, first_step, ordered_step}"
+    return None

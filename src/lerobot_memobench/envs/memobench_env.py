@@ -1,0 +1,200 @@
+"""The gym environment that LeRobot steps: an `Episode`, its observations, its line in the log."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from lerobot_memobench.envs.annotate import annotate
+from lerobot_memobench.envs.configuration_memobench import IMAGE_SIZE, SEED_BASE
+from lerobot_memobench.envs.episode import EXECUTION, HORIZON, IMAGE_KEYS, PROMPT, Episode
+from lerobot_memobench.envs.episode_log import EpisodeLog
+from lerobot_memobench.sim.rendering import RenderSettings
+from lerobot_memobench.tasks.failures import classify_failure
+from lerobot_memobench.tasks.task import load_task
+
+METADATA = {"render_modes": ["rgb_array"], "render_fps": 20}
+
+
+def _observation_space(expert_action: bool) -> spaces.Dict:
+    image = spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
+    parts: dict[str, spaces.Space[Any]] = {
+        "pixels": spaces.Dict({key: image for key in IMAGE_KEYS}),
+        "agent_pos": spaces.Box(-np.inf, np.inf, (8,), np.float32),
+        # LeRobot passes numeric keys that it does not know on as `observation.<key>`, so a policy with a memory can
+        # tell by itself when each row of a batch starts and stands still.
+        "phase": spaces.Box(PROMPT, EXECUTION, (1,), np.float32),
+        "step": spaces.Box(0, np.inf, (1,), np.float32),
+    }
+    if expert_action:
+        parts["expert_action"] = spaces.Box(-1.0, 1.0, (7,), np.float32)
+    return spaces.Dict(parts)
+
+
+def _action_space() -> spaces.Box:
+    return spaces.Box(-1.0, 1.0, (7,), np.float32)
+
+
+def spaces_and_metadata(expert_action: bool) -> tuple[spaces.Dict, spaces.Box, dict[str, Any]]:
+    """Return what a vector environment must know before its workers exist."""
+    return _observation_space(expert_action), _action_space(), METADATA
+
+
+class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
+    """One task of the benchmark.
+
+    Observation: ``pixels/image`` and ``pixels/wrist_image`` uint8 (256, 256, 3) upright; ``agent_pos`` float32 (8,):
+    end-effector position (3, m), axis-angle (3, rad), fingers (2, m); ``phase`` (1,): 0 while the prompt video plays and
+    actions have no effect, 1 in execution; ``step`` (1,): control steps since the episode began; on request
+    ``expert_action`` (7,).
+
+    Action: float32 (7,) in [−1, 1]: end-effector displacement (±5 cm, ±0.5 rad per unit), gripper (−1 opens, 1 closes).
+
+    Args:
+        folder: the task's folder.
+        log_dir: where finished episodes are logged; nowhere when None.
+        others: see `MemobenchEnvConfig`.
+    """
+
+    metadata = METADATA
+
+    def __init__(
+        self,
+        folder: str,
+        *,
+        log_dir: str | None = None,
+        referent: str = "fixed",
+        prompt_video: bool = True,
+        horizon: int = HORIZON,
+        render: str = "default",
+        render_every: int = 1,
+        replan_steps: int | None = None,
+        expert_action: bool = False,
+        seed_base: int = SEED_BASE,
+    ) -> None:
+        self.render_mode = "rgb_array"
+        self._task = load_task(folder)
+        self.task = self._task.name
+        self.task_description = self._task.language
+        self.observation_space = _observation_space(expert_action)
+        self.action_space = _action_space()
+        self._log = EpisodeLog(log_dir) if log_dir is not None else None
+        self._settings: dict[str, Any] = {
+            "referent": referent,
+            "prompt_video": prompt_video,
+            "horizon": horizon,
+            "render": RenderSettings(IMAGE_SIZE, IMAGE_SIZE, render),
+        }
+        self._render_every, self._replan_steps = render_every, replan_steps
+        self._expert_action, self._seed_base = expert_action, seed_base
+        self._next_seed = seed_base
+        self._episode: Episode | None = None
+
+    @property
+    def episode(self) -> Episode:
+        """The running episode; its scene is compiled and its GL context opened in the process that first asks."""
+        if self._episode is None:
+            self._episode = Episode(self._task, **self._settings)
+        return self._episode
+
+    @property
+    def _max_episode_steps(self) -> int:
+        """Upper bound for LeRobot's loop: prompt and execution. The horizon itself counts execution steps."""
+        prompt = self._settings["prompt_video"] and self._task.prompt is not None
+        from lerobot_memobench.envs.episode import PROMPT_LIMIT
+
+        return int(self._settings["horizon"]) + (PROMPT_LIMIT if prompt else 0)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Start the episode of a seed; without one, of the seed after the last."""
+        super().reset(seed=seed)
+        seed = self._next_seed if seed is None else int(seed)
+        self._next_seed = seed + 1
+        self._started = time.monotonic()
+        self._logged = False
+        self.episode.reset(seed)
+        self._images = self.episode.images()
+        return self._observation(), self._info()
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Advance by one control step of 50 ms. The reward is 1 at success, else 0."""
+        episode = self.episode
+        episode.step(np.asarray(action, dtype=np.float32))
+        if (
+            episode.phase == PROMPT
+            or episode.exec_steps % self._render_every == 0
+            or episode.done
+            or episode.exec_steps == 0
+        ):
+            self._images = episode.images()
+        success = episode.success
+        truncated = episode.done and not success
+        if episode.done and not self._logged:
+            self._logged = True
+            if self._log is not None:
+                self._log.append(self.record())
+        return self._observation(), float(success), success, truncated, self._info()
+
+    def record(self) -> dict[str, Any]:
+        """Return the episode's line for the log; see `spec/benchmark.md`, files that other tools read."""
+        episode = self.episode
+        progress, task = episode.progress, episode.task
+        return {
+            "task": task.name,
+            "memory_type": task.memory_type,
+            "episode": episode.seed - self._seed_base,
+            "seed": episode.seed,
+            "referent": episode.referent,
+            "variant": task.variant_index,
+            "replan_steps": self._replan_steps,
+            "prompt_steps": episode.exec_start if episode.exec_start is not None else episode.step_index,
+            "prompt_shown": episode.prompt_shown,
+            "steps": episode.exec_steps,
+            "success": episode.success,
+            "checkpoints": [
+                {"operation": checkpoint.operation, "first_step": first, "ordered_step": ordered}
+                for checkpoint, first, ordered in zip(
+                    task.checkpoints, progress.first_step, progress.ordered_step, strict=True
+                )
+            ],
+            "failure": classify_failure(task, progress.first_step, episode.success, episode.drifted),
+            "scene_hash": episode.scene_hash,
+            "wall_s": round(time.monotonic() - self._started, 3),
+        }
+
+    def _observation(self) -> dict[str, Any]:
+        episode = self.episode
+        observation: dict[str, Any] = {
+            "pixels": dict(self._images),
+            "agent_pos": episode.sim.proprio(),
+            "phase": np.array([episode.phase], dtype=np.float32),
+            "step": np.array([episode.step_index], dtype=np.float32),
+        }
+        if self._expert_action:
+            observation["expert_action"] = episode.expert_action()
+        return observation
+
+    def _info(self) -> dict[str, Any]:
+        episode = self.episode
+        return {
+            "is_success": episode.success,
+            "phase": episode.phase,
+            "checkpoints_completed": episode.progress.index,
+        }
+
+    def render(self) -> NDArray[np.uint8]:
+        """Return both cameras side by side under what is being remembered and done; the frame drawn last."""
+        return annotate(self._images, self.episode)
+
+    def close(self) -> None:
+        """Let the scene go; the next reset compiles or fetches it anew."""
+        self._episode = None

@@ -1,0 +1,24 @@
+"""The one error that users see, and the help it gives."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class MemobenchError(ValueError):
+    """Bad input, told in one sentence: what was given, what was expected, what to do.
+
+    The command line prints the message without a traceback and exits with status 2.
+    """
+
+
+def nearest(given: str, known: Iterable[str], count: int = 3) -> str:
+    """Return a hint that names the known words nearest to ``given``, or all of them when few."""
+    words = sorted(known)
+    close = difflib.get_close_matches(given, words, n=count, cutoff=0.4)
+    if close:
+        return "did you mean " + " or ".join(repr(word) for word in close) + "?"
+    if len(words) <= 12:
+        return "known are " + ", ".join(repr(word) for word in words)
+    return f"there are {len(words)} known ones"

@@ -1,0 +1,99 @@
+"""What the prompt videos of object and procedural tasks show, acted out by the arm.
+
+The scene is restored exactly afterwards by whoever plays the prompt; here it only has to be shown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.experts import motions
+from lerobot_memobench.experts.expert import Expert, steps_of
+from lerobot_memobench.experts.hand import CLOSED, OPEN, UP, Hand
+from lerobot_memobench.sim.rendering import Highlight
+from lerobot_memobench.sim.simulation import Simulation
+from lerobot_memobench.tasks.task import Task
+
+PAUSE = 8
+"""Still frames before and after, so that the video has a first and a last picture."""
+HIGHLIGHT_STEPS = 50
+
+
+class PromptDemonstrator:
+    """Play one prompt.
+
+    Args:
+        task: the episode's task, a variant of the published one where the referent is random.
+        sim: the running scene, at the episode's initial state.
+        rng: source of small variation.
+
+    Attributes:
+        shown: whether the last run showed what it had to, e.g. the goal of the routine really came about.
+    """
+
+    def __init__(self, task: Task, sim: Simulation, rng: np.random.Generator) -> None:
+        assert task.prompt is not None
+        self._task, self._sim, self._rng = task, sim, rng
+        self._prompt = task.prompt
+        self.shown = False
+
+    def actions(self) -> Iterator[NDArray[np.float32]]:
+        """Yield the demonstrator's actions (7,), one per control step."""
+        hand = Hand(self._sim, self._rng)
+        position, rotation = self._sim.eef_pose()
+        yield from hand.wait(PAUSE, OPEN)
+        match self._prompt.kind:
+            case "routine":
+                yield from self._routine()
+            case "pick":
+                yield from self._pick(hand)
+            case "point":
+                yield from self._point(hand)
+            case "highlight":
+                yield from self._highlight(hand)
+        yield from motions.go_home(hand, position, rotation)
+        yield from hand.wait(PAUSE, OPEN)
+
+    def _referent(self) -> str:
+        assert self._prompt.target is not None
+        return self._prompt.target
+
+    def _routine(self) -> Generator[NDArray[np.float32], None, None]:
+        expert = Expert(self._task, self._sim, self._rng)
+        while not expert.done:
+            yield expert.act()
+        self.shown = all(
+            self._sim.holds(atom) for atom in steps_of(self._task.goal) if not atom.predicate.startswith("was")
+        )
+
+    def _pick(self, hand: Hand) -> Generator[NDArray[np.float32], None, None]:
+        place, turned = self._sim.body_pose(self._referent())
+        held = yield from motions.pick(hand, self._referent())
+        if held is not None:
+            self.shown = True
+            yield from hand.wait(PAUSE, CLOSED)
+            yield from motions.put_at(hand, held, place, turned)
+
+    def _point(self, hand: Hand) -> Generator[NDArray[np.float32], None, None]:
+        asset = self._sim.assets[self._referent()]
+        place, _ = self._sim.body_pose(self._referent())
+        above = place + (asset.top + 0.03) * UP
+        rotation = hand.rotation
+        yield from hand.move(above + 0.10 * UP, rotation, CLOSED, tolerance=0.015)
+        for height in (0.0, 0.05, 0.0):
+            yield from hand.move(above + height * UP, rotation, CLOSED, tolerance=0.008, speed=0.6, timeout=60)
+        yield from hand.wait(PAUSE, CLOSED)
+        self.shown = bool(np.linalg.norm((hand.position - place)[:2]) < 0.03)
+        yield from hand.move(above + 0.10 * UP, rotation, CLOSED, tolerance=0.02)
+
+    def _highlight(self, hand: Hand) -> Generator[NDArray[np.float32], None, None]:
+        asset = self._sim.assets[self._referent()]
+        place, _ = self._sim.body_pose(self._referent())
+        spot = (float(place[0]), float(place[1]), float(place[2] + asset.bottom + 0.002))
+        self._sim.highlights = (Highlight(spot, asset.radius + 0.035),)
+        self.shown = True
+        yield from hand.wait(HIGHLIGHT_STEPS, OPEN)
+        self._sim.highlights = ()

@@ -1,0 +1,475 @@
+"""What every asset is made of: a builder over ``mujoco.MjSpec`` and the facts about a finished asset.
+
+An asset is a function of a `Builder`: it adds visual geoms (group 1, without contacts or mass), collision
+geoms (group 0, which cameras never draw) and sites below one root body, and returns an `Asset`, the numbers
+that a scene, a predicate or an expert wants to know without asking MuJoCo.
+
+Frames: x of an asset points to the agentview camera when it is placed with yaw 0, z points up. The origin of
+an object is its geometric centre; that of a container (bowl, plate, pan) is the centre of its bottom, and
+that of a fixture is on the table top. Units are metres, kilograms and radians.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Literal
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.sim.assets.meshes import MeshData
+
+Vector = Sequence[float] | NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+VISUAL_GROUP = 1
+COLLISION_GROUP = 0
+SITE_GROUP = 4
+
+# Contacts: stiff enough that things do not sink visibly, slow enough (5 physics steps) to be stable at 2 ms.
+SOLREF = (0.01, 1.0)
+SOLIMP = (0.95, 0.99, 0.001, 0.5, 2.0)
+FRICTION = (1.0, 0.02, 0.0005)
+ROLLING_FRICTION = 0.004
+GRIP_FRICTION = (1.8, 0.03, 0.0005)
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """A top-down grasp: gripper pointing down, its closing axis level.
+
+    ``position``: where the middle between the finger tips goes, in the body's frame [m].
+    ``yaw``: angle of the closing axis about the body's z [rad]; 0 closes along the body's x.
+    ``width``: what is between the fingers [m].
+    ``symmetric``: the grasp may be turned about the body's z axis by any angle, position and axis together.
+    ``depth``: how far below ``position`` there is still something to hold [m]; fingers may reach that deep.
+    """
+
+    position: tuple[float, float, float]
+    yaw: float
+    width: float
+    symmetric: bool = False
+    depth: float = 0.01
+
+
+@dataclass(frozen=True)
+class Handle:
+    """A bar to pull or a ridge to turn, in the frame of its site: x along it, y into the fixture.
+
+    ``length``: along x [m]. ``thickness``: the bar's cross-section, y and z [m]. ``clearance``: free space
+    behind the bar [m].
+    """
+
+    length: float
+    thickness: tuple[float, float]
+    clearance: float
+
+
+@dataclass(frozen=True)
+class Articulation:
+    """A joint that predicates read and experts move.
+
+    Drawers and doors are open when q < ``open_below`` and closed when q > ``closed_above``; knobs are on when
+    q >= ``on_at_least`` and off when q < ``off_below``. ``closed_q`` and ``open_q`` are good targets for q
+    (off and on for a knob). ``handle_site``: full name of the site at the handle's middle, which moves along.
+    """
+
+    joint: str
+    kind: Literal["drawer", "door", "knob"]
+    closed_q: float
+    open_q: float
+    handle_site: str
+    handle: Handle
+    open_below: float | None = None
+    closed_above: float | None = None
+    on_at_least: float | None = None
+    off_below: float | None = None
+
+
+@dataclass(frozen=True)
+class Asset:
+    """What is known of one built instance.
+
+    ``low`` and ``high``: corners of the bounding box in the body's frame [m], joints at their closed pose.
+    ``regions``: region name (``top_region``, ``cook_region``, ...) -> full name of its box site.
+    ``articulations``: region name, or ``""`` for the fixture as a whole -> its joint.
+    ``supports``: height in the body's frame of the surface on which things are put: a bowl's floor, the top
+    of anything else [m]; ``clear_radius``: radius of that surface [m].
+    ``glow``: full names of visual geoms whose rgba is ``glow_on`` while the fixture is on, else ``glow_off``.
+    ``round``: the outline from above is a circle about the origin.
+    """
+
+    name: str
+    class_name: str
+    kind: Literal["object", "fixture"]
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+    grasps: tuple[Grasp, ...] = ()
+    articulations: Mapping[str, Articulation] = field(default_factory=lambda: MappingProxyType({}))
+    regions: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    supports: float = 0.0
+    clear_radius: float = 0.0
+    glow: tuple[str, ...] = ()
+    glow_on: tuple[float, float, float, float] = (1.0, 0.12, 0.04, 1.0)
+    glow_off: tuple[float, float, float, float] = (0.34, 0.34, 0.35, 1.0)
+    round: bool = False
+
+    @property
+    def bottom(self) -> float:
+        """z of the lowest point in the body's frame [m], 0 or below."""
+        return self.low[2]
+
+    @property
+    def top(self) -> float:
+        """z of the highest point in the body's frame [m]."""
+        return self.high[2]
+
+    @property
+    def half_extents(self) -> tuple[float, float]:
+        """Half the size of the smallest origin-centred rectangle around the asset, x and y [m]."""
+        return (max(-self.low[0], self.high[0]), max(-self.low[1], self.high[1]))
+
+    @property
+    def radius(self) -> float:
+        """Radius about the origin, seen from above, that holds everything [m]."""
+        if self.round:
+            return max(self.half_extents)
+        return float(np.hypot(*self.half_extents))
+
+
+class Builder:
+    """Builds one instance of an asset into a shared ``MjSpec``.
+
+    Textures, materials and meshes are memoised by key in the spec: nine cartons share one of each. Bodies,
+    geoms, joints and sites are named ``f"{name}_{suffix}"``.
+    """
+
+    def __init__(
+        self, spec: mujoco.MjSpec, parent: mujoco.MjsBody, name: str, class_name: str, variant: int = 0
+    ) -> None:
+        """Add the root body ``name`` below ``parent``; the scene places it and frees objects with a joint."""
+        self.spec = spec
+        self.name = name
+        self.class_name = class_name
+        self.variant = variant
+        self.body: mujoco.MjsBody = parent.add_body(name=name)
+        self._counts: dict[str, int] = {}
+        self._grasps: list[Grasp] = []
+
+    # names -------------------------------------------------------------------------------------
+    def full(self, suffix: str) -> str:
+        """Return the full element name of ``suffix``."""
+        return f"{self.name}_{suffix}"
+
+    def _fresh(self, kind: str) -> str:
+        self._counts[kind] = self._counts.get(kind, -1) + 1
+        return self.full(f"{kind}{self._counts[kind]}")
+
+    # shared parts ------------------------------------------------------------------------------
+    def material(
+        self,
+        key: str,
+        image: Callable[[], Image] | None = None,
+        rgba: Vector = (1.0, 1.0, 1.0, 1.0),
+        specular: float = 0.2,
+        shininess: float = 0.3,
+        reflectance: float = 0.0,
+        emission: float = 0.0,
+    ) -> str:
+        """Return the name of the material ``key``, made on first use; ``image`` draws its texture."""
+        name = f"memobench_{key}"
+        if self.spec.material(name) is not None:
+            return name
+        made = self.spec.add_material(name=name, rgba=list(rgba), specular=specular, shininess=shininess)
+        made.reflectance = reflectance
+        made.emission = emission
+        if image is not None:
+            pixels = np.ascontiguousarray(image(), dtype=np.uint8)
+            texture = self.spec.add_texture(
+                name=name,
+                type=mujoco.mjtTexture.mjTEXTURE_2D,
+                height=pixels.shape[0],
+                width=pixels.shape[1],
+                nchannel=3,
+            )
+            texture.data = pixels.tobytes()
+            made.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
+        return name
+
+    def mesh(self, key: str, make: Callable[[], MeshData], smooth: bool = False) -> str:
+        """Return the name of the mesh ``key``, made on first use; ``smooth`` shades sharp edges as round."""
+        name = f"memobench_{key}"
+        if self.spec.mesh(name) is not None:
+            return name
+        data = make()
+        made = self.spec.add_mesh(
+            name=name,
+            uservert=data.vertices.astype(np.float32).ravel(),
+            userface=data.faces.astype(np.int32).ravel(),
+            smoothnormal=smooth,
+        )
+        made.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+        if data.uv is not None:
+            made.usertexcoord = data.uv.astype(np.float32).ravel()
+            indices = data.faces if data.uv_faces is None else data.uv_faces
+            made.userfacetexcoord = indices.astype(np.int32).ravel()
+        return name
+
+    # bodies and joints -------------------------------------------------------------------------
+    def child(self, suffix: str, pos: Vector = (0.0, 0.0, 0.0), quat: Vector | None = None) -> mujoco.MjsBody:
+        """Add a body below the root."""
+        made = self.body.add_body(name=self.full(suffix), pos=list(pos))
+        if quat is not None:
+            made.quat = list(quat)
+        return made
+
+    def joint(
+        self,
+        body: mujoco.MjsBody,
+        suffix: str,
+        kind: Literal["slide", "hinge"],
+        axis: Vector,
+        limits: tuple[float, float],
+        damping: float,
+        frictionloss: float,
+        pos: Vector = (0.0, 0.0, 0.0),
+    ) -> str:
+        """Add a joint limited to ``limits`` [m or rad] to ``body`` and return its full name."""
+        name = self.full(suffix)
+        kinds = {"slide": mujoco.mjtJoint.mjJNT_SLIDE, "hinge": mujoco.mjtJoint.mjJNT_HINGE}
+        # A spec reads hinge limits in the unit of its compiler option.
+        in_degrees = kind == "hinge" and self.spec.compiler.degree
+        body.add_joint(
+            name=name,
+            type=kinds[kind],
+            axis=list(axis),
+            pos=list(pos),
+            range=list(np.degrees(limits) if in_degrees else limits),
+            limited=mujoco.mjtLimited.mjLIMITED_TRUE,
+            damping=damping,
+            frictionloss=frictionloss,
+            armature=0.001,
+            solref_limit=[0.01, 1.0],
+        )
+        return name
+
+    def exclude(self, first: mujoco.MjsBody, second: mujoco.MjsBody) -> None:
+        """Keep two bodies from touching each other."""
+        self.spec.add_exclude(bodyname1=first.name, bodyname2=second.name)
+
+    # geoms and sites ---------------------------------------------------------------------------
+    def visual_mesh(
+        self,
+        mesh: str,
+        material: str,
+        pos: Vector = (0.0, 0.0, 0.0),
+        quat: Vector | None = None,
+        body: mujoco.MjsBody | None = None,
+        rgba: Vector | None = None,
+    ) -> mujoco.MjsGeom:
+        """Add a mesh that is seen and never touched."""
+        geom = (body or self.body).add_geom(
+            name=self._fresh("visual"),
+            type=mujoco.mjtGeom.mjGEOM_MESH,
+            meshname=mesh,
+            material=material,
+            pos=list(pos),
+        )
+        return self._seen(geom, quat, rgba)
+
+    def visual(
+        self,
+        kind: Literal["box", "cylinder", "capsule", "ellipsoid", "sphere"],
+        size: Vector,
+        material: str,
+        pos: Vector = (0.0, 0.0, 0.0),
+        quat: Vector | None = None,
+        body: mujoco.MjsBody | None = None,
+        rgba: Vector | None = None,
+    ) -> mujoco.MjsGeom:
+        """Add a primitive that is seen and never touched; for round things meshes have fewer faces."""
+        geom = (body or self.body).add_geom(
+            name=self._fresh("visual"), type=_TYPES[kind], size=_size(size), material=material, pos=list(pos)
+        )
+        return self._seen(geom, quat, rgba)
+
+    def _seen(self, geom: mujoco.MjsGeom, quat: Vector | None, rgba: Vector | None) -> mujoco.MjsGeom:
+        geom.contype, geom.conaffinity, geom.group, geom.mass = 0, 0, VISUAL_GROUP, 0.0
+        if quat is not None:
+            geom.quat = list(quat)
+        if rgba is not None:
+            geom.rgba = list(rgba)
+        return geom
+
+    def collision(
+        self,
+        kind: Literal["box", "cylinder", "capsule", "ellipsoid", "sphere"],
+        size: Vector,
+        mass: float,
+        pos: Vector = (0.0, 0.0, 0.0),
+        quat: Vector | None = None,
+        body: mujoco.MjsBody | None = None,
+        friction: Vector = FRICTION,
+    ) -> mujoco.MjsGeom:
+        """Add a primitive that is touched, weighs ``mass`` and is never seen."""
+        geom = (body or self.body).add_geom(
+            name=self._fresh("collision"),
+            type=_TYPES[kind],
+            size=_size(size),
+            pos=list(pos),
+            mass=mass,
+            group=COLLISION_GROUP,
+            rgba=[0.2, 0.8, 0.2, 0.4],
+            friction=list(friction),
+            condim=4,
+            solref=list(SOLREF),
+            solimp=list(SOLIMP),
+        )
+        if quat is not None:
+            geom.quat = list(quat)
+        if kind in ("sphere", "ellipsoid"):
+            # Fruit comes to rest: without rolling friction a ball would wander over the table for ever.
+            geom.condim = 6
+            geom.friction = [friction[0], friction[1], ROLLING_FRICTION]
+        return geom
+
+    def ring(
+        self,
+        count: int,
+        low: tuple[float, float],
+        high: tuple[float, float],
+        thickness: float,
+        mass: float,
+        friction: Vector = FRICTION,
+    ) -> None:
+        """Add tilted collision boxes around z, from (radius, z) ``low`` to ``high`` on the wall's middle."""
+        (r0, z0), (r1, z1) = low, high
+        slant = np.hypot(r1 - r0, z1 - z0)
+        along = np.array([(r1 - r0) / slant, 0.0, (z1 - z0) / slant])
+        out = np.array([along[2], 0.0, -along[0]])
+        middle = np.array([(r0 + r1) / 2, 0.0, (z0 + z1) / 2])
+        half_width = max(r0, r1) * np.tan(np.pi / count)
+        upright = np.stack([out, [0.0, 1.0, 0.0], along], axis=1)
+        for k in range(count):
+            turn = _about_z(2 * np.pi * k / count)
+            self.collision(
+                "box",
+                (thickness / 2, half_width, slant / 2),
+                mass / count,
+                pos=turn @ middle,
+                quat=_quat(turn @ upright),
+                friction=friction,
+            )
+
+    def site(
+        self,
+        suffix: str,
+        pos: Vector,
+        size: Vector = (0.005, 0.005, 0.005),
+        quat: Vector | None = None,
+        body: mujoco.MjsBody | None = None,
+        box: bool = False,
+    ) -> str:
+        """Add a site and return its full name; ``size`` holds half sizes when ``box``."""
+        name = self.full(suffix)
+        kind = mujoco.mjtGeom.mjGEOM_BOX if box else mujoco.mjtGeom.mjGEOM_SPHERE
+        made = (body or self.body).add_site(
+            name=name, pos=list(pos), size=_size(size), type=kind, group=SITE_GROUP, rgba=[0.2, 0.5, 1.0, 0.3]
+        )
+        if quat is not None:
+            made.quat = list(quat)
+        return name
+
+    # facts -------------------------------------------------------------------------------------
+    def grasp(
+        self, position: Vector, yaw: float, width: float, symmetric: bool = False, depth: float = 0.01
+    ) -> None:
+        """Note a way to hold the object from above."""
+        x, y, z = (float(v) for v in position)
+        self._grasps.append(Grasp((x, y, z), float(yaw), float(width), symmetric, float(depth)))
+
+    def object(
+        self,
+        low: Vector,
+        high: Vector,
+        round: bool = False,
+        floor: float | None = None,
+        clear: float | None = None,
+    ) -> Asset:
+        """Return the facts about an object; ``floor`` and ``clear`` are those of a container's inside."""
+        x, y, top = _triple(high)
+        return Asset(
+            name=self.name,
+            class_name=self.class_name,
+            kind="object",
+            low=_triple(low),
+            high=(x, y, top),
+            grasps=tuple(self._grasps),
+            supports=top if floor is None else floor,
+            clear_radius=min(x, y) if clear is None else clear,
+            round=round,
+        )
+
+    def fixture(
+        self,
+        low: Vector,
+        high: Vector,
+        regions: Mapping[str, str],
+        articulations: Mapping[str, Articulation] | None = None,
+        supports: float | None = None,
+        clear: float = 0.0,
+        glow: tuple[str, ...] = (),
+    ) -> Asset:
+        """Return the facts about a fixture; ``supports`` and ``clear`` tell of its top."""
+        return Asset(
+            name=self.name,
+            class_name=self.class_name,
+            kind="fixture",
+            low=_triple(low),
+            high=_triple(high),
+            articulations=MappingProxyType(dict(articulations or {})),
+            regions=MappingProxyType(dict(regions)),
+            supports=high[2] if supports is None else supports,
+            clear_radius=clear,
+            glow=glow,
+        )
+
+
+_TYPES = {
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+    "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+}
+
+
+def _size(size: Vector) -> list[float]:
+    values = [float(v) for v in size]
+    return values + [0.0] * (3 - len(values))
+
+
+def _triple(values: Vector) -> tuple[float, float, float]:
+    x, y, z = (float(v) for v in values)
+    return (x, y, z)
+
+
+def _about_z(angle: float) -> NDArray[np.float64]:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _quat(matrix: NDArray[np.float64]) -> list[float]:
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, np.ascontiguousarray(matrix).ravel())
+    return [float(v) for v in quat]
+
+
+def turned(axis: Vector, angle: float) -> list[float]:
+    """Return the quaternion (w, x, y, z) of a turn by ``angle`` [rad] about ``axis``."""
+    quat = np.zeros(4)
+    mujoco.mju_axisAngle2Quat(quat, np.asarray(axis, dtype=np.float64), angle)
+    return [float(v) for v in quat]

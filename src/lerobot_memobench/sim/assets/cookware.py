@@ -1,0 +1,177 @@
+"""A frying pan and a moka pot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from lerobot_memobench.sim.assets.base import GRIP_FRICTION, Asset, Builder, turned
+from lerobot_memobench.sim.assets.meshes import MeshData, ball, lathe, merged, tube
+from lerobot_memobench.sim.assets.paint import Canvas, Pixels, drawn
+
+# Frying pan: the disc's middle is the origin, the handle points to +y and rises.
+_PAN = 0.102
+_PAN_BASE = 0.078
+_PAN_WALL = 0.043
+_PAN_END = 0.254
+_PAN_HIGH = 0.058
+
+
+def _pan_mesh() -> MeshData:
+    return lathe(
+        [
+            (0.0, 0.0),
+            (_PAN_BASE, 0.0),
+            (_PAN_BASE + 0.010, 0.008),
+            (_PAN - 0.001, _PAN_WALL - 0.002),
+            (_PAN, _PAN_WALL),
+            (_PAN - 0.004, _PAN_WALL),
+            (_PAN_BASE + 0.005, 0.012),
+            (_PAN_BASE - 0.006, 0.0055),
+            (0.0, 0.005),
+        ],
+        segments=28,
+        by_length=True,
+    )
+
+
+def _pan_texture() -> Pixels:
+    def paint(canvas: Canvas) -> None:
+        canvas.rect(0, 0.00, 1, 0.31, (40, 41, 41))
+        canvas.rect(0, 0.31, 1, 0.345, (92, 95, 95))
+        canvas.rect(0, 0.345, 1, 0.49, (66, 69, 69))
+        canvas.rect(0, 0.475, 1, 0.515, (150, 153, 155))
+        canvas.rect(0, 0.515, 1, 1.0, (48, 50, 51))
+
+    return drawn(16, 256, (48, 50, 51), paint)
+
+
+def _handle_mesh() -> MeshData:
+    path = [
+        (0, 0.092, 0.036),
+        (0, 0.108, 0.038),
+        (0, 0.112, 0.039),
+        (0, 0.150, 0.0445),
+        (0, 0.200, 0.0495),
+        (0, 0.240, 0.0510),
+        (0, _PAN_END, 0.0505),
+    ]
+    radii = [
+        (0.010, 0.004),
+        (0.010, 0.004),
+        (0.0105, 0.008),
+        (0.0105, 0.007),
+        (0.012, 0.007),
+        (0.0125, 0.007),
+    ]
+    return tube(path, [*radii, (0.007, 0.004)], sides=8)
+
+
+def _frypan(b: Builder) -> Asset:
+    pan = b.material("frypan", _pan_texture, specular=0.6, shininess=0.5)
+    grip = b.material("frypan_handle", rgba=(0.075, 0.075, 0.08, 1), specular=0.4, shininess=0.5)
+    steel = b.material("steel", rgba=(0.72, 0.73, 0.75, 1), specular=0.8, shininess=0.7)
+    b.visual_mesh(b.mesh("frypan", _pan_mesh), pan)
+    b.visual_mesh(b.mesh("frypan_handle", _handle_mesh), grip)
+    b.visual("box", (0.0055, 0.012, 0.0012), grip, (0, 0.228, 0.0572), turned((1, 0, 0), 0.02))
+    b.visual("box", (0.0112, 0.011, 0.0048), steel, (0, 0.106, 0.0378), turned((1, 0, 0), 0.15))
+    b.collision("cylinder", (_PAN_BASE, 0.0025), 0.13, (0, 0, 0.0025))
+    b.ring(14, (_PAN_BASE + 0.002, 0.003), (_PAN - 0.002, _PAN_WALL - 0.001), 0.004, 0.04)
+    for y0, z0, y1, z1 in ((0.098, 0.0375, 0.150, 0.0445), (0.150, 0.0445, _PAN_END, 0.0505)):
+        slope = np.arctan2(z1 - z0, y1 - y0)
+        half = 0.5 * np.hypot(y1 - y0, z1 - z0)
+        b.collision(
+            "box",
+            (0.0105, half, 0.007),
+            0.01,
+            (0, (y0 + y1) / 2, (z0 + z1) / 2),
+            turned((1, 0, 0), slope),
+            friction=GRIP_FRICTION,
+        )
+    for y in (0.135, 0.165, 0.195):
+        b.grasp((0.0, y, 0.0445 + 0.1 * (y - 0.15)), 0.0, 0.021, depth=0.03)
+    high = (_PAN, _PAN_END, _PAN_HIGH)
+    return b.object((-_PAN, -_PAN, 0), high, floor=0.005, clear=_PAN_BASE - 0.006)
+
+
+# Moka pot: eight-sided, the spout at +y, the handle at -y.
+_MOKA_LOW = -0.076
+
+
+def _moka_body() -> MeshData:
+    z = _MOKA_LOW
+    profile = [
+        (0.0, z),
+        (0.0400, z),
+        (0.0405, z + 0.003),
+        (0.0335, z + 0.058),
+        (0.0340, z + 0.060),
+        (0.0340, z + 0.068),
+        (0.0300, z + 0.070),
+        (0.0300, z + 0.074),
+        (0.0325, z + 0.076),
+        (0.0395, z + 0.122),
+        (0.0395, z + 0.125),
+        (0.0180, z + 0.136),
+        (0.0, z + 0.138),
+    ]
+    # Two faces lie across x, so that the camera sees a facet and not an edge.
+    return lathe(profile, segments=8).turned((0, 0, 1), np.pi / 8)
+
+
+def _moka_spout() -> MeshData:
+    z = _MOKA_LOW
+    vertices = np.array(
+        [
+            (0.016, 0.034, z + 0.124),
+            (-0.016, 0.034, z + 0.124),
+            (0.003, 0.060, z + 0.128),
+            (-0.003, 0.060, z + 0.128),
+            (0.0, 0.031, z + 0.085),
+        ]
+    )
+    faces = np.array([(0, 2, 3), (0, 3, 1), (0, 4, 2), (2, 4, 3), (1, 3, 4)])
+    return MeshData(vertices, faces)
+
+
+def _moka_black() -> MeshData:
+    z = _MOKA_LOW
+    handle = tube(
+        [
+            (0, -0.034, z + 0.121),
+            (0, -0.060, z + 0.126),
+            (0, -0.075, z + 0.118),
+            (0, -0.080, z + 0.095),
+            (0, -0.084, z + 0.060),
+        ],
+        [(0.009, 0.006), (0.009, 0.006), (0.009, 0.006), (0.009, 0.005), (0.007, 0.004)],
+        sides=6,
+        up=(0, 0.6, 0.8),
+    )
+    knob = ball((0.009, 0.009, 0.008), 8, 5).moved((0, 0, z + 0.144))
+    return merged(MeshData(handle.vertices, handle.faces), MeshData(knob.vertices, knob.faces))
+
+
+def _moka_pot(b: Builder) -> Asset:
+    aluminium = b.material("moka_aluminium", rgba=(0.80, 0.81, 0.83, 1), specular=0.9, shininess=0.6)
+    black = b.material("moka_black", rgba=(0.06, 0.06, 0.065, 1), specular=0.5, shininess=0.5)
+    b.visual_mesh(b.mesh("moka_body", _moka_body), aluminium)
+    b.visual_mesh(b.mesh("moka_spout", _moka_spout), aluminium)
+    b.visual_mesh(b.mesh("moka_black", _moka_black), black)
+    z = _MOKA_LOW
+    b.collision("cylinder", (0.0385, 0.030), 0.14, (0, 0, z + 0.030))
+    b.collision("cylinder", (0.032, 0.008), 0.02, (0, 0, z + 0.068))
+    b.collision("cylinder", (0.0365, 0.030), 0.06, (0, 0, z + 0.106))
+    b.collision("box", (0.009, 0.006, 0.030), 0.01, (0, -0.080, z + 0.091), friction=GRIP_FRICTION)
+    b.collision("box", (0.009, 0.022, 0.006), 0.005, (0, -0.055, z + 0.123), friction=GRIP_FRICTION)
+    b.collision("cylinder", (0.009, 0.008), 0.005, (0, 0, z + 0.144), friction=GRIP_FRICTION)
+    b.grasp((0.0, -0.080, z + 0.110), 0.0, 0.018, depth=0.03)
+    b.grasp((0.0, 0.0, z + 0.144), 0.0, 0.018, depth=0.004)
+    return b.object((-0.0405, -0.087, z), (0.0405, 0.061, z + 0.152))
+
+
+BUILDERS: dict[str, Callable[[Builder], Asset]] = {
+    "chefmate_8_frypan": _frypan,
+    "moka_pot": _moka_pot,
+}

@@ -1,0 +1,257 @@
+"""Light triangle meshes from a few numbers: surfaces of revolution, boxes, tubes and what is bent from them.
+
+Texture coordinates: u grows to the right and v downwards in the image (its first row is v = 0).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+# Order of the faces of a box in an atlas of 3 x 2 cells (see `paint.atlas`).
+BOX_FACES = ("+x", "+y", "+z", "-x", "-y", "-z")
+
+
+@dataclass(frozen=True)
+class MeshData:
+    """Triangles: vertices (N, 3) [m], faces (M, 3) counter-clockwise from outside, uv (K, 2) and its indices.
+
+    ``uv_faces`` (M, 3) indexes ``uv``; without it ``uv`` goes by vertex.
+    """
+
+    vertices: Floats
+    faces: Ints
+    uv: Floats | None = None
+    uv_faces: Ints | None = None
+
+    def moved(self, offset: Sequence[float]) -> MeshData:
+        """Return the mesh shifted by ``offset`` (3,) [m]."""
+        return self.warped(lambda points: points + np.asarray(offset, dtype=np.float64))
+
+    def warped(self, function: Callable[[Floats], Floats]) -> MeshData:
+        """Return the mesh with its vertices (N, 3) passed through ``function``."""
+        return MeshData(function(self.vertices.copy()), self.faces, self.uv, self.uv_faces)
+
+    def turned(self, axis: Sequence[float], angle: float) -> MeshData:
+        """Return the mesh turned by ``angle`` [rad] about ``axis`` through the origin."""
+        unit = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
+        cross = np.array([[0, -unit[2], unit[1]], [unit[2], 0, -unit[0]], [-unit[1], unit[0], 0]])
+        matrix = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+        return self.warped(lambda points: points @ matrix.T)
+
+    def with_uv(self, u: float, v: float) -> MeshData:
+        """Return the mesh with one texture coordinate everywhere (a palette entry)."""
+        return MeshData(self.vertices, self.faces, np.array([[u, v]]), np.zeros_like(self.faces))
+
+
+def merged(*meshes: MeshData) -> MeshData:
+    """Return one mesh of all; either all of them have texture coordinates or none."""
+    vertices, faces, uv, uv_faces = [], [], [], []
+    count = uv_count = 0
+    for mesh in meshes:
+        vertices.append(mesh.vertices)
+        faces.append(mesh.faces + count)
+        count += len(mesh.vertices)
+        if mesh.uv is not None:
+            uv.append(mesh.uv)
+            uv_faces.append((mesh.faces if mesh.uv_faces is None else mesh.uv_faces) + uv_count)
+            uv_count += len(mesh.uv)
+    if not uv:
+        return MeshData(np.concatenate(vertices), np.concatenate(faces))
+    return MeshData(
+        np.concatenate(vertices), np.concatenate(faces), np.concatenate(uv), np.concatenate(uv_faces)
+    )
+
+
+def lathe(
+    profile: Sequence[tuple[float, float]],
+    segments: int = 24,
+    by_length: bool = False,
+    scale: tuple[float, float] = (1.0, 1.0),
+) -> MeshData:
+    """Return the surface of revolution of a profile of (radius, z), given from the bottom up the outside.
+
+    u runs around, with u = 0.5 at +x and growing towards +y: a label in the middle of the image faces +x.
+    v goes by height from the top (0) to the bottom (1), or by length along the profile from its end to its
+    start when ``by_length``. ``scale`` squeezes x and y into an ellipse. A profile may go on over a rim and
+    down the inside.
+    """
+    radii, heights = (np.array(values, dtype=np.float64) for values in zip(*profile, strict=True))
+    if by_length:
+        way = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(radii), np.diff(heights)))])
+        v = 1 - way / way[-1]
+    else:
+        v = (heights.max() - heights) / np.ptp(heights)
+    angles = np.linspace(-np.pi, np.pi, segments + 1)
+    vertices: list[tuple[float, float, float]] = []
+    rings: list[list[int]] = []
+    for radius, z in zip(radii, heights, strict=True):
+        if radius <= 0:
+            rings.append([len(vertices)] * (segments + 1))
+            vertices.append((0.0, 0.0, z))
+            continue
+        first = len(vertices)
+        rings.append([first + j for j in range(segments)] + [first])
+        vertices += [
+            (radius * np.cos(a) * scale[0], radius * np.sin(a) * scale[1], z) for a in angles[:segments]
+        ]
+    faces, uv_faces = [], []
+    for i in range(len(rings) - 1):
+        for j in range(segments):
+            quad = (rings[i][j], rings[i][j + 1], rings[i + 1][j + 1], rings[i + 1][j])
+            base = i * (segments + 1) + j
+            uv_quad = (base, base + 1, base + segments + 2, base + segments + 1)
+            for corners in ((0, 1, 2), (0, 2, 3)):
+                triangle = [quad[c] for c in corners]
+                if len(set(triangle)) == 3:
+                    faces.append(triangle)
+                    uv_faces.append([uv_quad[c] for c in corners])
+    # Textures repeat: keep clear of the first and last row, which blend into each other.
+    v = 0.008 + 0.984 * v
+    u = np.linspace(0.0, 1.0, segments + 1)
+    uv = np.stack([np.tile(u, len(v)), np.repeat(v, segments + 1)], axis=1)
+    return MeshData(np.array(vertices), np.array(faces), uv, np.array(uv_faces))
+
+
+def ball(radii: Sequence[float], segments: int = 16, rings: int = 9) -> MeshData:
+    """Return an ellipsoid with half axes ``radii`` (3,) [m]."""
+    angles = np.linspace(-np.pi / 2, np.pi / 2, rings + 1)
+    profile = [
+        (max(0.0, float(np.cos(a))) if 0 < k < rings else 0.0, float(np.sin(a))) for k, a in enumerate(angles)
+    ]
+    return lathe(profile, segments).warped(lambda points: points * np.asarray(radii, dtype=np.float64))
+
+
+def box(half: Sequence[float]) -> MeshData:
+    """Return a box whose faces take the cells of a 3 x 2 atlas, upright for somebody who looks at that face.
+
+    On the top and bottom faces the image's right is +y, as the agentview camera sees it.
+    """
+    x, y, z = half
+    sides = {
+        "+x": ((x, 0, 0), (0, y, 0), (0, 0, z)),
+        "-x": ((-x, 0, 0), (0, -y, 0), (0, 0, z)),
+        "+y": ((0, y, 0), (-x, 0, 0), (0, 0, z)),
+        "-y": ((0, -y, 0), (x, 0, 0), (0, 0, z)),
+        "+z": ((0, 0, z), (0, y, 0), (-x, 0, 0)),
+        "-z": ((0, 0, -z), (0, y, 0), (x, 0, 0)),
+    }
+    quads, cells = [], []
+    for k, face in enumerate(BOX_FACES):
+        centre, right, up = (np.array(vector, dtype=np.float64) for vector in sides[face])
+        quads.append([centre - right - up, centre + right - up, centre + right + up, centre - right + up])
+        cells.append((k % 3, k // 3))
+    return quads_mesh(quads, [cell_uv(column, row) for column, row in cells])
+
+
+def cell_uv(column: int, row: int, columns: int = 3, rows: int = 2) -> Floats:
+    """Return the corners (4, 2) of an atlas cell, counter-clockwise from bottom left, a hair inside."""
+    inset = 0.01
+    left, right = (column + inset) / columns, (column + 1 - inset) / columns
+    top, bottom = (row + inset) / rows, (row + 1 - inset) / rows
+    return np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
+
+
+def quads_mesh(quads: Sequence[Sequence[Floats]], uvs: Sequence[Floats]) -> MeshData:
+    """Return a mesh of flat quads: four corners each, counter-clockwise from outside, and their uv (4, 2)."""
+    vertices = np.array([corner for quad in quads for corner in quad], dtype=np.float64)
+    faces = [
+        [4 * k + a, 4 * k + b, 4 * k + c] for k in range(len(quads)) for a, b, c in ((0, 1, 2), (0, 2, 3))
+    ]
+    return MeshData(vertices, np.array(faces), np.concatenate(uvs))
+
+
+@dataclass(frozen=True)
+class Block:
+    """A box in a set of boards: middle and half sizes [m], and the axis along which the grain runs."""
+
+    centre: tuple[float, float, float]
+    half: tuple[float, float, float]
+    grain: int = 0
+
+
+def blocks(parts: Sequence[Block], tile: float = 0.3) -> MeshData:
+    """Return many boxes as one mesh; the image repeats every ``tile`` metres, its u along the grain."""
+    quads, uvs = [], []
+    for number, part in enumerate(parts):
+        half = np.array(part.half)
+        for axis in range(3):
+            a, b = (axis + 1) % 3, (axis + 2) % 3
+            for sign in (-1.0, 1.0):
+                corners = []
+                for p, q in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
+                    corner = np.zeros(3)
+                    corner[axis] = sign * half[axis]
+                    corner[a], corner[b] = p * half[a], q * half[b]
+                    corners.append(corner)
+                if sign < 0:
+                    corners.reverse()
+                along = part.grain if part.grain != axis else a
+                across = 3 - axis - along
+                # Boards are cut from different places of the plank.
+                shift = np.array([0.37 * number, 0.61 * number])
+                uvs.append(np.array([[c[along], c[across]] for c in corners]) / tile + shift)
+                quads.append([corner + np.array(part.centre) for corner in corners])
+    return quads_mesh(quads, uvs)
+
+
+def tube(
+    path: Sequence[Sequence[float]],
+    radii: Sequence[float | tuple[float, float]],
+    sides: int = 8,
+    up: Sequence[float] = (0.0, 0.0, 1.0),
+) -> MeshData:
+    """Return a closed tube along ``path`` (K, 3); a radius may be (sideways, upwards) for a flat section."""
+    points = np.array(path, dtype=np.float64)
+    tangents = np.gradient(points, axis=0)
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    angles = np.linspace(0, 2 * np.pi, sides, endpoint=False)
+    vertices: list[Floats] = []
+    for point, tangent, radius in zip(points, tangents, radii, strict=True):
+        side = np.cross(tangent, np.asarray(up, dtype=np.float64))
+        side /= np.linalg.norm(side)
+        over = np.cross(side, tangent)
+        a, b = radius if isinstance(radius, tuple) else (radius, radius)
+        vertices += [point + a * np.cos(t) * side + b * np.sin(t) * over for t in angles]
+    faces = []
+    rings = len(points)
+    for i in range(rings - 1):
+        for j in range(sides):
+            k = (j + 1) % sides
+            p, q, r, s = i * sides + j, i * sides + k, (i + 1) * sides + k, (i + 1) * sides + j
+            faces += [[p, r, q], [p, s, r]]
+    start, end = len(vertices), len(vertices) + 1
+    vertices += [points[0], points[-1]]
+    for j in range(sides):
+        k = (j + 1) % sides
+        faces += [[start, j, k], [end, (rings - 1) * sides + k, (rings - 1) * sides + j]]
+    return MeshData(np.array(vertices), np.array(faces))
+
+
+def prism(outline: Sequence[tuple[float, float]], low: float, high: float) -> MeshData:
+    """Return a convex outline (x, y), counter-clockwise from above, drawn out from ``low`` to ``high``."""
+    count = len(outline)
+    vertices = np.array([(x, y, z) for z in (low, high) for x, y in outline])
+    faces = []
+    for j in range(count):
+        k = (j + 1) % count
+        faces += [[j, k, count + k], [j, count + k, count + j]]
+    for j in range(1, count - 1):
+        faces += [[0, j + 1, j], [count, count + j, count + j + 1]]
+    return MeshData(vertices, np.array(faces))
+
+
+def arc(
+    centre: tuple[float, float], radius: float, start: float, stop: float, count: int
+) -> list[tuple[float, float]]:
+    """Return points (r, z) of an arc from angle ``start`` to ``stop`` [degrees], for profiles."""
+    return [
+        (centre[0] + radius * np.cos(np.radians(a)), centre[1] + radius * np.sin(np.radians(a)))
+        for a in np.linspace(start, stop, count)
+    ]

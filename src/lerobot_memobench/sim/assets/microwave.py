@@ -1,0 +1,183 @@
+"""The microwave. Its door is on the local -y side, hinged on the left and opening to q = -2.094.
+
+The body stands back from its origin: in the published scenes a plate starts where the published microwave's
+door is; here it has room.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from lerobot_memobench.sim.assets.base import GRIP_FRICTION, Articulation, Asset, Builder, Handle
+from lerobot_memobench.sim.assets.meshes import Block, Floats, MeshData, blocks, cell_uv, quads_mesh
+from lerobot_memobench.sim.assets.paint import Canvas, Pixels, drawn
+
+DOOR_RANGE = (-2.094, 0.0)
+
+_HALF_X = 0.1725
+_FRONT, _BACK = 0.000, 0.196  # y of the box without door
+_HIGH = 0.189
+_PLINTH = 0.028  # the door sweeps over a plate on the table
+_BOARD = 0.010
+_DOOR_THICK = 0.020
+_DOOR_GAP = 0.001
+_HANDLE_OUT = 0.045
+_HANDLE_THICK = 0.012
+_HANDLE_HALF = 0.050
+_PANEL = 0.075  # width of the strip with buttons, at the hinge's other side, part of the door's front
+
+
+def _shell() -> list[Block]:
+    """Return floor, top, back and sides; the floor is the thick plinth, set back from the front."""
+    x = _HALF_X
+    middle, depth = (_FRONT + _BACK) / 2, (_BACK - _FRONT) / 2
+    z = (_HIGH + _PLINTH) / 2
+    half = (_HIGH - _PLINTH) / 2
+    return [
+        Block((0, middle, _PLINTH + _BOARD / 2), (x, depth, _BOARD / 2), 0),
+        Block((0, middle, _HIGH - _BOARD / 2), (x, depth, _BOARD / 2), 0),
+        Block((0, _BACK - _BOARD / 2, z), (x, _BOARD / 2, half - _BOARD), 0),
+        Block((-x + _BOARD / 2, middle, z), (_BOARD / 2, depth, half - _BOARD), 1),
+        Block((x - _BOARD / 2, middle, z), (_BOARD / 2, depth, half - _BOARD), 1),
+        Block((0, middle + 0.015, _PLINTH / 2), (x - 0.02, depth - 0.03, _PLINTH / 2), 0),
+    ]
+
+
+def _lining() -> list[Block]:
+    """Return thin light boards inside."""
+    x = _HALF_X - _BOARD
+    middle, depth = (_FRONT + _BACK - _BOARD) / 2, (_BACK - _BOARD - _FRONT) / 2
+    low, high = _PLINTH + _BOARD, _HIGH - _BOARD
+    z, half = (low + high) / 2, (high - low) / 2
+    thin = 0.0006
+    return [
+        Block((0, middle, low + thin), (x, depth - 0.001, thin), 0),
+        Block((0, _BACK - _BOARD - thin, z), (x, thin, half), 0),
+        Block((-x + thin, middle, z), (thin, depth - 0.001, half), 1),
+        Block((x - thin, middle, z), (thin, depth - 0.001, half), 1),
+    ]
+
+
+_DOOR_HIGH = (_HIGH - _PLINTH) / 2 - 0.001
+_DOOR_Z = (_HIGH + _PLINTH) / 2
+
+
+def _door_mesh() -> MeshData:
+    """Return the door in the frame of its hinge, closed: the door runs to +x, its front is at -y."""
+    wide, thick, high = 2 * _HALF_X, _DOOR_THICK, _DOOR_HIGH
+    lo, hi = -high, high
+
+    def quad(*corners: tuple[float, float, float]) -> list[Floats]:
+        return [np.array(corner) for corner in corners]
+
+    quads = [
+        quad((0, -thick, lo), (wide, -thick, lo), (wide, -thick, hi), (0, -thick, hi)),
+        quad((wide, 0, lo), (0, 0, lo), (0, 0, hi), (wide, 0, hi)),
+        quad((wide, -thick, lo), (wide, 0, lo), (wide, 0, hi), (wide, -thick, hi)),
+        quad((0, 0, lo), (0, -thick, lo), (0, -thick, hi), (0, 0, hi)),
+        quad((0, -thick, hi), (wide, -thick, hi), (wide, 0, hi), (0, 0, hi)),
+        quad((0, 0, lo), (wide, 0, lo), (wide, -thick, lo), (0, -thick, lo)),
+    ]
+    # The image: left half front, right half everything else.
+    front, back = cell_uv(0, 0, 2, 1), cell_uv(1, 0, 2, 1)
+    edge = np.full((4, 2), (0.985, 0.015))
+    return quads_mesh(quads, [front, back, edge, edge, edge, edge])
+
+
+def _door_texture() -> Pixels:
+    grey, dark, glass = (62, 64, 67), (38, 39, 41), (14, 15, 17)
+
+    def paint(canvas: Canvas) -> None:
+        half = 0.5
+        canvas.rect(0, 0, half, 1, grey)
+        # Left of the front: clock and buttons; right: the window, and the handle at its edge.
+        canvas.rect(0.012, 0.06, 0.115, 0.94, dark)
+        canvas.rect(0.022, 0.10, 0.105, 0.26, (8, 20, 14))
+        canvas.text("12:00", 0.027, 0.125, 0.10, 0.235, (90, 240, 150))
+        for row in range(4):
+            for column in range(3):
+                x, y = 0.027 + 0.028 * column, 0.34 + 0.12 * row
+                canvas.rect(x, y, x + 0.019, y + 0.07, (178, 180, 182))
+        canvas.oval(0.045, 0.83, 0.085, 0.92, (70, 170, 90))
+        canvas.rect(0.135, 0.10, 0.42, 0.90, glass)
+        canvas.shape((34, 37, 40), 0.16, 0.90, 0.25, 0.10, 0.30, 0.10, 0.21, 0.90)
+        # Inside of the door.
+        canvas.rect(half, 0, 1, 1, (176, 178, 178))
+        canvas.rect(half + 0.06, 0.14, half + 0.35, 0.86, glass)
+        canvas.rect(0.975, 0, 1, 0.05, grey)
+
+    return drawn(512, 160, grey, paint)
+
+
+def _handle() -> list[Block]:
+    """Return a vertical bar on two posts at the door's free edge, in the hinge's frame."""
+    x, t = 2 * _HALF_X - 0.028, _HANDLE_THICK / 2
+    y = -_DOOR_THICK
+    reach = (_HANDLE_OUT - _HANDLE_THICK) / 2
+    return [
+        Block((x, y - _HANDLE_OUT + t, 0), (t, t, _HANDLE_HALF), 2),
+        *(Block((x, y - reach, s * (_HANDLE_HALF - t)), (t, reach, t), 1) for s in (-1.0, 1.0)),
+    ]
+
+
+def _microwave(b: Builder) -> Asset:
+    case = b.material("microwave_case", rgba=(0.23, 0.235, 0.245, 1), specular=0.4, shininess=0.4)
+    lining = b.material("microwave_lining", rgba=(0.72, 0.73, 0.72, 1), specular=0.2)
+    front = b.material("microwave_door", _door_texture, specular=0.5, shininess=0.6)
+    metal = b.material("microwave_handle", rgba=(0.66, 0.67, 0.69, 1), specular=0.8, shininess=0.6)
+    glass = b.material("microwave_tray", rgba=(0.86, 0.90, 0.90, 1), specular=0.5)
+    b.visual_mesh(b.mesh("microwave_case", lambda: blocks(_shell())), case)
+    b.visual_mesh(b.mesh("microwave_lining", lambda: blocks(_lining())), lining)
+    middle = (_FRONT + _BACK) / 2
+    floor = _PLINTH + _BOARD
+    b.visual("cylinder", (0.070, 0.001), glass, (0.03, middle - 0.005, floor + 0.0022))
+    for part in _shell():
+        b.collision("box", part.half, 0.5, part.centre)
+
+    door = b.child("door", (-_HALF_X, _FRONT - _DOOR_GAP, _DOOR_Z))
+    b.exclude(b.body, door)
+    joint = b.joint(door, "microjoint", "hinge", (0, 0, 1), DOOR_RANGE, damping=0.5, frictionloss=0.15)
+    b.visual_mesh(b.mesh("microwave_door", _door_mesh), front, body=door)
+    b.visual_mesh(b.mesh("microwave_bar", lambda: blocks(_handle())), metal, body=door)
+    b.collision("box", (_HALF_X, _DOOR_THICK / 2, _DOOR_HIGH), 0.5, (_HALF_X, -_DOOR_THICK / 2, 0), body=door)
+    for part in _handle():
+        b.collision("box", part.half, 0.03, part.centre, body=door, friction=GRIP_FRICTION)
+    bar = _handle()[0].centre
+    # The handle's frame has x along the bar (up) and y out of the door: turn z up to x about y.
+    handle = b.site("door_handle", bar, quat=(np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0), body=door)
+    inner = (_HIGH - _BOARD - floor) / 2
+    depth = (_BACK - _BOARD - _FRONT) / 2
+    regions = {
+        "heating_region": b.site(
+            "heating_region",
+            (0, _FRONT + depth, floor + inner),
+            (_HALF_X - _BOARD, depth, inner),
+            box=True,
+        ),
+        "top_side": b.site(
+            "top_side", (0, middle, _HIGH - 0.001), (_HALF_X, (_BACK - _FRONT) / 2, 0.001), box=True
+        ),
+    }
+    return b.fixture(
+        low=(-_HALF_X, _FRONT - _DOOR_GAP - _DOOR_THICK - _HANDLE_OUT, 0),
+        high=(_HALF_X, _BACK, _HIGH),
+        regions=regions,
+        articulations={
+            "": Articulation(
+                joint=joint,
+                kind="door",
+                closed_q=0.0,
+                open_q=-1.9,
+                handle_site=handle,
+                handle=Handle(2 * _HANDLE_HALF, (_HANDLE_THICK, _HANDLE_THICK), _HANDLE_OUT - _HANDLE_THICK),
+                open_below=-1.3,
+                closed_above=-0.005,
+            )
+        },
+        clear=depth,
+    )
+
+
+BUILDERS: dict[str, Callable[[Builder], Asset]] = {"microwave": _microwave}

@@ -1,0 +1,417 @@
+"""Things sold in boxes, cartons, blocks and bags, with labels that can be read or at least recognised."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from lerobot_memobench.sim.assets.base import GRIP_FRICTION, Asset, Builder
+from lerobot_memobench.sim.assets.meshes import Floats, MeshData, box, cell_uv, quads_mesh
+from lerobot_memobench.sim.assets.paint import BLACK, WHITE, Canvas, Colour, Pixels, atlas, drawn
+
+HALF_PI = float(np.pi / 2)
+Half = tuple[float, float, float]
+
+
+def _package(
+    b: Builder,
+    key: str,
+    half: Half,
+    texture: Callable[[], Pixels],
+    mass: float,
+    shape: Callable[[Half], MeshData] = box,
+    gloss: float = 0.25,
+) -> Asset:
+    """Build a box with a texture; it is held across every horizontal side that fits the gripper."""
+    b.visual_mesh(b.mesh(key, lambda: shape(half)), b.material(key, texture, specular=gloss, shininess=0.4))
+    b.collision("box", half, mass, friction=GRIP_FRICTION)
+    x, y, z = half
+    # A finger reaches about 4 cm below the palm, and should not touch the table.
+    at = max(0.0, z - 0.032)
+    for yaw, width in sorted(((0.0, 2 * x), (HALF_PI, 2 * y)), key=lambda pair: pair[1]):
+        if width <= 0.066:
+            b.grasp((0, 0, at), yaw, width, depth=min(0.03, at + z - 0.004))
+    return b.object((-x, -y, -z), half)
+
+
+def _wrapped(front: Pixels, side: Pixels, top: Pixels, colour: Colour) -> Pixels:
+    """Return the atlas of a package with equal front and back, equal sides, and a top."""
+    faces = {"+x": front, "-x": front, "+y": side, "-y": side, "+z": top}
+    return atlas(faces, colour)
+
+
+# Butter ----------------------------------------------------------------------------------------
+def _butter_texture() -> Pixels:
+    yellow: Colour = (250, 204, 62)
+    blue: Colour = (30, 70, 160)
+
+    def top(canvas: Canvas) -> None:
+        canvas.rect(0, 0, 1, 0.10, blue)
+        canvas.rect(0, 0.90, 1, 1, blue)
+        canvas.oval(0.10, 0.16, 0.90, 0.84, (255, 240, 180))
+        canvas.text("BUTTER", 0.24, 0.16, 0.76, 0.84, blue, turn=1)
+
+    def side(canvas: Canvas) -> None:
+        canvas.rect(0, 0, 0.1, 1, blue)
+        canvas.rect(0.9, 0, 1, 1, blue)
+        canvas.text("BUTTER", 0.15, 0.15, 0.85, 0.85, blue)
+
+    end = drawn(64, 32, yellow, lambda c: c.text("BUTTER", 0.08, 0.12, 0.92, 0.88, blue))
+    long = drawn(128, 32, yellow, side)
+    return atlas({"+z": drawn(96, 180, yellow, top), "+x": end, "-x": end, "+y": long, "-y": long}, yellow)
+
+
+def _butter(b: Builder) -> Asset:
+    return _package(b, "butter", (0.0385, 0.0200, 0.0090), _butter_texture, 0.06)
+
+
+# Milk ------------------------------------------------------------------------------------------
+def _carton(half: Half, shoulder: float = 0.032, fin: float = 0.009) -> MeshData:
+    """Return a gable-top carton: atlas cells as for a box, the slopes take the tops of front and back."""
+    x, y, z = half
+    base, ridge, thin = z - shoulder, z - fin, 0.0022
+    share = (base + z) / (2 * z)  # part of the front's image below the shoulder
+
+    def quad(*corners: tuple[float, float, float]) -> list[Floats]:
+        return [np.array(corner) for corner in corners]
+
+    def part(column: int, row: int, low: float, high: float) -> Floats:
+        """Cut the cell's uv to heights from ``low`` to ``high``, both 0 at the bottom and 1 at the top."""
+        uv = cell_uv(column, row)
+        bottom, top = uv[0, 1], uv[2, 1]
+        uv[:2, 1], uv[2:, 1] = bottom + low * (top - bottom), bottom + high * (top - bottom)
+        return uv
+
+    neck = (ridge + z) / (2 * z)
+    quads, uvs = [], []
+    for sign, row in ((1, 0), (-1, 1)):
+        s = float(sign)
+        quads += [
+            quad((s * x, -s * y, -z), (s * x, s * y, -z), (s * x, s * y, base), (s * x, -s * y, base)),
+            quad(
+                (s * x, -s * y, base),
+                (s * x, s * y, base),
+                (s * thin, s * y, ridge),
+                (s * thin, -s * y, ridge),
+            ),
+            quad(
+                (s * thin, -s * y, ridge),
+                (s * thin, s * y, ridge),
+                (s * thin, s * y, z),
+                (s * thin, -s * y, z),
+            ),
+            quad((s * x, s * y, -z), (-s * x, s * y, -z), (-s * x, s * y, base), (s * x, s * y, base)),
+            quad(
+                (s * x, s * y, base),
+                (-s * x, s * y, base),
+                (-s * thin, s * y, ridge),
+                (s * thin, s * y, ridge),
+            ),
+            quad(
+                (s * thin, s * y, ridge),
+                (-s * thin, s * y, ridge),
+                (-s * thin, s * y, z),
+                (s * thin, s * y, z),
+            ),
+        ]
+        for column in (0, 1):
+            uvs += [part(column, row, 0, share), part(column, row, share, neck), part(column, row, neck, 1)]
+    quads += [
+        quad((thin, -y, z), (thin, y, z), (-thin, y, z), (-thin, -y, z)),
+        quad((-x, -y, -z), (-x, y, -z), (x, y, -z), (x, -y, -z)),
+    ]
+    uvs += [cell_uv(2, 0), cell_uv(2, 1)]
+    return quads_mesh(quads, uvs)
+
+
+def _carton_asset(
+    b: Builder, key: str, half: Half, texture: Callable[[], Pixels], mass: float, shoulder: float = 0.032
+) -> Asset:
+    b.visual_mesh(
+        b.mesh(key, lambda: _carton(half, shoulder)), b.material(key, texture, specular=0.25, shininess=0.4)
+    )
+    x, y, z = half
+    base = z - shoulder
+    b.collision("box", (x, y, (base + z) / 2), 0.9 * mass, (0, 0, (base - z) / 2), friction=GRIP_FRICTION)
+    b.collision(
+        "box", (0.35 * x, y, shoulder / 2), 0.1 * mass, (0, 0, z - shoulder / 2), friction=GRIP_FRICTION
+    )
+    at = base - 0.007
+    b.grasp((0, 0, at), 0.0, 2 * x, depth=0.03)
+    b.grasp((0, 0, at), HALF_PI, 2 * y, depth=0.03)
+    return b.object((-x, -y, -z), half)
+
+
+def _splash(canvas: Canvas, colour: Colour, level: float) -> None:
+    """Paint a wave of milk over the lower part."""
+    points = []
+    for k in range(41):
+        x = k / 40
+        points += [x, level + 0.035 * np.sin(2 * np.pi * 1.5 * x) + 0.012 * np.sin(2 * np.pi * 4 * x)]
+    canvas.shape(colour, *points, 1, 1, 0, 1)
+
+
+def _milk_texture() -> Pixels:
+    red: Colour = (206, 38, 34)
+    blue: Colour = (38, 92, 176)
+
+    def front(canvas: Canvas) -> None:
+        canvas.rect(0, 0, 1, 0.26, (176, 28, 26))
+        canvas.text("MILK", 0.06, 0.29, 0.94, 0.55, WHITE)
+        _splash(canvas, WHITE, 0.66)
+        canvas.text("1 L", 0.30, 0.82, 0.70, 0.96, blue)
+
+    def side(canvas: Canvas) -> None:
+        canvas.rect(0, 0, 1, 0.26, (176, 28, 26))
+        _splash(canvas, WHITE, 0.66)
+        for k in range(5):
+            canvas.rect(0.15, 0.34 + 0.055 * k, 0.85, 0.36 + 0.055 * k, (240, 190, 186))
+
+    return _wrapped(drawn(128, 256, red, front), drawn(128, 256, red, side), drawn(16, 16, red), red)
+
+
+def _milk(b: Builder) -> Asset:
+    return _carton_asset(b, "milk", (0.0265, 0.0270, 0.0655), _milk_texture, 0.15)
+
+
+def _carton_of_milk_texture() -> Pixels:
+    sky: Colour = (86, 164, 222)
+    navy: Colour = (22, 58, 130)
+
+    def cow(canvas: Canvas) -> None:
+        canvas.oval(0.25, 0.62, 0.75, 0.84, WHITE)
+        canvas.oval(0.62, 0.55, 0.88, 0.74, WHITE)
+        canvas.oval(0.33, 0.64, 0.48, 0.75, BLACK)
+        canvas.oval(0.55, 0.70, 0.66, 0.80, BLACK)
+        canvas.oval(0.80, 0.62, 0.90, 0.72, (240, 170, 170))
+        for x in (0.32, 0.42, 0.60, 0.68):
+            canvas.rect(x, 0.80, x + 0.05, 0.92, WHITE)
+
+    def front(canvas: Canvas) -> None:
+        canvas.rect(0, 0, 1, 0.22, navy)
+        canvas.text("MILK", 0.06, 0.25, 0.94, 0.50, navy)
+        canvas.rect(0, 0.88, 1, 1, (96, 170, 74))
+        cow(canvas)
+
+    def side(canvas: Canvas) -> None:
+        canvas.rect(0, 0, 1, 0.22, navy)
+        canvas.rect(0, 0.88, 1, 1, (96, 170, 74))
+        canvas.text("MILK", 0.36, 0.28, 0.64, 0.84, navy, turn=1)
+
+    return _wrapped(
+        drawn(128, 256, (226, 240, 250), front), drawn(128, 256, sky, side), drawn(16, 16, navy), navy
+    )
+
+
+def _carton_of_milk(b: Builder) -> Asset:
+    return _carton_asset(b, "carton_of_milk", (0.0310, 0.0310, 0.0790), _carton_of_milk_texture, 0.20, 0.036)
+
+
+# Boxes -----------------------------------------------------------------------------------------
+def _oatmeal_texture() -> Pixels:
+    tan: Colour = (222, 186, 132)
+    brown: Colour = (110, 62, 26)
+    red: Colour = (188, 40, 36)
+
+    def bowl(canvas: Canvas) -> None:
+        canvas.oval(0.16, 0.54, 0.84, 0.74, (244, 226, 184))
+        canvas.oval(0.24, 0.57, 0.76, 0.70, (226, 192, 128))
+        canvas.shape((52, 98, 168), 0.16, 0.64, 0.84, 0.64, 0.68, 0.90, 0.32, 0.90)
+        for x, y in ((0.40, 0.60), (0.55, 0.63), (0.62, 0.595)):
+            canvas.oval(x, y, x + 0.07, y + 0.045, (60, 70, 150))
+
+    def front(canvas: Canvas) -> None:
+        canvas.rect(0, 0, 1, 0.36, red)
+        canvas.text("OATMEAL", 0.04, 0.06, 0.96, 0.32, WHITE)
+        canvas.rect(0, 0.36, 1, 0.39, WHITE)
+        bowl(canvas)
+
+    def side(canvas: Canvas) -> None:
+        canvas.rect(0, 0, 1, 0.36, red)
+        canvas.rect(0, 0.36, 1, 0.39, WHITE)
+        canvas.text("OATMEAL", 0.30, 0.42, 0.70, 0.96, brown, turn=1)
+
+    top = drawn(96, 64, red, lambda c: c.text("OATMEAL", 0.06, 0.1, 0.94, 0.9, WHITE))
+    return _wrapped(drawn(160, 224, tan, front), drawn(96, 224, tan, side), top, red)
+
+
+def _oatmeal(b: Builder) -> Asset:
+    return _package(b, "box_of_oatmeal", (0.0240, 0.0480, 0.0690), _oatmeal_texture, 0.18)
+
+
+def _cereal_texture() -> Pixels:
+    yellow: Colour = (252, 196, 38)
+    purple: Colour = (92, 42, 140)
+
+    def loops(canvas: Canvas) -> None:
+        canvas.oval(0.08, 0.60, 0.92, 0.96, (240, 246, 250))
+        colours = ((220, 52, 48), (62, 160, 72), (240, 130, 30), (70, 110, 200))
+        spots = (
+            (0.18, 0.68),
+            (0.38, 0.63),
+            (0.58, 0.66),
+            (0.72, 0.74),
+            (0.28, 0.80),
+            (0.48, 0.76),
+            (0.56, 0.85),
+        )
+        for k, (x, y) in enumerate(spots):
+            canvas.oval(x, y, x + 0.13, y + 0.095, colours[k % 4])
+            canvas.oval(x + 0.045, y + 0.032, x + 0.085, y + 0.063, (240, 246, 250))
+
+    def front(canvas: Canvas) -> None:
+        canvas.rect(0, 0.12, 1, 0.52, purple)
+        canvas.text("CEREAL", 0.04, 0.16, 0.96, 0.48, WHITE)
+        loops(canvas)
+
+    def side(canvas: Canvas) -> None:
+        canvas.rect(0, 0.12, 1, 0.52, purple)
+        canvas.text("CEREAL", 0.25, 0.55, 0.75, 0.97, purple, turn=1)
+
+    top = drawn(96, 64, yellow, lambda c: c.text("CEREAL", 0.06, 0.1, 0.94, 0.9, purple))
+    return _wrapped(drawn(160, 240, yellow, front), drawn(80, 240, yellow, side), top, yellow)
+
+
+def _cereal(b: Builder) -> Asset:
+    return _package(b, "box_of_cereal", (0.0210, 0.0500, 0.0720), _cereal_texture, 0.16)
+
+
+def _flour_texture() -> Pixels:
+    paper: Colour = (244, 236, 216)
+    blue: Colour = (38, 78, 148)
+    gold: Colour = (204, 154, 52)
+
+    def ear(canvas: Canvas) -> None:
+        canvas.line(gold, 0.035, 0.5, 0.97, 0.5, 0.60)
+        for k in range(5):
+            y = 0.60 + 0.06 * k
+            canvas.shape(gold, 0.5, y + 0.07, 0.30, y + 0.02, 0.34, y - 0.03, 0.5, y + 0.03)
+            canvas.shape(gold, 0.5, y + 0.07, 0.70, y + 0.02, 0.66, y - 0.03, 0.5, y + 0.03)
+        canvas.oval(0.44, 0.53, 0.56, 0.62, gold)
+
+    def front(canvas: Canvas) -> None:
+        canvas.rect(0, 0.10, 1, 0.46, blue)
+        canvas.text("FLOUR", 0.05, 0.14, 0.95, 0.42, WHITE)
+        ear(canvas)
+
+    def side(canvas: Canvas) -> None:
+        canvas.rect(0, 0.10, 1, 0.46, blue)
+        canvas.text("FLOUR", 0.28, 0.50, 0.72, 0.96, blue, turn=1)
+
+    top = drawn(96, 64, paper, lambda c: c.text("FLOUR", 0.06, 0.1, 0.94, 0.9, blue))
+    return _wrapped(drawn(160, 224, paper, front), drawn(112, 224, paper, side), top, paper)
+
+
+def _flour(b: Builder) -> Asset:
+    return _package(b, "box_of_flour", (0.0280, 0.0430, 0.0660), _flour_texture, 0.22)
+
+
+# Bean curd and snacks --------------------------------------------------------------------------
+def _bean_curd_texture() -> Pixels:
+    cream: Colour = (246, 240, 218)
+    green: Colour = (40, 130, 70)
+    rim: Colour = (224, 230, 226)
+
+    def top(canvas: Canvas) -> None:
+        canvas.rect(0.05, 0.05, 0.95, 0.95, cream)
+        canvas.rect(0.05, 0.30, 0.95, 0.72, green)
+        canvas.text("TOFU", 0.12, 0.34, 0.88, 0.68, WHITE)
+        for x in (0.28, 0.5, 0.72):
+            canvas.oval(x - 0.07, 0.77, x + 0.07, 0.89, (214, 196, 130))
+
+    def side(canvas: Canvas) -> None:
+        canvas.rect(0, 0, 1, 0.10, rim)
+        canvas.rect(0.34, 0.10, 0.66, 1, green)
+        for x in (0.17, 0.83):
+            canvas.line((226, 218, 192), 0.012, x, 0.12, x, 1)
+
+    edge = drawn(96, 64, cream, side)
+    faces = {"+z": drawn(128, 128, rim, top), "+x": edge, "-x": edge, "+y": edge, "-y": edge}
+    return atlas(faces, cream)
+
+
+def _bean_curd(b: Builder) -> Asset:
+    return _package(b, "bean_curd", (0.0250, 0.0300, 0.0175), _bean_curd_texture, 0.12)
+
+
+_BAG = (0.0230, 0.0480, 0.0600)
+
+
+def _bag_mesh(half: Half) -> MeshData:
+    """Return a bag on a gusset, pressed flat at the top; the image's halves are front and back."""
+    x, y, z = half
+    columns, rows = 8, 9
+    vertices: list[tuple[float, float, float]] = []
+    uv: list[tuple[float, float]] = []
+    faces: list[tuple[int, int, int]] = []
+    for sign in (1.0, -1.0):
+        first = len(vertices)
+        for i in range(rows + 1):
+            up = i / rows
+            # Thick below, flat at the seam on top; the bag narrows a little where it is full.
+            thick = np.sqrt(max(0.0, 1 - (max(0.0, up - 0.25) / 0.66) ** 2)) if up < 0.9 else 0.0
+            thick = max(0.06, thick * (0.72 + 0.28 * min(1.0, up / 0.2)))
+            wide = y * (1 - 0.05 * np.sin(np.pi * min(1.0, up / 0.9)))
+            for j in range(columns + 1):
+                across = 2 * j / columns - 1
+                bulge = thick * (1 - abs(across) ** 2.6) ** 0.6
+                side = sign * wide * across
+                vertices.append((sign * x * bulge, side, -z + 2 * z * up))
+                uv.append((0.01 + 0.48 * j / columns + (0.0 if sign > 0 else 0.5), 0.99 - 0.98 * up))
+        for i in range(rows):
+            for j in range(columns):
+                p = first + i * (columns + 1) + j
+                q = p + columns + 1
+                faces += [(p, p + 1, q + 1), (p, q + 1, q)]
+    back = (rows + 1) * (columns + 1)
+    for j in range(columns):
+        # The gusset: front and back edges run in opposite directions.
+        faces.append((j, back + columns - j, j + 1))
+        faces.append((j + 1, back + columns - j, back + columns - j - 1))
+    return MeshData(np.array(vertices), np.array(faces), np.array(uv))
+
+
+def _bag_texture() -> Pixels:
+    green: Colour = (24, 132, 74)
+    yellow: Colour = (252, 206, 52)
+
+    def side(canvas: Canvas) -> None:
+        canvas.rect(0, 0, 1, 0.085, (206, 210, 214))
+        for k in range(24):
+            canvas.rect(k / 24, 0, k / 24 + 0.016, 0.085, (150, 156, 162))
+        canvas.oval(-0.1, 0.22, 1.1, 0.58, (206, 34, 36))
+        canvas.text("CHIPS", 0.10, 0.28, 0.90, 0.52, WHITE)
+        for x, y in ((0.14, 0.66), (0.42, 0.62), (0.62, 0.70), (0.30, 0.77), (0.52, 0.82)):
+            canvas.oval(x, y, x + 0.27, y + 0.13, (196, 138, 30))
+            canvas.oval(x + 0.01, y, x + 0.26, y + 0.11, yellow)
+            canvas.oval(x + 0.07, y + 0.03, x + 0.19, y + 0.07, (240, 184, 40))
+
+    half = drawn(128, 200, green, side)
+    return np.concatenate([half, half], axis=1)
+
+
+def _bag_of_snacks(b: Builder) -> Asset:
+    half = _BAG
+    b.visual_mesh(
+        b.mesh("bag_of_snacks", lambda: _bag_mesh(half)),
+        b.material("bag_of_snacks", _bag_texture, specular=0.7, shininess=0.6),
+    )
+    x, y, z = half
+    b.collision("box", (0.72 * x, 0.94 * y, z - 0.008), 0.05, (0, 0, -0.008), friction=GRIP_FRICTION)
+    b.collision("box", (x, 0.6 * y, 0.5 * z), 0.03, (0, 0, -0.25 * z), friction=GRIP_FRICTION)
+    b.collision("box", (0.10 * x, 0.94 * y, 0.008), 0.002, (0, 0, z - 0.008), friction=GRIP_FRICTION)
+    b.grasp((0, 0, z - 0.030), 0.0, 1.44 * x, depth=0.02)
+    return b.object((-x, -y, -z), half)
+
+
+BUILDERS: dict[str, Callable[[Builder], Asset]] = {
+    "butter": _butter,
+    "milk": _milk,
+    "carton_of_milk": _carton_of_milk,
+    "box_of_oatmeal": _oatmeal,
+    "box_of_cereal": _cereal,
+    "box_of_flour": _flour,
+    "bean_curd": _bean_curd,
+    "bag_of_snacks": _bag_of_snacks,
+}

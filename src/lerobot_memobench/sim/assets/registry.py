@@ -1,0 +1,80 @@
+"""Which builder makes which class. A user may register LIBERO's own assets over the project's."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+import mujoco
+
+from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.sim.assets import (
+    bottles,
+    cabinet,
+    cookware,
+    dishes,
+    kitchen,
+    microwave,
+    packages,
+    produce,
+    shelf,
+    stove,
+    trinkets,
+)
+from lerobot_memobench.sim.assets.base import Asset, Builder
+
+Build = Callable[[Builder], Asset]
+
+_builders: dict[str, Build] = {}
+
+
+def register(class_name: str, builder: Build) -> None:
+    """Let ``builder`` make objects or fixtures of ``class_name`` from now on.
+
+    ``class_name`` may be exact (``cork__3``) or a family (``cork``, and with it every ``cork__k``); exact
+    names go first.
+    """
+    _builders[class_name] = builder
+
+
+def known_classes() -> list[str]:
+    """Return the registered class names, sorted."""
+    return sorted(_builders)
+
+
+def build_asset(spec: mujoco.MjSpec, parent: mujoco.MjsBody, name: str, class_name: str) -> Asset:
+    """Build an instance ``name`` of ``class_name`` below ``parent`` and return the facts about it.
+
+    Raises:
+        MemobenchError: no builder is registered for the class.
+    """
+    family, variant = split_class(class_name)
+    build = _builders.get(class_name) or _builders.get(family)
+    if build is None:
+        raise MemobenchError(
+            f"there is no asset of class {class_name!r} for {name!r}: {nearest(family, _builders)} "
+            "Register one with lerobot_memobench.sim.assets.registry.register."
+        )
+    return build(Builder(spec, parent, name, class_name, variant))
+
+
+def split_class(class_name: str) -> tuple[str, int]:
+    """Return family and variant: ``cork__3`` is variant 3 of ``cork``, and ``cork`` is variant 0."""
+    match = re.fullmatch(r"(.+?)__(\d+)", class_name)
+    return (match.group(1), int(match.group(2))) if match else (class_name, 0)
+
+
+for _module in (
+    bottles,
+    cabinet,
+    cookware,
+    dishes,
+    kitchen,
+    microwave,
+    packages,
+    produce,
+    shelf,
+    stove,
+    trinkets,
+):
+    _builders.update(_module.BUILDERS)

@@ -1,0 +1,146 @@
+"""Operational-space control of the arm, with the numbers of robosuite's OSC_POSE controller.
+
+One control step sets a goal from a 7-D action and then holds it over the physics steps. The torques are those that
+robosuite 1.4.1 would command (a test holds them equal to its controller's along a trajectory); what is gone is the
+work that the published stack does around them: a second `mj_forward` per physics step, string look-ups, full-model
+Jacobians and mass matrix copies, pseudo-inverses of matrices that are never singular in reach.
+
+Source: robosuite 1.4.1 `controllers/osc.py`, `config/osc_pose.json`; Khatib 1987.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.sim import robot
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class OSCConfig:
+    """Gains and scales of the published controller."""
+
+    kp: float = 150.0
+    damping_ratio: float = 1.0
+    position_scale: float = 0.05
+    """Metres per unit of action."""
+    rotation_scale: float = 0.5
+    """Radians per unit of action."""
+    nullspace_kp: float = 10.0
+    gripper_speed: float = 0.01
+    """Change of the gripper's command (−1 open … 1 closed, ideal range) per physics step."""
+
+
+class OSCController:
+    """Turn 7-D actions into joint torques and finger targets of one model.
+
+    Args:
+        model: a compiled scene that holds the arm of `sim.robot`.
+        config: gains; the published ones by default.
+    """
+
+    def __init__(self, model: mujoco.MjModel, config: OSCConfig | None = None) -> None:
+        self.config = config or OSCConfig()
+        self._model = model
+        joints = [model.joint(name).id for name in robot.ARM_JOINTS]
+        self._qpos = model.jnt_qposadr[joints]
+        self._dof = model.jnt_dofadr[joints]
+        first = int(self._dof[0])
+        # The arm comes first in the model, so that its rows are plain slices (cheaper than index arrays).
+        self._dofs = slice(first, first + len(joints))
+        self._qposs = slice(int(self._qpos[0]), int(self._qpos[0]) + len(joints))
+        self._site = model.site(robot.GRIP_SITE).id
+        self._arm = np.array([model.actuator(name).id for name in robot.ARM_ACTUATORS])
+        self._fingers = np.array([model.actuator(name).id for name in robot.FINGER_ACTUATORS])
+        self._torque_limits = model.actuator_ctrlrange[self._arm].T.copy()
+        low, high = model.actuator_ctrlrange[self._fingers].T
+        self._finger_bias, self._finger_scale = (high + low) / 2, (high - low) / 2
+        self._home = np.array(robot.ARM_START)
+        self._kp = self.config.kp
+        self._kd = 2 * np.sqrt(self.config.kp) * self.config.damping_ratio
+        self._null_kd = 2 * np.sqrt(self.config.nullspace_kp)
+        nv = model.nv
+        self._jac = np.zeros((6, nv))
+        self._mass = np.zeros((nv, nv))
+        self.goal_position = np.zeros(3)
+        self.goal_rotation = np.eye(3)
+        self.gripper = np.zeros(2)
+
+    def reset(self, data: mujoco.MjData) -> None:
+        """Hold the present pose, gripper command at mid-range."""
+        self.goal_position = data.site_xpos[self._site].copy()
+        self.goal_rotation = data.site_xmat[self._site].reshape(3, 3).copy()
+        self.gripper = np.zeros(2)
+
+    def set_goal(self, data: mujoco.MjData, action: Array) -> None:
+        """Set the pose to reach: the present one moved by ``action[:6]``, which is clipped to [−1, 1].
+
+        A zero rotation keeps the former goal's orientation, as the published controller does.
+        """
+        delta = np.clip(action[:6], -1.0, 1.0)
+        self.goal_position = data.site_xpos[self._site] + delta[:3] * self.config.position_scale
+        rotation = delta[3:] * self.config.rotation_scale
+        if np.any(np.abs(rotation) > 0.0):
+            present = data.site_xmat[self._site].reshape(3, 3)
+            self.goal_rotation = rotation_matrix(rotation) @ present
+
+    def torques(self, data: mujoco.MjData) -> Array:
+        """Return the arm's unclipped torques (7,), Nm, for the present state.
+
+        ``data`` must hold the position and velocity stages of the present state (`mujoco.mj_step1`).
+        """
+        dofs = self._dofs
+        mujoco.mj_jacSite(self._model, data, self._jac[:3], self._jac[3:], self._site)
+        mujoco.mj_fullM(self._model, self._mass, data.qM)
+        jacobian = self._jac[:, dofs]
+        mass = self._mass[dofs, dofs]
+        velocity = data.qvel[dofs]
+        present = data.site_xmat[self._site].reshape(3, 3)
+        twist = jacobian @ velocity
+        force = self._kp * (self.goal_position - data.site_xpos[self._site]) - self._kd * twist[:3]
+        torque = self._kp * orientation_error(self.goal_rotation, present) - self._kd * twist[3:]
+
+        mass_inverse_jt = np.linalg.solve(mass, jacobian.T)
+        inertia_inverse = jacobian @ mass_inverse_jt
+        wrench = np.concatenate(
+            [
+                np.linalg.solve(inertia_inverse[:3, :3], force),
+                np.linalg.solve(inertia_inverse[3:, 3:], torque),
+            ]
+        )
+        posture = mass @ (
+            self.config.nullspace_kp * (self._home - data.qpos[self._qposs]) - self._null_kd * velocity
+        )
+        # Nullspace: (I − Jᵀ Λ J M⁻¹) posture, with Λ the full task-space inertia.
+        posture = posture - jacobian.T @ np.linalg.solve(inertia_inverse, mass_inverse_jt.T @ posture)
+        return jacobian.T @ wrench + data.qfrc_bias[dofs] + posture
+
+    def apply(self, data: mujoco.MjData, gripper_action: float) -> None:
+        """Write the controls for one physics step into ``data.ctrl``."""
+        data.ctrl[self._arm] = np.clip(self.torques(data), self._torque_limits[0], self._torque_limits[1])
+        direction = np.array([-1.0, 1.0]) * np.sign(gripper_action)
+        self.gripper = np.clip(self.gripper + self.config.gripper_speed * direction, -1.0, 1.0)
+        data.ctrl[self._fingers] = self._finger_bias + self._finger_scale * self.gripper
+
+
+def orientation_error(desired: Array, present: Array) -> Array:
+    """Return half the summed cross products of the frames' axes, (3,): robosuite's small-angle rotation error."""
+    product = desired @ present.T
+    return 0.5 * np.array(
+        [product[2, 1] - product[1, 2], product[0, 2] - product[2, 0], product[1, 0] - product[0, 1]]
+    )
+
+
+def rotation_matrix(rotation_vector: Array) -> Array:
+    """Return the rotation (3, 3) about a vector by its length, rad (Rodrigues)."""
+    angle = float(np.linalg.norm(rotation_vector))
+    if angle < 1e-12:
+        return np.eye(3)
+    x, y, z = rotation_vector / angle
+    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + np.sin(angle) * skew + (1 - np.cos(angle)) * (skew @ skew)

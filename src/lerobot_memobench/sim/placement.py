@@ -1,0 +1,186 @@
+"""Draw a task's initial state from its regions and `init` atoms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.sim.assets.base import Asset
+from lerobot_memobench.sim.scene import TABLE, TABLE_TOP
+from lerobot_memobench.tasks.formula import Atom
+from lerobot_memobench.tasks.task import Region, Task
+
+ATTEMPTS = 500
+"""Draws before a task's regions count as too crowded."""
+PENETRATION = 0.0015
+"""Depth of contact that is rest, not overlap, m."""
+GAP = 0.0005
+"""Height over its support at which a thing is set down, m."""
+
+Pose = NDArray[np.float64]
+"""Position and quaternion wxyz, (7,)."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where everything starts."""
+
+    poses: dict[str, Pose]
+    """World pose of each fixture and object."""
+    joints: dict[str, float]
+    """Position of each articulated joint, m or rad."""
+
+
+def _yaw_pose(x: float, y: float, z: float, yaw: float) -> Pose:
+    return np.array([x, y, z, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
+
+
+def _draw_region(region: Region, rng: np.random.Generator) -> tuple[float, float, float]:
+    """Return x, y and yaw drawn evenly from one of the region's ranges."""
+    x1, y1, x2, y2 = region.ranges[int(rng.integers(len(region.ranges)))]
+    return float(rng.uniform(x1, x2)), float(rng.uniform(y1, y2)), float(rng.uniform(*region.yaw))
+
+
+def _compose(parent: Pose, offset: NDArray[np.float64], yaw: float = 0.0) -> Pose:
+    """Return the pose at an offset in a parent's frame, turned about its z axis."""
+    position, quaternion, turn = np.empty(3), np.empty(4), np.array([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
+    mujoco.mju_rotVecQuat(position, offset, parent[3:])
+    mujoco.mju_mulQuat(quaternion, parent[3:], turn)
+    return np.concatenate([parent[:3] + position, quaternion])
+
+
+class Placer:
+    """Draw placements of one task and write them into a simulation.
+
+    Args:
+        task: the task whose `init` atoms say where things stand.
+        model: the simulation's own model: fixtures are moved in it.
+        data: state that is written and used to look for overlap.
+        assets: sizes and joints by instance.
+    """
+
+    def __init__(self, task: Task, model: mujoco.MjModel, data: mujoco.MjData, assets: dict[str, Asset]):
+        self._task, self._model, self._data, self._assets = task, model, data, assets
+        self._places = {atom.args[0]: atom for atom in task.init if atom.predicate in ("on", "in")}
+        missing = [name for name in assets if name not in self._places]
+        if missing:
+            raise MemobenchError(
+                f"task {task.name} does not say where {missing[0]!r} starts: add (On {missing[0]} <region>) to its :init"
+            )
+        self._order = self._sorted()
+
+    def _sorted(self) -> list[str]:
+        """Things after what they stand on or in."""
+        done: list[str] = []
+        waiting = list(self._assets)
+        while waiting:
+            ready = [name for name in waiting if self._support(name) in (None, *done)]
+            if not ready:
+                raise MemobenchError(
+                    f"task {self._task.name}: {', '.join(waiting)} stand on each other in a circle; check its :init"
+                )
+            done += ready
+            waiting = [name for name in waiting if name not in ready]
+        return done
+
+    def _support(self, name: str) -> str | None:
+        """The instance that ``name`` stands on or in; None for the table."""
+        place = self._places[name].args[1]
+        if place in self._assets:
+            return place
+        region = self._task.regions.get(place)
+        if region is not None and region.target == TABLE:
+            return None
+        owners = [other for other in self._assets if place.startswith(f"{other}_")]
+        if not owners:
+            raise MemobenchError(f"task {self._task.name}: {name!r} starts at {place!r}, which is no region or object")
+        return max(owners, key=len)
+
+    def _joints(self, rng: np.random.Generator) -> dict[str, float]:
+        """Closed and off, unless an `init` atom says otherwise."""
+        wanted = {atom.args[0]: atom.predicate for atom in self._task.init if len(atom.args) == 1}
+        joints = {}
+        for name, asset in self._assets.items():
+            for region, articulation in asset.articulations.items():
+                state = wanted.get(f"{name}_{region}" if region else name, "close")
+                opened = state in ("open", "turnon")
+                joints[articulation.joint] = articulation.open_q if opened else articulation.closed_q
+        return joints
+
+    def draw(self, rng: np.random.Generator) -> Placement:
+        """Draw until nothing overlaps, and leave the last draw written in model and data.
+
+        Raises:
+            MemobenchError: when no draw of `ATTEMPTS` is free of overlap.
+        """
+        pair = ("", "")
+        for _ in range(ATTEMPTS):
+            placement = self._draw_once(rng)
+            self.write(placement)
+            overlap = self._overlap()
+            if overlap is None:
+                return placement
+            pair = overlap
+        raise MemobenchError(
+            f"task {self._task.name}: {pair[0]} and {pair[1]} overlapped in each of {ATTEMPTS} draws of the initial state; "
+            "move their regions apart"
+        )
+
+    def _draw_once(self, rng: np.random.Generator) -> Placement:
+        joints = self._joints(rng)
+        poses: dict[str, Pose] = {}
+        for name in self._order:
+            asset, atom = self._assets[name], self._places[name]
+            support = self._support(name)
+            if support is None:
+                x, y, yaw = _draw_region(self._task.regions[atom.args[1]], rng)
+                poses[name] = _yaw_pose(x, y, TABLE_TOP - asset.bottom + GAP, yaw)
+            elif atom.args[1] == support:
+                height = self._assets[support].supports - asset.bottom + GAP
+                poses[name] = _compose(poses[support], np.array([0.0, 0.0, height]))
+            else:
+                poses[name] = self._on_site(name, atom, poses, joints, rng)
+        return Placement(poses, joints)
+
+    def _on_site(
+        self, name: str, atom: Atom, poses: dict[str, Pose], joints: dict[str, float], rng: np.random.Generator
+    ) -> Pose:
+        """Draw a pose on top of a fixture's site, or on the floor of its region for `In`."""
+        asset = self._assets[name]
+        self.write(Placement(poses, joints))
+        site = self._model.site(atom.args[1]).id
+        half = self._model.site_size[site]
+        rotation = self._data.site_xmat[site].reshape(3, 3)
+        room = np.maximum(half[:2] - asset.radius, 0.0)
+        x, y = rng.uniform(-room, room)
+        z = (-half[2] if atom.predicate == "in" else half[2]) - asset.bottom + GAP
+        position = self._data.site_xpos[site] + rotation @ np.array([x, y, z])
+        return np.concatenate([position, [1.0, 0.0, 0.0, 0.0]])
+
+    def write(self, placement: Placement) -> None:
+        """Write a placement into the model (fixtures) and data (objects, joints); velocities stay."""
+        for name, pose in placement.poses.items():
+            body = self._model.body(name)
+            if self._assets[name].kind == "fixture":
+                self._model.body_pos[body.id], self._model.body_quat[body.id] = pose[:3], pose[3:]
+            else:
+                address = int(self._model.joint(f"{name}_joint0").qposadr[0])
+                self._data.qpos[address : address + 7] = pose
+        for joint, q in placement.joints.items():
+            self._data.qpos[int(self._model.joint(joint).qposadr[0])] = q
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_comPos(self._model, self._data)
+
+    def _overlap(self) -> tuple[str, str] | None:
+        """Return the names of the first two bodies whose geoms stand in each other."""
+        mujoco.mj_collision(self._model, self._data)
+        for contact in self._data.contact[: self._data.ncon] if self._data.ncon else ():
+            if contact.dist < -PENETRATION:
+                bodies = [self._model.geom_bodyid[geom] for geom in contact.geom]
+                roots = [self._model.body(self._model.body_rootid[body]).name for body in bodies]
+                return roots[0], roots[1]
+        return None

@@ -1,0 +1,127 @@
+"""The arm of the published stack: robosuite's Panda on the RethinkMount with the PandaGripper.
+
+The kinematics, masses, collision geometry and actuators are robosuite's own files, untouched. Only what is drawn is
+thinned: the visual meshes have 182,000 faces, most of which are never a pixel at 256×256 (spec: measured, a frame
+with all of them costs three times one without).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import logging
+import os
+import re
+import tempfile
+import warnings
+from functools import cache
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from lerobot_memobench.sim.meshes import area, read_mesh, simplify
+
+BASE_POSITION = (-0.66, 0.0, 0.0)
+"""Foot of the mount, m: x = −0.16 − table length / 2 (robosuite's offset for a table of 1 m)."""
+
+ARM_START = (0.0, -0.161037389, 0.0, -2.44459747, 0.0, 2.22675220, np.pi / 4)
+"""Joint angles at reset, rad (LIBERO's mounted Panda)."""
+
+GRIPPER_START = (0.020833, -0.020833)
+"""Finger positions at reset, m."""
+
+ARM_JOINTS = tuple(f"robot0_joint{i}" for i in range(1, 8))
+FINGER_JOINTS = ("gripper0_finger_joint1", "gripper0_finger_joint2")
+ARM_ACTUATORS = tuple(f"robot0_torq_j{i}" for i in range(1, 8))
+FINGER_ACTUATORS = ("gripper0_gripper_finger_joint1", "gripper0_gripper_finger_joint2")
+GRIP_SITE = "gripper0_grip_site"
+HAND_BODY = "robot0_right_hand"
+WRIST_CAMERA = "robot0_eye_in_hand"
+
+FACES_PER_SQUARE_METRE, LEAST_FACES, MOST_FACES = 12_000, 100, 1_200
+"""Density at which a visual mesh is drawn (a link of the arm has about 0.1 m²) and what one may have at least and at most."""
+
+
+def _robosuite_xml() -> str:
+    """Compose the arm's MJCF with robosuite, quietly: it warns about macro files that nobody needs here."""
+    logging.getLogger("robosuite_logs").setLevel(logging.ERROR)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from robosuite.models.grippers import gripper_factory
+        from robosuite.models.mounts import mount_factory
+        from robosuite.models.robots import Panda
+        from robosuite.models.world import MujocoWorldBase
+
+        arm = Panda(idn=0)
+        arm.add_mount(mount_factory("RethinkMount", idn=0))
+        arm.add_gripper(gripper_factory("PandaGripper", idn=0))
+        arm.set_base_xpos(np.array(BASE_POSITION))
+        world = MujocoWorldBase()
+        world.merge(arm)
+        return str(world.get_xml())
+
+
+def _build() -> dict[str, np.ndarray]:
+    """Return the MJCF text and, for each visual mesh, its thinned vertices and faces."""
+    xml = _robosuite_xml()
+    arrays: dict[str, np.ndarray] = {"xml": np.array(xml)}
+    drawn = set(re.findall(r'group="1"[^>]*\bmesh="([^"]+)"', xml))
+    drawn |= set(re.findall(r'\bmesh="([^"]+)"[^>]*group="1"', xml))
+    for name, file in re.findall(r'<mesh name="([^"]+)" file="([^"]+)"', xml):
+        # A mesh that is also collided with (a link drawn and felt by one file) keeps its own shape.
+        if name not in drawn or not ("vis" in name or "pedestal" in name):
+            continue
+        vertices, faces = read_mesh(Path(file))
+        target = max(LEAST_FACES, min(MOST_FACES, int(FACES_PER_SQUARE_METRE * area(vertices, faces))))
+        vertices, faces = simplify(vertices, faces, target)
+        arrays[f"v:{name}"], arrays[f"f:{name}"] = vertices, faces
+    return arrays
+
+
+def _cache_file() -> Path:
+    """Where the thinned arm is kept between processes, named by all that it depends on."""
+    source = Path(__file__).read_bytes() + (Path(__file__).parent / "meshes.py").read_bytes()
+    key = hashlib.sha256(source + importlib.metadata.version("robosuite").encode()).hexdigest()[:16]
+    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return root / "lerobot_memobench" / f"panda-{key}.npz"
+
+
+@cache
+def _arrays() -> dict[str, np.ndarray]:
+    """Load the thinned arm from the cache, or build it; a cache that cannot be written costs time, nothing else."""
+    path = _cache_file()
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = dict(stored)
+        if all(Path(f).exists() for f in re.findall(r'file="([^"]+)"', str(arrays["xml"]))):
+            return arrays
+    except (OSError, ValueError, KeyError, EOFError):
+        pass
+    arrays = _build()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
+            np.savez(file, **arrays)  # type: ignore[arg-type]  # numpy's stub wants one type for all
+        os.replace(file.name, path)
+    except OSError:
+        pass
+    return arrays
+
+
+def robot_spec() -> mujoco.MjSpec:
+    """Return a fresh spec that holds the arm and robosuite's physics options, for a scene to be added to."""
+    arrays = _arrays()
+    spec = mujoco.MjSpec.from_string(str(arrays["xml"]))
+    for mesh in spec.meshes:
+        if f"v:{mesh.name}" in arrays:
+            mesh.file = ""
+            mesh.uservert = arrays[f"v:{mesh.name}"].ravel().tolist()
+            mesh.userface = arrays[f"f:{mesh.name}"].ravel().tolist()
+    for geom in spec.geoms:
+        if geom.meshname and "vis" not in geom.meshname and geom.group == 1:
+            geom.contype, geom.conaffinity = 0, 0
+    # robosuite draws the grip site and its axes for debugging; a camera of the published stack does not see them.
+    for site in spec.sites:
+        site.group = 4
+    return spec

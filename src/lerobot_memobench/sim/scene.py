@@ -1,0 +1,89 @@
+"""Compile a task's scene: kitchen, arm, fixtures, objects. Once per task and process; seeds change only state."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from lerobot_memobench.sim import robot
+from lerobot_memobench.sim.assets.base import Asset
+from lerobot_memobench.sim.assets.kitchen import build_kitchen
+from lerobot_memobench.sim.assets.registry import build_asset
+from lerobot_memobench.tasks.task import Task
+
+TABLE = "kitchen_table"
+TABLE_TOP = 0.90
+"""Height of the table's top, m."""
+AGENTVIEW = "agentview"
+
+_AGENTVIEW_POSITION = (0.6586131746834771, 0.0, 1.6103500240372423)
+_AGENTVIEW_QUATERNION = (0.6380177736282349, 0.3048497438430786, 0.30484986305236816, 0.6380177736282349)
+
+PHYSICS_STEP = 0.002
+CONTROL_HZ = 20
+SUBSTEPS = round(1 / (CONTROL_HZ * PHYSICS_STEP))
+
+CACHED_SCENES = 4
+"""Compiled scenes kept per process: evaluation takes one task after the other, each scene has some MB."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A compiled scene. The model is shared: whoever changes it works on a copy."""
+
+    key: tuple[str, str]
+    model: mujoco.MjModel
+    assets: dict[str, Asset]
+    """Every fixture but the table, then every object, by instance name."""
+
+
+_scenes: OrderedDict[tuple[str, str], Scene] = OrderedDict()
+
+
+def get_scene(task: Task) -> Scene:
+    """Return the compiled scene of a task, from this process's cache where it is there.
+
+    Variants of a task (another referent) share the scene: they differ in goal, not in what stands on the table.
+    """
+    key = (task.name, task.bddl_text)
+    if key in _scenes:
+        _scenes.move_to_end(key)
+        return _scenes[key]
+    scene = _compile(task, key)
+    _scenes[key] = scene
+    while len(_scenes) > CACHED_SCENES:
+        _scenes.popitem(last=False)
+    return scene
+
+
+def _compile(task: Task, key: tuple[str, str]) -> Scene:
+    spec = robot.robot_spec()
+    spec.modelname = "memobench"
+    spec.option.timestep = PHYSICS_STEP
+    build_kitchen(spec)
+    spec.worldbody.add_camera(
+        name=AGENTVIEW, pos=list(_AGENTVIEW_POSITION), quat=list(_AGENTVIEW_QUATERNION), fovy=45.0
+    )
+    assets: dict[str, Asset] = {}
+    for name, class_name in task.fixtures.items():
+        if name != TABLE:
+            assets[name] = build_asset(spec, spec.worldbody, name, class_name)
+    for name, class_name in task.objects.items():
+        assets[name] = build_asset(spec, spec.worldbody, name, class_name)
+        spec.body(name).add_freejoint(name=f"{name}_joint0")
+    return Scene(key, spec.compile(), assets)
+
+
+def state_size(model: mujoco.MjModel) -> int:
+    """Length of the flattened state: time, positions, velocities."""
+    return int(1 + model.nq + model.nv)
+
+
+def pose_matrix(quaternion: np.ndarray) -> np.ndarray:
+    """Return the rotation matrix (3, 3) of a quaternion wxyz."""
+    matrix = np.empty(9)
+    mujoco.mju_quat2Mat(matrix, np.asarray(quaternion, dtype=np.float64))
+    return matrix.reshape(3, 3)

@@ -1,0 +1,239 @@
+"""One running scene: reset, step, look, ask."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import zlib
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.sim import robot
+from lerobot_memobench.sim.controller import OSCController
+from lerobot_memobench.sim.placement import Placement, Placer
+from lerobot_memobench.sim.rendering import Highlight, Image, RenderSettings, get_renderer
+from lerobot_memobench.sim.scene import AGENTVIEW, SUBSTEPS, get_scene, state_size
+from lerobot_memobench.sim.world import World
+from lerobot_memobench.tasks.formula import Atom
+from lerobot_memobench.tasks.task import Task
+
+Array = NDArray[np.float64]
+
+CAMERAS = {"agentview": AGENTVIEW, "wrist": robot.WRIST_CAMERA}
+ACTION_DIM = 7
+STABILISATION_STEPS = 10
+NO_OP = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
+"""No motion, gripper open."""
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """Everything that decides how a simulation goes on; see `Simulation.snapshot`."""
+
+    physics: Array
+    goal_position: Array
+    goal_rotation: Array
+    gripper: Array
+
+
+class Simulation:
+    """The scene of one task, stepped at 20 Hz.
+
+    After `reset` and after each `step`, positions, contacts and velocities-dependent terms in `data` belong to the
+    present state, so whatever is asked of the simulation is a function of `state()` and of where the fixtures stand.
+
+    Args:
+        task: what stands where; its goal does not matter here.
+        render: size and quality of frames. No GL context is opened before the first `render`.
+    """
+
+    def __init__(self, task: Task, render: RenderSettings | None = None) -> None:
+        scene = get_scene(task)
+        self.task = task
+        self.render_settings = render or RenderSettings()
+        self._scene = scene
+        self.model: mujoco.MjModel = copy.copy(scene.model)
+        self.data = mujoco.MjData(self.model)
+        self.assets = scene.assets
+        self.world = World(task, self.model, self.data, scene.assets)
+        self.highlights: tuple[Highlight, ...] = ()
+        self._controller = OSCController(self.model)
+        self._placer = Placer(task, self.model, self.data, scene.assets)
+        self._hand = self.model.body(robot.HAND_BODY).id
+        self._grip = self.model.site(robot.GRIP_SITE).id
+        self._arm_qpos = [int(self.model.joint(name).qposadr[0]) for name in robot.ARM_JOINTS]
+        self._finger_qpos = [int(self.model.joint(name).qposadr[0]) for name in robot.FINGER_JOINTS]
+        self._full = mujoco.mjtState.mjSTATE_INTEGRATION.value
+        self._glow = [
+            (asset, self.model.geom(geom).id) for asset in scene.assets.values() for geom in asset.glow
+        ]
+
+    # --- life -----------------------------------------------------------------------------------------------
+
+    def reset(self, seed: int) -> None:
+        """Draw the initial state of a seed and let it settle for the stabilisation steps.
+
+        Equal seeds of equal tasks give bit-equal states, whatever was simulated before.
+        """
+        rng = np.random.default_rng([seed, zlib.crc32(self.task.name.encode())])
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[self._arm_qpos] = robot.ARM_START
+        self.data.qpos[self._finger_qpos] = robot.GRIPPER_START
+        self._placement = self._placer.draw(rng)
+        self._settle()
+
+    def reset_to(self, placement: Placement) -> None:
+        """Like `reset`, from a placement that was recorded."""
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[self._arm_qpos] = robot.ARM_START
+        self.data.qpos[self._finger_qpos] = robot.GRIPPER_START
+        self._placement = placement
+        self._placer.write(placement)
+        self._settle()
+
+    def _settle(self) -> None:
+        self.highlights = ()
+        mujoco.mj_step1(self.model, self.data)
+        self._controller.reset(self.data)
+        for _ in range(STABILISATION_STEPS):
+            self.step(NO_OP)
+
+    def step(self, action: NDArray[np.floating]) -> None:
+        """Advance by one control step of 50 ms.
+
+        Args:
+            action: (7,) pose delta (±1 is ±5 cm, ±0.5 rad) and gripper (−1 open, +1 closed); clipped to [−1, 1].
+        """
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape != (ACTION_DIM,):
+            raise MemobenchError(f"an action has shape {action.shape}; expected ({ACTION_DIM},)")
+        if not np.isfinite(action).all():
+            raise MemobenchError(f"an action holds a value that is not finite: {action.tolist()}; check the policy's output")
+        self._controller.set_goal(self.data, action)
+        for _ in range(SUBSTEPS):
+            self._controller.apply(self.data, float(action[6]))
+            mujoco.mj_step2(self.model, self.data)
+            mujoco.mj_step1(self.model, self.data)
+
+    # --- state ----------------------------------------------------------------------------------------------
+
+    @property
+    def state_dim(self) -> int:
+        """Length of `state()`: 1 + nq + nv of the compiled model."""
+        return state_size(self.model)
+
+    def state(self) -> Array:
+        """Return time, qpos and qvel as one vector (state_dim,), as the published files store it."""
+        return np.concatenate([[self.data.time], self.data.qpos, self.data.qvel])
+
+    def set_state(self, state: Array, fixture_poses: dict[str, Array] | None = None) -> None:
+        """Show a recorded state: what is asked and rendered afterwards belongs to it.
+
+        Args:
+            state: (state_dim,) as `state()` returns it.
+            fixture_poses: where the fixtures stood, as `fixture_poses()` returns it; as they are when left out.
+        """
+        state = np.asarray(state, dtype=np.float64)
+        if state.shape != (self.state_dim,):
+            raise MemobenchError(
+                f"a state of task {self.task.name} has shape {state.shape}; expected ({self.state_dim},)"
+            )
+        for name, pose in (fixture_poses or {}).items():
+            body = self.model.body(name).id
+            self.model.body_pos[body], self.model.body_quat[body] = pose[:3], pose[3:]
+        self.data.time = state[0]
+        self.data.qpos[:] = state[1 : 1 + self.model.nq]
+        self.data.qvel[:] = state[1 + self.model.nq :]
+        mujoco.mj_step1(self.model, self.data)
+
+    def fixture_poses(self) -> dict[str, Array]:
+        """Return position and quaternion wxyz (7,) of each fixture: they differ by seed and are not in `state()`."""
+        return {
+            name: np.concatenate([self.model.body(name).pos, self.model.body(name).quat])
+            for name, asset in self.assets.items()
+            if asset.kind == "fixture"
+        }
+
+    def snapshot(self) -> Snapshot:
+        """Return all that decides how the simulation goes on, controller and solver warm start included."""
+        physics = np.empty(mujoco.mj_stateSize(self.model, self._full))
+        mujoco.mj_getState(self.model, self.data, physics, self._full)
+        controller = self._controller
+        return Snapshot(
+            physics, controller.goal_position.copy(), controller.goal_rotation.copy(), controller.gripper.copy()
+        )
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Go back to a snapshot of this simulation, bit for bit."""
+        mujoco.mj_setState(self.model, self.data, snapshot.physics, self._full)
+        self._controller.goal_position = snapshot.goal_position.copy()
+        self._controller.goal_rotation = snapshot.goal_rotation.copy()
+        self._controller.gripper = snapshot.gripper.copy()
+        mujoco.mj_step1(self.model, self.data)
+
+    def scene_hash(self) -> str:
+        """Return a short hash of the present state and of where the fixtures stand."""
+        digest = hashlib.sha256(self.state().tobytes())
+        for name, pose in sorted(self.fixture_poses().items()):
+            digest.update(name.encode() + pose.tobytes())
+        return digest.hexdigest()[:16]
+
+    # --- observation ----------------------------------------------------------------------------------------
+
+    def render(self, camera: str = "agentview") -> Image:
+        """Return what a camera (`agentview` or `wrist`) sees, (height, width, 3) uint8, upright."""
+        if camera not in CAMERAS:
+            raise MemobenchError(f"there is no camera {camera!r}; {nearest(camera, CAMERAS)}")
+        for asset, geom in self._glow:
+            lit = self.holds(Atom("turnon", (asset.name,)))
+            self.model.geom_rgba[geom] = asset.glow_on if lit else asset.glow_off
+        renderer = get_renderer(self._scene.key, self._scene.model, self.render_settings)
+        return renderer.render(self.model, self.data, CAMERAS[camera], self.highlights)
+
+    def proprio(self) -> NDArray[np.float32]:
+        """Return the 8-D proprioception: end-effector position (3), axis-angle (3), finger positions (2)."""
+        position, rotation_vector = self.data.site_xpos[self._grip], axis_angle(self.data.xquat[self._hand])
+        return np.concatenate([position, rotation_vector, self.data.qpos[self._finger_qpos]]).astype(np.float32)
+
+    def eef_pose(self) -> tuple[Array, Array]:
+        """Return position (3,) and rotation (3, 3) of the grip site, between the finger tips."""
+        return self.data.site_xpos[self._grip].copy(), self.data.site_xmat[self._grip].reshape(3, 3).copy()
+
+    def gripper_opening(self) -> float:
+        """Return the distance between the fingers, m."""
+        fingers = self.data.qpos[self._finger_qpos]
+        return float(fingers[0] - fingers[1])
+
+    def body_pose(self, name: str) -> tuple[Array, Array]:
+        """Return position (3,) and rotation (3, 3) of an instance or body."""
+        body = self.data.body(name)
+        return body.xpos.copy(), body.xmat.reshape(3, 3).copy()
+
+    def site_pose(self, name: str) -> tuple[Array, Array]:
+        """Return position (3,) and rotation (3, 3) of a site."""
+        site = self.data.site(name)
+        return site.xpos.copy(), site.xmat.reshape(3, 3).copy()
+
+    def site_half_size(self, name: str) -> Array:
+        """Return the half extents (3,) of a region's box, m."""
+        return self.model.site(name).size.copy()
+
+    def holds(self, atom: Atom) -> bool:
+        """Return whether an atom of the task language is true now."""
+        return self.world.holds(atom)
+
+
+def axis_angle(quaternion: Array) -> Array:
+    """Return the rotation vector (3,) of a quaternion wxyz as robosuite and openpi compute it.
+
+    The sign of the quaternion is kept: the hand's stays continuous through a half turn, a canonical form would jump.
+    """
+    w = float(np.clip(quaternion[0], -1.0, 1.0))
+    norm = np.sqrt(1.0 - w * w)
+    if norm < 1e-8:
+        return np.zeros(3)
+    return np.asarray(quaternion[1:]) * (2.0 * np.arccos(w) / norm)

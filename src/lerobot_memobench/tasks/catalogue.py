@@ -1,0 +1,133 @@
+"""The catalogue: the benchmark's 30 tasks, as folders beside this module."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import Any
+
+from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.tasks.formula import to_lists
+from lerobot_memobench.tasks.task import BDDL_FILE, MEMORY_TYPES, Task, load_task
+
+#: <memory type>/<task name>/{task_config.bddl, task_config.meta.json}
+CATALOGUE_DIR = Path(__file__).parent / "catalogue"
+
+
+@lru_cache(maxsize=1)
+def _folders() -> dict[str, Path]:
+    """Task name -> folder, by memory type (temporal, spatial, object, procedural), then by name."""
+    found: dict[str, Path] = {}
+    for memory_type in MEMORY_TYPES:
+        for folder in sorted((CATALOGUE_DIR / memory_type).iterdir(), key=lambda path: path.name):
+            if (folder / BDDL_FILE).is_file():
+                found[folder.name] = folder
+    return found
+
+
+def task_names(memory_types: str | Iterable[str] | None = None) -> list[str]:
+    """Return the names of all tasks, or of those of one or several memory types, in catalogue order."""
+    if memory_types is None:
+        return list(_folders())
+    wanted = [memory_types] if isinstance(memory_types, str) else list(memory_types)
+    for memory_type in wanted:
+        if memory_type not in MEMORY_TYPES:
+            raise MemobenchError(
+                f"found the memory type {memory_type!r}, expected one of {', '.join(MEMORY_TYPES)}"
+            )
+    return [name for name, folder in _folders().items() if folder.parent.name in wanted]
+
+
+def task_index(name: str) -> int:
+    """Return the stable number of a task: its position in ``task_names()``."""
+    get_task(name)
+    return list(_folders()).index(name)
+
+
+@cache
+def get_task(name: str) -> Task:
+    """Return a task of the catalogue; an unknown name is an error that tells the nearest known ones."""
+    if name not in _folders():
+        raise MemobenchError(f"found no task named {name!r} in the catalogue, {nearest(name, _folders())}")
+    return load_task(_folders()[name])
+
+
+def resolve_tasks(spec: str | Iterable[str]) -> list[str]:
+    """Return the task names meant by "all", memory types, names, or several of them separated by commas.
+
+    Names that hold commas themselves are recognised. The order given is kept and repetitions are dropped.
+    """
+    if not isinstance(spec, str):
+        return list(dict.fromkeys(name for part in spec for name in resolve_tasks(part)))
+    pieces = spec.split(",")
+    chosen: list[str] = []
+    start = 0
+    while start < len(pieces):
+        for end in range(len(pieces), start, -1):
+            word = ",".join(pieces[start:end]).strip()
+            found = _expand(word)
+            if found:
+                chosen += found
+                start = end
+                break
+        else:
+            word = pieces[start].strip()
+            hint = nearest(word, ["all", *MEMORY_TYPES, *_folders()])
+            raise MemobenchError(
+                f"found {word!r} among the tasks, expected 'all', a memory type ({', '.join(MEMORY_TYPES)}) "
+                f"or a task's name, {hint}"
+            )
+    return list(dict.fromkeys(chosen))
+
+
+def _expand(word: str) -> list[str]:
+    if word == "all":
+        return task_names()
+    if word in MEMORY_TYPES:
+        return task_names(word)
+    return [word] if word in _folders() else []
+
+
+def task_record(task: Task, state_dim: int) -> dict[str, Any]:
+    """Return the item of ``memobench tasks --json``; ``state_dim`` (1 + nq + nv) is the compiled model's."""
+    return {
+        "name": task.name,
+        "memory_type": task.memory_type,
+        "family": task.family,
+        "language": task.language,
+        "objects": _by_class(task.objects),
+        "fixtures": _by_class(task.fixtures),
+        "goal": to_lists(task.goal),
+        "checkpoints": [
+            {
+                "goal": to_lists(checkpoint.goal),
+                "operation": checkpoint.operation,
+                "language": list(checkpoint.language),
+            }
+            for checkpoint in task.checkpoints
+        ],
+        "state_dim": int(state_dim),
+    }
+
+
+def _by_class(instances: dict[str, str]) -> dict[str, list[str]]:
+    grouped: dict[str, list[str]] = {}
+    for instance, class_name in instances.items():
+        grouped.setdefault(class_name, []).append(instance)
+    return grouped
+
+
+def find_tasks(folder: str | Path) -> list[Path]:
+    """Return the task folders in a tree: the folder itself, or all below it that hold a task file, sorted.
+
+    Raises:
+        MemobenchError: there is no such folder, or no task in it.
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        raise MemobenchError(f"{root} is not a folder; expected one that holds {BDDL_FILE}, or a tree of such folders")
+    found = sorted(path.parent for path in root.rglob(BDDL_FILE))
+    if not found:
+        raise MemobenchError(f"found no {BDDL_FILE} in {root} or below it; expected a task in the published format")
+    return found

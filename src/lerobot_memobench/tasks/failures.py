@@ -1,0 +1,47 @@
+"""Why a rollout failed: one class per rollout, from what its checkpoints show (paper, failure taxonomy)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from lerobot_memobench.tasks.task import Task
+
+#: Failure classes in the order of the report.
+FAILURES = (
+    "storage_failure",
+    "stale_memory",
+    "compression_collapse",
+    "reference_drift",
+    "execution_failure",
+)
+
+_BY_OPERATION = {"S": "storage_failure", "U": "stale_memory", "C": "compression_collapse"}
+
+
+def classify_failure(
+    task: Task, first_steps: Sequence[int | None], success: bool, drift: bool = False
+) -> str | None:
+    """Return the failure class of an execution of ``task``, or None when it succeeded.
+
+    Args:
+        first_steps: (K,) per checkpoint the first execution step at which its predicate held, None for never.
+        success: the goal held at termination.
+        drift: a wrong sibling of the referent or of the target satisfied the relation (object tasks).
+    """
+    return classify(task.operations, first_steps, success, drift)
+
+
+def classify(
+    operations: Sequence[str], first_steps: Sequence[int | None], success: bool, drift: bool = False
+) -> str | None:
+    """Like ``classify_failure``, from the checkpoints' operation labels ("S", "U" or "C") alone.
+
+    The first checkpoint that was never satisfied names the class. A drift explains why it is missing, so it
+    goes before; once every checkpoint was satisfied the memory did its work and the hand did not.
+    """
+    if success:
+        return None
+    for operation, first_step in zip(operations, first_steps, strict=True):
+        if first_step is None:
+            return "reference_drift" if drift else _BY_OPERATION[operation]
+    return "execution_failure"

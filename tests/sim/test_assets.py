@@ -1,0 +1,415 @@
+"""Every class builds, has its published size, stands still, and can be grasped, opened or switched."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.sim.assets import registry
+from lerobot_memobench.sim.assets.base import Asset, Builder
+from lerobot_memobench.sim.assets.kitchen import TABLE_SIZE, TABLE_TOP, build_kitchen
+from lerobot_memobench.sim.assets.registry import build_asset, known_classes, register
+
+OBJECTS = {
+    "akita_black_bowl",
+    "artichoke",
+    "bag_of_snacks",
+    "bbq_sauce",
+    "bean_curd",
+    "beefsteak_tomato__1",
+    "biscuit",
+    "bottle_of_coffee",
+    "bottle_of_detergent__1",
+    "bottle_of_fabric_softener",
+    "bottle_of_olive_oil__1",
+    "bottle_of_protein_powder__2",
+    "box_of_cereal__2",
+    "box_of_flour",
+    "box_of_oatmeal__3",
+    "broccoli",
+    "brussels_sprouts__2",
+    "butter",
+    "cap__2",
+    "carton_of_milk__6",
+    "charger",
+    "chefmate_8_frypan",
+    "chestnut__2",
+    "cork__3",
+    "ketchup",
+    "milk",
+    "moka_pot",
+    "plate",
+    "white_bowl",
+}
+FIXTURES = {"flat_stove", "microwave", "wooden_cabinet", "wooden_two_layer_shelf"}
+
+# Collision extents in the published stack, x, y, z in cm (simulation facts of the benchmark).
+PUBLISHED = {
+    "akita_black_bowl": (10.7, 10.7, 5.1),
+    "bbq_sauce": (2.9, 4.7, 10.7),
+    "butter": (7.7, 4.0, 1.8),
+    "chefmate_8_frypan": (20.4, 35.6, 5.8),
+    "flat_stove": (29.7, 19.0, 7.0),
+    "ketchup": (3.7, 5.6, 14.6),
+    "microwave": (34.5, 26.3, 18.9),
+    "milk": (5.3, 5.4, 13.1),
+    "moka_pot": (8.1, 14.8, 15.2),
+    "plate": (13.7, 13.8, 1.9),
+    "white_bowl": (8.1, 8.1, 3.4),
+    "wooden_cabinet": (25.5, 22.1, 21.8),
+    "wooden_two_layer_shelf": (35.2, 19.1, 21.0),
+}
+IN_DRAWERS = (
+    "artichoke",
+    "beefsteak_tomato__1",
+    "broccoli",
+    "brussels_sprouts__2",
+    "charger",
+    "chestnut__2",
+    "biscuit",
+    "bean_curd",
+    "cap__2",
+    "cork__3",
+    "akita_black_bowl",
+)
+CONTAINERS = {"akita_black_bowl", "white_bowl", "plate", "chefmate_8_frypan"}
+
+Scene = tuple[mujoco.MjModel, mujoco.MjData, Asset]
+
+
+def kitchen() -> mujoco.MjSpec:
+    """Return a kitchen with the solver options of the published stack."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep = 0.002
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 20
+    build_kitchen(spec)
+    return spec
+
+
+def build(class_name: str, yaw: float = 0.0) -> Scene:
+    """Return a kitchen with one instance, half a millimetre above the table."""
+    spec = kitchen()
+    asset = build_asset(spec, spec.worldbody, "thing_1", class_name)
+    body = spec.body("thing_1")
+    if asset.kind == "object":
+        body.add_freejoint(name="thing_1_joint0")
+    body.pos = [0.0, 0.0, TABLE_TOP - asset.bottom + (0.0005 if asset.kind == "object" else 0.0)]
+    body.quat = [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    for articulation in asset.articulations.values():
+        data.joint(articulation.joint).qpos[0] = articulation.closed_q
+    mujoco.mj_forward(model, data)
+    return model, data, asset
+
+
+def geoms(model: mujoco.MjModel, group: int) -> list[int]:
+    """Return the ids of the thing's geoms of a group."""
+    root = model.body("thing_1").id
+    of_thing = [g for g in range(model.ngeom) if model.body_rootid[model.geom_bodyid[g]] == root]
+    return [g for g in of_thing if model.geom_group[g] == group]
+
+
+def corners(model: mujoco.MjModel, data: mujoco.MjData, group: int) -> np.ndarray:
+    """Return points (N, 3) in the thing's frame whose bounding box is that of its geoms of a group."""
+    points = []
+    body = data.body("thing_1")
+    for g in geoms(model, group):
+        if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH:
+            mesh = model.mesh(model.geom_dataid[g])
+            start, count = int(mesh.vertadr[0]), int(mesh.vertnum[0])
+            local = model.mesh_vert[start : start + count]
+        else:
+            size, kind = model.geom_size[g], model.geom_type[g]
+            if kind == mujoco.mjtGeom.mjGEOM_BOX:
+                signs = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T
+                local = signs * size
+            elif kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
+                a = np.linspace(0, 2 * np.pi, 33)
+                ring = np.stack([size[0] * np.cos(a), size[0] * np.sin(a), np.zeros_like(a)], axis=1)
+                up = np.array([0.0, 0.0, size[1]])
+                local = np.concatenate([ring + up, ring - up])
+            else:
+                raise AssertionError(f"no corners for geom type {kind}")
+        world = local @ data.geom_xmat[g].reshape(3, 3).T + data.geom_xpos[g]
+        points.append((world - body.xpos) @ body.xmat.reshape(3, 3))
+    return np.concatenate(points)
+
+
+def faces(model: mujoco.MjModel) -> int:
+    """Return the number of drawn triangles of the thing."""
+    count = 0
+    for g in geoms(model, 1):
+        is_mesh = model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH
+        count += int(model.mesh(model.geom_dataid[g]).facenum[0]) if is_mesh else 60
+    return count
+
+
+@pytest.fixture(scope="module")
+def scenes() -> dict[str, Scene]:
+    return {name: build(name) for name in sorted(OBJECTS | FIXTURES)}
+
+
+def test_every_class_of_the_catalogue_is_known() -> None:
+    families = {registry.split_class(name)[0] for name in OBJECTS | FIXTURES | {"kitchen_table"}}
+    assert families == set(known_classes())
+
+
+@pytest.mark.parametrize("class_name", sorted(OBJECTS | FIXTURES))
+def test_facts_agree_with_the_model(class_name: str, scenes: dict[str, Scene]) -> None:
+    model, data, asset = scenes[class_name]
+    assert asset.kind == ("object" if class_name in OBJECTS else "fixture")
+    seen, felt = corners(model, data, 1), corners(model, data, 0)
+    both = np.concatenate([seen, felt])
+    np.testing.assert_allclose(both.min(axis=0), asset.low, atol=0.004)
+    np.testing.assert_allclose(both.max(axis=0), asset.high, atol=0.004)
+    np.testing.assert_allclose(seen[:, 2].min(), felt[:, 2].min(), atol=0.002)
+    if asset.kind == "fixture" or class_name in CONTAINERS:
+        assert asset.bottom == 0
+    else:
+        assert asset.bottom == pytest.approx(-asset.top, abs=0.003)
+    # What is felt is what is seen: no wall in the air, no hand through a wall.
+    assert np.all(felt.min(axis=0) > seen.min(axis=0) - 0.004)
+    assert np.all(felt.max(axis=0) < seen.max(axis=0) + 0.004)
+
+
+@pytest.mark.parametrize("class_name", sorted(PUBLISHED))
+def test_published_sizes(class_name: str, scenes: dict[str, Scene]) -> None:
+    _, _, asset = scenes[class_name]
+    size = 100 * (np.array(asset.high) - np.array(asset.low))
+    np.testing.assert_allclose(size, PUBLISHED[class_name], rtol=0.15)
+
+
+@pytest.mark.parametrize("class_name", sorted(OBJECTS | FIXTURES))
+def test_light_and_plausible(class_name: str, scenes: dict[str, Scene]) -> None:
+    model, _, asset = scenes[class_name]
+    assert faces(model) <= 700
+    assert len(geoms(model, 0)) <= 45
+    assert not any(model.geom_contype[g] or model.geom_conaffinity[g] for g in geoms(model, 1))
+    root = model.body("thing_1").id
+    for body in range(model.nbody):
+        if model.body_rootid[body] == root:
+            assert model.body_mass[body] > 0
+            assert np.all(model.body_inertia[body] > 0)
+    if asset.kind == "object":
+        assert 0.01 <= model.body_subtreemass[root] <= 0.5
+
+
+@pytest.mark.parametrize("class_name", sorted(OBJECTS))
+def test_object_comes_to_rest_upright(class_name: str) -> None:
+    model, data, _ = build(class_name, yaw=0.4)
+    start = data.body("thing_1").xpos.copy()
+    mujoco.mj_step(model, data, 500)
+    assert np.abs(data.qvel).max() < 0.01
+    assert data.body("thing_1").xmat.reshape(3, 3)[2, 2] > 0.999
+    np.testing.assert_allclose(data.body("thing_1").xpos, start, atol=0.003)
+
+
+@pytest.mark.parametrize("class_name", sorted(OBJECTS))
+def test_grasps_fit_gripper_and_object(class_name: str, scenes: dict[str, Scene]) -> None:
+    _, _, asset = scenes[class_name]
+    assert asset.grasps, "every object can be held somehow"
+    for grasp in asset.grasps:
+        assert 0 < grasp.width < 0.075
+        position = np.array(grasp.position)
+        assert np.all(position >= np.array(asset.low) - 1e-6)
+        assert np.all(position <= np.array(asset.high) + 1e-6)
+        assert grasp.position[2] - grasp.depth >= asset.bottom
+        # The palm is about 4.5 cm above the tips.
+        assert asset.top - grasp.position[2] < 0.045
+
+
+@pytest.mark.parametrize("class_name", IN_DRAWERS)
+def test_fits_a_drawer(class_name: str, scenes: dict[str, Scene]) -> None:
+    _, _, asset = scenes[class_name]
+    assert asset.top - asset.bottom <= 0.0525
+    assert asset.radius < 0.075
+
+
+def test_cabinet_drawers_slide_and_stay(scenes: dict[str, Scene]) -> None:
+    _, _, asset = scenes["wooden_cabinet"]
+    assert set(asset.articulations) == {"top_region", "middle_region", "bottom_region"}
+    assert set(asset.regions) == {"top_region", "middle_region", "bottom_region", "top_side"}
+    for region, articulation in asset.articulations.items():
+        assert articulation.joint == f"thing_1_{region.removesuffix('_region')}_level"
+        assert (articulation.open_below, articulation.closed_above) == (-0.14, 0.0)
+        assert articulation.closed_q > 0
+        assert articulation.open_q < -0.14
+        model, data, _ = build("wooden_cabinet", yaw=np.pi)
+        joint = data.joint(articulation.joint)
+        np.testing.assert_allclose(model.joint(articulation.joint).range, (-0.16, 0.01))
+        for q in (-0.16, -0.07, 0.0, 0.01):
+            mujoco.mj_resetData(model, data)
+            joint.qpos[0] = q
+            mujoco.mj_step(model, data, 500)
+            assert joint.qpos[0] == pytest.approx(q, abs=2e-4)
+        for force, end in ((-40.0, -0.16), (40.0, 0.01)):
+            mujoco.mj_resetData(model, data)
+            joint.qpos[0] = -0.08
+            for _ in range(500):
+                joint.qfrc_applied[0] = force
+                mujoco.mj_step(model, data)
+            assert joint.qpos[0] == pytest.approx(end, abs=3e-3)
+
+
+def test_cabinet_regions_are_the_insides_of_the_drawers(scenes: dict[str, Scene]) -> None:
+    model, data, asset = scenes["wooden_cabinet"]
+    for level in ("top", "middle", "bottom"):
+        site = model.site(asset.regions[f"{level}_region"])
+        np.testing.assert_allclose(site.size, (0.11, 0.075, 0.03), atol=0.008)
+        assert model.body(int(site.bodyid[0])).name == f"thing_1_{level}_drawer"
+        # With yaw 0 drawers open to -y: the handle is in front of the region.
+        handle = data.site(asset.articulations[f"{level}_region"].handle_site)
+        assert handle.xpos[1] < data.site(site.name).xpos[1] - 0.075
+        assert asset.articulations[f"{level}_region"].handle.clearance >= 0.025
+    assert data.site(asset.regions["top_side"]).xpos[2] == pytest.approx(TABLE_TOP + asset.top - 0.001)
+
+
+def test_a_thing_in_a_drawer_rides_along() -> None:
+    spec = kitchen()
+    cabinet = build_asset(spec, spec.worldbody, "cabinet", "wooden_cabinet")
+    tomato = build_asset(spec, spec.worldbody, "tomato", "beefsteak_tomato__1")
+    spec.body("tomato").add_freejoint(name="tomato_joint0")
+    spec.body("cabinet").pos = [0, 0, TABLE_TOP]
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    articulation = cabinet.articulations["top_region"]
+    drawer = data.joint(articulation.joint)
+    drawer.qpos[0] = articulation.open_q
+    mujoco.mj_forward(model, data)
+    site = data.site(cabinet.regions["top_region"])
+    half = model.site(cabinet.regions["top_region"]).size
+    data.joint("tomato_joint0").qpos[:3] = site.xpos - [0, 0, half[2] + tomato.bottom - 0.001]
+    for _ in range(1500):
+        drawer.qfrc_applied[0] = 8.0 if drawer.qpos[0] < articulation.closed_q else 0.0
+        mujoco.mj_step(model, data)
+    assert articulation.closed_above is not None
+    assert drawer.qpos[0] > articulation.closed_above
+    assert np.all(np.abs(data.body("tomato").xpos - site.xpos) < half)
+
+
+def test_stove_knob_stays_and_burner_can_glow() -> None:
+    model, data, asset = build("flat_stove")
+    articulation = asset.articulations[""]
+    assert articulation.joint == "thing_1_button"
+    assert (articulation.on_at_least, articulation.off_below) == (0.5, 0.0)
+    np.testing.assert_allclose(model.joint("thing_1_button").range, (-0.005, 2.1))
+    for q in (-0.004, articulation.closed_q, 0.3, articulation.open_q, 2.09):
+        data.joint("thing_1_button").qpos[0] = q
+        data.qvel[:] = 0
+        mujoco.mj_step(model, data, 500)
+        assert data.joint("thing_1_button").qpos[0] == pytest.approx(q, abs=1e-3)
+    assert articulation.closed_q < 0
+    assert asset.glow
+    assert asset.glow_on != asset.glow_off
+    for geom in asset.glow:
+        assert model.geom(geom).group[0] == 1
+    site = model.site(asset.regions["cook_region"])
+    top = data.site("thing_1_cook_region").xpos[2] + site.size[2]
+    assert top == pytest.approx(TABLE_TOP + asset.supports, abs=1e-6)
+
+
+def test_microwave_door_stays_and_clears_a_plate() -> None:
+    model, data, asset = build("microwave", yaw=np.pi)
+    articulation = asset.articulations[""]
+    assert (articulation.open_below, articulation.closed_above) == (-1.3, -0.005)
+    np.testing.assert_allclose(model.joint("thing_1_microjoint").range, (-2.094, 0.0))
+    shut = data.site(articulation.handle_site).xpos.copy()
+    for q in (0.0, -0.7, articulation.open_q, -2.094):
+        data.joint("thing_1_microjoint").qpos[0] = q
+        data.qvel[:] = 0
+        mujoco.mj_step(model, data, 500)
+        assert data.joint("thing_1_microjoint").qpos[0] == pytest.approx(q, abs=1e-3)
+    # Turned by pi, the door swings to world +y.
+    assert data.site(articulation.handle_site).xpos[1] > shut[1] + 0.1
+    door = [g for g in geoms(model, 0) if model.geom_bodyid[g] == model.body("thing_1_door").id]
+    assert min(data.geom_xpos[g][2] - model.geom_size[g][2] for g in door) > TABLE_TOP + 0.024
+    assert set(asset.regions) == {"heating_region", "top_side"}
+
+
+def test_shelf_regions(scenes: dict[str, Scene]) -> None:
+    _, data, asset = scenes["wooden_two_layer_shelf"]
+    assert set(asset.regions) == {"top_side", "top_region", "bottom_region"}
+    low, high = (data.site(asset.regions[name]).xpos[2] for name in ("bottom_region", "top_region"))
+    assert low < high < data.site(asset.regions["top_side"]).xpos[2]
+
+
+def drop_on(lower: str, upper: str) -> tuple[np.ndarray, bool]:
+    """Drop one thing on another; return the offset of their origins (3,) and whether they touch."""
+    spec = kitchen()
+    below = build_asset(spec, spec.worldbody, "below", lower)
+    above = build_asset(spec, spec.worldbody, "above", upper)
+    for name in ("below", "above"):
+        spec.body(name).add_freejoint(name=f"{name}_joint0")
+    spec.body("below").pos = [0, 0, TABLE_TOP - below.bottom]
+    spec.body("above").pos = [0.004, 0.003, TABLE_TOP - below.bottom + below.top - above.bottom + 0.005]
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 1000)
+    assert np.abs(data.qvel).max() < 0.02
+    owner = {model.body(name).id for name in ("below", "above")}
+    pairs = [{int(model.geom_bodyid[g]) for g in contact.geom} for contact in data.contact]
+    return data.body("above").xpos - data.body("below").xpos, owner in pairs
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper"),
+    [
+        ("plate", "milk"),
+        ("plate", "butter"),
+        ("plate", "akita_black_bowl"),
+        ("plate", "white_bowl"),
+        ("akita_black_bowl", "butter"),
+        ("akita_black_bowl", "milk"),
+        ("akita_black_bowl", "akita_black_bowl"),
+    ],
+)
+def test_what_is_put_on_something_is_on_it(lower: str, upper: str) -> None:
+    offset, touching = drop_on(lower, upper)
+    assert touching
+    assert offset[2] >= 0
+    assert np.hypot(*offset[:2]) < 0.03
+
+
+def test_many_of_a_class_share_mesh_and_texture() -> None:
+    spec = mujoco.MjSpec()
+    for k in range(9):
+        build_asset(spec, spec.worldbody, f"milk_{k}", "milk")
+    model = spec.compile()
+    assert (model.nmesh, model.ntex, model.nmat) == (1, 1, 1)
+
+
+def test_kitchen() -> None:
+    spec = mujoco.MjSpec()
+    table = build_kitchen(spec)
+    model = spec.compile()
+    assert table.name == "kitchen_table"
+    assert sum(bool(value) for value in model.light_castshadow) == 1
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    tops = [g for g in range(model.ngeom) if model.geom(g).name.startswith("kitchen_table_collision")]
+    assert len(tops) == 1
+    np.testing.assert_allclose(2 * model.geom_size[tops[0]], TABLE_SIZE)
+    assert data.geom_xpos[tops[0]][2] + model.geom_size[tops[0]][2] == pytest.approx(TABLE_TOP)
+
+
+def test_unknown_class_names_the_nearest() -> None:
+    spec = mujoco.MjSpec()
+    with pytest.raises(MemobenchError, match="microwave"):
+        build_asset(spec, spec.worldbody, "oven_1", "microwav")
+
+
+def test_registered_builder_goes_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry, "_builders", dict(registry._builders))
+
+    def cube(b: Builder) -> Asset:
+        b.collision("box", (0.01, 0.01, 0.01), 0.01)
+        return b.object((-0.01, -0.01, -0.01), (0.01 * b.variant, 0.01, 0.01))
+
+    register("cork__3", cube)
+    spec = mujoco.MjSpec()
+    assert build_asset(spec, spec.worldbody, "a", "cork__3").high[0] == pytest.approx(0.03)
+    assert build_asset(spec, spec.worldbody, "b", "cork__1").high[0] != pytest.approx(0.01)
