@@ -1,0 +1,191 @@
+"""Do recorded actions, played again in the simulator, give the recorded states, success and labels?
+
+The scene is reset to the episode's seed and the actions are applied as they were recorded, in the prompt
+video too; no expert and no gym environment is asked. Everything is compared exactly, bit for bit.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.datasets.demonstration import Demonstration, labels
+from lerobot_memobench.datasets.language import persistent_rows
+from lerobot_memobench.datasets.lerobot_format import is_dataset
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.sim.simulation import Simulation
+from lerobot_memobench.tasks.catalogue import get_task
+from lerobot_memobench.tasks.progress import Progress
+from lerobot_memobench.tasks.task import Task
+
+Columns = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """The first thing that differs. ``frame`` is None for what belongs to the whole episode."""
+
+    column: str
+    frame: int | None
+    recorded: Any
+    replayed: Any
+
+    def __str__(self) -> str:
+        where = "" if self.frame is None else f" at frame {self.frame}"
+        return f"{self.column}{where}: recorded {_short(self.recorded)}, replayed {_short(self.replayed)}"
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedEpisode:
+    """An episode of a dataset on disk: ``columns`` per frame and what meta/episodes says."""
+
+    task_name: str
+    variant: int
+    seed: int
+    exec_start: int
+    columns: Columns
+    whole: dict[str, Any]
+
+
+def replay(recorded: Demonstration | RecordedEpisode, *, task: Task | None = None) -> Disagreement | None:
+    """Play an episode again and return the first disagreement, or None.
+
+    Compared are states (where recorded), proprioception, every label column, language rows, success, key
+    frames and the scene's hash. ``task`` replaces the catalogue's task of that name, for datasets of tasks of
+    one's own.
+    """
+    if isinstance(recorded, Demonstration):
+        again = resimulate(recorded.task, recorded.seed, recorded.actions, recorded.exec_start)
+        again = replace(again, referent=recorded.referent, variant=recorded.variant)
+        return _first_difference(demonstration_columns(recorded), demonstration_columns(again)) or _whole_difference(
+            _whole(recorded), _whole(again)
+        )
+    task = (task or get_task(recorded.task_name)).variant(recorded.variant)
+    again = resimulate(task, recorded.seed, recorded.columns["action"], recorded.exec_start)
+    return _first_difference(recorded.columns, demonstration_columns(again)) or _whole_difference(
+        recorded.whole, _whole(again)
+    )
+
+
+def resimulate(task: Task, seed: int, actions: NDArray[np.float32], exec_start: int) -> Demonstration:
+    """Apply (T, 7) float32 actions, starting in the scene of ``seed``; return the demonstration they make.
+
+    It has no images. At frame ``exec_start`` the scene goes back to where it began, as after a prompt video.
+    """
+    sim = Simulation(task)
+    sim.reset(seed)
+    start, scene_hash, fixture_poses = sim.snapshot(), sim.scene_hash(), sim.fixture_poses()
+    progress = Progress(task)
+    states, proprio, satisfied = [], [], []
+    success = False
+    for frame, action in enumerate(actions):
+        if frame == exec_start and frame > 0:
+            sim.restore(start)
+        states.append(sim.state())
+        proprio.append(sim.proprio())
+        satisfied.append(progress.satisfied)
+        success = success or progress.success
+        sim.step(action)
+        if frame >= exec_start:
+            progress.step(sim.holds)
+    return Demonstration(
+        task=task,
+        seed=seed,
+        referent="fixed",
+        variant=task.variant_index,
+        states=np.array(states),
+        actions=np.asarray(actions, dtype=np.float32),
+        proprio=np.array(proprio, dtype=np.float32),
+        images=None,
+        exec_start=exec_start,
+        satisfied=np.array(satisfied, dtype=np.bool_).reshape(len(states), len(task.checkpoints)),
+        success=success,
+        fixture_poses=fixture_poses,
+        scene_hash=scene_hash,
+    )
+
+
+def demonstration_columns(demo: Demonstration) -> Columns:
+    """Return states, proprioception and labels under the dataset's column names."""
+    return {"states": demo.states, "observation.state": demo.proprio, **labels(demo).columns()}
+
+
+def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
+    """Read an episode of a dataset that this package made; without states/, states are not compared."""
+    import pyarrow.parquet as pq
+
+    root = Path(root)
+    if not is_dataset(root):
+        raise MemobenchError(f"{root} is no dataset (there is no meta/info.json); name the folder of a generated one")
+    chosen = [("episode_index", "==", episode_index)]
+    rows = pq.read_table(root / "meta" / "episodes", filters=chosen).to_pylist()
+    if len(rows) != 1:
+        raise MemobenchError(f"{root} has no episode {episode_index}; see total_episodes in its meta/info.json")
+    meta = rows[0]
+    missing = [key for key in ("task_name", "variant", "seed", "exec_start_index") if key not in meta]
+    if missing:
+        raise MemobenchError(f"{root} lacks {', '.join(missing)} in meta/episodes: this package did not make it")
+    table = pq.read_table(root / "data", filters=chosen).sort_by("frame_index")
+    columns: Columns = {}
+    for name in table.column_names:
+        values = table.column(name).to_pylist()
+        is_text = name == "language_persistent" or isinstance(values[0], str)
+        columns[name] = values if is_text else np.array(values)
+    columns["action"] = columns["action"].astype(np.float32)
+    columns["observation.state"] = columns["observation.state"].astype(np.float32)
+    if (root / "states").is_dir():
+        states = pq.read_table(root / "states", filters=chosen).sort_by("frame_index")
+        columns["states"] = np.array(states.column("state").to_pylist(), dtype=np.float64)
+    whole = {key: meta[key] for key in ("success", "key_frames", "scene_hash") if key in meta}
+    if "fixture_poses" in meta:
+        whole["fixture_poses"] = json.loads(meta["fixture_poses"])
+    if "language_persistent" in columns:
+        whole["language_persistent"] = columns["language_persistent"][0]
+    return RecordedEpisode(meta["task_name"], meta["variant"], meta["seed"], meta["exec_start_index"], columns, whole)
+
+
+def _whole(demo: Demonstration) -> dict[str, Any]:
+    found = labels(demo)
+    return {
+        "success": demo.success,
+        "key_frames": found.key_frames.tolist(),
+        "scene_hash": demo.scene_hash,
+        "fixture_poses": {name: np.asarray(pose).tolist() for name, pose in demo.fixture_poses.items()},
+        "language_persistent": persistent_rows(found),
+    }
+
+
+def _first_difference(recorded: Columns, replayed: Columns) -> Disagreement | None:
+    """The earliest frame at which a column that both have differs; at one frame, states come first."""
+    first: Disagreement | None = None
+    for column, new in replayed.items():
+        if column not in recorded:
+            continue
+        old = recorded[column]
+        if np.shape(old) != np.shape(new):
+            return Disagreement(f"shape of {column}", None, np.shape(old), np.shape(new))
+        differs = [
+            frame
+            for frame, (a, b) in enumerate(zip(old, new, strict=True))
+            if not np.array_equal(np.asarray(a), np.asarray(b))
+        ]
+        if differs and (first is None or first.frame is None or differs[0] < first.frame):
+            first = Disagreement(column, differs[0], old[differs[0]], new[differs[0]])
+    return first
+
+
+def _whole_difference(recorded: dict[str, Any], replayed: dict[str, Any]) -> Disagreement | None:
+    for key, old in recorded.items():
+        if old != replayed[key]:
+            return Disagreement(key, None, old, replayed[key])
+    return None
+
+
+def _short(value: Any) -> str:
+    text = np.array2string(value, threshold=12) if isinstance(value, np.ndarray) else repr(value)
+    return text if len(text) <= 200 else text[:197] + "..."

@@ -1,0 +1,148 @@
+"""Camera frames to MP4 and their statistics, as LeRobot stores and computes them.
+
+Encoding: H.264, preset ultrafast, one key frame in ten, CRF 23, no B-frames. Measured on an episode of the
+benchmark (396 frames of 256×256, one encoder thread, on busy cores; third person / wrist):
+
+==========================  =============  =================================  ===================
+setting                     frames/s       PSNR mean (worst frame), dB        bytes per frame
+==========================  =============  =================================  ===================
+LeRobot's default, AV1 g=2  204 / 224      36.6 (34.2) / 37.6 (32.6)          3,965 / 1,999
+AV1, g=20                   291 / 351      36.5 (34.2) / 36.3 (32.2)          1,675 / 1,333
+H.264, CRF 30, g=2          599 / 527      32.4 (30.2) / 34.7 (30.7)          1,643 / 1,005
+this one                    2,011 / 1,722  37.6 (36.4) / 39.3 (34.6)          3,151 / 2,479
+==========================  =============  =================================  ===================
+
+So both cameras together are smaller than under LeRobot's default, closer to what was rendered, and encoded
+several times as fast. g=10 keeps random access cheap (at most nine small frames to decode before the one
+wanted); H.264 in yuv420p plays in every browser, so the hub's viewer shows it. Frames go from memory into the
+encoder: most of the time of LeRobot's recording loop is spent writing PNG files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.datasets.demonstration import FPS
+from lerobot_memobench.errors import MemobenchError
+
+if TYPE_CHECKING:
+    from lerobot.configs import RGBEncoderConfig
+
+QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
+
+Stats = dict[str, NDArray]
+
+
+def default_encoder() -> RGBEncoderConfig:
+    """Return the encoder settings of the module's docstring in LeRobot's own form."""
+    from lerobot.configs import RGBEncoderConfig
+
+    return RGBEncoderConfig(vcodec="h264", preset="ultrafast", g=10, crf=23, extra_options={"bf": 0})
+
+
+def encode_video(
+    frames: NDArray[np.uint8], path: Path, encoder: RGBEncoderConfig | None = None, fps: int = FPS
+) -> None:
+    """Encode (T, H, W, 3) uint8 frames to ``path``.
+
+    One thread, so that the bytes do not depend on the machine's cores or on what runs beside.
+    """
+    import av
+
+    encoder = encoder or default_encoder()
+    options = encoder.get_codec_options(1, as_strings=True)
+    with av.open(str(path), "w") as container:
+        stream: Any = container.add_stream(encoder.vcodec, fps, options=options)
+        stream.pix_fmt = encoder.pix_fmt
+        stream.height, stream.width = frames.shape[1:3]
+        for frame in frames:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        container.mux(stream.encode())
+
+
+def join_videos(videos: Sequence[tuple[Path, int]], path: Path, fps: int = FPS) -> None:
+    """Join videos of one encoder, given with their number of frames, without encoding them again.
+
+    Frame i of the whole is at i / ``fps`` s to the tick: the places follow from the frame counts, not from
+    the durations that the files state.
+    """
+    import av
+
+    with av.open(str(path), "w", options={"movflags": "faststart"}) as target:
+        stream: Any = None
+        offset = 0
+        for part, frames in videos:
+            with av.open(str(part)) as source:
+                template = source.streams.video[0]
+                assert template.time_base is not None
+                if stream is None:
+                    stream = target.add_stream_from_template(template, opaque=True)
+                    stream.time_base = time_base = template.time_base
+                    extradata = template.codec_context.extradata
+                if (template.time_base, template.codec_context.extradata) != (time_base, extradata):
+                    raise MemobenchError(
+                        f"{part} was encoded in another way than {videos[0][0]}; delete both folders, generate again"
+                    )
+                for packet in source.demux(template):
+                    if packet.dts is None or packet.pts is None:
+                        continue  # the demuxer's last, empty packet
+                    packet.pts += offset
+                    packet.dts += offset
+                    packet.stream = stream
+                    target.mux(packet)
+            offset += round(frames / (fps * time_base))
+
+
+def video_info(path: Path, encoder: RGBEncoderConfig | None = None) -> dict[str, Any]:
+    """Return what LeRobot keeps about a video in meta/info.json."""
+    import av
+    from lerobot.datasets.video_utils import get_video_info
+
+    level = av.logging.get_level()
+    try:
+        return get_video_info(path, video_encoder=encoder or default_encoder())
+    finally:
+        av.logging.set_level(level)  # LeRobot leaves FFmpeg printing to stderr
+
+
+def image_stats(frames: NDArray[np.uint8]) -> Stats:
+    """Return LeRobot's statistics of (T, H, W, 3) frames: each (3, 1, 1), in [0, 1], and ``count`` (1,).
+
+    Over the frames that LeRobot samples (evenly, at least 100), but exact over their pixels: eight bits need
+    a histogram of 256 bins, not of 5,000 adaptive ones.
+    """
+    from lerobot.datasets.compute_stats import sample_indices
+
+    chosen = sample_indices(len(frames))
+    counts = np.stack([np.bincount(frames[chosen, ..., channel].ravel(), minlength=256) for channel in range(3)])
+    levels, total = np.arange(256) / 255.0, counts[0].sum()
+    mean = counts @ levels / total
+    cumulative = counts.cumsum(axis=1)
+    stats = {
+        "min": levels[(counts > 0).argmax(axis=1)],
+        "max": levels[255 - (counts[:, ::-1] > 0).argmax(axis=1)],
+        "mean": mean,
+        "std": np.sqrt(np.maximum(counts @ levels**2 / total - mean**2, 0)),
+    }
+    for q in QUANTILES:
+        stats[f"q{int(q * 100):02d}"] = levels[(cumulative >= q * total).argmax(axis=1)]
+    return {name: value.reshape(3, 1, 1) for name, value in stats.items()} | {"count": np.array([len(chosen)])}
+
+
+def numeric_stats(values: NDArray) -> Stats:
+    """Return exact statistics of (T,) or (T, n) numbers over T: each (n,) (n = 1 for (T,)), and ``count``
+    (1,).
+
+    LeRobot averages the episodes' quantiles; over a whole dataset that is no quantile. pi0.5 normalises by
+    q01 and q99, so they are computed from all frames here.
+    """
+    flat = values.reshape(len(values), -1).astype(np.float64)
+    stats = {"min": flat.min(0), "max": flat.max(0), "mean": flat.mean(0), "std": flat.std(0)}
+    for q, row in zip(QUANTILES, np.quantile(flat, QUANTILES, axis=0), strict=True):
+        stats[f"q{int(q * 100):02d}"] = row
+    return stats | {"count": np.array([len(values)])}

@@ -1,0 +1,265 @@
+"""Generation without a simulator: recording is replaced by synthetic demonstrations."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import pathlib
+import shutil
+import signal
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from lerobot_memobench.datasets import generation
+from lerobot_memobench.datasets.generation import generate
+from lerobot_memobench.datasets.lerobot_format import is_dataset
+from lerobot_memobench.errors import MemobenchError
+
+FAILING_SEED = 10_002
+
+
+@pytest.fixture
+def tasks(make_task):
+    return [make_task("SU", name="task_a"), make_task("SU", name="task_b", memory_type="object")]
+
+
+@pytest.fixture
+def recorded(make_demo, monkeypatch):
+    """Replace the recording; the list of (task, seed) recorded so far. Seed 10,002 of task_a fails."""
+    calls: list[tuple[str, int]] = []
+    truth = ["0" * 6 + "1" * 9, "0" * 13 + "1" * 2]
+
+    def record(episode, seed, settings):
+        calls.append((episode.task.name, seed))
+        fails = episode.task.name == "task_a" and seed == FAILING_SEED
+        size = settings.image_size if settings.images else None
+        return replace(
+            make_demo(truth, task=episode.task, seed=seed, size=size, success=not fails),
+            referent=settings.referent,
+        )
+
+    def episode(task, settings):
+        return SimpleNamespace(
+            task=task, prompt_shown=None, horizon=1200, progress=SimpleNamespace(index=1), referent="fixed"
+        )
+
+    monkeypatch.setattr(generation, "_episode", episode)
+    monkeypatch.setattr(generation, "_record", record)
+    return calls
+
+
+def tree_hash(root: Path) -> dict[str, str]:
+    return {
+        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(root.rglob("*"))
+        if path.is_file()
+    }
+
+
+def run(tasks, out, episodes=2, **more):
+    return generate(tasks, episodes, out, **{"image_size": 32, **more})
+
+
+def test_summary_and_dataset(tasks, recorded, tmp_path):
+    from lerobot.datasets import LeRobotDataset
+
+    heard = []
+    summary = run(tasks, tmp_path / "ds", progress=heard.append)
+    assert summary.exit_status == 0
+    assert [(t.name, t.episodes, t.solved, t.frames) for t in summary.tasks] == [
+        ("task_a", 2, 2, (15, 15)),
+        ("task_b", 2, 2, (15, 15)),
+    ]
+    assert [(a.done, a.total, a.task_name, a.seed) for a in heard] == [
+        (1, 4, "task_a", 10_000),
+        (2, 4, "task_a", 10_001),
+        (3, 4, "task_b", 10_000),
+        (4, 4, "task_b", 10_001),
+    ]
+    dataset = LeRobotDataset("local/test", root=tmp_path / "ds")
+    assert dataset.num_episodes == 4
+    assert sorted(path.name for path in (tmp_path / "ds").iterdir()) == [
+        "README.md",
+        "data",
+        "manifest.json",
+        "meta",
+        "states",
+        "videos",
+    ]
+
+
+def test_failures_are_reported_everywhere(tasks, recorded, tmp_path):
+    summary = run(tasks, tmp_path / "ds", episodes=3)
+    assert summary.exit_status == 1
+    assert [(f.task_name, f.seed) for f in summary.failures] == [("task_a", FAILING_SEED)]
+    assert "goal not reached in 1200 steps (1 of 2 checkpoints" in summary.failures[0].reason
+    assert (summary.tasks[0].solved, summary.tasks[0].episodes) == (2, 3)
+    card = (tmp_path / "ds" / "README.md").read_text()
+    assert f"task_a, seed {FAILING_SEED}: goal not reached" in card
+    assert "2/3" in card
+    manifest = json.loads((tmp_path / "ds" / "manifest.json").read_text())
+    assert [row["episode_index"] for row in manifest["episodes"]] == [0, 1, None, 2, 3, 4]
+
+
+def test_nothing_but_failures_makes_no_dataset(tasks, recorded, tmp_path):
+    summary = run(tasks[:1], tmp_path / "ds", episodes=1, seed_base=FAILING_SEED)
+    assert summary.folder is None
+    assert summary.exit_status == 1
+    assert not is_dataset(tmp_path / "ds")
+
+
+def test_finished_run_is_only_reported(tasks, recorded, tmp_path):
+    first = run(tasks, tmp_path / "ds")
+    before = tree_hash(tmp_path / "ds")
+    recorded.clear()
+    assert run(tasks, tmp_path / "ds") == first
+    assert recorded == []
+    with pytest.raises(MemobenchError, match="finished dataset with episodes=2, now 3"):
+        run(tasks, tmp_path / "ds", episodes=3)
+    assert tree_hash(tmp_path / "ds") == before
+
+
+def test_resume_makes_only_what_is_missing(tasks, recorded, tmp_path, monkeypatch):
+    reference = tree_hash_of_run(tasks, tmp_path / "undisturbed")
+    inner = generation._record
+
+    def broken(episode, seed, settings):
+        if (episode.task.name, seed) == ("task_b", 10_000):
+            raise RuntimeError("power cut")
+        return inner(episode, seed, settings)
+
+    monkeypatch.setattr(generation, "_record", broken)
+    with pytest.raises(RuntimeError, match="power cut") as caught:
+        run(tasks, tmp_path / "ds")
+    assert "while recording task_b, seed 10000" in caught.value.__notes__
+    assert not is_dataset(tmp_path / "ds")
+    monkeypatch.setattr(generation, "_record", inner)
+    recorded.clear()
+    run(tasks, tmp_path / "ds")
+    assert recorded == [("task_b", 10_000), ("task_b", 10_001)]
+    assert tree_hash(tmp_path / "ds") == reference
+
+
+def tree_hash_of_run(tasks, out):
+    run(tasks, out)
+    return tree_hash(out)
+
+
+def test_an_unfinished_run_of_another_request_is_not_mixed_in(tasks, recorded, tmp_path, monkeypatch):
+    monkeypatch.setattr(generation, "assemble", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        run(tasks, tmp_path / "ds")
+    monkeypatch.undo()
+    with pytest.raises(MemobenchError, match="unfinished run with images=True, now False"):
+        run(tasks, tmp_path / "ds", images=False)
+    edited = [replace(tasks[0], bddl_text="another goal"), tasks[1]]
+    with pytest.raises(MemobenchError, match="unfinished run with task_files"):
+        run(edited, tmp_path / "ds")
+
+
+def test_start_anew(tasks, recorded, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(generation, "assemble", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            run(tasks, tmp_path / "ds")
+    recorded.clear()
+    run(tasks, tmp_path / "ds", resume=False, episodes=1)
+    assert recorded == [("task_a", 10_000), ("task_b", 10_000)]
+    assert is_dataset(tmp_path / "ds")
+
+
+def test_two_runs_at_once(tasks, recorded, tmp_path):
+    with pytest.raises(MemobenchError, match="another run is writing"):
+        run(tasks, tmp_path / "ds", progress=lambda _: run(tasks, tmp_path / "ds"))
+
+
+def test_a_worker_that_is_killed(tasks, recorded, tmp_path, monkeypatch):
+    def submit(_self, _function, _job):
+        future = Future()
+        future.set_exception(BrokenProcessPool("gone"))
+        return future
+
+    monkeypatch.setattr(generation.ProcessPoolExecutor, "submit", submit)
+    with pytest.raises(MemobenchError, match="one of 2 worker processes was killed"):
+        run(tasks, tmp_path / "ds", workers=2)
+    monkeypatch.undo()
+
+
+@pytest.mark.parametrize("arguments", [{"episodes": 0}, {"workers": 0}])
+def test_nothing_to_do(tasks, recorded, tmp_path, arguments):
+    with pytest.raises(MemobenchError, match="each must be at least 1"):
+        run(tasks, tmp_path / "ds", **arguments)
+    assert not (tmp_path / "ds").exists()
+
+
+def test_no_task_or_the_same_twice(tasks, recorded, tmp_path):
+    with pytest.raises(MemobenchError, match="0 tasks"):
+        run([], tmp_path / "ds")
+    with pytest.raises(MemobenchError, match="named twice"):
+        run([tasks[0], tasks[0]], tmp_path / "ds")
+
+
+def kill_at(call: int, work) -> bool:
+    """Do ``work`` in a child that ends, as by kill -9, before the ``call``-th change to the disk; whether it did.
+
+    A child that hangs, which a fork of a process with threads may, is killed too: that is a kill like any other.
+    """
+    pid = os.fork()
+    if pid:
+        return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) in (9, -signal.SIGALRM)
+    signal.alarm(60)
+    count = 0
+
+    def fatal(inner):
+        def outer(*args, **kwargs):
+            nonlocal count
+            count += 1
+            if count == call:
+                os._exit(9)
+            return inner(*args, **kwargs)
+
+        return outer
+
+    try:
+        for module, name in [
+            (os, "replace"),
+            (os, "fsync"),
+            (pathlib.Path, "rename"),
+            (pathlib.Path, "replace"),
+            (pathlib.Path, "mkdir"),
+            (pathlib.Path, "write_text"),
+            (shutil, "rmtree"),
+        ]:
+            setattr(module, name, fatal(getattr(module, name)))
+        work()
+        os._exit(0)
+    except BaseException:
+        os._exit(1)
+
+
+@pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
+def test_killed_at_every_change_to_the_disk(tasks, recorded, tmp_path):
+    """Kill after every n-th step of a run, resume, compare with an undisturbed run, byte for byte."""
+    out = tmp_path / "ds"
+    reference = tree_hash_of_run(tasks, tmp_path / "undisturbed")
+    killed = unfinished = 0
+    for call in range(1, 400, 9):
+        shutil.rmtree(out, ignore_errors=True)
+        if not kill_at(call, lambda: run(tasks, out)):
+            break
+        killed += 1
+        unfinished += not is_dataset(out)
+        # Once more, at another place, then to the end.
+        kill_at(call + 2, lambda: run(tasks, out))
+        if is_dataset(out):
+            assert {k: v for k, v in tree_hash(out).items() if not k.startswith(".staging")} == reference
+        run(tasks, out)
+        assert tree_hash(out) == reference, f"killed at change {call}"
+    assert killed > 8
+    assert unfinished > 8

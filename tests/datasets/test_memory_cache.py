@@ -1,0 +1,193 @@
+"""The memory cache: contents, going on after a kill, and refusing what does not fit."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from lerobot_memobench.datasets.memory_cache import (
+    FOLDER,
+    MemoryCache,
+    build_memory_cache,
+    dataset_fingerprint,
+    read_meta,
+    resolve_subgoals,
+)
+from lerobot_memobench.errors import MemobenchError
+
+CAMERA = "observation.images.image"
+
+
+def _synthetic():  # type: ignore[no-untyped-def]
+    """The policy tests' writer of a small dataset."""
+    path = Path(__file__).parents[1] / "policies" / "conftest.py"
+    spec = importlib.util.spec_from_file_location("synthetic_dataset", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+class _Frames:
+    """Four tokens per frame that hold the frame's mean brightness; counts its frames, or stops like a killed run."""
+
+    tokens_per_frame, dim = 4, 3
+
+    def __init__(self, key: str = "tower", stop_after: int | None = None) -> None:
+        self.key, self.stop_after, self.seen = key, stop_after, 0
+
+    def __call__(self, images: torch.Tensor) -> torch.Tensor:
+        if self.stop_after is not None and self.seen >= self.stop_after:
+            raise KeyboardInterrupt
+        self.seen += len(images)
+        return images.mean(dim=(1, 2, 3))[:, None, None].expand(-1, 4, 3).to(torch.bfloat16)
+
+
+class _Texts:
+    key, dim = "texts", 5
+
+    def __call__(self, texts: Sequence[str]) -> torch.Tensor:
+        return torch.tensor([[float(len(text))] * 5 for text in texts])
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return _synthetic().make_dataset(tmp_path_factory.mktemp("cache") / "data")
+
+
+@pytest.fixture
+def root(original: Path, tmp_path: Path) -> Path:
+    shutil.copytree(original, tmp_path / "data")
+    return tmp_path / "data"
+
+
+def _open(root: Path, **changes: object) -> MemoryCache:
+    wanted = {"frames_key": "tower", "camera": CAMERA, "stride": 1, "texts_key": "texts"} | changes
+    return MemoryCache.open(root, "test", **wanted)  # type: ignore[arg-type]
+
+
+def _frame(root: Path, episode: int, frame: int) -> torch.Tensor:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    dataset = LeRobotDataset("x/y", root=root)
+    return dataset[dataset.meta.episodes["dataset_from_index"][episode] + frame][CAMERA]
+
+
+def test_contents(root: Path) -> None:
+    synthetic = _synthetic()
+    calls: list[tuple[int, int]] = []
+    folder = build_memory_cache(
+        root, "test", _Frames(), _Texts(), batch_size=7, progress=lambda *done: calls.append(done)
+    )
+    assert folder == root / FOLDER / "test" and calls == [(0, 3), (1, 3), (2, 3), (3, 3)]
+    cache = _open(root)
+    assert cache.num_frames == sum(synthetic.LENGTHS)
+    assert np.diff(cache.episodes).tolist() == list(synthetic.LENGTHS)
+    assert cache.locate(0) == (0, 0) and cache.locate(40) == (1, 0) and cache.locate(93) == (2, 30)
+    tokens = cache.tokens(1, [0, 22, 5])
+    assert tokens.shape == (3, 4, 3) and tokens.dtype == torch.bfloat16
+    expected = torch.stack([_frame(root, 1, frame).mean() for frame in (0, 22, 5)]).to(torch.bfloat16)
+    torch.testing.assert_close(tokens[:, 0, 0], expected)
+    assert cache.phase[40:50].tolist() == [0] * 8 + [1] * 2 and cache.phase[:40].all()
+    rows = cache.text_rows("intermediate")
+    first = cache.texts[rows[0]]
+    assert first == "pick up the cream cheese"
+    assert float(cache.text_embeddings[rows[0], 0]) == len(first)
+    assert cache.texts[rows[3]] == first  # frame 3 has no text: the next frame's counts
+    assert cache.texts[cache.text_rows("fine")[0]].endswith("(0.1, 0.2)")
+    with pytest.raises(MemobenchError, match="level 'coarse'"):
+        cache.text_rows("coarse")
+    with pytest.raises(MemobenchError, match="outside"):
+        cache.locate(94)
+
+
+def test_stride(root: Path) -> None:
+    frames = _Frames()
+    build_memory_cache(root, "test", frames, _Texts(), stride=4)
+    assert frames.seen == 10 + 6 + 8
+    cache = _open(root, stride=4)
+    expected = _frame(root, 2, 28).mean().to(torch.bfloat16)
+    torch.testing.assert_close(cache.tokens(2, [7])[0, 0, 0], expected)
+
+
+def test_a_finished_cache_is_left_alone_and_moves_with_its_dataset(root: Path, tmp_path: Path) -> None:
+    build_memory_cache(root, "test", _Frames(), _Texts())
+    again = _Frames()
+    build_memory_cache(root, "test", again, _Texts())
+    assert again.seen == 0
+    moved = tmp_path / "elsewhere"
+    root.rename(moved)
+    assert _open(moved).num_frames == 94
+
+
+def test_a_killed_build_goes_on(root: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        build_memory_cache(root, "test", _Frames(stop_after=45), _Texts(), batch_size=10)
+    meta = read_meta(root, "test")
+    assert meta is not None and not meta.complete
+    with pytest.raises(MemobenchError, match="not finished.*memobench cache"):
+        _open(root)
+    rest = _Frames()
+    build_memory_cache(root, "test", rest, _Texts())
+    assert rest.seen == 94 - 40  # the first episode was done
+    whole = root / FOLDER / "test" / "tokens.bin"
+    resumed = whole.read_bytes()
+    shutil.rmtree(root / FOLDER)
+    build_memory_cache(root, "test", _Frames(), _Texts())
+    assert whole.read_bytes() == resumed
+
+
+def test_refusals_name_reason_and_fix(root: Path) -> None:
+    with pytest.raises(MemobenchError, match="no memory cache.*memobench cache"):
+        _open(root)
+    build_memory_cache(root, "test", _Frames(), _Texts())
+    for changes, reason in (
+        ({"frames_key": "other"}, "another vision tower"),
+        ({"stride": 2}, "stride 1, and stride 2"),
+        ({"texts_key": "other"}, "another text encoder"),
+    ):
+        with pytest.raises(MemobenchError, match=f"{reason}.*memobench cache") as caught:
+            _open(root, **changes)
+        assert str(caught.value).count("\n") == 0
+    assert _open(root, texts_key=None).texts  # without alignment the text encoder does not matter
+    meta_file = root / FOLDER / "test" / "meta.json"
+    meta_file.write_text(json.dumps({"something": "else"}))
+    with pytest.raises(MemobenchError, match="cannot|not a memory cache"):
+        _open(root)
+
+
+def test_a_changed_dataset_makes_its_cache_stale_and_building_mends_it(root: Path) -> None:
+    build_memory_cache(root, "test", _Frames(), _Texts())
+    before = dataset_fingerprint(root, CAMERA)
+    (root / "README.md").write_text("a card changes nothing")
+    assert dataset_fingerprint(root, CAMERA) == before
+    video = next((root / "videos" / CAMERA).rglob("*.mp4"))
+    content = bytearray(video.read_bytes())
+    content[-1] ^= 1
+    video.write_bytes(bytes(content))
+    with pytest.raises(MemobenchError, match="stale.*memobench cache"):
+        _open(root)
+    again = _Frames()
+    build_memory_cache(root, "test", again, _Texts())
+    assert again.seen == 94 and _open(root).num_frames == 94
+
+
+def test_wrong_folders_and_cameras(root: Path, tmp_path: Path) -> None:
+    with pytest.raises(MemobenchError, match="no LeRobotDataset"):
+        build_memory_cache(tmp_path, "test", _Frames(), _Texts())
+    with pytest.raises(MemobenchError, match="no camera 'observation.images.top'.*observation.images.image"):
+        build_memory_cache(root, "test", _Frames(), _Texts(), camera="observation.images.top")
+    assert not (root / FOLDER / "test").exists()
+
+
+def test_frames_without_text_take_the_next_then_the_last() -> None:
+    rows = np.array([-1, 4, -1, 5, -1, -1, -1, 6, -1], np.int32)
+    episodes = np.array([0, 5, 7, 9])
+    assert resolve_subgoals(rows, episodes).tolist() == [4, 4, 5, 5, 5, -1, -1, 6, 6]

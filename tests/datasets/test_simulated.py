@@ -1,0 +1,235 @@
+"""Recording, generation and replay in the real simulator, without images."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels
+from lerobot_memobench.datasets.generation import HOLD_FRAMES, generate, record_demonstration
+from lerobot_memobench.datasets.lerobot_format import is_dataset, write_dataset
+from lerobot_memobench.datasets.replay import read_episode, replay
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.tasks import get_task
+
+STOVE = "turn_on_the_stove_and_turn_it_off"
+BUTTER = "put_the_butter_into_the_bowl_from_the_prompt_video"
+SEED = 10_000
+
+
+@pytest.fixture(scope="module")
+def stove() -> Demonstration:
+    return record_demonstration(get_task(STOVE), SEED, images=False)
+
+
+@pytest.fixture(scope="module")
+def butter() -> Demonstration:
+    return record_demonstration(get_task(BUTTER), SEED, images=False)
+
+
+@pytest.fixture(scope="module")
+def dataset_folder(stove, butter, tmp_path_factory) -> Path:
+    return write_dataset([stove, butter], tmp_path_factory.mktemp("simulated") / "ds")
+
+
+def tree_hash(root: Path) -> dict[str, str]:
+    return {
+        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(root.rglob("*"))
+        if path.is_file()
+    }
+
+
+def test_a_recorded_demonstration(stove):
+    found = labels(stove)
+    assert stove.success
+    assert stove.exec_start == 0
+    assert (found.key_frames >= 0).all()
+    assert (np.diff(found.key_frames) >= 0).all()
+    # The goal was reached HOLD_FRAMES before the end, and the arm is told to stay from then on.
+    np.testing.assert_array_equal(
+        stove.actions[-HOLD_FRAMES:], np.tile(np.float32([0, 0, 0, 0, 0, 0, -1]), (HOLD_FRAMES, 1))
+    )
+    assert found.key_frames[-1] <= len(stove) - HOLD_FRAMES
+    assert found.operation[-1] == -1
+    assert np.abs(stove.actions).max() <= 1
+    assert set(stove.fixture_poses) == {"flat_stove_1"} | (set(stove.fixture_poses) & {"kitchen_table"})
+
+
+def test_a_prompt_video_returns_to_the_start(butter):
+    assert butter.success
+    assert 0 < butter.exec_start < len(butter)
+    np.testing.assert_array_equal(butter.states[butter.exec_start], butter.states[0])
+    assert not butter.satisfied[: butter.exec_start].any()
+    assert not np.array_equal(butter.states[butter.exec_start - 1], butter.states[0])
+
+
+def test_recording_again_gives_the_same(stove):
+    record_demonstration(get_task(STOVE), SEED + 1, images=False)
+    assert digest(record_demonstration(get_task(STOVE), SEED, images=False)) == digest(stove)
+
+
+def test_without_the_prompt_video(butter):
+    demo = record_demonstration(get_task(BUTTER), SEED, images=False, prompt_video=False)
+    assert demo.exec_start == 0
+    assert demo.scene_hash == butter.scene_hash
+
+
+def test_random_referent_decides_the_variant():
+    task = get_task(BUTTER)
+    if task.num_variants == 1:
+        pytest.skip("the task has no variants")
+    demo = record_demonstration(task, SEED, images=False, referent="random")
+    assert demo.variant == demo.task.variant_index
+    assert replay(demo) is None
+    with pytest.raises(MemobenchError, match="choose variants with 'fixed'"):
+        record_demonstration(task, SEED, images=False, referent="random", variant=1)
+
+
+def test_replay_agrees(stove, butter):
+    assert replay(stove) is None
+    assert replay(butter) is None
+
+
+def test_replay_of_a_dataset_agrees(dataset_folder):
+    for number in range(2):
+        episode = read_episode(dataset_folder, number)
+        assert "states" in episode.columns
+        assert replay(episode) is None
+
+
+def test_replay_finds_the_first_disagreement(stove, butter):
+    actions = stove.actions.copy()
+    actions[40, 0] = np.clip(actions[40, 0] + 0.05, -1, 1)
+    if np.array_equal(actions, stove.actions):
+        actions[40, 0] -= 0.05
+    found = replay(replace(stove, actions=actions))
+    assert found is not None
+    assert (found.column, found.frame) == ("states", 41)
+    assert "states at frame 41" in str(found)
+
+    satisfied = butter.satisfied.copy()
+    satisfied[butter.exec_start + 5] = True
+    found = replay(replace(butter, satisfied=satisfied))
+    assert found is not None
+    assert (found.column, found.frame) == ("checkpoint.completed", butter.exec_start + 5)
+
+    assert str(replay(replace(stove, success=False))) == "success: recorded False, replayed True"
+    assert replay(replace(stove, seed=SEED + 1)).column == "states"
+
+
+def test_replay_of_a_dataset_names_column_and_frame(dataset_folder):
+    episode = read_episode(dataset_folder, 0)
+    texts = list(episode.columns["simple_subgoal"])
+    texts[7] = "something else"
+    changed = replace(episode, columns={**episode.columns, "simple_subgoal": texts})
+    found = replay(changed)
+    assert found is not None
+    assert (found.column, found.frame, found.recorded) == ("simple_subgoal", 7, "something else")
+    whole = replace(episode, whole={**episode.whole, "key_frames": [1, 2]})
+    assert replay(whole).column == "key_frames"
+    # Without states/ the proprioception still tells.
+    columns = {k: v for k, v in episode.columns.items() if k != "states"}
+    proprio = columns["observation.state"].copy()
+    proprio[3, 0] += np.float32(1e-3)
+    found = replay(replace(episode, columns={**columns, "observation.state": proprio}))
+    assert (found.column, found.frame) == ("observation.state", 3)
+
+
+def test_replay_of_something_else(tmp_path, dataset_folder):
+    with pytest.raises(MemobenchError, match="is no dataset"):
+        read_episode(tmp_path, 0)
+    with pytest.raises(MemobenchError, match="has no episode 99"):
+        read_episode(dataset_folder, 99)
+
+
+SCRIPT = """
+import sys
+from lerobot_memobench.datasets.generation import generate
+from lerobot_memobench.tasks import get_task
+
+if __name__ == "__main__":
+    task = get_task("turn_on_the_stove_and_turn_it_off")
+    generate([task], 5, sys.argv[1], images=False, workers=2)
+"""
+
+
+def children(pid: int) -> list[int]:
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                fields = (entry / "stat").read_text().rsplit(")", 1)[1].split()
+            except OSError:
+                continue
+            if int(fields[1]) == pid:
+                found += [int(entry.name), *children(int(entry.name))]
+    return found
+
+
+def alive(pid: int) -> bool:
+    try:
+        return (Path(f"/proc/{pid}") / "stat").read_text().rsplit(")", 1)[1].split()[0] not in "ZX"
+    except OSError:
+        return False
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
+def test_two_workers_killed_and_resumed(tmp_path):
+    """kill -9 of the command ends its workers; going on gives the bytes of an undisturbed run with one worker."""
+    out, script = tmp_path / "ds", tmp_path / "make.py"
+    script.write_text(SCRIPT)
+    process = subprocess.Popen([sys.executable, str(script), str(out)], env={**os.environ, "OMP_NUM_THREADS": "1"})
+    try:
+        deadline = time.monotonic() + 300
+        while not list(out.glob(".staging/episodes/[0-9]*")):
+            assert process.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        workers = children(process.pid)
+        os.kill(process.pid, signal.SIGKILL)
+    finally:
+        process.kill()
+        process.wait()
+    assert workers
+    while any(alive(pid) for pid in workers):
+        assert time.monotonic() < deadline, "workers outlived the command"
+        time.sleep(0.05)
+    assert not is_dataset(out)
+    task = get_task(STOVE)
+    summary = generate([task], 5, out, images=False, workers=1)
+    assert summary.exit_status == 0
+    generate([task], 5, tmp_path / "undisturbed", images=False, workers=1)
+    assert tree_hash(out) == tree_hash(tmp_path / "undisturbed")
+
+
+@pytest.mark.slow
+def test_decoded_frames_are_what_the_simulator_shows(tmp_path):
+    """Decode an episode's video and render its recorded states anew: the same pictures, frame by frame."""
+    from lerobot.datasets import LeRobotDataset
+
+    from lerobot_memobench.envs.episode import IMAGE_KEYS
+    from lerobot_memobench.sim.simulation import Simulation
+
+    task = get_task(STOVE)
+    generate([task], 1, tmp_path / "ds")
+    dataset = LeRobotDataset("local/test", root=tmp_path / "ds")
+    episode = read_episode(tmp_path / "ds", 0)
+    assert replay(episode) is None
+    sim = Simulation(task)
+    sim.reset(SEED)
+    for t in range(0, len(dataset), 7):
+        sim.set_state(episode.columns["states"][t])
+        for name, camera in IMAGE_KEYS.items():
+            seen = (dataset[t][f"observation.images.{name}"] * 255).permute(1, 2, 0).numpy()
+            error = ((sim.render(camera).astype(np.float32) - seen) ** 2).mean()
+            assert 10 * np.log10(255**2 / error) > 32, (t, name)
