@@ -29,7 +29,8 @@ def _synthetic():  # type: ignore[no-untyped-def]
     """The policy tests' writer of a small dataset."""
     path = Path(__file__).parents[1] / "policies" / "conftest.py"
     spec = importlib.util.spec_from_file_location("synthetic_dataset", path)
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -86,16 +87,21 @@ def test_contents(root: Path) -> None:
     folder = build_memory_cache(
         root, "test", _Frames(), _Texts(), batch_size=7, progress=lambda *done: calls.append(done)
     )
-    assert folder == root / FOLDER / "test" and calls == [(0, 3), (1, 3), (2, 3), (3, 3)]
+    assert folder == root / FOLDER / "test"
+    assert calls == [(0, 3), (1, 3), (2, 3), (3, 3)]
     cache = _open(root)
     assert cache.num_frames == sum(synthetic.LENGTHS)
     assert np.diff(cache.episodes).tolist() == list(synthetic.LENGTHS)
-    assert cache.locate(0) == (0, 0) and cache.locate(40) == (1, 0) and cache.locate(93) == (2, 30)
+    assert cache.locate(0) == (0, 0)
+    assert cache.locate(40) == (1, 0)
+    assert cache.locate(93) == (2, 30)
     tokens = cache.tokens(1, [0, 22, 5])
-    assert tokens.shape == (3, 4, 3) and tokens.dtype == torch.bfloat16
+    assert tokens.shape == (3, 4, 3)
+    assert tokens.dtype == torch.bfloat16
     expected = torch.stack([_frame(root, 1, frame).mean() for frame in (0, 22, 5)]).to(torch.bfloat16)
     torch.testing.assert_close(tokens[:, 0, 0], expected)
-    assert cache.phase[40:50].tolist() == [0] * 8 + [1] * 2 and cache.phase[:40].all()
+    assert cache.phase[40:50].tolist() == [0] * 8 + [1] * 2
+    assert cache.phase[:40].all()
     rows = cache.text_rows("intermediate")
     first = cache.texts[rows[0]]
     assert first == "pick up the cream cheese"
@@ -131,8 +137,9 @@ def test_a_killed_build_goes_on(root: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         build_memory_cache(root, "test", _Frames(stop_after=45), _Texts(), batch_size=10)
     meta = read_meta(root, "test")
-    assert meta is not None and not meta.complete
-    with pytest.raises(MemobenchError, match="not finished.*memobench cache"):
+    assert meta is not None
+    assert not meta.complete
+    with pytest.raises(MemobenchError, match=r"not finished.*memobench cache"):
         _open(root)
     rest = _Frames()
     build_memory_cache(root, "test", rest, _Texts())
@@ -145,7 +152,7 @@ def test_a_killed_build_goes_on(root: Path) -> None:
 
 
 def test_refusals_name_reason_and_fix(root: Path) -> None:
-    with pytest.raises(MemobenchError, match="no memory cache.*memobench cache"):
+    with pytest.raises(MemobenchError, match=r"no memory cache.*memobench cache"):
         _open(root)
     build_memory_cache(root, "test", _Frames(), _Texts())
     for changes, reason in (
@@ -159,7 +166,7 @@ def test_refusals_name_reason_and_fix(root: Path) -> None:
     assert _open(root, texts_key=None).texts  # without alignment the text encoder does not matter
     meta_file = root / FOLDER / "test" / "meta.json"
     meta_file.write_text(json.dumps({"something": "else"}))
-    with pytest.raises(MemobenchError, match="cannot|not a memory cache"):
+    with pytest.raises(MemobenchError, match=r"cannot|not a memory cache"):
         _open(root)
 
 
@@ -172,17 +179,18 @@ def test_a_changed_dataset_makes_its_cache_stale_and_building_mends_it(root: Pat
     content = bytearray(video.read_bytes())
     content[-1] ^= 1
     video.write_bytes(bytes(content))
-    with pytest.raises(MemobenchError, match="stale.*memobench cache"):
+    with pytest.raises(MemobenchError, match=r"stale.*memobench cache"):
         _open(root)
     again = _Frames()
     build_memory_cache(root, "test", again, _Texts())
-    assert again.seen == 94 and _open(root).num_frames == 94
+    assert again.seen == 94
+    assert _open(root).num_frames == 94
 
 
 def test_wrong_folders_and_cameras(root: Path, tmp_path: Path) -> None:
     with pytest.raises(MemobenchError, match="no LeRobotDataset"):
         build_memory_cache(tmp_path, "test", _Frames(), _Texts())
-    with pytest.raises(MemobenchError, match="no camera 'observation.images.top'.*observation.images.image"):
+    with pytest.raises(MemobenchError, match=r"no camera 'observation.images.top'.*observation.images.image"):
         build_memory_cache(root, "test", _Frames(), _Texts(), camera="observation.images.top")
     assert not (root / FOLDER / "test").exists()
 

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import itertools
 import json
 import os
 import shutil
@@ -34,7 +35,7 @@ import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
-from ..errors import MemobenchError
+from lerobot_memobench.errors import MemobenchError
 
 FOLDER = "memory_cache"
 FORMAT = 1
@@ -194,7 +195,7 @@ def resolve_subgoals(rows: np.ndarray, episodes: np.ndarray) -> np.ndarray:
         (N,) text numbers; -1 is left only in episodes without any text (paper, framewise alignment).
     """
     resolved = rows.copy()
-    for start, end in zip(episodes[:-1], episodes[1:], strict=True):
+    for start, end in itertools.pairwise(episodes):
         annotated = np.flatnonzero(rows[start:end] >= 0)
         if len(annotated) == 0:
             continue
@@ -214,8 +215,7 @@ class MemoryCache:
         shape = (meta.slots, meta.tokens_per_frame, meta.dim)
         self._tokens = np.memmap(folder / "tokens.bin", dtype=np.uint16, mode="r", shape=shape)
         self._subgoals = {
-            level: resolve_subgoals(np.load(folder / f"subgoal-{level}.npy"), self.episodes)
-            for level in meta.levels
+            level: resolve_subgoals(np.load(folder / f"subgoal-{level}.npy"), self.episodes) for level in meta.levels
         }
         self.texts: list[str] = json.loads((folder / "texts.json").read_text())
         self.text_embeddings = torch.from_numpy(np.load(folder / "texts.npy"))
@@ -313,9 +313,7 @@ def read_meta(root: Path, name: str) -> CacheMeta | None:
     try:
         return CacheMeta(**json.loads(path.read_text()))
     except (TypeError, json.JSONDecodeError):
-        raise MemobenchError(
-            f"{path} is not a memory cache this version can read. {fix_hint(Path(root))}"
-        ) from None
+        raise MemobenchError(f"{path} is not a memory cache this version can read. {fix_hint(Path(root))}") from None
 
 
 def _slot_starts(episodes: np.ndarray, stride: int) -> np.ndarray:
@@ -408,9 +406,7 @@ def _write_tables(folder: Path, table: _Frames, texts: TextEncoder) -> None:
     _save_array(folder / "episodes.npy", table.episodes)
     _save_array(folder / "phase.npy", table.phase)
     for level, values in table.subgoals.items():
-        _save_array(
-            folder / f"subgoal-{level}.npy", np.array([number.get(text, -1) for text in values], np.int32)
-        )
+        _save_array(folder / f"subgoal-{level}.npy", np.array([number.get(text, -1) for text in values], np.int32))
     _write_json(folder / "texts.json", unique)
     _save_array(folder / "texts.npy", embeddings)
 
@@ -471,7 +467,7 @@ def _reader(root: Path, camera: str) -> Callable[[int, list[int]], Tensor]:
     return read
 
 
-def _CHW(meta: Any, camera: str) -> tuple[int, int, int]:  # noqa: N802
+def _CHW(meta: Any, camera: str) -> tuple[int, int, int]:
     height, width, channels = meta.features[camera]["shape"]
     return channels, height, width
 

@@ -60,6 +60,7 @@ class MemobenchEnvConfig(EnvConfig):
         replan_steps: that number, noted in the episode log.
         expert_action: offer the scripted expert's action as `observation.expert_action`.
         log_dir: where the episode log goes; LeRobot's output folder when left out.
+        videos: film every episode into `<log_dir>/videos/<task>.<episode>.mp4`, annotated as `render()` is.
         seed_base: the seed that counts as episode 0.
     """
 
@@ -75,6 +76,7 @@ class MemobenchEnvConfig(EnvConfig):
     replan_steps: int | None = None
     expert_action: bool = False
     log_dir: str | None = None
+    videos: bool = False
     seed_base: int = SEED_BASE
     features: dict[str, PolicyFeature] = field(default_factory=_features)
     features_map: dict[str, str] = field(default_factory=_features_map)
@@ -103,6 +105,7 @@ class MemobenchEnvConfig(EnvConfig):
             "render_every": self.render_every,
             "replan_steps": self.replan_steps,
             "expert_action": self.expert_action,
+            "videos": self.videos,
             "seed_base": self.seed_base,
         }
 

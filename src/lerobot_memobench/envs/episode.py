@@ -161,6 +161,11 @@ class Episode:
             self._expert = Expert(self.task, self.sim, self._rng(3))
         return self._expert.act()
 
+    @property
+    def expert_done(self) -> bool:
+        """The expert has gone through its plan; whatever does not hold by now it will not bring about."""
+        return self._expert is not None and self._expert.done
+
     def images(self) -> dict[str, Image]:
         """Return what both cameras see now, (256, 256, 3) uint8 each, upright."""
         return {key: self.sim.render(camera) for key, camera in IMAGE_KEYS.items()}

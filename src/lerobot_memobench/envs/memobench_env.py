@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -12,13 +13,14 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.envs.annotate import annotate
 from lerobot_memobench.envs.configuration_memobench import IMAGE_SIZE, SEED_BASE
-from lerobot_memobench.envs.episode import EXECUTION, HORIZON, IMAGE_KEYS, PROMPT, Episode
+from lerobot_memobench.envs.episode import EXECUTION, HORIZON, IMAGE_KEYS, PROMPT, PROMPT_LIMIT, Episode
 from lerobot_memobench.envs.episode_log import EpisodeLog
+from lerobot_memobench.envs.film import Film
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.tasks.failures import classify_failure
 from lerobot_memobench.tasks.task import load_task
 
-METADATA = {"render_modes": ["rgb_array"], "render_fps": 20}
+METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}
 
 
 def _observation_space(expert_action: bool) -> spaces.Dict:
@@ -75,6 +77,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         render_every: int = 1,
         replan_steps: int | None = None,
         expert_action: bool = False,
+        videos: bool = False,
         seed_base: int = SEED_BASE,
     ) -> None:
         self.render_mode = "rgb_array"
@@ -84,6 +87,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self.observation_space = _observation_space(expert_action)
         self.action_space = _action_space()
         self._log = EpisodeLog(log_dir) if log_dir is not None else None
+        self._videos = Path(log_dir) / "videos" if log_dir is not None and videos else None
+        self._film: Film | None = None
         self._settings: dict[str, Any] = {
             "referent": referent,
             "prompt_video": prompt_video,
@@ -106,8 +111,6 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     def _max_episode_steps(self) -> int:
         """Upper bound for LeRobot's loop: prompt and execution. The horizon itself counts execution steps."""
         prompt = self._settings["prompt_video"] and self._task.prompt is not None
-        from lerobot_memobench.envs.episode import PROMPT_LIMIT
-
         return int(self._settings["horizon"]) + (PROMPT_LIMIT if prompt else 0)
 
     def reset(
@@ -121,6 +124,11 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._logged = False
         self.episode.reset(seed)
         self._images = self.episode.images()
+        if self._film is not None:
+            self._film.discard()
+        if self._videos is not None:
+            self._film = Film(self._videos / f"{self.task}.{seed - self._seed_base}.mp4", METADATA["render_fps"])
+            self._film.add(self.render())
         return self._observation(), self._info()
 
     def step(
@@ -138,6 +146,11 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             self._images = episode.images()
         success = episode.success
         truncated = episode.done and not success
+        if self._film is not None:
+            self._film.add(self.render())
+            if episode.done:
+                self._film.finish()
+                self._film = None
         if episode.done and not self._logged:
             self._logged = True
             if self._log is not None:
@@ -197,4 +210,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     def close(self) -> None:
         """Let the scene go; the next reset compiles or fetches it anew."""
+        if self._film is not None:
+            self._film.discard()
+            self._film = None
         self._episode = None

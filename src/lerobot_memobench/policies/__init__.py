@@ -1,0 +1,1 @@
+"""Who learns it? The memory policy and the expert, as LeRobot policies."""

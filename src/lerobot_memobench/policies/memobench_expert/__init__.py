@@ -1,0 +1,1 @@
+"""The scripted expert, seen as a LeRobot policy."""

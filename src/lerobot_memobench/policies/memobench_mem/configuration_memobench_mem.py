@@ -1,0 +1,162 @@
+"""Configuration of ``memobench_mem``: pi0.5 with a visual memory (spec: policy.md; paper, Table "reproducibility")."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+from lerobot.configs import PreTrainedConfig
+from lerobot.optim import LRSchedulerConfig
+from lerobot.policies.pi05.configuration_pi05 import PI05Config
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR
+
+from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.policies.memobench_mem.dimensions import SIZES, Dimensions
+
+logger = logging.getLogger(__name__)
+
+ALIGN_WEIGHTS = {"none": 0.0, "semantic": 0.1, "contrastive": 0.1, "framewise": 0.05}
+INTEGRATIONS = ("modulation", "context")
+SUBGOAL_LEVELS = ("coarse", "intermediate", "fine")
+TOKENS_PER_FRAME = 16
+
+
+@LRSchedulerConfig.register_subclass("memobench_constant_with_warmup")
+@dataclass
+class WarmupFractionSchedulerConfig(LRSchedulerConfig):
+    """Linear warm-up over a fraction of the run, then constant (paper: 5 %).
+
+    LeRobot's own constant schedule counts warm-up steps, which would have to change with ``--steps``.
+    """
+
+    num_warmup_steps: int | None = None
+    warmup_fraction: float = 0.05
+
+    def build(self, optimizer: Optimizer, num_training_steps: int) -> LambdaLR:
+        steps = self.num_warmup_steps
+        warmup = max(1, round(self.warmup_fraction * num_training_steps) if steps is None else steps)
+        return LambdaLR(optimizer, lambda step: min(1.0, (step + 1) / warmup))
+
+
+def _choose(field: str, given: str, known: tuple[str, ...]) -> None:
+    if given not in known:
+        raise MemobenchError(
+            f"memobench_mem has no {field} '{given}': {nearest(str(given), known)} "
+            f"Pass --policy.{field}=<one of {', '.join(known)}>."
+        )
+
+
+@PreTrainedConfig.register_subclass("memobench_mem")
+@dataclass
+class MemobenchMemConfig(PI05Config):
+    """pi0.5's fields plus the memory's. Fields that are ``None`` here take the size's value after construction."""
+
+    size: str = "tiny"
+    """``tiny`` (from scratch, trains on a CPU) or ``pi05`` (3.2 B)."""
+
+    base_weights: str | None = None
+    """Folder or repository of pi0.5 weights to start from (e.g. ``lerobot/pi05_base``); none: from scratch."""
+
+    # -- alignment
+    align: str = "none"
+    align_weight: float | None = None
+    subgoal_level: str = "intermediate"
+    shuffle_subgoals: bool = False
+    """Control of the paper: the subgoal texts of an episode change places among themselves."""
+    text_encoder: str | None = None
+
+    # -- memory
+    integration: str = "modulation"
+    memory_camera: str = "observation.images.image"
+    memory_frames: int = 32
+    tokens_per_frame: int = TOKENS_PER_FRAME
+    memory_stride: int = 1
+    """Every how many control steps a frame enters the history (and the cache)."""
+
+    # -- training
+    prompt_loss: bool = False
+    """Whether prompt frames (``phase == 0``), whose actions have no effect, count in the action loss."""
+    ema_decay: float = 0.999
+    """Decay of the weights' moving average, which evaluation uses; 0 turns it off."""
+    freeze_vision_encoder: bool = True
+    warmup_fraction: float = 0.05
+
+    # -- pi0.5's fields with this recipe's values
+    image_resolution: tuple[int, int] | None = None
+    tokenizer_name: str | None = None
+    tokenizer_max_length: int | None = None
+    optimizer_lr: float | None = None
+    optimizer_weight_decay: float = 0.0
+
+    def __post_init__(self) -> None:
+        try:
+            self._complete()
+        except MemobenchError as error:
+            # LeRobot's parser reports only that the class "couldn't be instantiated".
+            logger.warning("%s", error)
+            raise
+
+    def _complete(self) -> None:
+        """Fill in what the size and the objective decide, and check every field."""
+        _choose("size", self.size, tuple(SIZES))
+        _choose("align", self.align, tuple(ALIGN_WEIGHTS))
+        _choose("integration", self.integration, INTEGRATIONS)
+        _choose("subgoal_level", self.subgoal_level, SUBGOAL_LEVELS)
+        dims = self.dimensions
+        if self.image_resolution is None:
+            self.image_resolution = (dims.vision.image, dims.vision.image)
+        if self.tokenizer_max_length is None:
+            self.tokenizer_max_length = dims.tokenizer_max_length
+        if self.optimizer_lr is None:
+            self.optimizer_lr = dims.learning_rate
+        self.tokenizer_name = self.tokenizer_name or dims.tokenizer
+        self.text_encoder = self.text_encoder or dims.text_encoder
+        if self.align_weight is None:
+            self.align_weight = ALIGN_WEIGHTS[self.align]
+        super().__post_init__()
+        self._check()
+
+    def _check(self) -> None:
+        for field in ("memory_frames", "memory_stride", "n_action_steps"):
+            if getattr(self, field) < 1:
+                raise MemobenchError(f"--policy.{field}={getattr(self, field)} must be at least 1.")
+        if self.tokens_per_frame != TOKENS_PER_FRAME:
+            raise MemobenchError(
+                f"--policy.tokens_per_frame={self.tokens_per_frame} is not supported: frames are pooled to a "
+                f"4x4 grid, so leave it at {TOKENS_PER_FRAME}."
+            )
+        if not 0.0 <= self.ema_decay < 1.0:
+            raise MemobenchError(f"--policy.ema_decay={self.ema_decay} must be in [0, 1); 0 turns it off.")
+        if self.align_weight is not None and self.align_weight < 0:
+            raise MemobenchError(f"--policy.align_weight={self.align_weight} must not be negative.")
+        if not self.freeze_vision_encoder:
+            raise MemobenchError(
+                "--policy.freeze_vision_encoder=false cannot be used: memory tokens are cached from the frozen "
+                "vision tower, and would no longer match a tower that learns."
+            )
+        patch = self.dimensions.vision.patch
+        if any(side % patch or (side // patch) % 4 for side in self.image_size):
+            raise MemobenchError(
+                f"--policy.image_resolution={self.image_resolution} must be a multiple of {4 * patch} pixels at "
+                f"size {self.size}, so that its patches pool to a 4x4 grid."
+            )
+
+    @property
+    def dimensions(self) -> Dimensions:
+        """Dimensions of this size."""
+        return SIZES[self.size]
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Height and width of the images the policy sees; ``image_resolution``, known to be set."""
+        assert self.image_resolution is not None
+        return tuple(self.image_resolution)  # type: ignore[return-value]  # a checkpoint gives a list
+
+    @property
+    def cache_name(self) -> str:
+        """Name of the memory cache this policy reads, below ``<dataset>/memory_cache``."""
+        return f"{self.size}-stride{self.memory_stride}"
+
+    def get_scheduler_preset(self) -> WarmupFractionSchedulerConfig:
+        return WarmupFractionSchedulerConfig(warmup_fraction=self.warmup_fraction)

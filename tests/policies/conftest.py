@@ -1,0 +1,77 @@
+"""Small synthetic datasets and configurations shared by the policy and cache tests."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+torch.set_num_threads(1)
+
+SIZE = 48  # pixels of the synthetic cameras
+LENGTHS = (40, 23, 31)
+PROMPTS = (0, 8, 0)
+SUBGOALS = (
+    ("pick up the cream cheese", "put it in the basket"),
+    ("open the top drawer", "put the bowl in the drawer", "close the top drawer"),
+    ("pick up the cream cheese", "pick up the butter", "put both in the basket"),
+)
+TASKS = ("put the cream cheese in the basket", "put the bowl away", "fetch cream cheese and butter")
+
+
+def make_dataset(root: Path, seed: int = 0) -> Path:
+    """Write a LeRobotDataset with this project's columns: three short episodes of coloured squares that move."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    image = {"dtype": "video", "shape": (SIZE, SIZE, 3), "names": ["height", "width", "channels"]}
+    string = {"dtype": "string", "shape": (1,), "names": None}
+    dataset = LeRobotDataset.create(
+        "memobench/synthetic",
+        fps=20,
+        root=root,
+        use_videos=True,
+        features={
+            "observation.images.image": image,
+            "observation.images.wrist_image": image,
+            "observation.state": {"dtype": "float32", "shape": (8,), "names": None},
+            "action": {"dtype": "float32", "shape": (7,), "names": None},
+            "phase": {"dtype": "int64", "shape": (1,), "names": None},
+            "simple_subgoal": string,
+            "grounded_subgoal": string,
+            "memory": string,
+        },
+    )
+    rng = np.random.default_rng(seed)
+    for length, prompt, subgoals, task in zip(LENGTHS, PROMPTS, SUBGOALS, TASKS, strict=True):
+        colour = rng.integers(60, 255, 3)
+        drift = rng.normal(size=7)
+        for t in range(length):
+            frame = np.full((SIZE, SIZE, 3), 30, np.uint8)
+            corner = 2 + (t * (SIZE - 16)) // length
+            frame[corner : corner + 12, corner : corner + 12] = colour
+            k = min(t * len(subgoals) // length, len(subgoals) - 1)
+            dataset.add_frame(
+                {
+                    "observation.images.image": frame,
+                    "observation.images.wrist_image": frame[::-1].copy(),
+                    "observation.state": (np.sin(t / 5 + np.arange(8)) + 0.05 * rng.normal(size=8)).astype(np.float32),
+                    "action": np.tanh(drift + np.sin(t / 5 + np.arange(7))).astype(np.float32),
+                    "phase": np.array([int(t >= prompt)]),
+                    # Some frames carry no text: the cache then looks at the next that does.
+                    "simple_subgoal": "" if t % 7 == 3 else subgoals[k],
+                    "grounded_subgoal": subgoals[k] + " at (0.1, 0.2)",
+                    "memory": ", then ".join(subgoals[:k]),
+                    "task": task,
+                }
+            )
+        dataset.save_episode()
+    dataset.finalize()
+    return root
+
+
+@pytest.fixture(scope="session")
+def dataset_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The synthetic dataset, without a cache at first; tests that change it must copy it."""
+    return make_dataset(tmp_path_factory.mktemp("data") / "synthetic")

@@ -1,0 +1,216 @@
+"""pi0.5 at other dimensions, and the memory on top of it, against LeRobot's own classes."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from lerobot.policies.pi05.configuration_pi05 import PI05Config
+from lerobot.policies.pi05.modeling_pi05 import PI05Pytorch
+
+from lerobot_memobench.policies.memobench_mem.backbone import MemoryPI05, SizedPI05
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+
+CHUNK, BATCH, FRAMES = 6, 2, 5
+
+
+def _config(**fields: object) -> MemobenchMemConfig:
+    return MemobenchMemConfig(
+        device="cpu", chunk_size=CHUNK, n_action_steps=CHUNK, num_inference_steps=3, memory_frames=FRAMES, **fields
+    )
+
+
+def _inputs(config: MemobenchMemConfig, device: str = "cpu", batch: int = BATCH) -> dict[str, object]:
+    torch.manual_seed(1)
+    side = config.image_resolution[0]
+    words = 12
+    masks = torch.ones(batch, words, dtype=torch.bool)
+    masks[-1, 7:] = False
+    inputs = {
+        "images": [torch.rand(batch, 3, side, side) * 2 - 1],
+        "img_masks": [torch.ones(batch, dtype=torch.bool)],
+        "tokens": torch.randint(0, 200, (batch, words)),
+        "masks": masks,
+        "actions": torch.randn(batch, CHUNK, 32),
+        "noise": torch.randn(batch, CHUNK, 32),
+        "time": torch.rand(batch),
+    }
+    move = {k: [t.to(device) for t in v] if isinstance(v, list) else v.to(device) for k, v in inputs.items()}
+    return move
+
+
+def _memory(config: MemobenchMemConfig, device: str = "cpu") -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    torch.manual_seed(2)
+    mask = torch.ones(BATCH, FRAMES, dtype=torch.bool)
+    mask[1, 2:] = False
+    tokens = torch.randn(BATCH, FRAMES, 16, config.dimensions.vlm.width)
+    steps = torch.arange(FRAMES).expand(BATCH, FRAMES)
+    return tokens.to(device), steps.to(device), mask.to(device)
+
+
+def _losses(model: PI05Pytorch, inputs: dict) -> torch.Tensor:
+    return model.forward(**inputs)
+
+
+def _actions(model: PI05Pytorch, inputs: dict) -> torch.Tensor:
+    keys = ("images", "img_masks", "tokens", "masks", "noise")
+    return model.sample_actions(**{key: inputs[key] for key in keys})
+
+
+def _pair(integration: str = "modulation") -> tuple[SizedPI05, MemoryPI05]:
+    """LeRobot's model at tiny dimensions with random weights, and the memory model with the same weights."""
+    config = _config(integration=integration)
+    torch.manual_seed(0)
+    plain, ours = SizedPI05(config).eval(), MemoryPI05(config).eval()
+    with torch.no_grad():
+        for parameter in plain.parameters():
+            parameter.add_(0.05 * torch.randn_like(parameter))  # some of pi0.5's start at zero and hide errors
+    weights = plain.state_dict()
+    missing, unexpected = ours.load_state_dict(
+        {
+            name.replace("post_attention_layernorm.", "post_attention_layernorm.norm.")
+            if ".gemma_expert." in name and integration == "modulation"
+            else name: tensor
+            for name, tensor in weights.items()
+        },
+        strict=False,
+    )
+    assert not unexpected
+    assert set(missing) <= set(ours.memory_parameters())
+    return plain, ours
+
+
+def test_without_modulation_the_policy_is_pi05_output_for_output() -> None:
+    plain, ours = _pair()
+    assert type(plain).forward is PI05Pytorch.forward
+    assert type(ours).sample_actions is PI05Pytorch.sample_actions
+    inputs = _inputs(ours.config)
+    ours.set_memory(*_memory(ours.config))
+    assert torch.equal(_losses(plain, inputs), _losses(ours, inputs))
+    assert torch.equal(_actions(plain, inputs), _actions(ours, inputs))
+
+
+def test_modulation_reaches_both_paths() -> None:
+    plain, ours = _pair()
+    with torch.no_grad():
+        for name, parameter in ours.memory_parameters().items():
+            if ".modulation." in name:
+                parameter.normal_(std=0.2)
+    inputs = _inputs(ours.config)
+    tokens, steps, mask = _memory(ours.config)
+    ours.set_memory(tokens, steps, mask)
+    losses, actions = _losses(ours, inputs), _actions(ours, inputs)
+    assert not torch.allclose(losses, _losses(plain, inputs))
+    assert not torch.allclose(actions, _actions(plain, inputs))
+    # Padding says nothing, real tokens and their times do.
+    changed = torch.where(mask[:, :, None, None], tokens, torch.full_like(tokens, 50.0))
+    ours.set_memory(changed, steps, mask)
+    torch.testing.assert_close(_actions(ours, inputs), actions)
+    ours.set_memory(tokens, steps + 40, mask)
+    assert not torch.allclose(_actions(ours, inputs), actions)
+
+
+@pytest.mark.parametrize("integration", ["modulation", "context"])
+def test_all_masked_memory_is_finite(integration: str) -> None:
+    _, ours = _pair(integration)
+    ours.train()
+    inputs = _inputs(ours.config)
+    tokens, steps, mask = _memory(ours.config)
+    ours.set_memory(tokens, steps, torch.zeros_like(mask))
+    loss = _losses(ours, inputs).mean()
+    loss.backward()
+    assert torch.isfinite(loss)
+    assert all(torch.isfinite(p.grad).all() for p in ours.parameters() if p.grad is not None)
+    assert torch.isfinite(_actions(ours, inputs)).all()
+
+
+def test_context_memory_joins_the_prefix_and_padding_says_nothing() -> None:
+    _, ours = _pair("context")
+    inputs = _inputs(ours.config)
+    tokens, steps, mask = _memory(ours.config)
+    ours.set_memory(tokens, steps, mask)
+    actions = _actions(ours, inputs)
+    ours.set_memory(torch.where(mask[:, :, None, None], tokens, torch.full_like(tokens, 50.0)), steps, mask)
+    torch.testing.assert_close(_actions(ours, inputs), actions)
+    ours.set_memory(-tokens, steps, mask)
+    assert not torch.allclose(_actions(ours, inputs), actions)
+
+
+def test_gradients_reach_memory_expert_and_vlm_but_not_the_tower() -> None:
+    _, ours = _pair()
+    with torch.no_grad():
+        for name, parameter in ours.memory_parameters().items():
+            if ".modulation." in name:
+                parameter.normal_(std=0.2)
+    ours.train()
+    ours.set_memory(*_memory(ours.config))
+    _losses(ours, _inputs(ours.config)).mean().backward()
+    with_gradient = {name for name, p in ours.named_parameters() if p.grad is not None and p.grad.abs().sum() > 0}
+    trained = {name for name, p in ours.named_parameters() if p.requires_grad}
+    # The last layer of the language model is only read through its keys and values.
+    idle = trained - with_gradient
+    last = f"language_model.layers.{ours.config.dimensions.vlm.depth - 1}."
+    assert all(last in name or "language_model.norm" in name for name in idle), idle
+    assert not any("vision_tower" in name or "multi_modal_projector" in name for name in trained)
+
+
+def test_gradient_checkpointing_gives_the_same_gradients() -> None:
+    _, ours = _pair()
+    with torch.no_grad():
+        for name, parameter in ours.memory_parameters().items():
+            if ".modulation." in name:
+                parameter.normal_(std=0.2)
+    ours.train()
+
+    def gradients() -> list[torch.Tensor]:
+        ours.zero_grad()
+        ours.set_memory(*_memory(ours.config))
+        _losses(ours, _inputs(ours.config)).mean().backward()
+        return [p.grad.clone() for p in ours.memory_parameters().values()]
+
+    plain = gradients()
+    ours.gradient_checkpointing_enable()
+    for a, b in zip(plain, gradients(), strict=True):
+        torch.testing.assert_close(a, b)
+
+
+def test_full_size_is_pi05_plus_the_stated_memory() -> None:
+    config = MemobenchMemConfig(size="pi05", device="cpu")
+    with torch.device("meta"):
+        ours = MemoryPI05(config)
+        lerobots = PI05Pytorch(PI05Config(device="cpu"))
+    memory = ours.memory_parameters()
+    own = {
+        name.replace("post_attention_layernorm.norm.", "post_attention_layernorm."): p.shape
+        for name, p in ours.named_parameters()
+        if name not in memory
+    }
+    assert own == {name: p.shape for name, p in lerobots.named_parameters()}
+    assert 85e6 < sum(p.numel() for p in memory.values()) < 95e6
+    layers = [sum(p.numel() for n, p in memory.items() if f"layers.{i}." in n) for i in range(18)]
+    assert all(4.7e6 < count < 4.75e6 for count in layers)
+
+
+@pytest.mark.parametrize("integration", ["modulation", "context"])
+def test_full_size_runs_in_shape(integration: str) -> None:
+    """One training pass at 3.2 B parameters, on the meta device: shapes only."""
+    config = _config(size="pi05", integration=integration)
+    with torch.device("meta"):
+        ours = MemoryPI05(config)
+    memory, mask = ours.set_memory(*_memory(config, "meta"))
+    assert memory.shape == (BATCH, FRAMES * 16, 2048)
+    assert mask.shape == (BATCH, FRAMES * 16)
+    assert _losses(ours, _inputs(config, "meta")).shape == (BATCH, CHUNK, 32)
+
+
+def test_the_tower_without_weights_is_the_same_every_time() -> None:
+    torch.manual_seed(5)
+    first = SizedPI05(_config()).paligemma_with_expert.frame_encoder((96, 96))
+    torch.manual_seed(6)
+    second = SizedPI05(_config()).paligemma_with_expert.frame_encoder((96, 96))
+    assert first.key == second.key
+    images = torch.rand(3, 3, 64, 80)
+    tokens = first(images)
+    assert tokens.shape == (3, 16, 128)
+    assert tokens.dtype == torch.bfloat16
+    assert torch.equal(tokens, second(images))
+    assert tokens.float().std(dim=0).mean() > 0.05  # images are told apart

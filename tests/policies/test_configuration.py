@@ -1,0 +1,69 @@
+"""Configuration: defaults per size and objective, refusals, and the learning-rate schedule."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lerobot.configs import PreTrainedConfig
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+
+
+def test_defaults_are_the_papers() -> None:
+    config = MemobenchMemConfig(size="pi05", align="contrastive", device="cpu")
+    assert config.type == "memobench_mem"
+    assert (config.memory_frames, config.tokens_per_frame, config.chunk_size) == (32, 16, 50)
+    assert (config.align_weight, config.ema_decay) == (0.1, 0.999)
+    assert config.image_resolution == (224, 224)
+    optimizer = config.get_optimizer_preset()
+    assert (optimizer.lr, optimizer.betas, optimizer.weight_decay, optimizer.grad_clip_norm) == (
+        5e-5,
+        (0.9, 0.95),
+        0,
+        1,
+    )
+    assert MemobenchMemConfig(align="framewise", device="cpu").align_weight == 0.05
+    assert MemobenchMemConfig(align="semantic", align_weight=0.3, device="cpu").align_weight == 0.3
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"align": "contrstive"}, "contrastive"),
+        ({"size": "tny"}, "tiny"),
+        ({"integration": "modulate"}, "modulation"),
+        ({"subgoal_level": "middle"}, "intermediate"),
+        ({"memory_stride": 0}, "memory_stride"),
+        ({"tokens_per_frame": 8}, "16"),
+        ({"ema_decay": 1.0}, "ema_decay"),
+        ({"freeze_vision_encoder": False}, "cached"),
+        ({"image_resolution": (100, 100)}, "multiple of 48"),
+    ],
+)
+def test_bad_values_are_refused_with_the_fix(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(MemobenchError, match=message):
+        MemobenchMemConfig(device="cpu", **fields)
+
+
+def test_saved_and_read_again(tmp_path: Path) -> None:
+    config = MemobenchMemConfig(align="framewise", memory_stride=4, device="cpu")
+    config.save_pretrained(tmp_path)
+    again = PreTrainedConfig.from_pretrained(tmp_path, cli_overrides=["--n_action_steps=20"])
+    assert dataclasses.asdict(again) == dataclasses.asdict(config) | {"n_action_steps": 20}
+
+
+def test_schedule_warms_up_over_a_twentieth_and_stays() -> None:
+    optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
+    schedule = MemobenchMemConfig(device="cpu").get_scheduler_preset().build(optimizer, num_training_steps=200)
+    rates = []
+    for _ in range(200):
+        rates.append(optimizer.param_groups[0]["lr"])
+        optimizer.step()
+        schedule.step()
+    assert rates[:10] == pytest.approx([(i + 1) / 10 for i in range(10)])
+    assert set(rates[10:]) == {1.0}

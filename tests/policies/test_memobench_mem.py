@@ -1,0 +1,559 @@
+"""The policy through LeRobot's own doors: factories, training batches, rollouts, checkpoints."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import json
+import operator
+import shutil
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from lerobot.datasets.factory import resolve_delta_timestamps
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.policies import make_policy, make_pre_post_processors
+from safetensors.torch import load_file, save_file
+
+from lerobot_memobench.datasets.memory_cache import FOLDER, MemoryCache
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.memory import sample_frames
+from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import (
+    GatherMemoryProcessorStep,
+    shuffle_within_episodes,
+)
+from lerobot_memobench.policies.memobench_mem.text import WordTextEncoder, make_vocabulary, make_word_tokenizer
+
+CHUNK = 6
+
+
+def _config(**fields: Any) -> MemobenchMemConfig:
+    fields = {"chunk_size": CHUNK, "n_action_steps": CHUNK, "num_inference_steps": 2, "memory_frames": 8} | fields
+    return MemobenchMemConfig(device="cpu", push_to_hub=False, **fields)
+
+
+def _training(root: Path, **fields: Any):  # type: ignore[no-untyped-def]
+    """Policy, preprocessor, postprocessor and dataset, as lerobot-train makes them."""
+    config = _config(**fields)
+    meta = LeRobotDataset("memobench/synthetic", root=root).meta
+    dataset = LeRobotDataset("memobench/synthetic", root=root, delta_timestamps=resolve_delta_timestamps(config, meta))
+    torch.manual_seed(0)
+    policy = make_policy(config, ds_meta=dataset.meta)
+    before, after = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)
+    return policy, before, after, dataset
+
+
+def _batch(dataset: LeRobotDataset, indices: list[int]) -> dict[str, Any]:
+    return torch.utils.data.default_collate([dataset[index] for index in indices])
+
+
+@pytest.fixture(scope="module")
+def trained(dataset_root: Path, tmp_path_factory: pytest.TempPathFactory):  # type: ignore[no-untyped-def]
+    """A policy after four updates, its processors, dataset, optimiser, and the checkpoint it was saved to."""
+    policy, before, after, dataset = _training(dataset_root, align="contrastive")
+    with torch.no_grad():
+        for name, parameter in policy.named_parameters():
+            if ".modulation." in name:
+                parameter.normal_(std=0.2)  # it starts at zero, and memory would hardly matter after four updates
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+    policy.train()
+    for step in range(4):
+        loss, logged = policy.forward(before(_batch(dataset, [step * 7, 45 + step, 70 + step, 90])))
+        loss.backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        policy.update()
+    folder = tmp_path_factory.mktemp("checkpoint") / "pretrained_model"
+    policy.save_pretrained(folder)
+    before.save_pretrained(folder)
+    after.save_pretrained(folder)
+    return policy, before, after, dataset, folder, logged
+
+
+# -- training ------------------------------------------------------------------------------------------------------
+
+
+def test_batch_gathers_the_history_of_its_frames(dataset_root: Path) -> None:
+    policy, before, _, dataset = _training(dataset_root, align="framewise", memory_stride=2)
+    batch = before(_batch(dataset, [0, 39, 40 + 22, 45]))
+    steps = [[2 * slot for slot in sample_frames(frame // 2, 8)] for frame in (0, 39, 22, 5)]
+    assert [row[mask].tolist() for row, mask in zip(batch["memory.steps"], batch["memory.mask"], strict=True)] == steps
+    assert batch["phase"].tolist() == [1, 1, 1, 0]
+    expected = policy._frames(torch.stack([dataset[40 + step]["observation.images.image"] for step in steps[2]]))
+    torch.testing.assert_close(batch["memory.tokens"][2, : len(steps[2])], expected)
+    assert batch["memory.text"].shape == (4, 8, 64)
+    assert batch["memory.text_mask"].equal(batch["memory.mask"])
+    texts = WordTextEncoder(64)(["put the bowl in the drawer"])
+    frame_8 = steps[2].index(next(step for step in steps[2] if 8 <= step < 15))
+    torch.testing.assert_close(batch["memory.text"][2, frame_8], texts[0])
+
+
+def test_losses_and_what_is_logged(trained: Any) -> None:
+    policy, before, _, dataset, _, logged = trained
+    assert {"action_loss", "align_loss", "align_grad_norm", "align_top1", "align_temperature"} <= set(logged)
+    assert logged["loss"] == pytest.approx(logged["action_loss"] + 0.1 * logged["align_loss"], rel=1e-5)
+    assert logged["align_grad_norm"] > 0
+    assert 0 <= logged["align_top1"] <= 1
+    per_sample, _ = policy.forward(before(_batch(dataset, [3, 50, 80])), reduction="none")
+    assert per_sample.shape == (3,)
+
+
+@pytest.mark.parametrize("integration", ["modulation", "context"])
+def test_half_precision_and_both_integrations_train_and_act(dataset_root: Path, integration: str) -> None:
+    """The full size trains in bfloat16 under autocast, as LeRobot runs it."""
+    policy, before, _, dataset = _training(dataset_root, align="framewise", integration=integration, dtype="bfloat16")
+    policy.train()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        loss, logged = policy.forward(before(_batch(dataset, [3, 50, 80])))
+    loss.backward()
+    policy.update()
+    assert np.isfinite(logged["loss"])
+    actions = _rollout(policy, before, [[_observation(dataset, 0, t)] for t in range(2)])
+    assert torch.isfinite(actions).all()
+
+
+def test_prompt_frames_do_not_count_unless_asked(dataset_root: Path) -> None:
+    policy, before, _, dataset = _training(dataset_root)
+    batch = before(_batch(dataset, [41, 43, 60, 5]))
+    assert batch["phase"].tolist() == [0, 0, 1, 1]
+    torch.manual_seed(3)
+    loss, _ = policy.forward(batch)
+    torch.manual_seed(3)
+    per_sample, _ = policy.forward(batch, reduction="none")
+    assert per_sample[:2].tolist() == [0, 0]
+    assert loss.item() == pytest.approx(per_sample[2:].mean().item(), rel=1e-5)
+    prompts, _ = policy.forward(before(_batch(dataset, [41, 42])))
+    assert prompts.item() == 0.0
+    policy.config.prompt_loss = True
+    torch.manual_seed(3)
+    per_sample, _ = policy.forward(batch, reduction="none")
+    assert (per_sample > 0).all()
+
+
+def test_training_moves_memory_expert_and_vlm_and_not_the_tower(trained: Any, dataset_root: Path) -> None:
+    policy = trained[0]
+    fresh, *_ = _training(dataset_root, align="contrastive")
+    moved = {
+        name
+        for (name, now), before in zip(policy.named_parameters(), fresh.parameters(), strict=True)
+        if not torch.equal(now, before)
+    }
+    for part in (
+        "model.memory.",
+        ".modulator.key",
+        "model.memory_to_expert",
+        ".gemma_expert.",
+        "language_model",
+        "alignment",
+    ):
+        assert any(part in name for name in moved), part
+    assert not any("vision_tower" in name or "multi_modal_projector" in name or "lm_head" in name for name in moved)
+
+
+def test_a_batch_without_memory_is_refused(trained: Any) -> None:
+    policy, before, _, dataset, _, _ = trained
+    batch = {key: value for key, value in before(_batch(dataset, [3])).items() if not key.startswith("memory.")}
+    with pytest.raises(MemobenchError, match="base_weights"):
+        policy.forward(batch)
+
+
+def test_missing_subgoal_level_is_refused(dataset_root: Path) -> None:
+    _, before, _, dataset = _training(dataset_root, align="semantic", subgoal_level="coarse")
+    with pytest.raises(MemobenchError, match="coarse_subgoal"):
+        before(_batch(dataset, [3]))
+
+
+def test_stale_cache_stops_training(dataset_root: Path, tmp_path: Path) -> None:
+    root = tmp_path / "data"
+    shutil.copytree(dataset_root, root, ignore=shutil.ignore_patterns(FOLDER))
+    folder = cache_dataset(root, _config())
+    assert folder == root / FOLDER / "tiny-stride1"
+    _training(root)  # the policy's own tower reads what `memobench cache` wrote
+    meta = json.loads((folder / "meta.json").read_text())
+    (folder / "meta.json").write_text(json.dumps(meta | {"frames_key": "another"}))
+    with pytest.raises(MemobenchError, match=r"another vision tower.*memobench cache"):
+        _training(root)
+
+
+def test_shuffled_subgoals_stay_in_their_episode_and_all_move() -> None:
+    rows = np.array([0, 0, 1, 2, -1, 5, 5, 7], np.int32)
+    shuffled = shuffle_within_episodes(rows, np.array([0, 5, 7, 8]))
+    assert set(shuffled[:4]) == {0, 1, 2}
+    assert (shuffled[:4] != rows[:4]).all()
+    assert shuffled[4:].tolist() == [-1, 5, 5, 7]
+    assert shuffled[0] == shuffled[1]
+    assert np.array_equal(shuffled, shuffle_within_episodes(rows, np.array([0, 5, 7, 8])))
+
+
+# -- rollout -------------------------------------------------------------------------------------------------------
+
+
+def _observation(dataset: LeRobotDataset, episode: int, frame: int) -> dict[str, Any]:
+    item = dataset[int(dataset.meta.episodes["dataset_from_index"][episode]) + frame]
+    keys = ("observation.images.image", "observation.images.wrist_image", "observation.state")
+    found = {key: item[key][None] for key in keys}
+    found["observation.step"] = torch.tensor([[float(frame)]])
+    found["observation.phase"] = item["phase"].reshape(1, 1).float()
+    found["task"] = [item["task"]]
+    return found
+
+
+def _join(*observations: dict[str, Any]) -> dict[str, Any]:
+    return {
+        key: functools.reduce(operator.iadd, (o[key] for o in observations), [])
+        if key == "task"
+        else torch.cat([o[key] for o in observations])
+        for key in observations[0]
+    }
+
+
+def test_rollout_memory_equals_the_gathered_one(trained: Any) -> None:
+    policy, before, _, dataset, _, _ = trained
+    policy.eval()
+    policy.reset()
+    for frame in range(23):
+        policy._observe(before(_join(_observation(dataset, 1, frame), _observation(dataset, 2, frame))))
+    tokens, steps, mask = policy._history.gather([0, 1])
+    batch = before(_batch(dataset, [40 + 22, 63 + 22]))
+    assert torch.equal(steps, batch["memory.steps"])
+    assert torch.equal(mask, batch["memory.mask"])
+    # The same tower, in batches of other sizes: equal up to the last bit of bfloat16.
+    torch.testing.assert_close(tokens, batch["memory.tokens"], rtol=1e-2, atol=1e-2)
+
+
+def _rollout(policy: Any, before: Any, frames: list[list[dict[str, Any]]]) -> torch.Tensor:
+    """Actions (steps, rows, 7) of a rollout whose observations are frames[step][row]."""
+    policy.eval()
+    policy.reset()
+    return torch.stack([policy.select_action(before(_join(*rows))) for rows in frames])
+
+
+def test_rows_of_a_batch_are_independent(trained: Any) -> None:
+    policy, before, _, dataset, _, _ = trained
+    episodes = (0, 1, 2)
+    frames = [[_observation(dataset, e, t) for e in episodes] for t in range(14)]
+    together = _rollout(policy, before, frames)
+    close = {"rtol": 1e-4, "atol": 1e-4}
+    for row in range(3):
+        torch.testing.assert_close(
+            together[:, row : row + 1], _rollout(policy, before, [[f[row]] for f in frames]), **close
+        )
+    permuted = _rollout(policy, before, [[f[2], f[0], f[1]] for f in frames])
+    torch.testing.assert_close(permuted, together[:, [2, 0, 1]], **close)
+    # Row 0 ends and is frozen, then begins again; row 1 never notices.
+    again = [[frames[min(t, 4)][0] if t < 9 else frames[t - 9][0], frames[t][1]] for t in range(14)]
+    mixed = _rollout(policy, before, again)
+    torch.testing.assert_close(mixed[:, 1], together[:, 1], **close)
+    torch.testing.assert_close(mixed[9:, 0], together[:5, 0], **close)
+    assert torch.equal(mixed[4:9, 0], mixed[4:5, 0].expand(5, -1))  # frozen: nothing new is planned
+
+
+def test_actions_depend_on_what_was_seen_long_ago(trained: Any) -> None:
+    policy, before, _, dataset, _, _ = trained
+    frames = [[_observation(dataset, 1, t)] for t in range(9)]
+    other = copy.deepcopy(frames)
+    other[0][0]["observation.images.image"] = 1 - other[0][0]["observation.images.image"]
+    noise = torch.zeros(1, CHUNK, 32)
+
+    def last_plan(sequence: list[list[dict[str, Any]]]) -> torch.Tensor:
+        policy.reset()
+        return [policy.predict_action_chunk(before(_join(*rows)), noise=noise) for rows in sequence][-1]
+
+    assert (last_plan(frames) - last_plan(other)).abs().max() > 1e-4
+    assert torch.equal(last_plan(frames), last_plan(frames))
+
+
+def test_plans_begin_with_the_execution_phase(trained: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, before, _, dataset, _, _ = trained
+    planned: list[tuple[int, list[int]]] = []
+    original = policy._plan
+    monkeypatch.setattr(policy, "_plan", lambda b, rows, *a: planned.append((t, rows)) or original(b, rows, *a))
+    policy.eval()
+    policy.reset()
+    for t in range(16):
+        policy.select_action(before(_join(_observation(dataset, 0, t), _observation(dataset, 1, t))))
+    # Row 1 executes from step 8 (its prompt is over); every plan lasts six steps.
+    assert planned == [(0, [0]), (6, [0]), (8, [1]), (12, [0]), (14, [1])]
+
+
+def test_sampling_noise_follows_the_seed_of_the_process(trained: Any) -> None:
+    policy, before, _, dataset, _, _ = trained
+    frames = [[_observation(dataset, 0, 0)]]
+    torch.manual_seed(7)
+    first = _rollout(policy, before, frames)
+    torch.rand(5)
+    assert torch.equal(_rollout(policy, before, frames), first)
+    torch.manual_seed(8)
+    assert not torch.equal(_rollout(policy, before, frames), first)
+
+
+def test_a_camera_of_another_name_is_refused(trained: Any) -> None:
+    policy, before, _, dataset, _, _ = trained
+    policy.reset()
+    observation = _observation(dataset, 0, 0)
+    observation["observation.images.top"] = observation.pop("observation.images.image")
+    with pytest.raises(MemobenchError, match=r"it has observation\.images\.wrist_image, observation\.images\.top"):
+        policy.select_action(before(observation))
+
+
+def test_chunk_of_all_rows(trained: Any) -> None:
+    policy, before, _, dataset, _, _ = trained
+    policy.reset()
+    batch = before(_join(_observation(dataset, 0, 0), _observation(dataset, 2, 0)))
+    assert policy.predict_action_chunk(batch).shape == (2, CHUNK, 7)
+    assert policy.predict_action_chunk(batch, noise=torch.zeros(2, CHUNK, 32)).shape == (2, CHUNK, 7)
+
+
+class _Env(gym.Env):
+    """Moves a square for a given number of steps; observations as the benchmark's environment gives them."""
+
+    metadata = {"render_fps": 20}
+    _max_episode_steps = 12
+
+    def __init__(self, length: int, prompt: int) -> None:
+        self.length, self.prompt, self.t = length, prompt, 0
+        self.task, self.task_description = "toy", "put the bowl away"
+        picture = gym.spaces.Box(0, 255, (48, 48, 3), np.uint8)
+        box = lambda n: gym.spaces.Box(-np.inf, np.inf, (n,), np.float32)  # noqa: E731
+        self.observation_space = gym.spaces.Dict(
+            {
+                "pixels": gym.spaces.Dict({"image": picture, "wrist_image": picture}),
+                "agent_pos": box(8),
+                "step": box(1),
+                "phase": box(1),
+            }
+        )
+        self.action_space = gym.spaces.Box(-1, 1, (7,), np.float32)
+
+    def _see(self) -> dict[str, Any]:
+        image = np.zeros((48, 48, 3), np.uint8)
+        image[self.t : self.t + 10] = 200
+        return {
+            "pixels": {"image": image, "wrist_image": image},
+            "agent_pos": np.zeros(8, np.float32),
+            "step": np.array([self.t], np.float32),
+            "phase": np.array([self.t >= self.prompt], np.float32),
+        }
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None):  # type: ignore[no-untyped-def]
+        self.t = 0
+        return self._see(), {"is_success": False}
+
+    def step(self, action: np.ndarray):  # type: ignore[no-untyped-def]
+        assert np.isfinite(action).all()
+        self.t += 1
+        done = self.t >= self.length
+        return self._see(), 0.0, done, False, {"is_success": done}
+
+
+def test_lerobots_rollout_loop_runs_on_a_checkpoint(trained: Any) -> None:
+    from lerobot.processor import PolicyProcessorPipeline
+    from lerobot.scripts.lerobot_eval import rollout
+
+    folder = trained[4]
+    policy = MemobenchMemPolicy.from_pretrained(folder)
+    before, after = make_pre_post_processors(policy.config, pretrained_path=str(folder))
+    envs = gym.vector.SyncVectorEnv([lambda: _Env(5, 0), lambda: _Env(12, 4)])
+    plain = PolicyProcessorPipeline(steps=[])
+    result = rollout(envs, policy, plain, plain, before, after, seeds=[1, 2])
+    assert result["action"].shape == (2, 12, 7)
+    assert torch.isfinite(result["action"]).all()
+    assert result["success"].any(dim=1).tolist() == [True, True]
+
+
+# -- checkpoints ---------------------------------------------------------------------------------------------------
+
+
+def test_evaluation_loads_the_average_and_training_both(trained: Any) -> None:
+    policy, before, _, dataset, folder, _ = trained
+    average = policy._average
+    assert average is not None
+    assert average.updates == 4
+    evaluated = MemobenchMemPolicy.from_pretrained(folder)
+    for name, parameter in evaluated.named_parameters():
+        expected = average.average.get(name, dict(policy.named_parameters())[name])
+        assert torch.equal(parameter, expected), name
+    assert evaluated._average is None
+    resumed = MemobenchMemPolicy.from_pretrained(folder, dataset_meta=dataset.meta)
+    assert resumed._average is not None
+    assert resumed._average.updates == 4
+    for name, parameter in resumed.named_parameters():
+        assert torch.equal(parameter, dict(policy.named_parameters())[name]), name
+    for name, tensor in resumed._average.average.items():
+        assert torch.equal(tensor, average.average[name]), name
+    # Evaluation during training uses the average too, and gives the trained weights back.
+    frames = [[_observation(dataset, 0, t)] for t in range(2)]
+    with torch.inference_mode():
+        assert torch.equal(_rollout(policy, before, frames), _rollout(evaluated, before, frames))
+    assert torch.equal(next(iter(policy.get_optim_params())), next(iter(resumed.get_optim_params())))
+    policy.train()
+    policy.forward(before(_batch(dataset, [3, 50])))[0].backward()
+    policy.zero_grad()
+
+
+def test_average_follows_its_formula() -> None:
+    from lerobot_memobench.policies.memobench_mem.ema import WeightAverage
+
+    parameter = torch.nn.Parameter(torch.tensor([1.0]))
+    average = WeightAverage({"w": parameter}, decay=0.15)
+    expected = 1.0
+    for n, value in enumerate((2.0, 3.0, 5.0)):
+        parameter.data.fill_(value)
+        average.update()
+        decay = min(0.15, (1 + n) / (10 + n))
+        expected = decay * expected + (1 - decay) * value
+        assert average.average["w"].item() == pytest.approx(expected)
+    half = torch.nn.Parameter(torch.tensor([1.0], dtype=torch.bfloat16))
+    kept = WeightAverage({"w": half}, decay=0.999)
+    kept.update()
+    assert kept.average["w"].dtype == torch.float32
+    with kept.applied():
+        assert half.dtype == torch.bfloat16
+
+
+def test_no_average_when_it_is_off(dataset_root: Path, tmp_path: Path) -> None:
+    policy, before, _, dataset = _training(dataset_root, ema_decay=0.0)
+    policy.train()
+    policy.forward(before(_batch(dataset, [3])))
+    policy.update()
+    assert policy._average is None
+    policy.save_pretrained(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["config.json", "model.safetensors"]
+
+
+def test_resuming_rebuilds_the_pipeline_and_finds_the_cache(trained: Any) -> None:
+    _, before, _, dataset, folder, _ = trained
+    policy = MemobenchMemPolicy.from_pretrained(folder, dataset_meta=dataset.meta)
+    again, _ = make_pre_post_processors(policy.config, pretrained_path=str(folder))
+    step = next(step for step in again.steps if isinstance(step, GatherMemoryProcessorStep))
+    assert (step.frames, step.align, step.cache) == (8, "contrastive", None)
+    raw = _batch(dataset, [3, 50])
+    first, second = before(copy.deepcopy(raw)), again(copy.deepcopy(raw))
+    for key in ("memory.tokens", "memory.text", "observation.language.tokens", "action"):
+        assert torch.equal(first[key], second[key]), key
+
+
+def test_changing_the_objective_keeps_the_rest(trained: Any, dataset_root: Path) -> None:
+    dataset, folder = trained[3], trained[4]
+    policy = MemobenchMemPolicy.from_pretrained(
+        folder,
+        config=_config(
+            align="framewise",
+            input_features=trained[0].config.input_features,
+            output_features=trained[0].config.output_features,
+        ),
+        dataset_meta=dataset.meta,
+    )
+    assert type(policy.alignment).__name__ == "FramewiseAlignment"
+
+
+def _copy(folder: Path, target: Path) -> Path:
+    shutil.copytree(folder, target)
+    return target
+
+
+def test_missing_statistics_are_refused(trained: Any, tmp_path: Path) -> None:
+    dataset, folder = trained[3], trained[4]
+    broken = _copy(folder, tmp_path / "a")
+    state = next(broken.glob("policy_preprocessor_step_*_normalizer_processor.safetensors"))
+    save_file({k: v for k, v in load_file(state).items() if not k.startswith("action")}, state)
+    with pytest.raises(MemobenchError, match="no dataset statistics for action"):
+        MemobenchMemPolicy.from_pretrained(broken)
+    MemobenchMemPolicy.from_pretrained(broken, dataset_meta=dataset.meta)  # a dataset brings its own
+    state.unlink()
+    with pytest.raises(MemobenchError, match=r"no dataset statistics for action and observation.state"):
+        MemobenchMemPolicy.from_pretrained(broken)
+    (broken / "policy_preprocessor.json").unlink()
+    with pytest.raises(MemobenchError, match=r"policy_preprocessor.json"):
+        MemobenchMemPolicy.from_pretrained(broken)
+    config = _config(input_features=trained[0].config.input_features, output_features=trained[0].config.output_features)
+    with pytest.raises(MemobenchError, match=r"never|no dataset statistics"):
+        make_pre_post_processors(config)
+
+
+def test_weights_that_do_not_fit_are_refused(trained: Any, tmp_path: Path) -> None:
+    folder = trained[4]
+    broken = _copy(folder, tmp_path / "a")
+    weights = load_file(broken / "model.safetensors")
+    weights.pop("model.memory.project.weight")
+    save_file(weights, broken / "model.safetensors")
+    with pytest.raises(MemobenchError, match=r"model.memory.project.weight"):
+        MemobenchMemPolicy.from_pretrained(broken)
+    (broken / "model.safetensors").unlink()
+    with pytest.raises(MemobenchError, match=r"no model.safetensors"):
+        MemobenchMemPolicy.from_pretrained(broken)
+
+
+def test_pi05_weights_as_a_start(trained: Any, tmp_path: Path) -> None:
+    """A file named as pi0.5's own, at tiny dimensions: everything but the memory comes from it."""
+    from lerobot_memobench.policies.memobench_mem.backbone import SizedPI05
+
+    torch.manual_seed(11)
+    plain = SizedPI05(_config())
+    with torch.no_grad():
+        for parameter in plain.parameters():
+            parameter.add_(0.1)
+    save_file({k: v.contiguous() for k, v in plain.state_dict().items()}, tmp_path / "model.safetensors")
+    features = {
+        "input_features": trained[0].config.input_features,
+        "output_features": trained[0].config.output_features,
+    }
+    policy = MemobenchMemPolicy(_config(base_weights=str(tmp_path), **features))
+    memory = policy.model.memory_parameters()
+    own = {
+        name.replace("post_attention_layernorm.norm.", "post_attention_layernorm."): tensor
+        for name, tensor in policy.model.named_parameters()
+        if name not in memory
+    }
+    for name, tensor in plain.named_parameters():
+        assert torch.equal(own[name], tensor), name
+    # The tower alone, as `memobench cache --weights` reads it, is the same tower.
+    from lerobot_memobench.policies.memobench_mem.caching import load_frame_encoder
+
+    assert load_frame_encoder(_config(), tmp_path).key == policy._frames.key
+    assert load_frame_encoder(_config()).key == trained[0]._frames.key != policy._frames.key
+
+
+# -- words ---------------------------------------------------------------------------------------------------------
+
+
+def test_word_tokenizer() -> None:
+    vocabulary = make_vocabulary(["Put the bowl away, then wait.", "put the lid on"], 1024)
+    tokenizer = make_word_tokenizer(vocabulary)
+    ids = tokenizer("Task: put the BOWL, State: -1 255 7;\nAction: zebra").input_ids
+    words = tokenizer.convert_ids_to_tokens(ids)
+    assert words == [
+        *("<bos>", "task", ":", "put", "the", "bowl", ",", "state", ":", "-", "1", "255", "7", ";", "action", ":"),
+        "<unk>",
+    ]
+    assert len(make_vocabulary((f"word{i}" for i in range(5000)), 1024)) == 1024
+
+
+def test_word_text_encoder_tells_texts_apart() -> None:
+    texts = ["pick up the red cup", "pick up the green cup", "put a on b", "put b on a", "pick up the red cup"]
+    vectors = WordTextEncoder(64)(texts)
+    similarity = vectors @ vectors.T
+    assert similarity[0, 4] > 0.999
+    similarity.fill_diagonal_(0)
+    similarity[0, 4] = similarity[4, 0] = 0
+    assert similarity.max() < 0.99
+
+
+def test_cache_of_one_dataset_is_not_used_for_another(trained: Any) -> None:
+    cache = MemoryCache.open(
+        Path(trained[3].root),
+        "tiny-stride1",
+        frames_key=trained[0]._frames.key,
+        camera="observation.images.image",
+        stride=1,
+    )
+    step = GatherMemoryProcessorStep(frames=4, cache=cache)
+    with pytest.raises(MemobenchError, match="outside the memory cache"):
+        step.gather(cache, [10_000])
