@@ -1,13 +1,7 @@
 """MEMOBench: a process-level memory benchmark for robot manipulation, as a LeRobot plugin.
 
-Importing this package makes the environment ``memobench`` and the policies ``memobench_mem`` and
-``memobench_expert`` known to LeRobot and does nothing else: no simulator, no model code, no GL. It does not
-import LeRobot either (see ``registration``), so commands and workers that do not need LeRobot start in a
-second.
+Importing this package imports nothing else, so commands that need no LeRobot start at once. What LeRobot must know
+is in ``registration``, which ``lerobot_policy_memobench``, the name that LeRobot discovers, imports.
 """
 
-from lerobot_memobench.registration import register
-
 __version__ = "0.1.0"
-
-register()

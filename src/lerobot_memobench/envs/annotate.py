@@ -17,13 +17,15 @@ OPERATION_COLOURS = {"S": (86, 180, 233), "U": (230, 159, 0), "C": (0, 158, 115)
 """Storage, Update, Compression: Okabe and Ito's palette, apart for the colour-blind too."""
 _PROMPT_COLOUR = (204, 121, 167)
 
+Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
+
 
 @lru_cache(maxsize=4)
-def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+def _font(size: int) -> Font:
     return ImageFont.load_default(size=size)
 
 
-def _fit(draw: ImageDraw.ImageDraw, text: str, size: int, width: int) -> tuple[str, object]:
+def _fit(draw: ImageDraw.ImageDraw, text: str, size: int, width: int) -> tuple[str, Font]:
     """Shrink a text until it fits, then cut it."""
     for points in range(size, 8, -1):
         if draw.textlength(text, font=_font(points)) <= width:
@@ -36,7 +38,7 @@ def _fit(draw: ImageDraw.ImageDraw, text: str, size: int, width: int) -> tuple[s
 def annotate(images: dict[str, NDArray[np.uint8]], episode: Episode) -> NDArray[np.uint8]:
     """Return a frame (BAND + height, 2 · width, 3) uint8 of the present step."""
     pictures = np.hstack(list(images.values()))
-    height, width = pictures.shape[:2]
+    width = pictures.shape[1]
     band = Image.new("RGB", (width, BAND), _BACKGROUND)
     draw = ImageDraw.Draw(band)
     prompt = episode.phase == PROMPT

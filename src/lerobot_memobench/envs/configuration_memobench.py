@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +55,7 @@ class MemobenchEnvConfig(EnvConfig):
         referent: `fixed`, the published goals, or `random`: by seed another admissible referent or order.
         prompt_video: whether object and procedural tasks begin with their prompt video.
         horizon: execution steps per episode.
-        render: `fast`, `default` or `high`.
+        render: `fast` (no shadows), `default`, or `high` (four samples per pixel, finer shadows).
         render_every: draw images every so many execution steps and repeat the last in between. Set it to the number
             of actions a policy executes per prediction: it looks at nothing else.
         replan_steps: that number, noted in the episode log.
@@ -132,6 +133,9 @@ class MemobenchEnvConfig(EnvConfig):
         from lerobot_memobench.envs.memobench_env import MemobenchEnv, spaces_and_metadata
 
         chosen = self.selected()  # before anything is written: a wrong name leaves nothing behind
+        if use_async_envs and n_envs > 1:
+            # LeRobot's workers are forked from a server: it imports torch and the simulator once for all of them.
+            get_context("forkserver").set_forkserver_preload([MemobenchEnv.__module__])
         log_dir = self.resolved_log_dir()
         spaces = spaces_and_metadata(self.expert_action)
         suites: dict[str, dict[int, gym.vector.VectorEnv]] = {}

@@ -92,7 +92,7 @@ class Episode:
         self.progress = Progress(task)
         self.step_index = 0
         self.exec_start: int | None = None
-        self.applied_action = np.zeros(7, dtype=np.float32)
+        self.applied_action: NDArray[np.float32] = np.zeros(7, dtype=np.float32)
         self.prompt_shown: bool | None = None
         self.drifted = False
         self._siblings = list(_wrong_atoms(task))
@@ -139,7 +139,8 @@ class Episode:
     def step(self, action: NDArray[np.floating]) -> None:
         """Advance by one control step; during the prompt the given action has no effect."""
         if self.phase == PROMPT:
-            assert self._demonstrator is not None and self._next_prompt_action is not None
+            assert self._demonstrator is not None
+            assert self._next_prompt_action is not None
             self.applied_action = np.asarray(self._next_prompt_action, dtype=np.float32)
             self.sim.step(self.applied_action)
             self.step_index += 1

@@ -26,7 +26,7 @@ METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}
 def _observation_space(expert_action: bool) -> spaces.Dict:
     image = spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
     parts: dict[str, spaces.Space[Any]] = {
-        "pixels": spaces.Dict({key: image for key in IMAGE_KEYS}),
+        "pixels": spaces.Dict(dict.fromkeys(IMAGE_KEYS, image)),
         "agent_pos": spaces.Box(-np.inf, np.inf, (8,), np.float32),
         # LeRobot passes numeric keys that it does not know on as `observation.<key>`, so a policy with a memory can
         # tell by itself when each row of a batch starts and stands still.
@@ -51,8 +51,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     """One task of the benchmark.
 
     Observation: ``pixels/image`` and ``pixels/wrist_image`` uint8 (256, 256, 3) upright; ``agent_pos`` float32 (8,):
-    end-effector position (3, m), axis-angle (3, rad), fingers (2, m); ``phase`` (1,): 0 while the prompt video plays and
-    actions have no effect, 1 in execution; ``step`` (1,): control steps since the episode began; on request
+    end-effector position (3, m), axis-angle (3, rad), fingers (2, m); ``phase`` (1,): 0 while the prompt video plays
+    and actions have no effect, 1 in execution; ``step`` (1,): control steps since the episode began; on request
     ``expert_action`` (7,).
 
     Action: float32 (7,) in [−1, 1]: end-effector displacement (±5 cm, ±0.5 rad per unit), gripper (−1 opens, 1 closes).
@@ -156,6 +156,10 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             if self._log is not None:
                 self._log.append(self.record())
         return self._observation(), float(success), success, truncated, self._info()
+
+    def scene_hash(self) -> str:
+        """Return the hash of the present scene: equal in two environments when all of their physics is."""
+        return self.episode.sim.scene_hash()
 
     def record(self) -> dict[str, Any]:
         """Return the episode's line for the log; see `spec/benchmark.md`, files that other tools read."""

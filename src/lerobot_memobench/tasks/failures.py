@@ -18,9 +18,7 @@ FAILURES = (
 _BY_OPERATION = {"S": "storage_failure", "U": "stale_memory", "C": "compression_collapse"}
 
 
-def classify_failure(
-    task: Task, first_steps: Sequence[int | None], success: bool, drift: bool = False
-) -> str | None:
+def classify_failure(task: Task, first_steps: Sequence[int | None], success: bool, drift: bool = False) -> str | None:
     """Return the failure class of an execution of ``task``, or None when it succeeded.
 
     Args:

@@ -1,0 +1,30 @@
+# The verbs a newcomer needs. Each one sets up first whatever is missing.
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test check lock
+
+PYTHON := .venv/bin/python
+ARGS ?=
+
+help: ## list these commands
+	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1\t\2/p' $(MAKEFILE_LIST)
+
+setup: ## install uv, .venv and system libraries (quick when there is nothing to do)
+	@scripts/setup
+
+demo: ## evaluate the scripted expert on four tasks; videos and report in outputs/demo
+	@scripts/setup
+	@.venv/bin/memobench demo $(ARGS)
+
+test: ## run the tests; ARGS are passed to pytest (ARGS="-m slow")
+	@scripts/setup
+	@$(PYTHON) -m pytest $(ARGS)
+
+check: ## lint, formatting and types
+	@scripts/setup
+	@.venv/bin/ruff check .
+	@.venv/bin/ruff format --check .
+	@.venv/bin/mypy
+
+lock: ## resolve pyproject.toml again into requirements.lock
+	@scripts/setup
+	@scripts/lock

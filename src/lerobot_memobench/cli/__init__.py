@@ -1,0 +1,1 @@
+"""The commands: ``lerobot`` (LeRobot's own commands with key=value) and ``memobench`` (everything else)."""

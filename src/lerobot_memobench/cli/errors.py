@@ -1,0 +1,54 @@
+"""Which failures a user can mend, and the one sentence that says how."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from lerobot_memobench.errors import MemobenchError
+
+
+def chain(error: BaseException) -> Iterator[BaseException]:
+    """Yield an error and the errors that led to it, outermost first."""
+    seen: set[int] = set()
+    current: BaseException | None = error
+    while current is not None and id(current) not in seen:
+        seen.add(id(current))
+        yield current
+        current = current.__cause__ or (None if current.__suppress_context__ else current.__context__)
+
+
+def one_sentence(error: BaseException) -> str | None:
+    """Return what to tell the user in one line, or None for a failure that needs its traceback."""
+    errors = list(chain(error))
+    for found in errors:
+        if isinstance(found, MemobenchError):
+            return _line(found)
+    from draccus.utils import ParsingError
+
+    if isinstance(errors[0], ParsingError):
+        # draccus hides what a configuration's own check says behind "couldn't instantiate".
+        return _line(next((e for e in reversed(errors) if isinstance(e, ValueError | TypeError)), errors[0]))
+    if isinstance(errors[0], ImportError) and "required but not installed" in str(errors[0]):
+        return _line(errors[0])  # LeRobot's own words for a missing extra
+    if isinstance(errors[0], FileExistsError):
+        return _line(errors[0])
+    hub = next((found for found in errors if _is_hub_error(found)), None)
+    if hub is not None:
+        return (
+            f"what was asked for is not on this machine and could not be fetched from the hub ({_line(hub)[:200]}); "
+            "name a folder that is here: dataset=<folder> or policy=<folder>"
+        )
+    return None
+
+
+def _is_hub_error(error: BaseException) -> bool:
+    import httpx
+    from huggingface_hub import errors as hub
+
+    return isinstance(
+        error, hub.HfHubHTTPError | hub.LocalEntryNotFoundError | hub.OfflineModeIsEnabled | httpx.TransportError
+    )
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split())

@@ -1,0 +1,60 @@
+"""Try one thing that may crash the process: ``python -m lerobot_memobench.cli.probe gl egl``. Prints JSON.
+
+A driver that is broken ends the process with a signal, which only its parent can report.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable
+from typing import Any
+
+SCENE = """
+<mujoco><worldbody><light pos='0 0 3'/><camera name='eye' pos='0 -1 0' xyaxes='1 0 0 0 0 1'/>
+<geom type='sphere' size='.2' rgba='.9 .2 .1 1'/></worldbody></mujoco>
+"""
+
+
+def gl(backend: str) -> dict[str, Any]:
+    """Render a sphere with a backend; return the GL strings and whether the sphere is there."""
+    os.environ["MUJOCO_GL"] = backend
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_string(SCENE)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    with mujoco.Renderer(model, 64, 64) as renderer:
+        from OpenGL import GL
+
+        renderer.update_scene(data, "eye")
+        image = renderer.render()
+        names = {"renderer": GL.GL_RENDERER, "vendor": GL.GL_VENDOR, "version": GL.GL_VERSION}
+        found = {key: GL.glGetString(name).decode() for key, name in names.items()}
+    centre = image[32, 32].astype(int)
+    return {**found, "sphere": bool(centre[0] > centre[1] + 40)}
+
+
+def golden() -> dict[str, Any]:
+    """Render the golden scene; return how far it is from the one that ships."""
+    from lerobot_memobench.cli.golden import difference, read_golden, render_golden
+
+    return {"difference": difference(render_golden(), read_golden())}
+
+
+def torchcodec() -> dict[str, Any]:
+    """Load torchcodec, which loads FFmpeg's libraries."""
+    from torchcodec.decoders import VideoDecoder
+
+    return {"decoder": VideoDecoder.__name__}
+
+
+PROBES: dict[str, Callable[..., dict[str, Any]]] = {"gl": gl, "golden": golden, "torchcodec": torchcodec}
+
+
+if __name__ == "__main__":
+    try:
+        print(json.dumps(PROBES[sys.argv[1]](*sys.argv[2:])))
+    except Exception as error:
+        print(json.dumps({"error": " ".join(f"{type(error).__name__}: {error}".split())[:300]}))

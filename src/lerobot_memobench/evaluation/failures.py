@@ -1,0 +1,39 @@
+"""How often each failure class occurs among rollouts; the rule itself is ``tasks.failures``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.tasks.failures import FAILURES, classify
+
+
+def failure_of(record: Mapping[str, Any]) -> str | None:
+    """Return the failure class of a logged rollout, None for a success.
+
+    A log without the class gets it from its checkpoints. Drift cannot be told from them, so it is then never
+    named.
+    """
+    if record["success"]:
+        return None
+    logged = record.get("failure")
+    if logged is None:
+        checkpoints = record["checkpoints"]
+        return classify([c["operation"] for c in checkpoints], [c["first_step"] for c in checkpoints], False)
+    if logged not in FAILURES:
+        raise MemobenchError(
+            f"a rollout of {record['task']!r} has the unknown failure class {logged!r}, "
+            + nearest(str(logged), FAILURES)
+        )
+    return str(logged)
+
+
+def failure_counts(records: Iterable[Mapping[str, Any]]) -> dict[str, int]:
+    """Return class -> number of failed rollouts, every class in the report's order."""
+    counts = dict.fromkeys(FAILURES, 0)
+    for record in records:
+        failure = failure_of(record)
+        if failure is not None:
+            counts[failure] += 1
+    return counts

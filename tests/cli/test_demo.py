@@ -1,0 +1,78 @@
+"""What the demo makes of an evaluation; the evaluation itself is LeRobot's and is replaced here."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+from lerobot_memobench.cli import demo
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.tasks.catalogue import get_task, task_index
+
+
+def write_video(path: Path, frames: int = 12) -> None:
+    """A video whose brightness rises from black to white."""
+    path.parent.mkdir(parents=True)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=20)
+        stream.width, stream.height, stream.pix_fmt = 128, 64, "yuv420p"
+        for k in range(frames):
+            image = np.full((64, 128, 3), 255 * k // (frames - 1), dtype=np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode())
+
+
+def fake_evaluation(output: Path) -> int:
+    per_task = []
+    for name in demo.TASKS:
+        number, group = task_index(name), get_task(name).memory_type
+        video = output / "videos" / f"{group}_{number}" / "eval_episode_0.mp4"
+        write_video(video)
+        per_task.append({"task_group": group, "task_id": number, "metrics": {"video_paths": [str(video)]}})
+    (output / "eval_info.json").write_text(json.dumps({"per_task": per_task}))
+    for name in ("episodes.jsonl", "report.json", "report.md"):
+        (output / name).write_text(name)
+    return 0
+
+
+def test_one_task_of_each_memory_type() -> None:
+    assert [get_task(name).memory_type for name in demo.TASKS] == ["temporal", "spatial", "object", "procedural"]
+
+
+def test_the_demo_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(demo, "run_expert", fake_evaluation)
+    out = tmp_path / "outputs" / "demo"
+    (out / "videos").mkdir(parents=True)
+    (out / "videos" / "old.mp4").write_text("")
+    (out / "notes.txt").write_text("the user's own")
+    assert demo.run_demo(out) == 0
+    assert {path.name for path in out.iterdir()} == {*demo.PRODUCTS, "notes.txt"}
+    assert {path.stem for path in (out / "videos").iterdir()} == set(demo.TASKS)
+    with Image.open(out / "contact_sheet.png") as sheet:
+        pixels = np.asarray(sheet.convert("L")).astype(int)
+    assert pixels.shape == (4 * 160, demo.FRAMES_PER_VIDEO * demo.COLUMN_WIDTH)
+    means = pixels[:160].reshape(160, demo.FRAMES_PER_VIDEO, -1).mean(axis=(0, 2))
+    assert (np.diff(means) > 20).all()  # evenly spaced in time, left to right
+
+
+def test_a_failed_evaluation_leaves_the_earlier_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "report.json").write_text("earlier")
+    monkeypatch.setattr(demo, "run_expert", lambda output: 3)
+    assert demo.run_demo(tmp_path) == 3
+    assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
+
+
+def test_a_missing_video_is_named(tmp_path: Path) -> None:
+    (tmp_path / "eval_info.json").write_text('{"per_task": []}')
+    with pytest.raises(MemobenchError, match=demo.TASKS[0]):
+        demo.collect_videos(tmp_path, tmp_path / "videos")
+
+
+def test_even_distances_hold_both_ends() -> None:
+    frames = [np.full((1, 1, 3), k, dtype=np.uint8) for k in range(11)]
+    assert [int(frame[0, 0, 0]) for frame in demo.evenly(frames, 3)] == [0, 5, 10]

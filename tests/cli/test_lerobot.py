@@ -1,0 +1,400 @@
+"""The command ``lerobot``: what LeRobot's own commands are called with, and what a mistake costs."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import lerobot.scripts.lerobot_eval
+import lerobot.scripts.lerobot_train
+import numpy as np
+import pytest
+from lerobot.configs.eval import EvalPipelineConfig
+from lerobot.configs.train import TrainPipelineConfig
+from safetensors.numpy import save_file
+
+from lerobot_memobench.cli.arguments import flag_value
+from lerobot_memobench.cli.lerobot import config_class, lerobot_commands, main
+from lerobot_memobench.datasets.lerobot_format import DEFAULT_REPO_ID
+from lerobot_memobench.envs.episode_log import EpisodeLog
+from lerobot_memobench.errors import MemobenchError
+
+TASK = "turn_on_the_stove_and_turn_it_off"
+
+
+class Called:
+    """Stands for LeRobot's main function and remembers how it was called."""
+
+    def __init__(self, module: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.flags: list[str] | None = None
+        self.program = ""
+        self.action: Callable[[list[str]], Any] = lambda flags: None
+
+        def fake() -> Any:
+            self.program, *self.flags = sys.argv
+            return self.action(self.flags)
+
+        fake.__module__ = module.__name__
+        monkeypatch.setattr(module, "main", fake)
+
+    def value(self, key: str) -> str | None:
+        assert self.flags is not None
+        return flag_value(self.flags, key)
+
+
+@pytest.fixture
+def in_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def evaluation(monkeypatch: pytest.MonkeyPatch, in_folder: Path) -> Called:
+    return Called(lerobot.scripts.lerobot_eval, monkeypatch)
+
+
+@pytest.fixture
+def training(monkeypatch: pytest.MonkeyPatch, in_folder: Path) -> Called:
+    return Called(lerobot.scripts.lerobot_train, monkeypatch)
+
+
+def log_episodes(flags: list[str], count: int | None = None) -> None:
+    """Write what the environment would have logged."""
+    log = EpisodeLog(flag_value(flags, "env.log_dir") or "")
+    for k in range(int(flag_value(flags, "eval.n_episodes") or 0) if count is None else count):
+        log.append(
+            {
+                "task": TASK,
+                "memory_type": "temporal",
+                "episode": k,
+                "seed": 7 + k,
+                "success": True,
+                "checkpoints": [{"operation": "S", "first_step": 1, "ordered_step": 1}],
+            }
+        )
+
+
+def checkpoint(folder: Path, statistics: tuple[str, ...] = ("observation.state.mean", "action.mean")) -> Path:
+    """Write what matters of a checkpoint of LeRobot's."""
+    folder.mkdir(parents=True)
+    (folder / "config.json").write_text(json.dumps({"type": "act", "device": "cpu"}))
+    save_file({"w": np.zeros(1)}, folder / "model.safetensors")
+    save_file({name: np.zeros(1) for name in (*statistics, "other.mean")}, folder / "stats.safetensors")
+    config = {
+        "features": {
+            "observation.state": {"type": "STATE", "shape": [8]},
+            "observation.images.image": {"type": "VISUAL", "shape": [3, 256, 256]},
+            "action": {"type": "ACTION", "shape": [7]},
+        },
+        "norm_map": {"STATE": "MEAN_STD", "ACTION": "MEAN_STD", "VISUAL": "IDENTITY"},
+    }
+    for name in ("policy_preprocessor", "policy_postprocessor"):
+        prefix = "un" if "post" in name else ""
+        step = {
+            "registry_name": prefix + "normalizer_processor",
+            "config": config,
+            "state_file": "stats.safetensors",
+        }
+        (folder / f"{name}.json").write_text(json.dumps({"name": name, "steps": [step]}))
+    return folder
+
+
+# --- finding LeRobot's commands ---
+
+
+def test_every_command_of_lerobot_is_there() -> None:
+    assert {"train", "eval", "record", "dataset-viz", "edit-dataset", "info"} <= set(lerobot_commands())
+
+
+def test_their_configurations_are_found() -> None:
+    assert config_class(lerobot.scripts.lerobot_eval.main) is EvalPipelineConfig
+    assert config_class(lerobot.scripts.lerobot_train.main) is TrainPipelineConfig
+
+
+def test_without_a_command_it_tells_which_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 0
+    assert "dataset-viz" in capsys.readouterr().out
+
+
+def test_an_unknown_command_names_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evl", "env=memobench"]) == 2
+    assert capsys.readouterr().err.startswith("lerobot: there is no command 'evl', did you mean 'eval'")
+
+
+# --- eval ---
+
+
+def test_eval_needs_nothing_but_the_environment(evaluation: Called) -> None:
+    evaluation.action = log_episodes
+    assert main(["eval", "env=memobench"]) == 0
+    assert evaluation.program == "lerobot-eval"
+    assert evaluation.value("env.type") == "memobench"
+    assert evaluation.value("policy.type") == "memobench_expert"
+    assert evaluation.value("env.expert_action") == "true"
+    assert evaluation.value("seed") == "7"
+    assert evaluation.value("eval.n_episodes") == "50"
+    assert 50 % int(evaluation.value("eval.batch_size") or 0) == 0
+    output = evaluation.value("output_dir")
+    assert output is not None
+    assert output.startswith("outputs/eval/")
+    assert output.endswith("_memobench_memobench_expert")
+    assert evaluation.value("env.log_dir") == output
+
+
+def test_what_the_user_sets_stays(evaluation: Called) -> None:
+    evaluation.action = log_episodes
+    words = ["eval", "env=memobench", f"tasks={TASK}", "episodes=7", "seed=3", "output_dir=out", "batch_size=7"]
+    assert main([*words, "--env.log_dir=log", "--policy.type=memobench_expert"]) == 0
+    assert evaluation.value("seed") == "3"
+    assert evaluation.value("eval.batch_size") == "7"
+    assert evaluation.value("env.log_dir") == "log"
+    assert evaluation.value("env.expert_action") == "true"
+
+
+def test_the_batch_divides_the_episodes(evaluation: Called, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.cpu_count", lambda: 16)
+    evaluation.action = log_episodes
+    assert main(["eval", "env=memobench", "episodes=9"]) == 0
+    assert evaluation.value("eval.batch_size") == "9"
+    assert main(["eval", "env=memobench", "episodes=50", "--eval.batch_size=0"]) == 0
+    assert evaluation.value("eval.batch_size") == "10"
+
+
+def test_the_report_is_written_and_printed(evaluation: Called, capsys: pytest.CaptureFixture[str]) -> None:
+    evaluation.action = log_episodes
+    assert main(["eval", "env=memobench", f"tasks={TASK}", "episodes=2", "output_dir=out"]) == 0
+    assert json.loads(Path("out/report.json").read_text())["average"]["SR"] == 100.0
+    assert Path("out/report.md").is_file()
+    assert len(Path("out/episodes.jsonl").read_text().splitlines()) == 2
+    assert TASK in capsys.readouterr().out
+
+
+def test_surplus_episodes_are_not_reported(evaluation: Called) -> None:
+    evaluation.action = lambda flags: log_episodes(flags, count=4)
+    assert main(["eval", "env=memobench", "episodes=3", "output_dir=out"]) == 0
+    assert json.loads(Path("out/report.json").read_text())["average"]["n"] == 3
+
+
+def test_the_replan_interval_of_the_policy_is_noted(evaluation: Called) -> None:
+    evaluation.action = log_episodes
+    path = checkpoint(Path("run/pretrained_model"))
+    assert main(["eval", "env=memobench", f"policy={path}", "policy.n_action_steps=20"]) == 0
+    assert evaluation.value("policy.path") == str(path)
+    assert evaluation.value("env.replan_steps") == "20"
+    assert evaluation.value("env.expert_action") is None
+
+
+def test_an_earlier_evaluation_is_not_mixed_in(evaluation: Called, capsys: pytest.CaptureFixture[str]) -> None:
+    log_episodes(["--env.log_dir=out", "--eval.n_episodes=1"])
+    assert main(["eval", "env=memobench", "output_dir=out"]) == 2
+    assert evaluation.flags is None
+    assert "already holds an evaluation" in capsys.readouterr().err
+
+
+def test_an_environment_of_lerobots_own_gets_no_defaults(evaluation: Called) -> None:
+    assert main(["eval", "env=pusht", "policy=diffusion"]) == 0
+    assert evaluation.flags == ["--env.type=pusht", "--policy.type=diffusion"]
+
+
+def test_help_is_passed_on(evaluation: Called) -> None:
+    assert main(["eval", "env=memobench", "--help"]) == 0
+    assert evaluation.flags == ["--help", "--env.type=memobench"]
+
+
+# --- train ---
+
+
+def test_train_as_the_table_says(training: Called, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.cpu_count", lambda: 8)
+    assert main(["train", "policy=memobench_mem", "align=contrastive"]) == 0
+    assert training.program == "lerobot-train"
+    assert training.flags == [
+        "--policy.type=memobench_mem",
+        "--policy.align=contrastive",
+        f"--dataset.repo_id={DEFAULT_REPO_ID}",
+        "--policy.push_to_hub=false",
+    ]
+
+
+def test_few_cores_get_few_loaders(training: Called, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    assert main(["train", "policy=act"]) == 0
+    assert training.value("num_workers") == "2"
+
+
+def test_train_pushes_where_a_repository_is_named(training: Called) -> None:
+    assert main(["train", "policy=act", "policy.repo_id=user/name"]) == 0
+    assert training.value("policy.push_to_hub") is None
+
+
+def test_a_short_training_shows_its_loss(training: Called) -> None:
+    assert main(["train", "policy=act", "steps=50"]) == 0
+    assert training.value("log_freq") == "5"
+
+
+def test_train_on_a_folder(training: Called, in_folder: Path) -> None:
+    (in_folder / "demos" / "meta").mkdir(parents=True)
+    (in_folder / "demos" / "meta" / "info.json").write_text("{}")
+    assert main(["train", "policy=act", "dataset=demos"]) == 0
+    assert training.value("dataset.repo_id") == "local/demos"
+    assert training.value("dataset.root") == "demos"
+
+
+def test_a_config_file_brings_its_own(training: Called, in_folder: Path) -> None:
+    Path("train.yaml").write_text("policy: {type: memobench_mem}\ndataset: {repo_id: a/b}\n")
+    assert main(["train", "config_path=train.yaml", "align=semantic"]) == 0
+    assert training.flags == ["--config_path=train.yaml", "--policy.align=semantic"]
+
+
+# --- mistakes: one sentence, status 2, LeRobot never called, nothing written ---
+
+
+def refused(words: list[str], called: Called, capsys: pytest.CaptureFixture[str]) -> str:
+    before = sorted(Path().rglob("*"))
+    assert main(words) == 2
+    assert called.flags is None
+    assert sorted(Path().rglob("*")) == before
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("lerobot: ")
+    assert err.count("\n") == 1
+    assert "Traceback" not in err
+    return err
+
+
+def test_a_wrong_task_name(evaluation: Called, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["eval", "env=memobench", "tasks=turn_on_the_stov"]
+    assert TASK in refused(words, evaluation, capsys)
+
+
+def test_an_unknown_policy(evaluation: Called, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "memobench_mem" in refused(["eval", "env=memobench", "policy=memobnch_mem"], evaluation, capsys)
+
+
+def test_an_unknown_alignment(training: Called, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["train", "policy=memobench_mem", "align=contrastiv"]
+    assert "contrastive" in refused(words, training, capsys)
+
+
+def test_an_unknown_referent(evaluation: Called, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "random" in refused(["eval", "env=memobench", "referent=rnd"], evaluation, capsys)
+
+
+def test_a_folder_that_is_no_dataset(training: Called, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("stuff").mkdir()
+    for words in (["dataset=stuff"], ["--dataset.repo_id=local/stuff", "--dataset.root=stuff"]):
+        assert "meta/info.json" in refused(["train", "policy=act", *words], training, capsys)
+
+
+def test_a_dataset_folder_that_is_not_there(training: Called, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "memobench generate" in refused(["train", "policy=act", "dataset=nothing"], training, capsys)
+
+
+def test_no_gl_library(evaluation: Called, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setattr("ctypes.util.find_library", lambda name: None)
+    assert "libegl1" in refused(["eval", "env=memobench"], evaluation, capsys)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda folder: (folder / "stats.safetensors").unlink(), "lacks its normalisation statistics"),
+        (lambda folder: (folder / "stats.safetensors").write_bytes(b"x"), "cannot be read"),
+        (lambda folder: (folder / "policy_preprocessor.json").unlink(), "policy_preprocessor.json is missing"),
+        (lambda folder: (folder / "policy_preprocessor.json").write_text("{"), "is not JSON"),
+        (lambda folder: (folder / "model.safetensors").unlink(), "holds no weights"),
+        (lambda folder: (folder / "config.json").write_text("{}"), "names no policy type"),
+    ],
+)
+def test_a_checkpoint_that_is_not_whole(
+    evaluation: Called, capsys: pytest.CaptureFixture[str], spoil: Callable[[Path], Any], message: str
+) -> None:
+    spoil(checkpoint(Path("run")))
+    assert message in refused(["eval", "env=memobench", "policy=run"], evaluation, capsys)
+
+
+def test_a_checkpoint_without_statistics(evaluation: Called, capsys: pytest.CaptureFixture[str]) -> None:
+    checkpoint(Path("run"), statistics=("action.mean",))
+    assert "statistics for observation.state" in refused(["eval", "env=memobench", "policy=run"], evaluation, capsys)
+
+
+def test_no_environment_and_no_policy(evaluation: Called, training: Called, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "env=memobench" in refused(["eval", "policy=act"], evaluation, capsys)
+    assert "policy=memobench_mem" in refused(["train"], training, capsys)
+
+
+def test_an_output_that_is_a_file(evaluation: Called, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("out").write_text("")
+    assert "is a file" in refused(["eval", "env=memobench", "output_dir=out"], evaluation, capsys)
+
+
+# --- failures inside LeRobot ---
+
+
+def test_an_error_from_inside_is_one_sentence_and_leaves_no_empty_folder(
+    evaluation: Called, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(flags: list[str]) -> None:
+        (Path(flag_value(flags, "output_dir") or "") / "videos").mkdir(parents=True)
+        try:
+            raise MemobenchError("the scene\nis wrong")
+        except MemobenchError as error:
+            raise RuntimeError("worker died") from error
+
+    evaluation.action = fail
+    assert main(["eval", "env=memobench", "output_dir=out"]) == 2
+    assert capsys.readouterr().err == "lerobot: the scene is wrong\n"
+    assert not Path("out").exists()
+
+
+def test_finished_episodes_of_a_failed_run_stay(evaluation: Called, capsys: pytest.CaptureFixture[str]) -> None:
+    def fail(flags: list[str]) -> None:
+        log_episodes(flags, count=1)
+        raise MemobenchError("enough")
+
+    evaluation.action = fail
+    assert main(["eval", "env=memobench", "output_dir=out"]) == 2
+    assert "memobench report out" in capsys.readouterr().err
+    assert list(Path("out/episodes").iterdir())
+
+
+def test_other_errors_keep_their_traceback(evaluation: Called) -> None:
+    def fail(flags: list[str]) -> None:
+        raise ZeroDivisionError
+
+    evaluation.action = fail
+    with pytest.raises(ZeroDivisionError):
+        main(["eval", "env=memobench"])
+
+
+@pytest.mark.parametrize(("code", "status"), [(None, 0), (0, 0), (3, 3), ("no", 1)])
+def test_lerobots_exit_status_is_passed_on(training: Called, code: Any, status: int) -> None:
+    training.action = lambda flags: sys.exit(code)
+    assert main(["train", "policy=act"]) == status
+
+
+# --- the installed program ---
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["eval", "env=memobench", "tasks=stove"], "found 'stove' among the tasks"),
+        (["evaluate"], "did you mean 'eval'"),
+        pytest.param(
+            ["train", "policy=memobench_mem", "aling=semantic"], "did you mean 'align'", marks=pytest.mark.slow
+        ),
+    ],
+)
+def test_the_program_itself(tmp_path: Path, words: list[str], message: str) -> None:
+    program = Path(sys.executable).with_name("lerobot")
+    done = subprocess.run([program, *words], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert not list(tmp_path.iterdir())
