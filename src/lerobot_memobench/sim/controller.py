@@ -15,10 +15,15 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dposv
 
 from lerobot_memobench.sim import robot
 
 Array = NDArray[np.float64]
+
+
+_CLOSING = np.array([-1.0, 1.0])
+"""Sign of the fingers' commands that closes them."""
 
 
 @dataclass(frozen=True)
@@ -67,9 +72,9 @@ class OSCController:
         nv = model.nv
         self._jac = np.zeros((6, nv))
         self._mass = np.zeros((nv, nv))
-        self.goal_position = np.zeros(3)
+        self.goal_position: Array = np.zeros(3)
         self.goal_rotation = np.eye(3)
-        self.gripper = np.zeros(2)
+        self.gripper: Array = np.zeros(2)
 
     def reset(self, data: mujoco.MjData) -> None:
         """Hold the present pose, gripper command at mid-range."""
@@ -105,42 +110,52 @@ class OSCController:
         force = self._kp * (self.goal_position - data.site_xpos[self._site]) - self._kd * twist[:3]
         torque = self._kp * orientation_error(self.goal_rotation, present) - self._kd * twist[3:]
 
-        mass_inverse_jt = np.linalg.solve(mass, jacobian.T)
+        # All three systems are symmetric and positive definite. LAPACK is called directly: at these sizes numpy's
+        # checks around it cost five times the solution.
+        mass_inverse_jt = dposv(mass, jacobian.T)[1]
         inertia_inverse = jacobian @ mass_inverse_jt
-        wrench = np.concatenate(
-            [
-                np.linalg.solve(inertia_inverse[:3, :3], force),
-                np.linalg.solve(inertia_inverse[3:, 3:], torque),
-            ]
-        )
-        posture = mass @ (
-            self.config.nullspace_kp * (self._home - data.qpos[self._qposs]) - self._null_kd * velocity
-        )
+        wrench = np.concatenate([dposv(inertia_inverse[:3, :3], force)[1], dposv(inertia_inverse[3:, 3:], torque)[1]])
+        posture = mass @ (self.config.nullspace_kp * (self._home - data.qpos[self._qposs]) - self._null_kd * velocity)
         # Nullspace: (I − Jᵀ Λ J M⁻¹) posture, with Λ the full task-space inertia.
-        posture = posture - jacobian.T @ np.linalg.solve(inertia_inverse, mass_inverse_jt.T @ posture)
+        wrench -= dposv(inertia_inverse, mass_inverse_jt.T @ posture)[1]
         return jacobian.T @ wrench + data.qfrc_bias[dofs] + posture
 
     def apply(self, data: mujoco.MjData, gripper_action: float) -> None:
         """Write the controls for one physics step into ``data.ctrl``."""
-        data.ctrl[self._arm] = np.clip(self.torques(data), self._torque_limits[0], self._torque_limits[1])
-        direction = np.array([-1.0, 1.0]) * np.sign(gripper_action)
-        self.gripper = np.clip(self.gripper + self.config.gripper_speed * direction, -1.0, 1.0)
+        low, high = self._torque_limits
+        data.ctrl[self._arm] = np.minimum(np.maximum(self.torques(data), low), high)
+        moved = self.gripper + _CLOSING * (self.config.gripper_speed * np.sign(gripper_action))
+        self.gripper = np.minimum(np.maximum(moved, -1.0), 1.0)
         data.ctrl[self._fingers] = self._finger_bias + self._finger_scale * self.gripper
 
 
 def orientation_error(desired: Array, present: Array) -> Array:
     """Return half the summed cross products of the frames' axes, (3,): robosuite's small-angle rotation error."""
     product = desired @ present.T
-    return 0.5 * np.array(
-        [product[2, 1] - product[1, 2], product[0, 2] - product[2, 0], product[1, 0] - product[0, 1]]
-    )
+    return 0.5 * np.array([product[2, 1] - product[1, 2], product[0, 2] - product[2, 0], product[1, 0] - product[0, 1]])
 
 
 def rotation_matrix(rotation_vector: Array) -> Array:
-    """Return the rotation (3, 3) about a vector by its length, rad (Rodrigues)."""
+    """Return the rotation (3, 3) about a vector by its length, rad.
+
+    By way of a quaternion in single precision, as robosuite's: in double precision the torques would part from its
+    controller's in the sixth digit.
+    """
     angle = float(np.linalg.norm(rotation_vector))
-    if angle < 1e-12:
+    if angle < 1e-9:
         return np.eye(3)
-    x, y, z = rotation_vector / angle
-    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle) * skew + (1 - np.cos(angle)) * (skew @ skew)
+    vector = np.sin(angle / 2) / angle * np.asarray(rotation_vector)
+    quaternion = np.array([np.cos(angle / 2), *vector], dtype=np.float32)
+    scale = np.sqrt(2.0 / float(quaternion @ quaternion))
+    quaternion = (quaternion.astype(np.float64) * scale).astype(np.float32)
+    # Twice the products of the quaternion's parts; only the diagonal's sums are in double precision.
+    p = np.outer(quaternion, quaternion)
+    d = p.diagonal().astype(np.float64)
+    return np.array(
+        [
+            [1 - d[2] - d[3], p[1, 2] - p[0, 3], p[1, 3] + p[0, 2]],
+            [p[1, 2] + p[0, 3], 1 - d[1] - d[3], p[2, 3] - p[0, 1]],
+            [p[1, 3] - p[0, 2], p[2, 3] + p[0, 1], 1 - d[1] - d[2]],
+        ],
+        dtype=np.float64,
+    )

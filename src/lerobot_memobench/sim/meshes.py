@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import fast_simplification
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,6 +21,8 @@ def read_mesh(path: Path) -> tuple[Vertices, Faces]:
     Raises:
         MemobenchError: for any other kind of file.
     """
+    corners: NDArray[np.float64]
+    faces: NDArray[np.integer]
     suffix = path.suffix.lower()
     if suffix == ".stl":
         raw = path.read_bytes()
@@ -67,7 +68,7 @@ def simplify(vertices: Vertices, faces: Faces, target: int) -> tuple[Vertices, F
     vertices, faces = weld(vertices, faces, side / 6)
     if len(faces) <= target:
         return vertices, faces
-    points, triangles = fast_simplification.simplify(
-        vertices.astype(np.float32), faces, target_count=target, agg=5
-    )
+    import fast_simplification  # only the first scene on a machine needs it
+
+    points, triangles = fast_simplification.simplify(vertices.astype(np.float32), faces, target_count=target, agg=5)
     return points.astype(np.float64), triangles.astype(np.int32)

@@ -69,7 +69,8 @@ class Placer:
         missing = [name for name in assets if name not in self._places]
         if missing:
             raise MemobenchError(
-                f"task {task.name} does not say where {missing[0]!r} starts: add (On {missing[0]} <region>) to its :init"
+                f"task {task.name} does not say where {missing[0]!r} starts: add (On {missing[0]} <region>) to "
+                "its :init"
             )
         self._order = self._sorted()
 
@@ -126,8 +127,8 @@ class Placer:
                 return placement
             pair = overlap
         raise MemobenchError(
-            f"task {self._task.name}: {pair[0]} and {pair[1]} overlapped in each of {ATTEMPTS} draws of the initial state; "
-            "move their regions apart"
+            f"task {self._task.name}: {pair[0]} and {pair[1]} overlapped in each of {ATTEMPTS} draws of the initial "
+            "state; move their regions apart"
         )
 
     def _draw_once(self, rng: np.random.Generator) -> Placement:

@@ -1,9 +1,11 @@
-"""Offscreen rendering: one GL context and one upload of meshes and textures per scene and process."""
+"""Offscreen rendering: qualities, GL backends, and one context per thread that all its renderers share."""
 
 from __future__ import annotations
 
+import atexit
 import ctypes.util
 import os
+import threading
 from collections import OrderedDict
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.sim.drawlist import build_draw_list
+from lerobot_memobench.sim.rasterizer import Rasterizer
 
 Image = NDArray[np.uint8]
 
@@ -21,11 +25,28 @@ BACKENDS = {"egl": "EGL", "osmesa": "OSMesa"}
 
 
 @dataclass(frozen=True)
-class RenderSettings:
-    """What a frame costs and shows.
+class Quality:
+    """What a frame is drawn with.
 
-    ``fast`` leaves out shadows, ``default`` has them, ``high`` adds 4× multisampling.
+    ``samples``: samples per pixel; 0 is one, without multisampling. ``shadow_map``: its side in pixels; 0 leaves
+    shadows out.
     """
+
+    samples: int
+    shadow_map: int
+
+
+QUALITIES = {"fast": Quality(0, 0), "default": Quality(0, 1024), "high": Quality(4, 2048)}
+"""Meshes, textures and light are the same in all: ``fast`` leaves out shadows, ``high`` smooths edges and sharpens
+shadows. In software `fast` costs about 0.6 of `default` and `high` three times as much."""
+
+ROOM = ("room", "kitchen_table")
+"""Bodies that cast no shadow: what theirs would fall on is under or behind them."""
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """Size and quality of frames; see `QUALITIES`."""
 
     height: int = 256
     width: int = 256
@@ -33,14 +54,9 @@ class RenderSettings:
 
     def __post_init__(self) -> None:
         if self.quality not in QUALITIES:
-            raise MemobenchError(
-                f"render quality {self.quality!r} is unknown; {nearest(self.quality, QUALITIES)}"
-            )
-
-
-QUALITIES = {"fast": (0, False), "default": (0, True), "high": (4, True)}
-"""Per quality: MSAA samples and shadows."""
-SHADOW_MAP = 1024
+            raise MemobenchError(f"render quality {self.quality!r} is unknown; {nearest(self.quality, QUALITIES)}")
+        if self.height < 1 or self.width < 1:
+            raise MemobenchError(f"frames of {self.height}×{self.width} pixels cannot be drawn; both must be 1 or more")
 
 
 def gl_backend() -> str:
@@ -50,7 +66,12 @@ def gl_backend() -> str:
         MemobenchError: when no usable library is there.
     """
     wanted = os.environ.get("MUJOCO_GL", "").lower()
-    if wanted in ("glfw",):
+    if wanted == "glfw":
+        if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+            raise MemobenchError(
+                "MUJOCO_GL is 'glfw', which needs a display, and neither DISPLAY nor WAYLAND_DISPLAY is set; "
+                "set MUJOCO_GL to egl or osmesa"
+            )
         return wanted
     if wanted and wanted not in BACKENDS:
         raise MemobenchError(f"MUJOCO_GL is {wanted!r}; for rendering without a display set it to egl or osmesa")
@@ -74,11 +95,14 @@ def _gl_context(width: int, height: int) -> Any:
             from mujoco.osmesa import GLContext
         else:
             from mujoco.glfw import GLContext
-        return GLContext(width, height)
+        context = GLContext(width, height)
+        context.make_current()
+        return context
     except Exception as error:  # each backend fails in its own way: missing driver, no device, no display
         other = "osmesa" if backend == "egl" else "egl"
         raise MemobenchError(
-            f"the GL backend {backend!r} could not open a context ({error}); try MUJOCO_GL={other}, and see `memobench doctor`"
+            f"the GL backend {backend!r} could not open a context ({error}); try MUJOCO_GL={other}, and see "
+            "`memobench doctor`"
         ) from error
 
 
@@ -91,33 +115,21 @@ class Highlight:
     rgba: tuple[float, float, float, float] = (1.0, 0.85, 0.1, 0.55)
 
 
+_DISC_HALF_HEIGHT = 0.001
+
+
 class Renderer:
-    """Draw any simulation of one scene.
+    """Draw any simulation of one scene, in the thread that made this.
 
     Simulations of the same scene share it: meshes and textures are the scene's, poses come with each frame's data.
     """
 
     def __init__(self, model: mujoco.MjModel, settings: RenderSettings) -> None:
-        samples, shadows = QUALITIES[settings.quality]
-        model.vis.quality.offsamples = samples
-        model.vis.quality.shadowsize = SHADOW_MAP
-        model.vis.global_.offwidth, model.vis.global_.offheight = settings.width, settings.height
-        self._settings = settings
-        self._gl = _gl_context(settings.width, settings.height)
-        self._gl.make_current()
-        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
-        self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + 64)
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
-        self._option = mujoco.MjvOption()
-        self._option.geomgroup[:] = 0
-        self._option.geomgroup[1] = 1  # visual geoms only
-        self._option.sitegroup[:] = 0
-        self._camera = mujoco.MjvCamera()
-        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._perturb = mujoco.MjvPerturb()
-        self._viewport = mujoco.MjrRect(0, 0, settings.width, settings.height)
+        quality = QUALITIES[settings.quality]
+        self._context = _thread.current()
+        self._rasterizer: Rasterizer | None = Rasterizer(
+            model, build_draw_list(model, ROOM), settings.width, settings.height, quality.samples, quality.shadow_map
+        )
 
     def render(
         self,
@@ -127,46 +139,86 @@ class Renderer:
         highlights: tuple[Highlight, ...] = (),
     ) -> Image:
         """Return the frame of a named camera, (height, width, 3) uint8, upright."""
-        self._camera.fixedcamid = model.camera(camera).id
-        self._gl.make_current()
-        mujoco.mjv_updateScene(
-            model, data, self._option, self._perturb, self._camera, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene
-        )
-        for highlight in highlights:
-            geom = self._scene.geoms[self._scene.ngeom]
-            mujoco.mjv_initGeom(
-                geom,
-                mujoco.mjtGeom.mjGEOM_CYLINDER.value,
-                np.array([highlight.radius, highlight.radius, 0.001]),
-                np.array(highlight.position),
-                np.eye(3).ravel(),
-                np.array(highlight.rgba, dtype=np.float32),
-            )
-            self._scene.ngeom += 1
-        image = np.empty((self._settings.height, self._settings.width, 3), dtype=np.uint8)
-        mujoco.mjr_render(self._viewport, self._scene, self._context)
-        mujoco.mjr_readPixels(image, None, self._viewport, self._context)
-        return image[::-1].copy()
+        if self._rasterizer is None:
+            raise MemobenchError("this renderer was closed; make another one")
+        self._context.make_current()
+        discs = [(np.array(h.position), h.radius, _DISC_HALF_HEIGHT, h.rgba) for h in highlights]
+        return self._rasterizer.draw(model, data, model.camera(camera).id, discs)
 
     def close(self) -> None:
-        """Free the GL context; safe to call twice."""
-        if self._gl is not None:
-            self._gl.make_current()
-            self._context.free()
-            self._gl.free()
-            self._gl = None
+        """Free what this holds on the GPU; safe to call twice."""
+        if self._rasterizer is not None:
+            self._context.make_current()
+            self._rasterizer.free()
+            self._rasterizer = None
 
 
-_renderers: OrderedDict[tuple[Any, RenderSettings], Renderer] = OrderedDict()
-CACHED_RENDERERS = 2
+CACHED_RENDERERS = 4
+"""Renderers kept per thread: each holds its scene's textures, some 20 MB."""
+
+
+class _Thread(threading.local):
+    """The GL context of a thread, and the renderers that live in it; a context serves one thread at a time."""
+
+    def __init__(self) -> None:
+        self.context: Any = None
+        self.renderers: OrderedDict[tuple[Any, RenderSettings], Renderer] = OrderedDict()
+
+    def current(self) -> Any:
+        """Return this thread's context, opened at the first call and made current.
+
+        Raises:
+            MemobenchError: no context can be opened, or the process was forked from one that had drawn.
+        """
+        global _drawing_process
+        if _drawing_process not in (None, os.getpid()):
+            # A fork copies neither the driver's threads nor its locks: the first frame would never come.
+            raise MemobenchError(
+                "this process was forked from one that had already rendered, which GL drivers do not survive; start "
+                "workers with the spawn or forkserver method, or render in the workers only"
+            )
+        _drawing_process = os.getpid()
+        if self.context is None:
+            self.context = _gl_context(64, 64)  # frames are drawn into framebuffers of their own size
+            # Registered after MuJoCo's backend has registered its own closing, and so called before it.
+            atexit.unregister(close_renderers)
+            atexit.register(close_renderers)
+        else:
+            self.context.make_current()
+        return self.context
+
+    def close(self) -> None:
+        """Free renderers and context."""
+        if _drawing_process != os.getpid():
+            return
+        while self.renderers:
+            self.renderers.popitem()[1].close()
+        if self.context is not None:
+            self.context.free()
+            self.context = None
+
+
+_drawing_process: int | None = None
+"""Id of the process that opened a context, here or before a fork."""
+_thread = _Thread()
 
 
 def get_renderer(key: Any, model: mujoco.MjModel, settings: RenderSettings) -> Renderer:
-    """Return this process's renderer for a scene, opened at its first frame."""
+    """Return this thread's renderer for a scene, opened at its first frame."""
+    _thread.current()
+    renderers = _thread.renderers
     full = (key, settings)
-    if full not in _renderers:
-        while len(_renderers) >= CACHED_RENDERERS:
-            _renderers.popitem(last=False)[1].close()
-        _renderers[full] = Renderer(model, settings)
-    _renderers.move_to_end(full)
-    return _renderers[full]
+    if full not in renderers:
+        while len(renderers) >= CACHED_RENDERERS:
+            renderers.popitem(last=False)[1].close()
+        renderers[full] = Renderer(model, settings)
+    renderers.move_to_end(full)
+    return renderers[full]
+
+
+def close_renderers() -> None:
+    """Free the calling thread's renderers and GL context; the next frame opens them anew.
+
+    A thread that has drawn calls this before it ends; for the main thread it happens at exit.
+    """
+    _thread.close()

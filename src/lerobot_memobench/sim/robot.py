@@ -39,8 +39,11 @@ GRIP_SITE = "gripper0_grip_site"
 HAND_BODY = "robot0_right_hand"
 WRIST_CAMERA = "robot0_eye_in_hand"
 
-FACES_PER_SQUARE_METRE, LEAST_FACES, MOST_FACES = 12_000, 100, 1_200
-"""Density at which a visual mesh is drawn (a link of the arm has about 0.1 m²) and what one may have at least and at most."""
+FACES_PER_SQUARE_METRE, LEAST_FACES, MOST_FACES = 6_000, 24, 700
+"""Density at which a visual mesh is drawn (a link of the arm has about 0.1 m²), and what one may have at least and at
+most."""
+HAND_FACES = 4
+"""How much denser the gripper is drawn: the wrist camera sees it from near."""
 
 
 def _robosuite_xml() -> str:
@@ -73,7 +76,8 @@ def _build() -> dict[str, np.ndarray]:
         if name not in drawn or not ("vis" in name or "pedestal" in name):
             continue
         vertices, faces = read_mesh(Path(file))
-        target = max(LEAST_FACES, min(MOST_FACES, int(FACES_PER_SQUARE_METRE * area(vertices, faces))))
+        density = FACES_PER_SQUARE_METRE * (HAND_FACES if name.startswith("gripper0") else 1)
+        target = max(LEAST_FACES, min(MOST_FACES, int(density * area(vertices, faces))))
         vertices, faces = simplify(vertices, faces, target)
         arrays[f"v:{name}"], arrays[f"f:{name}"] = vertices, faces
     return arrays

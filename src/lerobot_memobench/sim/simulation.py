@@ -68,9 +68,7 @@ class Simulation:
         self._arm_qpos = [int(self.model.joint(name).qposadr[0]) for name in robot.ARM_JOINTS]
         self._finger_qpos = [int(self.model.joint(name).qposadr[0]) for name in robot.FINGER_JOINTS]
         self._full = mujoco.mjtState.mjSTATE_INTEGRATION.value
-        self._glow = [
-            (asset, self.model.geom(geom).id) for asset in scene.assets.values() for geom in asset.glow
-        ]
+        self._glow = [(asset, self.model.geom(geom).id) for asset in scene.assets.values() for geom in asset.glow]
 
     # --- life -----------------------------------------------------------------------------------------------
 
@@ -112,8 +110,10 @@ class Simulation:
         if action.shape != (ACTION_DIM,):
             raise MemobenchError(f"an action has shape {action.shape}; expected ({ACTION_DIM},)")
         if not np.isfinite(action).all():
-            raise MemobenchError(f"an action holds a value that is not finite: {action.tolist()}; check the policy's output")
-        self._controller.set_goal(self.data, action)
+            raise MemobenchError(
+                f"an action holds a value that is not finite: {action.tolist()}; check the policy's output"
+            )
+        self._controller.set_goal(self.data, action.astype(np.float64, copy=False))
         for _ in range(SUBSTEPS):
             self._controller.apply(self.data, float(action[6]))
             mujoco.mj_step2(self.model, self.data)

@@ -63,7 +63,9 @@ class World:
                 return self._on_object(a, b) if b in self._instances else self._on_site(a, b)
             case "open" | "close" | "turnon" | "turnoff":
                 return self._articulated(atom.predicate, atom.args[0])
-        raise MemobenchError(f"the simulator cannot answer {atom.predicate!r}: it knows in, on, open, close, turnon, turnoff")
+        raise MemobenchError(
+            f"the simulator cannot answer {atom.predicate!r}: it knows in, on, open, close, turnon, turnoff"
+        )
 
     def touching(self, a: str, b: str) -> bool:
         """Return whether two instances (or an instance and the table) are in contact."""
@@ -109,9 +111,7 @@ class World:
         site = self._site(region)
         local = self._data.site_xmat[site].reshape(3, 3).T @ (self._data.body(a).xpos - self._data.site_xpos[site])
         half = self._model.site_size[site]
-        return bool(
-            np.all(np.abs(local[:2]) < half[:2]) and -half[2] - IN_SLACK < local[2] < half[2]
-        )
+        return bool(np.all(np.abs(local[:2]) < half[:2]) and -half[2] - IN_SLACK < local[2] < half[2])
 
     def _on_object(self, a: str, b: str) -> bool:
         self._index(a)
@@ -125,18 +125,16 @@ class World:
         position = self._data.body(a).xpos
         declared = self._task.regions.get(region)
         if declared is not None and declared.target == "kitchen_table":
-            inside = any(
-                x1 <= position[0] <= x2 and y1 <= position[1] <= y2 for x1, y1, x2, y2 in declared.ranges
-            )
+            inside = any(x1 <= position[0] <= x2 and y1 <= position[1] <= y2 for x1, y1, x2, y2 in declared.ranges)
             height = position[2] - TABLE_TOP
             return inside and -ON_SITE_BELOW < height < ON_SITE_ABOVE and self.touching(a, "kitchen_table")
         site = self._site(region)
         local = self._data.site_xmat[site].reshape(3, 3).T @ (position - self._data.site_xpos[site])
         half = self._model.site_size[site]
         height = local[2] - half[2]
-        return bool(
-            np.all(np.abs(local[:2]) < half[:2]) and -ON_SITE_BELOW < height < ON_SITE_ABOVE
-        ) and self.touching(a, self._parent(region))
+        return bool(np.all(np.abs(local[:2]) < half[:2]) and -ON_SITE_BELOW < height < ON_SITE_ABOVE) and self.touching(
+            a, self._parent(region)
+        )
 
     def _site(self, region: str) -> int:
         site = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_SITE, region)

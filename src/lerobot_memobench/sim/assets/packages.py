@@ -22,15 +22,16 @@ def _package(
     mass: float,
     shape: Callable[[Half], MeshData] = box,
     gloss: float = 0.25,
+    widest: float = 0.066,
 ) -> Asset:
-    """Build a box with a texture; it is held across every horizontal side that fits the gripper."""
+    """Build a box with a texture; it is held across every horizontal side of up to ``widest``, m."""
     b.visual_mesh(b.mesh(key, lambda: shape(half)), b.material(key, texture, specular=gloss, shininess=0.4))
     b.collision("box", half, mass, friction=GRIP_FRICTION)
     x, y, z = half
     # A finger reaches about 4 cm below the palm, and should not touch the table.
     at = max(0.0, z - 0.032)
     for yaw, width in sorted(((0.0, 2 * x), (HALF_PI, 2 * y)), key=lambda pair: pair[1]):
-        if width <= 0.066:
+        if width <= widest:
             b.grasp((0, 0, at), yaw, width, depth=min(0.03, at + z - 0.004))
     return b.object((-x, -y, -z), half)
 
@@ -63,7 +64,8 @@ def _butter_texture() -> Pixels:
 
 
 def _butter(b: Builder) -> Asset:
-    return _package(b, "butter", (0.0385, 0.0200, 0.0090), _butter_texture, 0.06)
+    # A little shorter than the published one, so that it can be taken by its ends where others lie close beside it.
+    return _package(b, "butter", (0.0358, 0.0195, 0.0090), _butter_texture, 0.06, widest=0.073)
 
 
 # Milk ------------------------------------------------------------------------------------------

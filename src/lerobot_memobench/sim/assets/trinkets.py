@@ -65,6 +65,8 @@ def _charger(b: Builder) -> Asset:
     b.collision("box", _CHARGER, 0.06, friction=GRIP_FRICTION)
     b.collision("box", (0.0085, 0.0087, 0.0035), 0.004, (-x - 0.0085, 0, 0))
     b.grasp((0, 0, 0), HALF_PI, 2 * y, depth=0.012)
+    # Lengthwise, by the prongs' ends and the port's side: for a hand that must not close towards a drawer.
+    b.grasp((-0.0085, 0, 0), 0.0, 2 * x + 0.017, depth=0.012)
     return b.object((-x - 0.017, -y, -z), (x + 0.0235, y + 0.0125, z))
 
 

@@ -1,0 +1,143 @@
+"""How fast demonstrations become a LeRobotDataset, beside LeRobot's own recording loop on the same frames.
+
+    python benchmarks/dataset_writing.py [--episodes 2] [--repeats 3]
+
+Episodes of the benchmark are recorded once, with images. Three ways to a dataset are timed, each in turn with
+LeRobot's plain loop (``create``, ``add_frame`` per frame, ``save_episode``, ``finalize``; its default encoder):
+
+- ``write``: from memory, this package's staging and assembly;
+- ``convert``: from an HDF5 file in the published layout, proprioception and checks included; the loop reads its frames
+  from the same file;
+- ``generate``: the scripted expert, the simulator and the renderer as well; the loop's time is added to that of
+  recording the same episodes.
+
+Prints one JSON line: the ratios of the best times (above 1: faster than the loop), and for both the image quality
+(PSNR of decoded frames against rendered ones, dB) and the video bytes per frame.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import av
+import numpy as np
+
+from lerobot_memobench.datasets.convert import convert
+from lerobot_memobench.datasets.demonstration import CAMERAS, FPS, Demonstration, labels
+from lerobot_memobench.datasets.generation import FIRST_SEED, generate, record_demonstration
+from lerobot_memobench.datasets.hdf5 import PublishedFile, write_task_file
+from lerobot_memobench.datasets.lerobot_format import dataset_features, image_key, write_dataset
+from lerobot_memobench.datasets.staging import stage_demonstration
+from lerobot_memobench.tasks import get_task
+
+TASK = "turn_on_the_stove_and_turn_it_off"
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--episodes", type=int, default=2)
+    parser.add_argument("--repeats", type=int, default=3)
+    asked = parser.parse_args()
+    import lerobot.datasets  # noqa: F401  (its import is nobody's time)
+
+    task = get_task(TASK)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        record_demonstration(task, FIRST_SEED, images=True)  # compiles the scene and opens the renderer
+        started = time.perf_counter()
+        demos = [record_demonstration(task, FIRST_SEED + i, images=True) for i in range(asked.episodes)]
+        recording = time.perf_counter() - started
+        staged = [stage_demonstration(demo, folder / "staged" / f"{i}", ("hdf5",)) for i, demo in enumerate(demos)]
+        source = folder / "task.hdf5"
+        write_task_file(source, staged[0].hdf5_attributes or {}, [episode.hdf5 for episode in staged])
+
+        def loop_from_file(out: Path) -> None:
+            with PublishedFile(source) as file:
+                plain_loop(((demo, file.images(f"demo_{i}")) for i, demo in enumerate(demos)), out)
+
+        ways: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any], float]] = {
+            "write": (
+                lambda out: write_dataset(demos, out),
+                lambda out: plain_loop(((demo, frames(demo)) for demo in demos), out),
+                0.0,
+            ),
+            "convert": (lambda out: convert(source, out), loop_from_file, 0.0),
+            "generate": (
+                lambda out: generate([task], asked.episodes, out),
+                lambda out: plain_loop(((demo, frames(demo)) for demo in demos), out),
+                recording,
+            ),
+        }
+        result: dict[str, Any] = {"benchmark": "dataset_writing", "frames": sum(map(len, demos))}
+        for way, (ours, theirs, added) in ways.items():
+            best = {"ours": np.inf, "lerobot": np.inf}
+            for _ in range(asked.repeats):
+                for side, run in (("ours", ours), ("lerobot", theirs)):
+                    shutil.rmtree(folder / side, ignore_errors=True)
+                    started = time.perf_counter()
+                    run(folder / side)
+                    best[side] = min(best[side], time.perf_counter() - started)
+            best["lerobot"] += added
+            result[way] = {"ratio": round(best["lerobot"] / best["ours"], 2)}
+            result[way] |= {f"{side}_s": round(seconds, 3) for side, seconds in best.items()}
+        for side in ("ours", "lerobot"):
+            result[side] = quality(folder / side, demos)
+        result["ratio"] = min(result[way]["ratio"] for way in ways)
+    print(json.dumps(result))
+
+
+def frames(demo: Demonstration) -> Iterator[dict[str, np.ndarray]]:
+    """Yield both cameras' frames."""
+    assert demo.images is not None
+    for t in range(len(demo)):
+        yield {camera: demo.images[camera][t] for camera in CAMERAS}
+
+
+def plain_loop(episodes: Iterable[tuple[Demonstration, Iterable[dict[str, np.ndarray]]]], out: Path) -> None:
+    """Write the same columns with LeRobot's own recording loop (which cannot write language rows)."""
+    from lerobot.datasets import LeRobotDataset
+
+    features = {key: value for key, value in dataset_features((256, 256)).items() if key != "language_persistent"}
+    dataset = LeRobotDataset.create("local/plain", fps=FPS, features=features, root=out, use_videos=True)
+    for demo, pictures in episodes:
+        columns = {"observation.state": demo.proprio, "action": demo.actions, **labels(demo).columns()}
+        for t, images in enumerate(pictures):
+            frame: dict[str, Any] = {image_key(camera): image for camera, image in images.items()}
+            for key, column in columns.items():
+                value = column[t]
+                frame[key] = value if isinstance(value, str) or np.ndim(value) else np.array([value])
+            dataset.add_frame(frame | {"task": demo.task.language})
+        dataset.save_episode()
+    dataset.finalize()
+
+
+def quality(folder: Path, demos: list[Demonstration]) -> dict[str, Any]:
+    """Return PSNR per camera, dB, and the video bytes per frame of both cameras together."""
+    found: dict[str, Any] = {}
+    for camera in CAMERAS:
+        shown = np.concatenate([(demo.images or {})[camera] for demo in demos])
+        errors = []
+        for path in sorted((folder / "videos" / image_key(camera)).rglob("*.mp4")):
+            with av.open(str(path)) as container:
+                for picture in container.decode(video=0):
+                    seen = picture.to_ndarray(format="rgb24").astype(np.float32)
+                    errors.append(float(((seen - shown[len(errors)]) ** 2).mean()))
+        assert len(errors) == len(shown), (len(errors), len(shown))
+        found[f"psnr_{camera}"] = round(10 * np.log10(255**2 / float(np.mean(errors))), 2)
+    size = sum(path.stat().st_size for path in (folder / "videos").rglob("*.mp4"))
+    return found | {"video_bytes_per_frame": round(size / sum(map(len, demos)))}
+
+
+if __name__ == "__main__":
+    main()

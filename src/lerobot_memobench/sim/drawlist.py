@@ -1,0 +1,265 @@
+"""What a camera can see of a model, as one list of triangles.
+
+MuJoCo draws geom by geom, each with its own state changes, and a shadow makes it draw everything three times. Here
+all visual geoms of a scene become one vertex array; where each stands and what it is made of is a small table that
+is sent anew for every frame. A frame is then three draw calls, whatever the number of geoms.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.errors import MemobenchError
+
+VISUAL_GROUP = 1
+"""Geoms of this group are seen; the others are for contacts."""
+LAYER_SIZE = 512
+"""Side to which textures are brought, pixels: the largest of the project's own."""
+ROUND = 32
+"""Sides of cylinders and spheres."""
+ROWS = 5
+"""Texels per geom in the table: three rows of the pose, colour, material."""
+
+_DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], dtype=np.float32)
+"""A geom of this colour shows its material's, as in MuJoCo."""
+
+VERTEX = np.dtype([("position", "<f4", 3), ("normal", "<f4", 3), ("uv", "<f4", 2), ("geom", "<f4")])
+
+Floats = NDArray[np.float32]
+Triangles = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating], NDArray[np.integer]]
+"""Positions (N, 3), normals (N, 3), texture coordinates (N, 2), triangles (M, 3)."""
+
+
+@dataclass(frozen=True)
+class DrawList:
+    """The triangles of a scene.
+
+    ``vertices``: structured array of `VERTEX`, in the frames of their geoms. ``indices``: three per triangle.
+    ``geoms``: model ids of the rows of the table. ``casting``: how many of the indices, from the first on, belong to
+    geoms that cast shadows. ``layers``: (L, LAYER_SIZE, LAYER_SIZE, 3) textures, the first one white.
+    """
+
+    vertices: NDArray[np.void]
+    indices: NDArray[np.uint32]
+    geoms: NDArray[np.int64]
+    casting: int
+    layers: NDArray[np.uint8]
+    materials: Floats
+
+    def table(self, model: mujoco.MjModel, data: mujoco.MjData) -> Floats:
+        """Return poses, colours and materials of the present state, (geoms, ROWS, 4)."""
+        table = np.empty((len(self.geoms), ROWS, 4), dtype=np.float32)
+        table[:, :3, :3] = data.geom_xmat[self.geoms].reshape(-1, 3, 3)
+        table[:, :3, 3] = data.geom_xpos[self.geoms]
+        table[:, 3] = colours(model, self.geoms)
+        table[:, 4] = self.materials
+        return table
+
+
+def build_draw_list(model: mujoco.MjModel, shadowless: tuple[str, ...] = ()) -> DrawList:
+    """Collect the visual geoms of a model.
+
+    Args:
+        model: a compiled scene.
+        shadowless: bodies that cast no shadow: drawn last, since they fill what the others leave free.
+
+    Raises:
+        MemobenchError: for a visual geom of a shape that is not drawn here.
+    """
+    bodies = {model.body(name).id for name in shadowless if _has_body(model, name)}
+    visual = [geom for geom in range(model.ngeom) if model.geom_group[geom] == VISUAL_GROUP]
+    background = [geom for geom in visual if int(model.geom_bodyid[geom]) in bodies]
+    casters = [geom for geom in visual if int(model.geom_bodyid[geom]) not in bodies]
+    # The table hides much of floor and walls, which were added before it.
+    order = casters + background[::-1]
+    parts, indices, start, casting = [], [], 0, 0
+    for row, geom in enumerate(order):
+        positions, normals, uv, triangles = _triangles(model, geom)
+        part = np.zeros(len(positions), dtype=VERTEX)
+        part["position"], part["normal"], part["uv"], part["geom"] = positions, normals, uv, row
+        parts.append(part)
+        indices.append((triangles + start).astype(np.uint32).ravel())
+        start += len(part)
+        casting += indices[-1].size if row < len(casters) else 0
+    layers, layer_of = _layers(model)
+    geoms = np.array(order, dtype=np.int64)
+    return DrawList(
+        np.concatenate(parts) if parts else np.zeros(0, VERTEX),
+        np.concatenate(indices) if indices else np.zeros(0, np.uint32),
+        geoms,
+        casting,
+        layers,
+        _materials(model, geoms, layer_of),
+    )
+
+
+def _has_body(model: mujoco.MjModel, name: str) -> bool:
+    return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) >= 0
+
+
+def colours(model: mujoco.MjModel, geoms: NDArray[np.int64]) -> Floats:
+    """Return the colours (N, 4) of geoms: their own where set, else their material's."""
+    rgba = model.geom_rgba[geoms]
+    material = model.geom_matid[geoms]
+    plain = (material >= 0) & np.all(rgba == _DEFAULT_RGBA, axis=1)
+    return np.where(plain[:, None], model.mat_rgba[np.maximum(material, 0)], rgba) if model.nmat else rgba
+
+
+def _materials(model: mujoco.MjModel, geoms: NDArray[np.int64], layer_of: dict[int, int]) -> Floats:
+    """Return specular, shininess exponent, emission and texture layer (N, 4); MuJoCo's defaults without material."""
+    rows = np.tile(np.array([0.5, 64.0, 0.0, 0.0], dtype=np.float32), (len(geoms), 1))
+    for row, geom in zip(rows, geoms, strict=True):
+        material = int(model.geom_matid[geom])
+        if material >= 0:
+            texture = int(model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB.value])
+            row[:] = (
+                model.mat_specular[material],
+                128.0 * model.mat_shininess[material],
+                model.mat_emission[material],
+                layer_of.get(texture, 0),
+            )
+    return rows
+
+
+def _layers(model: mujoco.MjModel) -> tuple[NDArray[np.uint8], dict[int, int]]:
+    """Return the two-dimensional textures at one size, and texture id → layer; layer 0 is white."""
+    from PIL import Image
+
+    layers: list[NDArray[np.uint8]] = [np.full((LAYER_SIZE, LAYER_SIZE, 3), 255, dtype=np.uint8)]
+    layer_of: dict[int, int] = {}
+    for texture in range(model.ntex):
+        if model.tex_type[texture] != mujoco.mjtTexture.mjTEXTURE_2D or model.tex_nchannel[texture] != 3:
+            continue
+        height, width = int(model.tex_height[texture]), int(model.tex_width[texture])
+        start = int(model.tex_adr[texture])
+        pixels = np.asarray(model.tex_data[start : start + 3 * height * width]).reshape(height, width, 3)
+        layer_of[texture] = len(layers)
+        # At its own size this leaves every pixel as it is.
+        resized = Image.fromarray(pixels).resize((LAYER_SIZE, LAYER_SIZE), Image.Resampling.BICUBIC)
+        layers.append(np.asarray(resized))
+    return np.stack(layers), layer_of
+
+
+def _triangles(model: mujoco.MjModel, geom: int) -> Triangles:
+    kind = mujoco.mjtGeom(int(model.geom_type[geom]))
+    size = np.asarray(model.geom_size[geom])
+    match kind:
+        case mujoco.mjtGeom.mjGEOM_MESH:
+            return _mesh(model, int(model.geom_dataid[geom]))
+        case mujoco.mjtGeom.mjGEOM_BOX:
+            return _box(size)
+        case mujoco.mjtGeom.mjGEOM_CYLINDER:
+            return _revolve([(0, 1), (1, 1), (1, 1), (1, -1), (1, -1), (0, -1)], [2, 2, 0, 0, -2, -2], size[[0, 0, 1]])
+        case mujoco.mjtGeom.mjGEOM_SPHERE:
+            return _ellipsoid(size[[0, 0, 0]])
+        case mujoco.mjtGeom.mjGEOM_ELLIPSOID:
+            return _ellipsoid(size)
+        case mujoco.mjtGeom.mjGEOM_CAPSULE:
+            return _capsule(float(size[0]), float(size[1]))
+    raise MemobenchError(
+        f"geom {model.geom(geom).name!r} is a {kind.name.removeprefix('mjGEOM_').lower()}, which is not drawn; make "
+        "what is seen of boxes, cylinders, spheres, ellipsoids, capsules and meshes"
+    )
+
+
+def _mesh(model: mujoco.MjModel, mesh: int) -> Triangles:
+    """Return a mesh's triangles, one vertex for each combination of point, normal and texture coordinate."""
+    face, faces = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
+    point, normal = int(model.mesh_vertadr[mesh]), int(model.mesh_normaladr[mesh])
+    uv = int(model.mesh_texcoordadr[mesh])
+    corners = np.stack(
+        [
+            model.mesh_face[face : face + faces].ravel(),
+            model.mesh_facenormal[face : face + faces].ravel(),
+            model.mesh_facetexcoord[face : face + faces].ravel() if uv >= 0 else np.zeros(3 * faces, np.int32),
+        ],
+        axis=1,
+    )
+    unique, index = _unique_in_order(corners)
+    coordinates = model.mesh_texcoord[uv + unique[:, 2]] if uv >= 0 else np.zeros((len(unique), 2))
+    return (
+        model.mesh_vert[point + unique[:, 0]],
+        model.mesh_normal[normal + unique[:, 1]],
+        coordinates,
+        index.reshape(-1, 3),
+    )
+
+
+def _unique_in_order(rows: NDArray[np.integer]) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
+    """Return the distinct rows by first use, and where each row went: neighbours in use are neighbours in memory."""
+    _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return rows[first[order]], rank[inverse.reshape(-1)]
+
+
+def _box(size: NDArray[np.floating]) -> Triangles:
+    positions: list[NDArray[np.float64]] = []
+    normals: list[NDArray[np.float64]] = []
+    triangles: list[tuple[int, int, int]] = []
+    square = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+    for axis in range(3):
+        for side in (-1, 1):
+            corners = np.zeros((4, 3))
+            corners[:, axis] = side
+            corners[:, [(axis + 1) % 3, (axis + 2) % 3]] = square[:: int(side)]
+            normal = np.zeros(3)
+            normal[axis] = side
+            start = 4 * len(positions)
+            positions.append(corners * size)
+            normals.append(np.tile(normal, (4, 1)))
+            triangles += [(start, start + 1, start + 2), (start, start + 2, start + 3)]
+    points = np.concatenate(positions)
+    return points, np.concatenate(normals), np.zeros((len(points), 2)), np.array(triangles)
+
+
+def _revolve(profile: list[tuple[float, float]], slopes: list[float], size: NDArray[np.floating]) -> Triangles:
+    """Turn a profile of (radius, z) about z, top to bottom, and scale it.
+
+    ``slopes`` gives the angle of the normal over the horizontal per point, in quarter turns of which ±2 stand for up
+    and down.
+    """
+    angle = np.linspace(0, 2 * np.pi, ROUND, endpoint=False)
+    around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    positions, normals = [], []
+    for (radius, z), slope in zip(profile, slopes, strict=True):
+        tilt = slope * np.pi / 4
+        positions.append(np.column_stack([radius * around, np.full(ROUND, z)]))
+        normals.append(np.column_stack([np.cos(tilt) * around, np.full(ROUND, np.sin(tilt))]))
+    points = np.concatenate(positions) * size
+    directions = np.concatenate(normals) / size
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    k = np.arange(ROUND)
+    after = (k + 1) % ROUND
+    triangles = []
+    for ring in range(len(profile) - 1):
+        upper, lower = ring * ROUND, (ring + 1) * ROUND
+        triangles.append(np.column_stack([upper + k, lower + k, lower + after]))
+        triangles.append(np.column_stack([upper + k, lower + after, upper + after]))
+    faces = np.concatenate(triangles)
+    edges = points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]]
+    whole = np.linalg.norm(np.cross(*edges), axis=1) > 1e-14  # rings that lie in each other leave no face
+    return points, directions, np.zeros((len(points), 2)), faces[whole]
+
+
+def _ellipsoid(size: NDArray[np.floating]) -> Triangles:
+    tilt = np.linspace(1, -1, ROUND // 2 + 1) * np.pi / 2
+    return _revolve([(float(np.cos(t)), float(np.sin(t))) for t in tilt], [float(t / (np.pi / 4)) for t in tilt], size)
+
+
+def _capsule(radius: float, half_length: float) -> Triangles:
+    tilt = np.linspace(1, 0, ROUND // 4 + 1) * np.pi / 2
+    upper = [(radius * float(np.cos(t)), half_length + radius * float(np.sin(t))) for t in tilt]
+    slopes = [float(t / (np.pi / 4)) for t in tilt]
+    lower = [(r, -z) for r, z in reversed(upper)]
+    return _revolve(upper + lower, slopes + [-slope for slope in reversed(slopes)], np.ones(3))
+
+
+def disc() -> Triangles:
+    """Return a flat cylinder of radius 1 and height 2, top and side: the shape of a highlight."""
+    return _revolve([(0, 1), (1, 1), (1, 1), (1, -1)], [2, 2, 0, 0], np.ones(3))

@@ -1,0 +1,284 @@
+"""The environment as LeRobot steps it: determinism in batches, prompt phase, freezing, logging, bad input."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.envs.episode import EXECUTION, PROMPT, PROMPT_LIMIT
+from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.envs.memobench_env import MemobenchEnv
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.sim.rendering import close_renderers, gl_backend
+from lerobot_memobench.tasks.catalogue import get_task, task_names
+
+DRAWER = "put_the_tomato_into_the_top_drawer_of_the_cabinet"
+STOVE = "turn_on_the_stove_and_turn_it_off"
+HIGHLIGHT = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
+SEEDS = [7, 8, 9, 10]
+
+
+@pytest.fixture(autouse=True)
+def gl() -> Iterator[None]:
+    """Skip without a GL library: every observation holds images."""
+    try:
+        gl_backend()
+    except MemobenchError as error:
+        pytest.skip(str(error))
+    yield
+    close_renderers()
+
+
+def make(name: str, **settings: Any) -> MemobenchEnv:
+    return MemobenchEnv(str(get_task(name).folder), **settings)
+
+
+def actions(seed: int, steps: int) -> np.ndarray:
+    """Return the actions (steps, 7) of a seed's episode, the same in every batch."""
+    return np.random.default_rng(seed).uniform(-1, 1, (steps, 7)).astype(np.float32)
+
+
+def vector(name: str, batch: int, log_dir: Path, use_async: bool = False, **settings: Any) -> gym.vector.VectorEnv:
+    config = MemobenchEnvConfig(tasks=name, log_dir=str(log_dir), **settings)
+    envs = config.create_envs(batch, use_async)
+    (suite,) = envs.values()
+    (env,) = suite.values()
+    return env
+
+
+def roll(env: gym.vector.VectorEnv, seeds: list[int], steps: int) -> tuple[list[str], dict[str, Any]]:
+    """Return hashes and the last observation of episodes stepped together."""
+    env.reset(seed=seeds)
+    plans = np.stack([actions(seed, steps) for seed in seeds], axis=1)
+    for plan in plans:
+        observation, *_ = env.step(plan)
+    return list(env.call("scene_hash")), observation
+
+
+def check_batches(name: str, tmp_path: Path, steps: int, seeds: list[int]) -> None:
+    alone = vector(name, 1, tmp_path / "alone")
+    hashes, images = [], []
+    for seed in seeds:
+        (found,), observation = roll(alone, [seed], steps)
+        hashes.append(found)
+        images.append(observation["pixels"]["wrist_image"][0].copy())
+    alone.close()
+    assert len(set(hashes)) == len(seeds)
+    for use_async in (False, True):
+        env = vector(name, len(seeds), tmp_path / f"async_{use_async}", use_async)
+        try:
+            together, observation = roll(env, seeds, steps)
+            assert together == hashes, f"async {use_async}"
+            np.testing.assert_array_equal(observation["pixels"]["wrist_image"], np.stack(images))
+        finally:
+            env.close()
+
+
+def test_batch_of_one_and_four_sync_and_async(tmp_path: Path) -> None:
+    check_batches(DRAWER, tmp_path, 12, SEEDS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", task_names())
+def test_batches_of_all_tasks(name: str, tmp_path: Path) -> None:
+    check_batches(name, tmp_path, 30, SEEDS)
+
+
+def test_observation_matches_its_space() -> None:
+    env = make(STOVE, expert_action=True)
+    observation, info = env.reset(seed=7)
+    assert env.observation_space.contains(observation)
+    assert info["is_success"] is False
+    observation, reward, terminated, truncated, info = env.step(np.zeros(7, np.float32))
+    assert env.observation_space.contains(observation)
+    assert (reward, terminated, truncated) == (0.0, False, False)
+    assert observation["phase"] == [EXECUTION]
+    assert observation["step"] == [1]
+    env.close()
+
+
+def test_prompt_plays_whatever_the_policy_does() -> None:
+    """Actions have no effect during the prompt; afterwards the scene is what it was, and only then does time count."""
+    ends = []
+    for seed in (1, 2):
+        env = make(HIGHLIGHT, horizon=3)
+        rng = np.random.default_rng(seed)
+        observation, info = env.reset(seed=7)
+        start = env.scene_hash()
+        first_image = observation["pixels"]["image"].copy()
+        assert info["phase"] == PROMPT
+        hashes = []
+        while observation["phase"] == [PROMPT]:
+            observation, _, terminated, truncated, info = env.step(rng.uniform(-1, 1, 7).astype(np.float32))
+            assert not terminated
+            assert not truncated
+            hashes.append(env.scene_hash())
+            assert len(hashes) <= PROMPT_LIMIT
+        assert observation["step"] == [len(hashes)]
+        assert env.scene_hash() == start
+        np.testing.assert_array_equal(observation["pixels"]["image"], first_image)
+        for step in range(3):
+            assert env.episode.exec_steps == step
+            observation, _, terminated, truncated, info = env.step(np.zeros(7, np.float32))
+        assert truncated
+        assert env.record()["prompt_steps"] == len(hashes)
+        assert env.record()["steps"] == 3
+        ends.append(hashes)
+        env.close()
+    assert ends[0] == ends[1]
+    assert len(set(ends[0])) > 20, "the prompt shows nothing"
+
+
+def test_highlight_is_seen_in_the_prompt_only() -> None:
+    env = make(HIGHLIGHT)
+    observation, _ = env.reset(seed=7)
+    still = observation["pixels"]["image"].astype(int)
+    most = 0.0
+    while observation["phase"] == [PROMPT]:
+        observation, *_ = env.step(np.zeros(7, np.float32))
+        most = max(most, float((np.abs(observation["pixels"]["image"] - still).max(axis=2) > 20).mean()))
+    assert most > 0.003
+    np.testing.assert_array_equal(observation["pixels"]["image"], still)
+    env.close()
+
+
+def test_without_prompt_video_execution_begins_at_once() -> None:
+    env = make(HIGHLIGHT, prompt_video=False)
+    with_prompt = make(HIGHLIGHT)
+    observation, info = env.reset(seed=7)
+    with_prompt.reset(seed=7)
+    assert observation["phase"] == [EXECUTION]
+    assert info["phase"] == EXECUTION
+    assert env.scene_hash() == with_prompt.scene_hash()
+    env.close()
+    with_prompt.close()
+
+
+def test_render_every_changes_images_only() -> None:
+    every, third = make(DRAWER), make(DRAWER, render_every=3)
+    plan = actions(7, 9)
+    every.reset(seed=7)
+    shown = third.reset(seed=7)[0]["pixels"]["image"]
+    for step, action in enumerate(plan, start=1):
+        one, two = every.step(action)[0], third.step(action)[0]
+        assert every.scene_hash() == third.scene_hash()
+        np.testing.assert_array_equal(one["agent_pos"], two["agent_pos"])
+        if step % 3 == 0:
+            shown = one["pixels"]["image"]
+        np.testing.assert_array_equal(two["pixels"]["image"], shown)
+    every.close()
+    third.close()
+
+
+def test_random_referent_is_the_seeds() -> None:
+    env = make(HIGHLIGHT, referent="random", prompt_video=False)
+    chosen = []
+    for _ in range(2):
+        row = []
+        for seed in range(7, 27):
+            env.episode.reset(seed)
+            row.append(env.episode.task.variant_index)
+        chosen.append(row)
+    assert chosen[0] == chosen[1]
+    assert len(set(chosen[0])) > 1
+    env.close()
+
+
+@pytest.mark.parametrize("use_async", [False, True])
+def test_rows_freeze_when_their_episode_ends(tmp_path: Path, use_async: bool) -> None:
+    env = vector(DRAWER, 2, tmp_path, use_async, horizon=2)
+    try:
+        env.reset(seed=[7, 8])
+        for _ in range(2):
+            _, _, terminated, truncated, _ = env.step(np.zeros((2, 7), np.float32))
+        assert truncated.all()
+        assert not terminated.any()
+        before = env.call("scene_hash")
+        for _ in range(3):
+            env.step(np.ones((2, 7), np.float32))
+        assert env.call("scene_hash") == before
+    finally:
+        env.close()
+    assert len(read_episodes(tmp_path)) == 2
+
+
+def test_log_holds_the_finished_episodes(tmp_path: Path) -> None:
+    env = make(DRAWER, log_dir=str(tmp_path), horizon=4, replan_steps=20)
+    hashes = []
+    for seed in (7, 8):
+        env.reset(seed=seed)
+        hashes.append(env.scene_hash())
+        for _ in range(4):
+            env.step(np.zeros(7, np.float32))
+    env.reset(seed=9)  # cut short: no line
+    env.step(np.zeros(7, np.float32))
+    env.close()
+    records = read_episodes(tmp_path)
+    assert [(r["task"], r["episode"], r["seed"], r["scene_hash"]) for r in records] == [
+        (DRAWER, 0, 7, hashes[0]),
+        (DRAWER, 1, 8, hashes[1]),
+    ]
+    record = records[0]
+    assert record["memory_type"] == "spatial"
+    assert record["steps"] == 4
+    assert record["success"] is False
+    assert record["replan_steps"] == 20
+    assert record["prompt_steps"] == 0
+    assert [checkpoint["first_step"] for checkpoint in record["checkpoints"]] == [None] * 3
+    assert record["failure"] == "storage_failure"
+
+
+def test_seeds_go_on_by_themselves() -> None:
+    env = make(STOVE)
+    env.reset()
+    assert env.episode.seed == 7
+    env.reset()
+    assert env.episode.seed == 8
+    env.close()
+
+
+def test_render_is_annotated() -> None:
+    env = make(STOVE)
+    env.reset(seed=7)
+    frame = env.render()
+    assert frame.dtype == np.uint8
+    assert frame.shape[0] > 256
+    assert frame.shape[1:] == (512, 3)
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"tasks": "turn_on_the_stofe_and_turn_it_off"}, "turn_on_the_stove_and_turn_it_off"),
+        ({"referent": "randon"}, "did you mean 'random'"),
+        ({"render": "ultra"}, "env.render is 'ultra'"),
+        ({"horizon": 0}, "env.horizon is 0"),
+        ({"render_every": 0}, "env.render_every is 0"),
+        ({"fps": 30}, "control rate is 20"),
+    ],
+)
+def test_bad_settings_are_told_in_one_sentence(tmp_path: Path, settings: dict[str, Any], words: str) -> None:
+    log = tmp_path / "log"
+    with pytest.raises(MemobenchError, match=words) as caught:
+        MemobenchEnvConfig(log_dir=str(log), **settings).create_envs(1)
+    assert "\n" not in str(caught.value)
+    assert not log.exists()
+
+
+@pytest.mark.parametrize(
+    ("action", "words"),
+    [(np.zeros(6, np.float32), r"shape \(6,\); expected \(7,\)"), (np.full(7, np.nan, np.float32), "not finite")],
+)
+def test_bad_actions_are_told_in_one_sentence(action: np.ndarray, words: str) -> None:
+    env = make(STOVE)
+    env.reset(seed=7)
+    with pytest.raises(MemobenchError, match=words):
+        env.step(action)
+    env.close()

@@ -1,0 +1,57 @@
+"""What simulator tests share: a scene of the arm alone, tasks by name, and a check for a GL library."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+
+import mujoco
+import pytest
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.sim import robot
+from lerobot_memobench.sim.assets.kitchen import build_kitchen
+from lerobot_memobench.sim.rendering import close_renderers, gl_backend
+from lerobot_memobench.sim.scene import PHYSICS_STEP
+from lerobot_memobench.sim.simulation import Simulation
+from lerobot_memobench.tasks.catalogue import get_task
+
+STOVE = "turn_on_the_stove_and_turn_it_off"
+DRAWER = "put_the_tomato_into_the_top_drawer_of_the_cabinet"
+BOWLS = "put_the_butter_into_the_bowl_from_the_prompt_video"
+ASSEMBLY = "execute_the_assembly_procedure_demonstrated_in_the_prompt_video"
+
+
+@pytest.fixture(scope="session")
+def arm_model() -> mujoco.MjModel:
+    """The arm over an empty table."""
+    spec = robot.robot_spec()
+    spec.option.timestep = PHYSICS_STEP
+    build_kitchen(spec)
+    return spec.compile()
+
+
+@pytest.fixture
+def simulate() -> Callable[..., Simulation]:
+    """Return a function of a task's name that gives a simulation, reset to seed 7."""
+
+    def make(name: str = DRAWER, seed: int = 7) -> Simulation:
+        sim = Simulation(get_task(name))
+        sim.reset(seed)
+        return sim
+
+    return make
+
+
+@pytest.fixture
+def gl() -> Iterator[str]:
+    """Skip without a GL library; free what was opened afterwards."""
+    try:
+        backend = gl_backend()
+    except MemobenchError as error:
+        pytest.skip(str(error))
+    before = os.environ.get("MUJOCO_GL")
+    yield backend
+    close_renderers()
+    if before is None:
+        os.environ.pop("MUJOCO_GL", None)

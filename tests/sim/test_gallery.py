@@ -1,0 +1,52 @@
+"""Figures: everything is on them, and they stay small."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.sim import gallery
+
+
+def test_grid_has_room_for_every_picture() -> None:
+    cells = [(f"picture {k}", np.full((40, 60, 3), 10 * k, np.uint8)) for k in range(5)]
+    sheet = np.asarray(gallery.grid(cells, 2))
+    for k in range(5):
+        assert (sheet == 10 * k).all(axis=2).sum() >= 40 * 60
+    with pytest.raises(MemobenchError, match="nothing to draw"):
+        gallery.grid([], 2)
+
+
+def test_figures_are_shrunk_until_they_are_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gallery, "LARGEST_FILE", 8_000)
+    noise = np.random.default_rng(0).integers(0, 255, (120, 120, 3), dtype=np.uint8)
+    path = gallery.save(Image.fromarray(noise), tmp_path / "deep" / "noise.png")
+    assert path.stat().st_size <= 8_000
+    assert Image.open(path).width < 120
+    plain = gallery.save(Image.new("RGB", (300, 300)), tmp_path / "plain.png")
+    assert Image.open(plain).size == (300, 300)
+
+
+def test_folder_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(MemobenchError, match="cannot be written"):
+        gallery.save(Image.new("RGB", (4, 4)), tmp_path / "file" / "figure.png")
+
+
+def test_sheets(gl: str) -> None:
+    tasks = gallery.draw_tasks(["turn_on_the_stove_and_turn_it_off"], size=64)
+    assert tasks.width == 64 + 12
+    objects = gallery.draw_objects(["butter", "milk"], size=32)
+    assert objects.width == 2 * 4 * 32 + 18
+    closed_and_open = np.asarray(gallery.draw_fixtures(["microwave"], size=64)).astype(int)
+    left, right = closed_and_open[6:70, 6:70], closed_and_open[6:70, 140:204]
+    assert np.abs(left - right).mean() > 5
+
+
+def test_all_classes_of_the_catalogue_are_drawn() -> None:
+    assert len(gallery._classes("object")) == 29
+    assert set(gallery._classes("fixture")) == set(gallery.FRONTS)

@@ -1,0 +1,378 @@
+"""Frames: what is in them, that they depend on the state alone, and what happens without a GL library."""
+
+from __future__ import annotations
+
+import ctypes.util
+import importlib
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+import pytest
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.sim import rendering
+from lerobot_memobench.sim.drawlist import build_draw_list, disc
+from lerobot_memobench.sim.rasterizer import HIGHLIGHTS
+from lerobot_memobench.sim.rendering import Highlight, RenderSettings, close_renderers, gl_backend
+from lerobot_memobench.sim.simulation import CAMERAS, NO_OP, Simulation
+from lerobot_memobench.tasks.catalogue import get_task
+
+Simulate = Callable[..., Simulation]
+STOVE = "turn_on_the_stove_and_turn_it_off"
+BOWLS = "put_the_butter_into_the_bowl_from_the_prompt_video"
+
+
+def difference(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the mean absolute difference of two frames, grey levels."""
+    return float(np.abs(a.astype(int) - b.astype(int)).mean())
+
+
+def turn_knob(sim: Simulation, q: float) -> None:
+    sim.data.joint("flat_stove_1_button").qpos[0] = q
+    mujoco.mj_step1(sim.model, sim.data)
+
+
+@pytest.fixture
+def mujoco_renderer(gl: str, monkeypatch: pytest.MonkeyPatch) -> type[mujoco.Renderer]:
+    """MuJoCo's own renderer on the backend in use; by itself it takes the one of MUJOCO_GL at MuJoCo's import."""
+    backend = importlib.import_module(f"mujoco.{gl}")
+    contexts = sys.modules[mujoco.Renderer.__module__].gl_context
+    monkeypatch.setattr(contexts, "GLContext", backend.GLContext)
+    return mujoco.Renderer
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_frame(gl: str, simulate: Simulate, camera: str) -> None:
+    frame = simulate().render(camera)
+    assert frame.shape == (256, 256, 3)
+    assert frame.dtype == np.uint8
+    assert frame.flags["C_CONTIGUOUS"]
+    assert frame.std() > 10
+
+
+def test_frame_is_upright(gl: str, simulate: Simulate) -> None:
+    """The agentview camera sees the light table in the lower half and the dark wall in the upper."""
+    frame = simulate().render("agentview").astype(float).mean(axis=2)
+    assert frame[180:, :].mean() > frame[:60, :60].mean() + 40
+
+
+def test_things_are_seen_where_the_camera_maths_says(gl: str, simulate: Simulate) -> None:
+    """The tomato's red pixels are around the projection of its origin, in both cameras."""
+    sim = simulate()
+    for name, camera in CAMERAS.items():
+        frame = sim.render(name).astype(int)
+        red = (frame[..., 0] > 110) & (frame[..., 1] < 70) & (frame[..., 2] < 70)
+        position = sim.body_pose("beefsteak_tomato__1_1")[0]
+        view = sim.model.camera(camera).id
+        local = sim.data.cam_xmat[view].reshape(3, 3).T @ (position - sim.data.cam_xpos[view])
+        scale = 128 / np.tan(np.radians(sim.model.cam_fovy[view]) / 2)
+        column, row = 128 + scale * local[0] / -local[2], 128 - scale * local[1] / -local[2]
+        rows, columns = np.nonzero(red)
+        near = np.hypot(rows - row, columns - column) < 14
+        assert near.sum() > 30, name
+        assert abs(rows[near].mean() - row) < 4, name
+        assert abs(columns[near].mean() - column) < 4, name
+
+
+def test_frame_depends_on_the_state_alone(gl: str, simulate: Simulate) -> None:
+    sim = simulate()
+    first = {camera: sim.render(camera) for camera in CAMERAS}
+    other = simulate(BOWLS)
+    for _ in range(3):
+        sim.step(np.array([0.5, 0.5, -0.5, 0, 0, 0.5, -1]))
+        other.step(NO_OP)
+        sim.render("wrist"), other.render("agentview")
+    sim.reset(7)
+    again = {camera: sim.render(camera) for camera in reversed(CAMERAS)}
+    for camera in CAMERAS:
+        np.testing.assert_array_equal(first[camera], again[camera])
+
+
+def test_two_renderers_take_turns(gl: str, simulate: Simulate) -> None:
+    sims = [simulate(name) for name in (STOVE, BOWLS)]
+    alone = []
+    for sim in sims:
+        alone.append(sim.render())
+        close_renderers()
+    for _ in range(3):
+        for sim, expected in zip(sims, alone, strict=True):
+            np.testing.assert_array_equal(sim.render(), expected)
+
+
+def test_more_scenes_than_renderers(gl: str) -> None:
+    names = [
+        STOVE,
+        BOWLS,
+        "open_and_close_the_microwave",
+        "put_the_tomato_into_the_top_drawer_of_the_cabinet",
+        "check_all_three_drawers_of_the_cabinet",
+    ]
+    sims = [Simulation(get_task(name)) for name in names]
+    assert len(sims) > rendering.CACHED_RENDERERS
+    for sim in sims:
+        sim.reset(7)
+    first = [sim.render() for sim in sims]
+    for sim, expected in zip(sims, first, strict=True):
+        np.testing.assert_array_equal(sim.render(), expected)
+    assert len(rendering._thread.renderers) == rendering.CACHED_RENDERERS
+
+
+def test_other_gl_users_do_not_disturb(mujoco_renderer: type[mujoco.Renderer], simulate: Simulate) -> None:
+    sim = simulate()
+    expected = sim.render()
+    with mujoco_renderer(sim.model, 64, 64) as other:
+        for _ in range(2):
+            other.update_scene(sim.data, "agentview")
+            theirs = other.render()
+            np.testing.assert_array_equal(sim.render(), expected)
+        other.update_scene(sim.data, "agentview")
+        np.testing.assert_array_equal(other.render(), theirs)
+
+
+def test_closing_frees_the_context(gl: str, simulate: Simulate) -> None:
+    sim = simulate()
+    expected = sim.render()
+    assert rendering._thread.context is not None
+    close_renderers()
+    close_renderers()
+    assert rendering._thread.context is None
+    assert not rendering._thread.renderers
+    np.testing.assert_array_equal(sim.render(), expected)
+
+
+def test_threads_have_their_own_contexts(gl: str, simulate: Simulate) -> None:
+    sim = simulate()
+    expected = sim.render()
+    frames: list[np.ndarray] = []
+
+    def draw() -> None:
+        mine = Simulation(get_task("put_the_tomato_into_the_top_drawer_of_the_cabinet"))
+        mine.reset(7)
+        frames.extend(mine.render() for _ in range(5))
+        close_renderers()
+
+    threads = [threading.Thread(target=draw) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for _ in range(5):
+        frames.append(sim.render())
+    for thread in threads:
+        thread.join()
+    assert len(frames) == 15
+    for frame in frames:
+        np.testing.assert_array_equal(frame, expected)
+
+
+_FORK = """
+import os, sys
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.sim.simulation import Simulation
+from lerobot_memobench.tasks.catalogue import get_task
+sim = Simulation(get_task(sys.argv[1]))
+sim.reset(7)
+child = os.fork()  # before anything is drawn: both may draw
+sim.render()
+if child:
+    assert os.waitpid(child, 0)[1] == 0
+    child = os.fork()
+    if child:
+        assert os.waitpid(child, 0)[1] == 0
+    else:
+        try:
+            sim.render()
+        except MemobenchError as error:
+            assert "forked" in str(error)
+            os._exit(0)
+        os._exit(1)
+"""
+
+
+def test_fork_after_a_frame_is_told_and_does_not_hang(gl: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", _FORK, STOVE], capture_output=True, text=True, timeout=120
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_qualities(gl: str, simulate: Simulate) -> None:
+    frames = {}
+    for quality in ("fast", "default", "high"):
+        sim = Simulation(get_task(STOVE), RenderSettings(quality=quality))
+        sim.reset(7)
+        frames[quality] = sim.render()
+    # Shadows darken; multisampling changes edges only.
+    assert frames["fast"].mean() > frames["default"].mean() + 0.5
+    assert 0 < difference(frames["default"], frames["high"]) < 3
+    assert difference(frames["fast"], frames["default"]) < 10
+
+
+@pytest.mark.parametrize(("height", "width"), [(64, 64), (101, 203), (480, 640)])
+def test_sizes(gl: str, height: int, width: int) -> None:
+    sim = Simulation(get_task(STOVE), RenderSettings(height, width))
+    sim.reset(7)
+    frame = sim.render()
+    assert frame.shape == (height, width, 3)
+    assert frame.std() > 10
+
+
+def test_burner_glows_while_on(gl: str, simulate: Simulate) -> None:
+    sim = simulate(STOVE)
+
+    def redness() -> float:
+        frame = sim.render("wrist").astype(int)
+        return float((frame[..., 0] - frame[..., 1] > 80).mean())
+
+    turn_knob(sim, -0.005)
+    off = redness()
+    turn_knob(sim, 1.0)
+    assert redness() > off + 0.01
+    turn_knob(sim, -0.005)
+    assert redness() == off
+
+
+def test_highlights_are_drawn_and_go_away(gl: str, simulate: Simulate) -> None:
+    sim = simulate(BOWLS)
+    plain = sim.render()
+    sim.highlights = (Highlight((0.1, 0.0, 0.902), 0.12), Highlight((-0.2, 0.2, 0.902), 0.05, (0.1, 0.2, 1.0, 0.5)))
+    marked = sim.render()
+    changed = np.abs(marked.astype(int) - plain).max(axis=2) > 20
+    assert 0.01 < changed.mean() < 0.3
+    sim.highlights = ()
+    np.testing.assert_array_equal(sim.render(), plain)
+    sim.highlights = (Highlight((0, 0, 0.9), 0.1),) * (HIGHLIGHTS + 1)
+    with pytest.raises(MemobenchError, match=f"at most {HIGHLIGHTS}"):
+        sim.render()
+
+
+def test_looks_like_mujocos_own_renderer(mujoco_renderer: type[mujoco.Renderer], simulate: Simulate) -> None:
+    """Same camera, light and textures: only the edges of shadows differ."""
+    sim = simulate()
+    ours = sim.render()
+    model = sim.model
+    with mujoco_renderer(model, 256, 256) as renderer:
+        option = mujoco.MjvOption()
+        option.geomgroup[:] = 0
+        option.geomgroup[1] = 1
+        option.sitegroup[:] = 0
+        renderer.update_scene(sim.data, "agentview", option)
+        theirs = renderer.render()
+    assert difference(ours, theirs) < 4
+    assert (np.abs(ours.astype(int) - theirs).max(axis=2) > 40).mean() < 0.04
+
+
+def test_unknown_camera(simulate: Simulate) -> None:
+    with pytest.raises(MemobenchError, match="there is no camera 'agentwiev'; did you mean 'agentview'"):
+        simulate().render("agentwiev")
+
+
+def test_unknown_quality() -> None:
+    with pytest.raises(MemobenchError, match="render quality 'hihg' is unknown; did you mean 'high'"):
+        RenderSettings(quality="hihg")
+
+
+def test_sizes_below_one() -> None:
+    with pytest.raises(MemobenchError, match="0×256 pixels cannot be drawn"):
+        RenderSettings(height=0)
+
+
+def test_no_gl_library(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ctypes.util, "find_library", lambda name: None)
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    with pytest.raises(MemobenchError, match=r"no GL library to render with.*make setup") as caught:
+        gl_backend()
+    assert "\n" not in str(caught.value)
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    with pytest.raises(MemobenchError, match="OSMesa not found"):
+        gl_backend()
+
+
+def test_other_library_is_taken_when_one_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ctypes.util, "find_library", lambda name: "libOSMesa.so.8" if name == "OSMesa" else None)
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    assert gl_backend() == "osmesa"
+
+
+@pytest.mark.parametrize(("value", "words"), [("vulkan", "set it to egl or osmesa"), ("glfw", "needs a display")])
+def test_backends_that_cannot_be(monkeypatch: pytest.MonkeyPatch, value: str, words: str) -> None:
+    monkeypatch.setenv("MUJOCO_GL", value)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(MemobenchError, match=words):
+        gl_backend()
+
+
+_FRAME = """
+import hashlib, sys
+from lerobot_memobench.sim.simulation import Simulation
+from lerobot_memobench.tasks.catalogue import get_task
+sim = Simulation(get_task(sys.argv[1]))
+sim.reset(7)
+print(hashlib.sha256(sim.render().tobytes() + sim.render("wrist").tobytes()).hexdigest())
+"""
+
+
+def frame_hash(backend: str) -> tuple[str, str]:
+    environment = {**os.environ, "MUJOCO_GL": backend}
+    environment.pop("PYOPENGL_PLATFORM", None)  # of the backend that this process has opened
+    done = subprocess.run(
+        [sys.executable, "-c", _FRAME, STOVE],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout, done.stderr
+
+
+@pytest.mark.parametrize("backend", ["egl", "osmesa"])
+def test_backends_in_processes_of_their_own(backend: str) -> None:
+    """Two processes draw the same, and go without a word."""
+    if not ctypes.util.find_library(rendering.BACKENDS[backend]):
+        pytest.skip(f"no {backend} here")
+    first, second = frame_hash(backend), frame_hash(backend)
+    assert first == second
+    assert first[1] == ""
+
+
+def test_draw_list_has_outward_faces() -> None:
+    """Every primitive is closed and wound counter-clockwise: volumes by the divergence theorem are right."""
+    spec = mujoco.MjSpec()
+    kinds = {
+        "mjGEOM_BOX": ([0.1, 0.2, 0.3], 8 * 0.1 * 0.2 * 0.3),
+        "mjGEOM_SPHERE": ([0.1, 0, 0], 4 / 3 * np.pi * 0.1**3),
+        "mjGEOM_ELLIPSOID": ([0.1, 0.2, 0.3], 4 / 3 * np.pi * 0.1 * 0.2 * 0.3),
+        "mjGEOM_CYLINDER": ([0.1, 0.2, 0], np.pi * 0.1**2 * 0.4),
+        "mjGEOM_CAPSULE": ([0.1, 0.2, 0], np.pi * 0.1**2 * 0.4 + 4 / 3 * np.pi * 0.1**3),
+    }
+    for kind, (size, _) in kinds.items():
+        spec.worldbody.add_geom(type=getattr(mujoco.mjtGeom, kind), size=size, group=1)
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[1, 1, 1], group=0)  # not seen
+    draw_list = build_draw_list(spec.compile())
+    assert len(draw_list.geoms) == len(kinds)
+    faces = draw_list.indices.reshape(-1, 3)
+    for row, (_, expected) in enumerate(kinds.values()):
+        mine = faces[draw_list.vertices["geom"][faces[:, 0]] == row]
+        a, b, c = (draw_list.vertices["position"][mine[:, k]].astype(float) for k in range(3))
+        assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6 == pytest.approx(expected, rel=0.03)
+        normals = draw_list.vertices["normal"][mine[:, 0]]
+        assert np.all(np.einsum("ij,ij->i", normals, np.cross(b - a, c - a)) >= -1e-9)
+    np.testing.assert_allclose(np.linalg.norm(draw_list.vertices["normal"], axis=1), 1, atol=1e-5)
+
+
+def test_shape_that_is_not_drawn() -> None:
+    spec = mujoco.MjSpec()
+    spec.worldbody.add_geom(name="endless", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 1], group=1)
+    with pytest.raises(MemobenchError, match="'endless' is a plane, which is not drawn"):
+        build_draw_list(spec.compile())
+
+
+def test_disc_faces_up() -> None:
+    points, _, _, triangles = disc()
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    assert np.all(np.cross(b - a, c - a)[:, 2] >= -1e-12)
