@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import av
@@ -12,12 +11,12 @@ from PIL import Image
 
 from lerobot_memobench.cli import demo
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.tasks.catalogue import get_task, task_index
+from lerobot_memobench.tasks.catalogue import get_task
 
 
 def write_video(path: Path, frames: int = 12) -> None:
     """A video whose brightness rises from black to white."""
-    path.parent.mkdir(parents=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
         stream = container.add_stream("mpeg4", rate=20)
         stream.width, stream.height, stream.pix_fmt = 128, 64, "yuv420p"
@@ -28,13 +27,8 @@ def write_video(path: Path, frames: int = 12) -> None:
 
 
 def fake_evaluation(output: Path) -> int:
-    per_task = []
     for name in demo.TASKS:
-        number, group = task_index(name), get_task(name).memory_type
-        video = output / "videos" / f"{group}_{number}" / "eval_episode_0.mp4"
-        write_video(video)
-        per_task.append({"task_group": group, "task_id": number, "metrics": {"video_paths": [str(video)]}})
-    (output / "eval_info.json").write_text(json.dumps({"per_task": per_task}))
+        write_video(output / "videos" / f"{name}.0.mp4")
     for name in ("episodes.jsonl", "report.json", "report.md"):
         (output / name).write_text(name)
     return 0
@@ -68,7 +62,6 @@ def test_a_failed_evaluation_leaves_the_earlier_demo(tmp_path: Path, monkeypatch
 
 
 def test_a_missing_video_is_named(tmp_path: Path) -> None:
-    (tmp_path / "eval_info.json").write_text('{"per_task": []}')
     with pytest.raises(MemobenchError, match=demo.TASKS[0]):
         demo.collect_videos(tmp_path, tmp_path / "videos")
 

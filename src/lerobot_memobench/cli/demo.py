@@ -4,7 +4,6 @@ report.
 
 from __future__ import annotations
 
-import json
 import shutil
 import tempfile
 from pathlib import Path
@@ -16,7 +15,6 @@ from lerobot_memobench.cli.console import console
 from lerobot_memobench.envs.episode_log import MERGED_FILE
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.report import REPORT_JSON, REPORT_MARKDOWN
-from lerobot_memobench.tasks.catalogue import task_index
 
 #: One task of each memory type.
 TASKS = (
@@ -66,25 +64,22 @@ def run_demo(out: Path) -> int:
 
 
 def run_expert(output: Path) -> int:
-    """Run ``lerobot eval env=memobench`` on the four tasks, one episode each."""
+    """Run ``lerobot eval env=memobench`` on the four tasks, one episode each, filmed."""
     from lerobot_memobench.cli.lerobot import run
 
-    return run(["eval", "env=memobench", f"tasks={','.join(TASKS)}", "episodes=1", f"output_dir={output}"], False)
+    words = ["eval", "env=memobench", f"tasks={','.join(TASKS)}", "episodes=1", "env.videos=true"]
+    return run([*words, f"output_dir={output}"])
 
 
 def collect_videos(evaluation: Path, folder: Path) -> dict[str, Path]:
-    """Move the first video of each task that LeRobot wrote into ``folder`` under the task's name; return
-    them.
-    """
-    info = json.loads((evaluation / "eval_info.json").read_text())
-    by_number = {entry["task_id"]: entry["metrics"]["video_paths"] for entry in info["per_task"]}
+    """Move the film of each task's episode into ``folder`` under the task's name; return them."""
     folder.mkdir(parents=True)
     found = {}
     for name in TASKS:
-        paths = by_number.get(task_index(name))
-        if not paths:
-            raise MemobenchError(f"LeRobot wrote no video of {name}; see its messages above")
-        found[name] = Path(shutil.move(paths[0], folder / f"{name}.mp4"))
+        film = evaluation / VIDEOS / f"{name}.0.mp4"
+        if not film.is_file():
+            raise MemobenchError(f"the evaluation left no film of {name}; see its messages above")
+        found[name] = Path(shutil.move(film, folder / f"{name}.mp4"))
     return found
 
 
