@@ -8,20 +8,26 @@ import os
 import pathlib
 import shutil
 import signal
+import sys
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 
+import dill
 import pytest
 
-from lerobot_memobench.datasets import generation
+from lerobot_memobench.datasets import generation, running
 from lerobot_memobench.datasets.generation import generate
 from lerobot_memobench.datasets.lerobot_format import is_dataset
 from lerobot_memobench.errors import MemobenchError
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
+
 FAILING_SEED = 10_002
+needs_datatrove = pytest.mark.skipif(find_spec("datatrove") is None, reason="datatrove is not installed")
 
 
 @pytest.fixture
@@ -35,22 +41,22 @@ def recorded(make_demo, monkeypatch):
     calls: list[tuple[str, int]] = []
     truth = ["0" * 6 + "1" * 9, "0" * 13 + "1" * 2]
 
-    def record(episode, seed, settings):
+    def record(episode, seed, settings, show):
         calls.append((episode.task.name, seed))
         fails = episode.task.name == "task_a" and seed == FAILING_SEED
         size = settings.image_size if settings.images else None
-        return replace(
-            make_demo(truth, task=episode.task, seed=seed, size=size, success=not fails),
-            referent=settings.referent,
-        )
+        demo = make_demo(truth, task=episode.task, seed=seed, size=size, success=not fails)
+        for frame in range(len(demo)) if settings.images else ():
+            show({camera: images[frame] for camera, images in demo.images.items()})
+        return replace(demo, referent=settings.referent, images=None)
 
     def episode(task, settings):
-        return SimpleNamespace(
-            task=task, prompt_shown=None, horizon=1200, progress=SimpleNamespace(index=1), referent="fixed"
-        )
+        progress = SimpleNamespace(index=1, steps=1200)
+        return SimpleNamespace(task=task, prompt_shown=None, horizon=1200, progress=progress, referent="fixed")
 
     monkeypatch.setattr(generation, "_episode", episode)
     monkeypatch.setattr(generation, "_record", record)
+    monkeypatch.setattr(generation, "model_file", lambda task, poses: "<mujoco/>")
     return calls
 
 
@@ -129,10 +135,10 @@ def test_resume_makes_only_what_is_missing(tasks, recorded, tmp_path, monkeypatc
     reference = tree_hash_of_run(tasks, tmp_path / "undisturbed")
     inner = generation._record
 
-    def broken(episode, seed, settings):
+    def broken(episode, seed, settings, show):
         if (episode.task.name, seed) == ("task_b", 10_000):
             raise RuntimeError("power cut")
-        return inner(episode, seed, settings)
+        return inner(episode, seed, settings, show)
 
     monkeypatch.setattr(generation, "_record", broken)
     with pytest.raises(RuntimeError, match="power cut") as caught:
@@ -185,7 +191,7 @@ def test_a_worker_that_is_killed(tasks, recorded, tmp_path, monkeypatch):
         future.set_exception(BrokenProcessPool("gone"))
         return future
 
-    monkeypatch.setattr(generation.ProcessPoolExecutor, "submit", submit)
+    monkeypatch.setattr(running.ProcessPoolExecutor, "submit", submit)
     with pytest.raises(MemobenchError, match="one of 2 worker processes was killed"):
         run(tasks, tmp_path / "ds", workers=2)
     monkeypatch.undo()
@@ -203,6 +209,130 @@ def test_no_task_or_the_same_twice(tasks, recorded, tmp_path):
         run([], tmp_path / "ds")
     with pytest.raises(MemobenchError, match="named twice"):
         run([tasks[0], tasks[0]], tmp_path / "ds")
+
+
+def test_both_formats(tasks, recorded, tmp_path):
+    import h5py
+
+    run(tasks, tmp_path / "plain", episodes=3)
+    run(tasks, tmp_path / "both", episodes=3, formats={"hdf5", "lerobot"})
+    plain, both = tree_hash(tmp_path / "plain"), tree_hash(tmp_path / "both")
+    files = {f"hdf5/{name}_demo.hdf5" for name in ("task_a", "task_b")}
+    assert set(both) == set(plain) | files
+    assert {name for name in plain if plain[name] != both[name]} == {"manifest.json"}  # it says what was asked for
+    with h5py.File(tmp_path / "both" / "hdf5" / "task_a_demo.hdf5") as file:
+        assert [file[f"data/demo_{k}"].attrs["seed"] for k in range(2)] == [10_000, 10_001]
+        assert file["data"].attrs["num_demos"] == 2
+        assert file["data"].attrs["total"] == 30
+
+    recorded.clear()
+    run(tasks, tmp_path / "hdf5", episodes=3, formats=["hdf5"])
+    assert len(recorded) == 6
+    alone = tree_hash(tmp_path / "hdf5")
+    assert set(alone) == files | {"manifest.json"}
+    assert all(alone[name] == both[name] for name in files)
+    recorded.clear()
+    assert run(tasks, tmp_path / "hdf5", episodes=3, formats=["hdf5"]).exit_status == 1  # reported, not made again
+    assert recorded == []
+    with pytest.raises(MemobenchError, match="finished dataset with formats"):
+        run(tasks, tmp_path / "hdf5", episodes=3)
+
+
+def test_hdf5_killed_at_every_change_to_the_disk(tasks, recorded, tmp_path):
+    out, formats = tmp_path / "ds", ("hdf5",)
+    run(tasks, tmp_path / "undisturbed", formats=formats)
+    reference = tree_hash(tmp_path / "undisturbed")
+    killed = 0
+    for call in range(1, 400, 13):
+        shutil.rmtree(out, ignore_errors=True)
+        if not kill_at(call, lambda: run(tasks, out, formats=formats)):
+            break
+        killed += 1
+        run(tasks, out, formats=formats)
+        assert {k: v for k, v in tree_hash(out).items() if not k.startswith(".staging")} == reference, call
+    assert killed > 4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"formats": ["parquet"]}, "found format 'parquet', known are 'hdf5', 'lerobot'"),
+        ({"formats": []}, "no format was asked for"),
+        ({"formats": ["hdf5"], "images": False}, "'hdf5' was asked for without images"),
+        ({"executor": "condor"}, "found executor 'condor', known are"),
+        ({"executor": "processes", "executor_options": {"partition": "cpu"}}, "takes none"),
+        ({"executor": "slurm"}, "executor 'slurm' needs (partition and time|datatrove)"),
+    ],
+)
+def test_what_cannot_be_asked_for(tasks, recorded, tmp_path, arguments, message):
+    with pytest.raises(MemobenchError, match=message):
+        run(tasks, tmp_path / "ds", **arguments)
+    assert not (tmp_path / "ds").exists()
+
+
+@needs_datatrove
+def test_datatroves_local_executor_makes_the_same(tasks, recorded, tmp_path):
+    heard = []
+    run(tasks, tmp_path / "here", episodes=3)
+    run(tasks, tmp_path / "there", episodes=3, executor="local", progress=heard.append)
+    assert tree_hash(tmp_path / "here") == tree_hash(tmp_path / "there")
+    assert len(heard) == heard[-1].done == heard[-1].total == 6
+
+
+@needs_datatrove
+def test_ray_is_asked_for_without_being_there(tasks, recorded, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(MemobenchError, match="executor 'ray' needs ray, which is not installed"):
+        run(tasks, tmp_path / "ds", executor="ray")
+
+
+SBATCH = """#!/bin/sh
+echo "$@" >> "$SBATCH_LOG"
+for word in "$@"; do script="$word"; done
+cat "$script" >> "$SBATCH_LOG"
+echo "Submitted batch job 4711"
+"""
+
+
+@needs_datatrove
+def test_slurm_gets_a_script_and_a_last_job(tasks, recorded, tmp_path, monkeypatch):
+    """With a stand-in for sbatch: what it is given, and what the jobs then do when they run."""
+    log, tools = tmp_path / "sbatch.log", tmp_path / "bin"
+    tools.mkdir()
+    (tools / "sbatch").write_text(SBATCH)
+    (tools / "scontrol").write_text("#!/bin/sh\necho node1\n")
+    for tool in tools.iterdir():
+        tool.chmod(0o755)
+    monkeypatch.setenv("SLURM_NODELIST", "node1")
+    monkeypatch.setenv("PATH", f"{tools}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv("SBATCH_LOG", str(log))
+    out = tmp_path / "ds"
+    options = {"partition": "cpu", "time": "04:00:00", "mem_per_cpu_gb": 4, "env_command": ". /opt/venv/bin/activate"}
+    asked = {"executor": "slurm", "executor_options": options, "workers": 3}
+    summary = run(tasks, out, **asked)
+    assert (summary.submitted, summary.folder, recorded) == (True, None, [])
+    script = log.read_text()
+    for line in (
+        "#SBATCH --partition=cpu",
+        "#SBATCH --time=04:00:00",
+        "#SBATCH --mem-per-cpu=4G",
+        "#SBATCH --array=0-2%3",
+        ". /opt/venv/bin/activate",
+        f"launch_pickled_pipeline {out}_slurm/make/executor.pik",
+        f"launch_pickled_pipeline {out}_slurm/finish/executor.pik",
+        "--dependency=afterok:4711",
+    ):
+        assert line in script, line
+
+    # What the array's tasks and the last job do on their machines.
+    for part, ranks in (("make", range(3)), ("finish", range(1))):
+        for rank in ranks:
+            monkeypatch.setenv("SLURM_ARRAY_TASK_ID", str(rank))
+            with open(tmp_path / "ds_slurm" / part / "executor.pik", "rb") as file:
+                dill.load(file).run()  # noqa: S301 - datatrove wrote it, in this test
+    assert len(recorded) == 4
+    run(tasks, tmp_path / "here")
+    assert tree_hash(out) == tree_hash(tmp_path / "here")
 
 
 def kill_at(call: int, work) -> bool:
@@ -243,7 +373,6 @@ def kill_at(call: int, work) -> bool:
         os._exit(1)
 
 
-@pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
 def test_killed_at_every_change_to_the_disk(tasks, recorded, tmp_path):
     """Kill after every n-th step of a run, resume, compare with an undisturbed run, byte for byte."""
     out = tmp_path / "ds"

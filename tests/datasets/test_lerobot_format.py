@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -281,7 +283,11 @@ def test_card(dataset):
     assert card.data.license == "apache-2.0"
     for column in dataset_features((SIZE, SIZE)):
         assert f"`{column}`" in card.text
-    assert "| object | 1 | 2 | 60 | 30.0 | 30 | 30 | 30 | 5.0 |" in card.text
+    assert "| object | here | 1 | 2 | 60 | 30.00 | 30.00 | 30.00 | 30 | 0." in card.text
+    assert "|  | paper | 5 | 250 | 121,276 | 485.10 | 492.00 | 526.00 | 556 | 44.53 GiB |" in card.text
+    assert "5.0 in object tasks" in card.text
+    assert "| 0–199 | 3 | 100.00 % | 50 | 3.33 % |" in card.text
+    assert "| 1,500+ | 0 | 0.00 % | 25 | 1.67 % |" in card.text
 
 
 def test_manifest(dataset, demos):
@@ -339,3 +345,32 @@ def test_encoding_is_close(demos, tmp_path):
         decoded = np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
     error = ((decoded.astype(np.float64) - frames) ** 2).mean()
     assert 10 * np.log10(255**2 / error) > 32
+
+
+def test_torchs_own_collate_function_batches_an_episode(dataset):
+    """`lerobot-dataset-viz` loads an episode that way, language rows and all."""
+    from lerobot.datasets import LeRobotDataset
+
+    episode = LeRobotDataset(REPO, root=dataset.root, episodes=[1])
+    batches = list(torch.utils.data.DataLoader(episode, batch_size=16, num_workers=0))
+    assert [len(batch["index"]) for batch in batches] == [16, 14]
+
+
+@pytest.mark.slow
+def test_lerobots_viewer_opens_it(dataset, tmp_path):
+    pytest.importorskip("rerun", reason="rerun-sdk is not installed (lerobot's extra viz)")
+    words = [
+        "--repo-id",
+        REPO,
+        "--root",
+        str(dataset.root),
+        "--episode-index",
+        "1",
+        "--save",
+        "1",
+        "--num-workers",
+        "0",
+    ]
+    command = "from lerobot.scripts.lerobot_dataset_viz import main; main()"
+    subprocess.run([sys.executable, "-c", command, *words, "--output-dir", str(tmp_path)], check=True)
+    assert (tmp_path / "local_test_episode_1.rrd").stat().st_size > 10_000

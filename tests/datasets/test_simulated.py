@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,12 +13,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels
-from lerobot_memobench.datasets.generation import HOLD_FRAMES, generate, record_demonstration
+from lerobot_memobench.datasets.generation import HOLD_FRAMES, PATIENCE, generate, record_demonstration
 from lerobot_memobench.datasets.lerobot_format import is_dataset, write_dataset
 from lerobot_memobench.datasets.replay import read_episode, replay
+from lerobot_memobench.datasets.validate import Verdict, exit_status, validate
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks import get_task
 
@@ -152,6 +156,46 @@ def test_replay_of_something_else(tmp_path, dataset_folder):
         read_episode(dataset_folder, 99)
 
 
+def test_validation_names_each_episode_and_its_first_disagreement(dataset_folder, tmp_path):
+    folder = Path(shutil.copytree(dataset_folder, tmp_path / "ds"))
+    told = []
+    verdicts = validate(folder, progress=lambda *news: told.append(news))
+    assert verdicts == [Verdict("episode 0", None), Verdict("episode 1", None)]
+    assert [news[:2] for news in told] == [(1, 2), (2, 2)]
+    assert exit_status(verdicts) == 0
+    (path,) = (folder / "data").rglob("*.parquet")
+    table = pq.read_table(path)
+    index = table.schema.get_field_index("checkpoint.index")
+    values = table.column("checkpoint.index").to_pylist()
+    values[11] = 1
+    pq.write_table(table.set_column(index, table.schema.field(index), pa.array(values)), path)
+    (states,) = (folder / "states").rglob("*.parquet")
+    states.write_bytes(states.read_bytes()[:-100])
+    first, second = validate(folder)
+    assert first.disagreement.startswith("it cannot be read")
+    shutil.rmtree(folder / "states")
+    first, second = validate(folder)
+    assert first == Verdict("episode 0", "checkpoint.index at frame 11: recorded np.int64(1), replayed np.int64(0)")
+    assert second.disagreement is None
+    assert exit_status([first, second]) == 1
+    with pytest.raises(MemobenchError, match="holds neither a dataset"):
+        validate(tmp_path / "absent")
+
+
+def test_an_episode_is_given_up_when_the_expert_is_through(monkeypatch):
+    """The horizon is far away, but nothing that the expert still does will reach the goal."""
+    from lerobot_memobench.envs.episode import Episode
+
+    def standstill(episode):
+        return np.zeros(7, dtype=np.float32)
+
+    monkeypatch.setattr(Episode, "expert_action", standstill)
+    monkeypatch.setattr(Episode, "expert_done", property(lambda episode: episode.exec_steps >= 30))
+    demo = record_demonstration(get_task(STOVE), SEED, images=False)
+    assert not demo.success
+    assert len(demo) == 30 + PATIENCE + HOLD_FRAMES
+
+
 SCRIPT = """
 import sys
 from lerobot_memobench.datasets.generation import generate
@@ -159,7 +203,7 @@ from lerobot_memobench.tasks import get_task
 
 if __name__ == "__main__":
     task = get_task("turn_on_the_stove_and_turn_it_off")
-    generate([task], 5, sys.argv[1], images=False, workers=2)
+    generate([task], 3, sys.argv[1], images=False, workers=2)
 """
 
 
@@ -206,9 +250,9 @@ def test_two_workers_killed_and_resumed(tmp_path):
         time.sleep(0.05)
     assert not is_dataset(out)
     task = get_task(STOVE)
-    summary = generate([task], 5, out, images=False, workers=1)
+    summary = generate([task], 3, out, images=False, workers=1)
     assert summary.exit_status == 0
-    generate([task], 5, tmp_path / "undisturbed", images=False, workers=1)
+    generate([task], 3, tmp_path / "undisturbed", images=False, workers=1)
     assert tree_hash(out) == tree_hash(tmp_path / "undisturbed")
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
-import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -154,20 +154,17 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
         EpisodeLog(tmp_path / "file").append(record())
 
 
-def _write_until_killed(folder: str) -> None:
-    log = EpisodeLog(folder)
-    for k in range(100_000):
-        log.append(record("a", k))
-
-
 def test_a_killed_writer_loses_nothing_that_was_finished(tmp_path: Path) -> None:
-    process = multiprocessing.get_context("fork").Process(target=_write_until_killed, args=(str(tmp_path),))
-    process.start()
+    code = (
+        "import json, sys; from lerobot_memobench.envs.episode_log import EpisodeLog; "
+        "log, record = EpisodeLog(sys.argv[1]), json.loads(sys.argv[2]); "
+        "[log.append({**record, 'episode': k}) for k in range(100_000)]"
+    )
+    writer = subprocess.Popen([sys.executable, "-c", code, str(tmp_path), json.dumps(record("a"))])
     while not has_log(tmp_path) or len(read_episodes(tmp_path)) < 20:
-        assert process.is_alive()
-    assert process.pid is not None
-    os.kill(process.pid, signal.SIGKILL)
-    process.join()
+        assert writer.poll() is None
+    writer.kill()
+    writer.wait()
     episodes = [item["episode"] for item in read_episodes(tmp_path)]
     assert len(episodes) >= 20
     assert episodes == list(range(len(episodes)))

@@ -66,9 +66,7 @@ def bddl() -> str:
 def write_task(tmp_path: Path) -> Callable[..., Path]:
     """Write a task folder; metadata may be a dict, raw text or None (no file)."""
 
-    def write(
-        bddl: str = BDDL, metadata: Any = METADATA, parent: str = "tasks", name: str = "my_task"
-    ) -> Path:
+    def write(bddl: str = BDDL, metadata: Any = METADATA, parent: str = "tasks", name: str = "my_task") -> Path:
         folder = tmp_path / parent / name
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "task_config.bddl").write_text(bddl)

@@ -54,9 +54,7 @@ def test_language_is_free_text(bddl: str) -> None:
 
 
 def test_optional_sections(bddl: str) -> None:
-    problem = parse_bddl(
-        bddl.replace("(:domain robosuite)", "").replace("(:obj_of_interest cup_1 box_1)", "")
-    )
+    problem = parse_bddl(bddl.replace("(:domain robosuite)", "").replace("(:obj_of_interest cup_1 box_1)", ""))
     assert problem.domain == ""
     assert problem.objects_of_interest == ()
 
@@ -131,9 +129,7 @@ MALFORMED = [
 
 
 @pytest.mark.parametrize(("old", "new", "line", "words"), MALFORMED)
-def test_malformed_file_names_file_line_found_expected(
-    bddl: str, old: str, new: str, line: int, words: str
-) -> None:
+def test_malformed_file_names_file_line_found_expected(bddl: str, old: str, new: str, line: int, words: str) -> None:
     assert bddl.count(old) >= 1
     with pytest.raises(MemobenchError) as error:
         parse_bddl(bddl.replace(old, new, 1), "some/file.bddl")

@@ -38,9 +38,7 @@ def everything_said(task: Task) -> list[str]:
 
 def test_size_and_order() -> None:
     assert len(task_names()) == 30
-    assert Counter(task.memory_type for task in tasks()) == dict(
-        zip(MEMORY_TYPES, (10, 10, 5, 5), strict=True)
-    )
+    assert Counter(task.memory_type for task in tasks()) == dict(zip(MEMORY_TYPES, (10, 10, 5, 5), strict=True))
     operations = Counter("".join(task.operations for task in tasks()))
     assert operations == {"S": 35, "U": 32, "C": 17}
     keys = [(MEMORY_TYPES.index(task.memory_type), task.name) for task in tasks()]
@@ -92,8 +90,7 @@ def test_variants_of_the_catalogue() -> None:
             if task.memory_type == "procedural":
                 if variant.goal != task.goal or task.num_variants == len(drawn):
                     assert any(
-                        isinstance(node, Then)
-                        for node in (variant.goal, *getattr(variant.goal, "children", ()))
+                        isinstance(node, Then) for node in (variant.goal, *getattr(variant.goal, "children", ()))
                     )
                 # The goal asks for the checkpoints' atoms in the checkpoints' order.
                 wanted = [atom for checkpoint in variant.checkpoints for atom in atoms(checkpoint.goal)]

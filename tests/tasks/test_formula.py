@@ -263,9 +263,7 @@ def test_lists_roundtrip(formula: Formula) -> None:
 
 @given(FORMULAS, STATES)
 @settings(max_examples=60)
-def test_evaluation_is_deterministic_and_shared_formulas_agree(
-    formula: Formula, states: list[set[Atom]]
-) -> None:
+def test_evaluation_is_deterministic_and_shared_formulas_agree(formula: Formula, states: list[set[Atom]]) -> None:
     first = run(formula, *states)
     assert run(formula, *states) == first
     evaluator = Evaluator([formula, Not(formula), formula])

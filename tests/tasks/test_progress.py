@@ -71,8 +71,7 @@ def test_latched_checkpoint() -> None:
 
 def test_then_goal_of_the_swap() -> None:
     one, two, three = (
-        Atom("on", args)
-        for args in (("milk_1", "plate_mid"), ("butter_1", "plate_left"), ("milk_1", "plate_right"))
+        Atom("on", args) for args in (("milk_1", "plate_mid"), ("butter_1", "plate_left"), ("milk_1", "plate_right"))
     )
     progress = play(get_task(SWAP), *[{one}] * 10, *[{one, two}] * 10, *[{two, three}] * 18)
     assert progress.ordered_step == [1, 11, 21]
@@ -105,8 +104,7 @@ def test_task_without_checkpoints(write_task: Callable[..., Path], bddl: str) ->
 def test_order_properties(states: list[Any]) -> None:
     task = get_task(SWAP)
     parts = [
-        Atom("on", args)
-        for args in (("milk_1", "plate_mid"), ("butter_1", "plate_left"), ("milk_1", "plate_right"))
+        Atom("on", args) for args in (("milk_1", "plate_mid"), ("butter_1", "plate_left"), ("milk_1", "plate_right"))
     ]
     progress = play(task, *({parts[i] for i in state} for state in states))
     done = [step for step in progress.ordered_step if step is not None]

@@ -48,9 +48,7 @@ def test_equal_hashable_and_picklable(write_task: Write) -> None:
         ("do the 3-step sequence shown in the prompt", "(In cup_1 box_1_top_region)", "procedural"),
     ],
 )
-def test_memory_type_is_inferred(
-    write_task: Write, bddl: str, language: str, goal: str, expected: str
-) -> None:
+def test_memory_type_is_inferred(write_task: Write, bddl: str, language: str, goal: str, expected: str) -> None:
     bddl = bddl.replace("put the cup, the red one, into the drawer", language)
     bddl = bddl.replace("(And (In cup_1 box_1_top_region) (Not (Open box_1_top_region)))", goal)
     assert load_task(write_task(bddl)).memory_type == expected
@@ -74,9 +72,7 @@ def test_prompt_is_inferred(write_task: Write, bddl: str, language: str, kind: s
         assert load_task(write_task(bddl, parent="procedural")).prompt == Prompt("routine", None)
 
 
-def test_referent_is_the_object_that_has_siblings(
-    write_task: Write, bddl: str, metadata: dict[str, Any]
-) -> None:
+def test_referent_is_the_object_that_has_siblings(write_task: Write, bddl: str, metadata: dict[str, Any]) -> None:
     metadata["subtask_goals"][0] = ["on", "lid,v1.2", "cup_2"]
     prompt = load_task(write_task(bddl, metadata, parent="object")).prompt
     assert prompt == Prompt("routine", "cup_2")

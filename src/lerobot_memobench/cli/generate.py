@@ -35,7 +35,9 @@ def generate(tasks: str, episodes: int, out: Path, **settings: Any) -> int:
     screen.print(_summary_table(summary))
     for failure in summary.failures:
         screen.print(f"no demonstration of {failure.task_name}, seed {failure.seed}: {failure.reason}")
-    if summary.folder is None:
+    if summary.submitted:
+        screen.print(f"jobs are submitted; the last of them assembles the dataset in {out}", soft_wrap=True)
+    elif summary.folder is None:
         screen.print("no dataset was written: no seed was solved")
     else:
         screen.print(f"dataset: {summary.folder}", soft_wrap=True)

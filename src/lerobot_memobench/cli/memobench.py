@@ -16,6 +16,7 @@ from typing import Annotated, Any
 
 import typer
 
+from lerobot_memobench.cli import data
 from lerobot_memobench.cli.console import console
 from lerobot_memobench.errors import MemobenchError
 
@@ -62,6 +63,22 @@ class Referent(StrEnum):
     RANDOM = "random"
 
 
+class Format(StrEnum):
+    """What demonstrations are written as."""
+
+    LEROBOT = "lerobot"
+    HDF5 = "hdf5"
+
+
+class Executor(StrEnum):
+    """What runs the episodes."""
+
+    PROCESSES = "processes"
+    LOCAL = "local"
+    SLURM = "slurm"
+    RAY = "ray"
+
+
 # --- tasks ---
 
 
@@ -100,6 +117,15 @@ def generate(
     prompt_video: Annotated[bool, typer.Option(help="Begin with the prompt where a task has one.")] = True,
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     repo_id: Annotated[str | None, typer.Option(help="Name of the dataset, user/name.")] = None,
+    formats: Annotated[
+        list[Format] | None, typer.Option("--format", help="lerobot (default), hdf5, or both by naming both.")
+    ] = None,
+    executor: Annotated[
+        Executor, typer.Option(help="processes here, or datatrove's: local, slurm, ray.")
+    ] = Executor.PROCESSES,
+    executor_option: Annotated[
+        list[str] | None, typer.Option(help="key=value for datatrove's executor, e.g. partition=cpu; repeatable.")
+    ] = None,
 ) -> int:
     """Let the scripted experts make demonstrations into a LeRobotDataset. The same command continues a killed
     run.
@@ -116,6 +142,9 @@ def generate(
         image_size=image_size,
         prompt_video=prompt_video,
         workers=workers,
+        formats=tuple(format_.value for format_ in formats or [Format.LEROBOT]),
+        executor=executor.value,
+        executor_options=data.executor_options(executor_option or []),
         **({} if repo_id is None else {"repo_id": repo_id}),
     )
 
@@ -135,6 +164,11 @@ def cache(
     from lerobot_memobench.cli.generate import cache as run
 
     run(dataset, size=size, stride=stride, weights=weights, device=device, batch_size=batch_size)
+
+
+app.command()(data.convert)
+app.command()(data.validate)
+app.command()(data.push)
 
 
 # --- reports ---
@@ -172,6 +206,33 @@ def doctor(
     else:
         console().print(finding_table(findings))
     return exit_status(findings)
+
+
+@app.command()
+def gallery(
+    out: Annotated[Path, typer.Option(help="Folder of the pictures; those of the same name are replaced.")] = Path(
+        "outputs/gallery"
+    ),
+) -> None:
+    """Draw every task's initial scene, every object from all sides, every fixture open and closed."""
+    from lerobot_memobench.sim.gallery import write_gallery
+
+    for picture in write_gallery(out):
+        console().print(str(picture), soft_wrap=True)
+
+
+@app.command()
+def bench(
+    names: Annotated[list[str] | None, typer.Argument(help="Which benchmarks; all when left out.")] = None,
+) -> None:
+    """Time steps, resets and workers against stock robosuite, in one run; the table belongs in a bug report."""
+    from lerobot_memobench.sim.bench import run, table
+
+    lines = []
+    for line in run(names):
+        print(line.json(), flush=True)
+        lines.append(line)
+    print(f"\n{table(lines)}")
 
 
 @app.command()

@@ -8,9 +8,15 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_memobench.datasets.paper_figures import FAMILIES, LENGTH_BUCKETS
 from lerobot_memobench.datasets.staging import StagedEpisode
 
 LICENSE = "apache-2.0"
+
+SCRIPTED = (
+    "Scripted experts act in a MuJoCo simulation; nothing was collected from people or robots. Actions were recorded "
+    "as applied, so that replaying them from the seed gives the same states."
+)
 
 COLUMNS = {
     "observation.images.image": "third-person camera",
@@ -52,12 +58,13 @@ def write_card(
     *,
     repo_id: str,
     made_by: str,
+    left_out: Sequence[str] = (),
 ) -> None:
     """Write ``folder``/README.md: what the dataset is, its columns, how it was made, statistics, licence."""
     written = [episode.info for episode in episodes if episode.failure is None]
     failed = [episode for episode in episodes if episode.failure is not None]
     tasks = sorted({info["task_name"] for info in written})
-    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    storage = _storage(folder, [episode for episode in episodes if episode.failure is None])
     parts = [
         _front_matter(len(written)),
         "# MEMOBench demonstrations",
@@ -75,16 +82,18 @@ def write_card(
         "rows "
         "differ in number between episodes. `lerobot-train` does so by itself.",
         "## How it was made",
-        (made_by or "Written by `lerobot_memobench`.")
-        + " Scripted experts act in a MuJoCo simulation; nothing was collected from people or robots. "
-        "Actions were "
-        "recorded as applied, so that replaying them from the seed gives the same states. `manifest.json` "
-        "holds "
-        "a hash of every episode's states, actions and labels; `states/` holds the simulator's states "
-        "(1 + nq + nv numbers per frame).",
+        (made_by or f"Written by `lerobot_memobench`. {SCRIPTED}") + " `manifest.json` holds a hash of every episode's "
+        "states, actions and labels; `states/` holds the simulator's states (1 + nq + nv numbers per frame).",
         _failures(failed, len(episodes)),
+        _left_out(left_out),
         "## Statistics",
-        _statistics(written, size),
+        "Steps are frames: control steps of 50 ms, prompt video included. The paper's rows are those of its "
+        "demonstrations (appendix, family level statistics), stored as HDF5; storage here is that of the "
+        "LeRobotDataset: videos as they are, everything else in proportion to the frames.",
+        _statistics(written, storage),
+        _prompts(written),
+        "How many episodes have which length, in steps (paper: appendix, distribution of lengths):",
+        _buckets(written),
         _per_task(written, failed),
         "## Columns",
         _table(
@@ -127,8 +136,7 @@ def _front_matter(count: int) -> str:
 
 
 def _memory_types(infos: Sequence[dict[str, Any]]) -> str:
-    types = sorted({info["memory_type"] for info in infos})
-    return ", ".join(types)
+    return ", ".join(_ordered_types(infos))
 
 
 def _failures(failed: Sequence[StagedEpisode], asked: int) -> str:
@@ -138,39 +146,78 @@ def _failures(failed: Sequence[StagedEpisode], asked: int) -> str:
     return f"**{len(failed)} of {asked} seeds asked for have no demonstration here:**\n\n" + "\n".join(lines)
 
 
-def _statistics(infos: Sequence[dict[str, Any]], size: int) -> str:
+def _left_out(problems: Sequence[str]) -> str:
+    if not problems:
+        return ""
+    return f"**Left out ({len(problems)}):**\n\n" + "\n".join(f"- {problem}" for problem in problems)
+
+
+def _storage(folder: Path, episodes: Sequence[StagedEpisode]) -> dict[str, float]:
+    """Return bytes per memory type, and their ``total``; what belongs to no episode is shared out by frames."""
+    total = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file() and "hdf5" not in path.parts)
+    videos = sum(episode.video_bytes for episode in episodes)
+    frames = sum(episode.info["frames"] for episode in episodes)
+    found: dict[str, float] = {"total": float(total)}
+    for episode in episodes:
+        share = episode.video_bytes + (total - videos) * episode.info["frames"] / frames
+        found[episode.info["memory_type"]] = found.get(episode.info["memory_type"], 0.0) + share
+    return found
+
+
+def _ordered_types(infos: Sequence[dict[str, Any]]) -> list[str]:
+    there = {info["memory_type"] for info in infos}
+    return [name for name in FAMILIES if name in there] + sorted(there - set(FAMILIES))
+
+
+def _statistics(infos: Sequence[dict[str, Any]], storage: dict[str, float]) -> str:
     rows = []
-    types = sorted({info["memory_type"] for info in infos})
-    for name in [*types, "total"]:
+    for name in [*_ordered_types(infos), "total"]:
         chosen = [info for info in infos if name in (info["memory_type"], "total")]
         lengths = np.array([info["frames"] for info in chosen])
-        prompts = np.array([info["exec_start_index"] for info in chosen])
+        tasks = len({info["task_name"] for info in chosen})
+        figures = [lengths.mean(), np.median(lengths), np.percentile(lengths, 95)]
+        row = [name, "here", f"{tasks}", f"{len(chosen):,}", f"{lengths.sum():,}", *(f"{x:,.2f}" for x in figures)]
+        rows.append([*row, f"{lengths.max():,}", _bytes(storage.get(name, 0.0))])
+        if name in FAMILIES:
+            paper = FAMILIES[name]
+            figures = [paper.mean, paper.median, paper.p95]
+            row = ["", "paper", f"{paper.tasks}", f"{paper.episodes:,}", f"{paper.steps:,}"]
+            rows.append([*row, *(f"{x:,.2f}" for x in figures), f"{paper.max:,}", f"{paper.storage:.2f} GiB"])
+    header = ["memory type", "", "tasks", "episodes", "steps", "mean", "median", "P95", "max", "storage"]
+    frames = sum(info["frames"] for info in infos)
+    return _table(header, rows) + f"\n\n{storage['total'] / frames:,.0f} bytes per frame."
+
+
+def _bytes(size: float) -> str:
+    return f"{size / 1024**3:.2f} GiB" if size >= 0.1 * 1024**3 else f"{size / 1024**2:.2f} MiB"
+
+
+def _prompts(infos: Sequence[dict[str, Any]]) -> str:
+    parts = []
+    for name in _ordered_types(infos):
+        lengths = [info["exec_start_index"] for info in infos if info["memory_type"] == name]
+        if any(lengths):
+            parts.append(f"{np.mean(lengths):.1f} in {name} tasks")
+    return f"Of these steps the prompt video takes, on average, {' and '.join(parts)}." if parts else ""
+
+
+def _buckets(infos: Sequence[dict[str, Any]]) -> str:
+    lengths = np.array([info["frames"] for info in infos])
+    published = sum(LENGTH_BUCKETS.values())
+    rows = []
+    for (low, high), theirs in LENGTH_BUCKETS.items():
+        ours = int(((lengths >= low) & (lengths < (high or np.inf))).sum())
+        span = f"{low:,}+" if high is None else f"{low:,}–{high - 1:,}"
         rows.append(
             [
-                name,
-                str(len({info["task_name"] for info in chosen})),
-                str(len(chosen)),
-                f"{lengths.sum():,}",
-                f"{lengths.mean():.1f}",
-                f"{np.median(lengths):g}",
-                f"{np.percentile(lengths, 95):g}",
-                str(lengths.max()),
-                f"{prompts.mean():.1f}",
+                span,
+                f"{ours:,}",
+                f"{100 * ours / len(lengths):.2f} %",
+                f"{theirs:,}",
+                f"{100 * theirs / published:.2f} %",
             ]
         )
-    header = [
-        "memory type",
-        "tasks",
-        "episodes",
-        "frames",
-        "mean",
-        "median",
-        "P95",
-        "max",
-        "of it prompt (mean)",
-    ]
-    frames = sum(info["frames"] for info in infos)
-    return _table(header, rows) + f"\n\n{size / 1024**2:.1f} MiB in all, {size / frames:,.0f} bytes per frame."
+    return _table(["length", "episodes here", "share", "episodes in the paper", "share"], rows)
 
 
 def _per_task(infos: Sequence[dict[str, Any]], failed: Sequence[StagedEpisode]) -> str:

@@ -7,48 +7,60 @@ of task, seed and settings, so neither interruptions nor the number of workers c
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
-import multiprocessing
-import os
 import shutil
-import signal
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from importlib.metadata import PackageNotFoundError, version
-from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from lerobot_memobench.datasets.card import SCRIPTED
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.lerobot_format import (
     DEFAULT_REPO_ID,
+    HDF5_FOLDER,
     MANIFEST_FILE,
     STAGING,
     assemble,
     check_destination,
     is_dataset,
 )
+from lerobot_memobench.datasets.mjcf import model_file
+from lerobot_memobench.datasets.running import Advance, ProgressCallback, check_executor, run_jobs, staged
 from lerobot_memobench.datasets.staging import (
+    FORMATS,
+    HDF5,
+    LEROBOT,
+    EpisodeStage,
     StagedEpisode,
     clean_temporaries,
-    read_staged,
-    stage_demonstration,
     stage_failure,
-    write_json,
 )
+from lerobot_memobench.datasets.unfinished import REQUEST_FILE, check_request, compare_requests, locked
 from lerobot_memobench.envs.episode import Episode
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import NO_OP
 from lerobot_memobench.tasks.task import Task
+
+__all__ = [
+    "FIRST_SEED",
+    "HOLD_FRAMES",
+    "Advance",
+    "Failure",
+    "GenerationSummary",
+    "ProgressCallback",
+    "RecordingSettings",
+    "TaskSummary",
+    "generate",
+    "record_demonstration",
+]
 
 FIRST_SEED = 10_000
 """Demonstrations use the seeds 10,000 + i; evaluation uses 7 + i (paper, section 5.1)."""
@@ -56,8 +68,9 @@ FIRST_SEED = 10_000
 HOLD_FRAMES = 10
 """Frames kept after success, without motion: the last event has a frame, and a policy learns to stop."""
 
-REQUEST_FILE = "request.json"
-LOCK_FILE = "lock"
+PATIENCE = 40
+"""Steps that an episode goes on after the expert is through with its plan: what still falls, slides or has to hold for
+some steps may yet reach the goal. Then it is given up, long before the horizon."""
 
 
 @dataclass(frozen=True)
@@ -97,12 +110,14 @@ class GenerationSummary:
     """What a run made.
 
     Attributes:
-        folder: the dataset, or None when no episode succeeded.
+        folder: what was made, or None when no episode succeeded, or none is there yet.
         tasks: one entry per task, in the order asked for.
+        submitted: the episodes are being made on Slurm, whose last job will write the dataset.
     """
 
     folder: Path | None
     tasks: tuple[TaskSummary, ...]
+    submitted: bool = False
 
     @property
     def failures(self) -> tuple[Failure, ...]:
@@ -112,20 +127,6 @@ class GenerationSummary:
     def exit_status(self) -> int:
         """0 when every seed asked for was solved, else 1."""
         return 1 if self.failures else 0
-
-
-@dataclass(frozen=True)
-class Advance:
-    """Told to the progress callback after each episode: how many are there, and the newest one's identity."""
-
-    done: int
-    total: int
-    task_name: str
-    seed: int
-    failure: str | None
-
-
-ProgressCallback = Callable[[Advance], None]
 
 
 # --- one demonstration --------------------------------------------------------------------------------------
@@ -167,7 +168,13 @@ def _episode(task: Task, settings: RecordingSettings) -> Episode:
     )
 
 
-def _record(episode: Episode, seed: int, settings: RecordingSettings) -> Demonstration:
+def _record(
+    episode: Episode,
+    seed: int,
+    settings: RecordingSettings,
+    show: Callable[[dict[str, NDArray[np.uint8]]], None] | None = None,
+) -> Demonstration:
+    """Record an episode. Images go to ``show``, frame by frame, or without it into the demonstration."""
     if settings.hold_frames < 1:
         raise MemobenchError(
             f"hold_frames is {settings.hold_frames}; the last event shows only with at least 1 frame after success"
@@ -177,16 +184,21 @@ def _record(episode: Episode, seed: int, settings: RecordingSettings) -> Demonst
     states, actions, proprio, satisfied = [], [], [], []
     images: dict[str, list[Any]] = {}
     reached = False
-    held = 0
+    held = idle = 0
     while held < settings.hold_frames:
         states.append(episode.sim.state())
         proprio.append(episode.sim.proprio())
         satisfied.append(episode.progress.satisfied)
         if settings.images:
-            for name, frame in episode.images().items():
-                images.setdefault(name, []).append(frame)
+            seen = episode.images()
+            if show is not None:
+                show(seen)
+            else:
+                for name, frame in seen.items():
+                    images.setdefault(name, []).append(frame)
         reached = reached or episode.success
-        over = reached or episode.done
+        idle += getattr(episode, "expert_done", False)
+        over = reached or episode.done or idle > PATIENCE
         held += over
         episode.step(np.asarray(NO_OP, dtype=np.float32) if over else episode.expert_action())
         actions.append(episode.applied_action)
@@ -199,7 +211,7 @@ def _record(episode: Episode, seed: int, settings: RecordingSettings) -> Demonst
         states=np.array(states, dtype=np.float64),
         actions=np.array(actions, dtype=np.float32),
         proprio=np.array(proprio, dtype=np.float32),
-        images={name: np.stack(images.pop(name)) for name in list(images)} if settings.images else None,
+        images={name: np.stack(images.pop(name)) for name in list(images)} if images else None,
         exec_start=episode.exec_start,
         satisfied=np.array(satisfied, dtype=np.bool_).reshape(len(states), len(episode.task.checkpoints)),
         success=reached and episode.prompt_shown is not False,
@@ -213,7 +225,9 @@ def _failure_reason(demo: Demonstration, episode: Episode) -> str | None:
         return "the prompt video did not show what it had to"
     if not demo.success:
         index, count = episode.progress.index, len(demo.task.checkpoints)
-        return f"goal not reached in {episode.horizon} steps ({index} of {count} checkpoints completed)"
+        steps = episode.progress.steps
+        how = f"in {episode.horizon} steps" if steps >= episode.horizon else f"by step {steps}, the expert's plan over"
+        return f"goal not reached {how} ({index} of {count} checkpoints completed)"
     return None
 
 
@@ -221,39 +235,48 @@ def _failure_reason(demo: Demonstration, episode: Episode) -> str | None:
 
 
 @dataclass(frozen=True)
-class _Job:
+class RecordingJob:
+    """One seed of one task, to be recorded and staged in ``folder``."""
+
     task: Task
     seed: int
     settings: RecordingSettings
     folder: Path
+    formats: tuple[str, ...] = (LEROBOT,)
 
+    @property
+    def task_name(self) -> str:
+        return self.task.name
 
-def run_job(job: _Job) -> None:
-    """Make one episode and stage it. Runs in any process; the folder is all that it leaves behind."""
-    where = f"{job.task.name}, seed {job.seed}"
-    try:
-        episode = _episode(job.task, job.settings)
-        demo = _record(episode, job.seed, job.settings)
-        reason = _failure_reason(demo, episode)
-    except MemobenchError as error:
-        raise MemobenchError(f"{where}: {error}") from error
-    except Exception as error:
-        error.add_note(f"while recording {where}")
-        raise
-    if reason is None:
-        stage_demonstration(demo, job.folder)
-        return
-    info = {
-        "task_name": job.task.name,
-        "memory_type": job.task.memory_type,
-        "seed": job.seed,
-        "referent": job.settings.referent,
-        "variant": demo.variant,
-        "success": False,
-        "frames": len(demo),
-        "scene_hash": demo.scene_hash,
-    }
-    stage_failure(info, reason, job.folder)
+    def run(self) -> None:
+        """Make the episode. Runs in any process; the folder is all that it leaves behind."""
+        where = f"{self.task.name}, seed {self.seed}"
+        try:
+            episode = _episode(self.task, self.settings)
+            with EpisodeStage(self.folder, self.formats) as stage:
+                demo = _record(episode, self.seed, self.settings, stage.add_images)
+                reason = _failure_reason(demo, episode)
+                if reason is None:
+                    if HDF5 in self.formats:
+                        demo = replace(demo, model_xml=model_file(self.task, demo.fixture_poses))
+                    stage.publish(demo)
+                    return
+        except MemobenchError as error:
+            raise MemobenchError(f"{where}: {error}") from error
+        except Exception as error:
+            error.add_note(f"while recording {where}")
+            raise
+        info = {
+            "task_name": self.task.name,
+            "memory_type": self.task.memory_type,
+            "seed": self.seed,
+            "referent": self.settings.referent,
+            "variant": demo.variant,
+            "success": False,
+            "frames": len(demo),
+            "scene_hash": demo.scene_hash,
+        }
+        stage_failure(info, reason, self.folder)
 
 
 def generate(
@@ -267,16 +290,23 @@ def generate(
     image_size: int = 256,
     prompt_video: bool = True,
     hold_frames: int = HOLD_FRAMES,
+    formats: Collection[str] = (LEROBOT,),
     workers: int = 1,
+    executor: str = "processes",
+    executor_options: Mapping[str, Any] | None = None,
     resume: bool = True,
     repo_id: str = DEFAULT_REPO_ID,
     progress: ProgressCallback | None = None,
 ) -> GenerationSummary:
-    """Make ``episodes`` demonstrations of each task into a LeRobotDataset in the folder ``out``.
+    """Make ``episodes`` demonstrations of each task into the folder ``out``.
 
-    The seeds are ``seed_base`` + i. An unfinished run of the same request in ``out`` is continued
-    (``resume=False`` starts anew), a finished one is only reported. Failed episodes are in no dataset, but in
-    the summary, the manifest and the card.
+    ``formats`` says what becomes of them: ``lerobot`` is a LeRobotDataset in ``out``, ``hdf5`` a file per task in
+    the published layout in ``out``/hdf5. The seeds are ``seed_base`` + i. An unfinished run of the same request in
+    ``out`` is continued (``resume=False`` starts anew), a finished one is only reported. Failed episodes are in no
+    dataset, but in the summary, the manifest and the card.
+
+    ``executor`` says where ``workers`` episodes at a time are made (``running.EXECUTORS``); it changes nothing of
+    the result. On Slurm the call returns when the jobs are submitted, the last of which writes the dataset.
 
     Raises:
         MemobenchError: nothing to do, ``out`` holds something else, another run is writing there, or an
@@ -290,140 +320,96 @@ def generate(
     names = [task.name for task in tasks]
     if len(set(names)) < len(names):
         raise MemobenchError(f"a task was named twice among {', '.join(names)}; name each once")
+    formats = _checked_formats(formats, images)
+    check_executor(executor, executor_options)
     settings = RecordingSettings(referent, images, image_size, prompt_video, hold_frames)
     request = {
         "tasks": names,
+        "formats": list(formats),
         "episodes": episodes,
         "seed_base": seed_base,
         **asdict(settings),
         "task_files": [_task_hash(task) for task in tasks],
         "versions": _versions(),
     }
-    if is_dataset(out):
+    if is_finished(out):
         return _finished(out, request, tasks)
     check_destination(out)
     staging = out / STAGING
     staging.mkdir(parents=True, exist_ok=True)
-    with _locked(staging / LOCK_FILE, out):
+    with locked(staging, out):
         if not resume:
             shutil.rmtree(staging / "episodes", ignore_errors=True)
             (staging / REQUEST_FILE).unlink(missing_ok=True)
-        _check_request(staging / REQUEST_FILE, request, out)
+        check_request(staging, request, out, "pass resume=false to start anew or name another folder")
         folder = staging / "episodes"
         folder.mkdir(exist_ok=True)
         clean_temporaries(folder)
         jobs = [
-            _Job(task, seed_base + i, settings, folder / f"{number * episodes + i:06d}")
+            RecordingJob(task, seed_base + i, settings, folder.absolute() / f"{number * episodes + i:06d}", formats)
             for number, task in enumerate(tasks)
             for i in range(episodes)
         ]
-        _run(jobs, workers, progress)
-        staged = [_staged(job) for job in jobs]
-        summary = _summarise([_row(episode) for episode in staged], tasks, out)
+        again = partial(
+            generate,
+            tasks,
+            episodes,
+            out.absolute(),
+            seed_base=seed_base,
+            **asdict(settings),
+            formats=formats,
+            repo_id=repo_id,
+        )
+        complete = run_jobs(
+            jobs,
+            workers=workers,
+            progress=progress,
+            executor=executor,
+            options=executor_options,
+            # Slurm's logs outlive the run, and its last job still writes to them when the staging folder is gone.
+            logs=out.absolute().with_name(f"{out.absolute().name}_slurm") if executor == "slurm" else staging / "logs",
+            finish=again,
+        )
+        if not complete:
+            return GenerationSummary(None, _summarise([], tasks, out).tasks, submitted=True)
+        episodes_staged = [staged(job) for job in jobs]
+        summary = _summarise([_row(episode) for episode in episodes_staged], tasks, out)
         if summary.folder is not None:
-            made_by = f"`memobench generate`, {episodes} seeds per task from {seed_base} on, referent {referent}."
-            assemble(staged, out, repo_id=repo_id, made_by=made_by, manifest={"request": request})
+            made_by = f"`memobench generate`, {episodes} seeds per task from {seed_base} on, referent {referent}. "
+            assemble(
+                episodes_staged,
+                out,
+                formats=formats,
+                repo_id=repo_id,
+                made_by=made_by + SCRIPTED,
+                manifest={"request": request},
+            )
             shutil.rmtree(staging)
     return summary
 
 
-def _run(jobs: Sequence[_Job], workers: int, progress: ProgressCallback | None) -> None:
-    """Run the jobs that are not staged yet; tell ``progress`` of every one, old or new."""
-    done = 0
-
-    def tell(job: _Job) -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress(Advance(done, len(jobs), job.task.name, job.seed, _staged(job).failure))
-
-    waiting = []
-    for job in jobs:
-        if read_staged(job.folder) is None:
-            waiting.append(job)
-        else:
-            tell(job)
-    if workers == 1 or len(waiting) <= 1:
-        for job in waiting:
-            run_job(job)
-            tell(job)
-        return
-    # Processes are spawned: a forked child would share GL contexts and threads with its parent.
-    pool = ProcessPoolExecutor(
-        min(workers, len(waiting)),
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=_begin_worker,
-    )
+def is_finished(out: Path) -> bool:
+    """Whether ``out`` holds everything that a run had to make: its manifest comes last, or the dataset after it."""
+    if is_dataset(out):
+        return True
     try:
-        futures: dict[Future[None], _Job] = {pool.submit(run_job, job): job for job in waiting}
-        for future in as_completed(futures):
-            future.result()
-            tell(futures[future])
-    except BrokenProcessPool:
-        raise MemobenchError(
-            f"one of {workers} worker processes was killed, perhaps because memory ran out; run the same command "
-            "again to go on from here, with fewer workers"
-        ) from None
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+        manifest = json.loads((out / MANIFEST_FILE).read_text())
+        return LEROBOT not in manifest["request"]["formats"] and (out / HDF5_FOLDER).is_dir()
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
 
 
-def _begin_worker() -> None:
-    """End this worker when the process that started it is gone, however it went; else it would wait on.
-
-    Ctrl-C is the parent's to handle: the episode being made is finished, so that nothing is lost.
-    """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def watch() -> None:
-        wait([parent.sentinel])
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
-def _staged(job: _Job) -> StagedEpisode:
-    staged = read_staged(job.folder)
-    if staged is None:
-        raise MemobenchError(f"{job.folder} has vanished while the run was going on; run the command again")
-    return staged
-
-
-@contextlib.contextmanager
-def _locked(path: Path, out: Path) -> Iterator[None]:
-    """Let one run at a time write to ``out``. The lock is the kernel's and ends with the process."""
-    import fcntl
-
-    with open(path, "w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise MemobenchError(
-                f"another run is writing to {out}; wait for it to end or name another folder"
-            ) from None
-        yield
-
-
-def _check_request(path: Path, request: dict[str, Any], out: Path) -> None:
-    try:
-        earlier = json.loads(path.read_text())
-    except FileNotFoundError:
-        write_json(request, path)
-        return
-    _compare(
-        earlier,
-        request,
-        f"{out} holds an unfinished run",
-        "pass resume=false to start anew or name another folder",
-    )
-
-
-def _compare(earlier: dict[str, Any], request: dict[str, Any], what: str, advice: str) -> None:
-    for key, value in request.items():
-        if earlier.get(key) != value:
-            raise MemobenchError(f"{what} with {key}={earlier.get(key)!r}, now {value!r} was asked for; {advice}")
+def _checked_formats(formats: Collection[str], images: bool) -> tuple[str, ...]:
+    """Return the formats in their order, each once."""
+    given = [formats] if isinstance(formats, str) else list(formats)
+    for name in given:
+        if name not in FORMATS:
+            raise MemobenchError(f"found format {name!r}, {nearest(name, FORMATS)}")
+    if not given:
+        raise MemobenchError(f"no format was asked for; name {' or '.join(FORMATS)}, or both")
+    if HDF5 in given and not images:
+        raise MemobenchError("format 'hdf5' was asked for without images, which its layout holds; record them as well")
+    return tuple(name for name in FORMATS if name in given)
 
 
 def _finished(out: Path, request: dict[str, Any], tasks: Sequence[Task]) -> GenerationSummary:
@@ -439,7 +425,7 @@ def _finished(out: Path, request: dict[str, Any], tasks: Sequence[Task]) -> Gene
         **earlier,
         "versions": request["versions"],
     }  # a finished dataset stays valid under newer versions
-    _compare(earlier, request, f"{out} already holds a finished dataset", "name another folder")
+    compare_requests(earlier, request, f"{out} already holds a finished dataset", "name another folder")
     shutil.rmtree(out / STAGING, ignore_errors=True)
     return _summarise(manifest["episodes"], tasks, out)
 

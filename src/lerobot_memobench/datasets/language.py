@@ -54,6 +54,9 @@ def _row(style: str, text: str, frame: int, fps: int) -> LanguageRow:
         "content": text,
         "style": style,
         "timestamp": timestamp,
-        "camera": None,
-        "tool_calls": None,
+        # LeRobot's annotation writer puts None here, and then its own `lerobot-dataset-viz` cannot open the dataset:
+        # it batches frames with torch's collate function, which knows no None. Empty means the same to LeRobot's
+        # recipes: they look at a camera only when asked for one, and at tool calls if there are any.
+        "camera": "",
+        "tool_calls": [],
     }

@@ -16,7 +16,7 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +32,10 @@ from lerobot_memobench.datasets.demonstration import (
     PROPRIO_DIM,
     Demonstration,
 )
+from lerobot_memobench.datasets.hdf5 import SUFFIX, write_task_file
 from lerobot_memobench.datasets.staging import (
+    HDF5,
+    LEROBOT,
     TEMPORARY,
     StagedEpisode,
     clean_temporaries,
@@ -52,6 +55,7 @@ logger = logging.getLogger(__name__)
 DEFAULT_REPO_ID = "memobench/memobench"
 ROBOT_TYPE = "panda"
 STAGING = ".staging"
+HDF5_FOLDER = "hdf5"
 MANIFEST_FILE = "manifest.json"
 STATES_PATH = "states/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_PER_STATES_FILE = 100
@@ -59,8 +63,8 @@ EPISODES_PER_STATES_FILE = 100
 PROPRIO_NAMES = ["x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z", "finger_left", "finger_right"]
 ACTION_NAMES = ["x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z", "gripper"]
 
-# Moved in this order; with `meta` the folder becomes a dataset.
-TOP_LEVEL = ("videos", "states", "data", MANIFEST_FILE, "README.md", "meta")
+# Moved in this order; with `meta` the folder becomes a dataset, without it the manifest is the last.
+TOP_LEVEL = (HDF5_FOLDER, "videos", "states", "data", "README.md", MANIFEST_FILE, "meta")
 
 
 def image_key(camera: str) -> str:
@@ -145,13 +149,16 @@ def assemble(
     episodes: Sequence[StagedEpisode],
     out: Path | str,
     *,
+    formats: Collection[str] = (LEROBOT,),
     repo_id: str = DEFAULT_REPO_ID,
     made_by: str = "",
     manifest: dict[str, Any] | None = None,
+    left_out: Sequence[str] = (),
 ) -> Path:
-    """Build the dataset of the staged ``episodes`` in ``out``; episodes that failed are named, not written.
+    """Build what ``formats`` says of the staged ``episodes`` in ``out``; failed ones are named, not written.
 
-    Deterministic: the same episodes give the same files. ``manifest`` is added to manifest.json.
+    Deterministic: the same episodes give the same files. ``manifest`` is added to manifest.json, ``left_out`` says
+    on the card what else is missing and why.
     """
     out = Path(out)
     written = [episode for episode in episodes if episode.failure is None]
@@ -162,27 +169,52 @@ def assemble(
     for episode in written:
         episode.check()
 
-    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-
     build = out / STAGING / f"{TEMPORARY}dataset"
     shutil.rmtree(build, ignore_errors=True)
-    build.parent.mkdir(parents=True, exist_ok=True)
+    build.mkdir(parents=True)
+    features = _write_lerobot(written, build, repo_id) if LEROBOT in formats else {}
+    if HDF5 in formats:
+        _write_hdf5(written, build / HDF5_FOLDER)
+    _write_manifest(episodes, manifest or {}, build)
+    if LEROBOT in formats:
+        write_card(build, episodes, features, repo_id=repo_id, made_by=made_by, left_out=left_out)
+    _move(build, out)
+    return out
+
+
+def _write_lerobot(written: Sequence[StagedEpisode], build: Path, repo_id: str) -> dict[str, dict[str, Any]]:
+    """Write the LeRobotDataset of the episodes into ``build``; return its features."""
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+
+    part = build.with_name(f"{build.name}-lerobot")  # LeRobot wants a folder that is not there yet
+    shutil.rmtree(part, ignore_errors=True)
     meta = LeRobotDatasetMetadata.create(
         repo_id=repo_id,
         fps=FPS,
         features=dataset_features(_image_size(written[0])),
-        root=build,
+        root=part,
         robot_type=ROBOT_TYPE,
         use_videos=written[0].has_images,
         metadata_buffer_size=len(written) + 1,  # one table: types of its columns come from all episodes
     )
-    places = _join_videos(meta, written, build)
-    _write_frames(meta, written, places, build)
+    places = _join_videos(meta, written, part)
+    _write_frames(meta, written, places, part)
     meta.finalize()
-    _write_manifest(episodes, manifest or {}, build)
-    write_card(build, episodes, meta.features, repo_id=repo_id, made_by=made_by)
-    _move(build, out)
-    return out
+    for path in part.iterdir():
+        path.replace(build / path.name)
+    part.rmdir()
+    return dict(meta.features)
+
+
+def _write_hdf5(written: Sequence[StagedEpisode], folder: Path) -> None:
+    """Write a file per task, in the order in which the tasks first appear."""
+    by_task: dict[str, list[StagedEpisode]] = {}
+    for episode in written:
+        by_task.setdefault(episode.info["task_name"], []).append(episode)
+    for name, chosen in by_task.items():
+        attributes = chosen[0].hdf5_attributes
+        assert attributes is not None
+        write_task_file(folder / f"{name}{SUFFIX}", attributes, [episode.hdf5 for episode in chosen])
 
 
 def _image_size(episode: StagedEpisode) -> tuple[int, int] | None:

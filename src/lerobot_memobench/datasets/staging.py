@@ -9,6 +9,9 @@ its own. An episode's file names and bytes depend on the episode alone, never on
     <staging>/episodes/000012/episode.json        identity, digest, statistics, hash of each file
                               arrays.npz          states, actions, proprio, label columns (no pickle)
                               image.mp4, wrist_image.mp4
+                              demonstration.hdf5  in the published layout, when that was asked for
+
+Frames go to the encoder while the episode is being made, so a worker's memory does not grow with its length.
 """
 
 from __future__ import annotations
@@ -16,23 +19,32 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import shutil
-from collections.abc import Iterable
+import socket
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.demonstration import CAMERAS, Demonstration, digest, labels
+from lerobot_memobench.datasets.hdf5 import EpisodeFile, data_attributes
 from lerobot_memobench.datasets.language import LanguageRow, persistent_rows
-from lerobot_memobench.datasets.video import Stats, encode_video, image_stats
+from lerobot_memobench.datasets.video import ImageHistograms, Stats, VideoWriter
 from lerobot_memobench.errors import MemobenchError
 
 RECORD_FILE = "episode.json"
 ARRAYS_FILE = "arrays.npz"
+HDF5_FILE = "demonstration.hdf5"
 TEMPORARY = ".tmp-"
+
+LEROBOT, HDF5 = "lerobot", "hdf5"
+FORMATS = (LEROBOT, HDF5)
+"""What a run can make of its episodes."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +71,21 @@ class StagedEpisode:
     @property
     def has_images(self) -> bool:
         return bool(self.record["image_stats"])
+
+    @property
+    def hdf5(self) -> Path:
+        """The demonstration in the published layout, alone at the root of a file of its own."""
+        return self.folder / HDF5_FILE
+
+    @property
+    def hdf5_attributes(self) -> dict[str, Any] | None:
+        """Attributes of its task's HDF5 file; None where HDF5 was not asked for."""
+        return self.record.get("hdf5")
+
+    @property
+    def video_bytes(self) -> int:
+        """Size of its videos."""
+        return sum(self.video(camera).stat().st_size for camera in self.record["image_stats"])
 
     def video(self, camera: str) -> Path:
         return self.folder / f"{camera}.mp4"
@@ -105,25 +132,86 @@ def episode_info(demo: Demonstration) -> dict[str, Any]:
     }
 
 
-def stage_demonstration(demo: Demonstration, folder: Path) -> StagedEpisode:
-    """Write a demonstration, images as video, to ``folder``; the same one, if there, is kept."""
-    found = labels(demo)
-    columns: dict[str, Any] = {"states": demo.states, "actions": demo.actions, "proprio": demo.proprio}
-    columns |= {name: np.asarray(column) for name, column in found.columns().items()}
-    temporary = _temporary(folder)
-    np.savez_compressed(temporary / ARRAYS_FILE, **columns)
-    stats: dict[str, Any] = {}
-    if demo.images is not None:
-        for camera in CAMERAS:
-            encode_video(demo.images[camera], temporary / f"{camera}.mp4")
-            stats[camera] = {name: value.tolist() for name, value in image_stats(demo.images[camera]).items()}
-    record = {
-        "failure": None,
-        "info": episode_info(demo),
-        "language_persistent": persistent_rows(found),
-        "image_stats": stats,
-    }
-    return _publish(temporary, folder, record)
+class EpisodeStage:
+    """An episode on its way to the disk: images frame by frame, everything else at the end.
+
+    A context: whatever was not published when it ends leaves nothing behind.
+
+    Args:
+        folder: where the finished episode goes; the same one, if there, is kept.
+        formats: which of ``FORMATS`` to write.
+    """
+
+    def __init__(self, folder: Path, formats: Collection[str] = (LEROBOT,)) -> None:
+        self._folder = folder
+        self._formats = tuple(formats)
+        self._temporary = _temporary(folder)
+        self._videos: dict[str, VideoWriter] = {}
+        self._histograms: dict[str, ImageHistograms] = {}
+        self._hdf5 = EpisodeFile(self._temporary / HDF5_FILE) if HDF5 in self._formats else None
+        self._frames = 0
+        if LEROBOT in self._formats:
+            self._videos = {camera: VideoWriter(self._temporary / f"{camera}.mp4") for camera in CAMERAS}
+            self._histograms = {camera: ImageHistograms() for camera in CAMERAS}
+
+    def __enter__(self) -> EpisodeStage:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for video in self._videos.values():
+            video.abandon()
+        if self._hdf5 is not None:
+            self._hdf5.abandon()
+        shutil.rmtree(self._temporary, ignore_errors=True)
+
+    def add_images(self, images: Mapping[str, NDArray[np.uint8]]) -> None:
+        """Take both cameras' next frame, (H, W, 3) uint8 each."""
+        self._frames += 1
+        for camera, video in self._videos.items():
+            video.add(images[camera])
+            self._histograms[camera].add(images[camera])
+        if self._hdf5 is not None:
+            self._hdf5.add_images(images)
+
+    def publish(self, demo: Demonstration) -> StagedEpisode:
+        """Add everything but the images, which have been given, and make it a finished episode."""
+        if self._frames not in (0, len(demo)):
+            raise MemobenchError(
+                f"{demo.task.name}, seed {demo.seed}: {self._frames} images of a demonstration of {len(demo)} frames "
+                "were recorded; give one per frame and camera, or none"
+            )
+        found = labels(demo)
+        stats: dict[str, Any] = {}
+        if LEROBOT in self._formats:
+            columns: dict[str, Any] = {"states": demo.states, "actions": demo.actions, "proprio": demo.proprio}
+            columns |= {name: np.asarray(column) for name, column in found.columns().items()}
+            np.savez_compressed(self._temporary / ARRAYS_FILE, **columns)
+            for camera, video in self._videos.items():
+                video.close()
+                if self._frames:
+                    found_stats = self._histograms[camera].stats()
+                    stats[camera] = {name: value.tolist() for name, value in found_stats.items()}
+        record = {
+            "failure": None,
+            "info": episode_info(demo),
+            "language_persistent": persistent_rows(found),
+            "image_stats": stats,
+        }
+        if self._hdf5 is not None:
+            self._hdf5.finish(demo)
+            record["hdf5"] = data_attributes(demo.task)
+        return _publish(self._temporary, self._folder, record)
+
+
+def stage_demonstration(demo: Demonstration, folder: Path, formats: Collection[str] = (LEROBOT,)) -> StagedEpisode:
+    """Write a demonstration that is in memory, images included, to ``folder``; the same one, if there, is kept."""
+    with EpisodeStage(folder, formats) as stage:
+        if demo.images is not None:
+            for frame in range(len(demo)):
+                stage.add_images({camera: demo.images[camera][frame] for camera in CAMERAS})
+        return stage.publish(demo)
 
 
 def stage_failure(info: dict[str, Any], reason: str, folder: Path) -> StagedEpisode:
@@ -145,9 +233,25 @@ def read_staged(folder: Path) -> StagedEpisode | None:
 
 
 def clean_temporaries(folder: Path) -> None:
-    """Remove what killed workers left in the folder of episodes."""
-    for path in folder.glob(f"{TEMPORARY}*"):
-        shutil.rmtree(path, ignore_errors=True)
+    """Remove what this machine's killed workers left in the folder of episodes; others may still be working."""
+    for path in folder.glob(f"{TEMPORARY}{_host()}-*"):
+        pid = path.name.removeprefix(f"{TEMPORARY}{_host()}-").split("-")[0]
+        if not (pid.isdigit() and _alive(int(pid))):
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _host() -> str:
+    return re.sub(r"[^A-Za-z0-9]", "_", socket.gethostname())
+
+
+def _alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return pid != os.getpid()  # what this process left behind earlier is rubbish too
 
 
 def file_hash(path: Path) -> str:
@@ -157,7 +261,7 @@ def file_hash(path: Path) -> str:
 
 def write_json(value: Any, path: Path) -> None:
     """Write JSON so that ``path`` holds either its old content or all of the new one."""
-    temporary = path.with_name(f"{TEMPORARY}{os.getpid()}-{path.name}")
+    temporary = path.with_name(f"{TEMPORARY}{_host()}-{os.getpid()}-{path.name}")
     temporary.write_text(json.dumps(value, indent=1))
     flush_to_disk([temporary])
     temporary.replace(path)
@@ -173,7 +277,7 @@ def flush_to_disk(paths: Iterable[Path]) -> None:
 
 
 def _temporary(folder: Path) -> Path:
-    temporary = folder.parent / f"{TEMPORARY}{os.getpid()}-{folder.name}"
+    temporary = folder.parent / f"{TEMPORARY}{_host()}-{os.getpid()}-{folder.name}"
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
     return temporary

@@ -45,24 +45,52 @@ def default_encoder() -> RGBEncoderConfig:
     return RGBEncoderConfig(vcodec="h264", preset="ultrafast", g=10, crf=23, extra_options={"bf": 0})
 
 
-def encode_video(
-    frames: NDArray[np.uint8], path: Path, encoder: RGBEncoderConfig | None = None, fps: int = FPS
-) -> None:
-    """Encode (T, H, W, 3) uint8 frames to ``path``.
+class VideoWriter:
+    """A video that is being encoded frame by frame, so that an episode's images are never in memory together.
 
     One thread, so that the bytes do not depend on the machine's cores or on what runs beside.
     """
-    import av
 
-    encoder = encoder or default_encoder()
-    options = encoder.get_codec_options(1, as_strings=True)
-    with av.open(str(path), "w") as container:
-        stream: Any = container.add_stream(encoder.vcodec, fps, options=options)
-        stream.pix_fmt = encoder.pix_fmt
-        stream.height, stream.width = frames.shape[1:3]
-        for frame in frames:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
-        container.mux(stream.encode())
+    def __init__(self, path: Path, encoder: RGBEncoderConfig | None = None, fps: int = FPS) -> None:
+        self._path, self._encoder, self._fps = path, encoder or default_encoder(), fps
+        self._container: Any = None
+        self._stream: Any = None
+
+    def add(self, frame: NDArray[np.uint8]) -> None:
+        """Encode one more frame, (H, W, 3) uint8."""
+        import av
+
+        if self._container is None:
+            options = self._encoder.get_codec_options(1, as_strings=True)
+            self._container = av.open(str(self._path), "w")
+            self._stream = self._container.add_stream(self._encoder.vcodec, self._fps, options=options)
+            self._stream.pix_fmt = self._encoder.pix_fmt
+            self._stream.height, self._stream.width = frame.shape[:2]
+        picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
+        self._container.mux(self._stream.encode(picture))
+
+    def close(self) -> None:
+        """Write what the encoder still holds and end the file."""
+        if self._container is not None:
+            self._container.mux(self._stream.encode())
+            self._container.close()
+            self._container = None
+
+    def abandon(self) -> None:
+        """Close the file as it is; it is about to be deleted."""
+        if self._container is not None:
+            self._container.close()
+            self._container = None
+
+
+def encode_video(
+    frames: NDArray[np.uint8], path: Path, encoder: RGBEncoderConfig | None = None, fps: int = FPS
+) -> None:
+    """Encode (T, H, W, 3) uint8 frames to ``path``."""
+    writer = VideoWriter(path, encoder, fps)
+    for frame in frames:
+        writer.add(frame)
+    writer.close()
 
 
 def join_videos(videos: Sequence[tuple[Path, int]], path: Path, fps: int = FPS) -> None:
@@ -110,28 +138,53 @@ def video_info(path: Path, encoder: RGBEncoderConfig | None = None) -> dict[str,
         av.logging.set_level(level)  # LeRobot leaves FFmpeg printing to stderr
 
 
-def image_stats(frames: NDArray[np.uint8]) -> Stats:
-    """Return LeRobot's statistics of (T, H, W, 3) frames: each (3, 1, 1), in [0, 1], and ``count`` (1,).
+class ImageHistograms:
+    """Statistics of a video's frames, collected while they pass: a histogram of 256 bins per frame and channel.
 
-    Over the frames that LeRobot samples (evenly, at least 100), but exact over their pixels: eight bits need
-    a histogram of 256 bins, not of 5,000 adaptive ones.
+    LeRobot takes frames evenly spread over the episode, at least 100; which ones is known only at its end. A
+    frame's histograms are 3 kB, the frame itself 192 kB.
     """
-    from lerobot.datasets.compute_stats import sample_indices
 
-    chosen = sample_indices(len(frames))
-    counts = np.stack([np.bincount(frames[chosen, ..., channel].ravel(), minlength=256) for channel in range(3)])
-    levels, total = np.arange(256) / 255.0, counts[0].sum()
-    mean = counts @ levels / total
-    cumulative = counts.cumsum(axis=1)
-    stats = {
-        "min": levels[(counts > 0).argmax(axis=1)],
-        "max": levels[255 - (counts[:, ::-1] > 0).argmax(axis=1)],
-        "mean": mean,
-        "std": np.sqrt(np.maximum(counts @ levels**2 / total - mean**2, 0)),
-    }
-    for q in QUANTILES:
-        stats[f"q{int(q * 100):02d}"] = levels[(cumulative >= q * total).argmax(axis=1)]
-    return {name: value.reshape(3, 1, 1) for name, value in stats.items()} | {"count": np.array([len(chosen)])}
+    def __init__(self) -> None:
+        self._counts: list[NDArray[np.int32]] = []
+
+    def add(self, frame: NDArray[np.uint8]) -> None:
+        """Count one more frame, (H, W, 3) uint8."""
+        import cv2
+
+        counts = [cv2.calcHist([frame], [channel], None, [256], [0, 256])[:, 0] for channel in range(3)]
+        self._counts.append(np.array(counts, dtype=np.int32))
+
+    def stats(self) -> Stats:
+        """Return LeRobot's statistics: each (3, 1, 1), in [0, 1], and ``count`` (1,).
+
+        Over the frames that LeRobot samples, but exact over their pixels: eight bits need a histogram of 256
+        bins, not of 5,000 adaptive ones.
+        """
+        from lerobot.datasets.compute_stats import sample_indices
+
+        chosen = sample_indices(len(self._counts))
+        counts = np.stack([self._counts[index] for index in chosen]).sum(axis=0, dtype=np.int64)
+        levels, total = np.arange(256) / 255.0, counts[0].sum()
+        mean = counts @ levels / total
+        cumulative = counts.cumsum(axis=1)
+        stats = {
+            "min": levels[(counts > 0).argmax(axis=1)],
+            "max": levels[255 - (counts[:, ::-1] > 0).argmax(axis=1)],
+            "mean": mean,
+            "std": np.sqrt(np.maximum(counts @ levels**2 / total - mean**2, 0)),
+        }
+        for q in QUANTILES:
+            stats[f"q{int(q * 100):02d}"] = levels[(cumulative >= q * total).argmax(axis=1)]
+        return {name: value.reshape(3, 1, 1) for name, value in stats.items()} | {"count": np.array([len(chosen)])}
+
+
+def image_stats(frames: NDArray[np.uint8]) -> Stats:
+    """Return the statistics of (T, H, W, 3) uint8 frames, see :class:`ImageHistograms`."""
+    histograms = ImageHistograms()
+    for frame in frames:
+        histograms.add(frame)
+    return histograms.stats()
 
 
 def numeric_stats(values: NDArray) -> Stats:

@@ -117,16 +117,13 @@ class MemobenchEnvConfig(EnvConfig):
 
         if self.task_dir is not None:
             return [
-                (load_task(folder).memory_type, index, folder)
-                for index, folder in enumerate(find_tasks(self.task_dir))
+                (load_task(folder).memory_type, index, folder) for index, folder in enumerate(find_tasks(self.task_dir))
             ]
         spec = self.task if self.task is not None else self.tasks
         tasks = [get_task(name) for name in resolve_tasks(spec)]
         return [(task.memory_type, task_index(task.name), task.folder) for task in tasks]
 
-    def create_envs(
-        self, n_envs: int, use_async_envs: bool = False
-    ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """Return `{memory type: {task id: vector env}}`; nothing is simulated before an env's first reset."""
         from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 

@@ -131,9 +131,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             self._film.add(self.render())
         return self._observation(), self._info()
 
-    def step(
-        self, action: NDArray[np.float32]
-    ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+    def step(self, action: NDArray[np.float32]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Advance by one control step of 50 ms. The reward is 1 at success, else 0."""
         episode = self.episode
         episode.step(np.asarray(action, dtype=np.float32))

@@ -7,12 +7,12 @@ from collections.abc import Callable, Generator
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.experts import motions
-from lerobot_memobench.experts.hand import OPEN, Hand
+from lerobot_memobench.experts.hand import OPEN, UP, Hand
 from lerobot_memobench.sim.scene import TABLE, TABLE_TOP
 from lerobot_memobench.sim.simulation import Simulation
-from lerobot_memobench.tasks.formula import And, Atom, Formula, Not, Or, Then
+from lerobot_memobench.tasks.formula import And, Atom, Evaluator, Formula, Not, Or, Then
 from lerobot_memobench.tasks.task import Task
 
 Doing = Generator[NDArray[np.float32], None, None]
@@ -46,26 +46,37 @@ class Expert:
         task: goal and checkpoints.
         sim: the running scene.
         rng: source of small variation in speed, grasp and approach.
+
+    Attributes:
+        done: nothing is left to do: the goal holds, or the plan has come to its end.
+        succeeded: the goal held when the expert was last asked.
+        hand: the arm it moves.
     """
 
     def __init__(self, task: Task, sim: Simulation, rng: np.random.Generator) -> None:
         self.task, self.sim = task, sim
-        self._hand = Hand(sim, rng)
-        self._was: set[tuple[str, ...]] = set()
+        self.hand = Hand(sim, rng)
+        self._watch = Evaluator([task.goal, *(checkpoint.goal for checkpoint in task.checkpoints)])
+        self._started = False
         self._doing = self._plan()
-        self.done = False
+        self.done = self.succeeded = False
 
     def act(self) -> NDArray[np.float32]:
-        """Return the action (7,) for the present state; holding still with open fingers once the plan is done.
+        """Return the action (7,) for the present state; coming to rest with open fingers once the plan is done.
 
         Ask once per control step: each call moves the plan on.
         """
+        if self._started:
+            # Latches and order are followed here too: what an atom says now does not tell whether a goal is reached.
+            self.succeeded, *_ = self._watch.step(self.sim.holds)
+            self.done = self.done or self.succeeded
+        self._started = True
         if not self.done:
             try:
                 return np.clip(next(self._doing), -1.0, 1.0)
             except StopIteration:
                 self.done = True
-        return np.array([0, 0, 0, 0, 0, 0, OPEN], dtype=np.float32)
+        return self.hand.rest(OPEN)
 
     def _plan(self) -> Doing:
         for checkpoint in self.task.checkpoints:
@@ -80,23 +91,22 @@ class Expert:
 
     def _holds(self, atom: Atom) -> bool:
         if atom.predicate in ("wasopen", "wasturnedon"):
-            return (atom.predicate, *atom.args) in self._was
+            return atom in self._watch.latched
         return self.sim.holds(atom)
 
     def achieve(self, atom: Atom) -> Doing:
         """Bring one atom about, unless it is already so."""
         if self._holds(atom):
             return
-        hand = self._hand
+        hand = self.hand
         match atom.predicate, atom.args:
-            case ("open" | "wasopen"), (name,):
+            case (("open" | "wasopen"), (name,)):
                 yield from self._open(name)
-                self._was.add(("wasopen", name))
             case "close", (name,):
-                yield from motions.close_drawer(hand, name)
-            case ("turnon" | "wasturnedon"), (name,):
+                door = self.sim.world.articulation(name)[0].kind == "door"
+                yield from motions.close_door(hand, name) if door else motions.close_drawer(hand, name)
+            case (("turnon" | "wasturnedon"), (name,)):
                 yield from motions.turn_knob(hand, name, on=True)
-                self._was.add(("wasturnedon", name))
             case "turnoff", (name,):
                 yield from motions.turn_knob(hand, name, on=False)
             case "in", (name, region):
@@ -114,13 +124,16 @@ class Expert:
                 return
 
     def _put_on(self, name: str, support: str) -> Doing:
-        held = yield from motions.pick(self._hand, name)
+        on_object = support in self.sim.assets
+        place = self.sim.body_pose(support)[0] if on_object else self._middle_of(support)
+        place = place - self.sim.assets[name].bottom * UP
+        held = yield from motions.pick(self.hand, name, place=place)
         if held is None:
             return
         if support in self.sim.assets:
-            yield from motions.put_on(self._hand, held, support)
+            yield from motions.put_on(self.hand, held, support)
         else:
-            yield from motions.put_on_region(self._hand, held, self._middle_of(support))
+            yield from motions.put_on_region(self.hand, held, self._middle_of(support))
 
     def _middle_of(self, region: str) -> NDArray[np.float64]:
         """The middle of a region's upper face, (3,), m."""
@@ -132,13 +145,24 @@ class Expert:
         return centre + rotation @ np.array([0.0, 0.0, self.sim.site_half_size(region)[2]])
 
     def _open(self, name: str) -> Doing:
-        yield from motions.open_drawer(self._hand, name)
+        door = self.sim.world.articulation(name)[0].kind == "door"
+        yield from motions.open_door(self.hand, name) if door else motions.open_drawer(self.hand, name)
 
     def _put_in(self, name: str, region: str) -> Doing:
+        drawers = [
+            full
+            for asset in self.sim.assets.values()
+            for part, full in asset.regions.items()
+            if part in asset.articulations
+        ]
+        if region not in drawers:
+            raise MemobenchError(
+                f"the expert puts things into drawers only, and {region!r} is none; {nearest(region, drawers)}"
+            )
         articulation, q = self.sim.world.articulation(region)
         if articulation.open_below is not None and q > articulation.open_below:
             yield from self._open(region)
-        out = motions.outward_of(self._hand, articulation)
-        held = yield from motions.pick(self._hand, name, avoid=out)
+        out = motions.outward_of(self.hand, articulation)
+        held = yield from motions.pick(self.hand, name, avoid=out)
         if held is not None:
-            yield from motions.put_in_drawer(self._hand, held, region, out)
+            yield from motions.put_in_drawer(self.hand, held, region, out)

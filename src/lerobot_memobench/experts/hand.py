@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from lerobot_memobench.sim.robot import ARM_JOINTS
 from lerobot_memobench.sim.simulation import Simulation
 
 Array = NDArray[np.float64]
@@ -23,17 +25,52 @@ UP = np.array([0.0, 0.0, 1.0])
 POSITION_SCALE, ROTATION_SCALE = 0.05, 0.5
 """Metres and radians per unit of action (OSC_POSE)."""
 
+COARSE = 0.02
+"""Tolerance from which a place only has to be passed, m."""
+SLOW = 0.4
+"""Linear action under which a hand that arrives does not shoot past."""
+PATIENCE = 25
+"""Steps without getting nearer after which a hand is taken to be stopped by something."""
+SHOULDER = "robot0_link2"
+"""The body whose origin is where the arm's shoulder turns."""
+FLANGE, ELL = 0.2035, 0.088
+"""From the grip site back to the last joint and from there sideways to the wrist, m."""
+STRETCHED = 0.70
+"""Distance from shoulder to wrist that the arm should not exceed, m: at 0.719 it is straight."""
+COMFORTABLE = 0.685
+"""Distance from shoulder to wrist up to which the arm is as good as anywhere, m."""
+ELBOW_STRAIGHT = -0.42
+"""Angle of the elbow above which the arm is bent the wrong way round its straight pose, rad."""
+LAST_JOINT_STOP = 2.75
+"""How far the last joint of the arm is turned at most, rad; it turns with the hand about the fingers' direction."""
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Return the cross product of two vectors (3,); numpy's own takes fifty times as long for so little."""
+    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+
+
+def length(vector: Array) -> float:
+    """Return the length of a vector."""
+    return math.sqrt(float(vector @ vector))
+
+
+def unit(vector: Array) -> Array:
+    """Return a vector at length 1; a vector of length 0 stays."""
+    return vector / max(length(vector), 1e-9)
+
 
 def frame(approach: Array, closing: Array) -> Array:
     """Return the hand's rotation (3, 3): z along ``approach`` (out of the palm), x along which the fingers close."""
-    z = np.asarray(approach, dtype=np.float64) / np.linalg.norm(approach)
+    z = unit(np.asarray(approach, dtype=np.float64))
     x = np.asarray(closing, dtype=np.float64)
-    x = x - z * (x @ z)
-    x = x / np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z], axis=1)
+    x = unit(x - z * (x @ z))
+    return np.array([x, cross(z, x), z]).T
 
 
-_EASY_CLOSING = np.array([-0.5, np.sqrt(0.75), 0.0])
+EASY_CLOSING = np.array([-0.5, np.sqrt(0.75), 0.0])
+"""Closing direction of a hand that points down, at which the last joint of the arm is in its middle."""
 
 
 def downward(yaw: float) -> Array:
@@ -43,7 +80,7 @@ def downward(yaw: float) -> Array:
     of the arm farther from its stops is taken.
     """
     closing = np.array([np.cos(yaw), np.sin(yaw), 0.0])
-    return frame(DOWN, closing if closing @ _EASY_CLOSING >= 0 else -closing)
+    return frame(DOWN, closing if closing @ EASY_CLOSING >= 0 else -closing)
 
 
 class Hand:
@@ -62,7 +99,7 @@ class Hand:
         self.slew = float(rng.uniform(0.16, 0.22))
         """Largest change of an action's component per step."""
         self.rotation_speed = 0.35
-        self._last = np.zeros(6)
+        self._last: Array = np.zeros(6)
 
     @property
     def position(self) -> Array:
@@ -74,25 +111,54 @@ class Hand:
         """How the hand is turned, (3, 3)."""
         return self.sim.eef_pose()[1]
 
-    def toward(
-        self, position: Array, rotation: Array, gripper: float, speed: float = 1.0
-    ) -> NDArray[np.float32]:
+    def toward(self, position: Array, rotation: Array, gripper: float, speed: float = 1.0) -> NDArray[np.float32]:
         """Return the action (7,) that brings the hand nearer to a pose."""
         here, turned = self.sim.eef_pose()
+        if self._elbow() > ELBOW_STRAIGHT:
+            # Through the straight pose: only from stretched the elbow bends back the right way.
+            position = here + 0.04 * self.radial(here)
         linear = (position - here) / POSITION_SCALE
         limit = self.speed * speed
-        linear *= min(1.0, limit / max(float(np.linalg.norm(linear)), 1e-9))
-        angular = Rotation.from_matrix(rotation @ turned.T).as_rotvec() / ROTATION_SCALE
-        angular *= min(1.0, self.rotation_speed / max(float(np.linalg.norm(angular)), 1e-9))
+        linear *= min(1.0, limit / max(length(linear), 1e-9))
+        angular = self._turn(rotation, turned) / ROTATION_SCALE
+        angular *= min(1.0, self.rotation_speed / max(length(angular), 1e-9))
         wanted = np.concatenate([linear, angular])
         self._last = self._last + np.clip(wanted - self._last, -self.slew, self.slew)
         return np.append(self._last, gripper).astype(np.float32)
 
+    def rest(self, gripper: float) -> NDArray[np.float32]:
+        """Return the action (7,) that lets the present motion run out."""
+        self._last = self._last - np.clip(self._last, -self.slew, self.slew)
+        return np.append(self._last, gripper).astype(np.float32)
+
+    def _elbow(self) -> float:
+        return float(self.sim.data.joint(ARM_JOINTS[3]).qpos[0])
+
+    def radial(self, place: Array) -> Array:
+        """Return the level direction (3,) from the arm's foot to a place."""
+        out = (place - self.sim.data.body(SHOULDER).xpos) * np.array([1.0, 1.0, 0.0])
+        return unit(out)
+
+    def stretch(self, position: Array, rotation: Array) -> float:
+        """Return the distance from shoulder to wrist when the hand is at a pose, m."""
+        inward = -self.radial(position)
+        inward = inward - rotation[:, 2] * (inward @ rotation[:, 2])
+        inward = unit(inward)
+        wrist = position - FLANGE * rotation[:, 2] + ELL * inward
+        return length(wrist - self.sim.data.body(SHOULDER).xpos)
+
+    def _turn(self, rotation: Array, turned: Array) -> Array:
+        """Return the rotation vector (3,), rad, to an orientation: the short way, if the last joint allows it."""
+        turn = Rotation.from_matrix(rotation @ turned.T).as_rotvec()
+        angle = length(turn)
+        last = float(self.sim.data.joint(ARM_JOINTS[-1]).qpos[0]) + turn @ turned[:, 2]
+        return turn * (1.0 - 2 * np.pi / angle) if angle > 1.5 and abs(last) > LAST_JOINT_STOP else turn
+
     def error(self, position: Array, rotation: Array) -> tuple[float, float]:
         """Return the distance to a pose, m and rad."""
         here, turned = self.sim.eef_pose()
-        angle = float(np.linalg.norm(Rotation.from_matrix(rotation @ turned.T).as_rotvec()))
-        return float(np.linalg.norm(position - here)), angle
+        angle = length(Rotation.from_matrix(rotation @ turned.T).as_rotvec())
+        return length(position - here), angle
 
     def move(
         self,
@@ -106,14 +172,26 @@ class Hand:
         timeout: int = 160,
         give_up: Callable[[], bool] | None = None,
     ) -> Motion:
-        """Go to a pose, following it where it moves; stop after ``timeout`` steps or when ``give_up`` says so."""
+        """Go to a pose, following it where it moves.
+
+        Stop after ``timeout`` steps, when ``give_up`` says so, or when for `PATIENCE` steps it got no nearer.
+        """
+        best, since = np.inf, 0
         for _ in range(timeout):
             if give_up is not None and give_up():
                 return
             goal = position() if callable(position) else position
             turn = rotation() if callable(rotation) else rotation
+            excess = self.stretch(goal, turn) - STRETCHED
+            if excess > 0.0:
+                goal = goal - min(excess, 0.05) * self.radial(goal)
             distance, angle = self.error(goal, turn)
-            if distance < tolerance and angle < turn_tolerance:
+            slow = tolerance >= COARSE or length(self._last[:3]) < SLOW
+            if distance < tolerance and angle < turn_tolerance and slow:
+                return
+            left = distance + 0.1 * angle
+            best, since = (left, 0) if left < best - 0.002 else (best, since + 1)
+            if since > PATIENCE:
                 return
             yield self.toward(goal, turn, gripper, speed)
 

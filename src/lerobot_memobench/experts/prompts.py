@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.experts import motions
-from lerobot_memobench.experts.expert import Expert, steps_of
-from lerobot_memobench.experts.hand import CLOSED, OPEN, UP, Hand
+from lerobot_memobench.experts.expert import Expert
+from lerobot_memobench.experts.hand import CLOSED, OPEN, UP, Array, Hand
 from lerobot_memobench.sim.rendering import Highlight
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.task import Task
@@ -47,7 +47,7 @@ class PromptDemonstrator:
         yield from hand.wait(PAUSE, OPEN)
         match self._prompt.kind:
             case "routine":
-                yield from self._routine()
+                yield from self._routine((position, rotation))
             case "pick":
                 yield from self._pick(hand)
             case "point":
@@ -61,13 +61,12 @@ class PromptDemonstrator:
         assert self._prompt.target is not None
         return self._prompt.target
 
-    def _routine(self) -> Generator[NDArray[np.float32], None, None]:
+    def _routine(self, home: tuple[Array, Array]) -> Generator[NDArray[np.float32], None, None]:
         expert = Expert(self._task, self._sim, self._rng)
         while not expert.done:
             yield expert.act()
-        self.shown = all(
-            self._sim.holds(atom) for atom in steps_of(self._task.goal) if not atom.predicate.startswith("was")
-        )
+        self.shown = expert.succeeded
+        yield from motions.go_home(expert.hand, *home)
 
     def _pick(self, hand: Hand) -> Generator[NDArray[np.float32], None, None]:
         place, turned = self._sim.body_pose(self._referent())
@@ -81,7 +80,7 @@ class PromptDemonstrator:
         asset = self._sim.assets[self._referent()]
         place, _ = self._sim.body_pose(self._referent())
         above = place + (asset.top + 0.03) * UP
-        rotation = hand.rotation
+        rotation = motions.pointing(hand, above)
         yield from hand.move(above + 0.10 * UP, rotation, CLOSED, tolerance=0.015)
         for height in (0.0, 0.05, 0.0):
             yield from hand.move(above + height * UP, rotation, CLOSED, tolerance=0.008, speed=0.6, timeout=60)

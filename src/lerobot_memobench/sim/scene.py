@@ -26,6 +26,8 @@ PHYSICS_STEP = 0.002
 CONTROL_HZ = 20
 SUBSTEPS = round(1 / (CONTROL_HZ * PHYSICS_STEP))
 
+ARENA_BYTES = 32 * 2**20
+"""Room for contacts and constraints of one simulation."""
 CACHED_SCENES = 4
 """Compiled scenes kept per process: evaluation takes one task after the other, each scene has some MB."""
 
@@ -52,17 +54,21 @@ def get_scene(task: Task) -> Scene:
     if key in _scenes:
         _scenes.move_to_end(key)
         return _scenes[key]
-    scene = _compile(task, key)
+    spec, assets = scene_spec(task)
+    scene = Scene(key, spec.compile(), assets)
     _scenes[key] = scene
     while len(_scenes) > CACHED_SCENES:
         _scenes.popitem(last=False)
     return scene
 
 
-def _compile(task: Task, key: tuple[str, str]) -> Scene:
+def scene_spec(task: Task) -> tuple[mujoco.MjSpec, dict[str, Asset]]:
+    """Return a task's scene as a specification that may still be changed or saved, and its assets by instance."""
     spec = robot.robot_spec()
     spec.modelname = "memobench"
     spec.option.timestep = PHYSICS_STEP
+    # robosuite's files reserve room for 5,000 contacts, 1.3 GB of addresses per simulation; no scene uses 1 MB.
+    spec.nconmax, spec.njmax, spec.memory = -1, -1, ARENA_BYTES
     build_kitchen(spec)
     spec.worldbody.add_camera(
         name=AGENTVIEW, pos=list(_AGENTVIEW_POSITION), quat=list(_AGENTVIEW_QUATERNION), fovy=45.0
@@ -74,7 +80,7 @@ def _compile(task: Task, key: tuple[str, str]) -> Scene:
     for name, class_name in task.objects.items():
         assets[name] = build_asset(spec, spec.worldbody, name, class_name)
         spec.body(name).add_freejoint(name=f"{name}_joint0")
-    return Scene(key, spec.compile(), assets)
+    return spec, assets
 
 
 def state_size(model: mujoco.MjModel) -> int:

@@ -116,9 +116,7 @@ class Problem:
         else:
             allowed = ("fixture", "region")
         if kind not in allowed:
-            raise MemobenchError(
-                f"{where}: found the {kind} {name!r} in {atom}, expected {' or '.join(allowed)} there"
-            )
+            raise MemobenchError(f"{where}: found the {kind} {name!r} in {atom}, expected {' or '.join(allowed)} there")
 
 
 # --- the problem ---
@@ -246,9 +244,7 @@ def _regions(reader: Reader, nodes: list[Node], used: _Used) -> dict[str, Region
 
 
 def _region(reader: Reader, node: Node, targets: Mapping[str, str]) -> Region:
-    expected = (
-        "a region such as (NAME (:target FIXTURE) (:ranges ((x1 y1 x2 y2))) (:yaw_rotation ((low high))))"
-    )
+    expected = "a region such as (NAME (:target FIXTURE) (:ranges ((x1 y1 x2 y2))) (:yaw_rotation ((low high))))"
     head_items = reader.sequence(node, expected)
     if not head_items:
         raise reader.error(node, "an empty list ()", expected)
@@ -315,9 +311,7 @@ def _formula(reader: Reader, problem: Problem, node: Node, depth: int = 0) -> Fo
         raise reader.error(node, f"a formula nested deeper than {MAX_DEPTH} levels", "a flatter one")
     head, rest = reader.head(node, expected)
     if is_operator(head):
-        return make_operator(
-            head, [_formula(reader, problem, item, depth + 1) for item in rest], reader.where(node)
-        )
+        return make_operator(head, [_formula(reader, problem, item, depth + 1) for item in rest], reader.where(node))
     assert node.items is not None
     args = [reader.word(item, f"an entity name as argument of {node.items[0].word}") for item in rest]
     return problem.resolve(make_atom(node.items[0].word, args, reader.where(node)), reader.where(node))
@@ -402,11 +396,7 @@ def format_bddl(problem: Problem, comment: str = "") -> str:
             by_class.setdefault(class_name, []).append(instance)
         # One line per class keeps the order of declaration only if instances of a class stand together.
         grouped = [instance for names in by_class.values() for instance in names] == list(declared)
-        rows = (
-            by_class.items()
-            if grouped
-            else [(class_name, [instance]) for instance, class_name in declared.items()]
-        )
+        rows = by_class.items() if grouped else [(class_name, [instance]) for instance, class_name in declared.items()]
         section(name, [f"{' '.join(names)} - {class_name}" for class_name, names in rows])
     section("obj_of_interest", [" ".join(problem.objects_of_interest)] if problem.objects_of_interest else [])
     lines += ["", "  (:init", *(f"    {format_formula(atom)}" for atom in problem.init), "  )"]

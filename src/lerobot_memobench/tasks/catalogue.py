@@ -33,9 +33,7 @@ def task_names(memory_types: str | Iterable[str] | None = None) -> list[str]:
     wanted = [memory_types] if isinstance(memory_types, str) else list(memory_types)
     for memory_type in wanted:
         if memory_type not in MEMORY_TYPES:
-            raise MemobenchError(
-                f"found the memory type {memory_type!r}, expected one of {', '.join(MEMORY_TYPES)}"
-            )
+            raise MemobenchError(f"found the memory type {memory_type!r}, expected one of {', '.join(MEMORY_TYPES)}")
     return [name for name, folder in _folders().items() if folder.parent.name in wanted]
 
 

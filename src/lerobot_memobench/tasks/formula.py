@@ -95,9 +95,7 @@ def make_atom(predicate: str, args: Sequence[str], where: str = "formula") -> At
             f"{where}: found {len(args)} argument(s) after {spelling}, expected {arity} entity name(s)"
         )
     if len(set(args)) != len(args):
-        raise MemobenchError(
-            f"{where}: found {spelling} with {args[0]!r} twice, expected two different entities"
-        )
+        raise MemobenchError(f"{where}: found {spelling} with {args[0]!r} twice, expected two different entities")
     return Atom(key, tuple(args))
 
 
@@ -112,9 +110,7 @@ def make_operator(operator: str, children: Sequence[Formula], where: str = "form
     if key not in _OPERATORS:
         raise MemobenchError(f"{where}: found the operator {operator!r}, {nearest(key, _OPERATORS)}")
     if not children:
-        raise MemobenchError(
-            f"{where}: found {_OPERATORS[key]} with nothing in it, expected at least one formula"
-        )
+        raise MemobenchError(f"{where}: found {_OPERATORS[key]} with nothing in it, expected at least one formula")
     if key == "not":
         if len(children) != 1:
             raise MemobenchError(f"{where}: found Not over {len(children)} formulas, expected exactly one")
@@ -135,9 +131,7 @@ def parse_formula(value: Any, where: str = "formula") -> Formula:
 
 def _parse(value: Any, where: str, depth: int) -> Formula:
     if depth > MAX_DEPTH:
-        raise MemobenchError(
-            f"{where}: found a formula nested deeper than {MAX_DEPTH} levels, expected a flatter one"
-        )
+        raise MemobenchError(f"{where}: found a formula nested deeper than {MAX_DEPTH} levels, expected a flatter one")
     if isinstance(value, Mapping):
         if len(value) != 1:
             raise MemobenchError(
@@ -145,13 +139,9 @@ def _parse(value: Any, where: str, depth: int) -> Formula:
             )
         ((head, rest),) = value.items()
         if not isinstance(head, str) or not is_operator(head):
-            raise MemobenchError(
-                f"{where}: found the key {head!r}, expected one of 'and', 'or', 'not', 'then'"
-            )
+            raise MemobenchError(f"{where}: found the key {head!r}, expected one of 'and', 'or', 'not', 'then'")
         # {"not": ["on", "a", "b"]} and {"not": {"and": ...}} hold one formula, not a list of them.
-        bare = isinstance(rest, Mapping) or (
-            isinstance(rest, (list, tuple)) and rest and isinstance(rest[0], str)
-        )
+        bare = isinstance(rest, Mapping) or (isinstance(rest, (list, tuple)) and rest and isinstance(rest[0], str))
         items = [rest] if bare else rest
         if not isinstance(items, (list, tuple)):
             raise MemobenchError(f"{where}: found {_short(rest)} under {head!r}, expected a list of formulas")
@@ -163,9 +153,7 @@ def _parse(value: Any, where: str, depth: int) -> Formula:
         return make_operator(head, [_parse(item, where, depth + 1) for item in items], where)
     for item in items:
         if not isinstance(item, str) or not item:
-            raise MemobenchError(
-                f"{where}: found {_short(item)} as an argument of {head!r}, expected an entity name"
-            )
+            raise MemobenchError(f"{where}: found {_short(item)} as an argument of {head!r}, expected an entity name")
     return make_atom(head, items, where)
 
 

@@ -53,9 +53,7 @@ class Reader:
             assert items is not None
             if token == ")":
                 if len(stack) == 1:
-                    raise self.error(
-                        Node(line, 0), "a ')' that closes nothing", "'(' before it or the end of the file"
-                    )
+                    raise self.error(Node(line, 0), "a ')' that closes nothing", "'(' before it or the end of the file")
                 stack.pop().end = match.end()
                 continue
             node = Node(line, match.start(), match.end(), token)
@@ -64,9 +62,7 @@ class Reader:
                 node.word, node.items = "", []
                 stack.append(node)
         if len(stack) > 1:
-            raise self.error(
-                stack[-1], "a '(' that is never closed", "a ')' for it before the end of the file"
-            )
+            raise self.error(stack[-1], "a '(' that is never closed", "a ')' for it before the end of the file")
         assert root.items is not None
         if len(root.items) != 1 or root.items[0].items is None:
             node = root.items[1] if len(root.items) > 1 else (root.items or [root])[0]

@@ -184,9 +184,7 @@ class Task:
         if k == 0:
             return base
         if not 0 < k < self.num_variants:
-            raise MemobenchError(
-                f"{self.name} has variants 0 to {self.num_variants - 1}, not {k}; pass one of those"
-            )
+            raise MemobenchError(f"{self.name} has variants 0 to {self.num_variants - 1}, not {k}; pass one of those")
         chosen = self.variants[k - 1]
         order = chosen.order or tuple(range(len(base.checkpoints)))
         goals = chosen.goals or tuple(rename(base.checkpoints[i].goal, chosen.substitute) for i in order)
@@ -224,9 +222,7 @@ def load_task(folder: str | Path, require_metadata: bool = True) -> Task:
     """
     folder = Path(folder).resolve()
     if not folder.is_dir():
-        raise MemobenchError(
-            f"{folder} is not a folder, expected a task folder with {BDDL_FILE} and {METADATA_FILE}"
-        )
+        raise MemobenchError(f"{folder} is not a folder, expected a task folder with {BDDL_FILE} and {METADATA_FILE}")
     text = _read(folder / BDDL_FILE, "the scene, instruction and goal in BDDL")
     problem = parse_bddl(text, folder / BDDL_FILE)
     path = folder / METADATA_FILE
@@ -249,9 +245,7 @@ def load_task(folder: str | Path, require_metadata: bool = True) -> Task:
         objects_of_interest=problem.objects_of_interest,
         goal=problem.goal,
         checkpoints=checkpoints,
-        prompt=metadata.prompt()
-        if metadata and "prompt" in data
-        else _infer_prompt(memory_type, problem, referent),
+        prompt=metadata.prompt() if metadata and "prompt" in data else _infer_prompt(memory_type, problem, referent),
         variants=metadata.variants(len(checkpoints)) if metadata else (),
         demo_summary=_text(data, "demo_summary", path),
         folder=folder,
@@ -270,9 +264,7 @@ def _read(path: Path, holds: str) -> str:
             f"{path}: found a byte at offset {error.start} that is no UTF-8, expected UTF-8 text"
         ) from None
     except OSError as error:
-        raise MemobenchError(
-            f"{path} cannot be read ({error.strerror}), expected a file that holds {holds}"
-        ) from None
+        raise MemobenchError(f"{path} cannot be read ({error.strerror}), expected a file that holds {holds}") from None
 
 
 def _infer_memory_type(folder: Path, problem: Problem) -> str:
@@ -351,25 +343,19 @@ class _Metadata:
         except MemobenchError:
             raise
         except (ValueError, RecursionError) as error:
-            raise MemobenchError(
-                f"{path}: found JSON that cannot be read ({error}), expected an object"
-            ) from None
+            raise MemobenchError(f"{path}: found JSON that cannot be read ({error}), expected an object") from None
         if not isinstance(data, dict):
             raise MemobenchError(f"{path}: found {_short(data)}, expected a JSON object that holds {holds}")
         missing = [key for key in ("memory", "operating_type", "subtask_goals") if key not in data]
         if missing:
-            raise MemobenchError(
-                f"{path} lacks {', '.join(map(repr, missing))}, expected an object that holds {holds}"
-            )
+            raise MemobenchError(f"{path} lacks {', '.join(map(repr, missing))}, expected an object that holds {holds}")
         self.data: dict[str, Any] = data
 
     def _pairs(self, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         keys = [key for key, _ in pairs]
         for key in keys:
             if keys.count(key) > 1:
-                raise MemobenchError(
-                    f"{self.path}: found the key {key!r} twice in one object, expected it once"
-                )
+                raise MemobenchError(f"{self.path}: found the key {key!r} twice in one object, expected it once")
         return dict(pairs)
 
     def error(self, place: str, found: Any, expected: str) -> MemobenchError:
@@ -381,15 +367,9 @@ class _Metadata:
             raise self.error("subtask_goals", goals, "a list of at least one formula")
         labels = self.data["operating_type"]
         if not isinstance(labels, list) or len(labels) != len(goals):
-            raise self.error(
-                "operating_type", labels, f"a list of {len(goals)} entries, one per subtask goal"
-            )
+            raise self.error("operating_type", labels, f"a list of {len(goals)} entries, one per subtask goal")
         for k, label in enumerate(labels):
-            if (
-                not isinstance(label, list)
-                or len(label) != 3
-                or not all(_is_int(x) and 0 <= x <= 2 for x in label)
-            ):
+            if not isinstance(label, list) or len(label) != 3 or not all(_is_int(x) and 0 <= x <= 2 for x in label):
                 raise self.error(f"operating_type[{k}]", label, "three labels, each 0, 1 or 2")
         frames = self.data.get("key_frame", [-1] * len(goals))
         if not isinstance(frames, list) or len(frames) != len(goals) or not all(map(_is_int, frames)):
@@ -461,9 +441,7 @@ class _Metadata:
             "replaces_published",
         }
         if not isinstance(value, dict) or not set(value) <= keys or "memory" not in value:
-            raise self.error(
-                place, value, f"an object with 'memory' and any of {', '.join(sorted(keys - {'memory'}))}"
-            )
+            raise self.error(place, value, f"an object with 'memory' and any of {', '.join(sorted(keys - {'memory'}))}")
         substitute = value.get("substitute", {})
         if not isinstance(substitute, dict):
             raise self.error(f"{place}.substitute", substitute, "an object of names to names")
@@ -499,6 +477,5 @@ class _Metadata:
 
     def _renamed(self, substitute: Mapping[str, str]) -> list[Formula]:
         return [
-            rename(self.formula(g, f"subtask_goals[{k}]"), substitute)
-            for k, g in enumerate(self.data["subtask_goals"])
+            rename(self.formula(g, f"subtask_goals[{k}]"), substitute) for k, g in enumerate(self.data["subtask_goals"])
         ]

@@ -384,9 +384,7 @@ class Builder:
         return name
 
     # facts -------------------------------------------------------------------------------------
-    def grasp(
-        self, position: Vector, yaw: float, width: float, symmetric: bool = False, depth: float = 0.01
-    ) -> None:
+    def grasp(self, position: Vector, yaw: float, width: float, symmetric: bool = False, depth: float = 0.01) -> None:
         """Note a way to hold the object from above."""
         x, y, z = (float(v) for v in position)
         self._grasps.append(Grasp((x, y, z), float(yaw), float(width), symmetric, float(depth)))

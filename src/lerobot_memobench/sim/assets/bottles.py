@@ -39,9 +39,9 @@ class Bottle:
         middle = high / 2
         mesh = b.mesh(
             self.key,
-            lambda: lathe(
-                ((0.0, self.profile[0][1]), *self.profile, (0.0, high)), 20, scale=self.scale
-            ).moved((0, 0, -middle)),
+            lambda: lathe(((0.0, self.profile[0][1]), *self.profile, (0.0, high)), 20, scale=self.scale).moved(
+                (0, 0, -middle)
+            ),
         )
         b.visual_mesh(mesh, b.material(self.key, self.texture, specular=self.gloss, shininess=0.6))
         radius = max(r for r, _ in self.profile)
@@ -52,12 +52,8 @@ class Bottle:
             b.collision("cylinder", (x, self.shoulder / 2), 0.9 * self.mass, body, friction=GRIP_FRICTION)
         else:
             # The corners of a box around an ellipse stand out: two crossed boxes are nearer to it.
-            b.collision(
-                "box", (x, 0.72 * y, self.shoulder / 2), 0.5 * self.mass, body, friction=GRIP_FRICTION
-            )
-            b.collision(
-                "box", (0.72 * x, y, self.shoulder / 2), 0.4 * self.mass, body, friction=GRIP_FRICTION
-            )
+            b.collision("box", (x, 0.72 * y, self.shoulder / 2), 0.5 * self.mass, body, friction=GRIP_FRICTION)
+            b.collision("box", (0.72 * x, y, self.shoulder / 2), 0.4 * self.mass, body, friction=GRIP_FRICTION)
         rest = (high - self.shoulder) / 2
         if rest > 0:
             b.collision(

@@ -42,8 +42,7 @@ def _carcass() -> list[Block]:
     middle, depth = (_FRONT + _BACK) / 2, (_BACK - _FRONT) / 2
     inner = _HALF_X - _SIDE
     parts = [
-        Block((s * (_HALF_X - _SIDE / 2), middle, _HIGH / 2), (_SIDE / 2, depth, _HIGH / 2), 1)
-        for s in (-1.0, 1.0)
+        Block((s * (_HALF_X - _SIDE / 2), middle, _HIGH / 2), (_SIDE / 2, depth, _HIGH / 2), 1) for s in (-1.0, 1.0)
     ]
     parts += [
         Block((0, middle, _BOARD / 2), (inner, depth, _BOARD / 2), 0),
@@ -77,10 +76,7 @@ def _handle() -> list[Block]:
     reach = (_HANDLE_OUT - _HANDLE_THICK) / 2
     return [
         Block((0, out + post, z), (_HANDLE_LENGTH / 2, post, post), 0),
-        *(
-            Block((s * (_HANDLE_LENGTH / 2 - 0.004), _FACE - reach, z), (0.004, reach, post), 1)
-            for s in (-1.0, 1.0)
-        ),
+        *(Block((s * (_HANDLE_LENGTH / 2 - 0.004), _FACE - reach, z), (0.004, reach, post), 1) for s in (-1.0, 1.0)),
     ]
 
 
@@ -121,9 +117,7 @@ def _cabinet(b: Builder) -> Asset:
         for other in bodies:
             b.exclude(other, drawer)
         bodies.append(drawer)
-        joint = b.joint(
-            drawer, f"{level}_level", "slide", (0, 1, 0), DRAWER_RANGE, damping=50, frictionloss=2.0
-        )
+        joint = b.joint(drawer, f"{level}_level", "slide", (0, 1, 0), DRAWER_RANGE, damping=50, frictionloss=2.0)
         box, panel = _drawer()[:-1], _drawer()[-1]
         b.visual_mesh(b.mesh("cabinet_drawer", _mesh(lambda: _drawer()[:-1])), inside, body=drawer)
         b.visual_mesh(b.mesh("cabinet_panel", _mesh(lambda: _drawer()[-1:])), front, body=drawer)
@@ -140,9 +134,7 @@ def _cabinet(b: Builder) -> Asset:
             body=drawer,
             box=True,
         )
-        handle = b.site(
-            f"{level}_handle", (0, _FACE - _HANDLE_OUT + _HANDLE_THICK / 2, _DRAWER_HIGH / 2), body=drawer
-        )
+        handle = b.site(f"{level}_handle", (0, _FACE - _HANDLE_OUT + _HANDLE_THICK / 2, _DRAWER_HIGH / 2), body=drawer)
         articulations[f"{level}_region"] = Articulation(
             joint=joint,
             kind="drawer",

@@ -69,9 +69,7 @@ class Bowl:
         """Add the bowl to the scene."""
         material = b.material(self.key, self.texture, specular=0.6, shininess=0.7)
         b.visual_mesh(b.mesh(self.key, self.mesh), material)
-        b.collision(
-            "cylinder", (self.foot - 0.001, 0.5 * self.base), 0.5 * self.mass, (0, 0, 0.5 * self.base)
-        )
+        b.collision("cylinder", (self.foot - 0.001, 0.5 * self.base), 0.5 * self.mass, (0, 0, 0.5 * self.base))
         middle, top = 0.5 * self.wall, self.height - 0.001
         low = (self._wall(self.base) - middle, 0.5 * self.base)
         b.ring(16, low, (self.rim - middle, top), self.wall, 0.5 * self.mass, GRIP_FRICTION)
@@ -148,9 +146,7 @@ def _plate(b: Builder) -> Asset:
     material = b.material("plate", _plate_texture, specular=0.5, shininess=0.7)
     b.visual_mesh(b.mesh("plate", _plate_mesh), material)
     mass = 0.18
-    b.collision(
-        "cylinder", (_PLATE_FOOT + 0.003, 0.0025), 0.6 * mass, (0, 0, 0.0025), friction=GLAZE
-    ).priority = 1
+    b.collision("cylinder", (_PLATE_FOOT + 0.003, 0.0025), 0.6 * mass, (0, 0, 0.0025), friction=GLAZE).priority = 1
     b.ring(
         16,
         (_PLATE_FLOOR - 0.002, 0.003),

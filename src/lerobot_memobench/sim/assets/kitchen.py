@@ -54,9 +54,7 @@ def build_kitchen(spec: mujoco.MjSpec, table: str = "kitchen_table") -> Asset:
     room = Builder(spec, world, "room", "room")
     floor = room.material("floor", lambda: speckle((128, 122, 112), 5, seed=11), specular=0.0)
     wall = room.material("wall", lambda: speckle((146, 146, 124), 5, seed=12, along=0.03), specular=0.0)
-    room.visual_mesh(
-        room.mesh("room_floor", lambda: blocks([Block((0, 0, -0.05), (2.5, 2.5, 0.05))], 0.8)), floor
-    )
+    room.visual_mesh(room.mesh("room_floor", lambda: blocks([Block((0, 0, -0.05), (2.5, 2.5, 0.05))], 0.8)), floor)
     walls = [
         Block((WALL_X - 0.05, 0, 1.5), (0.05, 2.5, 1.5), 2),
         Block((0, -2.45, 1.5), (2.5, 0.05, 1.5), 2),

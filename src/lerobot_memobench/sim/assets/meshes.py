@@ -64,9 +64,7 @@ def merged(*meshes: MeshData) -> MeshData:
             uv_count += len(mesh.uv)
     if not uv:
         return MeshData(np.concatenate(vertices), np.concatenate(faces))
-    return MeshData(
-        np.concatenate(vertices), np.concatenate(faces), np.concatenate(uv), np.concatenate(uv_faces)
-    )
+    return MeshData(np.concatenate(vertices), np.concatenate(faces), np.concatenate(uv), np.concatenate(uv_faces))
 
 
 def lathe(
@@ -98,9 +96,7 @@ def lathe(
             continue
         first = len(vertices)
         rings.append([first + j for j in range(segments)] + [first])
-        vertices += [
-            (radius * np.cos(a) * scale[0], radius * np.sin(a) * scale[1], z) for a in angles[:segments]
-        ]
+        vertices += [(radius * np.cos(a) * scale[0], radius * np.sin(a) * scale[1], z) for a in angles[:segments]]
     faces, uv_faces = [], []
     for i in range(len(rings) - 1):
         for j in range(segments):
@@ -122,9 +118,7 @@ def lathe(
 def ball(radii: Sequence[float], segments: int = 16, rings: int = 9) -> MeshData:
     """Return an ellipsoid with half axes ``radii`` (3,) [m]."""
     angles = np.linspace(-np.pi / 2, np.pi / 2, rings + 1)
-    profile = [
-        (max(0.0, float(np.cos(a))) if 0 < k < rings else 0.0, float(np.sin(a))) for k, a in enumerate(angles)
-    ]
+    profile = [(max(0.0, float(np.cos(a))) if 0 < k < rings else 0.0, float(np.sin(a))) for k, a in enumerate(angles)]
     return lathe(profile, segments).warped(lambda points: points * np.asarray(radii, dtype=np.float64))
 
 
@@ -161,9 +155,7 @@ def cell_uv(column: int, row: int, columns: int = 3, rows: int = 2) -> Floats:
 def quads_mesh(quads: Sequence[Sequence[Floats]], uvs: Sequence[Floats]) -> MeshData:
     """Return a mesh of flat quads: four corners each, counter-clockwise from outside, and their uv (4, 2)."""
     vertices = np.array([corner for quad in quads for corner in quad], dtype=np.float64)
-    faces = [
-        [4 * k + a, 4 * k + b, 4 * k + c] for k in range(len(quads)) for a, b, c in ((0, 1, 2), (0, 2, 3))
-    ]
+    faces = [[4 * k + a, 4 * k + b, 4 * k + c] for k in range(len(quads)) for a, b, c in ((0, 1, 2), (0, 2, 3))]
     return MeshData(vertices, np.array(faces), np.concatenate(uvs))
 
 
@@ -247,9 +239,7 @@ def prism(outline: Sequence[tuple[float, float]], low: float, high: float) -> Me
     return MeshData(vertices, np.array(faces))
 
 
-def arc(
-    centre: tuple[float, float], radius: float, start: float, stop: float, count: int
-) -> list[tuple[float, float]]:
+def arc(centre: tuple[float, float], radius: float, start: float, stop: float, count: int) -> list[tuple[float, float]]:
     """Return points (r, z) of an arc from angle ``start`` to ``stop`` [degrees], for profiles."""
     return [
         (centre[0] + radius * np.cos(np.radians(a)), centre[1] + radius * np.sin(np.radians(a)))

@@ -156,9 +156,7 @@ def _microwave(b: Builder) -> Asset:
             (_HALF_X - _BOARD, depth, inner),
             box=True,
         ),
-        "top_side": b.site(
-            "top_side", (0, middle, _HIGH - 0.001), (_HALF_X, (_BACK - _FRONT) / 2, 0.001), box=True
-        ),
+        "top_side": b.site("top_side", (0, middle, _HIGH - 0.001), (_HALF_X, (_BACK - _FRONT) / 2, 0.001), box=True),
     }
     return b.fixture(
         low=(-_HALF_X, _FRONT - _DOOR_GAP - _DOOR_THICK - _HANDLE_OUT, 0),

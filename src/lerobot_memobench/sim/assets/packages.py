@@ -130,15 +130,11 @@ def _carton(half: Half, shoulder: float = 0.032, fin: float = 0.009) -> MeshData
 def _carton_asset(
     b: Builder, key: str, half: Half, texture: Callable[[], Pixels], mass: float, shoulder: float = 0.032
 ) -> Asset:
-    b.visual_mesh(
-        b.mesh(key, lambda: _carton(half, shoulder)), b.material(key, texture, specular=0.25, shininess=0.4)
-    )
+    b.visual_mesh(b.mesh(key, lambda: _carton(half, shoulder)), b.material(key, texture, specular=0.25, shininess=0.4))
     x, y, z = half
     base = z - shoulder
     b.collision("box", (x, y, (base + z) / 2), 0.9 * mass, (0, 0, (base - z) / 2), friction=GRIP_FRICTION)
-    b.collision(
-        "box", (0.35 * x, y, shoulder / 2), 0.1 * mass, (0, 0, z - shoulder / 2), friction=GRIP_FRICTION
-    )
+    b.collision("box", (0.35 * x, y, shoulder / 2), 0.1 * mass, (0, 0, z - shoulder / 2), friction=GRIP_FRICTION)
     at = base - 0.007
     b.grasp((0, 0, at), 0.0, 2 * x, depth=0.03)
     b.grasp((0, 0, at), HALF_PI, 2 * y, depth=0.03)
@@ -201,9 +197,7 @@ def _carton_of_milk_texture() -> Pixels:
         canvas.rect(0, 0.88, 1, 1, (96, 170, 74))
         canvas.text("MILK", 0.36, 0.28, 0.64, 0.84, navy, turn=1)
 
-    return _wrapped(
-        drawn(128, 256, (226, 240, 250), front), drawn(128, 256, sky, side), drawn(16, 16, navy), navy
-    )
+    return _wrapped(drawn(128, 256, (226, 240, 250), front), drawn(128, 256, sky, side), drawn(16, 16, navy), navy)
 
 
 def _carton_of_milk(b: Builder) -> Asset:

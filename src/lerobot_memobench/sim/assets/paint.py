@@ -47,9 +47,7 @@ class Canvas:
         """Draw a line; ``width`` is a fraction of the image's width."""
         self.draw.line(self.xy(*points), fill=colour, width=max(1, round(width * self.width)), joint="curve")
 
-    def text(
-        self, words: str, x0: float, y0: float, x1: float, y1: float, colour: Colour, turn: int = 0
-    ) -> None:
+    def text(self, words: str, x0: float, y0: float, x1: float, y1: float, colour: Colour, turn: int = 0) -> None:
         """Write bold ``words`` as large as the rectangle lets them be, turned by ``turn`` x 90 degrees."""
         left, top, right, bottom = (round(v) for pair in self.xy(x0, y0, x1, y1) for v in pair)
         wide, high = max(1, right - left), max(1, bottom - top)
@@ -107,9 +105,7 @@ def wood(dark: Colour, light: Colour, seed: int, size: int = 256, waves: float =
         bend += 0.05 / k * np.sin(2 * np.pi * k * u + phase) * np.cos(2 * np.pi * v + phase2)
     rings = np.zeros((size, size))
     for k in (1, 2, 3, 5, 9, 14):
-        rings += (
-            np.sin(2 * np.pi * round(waves * k / 3 + 1) * (v + bend) + rng.uniform(0, 2 * np.pi)) / k**0.7
-        )
+        rings += np.sin(2 * np.pi * round(waves * k / 3 + 1) * (v + bend) + rng.uniform(0, 2 * np.pi)) / k**0.7
     noise = rng.normal(size=(size, size))
     fibres = np.real(np.fft.ifft2(np.fft.fft2(noise) * _fibre_filter(size)))
     fibres /= fibres.std()

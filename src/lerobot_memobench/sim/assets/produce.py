@@ -35,9 +35,7 @@ _TOMATO = (0.031, 0.0245)
 def _tomato_mesh() -> MeshData:
     radius, half = _TOMATO
     angles = np.radians([-90, -72, -50, -28, -8, 12, 32, 52, 68, 80])
-    profile = [
-        (radius * float(np.cos(a)) ** 0.85 if a > -1.5 else 0.0, half * float(np.sin(a))) for a in angles
-    ]
+    profile = [(radius * float(np.cos(a)) ** 0.85 if a > -1.5 else 0.0, half * float(np.sin(a))) for a in angles]
     profile.append((0.0, 0.86 * half))
     body = lathe(profile, 24)
 
@@ -107,9 +105,7 @@ def _artichoke_mesh() -> MeshData:
     radius, half = _ARTICHOKE
     radii = (0.92 * radius, 0.89 * half)
     parts = [ball((0.91 * radius, 0.91 * radius, 0.88 * half), 12, 7).with_uv(0.5, 0.70)]
-    for row, (elevation, count) in enumerate(
-        ((-0.75, 7), (-0.32, 8), (0.10, 8), (0.50, 7), (0.88, 5), (1.18, 4))
-    ):
+    for row, (elevation, count) in enumerate(((-0.75, 7), (-0.32, 8), (0.10, 8), (0.50, 7), (0.88, 5), (1.18, 4))):
         wide = 0.72 * np.pi / count + 0.08
         for k in range(count):
             angle = 2 * np.pi * (k + 0.5 * (row % 2)) / count
@@ -172,9 +168,7 @@ def _broccoli_texture() -> Pixels:
     """Return dark green buds with light tips."""
     rng = np.random.default_rng(9)
     noise = rng.random((64, 64, 1))
-    colour = np.where(
-        noise > 0.72, np.array((96, 150, 62)), np.where(noise > 0.3, (44, 104, 40), (26, 74, 30))
-    )
+    colour = np.where(noise > 0.72, np.array((96, 150, 62)), np.where(noise > 0.3, (44, 104, 40), (26, 74, 30)))
     return colour.astype(np.uint8)
 
 
@@ -228,8 +222,7 @@ def _sprout_mesh() -> MeshData:
     radius, half = _SPROUT
     core = ball((0.92 * radius, 0.92 * radius, 0.95 * half), 14, 8)
     leaves = [
-        _sprout_leaf(2 * np.pi * k / 5 + 0.35, 0.55 + 0.35 * (k % 2), 0.85, 0.07 + 0.02 * (k % 2))
-        for k in range(5)
+        _sprout_leaf(2 * np.pi * k / 5 + 0.35, 0.55 + 0.35 * (k % 2), 0.85, 0.07 + 0.02 * (k % 2)) for k in range(5)
     ]
     stem = lathe([(0.0, -half), (0.009, -half), (0.010, -0.8 * half)], 8).with_uv(0.5, 0.99)
     return merged(core, *leaves, stem)

@@ -67,9 +67,7 @@ def _coil_texture() -> Pixels:
 
 def _knob_mesh() -> MeshData:
     r, h = _KNOB_RADIUS, _KNOB_BASE
-    return lathe(
-        [(r, 0.0), (r, 0.5 * h), (r - 0.004, h - 0.002), (r - 0.010, h), (0.0, h + 0.001)], segments=20
-    )
+    return lathe([(r, 0.0), (r, 0.5 * h), (r - 0.004, h - 0.002), (r - 0.010, h), (0.0, h + 0.001)], segments=20)
 
 
 def _ridge_mesh() -> MeshData:
@@ -113,9 +111,7 @@ def _stove(b: Builder) -> Asset:
     joint = b.joint(knob, "button", "hinge", (0, 0, 1), BUTTON_RANGE, damping=0.2, frictionloss=0.05)
     b.visual_mesh(b.mesh("stove_knob", _knob_mesh), black, body=knob)
     b.visual_mesh(b.mesh("stove_ridge", _ridge_mesh), ridge, body=knob)
-    b.collision(
-        "cylinder", (_KNOB_RADIUS, _KNOB_BASE / 2 - 0.0005), 0.1, (0, 0, _KNOB_BASE / 2 + 0.0005), body=knob
-    )
+    b.collision("cylinder", (_KNOB_RADIUS, _KNOB_BASE / 2 - 0.0005), 0.1, (0, 0, _KNOB_BASE / 2 + 0.0005), body=knob)
     rise = 0.5 * (_RIDGE_TOP - _KNOB_BASE)
     b.collision("box", (*_RIDGE, rise), 0.05, (0, 0, _KNOB_BASE + rise), body=knob, friction=GRIP_FRICTION)
     handle = b.site("button_handle", (0, 0, _RIDGE_TOP - 0.02), body=knob)

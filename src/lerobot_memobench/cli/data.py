@@ -1,0 +1,120 @@
+"""``memobench convert``, ``memobench validate`` and ``memobench push``: functions for the typer application.
+
+Register them with ``app.command()(convert)`` and so on; each returns the exit status.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from lerobot_memobench.cli.console import console
+from lerobot_memobench.errors import MemobenchError
+
+if TYPE_CHECKING:
+    from lerobot_memobench.datasets.running import Advance
+    from lerobot_memobench.datasets.validate import Verdict
+
+
+def convert(
+    source: Annotated[Path, typer.Argument(help="HDF5 file in the published layout, or a folder of them.")],
+    out: Annotated[Path, typer.Option(help="Folder of the dataset that is made.")],
+    upside_down: Annotated[
+        bool, typer.Option("--upside-down", help="The images are stored bottom row first: turn them up.")
+    ] = False,
+    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    repo_id: Annotated[str | None, typer.Option(help="Name of the dataset, user/name.")] = None,
+) -> int:
+    """Turn HDF5 demonstrations into a LeRobotDataset; name what cannot be used. The same command continues a killed
+    run.
+    """
+    from lerobot_memobench.datasets.convert import convert as run
+
+    screen = console()
+    with _progress(screen) as progress:
+        bar = progress.add_task("episodes", total=None)
+
+        def advance(news: Advance) -> None:
+            progress.update(bar, completed=news.done, total=news.total)
+            if not screen.is_terminal:
+                progress.console.print(f"{news.done}/{news.total} {news.task_name}, demo_{news.seed}")
+
+        summary = run(
+            source,
+            out,
+            upside_down=upside_down,
+            workers=workers,
+            progress=advance,
+            **({} if repo_id is None else {"repo_id": repo_id}),
+        )
+    for problem in summary.problems:
+        screen.print(f"left out: {problem}", soft_wrap=True, markup=False)
+    if summary.folder is None:
+        screen.print("no dataset was written: nothing could be used")
+    else:
+        screen.print(f"dataset of {summary.episodes} episodes: {summary.folder}", soft_wrap=True)
+    return summary.exit_status
+
+
+def validate(
+    folder: Annotated[Path, typer.Argument(help="Folder of a dataset, of HDF5 files of this package, or of both.")],
+    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+) -> int:
+    """Replay every episode in the simulator; report the first disagreement of each."""
+    from lerobot_memobench.datasets.validate import exit_status
+    from lerobot_memobench.datasets.validate import validate as run
+
+    screen = console()
+    with _progress(screen) as progress:
+        bar = progress.add_task("episodes", total=None)
+
+        def advance(done: int, total: int, verdict: Verdict) -> None:
+            progress.update(bar, completed=done, total=total)
+            if verdict.disagreement is not None:
+                progress.console.print(f"{verdict.episode}: {verdict.disagreement}", soft_wrap=True, markup=False)
+
+        verdicts = run(folder, workers=workers, progress=advance)
+    wrong = sum(verdict.disagreement is not None for verdict in verdicts)
+    screen.print(f"{len(verdicts) - wrong} of {len(verdicts)} episodes agree")
+    return exit_status(verdicts)
+
+
+def push(
+    folder: Annotated[Path, typer.Argument(help="Folder of a finished dataset.")],
+    repo_id: Annotated[str, typer.Option(help="Where to, user/name on the Hugging Face hub.")],
+    private: Annotated[bool | None, typer.Option(help="Whether a repository that has to be made is private.")] = None,
+    hdf5: Annotated[bool, typer.Option("--hdf5", help="Upload the HDF5 files as well.")] = False,
+) -> int:
+    """Upload a dataset to the Hugging Face hub (token: `hf auth login` or HF_TOKEN). The same command continues a
+    broken upload.
+    """
+    from lerobot_memobench.datasets.push import push as run
+
+    address = run(folder, repo_id, private=private, hdf5=hdf5)
+    console().print(f"dataset: {address}", soft_wrap=True)
+    return 0
+
+
+def executor_options(given: list[str]) -> dict[str, Any]:
+    """Return ``key=value`` words (``memobench generate --executor-option``) as arguments; numbers as numbers."""
+    options: dict[str, Any] = {}
+    for word in given:
+        key, equals, value = word.partition("=")
+        if not key or not equals:
+            raise MemobenchError(f"found executor option {word!r}, expected key=value, such as partition=cpu")
+        options[key] = int(value) if value.isdigit() else value
+    return options
+
+
+def _progress(screen: Any) -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=screen,
+        disable=not screen.is_terminal,
+    )

@@ -1,0 +1,212 @@
+"""Files in the published HDF5 layout, this package's or others', to a LeRobotDataset.
+
+What can be used is used; what cannot is named with file, group and reason. Episodes go through the same staging as
+generated ones, so a killed conversion is continued by the same command, and a folder without ``meta/info.json`` is no
+dataset to anybody.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from lerobot_memobench.datasets.hdf5 import Problem, PublishedFile, Unusable, find_files
+from lerobot_memobench.datasets.lerobot_format import (
+    DEFAULT_REPO_ID,
+    MANIFEST_FILE,
+    STAGING,
+    assemble,
+    check_destination,
+    is_dataset,
+)
+from lerobot_memobench.datasets.restore import NO_SEED, restore, task_of
+from lerobot_memobench.datasets.running import ProgressCallback, run_jobs, staged
+from lerobot_memobench.datasets.staging import EpisodeStage, clean_temporaries, stage_failure
+from lerobot_memobench.datasets.unfinished import check_request, compare_requests, locked
+from lerobot_memobench.errors import MemobenchError
+
+
+@dataclass(frozen=True)
+class ConversionSummary:
+    """What a conversion made.
+
+    Attributes:
+        folder: the dataset, or None when nothing could be converted.
+        episodes: how many episodes it has.
+        problems: what was left out, and why.
+    """
+
+    folder: Path | None
+    episodes: int
+    problems: tuple[Problem, ...]
+
+    @property
+    def exit_status(self) -> int:
+        """0 when everything was converted, else 1."""
+        return 1 if self.problems or self.folder is None else 0
+
+
+@dataclass(frozen=True)
+class ConversionJob:
+    """One group of one file, to be staged in ``folder``. ``task_name`` is the file's name, for the progress."""
+
+    file: Path
+    group: str
+    folder: Path
+    image_size: tuple[int, int]
+    upside_down: bool = False
+
+    @property
+    def task_name(self) -> str:
+        return self.file.name
+
+    @property
+    def seed(self) -> int:
+        return int(self.group.removeprefix("demo_"))
+
+    def run(self) -> None:
+        """Stage the episode, or why it cannot be used."""
+        try:
+            with PublishedFile(self.file) as file:
+                found = file.read(self.group)
+                if found.image_size != self.image_size:
+                    raise Unusable(
+                        f"its images are {found.image_size[0]}×{found.image_size[1]} pixels, those of the first "
+                        f"demonstration {self.image_size[0]}×{self.image_size[1]}"
+                    )
+                demo = restore(task_of(file, found), found)
+                with EpisodeStage(self.folder) as stage:
+                    for images in file.images(self.group, upside_down=self.upside_down):
+                        stage.add_images(images)
+                    stage.publish(demo)
+        except MemobenchError as error:
+            info = {"task_name": self.task_name, "seed": NO_SEED, "group": self.group}
+            stage_failure(info, " ".join(str(error).split()), self.folder)
+        except Exception as error:
+            error.add_note(f"while converting {self.file}, {self.group}")
+            raise
+
+
+def convert(
+    source: Path | str,
+    out: Path | str,
+    *,
+    repo_id: str = DEFAULT_REPO_ID,
+    upside_down: bool = False,
+    workers: int = 1,
+    progress: ProgressCallback | None = None,
+) -> ConversionSummary:
+    """Convert a file in the published layout, or all in a folder, to a LeRobotDataset in the folder ``out``.
+
+    Args:
+        source: the file or folder.
+        out: absent, empty, or a conversion of the same files that was not finished.
+        repo_id: name of the dataset.
+        upside_down: the images are stored as robosuite's renderer gives them, bottom row first: turn them up.
+        workers: processes.
+        progress: called after each episode; its ``task_name`` is the file's name, its ``seed`` the group's number.
+
+    Raises:
+        MemobenchError: there is nothing to convert, or ``out`` holds something else.
+    """
+    source, out = Path(source).absolute(), Path(out)
+    if not source.exists():
+        raise MemobenchError(f"{source} does not exist; name an HDF5 file or a folder of them")
+    files = find_files(source)
+    request = {
+        "files": [[_name(path, source), path.stat().st_size, path.stat().st_mtime_ns] for path in files],
+        "upside_down": upside_down,
+    }
+    if is_dataset(out):
+        return _finished(out, request)
+    check_destination(out)
+    staging = out / STAGING
+    staging.mkdir(parents=True, exist_ok=True)
+    finished = False
+    try:
+        with locked(staging, out):
+            check_request(staging, request, out, f"delete {staging} to start anew or name another folder")
+            folder = staging / "episodes"
+            folder.mkdir(exist_ok=True)
+            clean_temporaries(folder)
+            jobs, problems = _plan(files, folder.absolute(), upside_down)
+            run_jobs(jobs, workers=workers, progress=progress, logs=staging / "logs")
+            episodes = [staged(job) for job in jobs]
+            for job, episode in zip(jobs, episodes, strict=True):
+                if episode.failure is not None:
+                    problems.append(Problem(str(job.file), f"data/{job.group}", episode.failure))
+            order = {str(path): number for number, path in enumerate(files)}
+            problems.sort(key=lambda problem: order[problem.file])
+            problems = [replace(problem, file=_name(Path(problem.file), source)) for problem in problems]
+            good = [episode for episode in episodes if episode.failure is None]
+            if good:
+                assemble(
+                    good,
+                    out,
+                    repo_id=repo_id,
+                    made_by=f"Converted by `memobench convert` from {len(files)} HDF5 files in the published layout; "
+                    "what they do not hold was read off their states in the simulator.",
+                    manifest={"request": request, "left_out": [asdict(problem) for problem in problems]},
+                    left_out=[str(problem) for problem in problems],
+                )
+        finished = True
+    finally:
+        if finished:
+            shutil.rmtree(staging, ignore_errors=True)
+            if not any(out.iterdir()):
+                out.rmdir()
+    return ConversionSummary(out if good else None, len(good), tuple(problems))
+
+
+def _plan(files: Sequence[Path], folder: Path, upside_down: bool) -> tuple[list[ConversionJob], list[Problem]]:
+    """Return a job per group that looks as it should, and what does not."""
+    jobs: list[ConversionJob] = []
+    problems: list[Problem] = []
+    size: tuple[int, int] | None = None
+    number = 0
+    for path in files:
+        try:
+            with PublishedFile(path) as file:
+                groups = file.groups()
+                announced = file.announced()
+                if announced is not None and announced != len(groups):
+                    reason = f"it says that it has {announced} demonstrations, but there are {len(groups)}"
+                    problems.append(Problem(str(path), "data", reason))
+                if not groups:
+                    problems.append(Problem(str(path), "data", "it has no demonstrations"))
+                for group in groups:
+                    try:
+                        found = file.read(group)
+                    except Unusable as error:
+                        problems.append(Problem(str(path), f"data/{group}", str(error)))
+                        continue
+                    size = size or found.image_size
+                    jobs.append(ConversionJob(path, group, folder / f"{number:06d}", size, upside_down))
+                    number += 1
+        except Unusable as error:
+            problems.append(Problem(str(path), "", str(error)))
+    return jobs, problems
+
+
+def _name(path: Path, source: Path) -> str:
+    """A file's name within the source: where on a disk it was is nobody's business."""
+    return path.relative_to(source).as_posix() if source in path.parents else path.name
+
+
+def _finished(out: Path, request: dict[str, Any]) -> ConversionSummary:
+    """Report a conversion that is finished already."""
+    try:
+        manifest = json.loads((out / MANIFEST_FILE).read_text())
+        earlier, left_out = manifest["request"], manifest["left_out"]
+        count = len(manifest["episodes"])
+    except (OSError, KeyError, ValueError):
+        raise MemobenchError(
+            f"{out} already holds a dataset that this command did not make; name another folder"
+        ) from None
+    compare_requests(earlier, request, f"{out} already holds a finished conversion", "name another folder")
+    shutil.rmtree(out / STAGING, ignore_errors=True)
+    return ConversionSummary(out, count, tuple(Problem(**problem) for problem in left_out))

@@ -1,0 +1,51 @@
+"""The project's jobs as steps of a datatrove pipeline, which knows how to reach Slurm and Ray."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+from datatrove.pipeline.base import PipelineStep
+
+from lerobot_memobench.datasets.staging import read_staged
+
+if TYPE_CHECKING:
+    from lerobot_memobench.datasets.running import Job
+
+
+class JobsStep(PipelineStep):
+    """Run the jobs of one rank: neighbours in the list, which are mostly of one task and share its scene."""
+
+    name = "episodes"
+    type = "MEMOBench"
+
+    def __init__(self, jobs: list[Job]) -> None:
+        super().__init__()
+        self.jobs = jobs
+
+    def run(self, data: Any = None, rank: int = 0, world_size: int = 1) -> Iterator[Any]:
+        """Make what is not there yet of every ``world_size``-th part of the list."""
+        yield from data or ()
+        count = len(self.jobs)
+        for job in self.jobs[rank * count // world_size : (rank + 1) * count // world_size]:
+            if read_staged(job.folder) is None:
+                with self.track_time("episode"):
+                    job.run()
+                self.stat_update("episodes")
+
+
+class FinishStep(PipelineStep):
+    """Do what remains once all episodes are there; a job of its own, depending on theirs."""
+
+    name = "finish"
+    type = "MEMOBench"
+
+    def __init__(self, finish: Callable[[], Any]) -> None:
+        super().__init__()
+        self.finish = finish
+
+    def run(self, data: Any = None, rank: int = 0, world_size: int = 1) -> Iterator[Any]:
+        """Call it, in the first rank."""
+        yield from data or ()
+        if rank == 0:
+            self.finish()

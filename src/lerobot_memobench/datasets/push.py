@@ -1,0 +1,115 @@
+"""A dataset to the Hugging Face hub, so that ``LeRobotDataset("<user>/memobench")`` loads it anywhere.
+
+huggingface_hub's ``upload_folder`` does the work (its ``upload_large_folder`` is deprecated in favour of it): it
+commits a large folder in parts, and the same call continues an upload that was broken off, since what the hub has
+already is known by its hash. When it is over the hub is asked what it holds.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lerobot_memobench.datasets.lerobot_format import HDF5_FOLDER, is_dataset
+from lerobot_memobench.errors import MemobenchError
+
+if TYPE_CHECKING:
+    from huggingface_hub import HfApi
+
+PARTS = ("README.md", "manifest.json", "data/**", "meta/**", "states/**", "videos/**")
+"""What is uploaded: the dataset, and nothing that was later put beside it, such as a memory cache."""
+
+
+def push(
+    folder: Path | str,
+    repo_id: str,
+    *,
+    token: str | None = None,
+    private: bool | None = None,
+    hdf5: bool = False,
+) -> str:
+    """Upload a finished dataset; return its address. The same call continues an upload that was broken off.
+
+    Args:
+        folder: the dataset.
+        repo_id: ``user/name`` on the hub; made if it is not there.
+        token: a token that may write; by default the one of ``hf auth login`` or HF_TOKEN.
+        private: whether a repository that has to be made is private; None leaves it to the account's setting.
+        hdf5: upload the HDF5 files beside the dataset as well.
+
+    Raises:
+        MemobenchError: no dataset, no token, a token that may not write there, or a hub that cannot be reached.
+    """
+    import httpx
+    from huggingface_hub import HfApi, get_token
+    from huggingface_hub.errors import HfHubHTTPError, HFValidationError
+
+    folder = Path(folder)
+    if not is_dataset(folder):
+        raise MemobenchError(f"{folder} is no finished dataset (there is no meta/info.json); name a generated one")
+    if repo_id.count("/") != 1:
+        raise MemobenchError(f"found repository {repo_id!r}, expected user/name, such as memobench/memobench")
+    token = token or get_token()
+    if not token:
+        raise MemobenchError(
+            f"there is no token to write to {repo_id}: run `hf auth login`, set HF_TOKEN, or pass one that may write"
+        )
+    api = HfApi(token=token)
+    try:
+        repo_id = api.create_repo(repo_id, repo_type="dataset", private=private, exist_ok=True).repo_id
+        parts = [*PARTS, *([f"{HDF5_FOLDER}/**"] if hdf5 else [])]
+        api.upload_folder(
+            repo_id=repo_id,
+            folder_path=folder,
+            repo_type="dataset",
+            allow_patterns=parts,
+            commit_message="Upload MEMOBench demonstrations",
+        )
+        missing = _missing(api, folder, repo_id, hdf5)
+        if missing:
+            raise MemobenchError(
+                f"{len(missing)} files, such as {missing[0]}, did not arrive at {repo_id}; run the same command again"
+            )
+        _tag(api, folder, repo_id)
+    except HFValidationError as error:
+        raise MemobenchError(f"found repository {repo_id!r}, which the hub does not allow: {_line(error)}") from None
+    except HfHubHTTPError as error:
+        status = error.response.status_code if error.response is not None else None
+        if status in (401, 403):
+            raise MemobenchError(
+                f"the hub refused to write to {repo_id} ({status}): the token is not valid or may not write there; "
+                "pass another one or name a repository of yours"
+            ) from None
+        raise MemobenchError(f"the hub answered {_line(error)[:300]}; run the same command again to go on") from None
+    except (httpx.TransportError, OSError) as error:
+        raise MemobenchError(
+            f"the hub could not be reached ({type(error).__name__}: {_line(error)[:200]}); run the same command "
+            "again to go on"
+        ) from None
+    return f"{api.endpoint}/datasets/{repo_id}"
+
+
+def _missing(api: HfApi, folder: Path, repo_id: str, hdf5: bool) -> list[str]:
+    """Return what the hub does not hold in the size that it has here."""
+    there = {
+        entry.path: entry.size
+        for entry in api.list_repo_tree(repo_id, repo_type="dataset", recursive=True)
+        if hasattr(entry, "size")
+    }
+    wanted = [pattern.removesuffix("/**") for pattern in PARTS] + ([HDF5_FOLDER] if hdf5 else [])
+    files = [path for top in wanted for path in [folder / top, *(folder / top).rglob("*")] if path.is_file()]
+    sizes = {path.relative_to(folder).as_posix(): path.stat().st_size for path in files}
+    return sorted(name for name, size in sizes.items() if there.get(name) != size)
+
+
+def _tag(api: HfApi, folder: Path, repo_id: str) -> None:
+    """Mark the commit with the version of LeRobot's format: LeRobot loads no dataset without it."""
+    version = json.loads((folder / "meta" / "info.json").read_text())["codebase_version"]
+    if version in [tag.name for tag in api.list_repo_refs(repo_id, repo_type="dataset").tags]:
+        api.delete_tag(repo_id, tag=version, repo_type="dataset")
+    api.create_tag(repo_id, tag=version, repo_type="dataset")
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split())

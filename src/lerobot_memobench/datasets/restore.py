@@ -1,0 +1,262 @@
+"""A demonstration from a group of the published layout: its task, where execution starts, what was satisfied when.
+
+The layout holds states, not what the arm felt or which predicates held. Proprioception is read off the states in
+the simulator. Checkpoint columns come from the key frames where all are there; where one is missing (-1) the
+predicates are evaluated on the states, with the latches and orders that a rollout has.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.datasets.demonstration import Demonstration, digest
+from lerobot_memobench.datasets.hdf5 import SUFFIX, PublishedDemo, PublishedFile, Unusable, truth_from_intervals
+from lerobot_memobench.datasets.mjcf import Pose, read_fixture_poses
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.sim.placement import GAP
+from lerobot_memobench.sim.scene import TABLE_TOP
+from lerobot_memobench.sim.simulation import Simulation
+from lerobot_memobench.tasks.catalogue import get_task, task_names
+from lerobot_memobench.tasks.progress import Progress
+from lerobot_memobench.tasks.task import BDDL_FILE, MEMORY_TYPES, METADATA_FILE, Task, load_task
+
+NO_SEED = -1
+"""Seed of a demonstration that does not say it."""
+
+Metadata = dict[str, Any]
+
+
+def task_of(file: PublishedFile, demo: PublishedDemo) -> Task:
+    """Return the task that a demonstration shows, from the file's own BDDL and metadata.
+
+    Raises:
+        Unusable: they do not make a task.
+    """
+    name = task_name(file)
+    ours = file.task_metadata
+    metadata = dict(demo.metadata if ours is None else ours)
+    if ours is None:
+        # The frames differ between demonstrations, the task must not: its scene is compiled once.
+        goals = metadata.get("subtask_goals")
+        metadata["key_frame"] = [-1] * len(goals) if isinstance(goals, list) else []
+        metadata["timestep_exec_start_idx"] = -1
+    memory_type = file.attribute("memory_type") or _memory_type(name, file)
+    task = _load(name, memory_type, file.bddl_text, json.dumps(metadata, sort_keys=True))
+    if name in task_names():
+        known = get_task(name)
+        if "family" not in metadata:
+            task = replace(task, family=known.family)
+        if (task.bddl_text, task.metadata) == (known.bddl_text, known.metadata):
+            task = known
+    return task.variant(int(demo.extras.get("variant", 0))) if ours is not None else task
+
+
+def task_name(file: PublishedFile) -> str:
+    """Return the task's name: the folder of ``bddl_file_name``, or its stem, or the HDF5 file's."""
+    path = PurePosixPath(file.bddl_name.replace("\\", "/"))
+    if path.name == BDDL_FILE and path.parent.name not in ("", "..", "."):
+        return path.parent.name
+    if path.stem not in ("", "..", "task_config"):
+        return path.stem
+    return file.path.name.removesuffix(SUFFIX).removesuffix(file.path.suffix)
+
+
+def _memory_type(name: str, file: PublishedFile) -> str:
+    if name in task_names():
+        return get_task(name).memory_type
+    folders = [*PurePosixPath(file.bddl_name.replace("\\", "/")).parts, *file.path.resolve().parts]
+    return next((folder for folder in reversed(folders) if folder in MEMORY_TYPES), "")
+
+
+@lru_cache(maxsize=64)
+def _load(name: str, memory_type: str, bddl_text: str, metadata: str) -> Task:
+    with tempfile.TemporaryDirectory() as parent:
+        folder = Path(parent).resolve() / (memory_type or "tasks") / name
+        folder.mkdir(parents=True)
+        (folder / BDDL_FILE).write_text(bddl_text, encoding="utf-8")
+        (folder / METADATA_FILE).write_text(metadata, encoding="utf-8")
+        try:
+            return load_task(folder)
+        except MemobenchError as error:
+            told = str(error).replace(str(folder / METADATA_FILE), "meta_data")
+            raise Unusable(told.replace(str(folder / BDDL_FILE), "bddl_file_content")) from None
+
+
+def restore(task: Task, demo: PublishedDemo) -> Demonstration:
+    """Return the demonstration of a checked group, without images.
+
+    Raises:
+        Unusable: what the group says contradicts itself or the task.
+    """
+    sim = _simulation(task)
+    if demo.states.shape[1] != sim.state_dim:
+        raise Unusable(f"states have width {demo.states.shape[1]}, expected {sim.state_dim} of task {task.name}")
+    exec_start = execution_start(task, demo)
+    _check_clock(demo.states, exec_start)
+    frames = key_frames(task, demo, exec_start)
+    poses = fixture_poses(sim, task, demo)
+    intervals = demo.extras.get("satisfied_intervals")
+    known: NDArray[np.bool_] | None = None
+    if intervals is not None:
+        known = truth_from_intervals(json.loads(intervals), len(demo.states))
+    elif frames and min(frames) >= 0:
+        known = np.arange(len(demo.states))[:, None] >= np.array(frames)
+    found = _read_off(sim, task, demo.states, exec_start, poses, evaluate="success" not in demo.extras)
+    success = bool(demo.extras.get("success", found.success or (known is not None and len(frames) > 0)))
+    try:
+        restored = Demonstration(
+            task=task,
+            seed=int(demo.extras.get("seed", NO_SEED)),
+            referent=str(demo.extras.get("referent", "fixed")),
+            variant=int(demo.extras.get("variant", 0)),
+            states=demo.states,
+            actions=demo.actions,
+            proprio=found.proprio,
+            images=None,
+            exec_start=exec_start,
+            satisfied=found.satisfied if known is None else known,
+            success=success,
+            fixture_poses=poses,
+            model_xml=demo.model_file,
+            scene_hash=str(demo.extras.get("scene_hash", "")),
+        )
+    except Unusable:
+        raise
+    except MemobenchError as error:
+        raise Unusable(str(error)) from None
+    if demo.extras.get("digest", digest(restored)) != digest(restored):
+        raise Unusable("its states, actions or labels are not those that were written (the digest differs)")
+    return restored
+
+
+def execution_start(task: Task, demo: PublishedDemo) -> int:
+    """Return the frame at which execution starts.
+
+    Where ``timestep_exec_start_idx`` is missing (-1) it is 0 for a task without prompt video, else the last frame
+    at which the scene is back exactly where it began.
+    """
+    value = demo.metadata.get("timestep_exec_start_idx", -1)
+    values = value if isinstance(value, list) else [value]
+    if not values or not all(isinstance(item, int) and not isinstance(item, bool) for item in values):
+        raise Unusable(f"meta_data has timestep_exec_start_idx {value!r}, expected a frame or -1")
+    start = max(values)
+    if start >= len(demo.states):
+        raise Unusable(f"execution starts at frame {start}, but it has {len(demo.states)} frames")
+    if start >= 0:
+        return start
+    if task.prompt is None:
+        return 0
+    back = np.flatnonzero((demo.states[1:, 1:] == demo.states[0, 1:]).all(axis=1)) + 1
+    if back.size:
+        return int(back[-1])
+    raise Unusable(
+        "timestep_exec_start_idx is -1 for a task with a prompt video, and no later frame shows the scene back at its "
+        "start: write the frame at which execution starts into meta_data"
+    )
+
+
+def key_frames(task: Task, demo: PublishedDemo, exec_start: int) -> list[int]:
+    """Return ``key_frame``, one per checkpoint (-1 where unknown), after checking it."""
+    frames = demo.metadata.get("key_frame", [-1] * len(task.checkpoints))
+    if (
+        not isinstance(frames, list)
+        or len(frames) != len(task.checkpoints)
+        or not all(isinstance(frame, int) and not isinstance(frame, bool) for frame in frames)
+    ):
+        raise Unusable(f"meta_data has key_frame {frames!r}, expected {len(task.checkpoints)} frames, -1 where unknown")
+    known = [frame for frame in frames if frame >= 0]
+    if known != sorted(known):
+        raise Unusable(f"key_frame {frames} is not in order: checkpoints are completed one after the other")
+    if any(not exec_start <= frame < len(demo.states) for frame in known):
+        raise Unusable(f"key_frame {frames} is outside of the execution, frames {exec_start} to {len(demo.states) - 1}")
+    return frames
+
+
+def fixture_poses(sim: Simulation, task: Task, demo: PublishedDemo) -> dict[str, Pose]:
+    """Return where the fixtures stood: as this package wrote it, else by ``model_file``, else their regions' middle."""
+    names = list(sim.fixture_poses())
+    if "fixture_poses" in demo.extras:
+        return {name: np.array(pose) for name, pose in json.loads(demo.extras["fixture_poses"]).items()}
+    try:
+        found = read_fixture_poses(demo.model_file, names) if demo.model_file.strip() else {}
+    except MemobenchError as error:
+        raise Unusable(str(error)) from None
+    return {name: found[name] if name in found else _middle(sim, task, name) for name in names}
+
+
+def _middle(sim: Simulation, task: Task, name: str) -> Pose:
+    """The pose of a fixture in the middle of the table region that it starts in."""
+    places = {atom.args[0]: atom.args[1] for atom in task.init if len(atom.args) == 2}
+    region = task.regions.get(places.get(name, ""))
+    if region is None or not region.ranges:
+        return sim.fixture_poses()[name]
+    x1, y1, x2, y2 = region.ranges[0]
+    half = sum(region.yaw) / 4
+    height = TABLE_TOP - sim.assets[name].bottom + GAP
+    return np.array([(x1 + x2) / 2, (y1 + y2) / 2, height, np.cos(half), 0.0, 0.0, np.sin(half)])
+
+
+@dataclass(frozen=True, eq=False)
+class _ReadOff:
+    proprio: NDArray[np.float32]
+    satisfied: NDArray[np.bool_]
+    success: bool
+
+
+def _read_off(
+    sim: Simulation,
+    task: Task,
+    states: NDArray[np.float64],
+    exec_start: int,
+    poses: dict[str, Pose],
+    *,
+    evaluate: bool,
+) -> _ReadOff:
+    """Show the states to the simulator one after the other and note what it says."""
+    progress = Progress(task)
+    proprio, satisfied = [], []
+    success = False
+    for frame, state in enumerate(states):
+        sim.set_state(state, poses)
+        proprio.append(sim.proprio())
+        if evaluate and frame > exec_start:  # the world is evaluated after a control step, see Demonstration
+            success = progress.step(sim.holds) or success
+        satisfied.append(progress.satisfied)
+    return _ReadOff(
+        np.array(proprio, dtype=np.float32),
+        np.array(satisfied, dtype=np.bool_).reshape(len(states), len(task.checkpoints)),
+        success,
+    )
+
+
+def _check_clock(states: NDArray[np.float64], exec_start: int) -> None:
+    """Raise when the frames are not in the order of their time, which may start anew where execution starts.
+
+    Only a time that runs evenly is taken for a clock: other writers leave zeros or something else there.
+    """
+    time = states[:, 0]
+    ticks = np.unique(np.round(time, 5))
+    if len(ticks) < 3 or np.ptp(np.diff(ticks)) > 0.01 * np.diff(ticks).mean():
+        return
+    back = [int(frame) for frame in np.flatnonzero(np.diff(time) < 0) + 1 if frame != exec_start]
+    if back:
+        raise Unusable(
+            f"its states are not in order: frame {back[0]} is earlier ({time[back[0]]:.2f} s) than the one before it "
+            f"({time[back[0] - 1]:.2f} s)"
+        )
+
+
+@lru_cache(maxsize=1)
+def _simulation(task: Task) -> Simulation:
+    """The last task's simulation stays: a file's demonstrations come one after another."""
+    sim = Simulation(task)
+    sim.reset(0)
+    return sim

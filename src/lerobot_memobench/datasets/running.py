@@ -1,0 +1,268 @@
+"""Run many independent jobs, each of which leaves one finished episode in its folder: here, on Slurm or on Ray.
+
+Whatever runs them, the result is the same, because a job depends on nothing but itself and its folder is complete or
+absent. So a killed run is continued by giving the same jobs again, and two workers at the same job do no harm.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from multiprocessing.connection import wait
+from pathlib import Path
+from typing import Any, Protocol
+
+from lerobot_memobench.datasets.staging import StagedEpisode, read_staged
+from lerobot_memobench.errors import MemobenchError, nearest
+
+EXECUTORS = ("processes", "local", "slurm", "ray")
+"""``processes``: this package's own; the others are datatrove's."""
+
+EPISODES_PER_RANK = 10
+"""Episodes that a datatrove task makes, one after another: neighbours share a compiled scene."""
+
+POLL_SECONDS = 1.0
+
+
+class Job(Protocol):
+    """One episode to be made. Pickled to other processes and machines, so ``folder`` is on a disk they share."""
+
+    @property
+    def folder(self) -> Path: ...
+
+    @property
+    def task_name(self) -> str: ...
+
+    @property
+    def seed(self) -> int: ...
+
+    def run(self) -> None:
+        """Leave the episode, or the reason why there is none, in ``folder``."""
+
+
+@dataclass(frozen=True)
+class Advance:
+    """Told to the progress callback after each episode: how many are there, and the newest one's identity."""
+
+    done: int
+    total: int
+    task_name: str
+    seed: int
+    failure: str | None
+
+
+ProgressCallback = Callable[[Advance], None]
+
+
+def run_jobs(
+    jobs: Sequence[Job],
+    *,
+    workers: int = 1,
+    progress: ProgressCallback | None = None,
+    executor: str = "processes",
+    options: Mapping[str, Any] | None = None,
+    logs: Path,
+    finish: Callable[[], Any] | None = None,
+) -> bool:
+    """Run the jobs that are not staged yet; tell ``progress`` of every one, old or new.
+
+    Args:
+        jobs: what to make.
+        workers: how many run at a time.
+        progress: called after each episode (on Slurm, for those that were there before).
+        executor: one of ``EXECUTORS``.
+        options: further arguments of datatrove's executor, such as Slurm's ``partition`` and ``time``.
+        logs: folder for datatrove's logs.
+        finish: what is to be done when all jobs are; called only on Slurm, in a job of its own.
+
+    Returns:
+        Whether all episodes are there; False when they have been handed to Slurm.
+
+    Raises:
+        MemobenchError: a worker was killed, or the executor is unknown, not installed or misses an option.
+    """
+    check_executor(executor, options)
+    done: set[Path] = set()
+    lock = threading.Lock()
+
+    def tell(job: Job) -> None:
+        with lock:
+            if job.folder in done:
+                return
+            done.add(job.folder)
+            if progress is not None:
+                progress(Advance(len(done), len(jobs), job.task_name, job.seed, staged(job).failure))
+
+    waiting = []
+    for job in jobs:
+        if read_staged(job.folder) is None:
+            waiting.append(job)
+        else:
+            tell(job)
+    if not waiting:
+        return True
+    if executor != "processes":
+        return _run_by_datatrove(waiting, workers, executor, dict(options or {}), logs, finish, tell)
+    if workers == 1 or len(waiting) == 1:
+        for job in waiting:
+            job.run()
+            tell(job)
+        return True
+    _run_in_processes(waiting, workers, tell)
+    return True
+
+
+def staged(job: Job) -> StagedEpisode:
+    """Return the finished episode of a job that has been run."""
+    found = read_staged(job.folder)
+    if found is None:
+        raise MemobenchError(f"{job.folder} has vanished while the run was going on; run the command again")
+    return found
+
+
+def check_executor(executor: str, options: Mapping[str, Any] | None) -> None:
+    """Raise when jobs cannot be run that way."""
+    if executor not in EXECUTORS:
+        raise MemobenchError(f"found executor {executor!r}, {nearest(executor, EXECUTORS)}")
+    if executor == "processes":
+        if options:
+            raise MemobenchError(
+                f"options {', '.join(options)} were given for executor 'processes', which takes none; name local, "
+                "slurm or ray"
+            )
+        return
+    try:
+        import datatrove  # noqa: F401
+
+        if executor == "ray":
+            import ray  # noqa: F401
+    except ImportError as error:
+        raise MemobenchError(
+            f"executor {executor!r} needs {error.name}, which is not installed: pip install "
+            f"{'datatrove ray' if executor == 'ray' else 'datatrove'}"
+        ) from None
+    missing = [name for name in ("partition", "time") if executor == "slurm" and name not in (options or {})]
+    if missing:
+        raise MemobenchError(
+            f"executor 'slurm' needs {' and '.join(missing)}: pass e.g. partition=cpu and time=08:00:00 as options"
+        )
+
+
+# --- processes of this machine ------------------------------------------------------------------------------
+
+
+def _run_in_processes(waiting: Sequence[Job], workers: int, tell: Callable[[Job], None]) -> None:
+    with process_pool(min(workers, len(waiting))) as pool:
+        futures: dict[Future[None], Job] = {pool.submit(_run, job): job for job in waiting}
+        for future in as_completed(futures):
+            future.result()
+            tell(futures[future])
+
+
+@contextlib.contextmanager
+def process_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
+    """Processes that end with the one that started them; what still waits when the context ends is dropped."""
+    # Processes are spawned: a forked child would share GL contexts and threads with its parent.
+    pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"), initializer=_begin_worker)
+    try:
+        yield pool
+    except BrokenProcessPool:
+        raise MemobenchError(
+            f"one of {workers} worker processes was killed, perhaps because memory ran out; run the same command "
+            "again to go on from here, with fewer workers"
+        ) from None
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _run(job: Job) -> None:
+    job.run()
+
+
+def _begin_worker() -> None:
+    """End this worker when the process that started it is gone, however it went; else it would wait on.
+
+    Ctrl-C is the parent's to handle: the episode being made is finished, so that nothing is lost.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+# --- datatrove ----------------------------------------------------------------------------------------------
+
+
+def _run_by_datatrove(
+    waiting: Sequence[Job],
+    workers: int,
+    executor: str,
+    options: dict[str, Any],
+    logs: Path,
+    finish: Callable[[], Any] | None,
+    tell: Callable[[Job], None],
+) -> bool:
+    from datatrove import executor as executors
+
+    from lerobot_memobench.datasets.datatrove_steps import FinishStep, JobsStep
+
+    # What is there is known from the staging folder, better than from datatrove's list of completed tasks.
+    common: dict[str, Any] = {"skip_completed": False, **options}
+    ranks = max(min(workers, len(waiting)), -(-len(waiting) // EPISODES_PER_RANK))
+    steps = [JobsStep(list(waiting))]
+    if executor == "slurm":
+        making = executors.SlurmPipelineExecutor(
+            steps,
+            tasks=ranks,
+            workers=workers,
+            **{"job_name": "memobench", "logging_dir": str(logs / "make"), **common},
+        )
+        if finish is None:
+            making.run()
+        else:
+            executors.SlurmPipelineExecutor(
+                [FinishStep(finish)],
+                tasks=1,
+                depends=making,
+                **{"job_name": "memobench-finish", **common, "logging_dir": str(logs / "finish")},
+            ).run()
+        return False
+    kind = executors.LocalPipelineExecutor if executor == "local" else executors.RayPipelineExecutor
+    with _watching(waiting, tell):
+        kind(steps, tasks=ranks, workers=workers, **{"logging_dir": str(logs / "make"), **common}).run()
+    for job in waiting:
+        tell(job)
+    return True
+
+
+@contextlib.contextmanager
+def _watching(jobs: Sequence[Job], tell: Callable[[Job], None]) -> Iterator[None]:
+    """Tell of finished episodes as they appear: datatrove has no such callback."""
+    over = threading.Event()
+
+    def watch() -> None:
+        waiting = list(jobs)
+        while not over.wait(POLL_SECONDS):
+            for job in [job for job in waiting if read_staged(job.folder) is not None]:
+                waiting.remove(job)
+                tell(job)
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()

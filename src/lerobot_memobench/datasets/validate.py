@@ -1,0 +1,139 @@
+"""Replay every episode of a folder and say which do not come out as they were recorded.
+
+The folder may hold a LeRobotDataset, HDF5 files of this package in the published layout, or both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import as_completed
+from dataclasses import dataclass
+from pathlib import Path
+
+from lerobot_memobench.datasets.hdf5 import PublishedFile, Unusable, find_files
+from lerobot_memobench.datasets.lerobot_format import is_dataset
+from lerobot_memobench.datasets.replay import read_episode, replay
+from lerobot_memobench.datasets.restore import restore, task_of
+from lerobot_memobench.datasets.running import process_pool
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.tasks.task import Task
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What replaying one episode showed.
+
+    Attributes:
+        episode: ``episode 3`` of the dataset, or a file and its group.
+        disagreement: the first one, as a sentence; None when everything agrees.
+    """
+
+    episode: str
+    disagreement: str | None
+
+
+@dataclass(frozen=True)
+class _Check:
+    """An episode to be replayed, in any process: of a dataset (``index``), or of an HDF5 file (``group``)."""
+
+    path: Path
+    name: str
+    index: int | None = None
+    group: str = ""
+    tasks: Mapping[str, Task] | None = None
+
+    def run(self) -> Verdict:
+        try:
+            return Verdict(self.name, self._replay())
+        except MemobenchError as error:
+            return Verdict(self.name, str(error))
+        except (OSError, KeyError, ValueError, IndexError) as error:
+            return Verdict(self.name, f"it cannot be read ({type(error).__name__}: {error})")
+
+    def _replay(self) -> str | None:
+        if self.index is not None:
+            episode = read_episode(self.path, self.index)
+            if episode.seed < 0:
+                return "it has no seed, so its scene cannot be made again"
+            found = replay(episode, task=(self.tasks or {}).get(episode.task_name))
+            return None if found is None else str(found)
+        with PublishedFile(self.path) as file:
+            published = file.read(self.group)
+            if "seed" not in published.extras or int(published.extras["seed"]) < 0:
+                return "it has no seed, so its scene cannot be made again"
+            found = replay(restore(task_of(file, published), published))
+            return None if found is None else str(found)
+
+
+ValidationProgress = Callable[[int, int, Verdict], None]
+"""Called with how many are done, of how many, and the newest verdict."""
+
+
+def validate(
+    folder: Path | str,
+    *,
+    workers: int = 1,
+    tasks: Mapping[str, Task] | None = None,
+    progress: ValidationProgress | None = None,
+) -> list[Verdict]:
+    """Replay the episodes of a folder (or of an HDF5 file) and return a verdict for each, in their order.
+
+    States, success, every checkpoint column, subgoal texts, language rows, key frames and the scene must come out
+    exactly; images are not compared.
+
+    Args:
+        folder: what to check.
+        workers: processes.
+        tasks: tasks by name that are not those of the catalogue.
+        progress: called after each episode.
+
+    Raises:
+        MemobenchError: there is nothing to check.
+    """
+    folder = Path(folder).absolute()
+    if workers < 1:
+        raise MemobenchError(f"{workers} workers were asked for; it must be at least 1")
+    checks = _checks(folder, tasks)
+    verdicts: dict[int, Verdict] = {}
+
+    def note(number: int, verdict: Verdict) -> None:
+        verdicts[number] = verdict
+        if progress is not None:
+            progress(len(verdicts), len(checks), verdict)
+
+    if workers == 1 or len(checks) == 1:
+        for number, check in enumerate(checks):
+            note(number, check.run())
+    else:
+        with process_pool(min(workers, len(checks))) as pool:
+            futures = {pool.submit(check.run): number for number, check in enumerate(checks)}
+            for future in as_completed(futures):
+                note(futures[future], future.result())
+    return [verdicts[number] for number in range(len(checks))]
+
+
+def exit_status(verdicts: Sequence[Verdict]) -> int:
+    """Return 0 when everything agreed, else 1."""
+    return 1 if any(verdict.disagreement is not None for verdict in verdicts) else 0
+
+
+def _checks(folder: Path, tasks: Mapping[str, Task] | None) -> list[_Check]:
+    checks: list[_Check] = []
+    if is_dataset(folder):
+        import json
+
+        total = json.loads((folder / "meta" / "info.json").read_text())["total_episodes"]
+        checks += [_Check(folder, f"episode {index}", index=index, tasks=tasks) for index in range(total)]
+    has_files = folder.is_file() or any(path.suffix in (".hdf5", ".h5") for path in folder.rglob("*"))
+    if not checks and not has_files:
+        raise MemobenchError(
+            f"{folder} holds neither a dataset (meta/info.json) nor HDF5 files; name the folder of generated ones"
+        )
+    for path in find_files(folder) if has_files else ():
+        name = path.name if path == folder else path.relative_to(folder).as_posix()
+        try:
+            with PublishedFile(path) as file:
+                checks += [_Check(path, f"{name}, {group}", group=group) for group in file.groups()]
+        except Unusable as error:
+            raise MemobenchError(f"{path}: {error}") from None
+    return checks

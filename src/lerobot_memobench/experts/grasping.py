@@ -1,0 +1,186 @@
+"""Pick: choose a way to hold a thing, take it from above, lift it, try another way when it was missed."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.experts.hand import CLOSED, COMFORTABLE, OPEN, STRETCHED, Array, Hand, downward, length
+from lerobot_memobench.experts.leaning import clear_of_objects, lean_from_fixtures, reach_lean
+from lerobot_memobench.experts.surroundings import FINGER_REACH, FULLY_OPEN, crowding, in_the_way
+from lerobot_memobench.experts.travel import Held, rise, travel
+from lerobot_memobench.sim.assets.base import Grasp
+from lerobot_memobench.sim.scene import TABLE_TOP
+
+ATTEMPTS = 4
+"""How often a thing is reached for, a handle, door or knob moved, before it is given up."""
+LYING = 0.7
+"""Cosine of the tilt from which a thing lies on its side."""
+MUCH_WORSE = 1.5
+"""Cost by which a hold is behind the best one and not tried."""
+FUNNEL, FUNNEL_MOUTH = 4.0, 0.006
+"""Height kept per distance from the line over the target, and the distance from which on, m."""
+LIFT = 0.10
+"""How high a thing is lifted before it is carried, m."""
+HOVER = 0.09
+"""Height over a grasp at which the hand turns and aligns, m."""
+RIM_GAP = 0.004
+"""Room left between a rim and the inner finger while the hand comes down, m."""
+CLOSING_LEAD = 0.03
+"""How much narrower than they are the fingers are taken to be while they close: the arm is slower than they, m."""
+EMPTY = 0.003
+"""Opening under which the fingers hold nothing, m."""
+WIDE = 0.068
+"""Width from which an object is hard to take, m."""
+RIM_LEAN = np.radians(14)
+"""How far the hand may lean with the wall of a bowl, rad."""
+
+
+def _yaw(rotation: Array) -> float:
+    return float(np.arctan2(rotation[1, 0], rotation[0, 0]))
+
+
+def _is_rim(hand: Hand, name: str, grasp: Grasp) -> bool:
+    return grasp.symmetric and hand.sim.assets[name].clear_radius > 0 and abs(grasp.position[0]) > 0.02
+
+
+def grasp_pose(
+    hand: Hand, name: str, grasp: Grasp, spin: float, opening: float | None = None, place: Array | None = None
+) -> tuple[Array, Array]:
+    """Return where the grip site goes to take ``name``, and how the hand is turned there.
+
+    A rim is taken with the inner finger close to the wall, however wide the fingers stand: the hand comes in from
+    outside and follows the outer finger as it closes. What lies in the bowl is not touched. The hand leans away from
+    what stands beside the object, and towards the arm where the object or ``place``, where it will be brought, is far.
+    """
+    opening = hand.sim.gripper_opening() if opening is None else opening
+    position, rotation = hand.sim.body_pose(name)
+    spun = rotation @ Rotation.from_rotvec([0.0, 0.0, spin]).as_matrix()
+    target = position + spun @ np.asarray(grasp.position)
+    rim = _is_rim(hand, name, grasp)
+    outward = np.zeros(3)
+    if rim:
+        outward = spun[:, 0] * np.sign(grasp.position[0])
+        target = target + outward * max(0.0, opening / 2 - grasp.width / 2 - RIM_GAP)
+    closing = _yaw(rotation) + spin + grasp.yaw
+    if rotation[2, 2] < LYING:
+        target, rim = position.copy(), False
+        closing = _closing_of_fallen(hand, name)
+    target[2] = max(target[2], TABLE_TOP + FINGER_REACH)
+    turn = downward(closing)
+    lean = lean_from_fixtures(hand, name, target)
+    # Only about the closing axis: the fingers stay level and the thin side of the hand turns away.
+    away = lean - (lean @ turn[:, 0]) * turn[:, 0]
+    reach = reach_lean(hand, target)
+    if place is not None:
+        there = reach_lean(hand, place + target - position, STRETCHED)
+        reach = max(reach, there, key=length)
+    away = away + reach - (reach @ turn[:, 0]) * turn[:, 0]
+    if rim:
+        # The wall of a bowl slopes: on the arm's side the fingers may lean with it.
+        away = away + outward * float(np.clip(reach @ outward, 0.0, RIM_LEAN))
+    return target, clear_of_objects(hand, name, target, turn[:, 0], away)
+
+
+def _closing_of_fallen(hand: Hand, name: str) -> float:
+    """Return the angle, rad, of the narrower of the two level sides of a thing that lies on its side."""
+    _, rotation = hand.sim.body_pose(name)
+    asset = hand.sim.assets[name]
+    size = np.asarray(asset.high) - np.asarray(asset.low)
+    upright = int(np.argmax(np.abs(rotation[2])))
+    side = min((k for k in range(3) if k != upright), key=lambda k: float(size[k]))
+    return float(np.arctan2(rotation[1, side], rotation[0, side]))
+
+
+def _choose_grasp(hand: Hand, name: str, attempt: int, avoid: Array | None, place: Array | None) -> tuple[Grasp, float]:
+    """Pick one of an object's grasps, turned where that is free: easy for the wrist, clear of its neighbours."""
+    asset = hand.sim.assets[name]
+    if not asset.grasps:
+        raise MemobenchError(
+            f"the expert does not know how to hold {name!r}: class {asset.class_name} declares no grasp"
+        )
+    options: list[tuple[float, Grasp, float]] = []
+    here, start = hand.sim.eef_pose()
+    for grasp in asset.grasps:
+        spins = np.arange(0.0, 2 * np.pi, np.pi / 12) if grasp.symmetric else [0.0]
+        for spin in spins:
+            target, turn = grasp_pose(hand, name, grasp, float(spin), FULLY_OPEN, place)
+            wrist = length(Rotation.from_matrix(turn @ start.T).as_rotvec())
+            cost = 0.3 * wrist + length(target - here) + crowding(hand, name, target, turn)
+            if avoid is not None:
+                cost += 2.0 * abs(float(turn[:, 0] @ avoid))
+            cost += 3.0 * abs(float(turn[:, 0] @ lean_from_fixtures(hand, name, target)))
+            blocked = in_the_way(hand, name, target, turn)
+            cost += 2.0 + 20.0 * blocked if blocked > 0.0 else 0.0
+            cost += 0.3 if grasp.width > WIDE else 0.0
+            ends = [target] if place is None else [target, place + target - hand.sim.body_pose(name)[0]]
+            cost += 20.0 * max(0.0, max(hand.stretch(end, turn) for end in ends) - COMFORTABLE)
+            options.append((cost, grasp, float(spin)))
+    options.sort(key=lambda option: option[0])
+    options = [option for option in options if option[0] < options[0][0] + MUCH_WORSE]
+    # A later attempt tries the next different way; each varies a little between episodes.
+    rank = min(attempt * max(1, len(options) // 6), len(options) - 1)
+    _, grasp, spin = options[rank]
+    if grasp.symmetric:
+        spin += float(hand.rng.uniform(-0.1, 0.1))
+    return grasp, spin
+
+
+def pick(
+    hand: Hand, name: str, avoid: Array | None = None, place: Array | None = None
+) -> Generator[NDArray[np.float32], None, Held | None]:
+    """Take an object from above and lift it; try other grasps when one misses.
+
+    Args:
+        hand: the arm.
+        name: the object.
+        avoid: horizontal direction (3,) along which the fingers should not close, for the place it is brought to.
+        place: where the object's origin will be brought, (3,), m: a far place wants another hold than a near one.
+
+    Returns:
+        How it is held, or None when every attempt missed.
+    """
+    for attempt in range(ATTEMPTS):
+        grasp, spin = _choose_grasp(hand, name, attempt, avoid, place)
+
+        def pose(opening: float | None = None, grasp: Grasp = grasp, spin: float = spin) -> tuple[Array, Array]:
+            return grasp_pose(hand, name, grasp, spin, opening, place)
+
+        def above() -> Array:
+            # Along the fingers, so that a leaning hand comes in as it will leave.
+            target, turn = pose()
+            return target - HOVER * turn[:, 2]
+
+        def at() -> Array:
+            # As through a funnel: lower only where it is over the middle.
+            target, turn = pose()
+            off = hand.position - target
+            beside = length(off - (off @ turn[:, 2]) * turn[:, 2])
+            return target - min(HOVER, FUNNEL * max(0.0, beside - FUNNEL_MOUTH)) * turn[:, 2]
+
+        def turned() -> Array:
+            return pose()[1]
+
+        yield from rise(hand, OPEN)
+        yield from travel(hand, above, turned, OPEN, target=name)
+        yield from hand.move(above, turned, OPEN, tolerance=0.012, turn_tolerance=0.08)
+        yield from hand.move(at, turned, OPEN, tolerance=0.005, speed=0.6, timeout=60)
+
+        def closing(width: float = grasp.width) -> Array:
+            return pose(max(hand.sim.gripper_opening() - CLOSING_LEAD, width))[0]
+
+        yield from hand.close(closing, hand.rotation)
+        start, _ = hand.sim.body_pose(name)
+        # Back along the fingers: straight up where the hand hangs down, away from what it leans away from.
+        lifted = hand.position - LIFT * hand.rotation[:, 2]
+        yield from hand.move(lifted, hand.rotation, CLOSED, tolerance=0.02, speed=0.7, timeout=60)
+        now, turn = hand.sim.body_pose(name)
+        if hand.sim.gripper_opening() > EMPTY and now[2] - start[2] > LIFT * 0.5:
+            position, rotation = hand.sim.eef_pose()
+            return Held(name, rotation.T @ (now - position), rotation.T @ turn)
+        yield from hand.wait(4, OPEN)
+    return None

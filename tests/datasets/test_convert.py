@@ -1,0 +1,313 @@
+"""Conversion of files in the published layout, by this package and by hand; the simulator gives what they lack."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from lerobot_memobench.datasets import convert as convert_module
+from lerobot_memobench.datasets.convert import convert
+from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels
+from lerobot_memobench.datasets.generation import record_demonstration
+from lerobot_memobench.datasets.hdf5 import PublishedFile, write_task_file
+from lerobot_memobench.datasets.lerobot_format import is_dataset, write_dataset
+from lerobot_memobench.datasets.mjcf import model_file, read_fixture_poses
+from lerobot_memobench.datasets.replay import read_episode, replay
+from lerobot_memobench.datasets.restore import restore, task_of
+from lerobot_memobench.datasets.staging import stage_demonstration
+from lerobot_memobench.datasets.validate import validate
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.tasks import get_task
+
+STOVE = "turn_on_the_stove_and_turn_it_off"
+BUTTER = "put_the_butter_into_the_bowl_from_the_prompt_video"
+SIZE = 32
+HAND = Path(__file__).with_name("published_by_hand.py")
+
+
+def with_images(demo: Demonstration) -> Demonstration:
+    """Give it small pictures, each another."""
+    x = np.arange(SIZE) * 2
+    frames = np.stack([np.stack([np.add.outer(x, x) + c + t for c in (0, 40, 80)], -1) for t in range(len(demo))])
+    frames = (frames % 256).astype(np.uint8)
+    return replace(demo, images={"image": frames, "wrist_image": 255 - frames})
+
+
+@pytest.fixture(scope="module")
+def stove() -> Demonstration:
+    demo = record_demonstration(get_task(STOVE), 10_000, images=False)
+    return with_images(replace(demo, model_xml=model_file(demo.task, demo.fixture_poses)))
+
+
+@pytest.fixture(scope="module")
+def butter() -> Demonstration:
+    return with_images(record_demonstration(get_task(BUTTER), 10_000, images=False))
+
+
+@pytest.fixture(scope="module")
+def written(stove, butter, tmp_path_factory) -> Path:
+    """Both as this package writes them."""
+    folder = tmp_path_factory.mktemp("published")
+    for demo in (stove, butter):
+        staged = stage_demonstration(demo, folder / "staged" / demo.task.name, ("hdf5",))
+        write_task_file(folder / "hdf5" / f"{demo.task.name}_demo.hdf5", staged.hdf5_attributes, [staged.hdf5] * 2)
+    return folder / "hdf5"
+
+
+@pytest.fixture
+def source(written, tmp_path) -> Path:
+    return Path(shutil.copytree(written, tmp_path / "source"))
+
+
+def by_hand(folder: Path, demo: Demonstration, name: str, **metadata) -> Path:
+    """Write a demonstration with the independent script, in a process of its own."""
+    task_folder = folder / "tasks" / demo.task.memory_type / demo.task.name
+    task_folder.mkdir(parents=True, exist_ok=True)
+    for file in demo.task.folder.iterdir():
+        shutil.copy(file, task_folder)
+    given = json.loads((task_folder / "task_config.meta.json").read_text())
+    for key in ("memory_type", "family", "variants", "prompt"):
+        given.pop(key, None)  # the published metadata has none of them
+    (folder / "meta.json").write_text(json.dumps(given | metadata))
+    np.savez(folder / "arrays.npz", states=demo.states, actions=demo.actions.astype(np.float64), **demo.images)
+    out = folder / name
+    arguments = [out, folder / "arrays.npz", task_folder / "task_config.bddl", folder / "meta.json"]
+    subprocess.run([sys.executable, str(HAND), *map(str, arguments)], check=True, cwd="/")
+    return out
+
+
+def test_our_own_files_come_back_as_they_were(written, stove, butter, tmp_path):
+    summary = convert(written, tmp_path / "ds", repo_id="local/test")
+    assert summary.exit_status == 0
+    assert (summary.episodes, summary.problems) == (4, ())
+    direct = write_dataset([butter, butter, stove, stove], tmp_path / "direct", repo_id="local/test")
+    for folder in ("data", "videos", "states", "meta"):
+        files = [path for path in (direct / folder).rglob("*") if path.is_file()]
+        assert files
+        for path in files:
+            assert path.read_bytes() == (summary.folder / path.relative_to(direct)).read_bytes(), path
+    assert replay(read_episode(summary.folder, 2)) is None
+    assert not (tmp_path / "ds" / ".staging").exists()
+
+
+def test_our_own_files_replay(source, tmp_path):
+    verdicts = validate(source)
+    assert [(v.episode, v.disagreement) for v in verdicts] == [
+        (f"{name}_demo.hdf5, demo_{k}", None) for name in (BUTTER, STOVE) for k in range(2)
+    ]
+    with h5py.File(source / f"{STOVE}_demo.hdf5", "a") as file:
+        file["data/demo_0/actions"][20, 0] = 1.0
+        del file["data/demo_0"].attrs["digest"]
+        del file["data/demo_1"].attrs["seed"]
+    changed, unknown = validate(source / f"{STOVE}_demo.hdf5")
+    assert changed.disagreement.startswith("states at frame 21")
+    assert unknown.disagreement == "it has no seed, so its scene cannot be made again"
+
+
+def test_files_by_hand_without_key_frames(stove, tmp_path):
+    """Checkpoint columns, proprioception and success are read off the states."""
+    path = by_hand(tmp_path, stove, "stove.hdf5")
+    with PublishedFile(path) as file:
+        found = file.read("demo_0")
+        task = task_of(file, found)
+        assert found.extras == {}
+        assert (task.name, task.memory_type, task.family) == (STOVE, "temporal", stove.task.family)
+        # Nothing says where the stove stood, so it is taken to stand in the middle of its region.
+        assert not np.array_equal(
+            restore(task, found).fixture_poses["flat_stove_1"], stove.fixture_poses["flat_stove_1"]
+        )
+    summary = convert(path, tmp_path / "ds")
+    assert summary.exit_status == 0
+    episode = read_episode(tmp_path / "ds", 0)
+    assert (episode.seed, episode.task_name, episode.whole["success"]) == (-1, STOVE, True)
+    assert episode.whole["key_frames"] == labels(stove).key_frames.tolist()
+    for name, column in labels(stove).columns().items():
+        assert np.array_equal(episode.columns[name], column), name
+    np.testing.assert_array_equal(episode.columns["observation.state"], stove.proprio)
+
+
+def test_files_by_hand_with_key_frames_and_a_model_file(stove, tmp_path):
+    path = by_hand(tmp_path, stove, "stove.hdf5", key_frame=[30, 44], timestep_exec_start_idx=[5])
+    with h5py.File(path, "a") as file:
+        file["data/demo_0"].attrs["model_file"] = stove.model_xml.replace(
+            'name="flat_stove_1"', 'name="flat_stove_1_main"'
+        )
+    convert(path, tmp_path / "ds")
+    episode = read_episode(tmp_path / "ds", 0)
+    assert episode.whole["key_frames"] == [30, 44]
+    assert episode.exec_start == 5
+    assert episode.whole["fixture_poses"] == {k: v.tolist() for k, v in stove.fixture_poses.items()}
+    assert episode.columns["checkpoint.index"].tolist() == [0] * 31 + [1] * 14 + [2] * (len(stove) - 45)
+
+
+def test_a_prompt_video_whose_end_is_not_told(butter, tmp_path):
+    path = by_hand(tmp_path, butter, "butter.hdf5")
+    with PublishedFile(path) as file:
+        found = file.read("demo_0")
+        restored = restore(task_of(file, found), found)
+    assert restored.exec_start == butter.exec_start
+    np.testing.assert_array_equal(restored.satisfied, butter.satisfied)
+    assert restored.success
+    moved = replace(found, states=found.states + np.linspace(0, 1, len(found.states))[:, None])
+    with pytest.raises(MemobenchError, match="timestep_exec_start_idx is -1 for a task with a prompt video"):
+        restore(restored.task, moved)
+
+
+def test_what_contradicts_itself_is_said(written, stove):
+    with PublishedFile(written / f"{STOVE}_demo.hdf5") as file:
+        found = file.read("demo_0")
+        task = task_of(file, found)
+    assert digest(restore(task, found)) == digest(stove)
+    foreign = replace(found, extras={})
+
+    def said(reason: str, **change) -> None:
+        metadata = found.metadata | change.pop("metadata", {})
+        with pytest.raises(MemobenchError, match=reason):
+            restore(task, replace(foreign, metadata=metadata, **change))
+
+    said("key_frame .* is not in order", metadata={"key_frame": [50, 20]})
+    said("outside of the execution", metadata={"key_frame": [20, 5000]})
+    said("expected 2 frames", metadata={"key_frame": [20]})
+    said("expected a frame or -1", metadata={"timestep_exec_start_idx": "first"})
+    said("execution starts at frame 9999", metadata={"timestep_exec_start_idx": 9999})
+    said("states have width 12, expected", states=found.states[:, :12])
+    said("not in order: frame 1 is earlier", states=found.states[::-1])
+    said("not in order: frame 21 is earlier", states=found.states[[*range(20), 21, 20, *range(22, len(stove))]])
+    said("model_file is no XML", model_file="<mujoco>")
+    said("pos='1 2'", model_file='<mujoco><body name="flat_stove_1" pos="1 2"/></mujoco>')
+    with pytest.raises(MemobenchError, match="the digest differs"):
+        restore(task, replace(found, actions=found.actions[::-1]))
+
+
+def test_the_model_file_is_the_scene(stove):
+    import mujoco
+
+    from lerobot_memobench.sim.simulation import Simulation
+
+    sim = Simulation(stove.task)
+    sim.reset(10_000)
+    model = mujoco.MjModel.from_xml_string(stove.model_xml)
+    assert (model.nq, model.nv, model.ngeom) == (sim.model.nq, sim.model.nv, sim.model.ngeom)
+    names = [model.body(k).name for k in range(model.nbody)]
+    assert names == [sim.model.body(k).name for k in range(sim.model.nbody)]
+    np.testing.assert_array_equal(model.body_pos, sim.model.body_pos)
+    np.testing.assert_allclose(model.body_mass, sim.model.body_mass, rtol=1e-5)  # six digits
+    poses = read_fixture_poses(stove.model_xml, stove.fixture_poses)
+    for name, pose in stove.fixture_poses.items():
+        np.testing.assert_array_equal(poses[name], pose)
+
+
+def test_the_rest_converts(source, stove, tmp_path):
+    """Each kind of damage is named with file, group and reason; what is sound is in the dataset."""
+    (source / "notes.hdf5").write_text("no HDF5")
+    whole = (source / f"{BUTTER}_demo.hdf5").read_bytes()
+    (source / f"{BUTTER}_demo.hdf5").write_bytes(whole[: len(whole) * 2 // 3])
+    with h5py.File(source / f"{STOVE}_demo.hdf5", "a") as file:
+        file["data"].attrs["num_demos"] = 5
+        file.copy("data/demo_0", "data/demo_2")
+        file.copy("data/demo_0", "data/demo_3")
+        file["data/demo_1"].attrs["meta_data"] = "{"
+        del file["data/demo_2"].attrs["num_samples"]
+        file["data/demo_3/states"][:] = file["data/demo_3/states"][:][::-1]
+    summary = convert(source, tmp_path / "ds")
+    assert summary.exit_status == 1
+    assert summary.episodes == 1
+    told = [str(problem) for problem in summary.problems]
+    assert [line.split(": ")[0] for line in told] == [
+        "notes.hdf5",
+        f"{BUTTER}_demo.hdf5",
+        f"{STOVE}_demo.hdf5, data",
+        f"{STOVE}_demo.hdf5, data/demo_1",
+        f"{STOVE}_demo.hdf5, data/demo_2",
+        f"{STOVE}_demo.hdf5, data/demo_3",
+    ]
+    for line, reason in zip(
+        told,
+        ["no HDF5 file", "cut off", "says that it has 5", "no valid JSON", "num_samples", "not in order"],
+        strict=True,
+    ):
+        assert reason in line
+    assert not (tmp_path / "ds" / ".staging").exists()
+    manifest = json.loads((tmp_path / "ds" / "manifest.json").read_text())
+    assert len(manifest["left_out"]) == 6
+    assert "Left out (6)" in (tmp_path / "ds" / "README.md").read_text()
+    again = convert(source, tmp_path / "ds")
+    assert (again.episodes, again.problems) == (summary.episodes, summary.problems)
+    np.testing.assert_array_equal(read_episode(tmp_path / "ds", 0).columns["action"], stove.actions)
+
+
+def test_images_that_cannot_be_read_are_a_problem_of_their_group(source, tmp_path):
+    """A byte is changed within a compressed frame; only reading the frame shows it."""
+    path = source / f"{STOVE}_demo.hdf5"
+    with h5py.File(path) as file:
+        chunk = file["data/demo_0/obs/agentview_image"].id.get_chunk_info(40)
+    data = bytearray(path.read_bytes())
+    data[chunk.byte_offset + 2 : chunk.byte_offset + chunk.size] = b"\xff" * (chunk.size - 2)
+    path.write_bytes(data)
+    summary = convert(path, tmp_path / "ds")
+    assert summary.episodes == 1
+    (problem,) = summary.problems
+    assert problem.group == "data/demo_0"
+    assert "its images cannot be read from frame 32 on" in problem.reason
+
+
+def test_nothing_usable_leaves_nothing(tmp_path):
+    (tmp_path / "a.hdf5").write_text("no HDF5")
+    summary = convert(tmp_path / "a.hdf5", tmp_path / "ds")
+    assert summary.folder is None
+    assert summary.exit_status == 1
+    assert not (tmp_path / "ds").exists()
+    for missing in ("absent", "."):
+        (tmp_path / "empty").mkdir(exist_ok=True)
+        with pytest.raises(MemobenchError, match=r"does not exist|found no HDF5 file"):
+            convert(tmp_path / "empty" / missing, tmp_path / "ds")
+        assert not (tmp_path / "ds").exists()
+
+
+def test_a_broken_off_conversion_goes_on(written, tmp_path, monkeypatch):
+    reference = convert(written / f"{STOVE}_demo.hdf5", tmp_path / "reference")
+    made: list[str] = []
+    inner = convert_module.ConversionJob.run
+
+    def run(job):
+        if job.group == "demo_1" and "demo_1" not in made:
+            made.append("demo_1")
+            raise KeyboardInterrupt
+        made.append(job.group)
+        inner(job)
+
+    monkeypatch.setattr(convert_module.ConversionJob, "run", run)
+    with pytest.raises(KeyboardInterrupt):
+        convert(written / f"{STOVE}_demo.hdf5", tmp_path / "ds")
+    assert not is_dataset(tmp_path / "ds")
+    with pytest.raises(MemobenchError, match="unfinished run with upside_down=False, now True"):
+        convert(written / f"{STOVE}_demo.hdf5", tmp_path / "ds", upside_down=True)
+    convert(written / f"{STOVE}_demo.hdf5", tmp_path / "ds")
+    assert made == ["demo_0", "demo_1", "demo_1"]
+    for path in reference.folder.rglob("*"):
+        if path.is_file():
+            assert path.read_bytes() == (tmp_path / "ds" / path.relative_to(reference.folder)).read_bytes(), path
+
+
+def test_metadata_that_is_none(source, tmp_path):
+    """A task that its file does not describe is left out, in one sentence without anybody's temporary folder."""
+    path = source / f"{STOVE}_demo.hdf5"
+    with h5py.File(path, "a") as file:
+        del file["data"].attrs["task_metadata"]
+        file["data/demo_0"].attrs["meta_data"] = json.dumps({"memory": []})
+        del file["data/demo_1"].attrs["digest"]  # it is of the task by its real name
+        file["data"].attrs["bddl_file_name"] = "C:\\tasks\\own task\\task_config.bddl"
+    summary = convert(path, tmp_path / "ds")
+    (problem,) = summary.problems
+    assert problem.reason.startswith("meta_data lacks 'operating_type', 'subtask_goals'")
+    assert os.sep + "tmp" not in problem.reason
+    assert read_episode(tmp_path / "ds", 0).task_name == "own task"

@@ -1,0 +1,218 @@
+"""The published layout, written and read, without a simulator."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+
+from lerobot_memobench.datasets.demonstration import digest, labels
+from lerobot_memobench.datasets.hdf5 import (
+    PublishedFile,
+    Unusable,
+    data_attributes,
+    find_files,
+    truth_from_intervals,
+    write_task_file,
+)
+from lerobot_memobench.datasets.staging import EpisodeStage, stage_demonstration
+from lerobot_memobench.errors import MemobenchError
+
+SIZE = 32
+ROWS = ["0010011", "0001111"]
+
+
+@pytest.fixture
+def demos(make_demo):
+    return [replace(make_demo(ROWS, seed=10_000 + k, size=SIZE), model_xml="<mujoco/>") for k in range(2)]
+
+
+@pytest.fixture
+def path(demos, tmp_path):
+    staged = [stage_demonstration(demo, tmp_path / f"{k}", ("hdf5",)) for k, demo in enumerate(demos)]
+    out = tmp_path / "hdf5" / "synthetic_task_demo.hdf5"
+    write_task_file(out, staged[0].hdf5_attributes, [episode.hdf5 for episode in staged])
+    return out
+
+
+def test_the_layout_as_published(path, demos):
+    with h5py.File(path) as file:
+        assert set(file) == {"data"}
+        data = file["data"]
+        assert set(data) == {"demo_0", "demo_1"}
+        assert data.attrs["bddl_file_name"] == "temporal/synthetic_task/task_config.bddl"
+        assert data.attrs["bddl_file_content"] == "synthetic_task"
+        assert json.loads(data.attrs["problem_info"])["language_instruction"] == "do the synthetic task"
+        assert json.loads(data.attrs["env_info"])["env_kwargs"]["control_freq"] == 20
+        for k, demo in enumerate(demos):
+            group = data[f"demo_{k}"]
+            assert set(group) == {"states", "actions", "obs"}
+            assert set(group["obs"]) == {"agentview_image", "robot0_eye_in_hand_image"}
+            assert group["states"].dtype == np.float64
+            np.testing.assert_array_equal(group["states"], demo.states)
+            np.testing.assert_array_equal(group["actions"], demo.actions)
+            np.testing.assert_array_equal(group["obs/agentview_image"], demo.images["image"])
+            np.testing.assert_array_equal(group["obs/robot0_eye_in_hand_image"], demo.images["wrist_image"])
+            assert group.attrs["num_samples"] == 7
+            assert group.attrs["model_file"] == "<mujoco/>"
+            metadata = json.loads(group.attrs["meta_data"])
+            assert metadata["key_frame"] == labels(demo).key_frames.tolist() == [2, 3]
+            assert metadata["timestep_exec_start_idx"] == 0
+            assert group.attrs["seed"] == demo.seed
+            assert group.attrs["digest"] == digest(demo)
+            intervals = json.loads(group.attrs["satisfied_intervals"])
+            assert intervals == [[[2, 3], [5, 7]], [[3, 7]]]
+            np.testing.assert_array_equal(truth_from_intervals(intervals, 7), demo.satisfied)
+
+
+def test_a_long_model_file_and_a_list_of_the_execution_start(make_demo, make_task, tmp_path):
+    task = replace(make_task("S"), metadata={"timestep_exec_start_idx": [-1], "own": "kept"})
+    demo = replace(make_demo(["000011"], task=task, exec_start=2, size=SIZE), model_xml="<a>" + "x" * 300_000 + "</a>")
+    staged = stage_demonstration(demo, tmp_path / "0", ("hdf5",))
+    write_task_file(tmp_path / "a.hdf5", data_attributes(task), [staged.hdf5])
+    with PublishedFile(tmp_path / "a.hdf5") as file:
+        read = file.read("demo_0")
+    assert len(read.model_file) > 300_000
+    assert read.metadata == {"timestep_exec_start_idx": [2], "key_frame": [4], "own": "kept"}
+
+
+def test_reading_back(path, demos):
+    with PublishedFile(path) as file:
+        assert file.groups() == ["demo_0", "demo_1"]
+        assert file.announced() == 2
+        for group, demo in zip(file.groups(), demos, strict=True):
+            read = file.read(group)
+            np.testing.assert_array_equal(read.states, demo.states)
+            np.testing.assert_array_equal(read.actions, demo.actions)
+            assert read.image_size == (SIZE, SIZE)
+            frames = list(file.images(group))
+            for camera in demo.images:
+                np.testing.assert_array_equal([frame[camera] for frame in frames], demo.images[camera])
+            flipped = next(file.images(group, upside_down=True))
+            np.testing.assert_array_equal(flipped["image"][::-1], demo.images["image"][0])
+
+
+def test_groups_in_the_order_of_their_numbers(path):
+    with h5py.File(path, "a") as file:
+        file.copy("data/demo_0", "data/demo_10")
+        file.copy("data/demo_0", "data/demo_9")
+        file["data"].create_group("mask")
+    with PublishedFile(path) as file:
+        assert file.groups() == ["demo_0", "demo_1", "demo_9", "demo_10", "mask"]
+        with pytest.raises(Unusable, match="no group demo_<number>"):
+            file.read("mask")
+
+
+def _delete(name):
+    def change(group):
+        del group[name]
+
+    return change
+
+
+def _put(name, make):
+    def change(group):
+        old = group[name][:]
+        del group[name]
+        group[name] = make(old)
+
+    return change
+
+
+def _attribute(name, value):
+    def change(group):
+        if value is None:
+            del group.attrs[name]
+        else:
+            group.attrs[name] = value
+
+    return change
+
+
+def _nan(old):
+    old[3, 1] = np.nan
+    return old
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (_delete("states"), "array 'states' is missing"),
+        (_delete("obs"), "group 'obs' is missing"),
+        (_delete("obs/robot0_eye_in_hand_image"), "'obs/robot0_eye_in_hand_image' is missing"),
+        (_put("actions", lambda old: old[:-1]), "different lengths: states 7, actions 6, agentview_image 7"),
+        (_put("actions", lambda old: old[:, :6]), r"actions has shape \(7, 6\)"),
+        (_put("actions", lambda old: old.astype(np.int64)), "actions has type int64, expected float32 or float64"),
+        (_put("states", lambda old: old.astype(np.float32)), "states has type float32, expected float64"),
+        (_put("states", _nan), "states holds a value that is not finite at frame 3"),
+        (_put("obs/agentview_image", lambda old: old.astype(np.float32)), "agentview_image has type float32"),
+        (_put("obs/agentview_image", lambda old: old[:, :16]), "cameras have different sizes"),
+        (_attribute("num_samples", None), "attribute 'num_samples' is missing"),
+        (_attribute("num_samples", 8), "num_samples is 8, but its arrays have 7 frames"),
+        (_attribute("meta_data", None), "attribute 'meta_data' is missing"),
+        (_attribute("meta_data", "{'key_frame': [2]}"), "meta_data is no valid JSON"),
+        (_attribute("meta_data", "[1]"), "meta_data holds a list"),
+        (_attribute("meta_data", 7), "attribute 'meta_data' is of type int64"),
+    ],
+)
+def test_what_is_wrong_with_a_group_is_said(path, change, reason):
+    with h5py.File(path, "a") as file:
+        change(file["data/demo_1"])
+    with PublishedFile(path) as file:
+        file.read("demo_0")
+        with pytest.raises(Unusable, match=reason):
+            file.read("demo_1")
+
+
+def test_what_is_wrong_with_a_file_is_said(path, tmp_path):
+    whole = path.read_bytes()
+    (tmp_path / "cut.hdf5").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "text.hdf5").write_text("no HDF5")
+    with h5py.File(tmp_path / "empty.hdf5", "w") as file:
+        file.create_group("episodes")
+    with h5py.File(path, "a") as file:
+        del file["data"].attrs["bddl_file_content"]
+    for name, reason in [
+        ("cut.hdf5", "cut off"),
+        ("text.hdf5", "no HDF5 file"),
+        ("empty.hdf5", r"no group 'data' \(found episodes\)"),
+        ("hdf5/synthetic_task_demo.hdf5", "attribute 'bddl_file_content' is missing"),
+        ("absent.hdf5", "no such file"),
+    ]:
+        with pytest.raises(Unusable, match=reason):
+            PublishedFile(tmp_path / name)
+
+
+def test_finding_files(path, tmp_path):
+    assert find_files(tmp_path / "hdf5") == [path]
+    assert find_files(path) == [path]
+    (tmp_path / "nothing").mkdir()
+    with pytest.raises(MemobenchError, match="found no HDF5 file"):
+        find_files(tmp_path / "nothing")
+
+
+def test_frames_streamed_give_the_bytes_of_frames_in_memory(demos, tmp_path):
+    whole = stage_demonstration(demos[0], tmp_path / "whole", ("lerobot", "hdf5"))
+    with EpisodeStage(tmp_path / "streamed", ("lerobot", "hdf5")) as stage:
+        for t in range(len(demos[0])):
+            stage.add_images({camera: frames[t] for camera, frames in demos[0].images.items()})
+        streamed = stage.publish(replace(demos[0], images=None))
+    assert streamed.record == whole.record
+    assert set(whole.record["files"]) == {"arrays.npz", "demonstration.hdf5", "image.mp4", "wrist_image.mp4"}
+
+
+def test_an_episode_that_is_not_published_leaves_nothing(demos, tmp_path):
+    images = {camera: frames[0] for camera, frames in demos[0].images.items()}
+    stage = EpisodeStage(tmp_path / "a" / "0", ("lerobot", "hdf5"))
+    with stage:
+        stage.add_images(images)
+        assert len(list((tmp_path / "a").iterdir())) == 1
+    assert list((tmp_path / "a").iterdir()) == []
+    with EpisodeStage(tmp_path / "a" / "0") as stage:
+        stage.add_images(images)
+        with pytest.raises(MemobenchError, match="1 images of a demonstration of 7 frames"):
+            stage.publish(replace(demos[0], images=None))
+    assert list((tmp_path / "a").iterdir()) == []

@@ -1,0 +1,186 @@
+"""Experts solve the tasks, in order, smoothly, and get over mishaps."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from lerobot_memobench.envs.episode import EXECUTION, Episode
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.experts.expert import Expert
+from lerobot_memobench.sim.simulation import Simulation
+from lerobot_memobench.tasks.catalogue import get_task, task_names
+from lerobot_memobench.tasks.formula import parse_formula
+from lerobot_memobench.tasks.task import Task
+
+STOVE = "turn_on_the_stove_and_turn_it_off"
+DRAWER = "put_the_tomato_into_the_top_drawer_of_the_cabinet"
+BOWL = "put_the_butter_into_the_bowl_from_the_prompt_video"
+ASSEMBLY = "execute_the_assembly_procedure_demonstrated_in_the_prompt_video"
+MICROWAVE = "open_and_close_the_microwave"
+SMOOTH = 0.25
+"""Largest change of an action's component from one step to the next."""
+
+
+@dataclass
+class Played:
+    """What came of an episode."""
+
+    episode: Episode
+    actions: np.ndarray
+    """Of the execution, (T, 7)."""
+    faults: list[str] = field(default_factory=list)
+
+
+def play(
+    task: Task,
+    seed: int,
+    *,
+    prompt: bool = False,
+    referent: str = "fixed",
+    disturb: Callable[[Episode, np.ndarray], np.ndarray] | None = None,
+) -> Played:
+    """Let the expert act until the episode ends; note whatever is not as it must be."""
+    episode = Episode(task, prompt_video=prompt, referent=referent)
+    episode.reset(seed)
+    actions = []
+    while not episode.done:
+        action = episode.expert_action()
+        if episode.phase == EXECUTION:
+            actions.append(action)
+        episode.step(action if disturb is None else disturb(episode, action))
+    played = Played(episode, np.array(actions))
+    if not episode.success:
+        played.faults.append(f"no success in {episode.exec_steps} steps")
+    order = episode.progress.ordered_step
+    if None in order:
+        played.faults.append(f"checkpoints not completed in order: {order}")
+    if episode.prompt_shown is False:
+        played.faults.append("the prompt did not show what it had to")
+    if np.abs(played.actions).max() > 1.0:
+        played.faults.append("an action outside [-1, 1]")
+    jump = np.abs(np.diff(played.actions[:, :6], axis=0)).max()
+    if jump > SMOOTH:
+        played.faults.append(f"an action jumps by {jump:.2f}")
+    return played
+
+
+def sweep(tasks: list[Task], seeds: range, **settings: object) -> dict[str, list[str]]:
+    """Play every task on every seed; return the faults by task and seed, of those that have any."""
+    faults = {}
+    for task in tasks:
+        for seed in seeds:
+            found = play(task, seed, **settings).faults  # type: ignore[arg-type]
+            if found:
+                faults[f"{task.name} {seed}"] = found
+    return faults
+
+
+def with_goal(name: str, goal: list[object]) -> Task:
+    """Return a task of one's own: the scene of another, a goal, no checkpoints."""
+    return dataclasses.replace(get_task(name), goal=parse_formula(goal), checkpoints=())
+
+
+@pytest.mark.parametrize(
+    ("name", "seed"), [(STOVE, 7), (DRAWER, 10_001), (BOWL, 10_002), (ASSEMBLY, 8), (MICROWAVE, 9)]
+)
+def test_solves_in_order_and_smoothly(name: str, seed: int) -> None:
+    assert not play(get_task(name), seed).faults
+
+
+def test_prompt_points_at_the_random_referent() -> None:
+    name = "find_the_specific_milk_pointed_out_in_the_prompt_video_and_put_it_on_the_plate"
+    played = play(get_task(name), 10_000, prompt=True, referent="random")
+    assert not played.faults
+    assert played.episode.prompt_shown
+
+
+def test_a_task_of_ones_own_needs_no_code() -> None:
+    goal = [
+        "and",
+        ["close", "wooden_cabinet_1_middle_region"],
+        ["on", "akita_black_bowl_1", "wooden_cabinet_1_top_side"],
+    ]
+    own = with_goal("check_the_middle_drawer_of_the_cabinet", goal)
+    assert not play(own, 10_000).faults
+
+
+def test_what_was_dropped_is_picked_up_again() -> None:
+    left = 15
+
+    def let_go(episode: Episode, action: np.ndarray) -> np.ndarray:
+        nonlocal left
+        if left and episode.sim.body_pose("butter_1")[0][2] > 0.96:
+            left -= 1
+            return np.append(action[:6], -1.0)
+        return action
+
+    assert not play(get_task(BOWL), 10_000, disturb=let_go).faults
+    assert left == 0
+
+
+def test_a_handle_that_slipped_is_taken_again() -> None:
+    left = 12
+
+    def slip(episode: Episode, action: np.ndarray) -> np.ndarray:
+        nonlocal left
+        _, q = episode.sim.world.articulation("wooden_cabinet_1_top_region")
+        if left and q < -0.07:
+            left -= 1
+            return np.array([0.0, 0.4, 0.4, 0.0, 0.0, 0.0, -1.0])
+        return action
+
+    assert not play(get_task("check_the_top_drawer_of_the_cabinet"), 10_000, disturb=slip).faults
+    assert left == 0
+
+
+def test_seeds_differ_and_repeat() -> None:
+    task = get_task(STOVE)
+    first, again, other = (play(task, seed).actions for seed in (10_000, 10_000, 10_001))
+    np.testing.assert_array_equal(first, again)
+    length = min(len(first), len(other))
+    assert np.abs(first[:length] - other[:length]).max() > 0.05
+
+
+def test_rests_once_the_goal_holds() -> None:
+    task = get_task(STOVE)
+    episode = play(task, 10_000).episode
+    for _ in range(8):
+        action = episode.expert_action()
+        episode.step(action)
+    np.testing.assert_array_equal(action, [0, 0, 0, 0, 0, 0, -1])
+    assert episode.success
+
+
+def test_says_which_goal_it_cannot_bring_about() -> None:
+    own = with_goal(STOVE, ["in", "moka_pot_1", "flat_stove_1_cook_region"])
+    sim = Simulation(own)
+    sim.reset(10_000)
+    expert = Expert(own, sim, np.random.default_rng(0))
+    with pytest.raises(MemobenchError, match="flat_stove_1_cook_region"):
+        expert.act()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [STOVE, DRAWER, BOWL, ASSEMBLY])
+def test_never_fails_on_the_first_four(name: str) -> None:
+    task = get_task(name)
+    assert not sweep([task], range(10_000, 10_010)) | sweep([task], range(7, 17))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("name", task_names())
+def test_solves_every_task(name: str) -> None:
+    assert not sweep([get_task(name)], range(10_000, 10_003)) | sweep([get_task(name)], range(7, 9))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("referent", ["fixed", "random"])
+@pytest.mark.parametrize("name", task_names("object") + task_names("procedural"))
+def test_shows_every_prompt(name: str, referent: str) -> None:
+    assert not sweep([get_task(name)], range(10_000, 10_002), prompt=True, referent=referent)
