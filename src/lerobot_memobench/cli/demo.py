@@ -68,7 +68,7 @@ def run_expert(output: Path) -> int:
     from lerobot_memobench.cli.lerobot import run
 
     words = ["eval", "env=memobench", f"tasks={','.join(TASKS)}", "episodes=1", "env.videos=true"]
-    return run([*words, f"output_dir={output}"])
+    return run([*words, f"output_dir={output}"], say_where=False)
 
 
 def collect_videos(evaluation: Path, folder: Path) -> dict[str, Path]:
