@@ -163,3 +163,21 @@ def test_generate_tells_what_became_of_every_seed(
     printed = capsys.readouterr().out
     assert ("no dataset was written" in printed) == (solved == 0)
     assert ("it slipped" in printed) == (solved < 2)
+
+
+def test_a_tree_of_tasks_lists_what_loads_and_names_what_does_not(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import shutil
+
+    from lerobot_memobench.tasks.catalogue import get_task
+
+    whole = get_task(TASK).folder
+    shutil.copytree(whole, tmp_path / "temporal" / TASK)
+    shutil.copytree(whole, tmp_path / "temporal" / "lacking")
+    (tmp_path / "temporal" / "lacking" / "task_config.meta.json").unlink()
+    assert main(["tasks", "--dir", str(tmp_path)]) == 1
+    printed = capsys.readouterr()
+    assert "1 tasks" in printed.out
+    assert printed.err.count("\n") == 1
+    assert "lacking/task_config.meta.json is missing" in printed.err

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from lerobot_memobench.cli.console import console
+from lerobot_memobench.cli.console import console, progress_bar
 from lerobot_memobench.errors import MemobenchError
 
 if TYPE_CHECKING:
@@ -34,7 +33,7 @@ def convert(
     from lerobot_memobench.datasets.convert import convert as run
 
     screen = console()
-    with _progress(screen) as progress:
+    with progress_bar(screen) as progress:
         bar = progress.add_task("episodes", total=None)
 
         def advance(news: Advance) -> None:
@@ -68,7 +67,7 @@ def validate(
     from lerobot_memobench.datasets.validate import validate as run
 
     screen = console()
-    with _progress(screen) as progress:
+    with progress_bar(screen) as progress:
         bar = progress.add_task("episodes", total=None)
 
         def advance(done: int, total: int, verdict: Verdict) -> None:
@@ -107,14 +106,3 @@ def executor_options(given: list[str]) -> dict[str, Any]:
             raise MemobenchError(f"found executor option {word!r}, expected key=value, such as partition=cpu")
         options[key] = int(value) if value.isdigit() else value
     return options
-
-
-def _progress(screen: Any) -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=screen,
-        disable=not screen.is_terminal,
-    )

@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from lerobot_memobench.cli.console import console
+from lerobot_memobench.cli.console import console, progress_bar
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 
 if TYPE_CHECKING:
@@ -21,7 +20,7 @@ def generate(tasks: str, episodes: int, out: Path, **settings: Any) -> int:
     from lerobot_memobench.datasets.generation import generate as run
 
     screen = console()
-    with _progress(screen) as progress:
+    with progress_bar(screen) as progress:
         bar = progress.add_task("episodes", total=len(chosen) * episodes)
 
         def advance(news: Advance) -> None:
@@ -64,7 +63,7 @@ def cache(dataset: Path, *, size: str, stride: int, weights: str | None, device:
     with quiet():
         config = MemobenchMemConfig(size=size, memory_stride=stride, device=device)
     screen = console()
-    with _progress(screen) as progress:
+    with progress_bar(screen) as progress:
         bar = progress.add_task("episodes", total=None)
         folder = cache_dataset(
             dataset,
@@ -74,14 +73,3 @@ def cache(dataset: Path, *, size: str, stride: int, weights: str | None, device:
             progress=lambda done, total: progress.update(bar, completed=done, total=total),
         )
     screen.print(f"memory cache: {folder}", soft_wrap=True)
-
-
-def _progress(screen: Any) -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=screen,
-        disable=not screen.is_terminal,
-    )

@@ -89,15 +89,18 @@ def tasks(
         Path | None,
         typer.Option("--dir", help="A task folder, or a folder of them, instead of the catalogue."),
     ] = None,
-) -> None:
+) -> int:
     """List the benchmark's tasks, or those of a folder."""
     from lerobot_memobench.cli.tasks import load_tasks, records, task_table
 
-    found = load_tasks(folder)
+    found, problems = load_tasks(folder)
     if as_json:
         print(json.dumps(records(found), indent=1))
     else:
         console().print(task_table(found))
+    for problem in problems:
+        print(f"memobench: {problem}", file=sys.stderr)
+    return 1 if problems else 0
 
 
 # --- demonstrations ---

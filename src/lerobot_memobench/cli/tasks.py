@@ -7,19 +7,28 @@ from typing import Any
 
 from rich.table import Table
 
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import find_tasks, get_task, task_names, task_record
 from lerobot_memobench.tasks.task import Task, load_task
 
 
-def load_tasks(folder: Path | None) -> list[Task]:
-    """Return the catalogue's tasks, or those of a task folder or of a folder of task folders.
+def load_tasks(folder: Path | None) -> tuple[list[Task], list[str]]:
+    """Return the catalogue's tasks, or those below a folder and what keeps others of them from loading.
 
     Raises:
-        MemobenchError: no task is there, or one cannot be loaded.
+        MemobenchError: no task is there, or none can be loaded.
     """
     if folder is None:
-        return [get_task(name) for name in task_names()]
-    return [load_task(place) for place in find_tasks(folder)]
+        return [get_task(name) for name in task_names()], []
+    found, problems = [], []
+    for place in find_tasks(folder):
+        try:
+            found.append(load_task(place))
+        except MemobenchError as error:
+            problems.append(str(error))
+    if not found:
+        raise MemobenchError(problems[0])
+    return found, problems
 
 
 def records(found: list[Task]) -> list[dict[str, Any]]:
