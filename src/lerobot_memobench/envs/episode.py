@@ -69,11 +69,6 @@ class Episode:
         self.task = task
         self.seed = -1
 
-    @property
-    def max_steps(self) -> int:
-        """Upper bound of control steps in an episode, prompt included."""
-        return self.horizon + (PROMPT_LIMIT if self.prompt_video else 0)
-
     def _rng(self, stream: int) -> np.random.Generator:
         """A generator of its own for each use, so that one cannot shift the other's draws."""
         return np.random.default_rng([self.seed, zlib.crc32(self.published.name.encode()), stream])

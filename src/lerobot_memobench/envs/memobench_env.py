@@ -135,12 +135,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         """Advance by one control step of 50 ms. The reward is 1 at success, else 0."""
         episode = self.episode
         episode.step(np.asarray(action, dtype=np.float32))
-        if (
-            episode.phase == PROMPT
-            or episode.exec_steps % self._render_every == 0
-            or episode.done
-            or episode.exec_steps == 0
-        ):
+        if episode.phase == PROMPT or episode.exec_steps % self._render_every == 0 or episode.done:
             self._images = episode.images()
         success = episode.success
         truncated = episode.done and not success

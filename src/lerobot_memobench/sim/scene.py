@@ -6,7 +6,6 @@ from collections import OrderedDict
 from dataclasses import dataclass
 
 import mujoco
-import numpy as np
 
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.assets.base import Asset
@@ -86,10 +85,3 @@ def scene_spec(task: Task) -> tuple[mujoco.MjSpec, dict[str, Asset]]:
 def state_size(model: mujoco.MjModel) -> int:
     """Length of the flattened state: time, positions, velocities."""
     return int(1 + model.nq + model.nv)
-
-
-def pose_matrix(quaternion: np.ndarray) -> np.ndarray:
-    """Return the rotation matrix (3, 3) of a quaternion wxyz."""
-    matrix = np.empty(9)
-    mujoco.mju_quat2Mat(matrix, np.asarray(quaternion, dtype=np.float64))
-    return matrix.reshape(3, 3)

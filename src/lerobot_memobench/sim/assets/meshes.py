@@ -226,19 +226,6 @@ def tube(
     return MeshData(np.array(vertices), np.array(faces))
 
 
-def prism(outline: Sequence[tuple[float, float]], low: float, high: float) -> MeshData:
-    """Return a convex outline (x, y), counter-clockwise from above, drawn out from ``low`` to ``high``."""
-    count = len(outline)
-    vertices = np.array([(x, y, z) for z in (low, high) for x, y in outline])
-    faces = []
-    for j in range(count):
-        k = (j + 1) % count
-        faces += [[j, k, count + k], [j, count + k, count + j]]
-    for j in range(1, count - 1):
-        faces += [[0, j + 1, j], [count, count + j, count + j + 1]]
-    return MeshData(vertices, np.array(faces))
-
-
 def arc(centre: tuple[float, float], radius: float, start: float, stop: float, count: int) -> list[tuple[float, float]]:
     """Return points (r, z) of an arc from angle ``start`` to ``stop`` [degrees], for profiles."""
     return [
