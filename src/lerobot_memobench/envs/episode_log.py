@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from lerobot_memobench.envs.protocol import write_protocol
 from lerobot_memobench.errors import MemobenchError
 
 logger = logging.getLogger(__name__)
@@ -30,10 +31,15 @@ REQUIRED = ("task", "memory_type", "episode", "success", "checkpoints")
 
 
 class EpisodeLog:
-    """Appends finished rollouts of this process to ``directory``, which is made when the first one ends."""
+    """Appends finished rollouts of this process to ``directory``, which is made when the first one ends.
 
-    def __init__(self, directory: str | Path) -> None:
+    Args:
+        protocol: settings of the evaluation, written beside the log before its first line.
+    """
+
+    def __init__(self, directory: str | Path, protocol: Mapping[str, Any] | None = None) -> None:
         self.directory = Path(directory)
+        self._protocol = protocol
 
     def append(self, record: Mapping[str, Any]) -> Path:
         """Write one rollout to disk, for good when this returns; return the file it went to.
@@ -41,7 +47,8 @@ class EpisodeLog:
         The process is looked up here, not at construction: a log made before a fork is used after it.
 
         Raises:
-            MemobenchError: the folder cannot be written, or the record is no JSON.
+            MemobenchError: the folder cannot be written or holds episodes of another protocol, or the record is no
+                JSON.
         """
         path = self.directory / EPISODES_FOLDER / f"{record['task']}.{os.getpid()}.jsonl"
         try:
@@ -53,6 +60,9 @@ class EpisodeLog:
             ) from error
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
+            if self._protocol is not None:
+                write_protocol(self.directory, self._protocol)
+                self._protocol = None
             with path.open("ab+") as file:
                 if _ends_torn(file):  # a killed process with the same number was here before
                     line = b"\n" + line

@@ -86,7 +86,16 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self.task_description = self._task.language
         self.observation_space = _observation_space(expert_action)
         self.action_space = _action_space()
-        self._log = EpisodeLog(log_dir) if log_dir is not None else None
+        protocol = {
+            "seed_base": seed_base,
+            "referent": referent,
+            "prompt_video": prompt_video,
+            "horizon": horizon,
+            "replan_steps": replan_steps,
+            "render": render,
+            "render_every": render_every,
+        }
+        self._log = EpisodeLog(log_dir, protocol) if log_dir is not None else None
         self._videos = Path(log_dir) / "videos" if log_dir is not None and videos else None
         self._film: Film | None = None
         self._settings: dict[str, Any] = {

@@ -1,0 +1,110 @@
+"""The protocol that an episode log was made under: one small file beside it, written with the first episode.
+
+The log's lines tell what happened; what they leave out and what decides whether two evaluations may be compared (the
+horizon, the rendering) is told here once, also by plain ``lerobot-eval`` and from async workers.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+from lerobot_memobench.errors import MemobenchError
+
+PROTOCOL_FILE = "protocol.json"
+
+SETTINGS = ("seed_base", "referent", "prompt_video", "horizon", "replan_steps", "render", "render_every")
+"""What must agree for two evaluations to be one, or to be compared."""
+
+EXTENT = ("tasks", "episodes")
+"""How much was run: it may differ, the episodes in common still compare."""
+
+POLICY = "policy"
+
+
+def differences(
+    a: Mapping[str, Any],
+    b: Mapping[str, Any],
+    *,
+    extent: bool = False,
+    policy: bool = False,
+    ignore: Collection[str] = (),
+) -> list[str]:
+    """Return the settings in which two protocols differ, each as ``horizon: 1200 and 600``.
+
+    A setting that one of them does not tell (logs of other tools) is not a difference.
+
+    Args:
+        extent: whether tasks and number of episodes are compared as well.
+        policy: whether what is known of the policy is.
+        ignore: settings that may differ.
+    """
+    left_out = {*ignore, POLICY, *(() if extent else EXTENT)}
+    found = _differing({k: v for k, v in a.items() if k not in left_out}, b)
+    if policy:
+        found += _differing(a.get(POLICY) or {}, b.get(POLICY) or {}, f"{POLICY}.")
+    return found
+
+
+def _differing(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -> list[str]:
+    found = []
+    for key, value in a.items():
+        if key not in b or b[key] == value:
+            continue
+        other = b[key]
+        if isinstance(value, Mapping) and isinstance(other, Mapping):
+            found += _differing(value, other, f"{prefix}{key}.")
+        else:
+            found.append(f"{prefix}{key}: {_text(value)} and {_text(other)}")
+    return found
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, list) and len(value) > 3:
+        return f"{', '.join(map(str, value[:3]))}, … ({len(value)})"
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def read_protocol_file(directory: Path) -> dict[str, Any]:
+    """Return the settings written beside a log, {} where there are none.
+
+    Raises:
+        MemobenchError: the file is none of this package's.
+    """
+    path = directory / PROTOCOL_FILE
+    try:
+        found = json.loads(path.read_text())
+    except FileNotFoundError:
+        return {}
+    except ValueError as error:
+        raise MemobenchError(f"{path} is not JSON ({error}); remove it or evaluate into another folder") from None
+    if not isinstance(found, dict):
+        raise MemobenchError(f"{path} holds no JSON object; remove it or evaluate into another folder")
+    return found
+
+
+def check_protocol(directory: Path, settings: Mapping[str, Any]) -> bool:
+    """Return whether the folder holds this protocol already; raise where it holds another one."""
+    earlier = read_protocol_file(directory)
+    found = differences(earlier, settings)
+    if found:
+        raise MemobenchError(
+            f"{directory} holds episodes of another protocol ({'; '.join(found)}, the first value being that of the "
+            "episodes there); evaluate into another folder"
+        )
+    return bool(earlier)
+
+
+def write_protocol(directory: Path, settings: Mapping[str, Any]) -> None:
+    """Write the settings beside a log, whole or not at all; leave equal ones as they are, refuse others."""
+    if check_protocol(directory, settings):
+        return
+    draft = directory / f".{PROTOCOL_FILE}.{os.getpid()}"
+    with draft.open("w") as file:
+        file.write(json.dumps(dict(settings), indent=1) + "\n")
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(draft, directory / PROTOCOL_FILE)
