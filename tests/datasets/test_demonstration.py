@@ -32,6 +32,7 @@ def test_texts(make_demo):
     found = labels(make_demo(["01000", "00100", "00010"]))
     assert found.simple_subgoal == ["did thing 0"] * 2 + ["did thing 1"] + ["did thing 2"] * 2
     assert found.grounded_subgoal[2] == "did thing 1 with the left hand"
+    assert found.coarse_subgoal == ["coarse 0"] * 2 + ["coarse 1"] + ["coarse 2"] * 2
     assert found.memory == [
         "",
         "",
@@ -47,6 +48,7 @@ def test_after_the_last_checkpoint_its_text_stays(make_demo):
     assert found.index.tolist() == [0, 0, 1, 2, 2]
     assert found.simple_subgoal[-1] == "did thing 1"
     assert found.grounded_subgoal[-1] == "did thing 1 with the left hand"
+    assert found.coarse_subgoal[-1] == "coarse 1"
 
 
 def test_prompt_frames(make_demo):
@@ -123,7 +125,7 @@ def test_columns_are_typed_and_complete(make_demo):
         "checkpoint.completed": "bool",
         "checkpoint.event": "bool",
     }
-    assert set(columns) - set(kinds) == {"simple_subgoal", "grounded_subgoal", "memory"}
+    assert set(columns) - set(kinds) == {"simple_subgoal", "grounded_subgoal", "coarse_subgoal", "memory"}
     assert all(len(column) == 4 for column in columns.values())
 
 

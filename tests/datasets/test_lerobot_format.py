@@ -162,7 +162,7 @@ def test_dataloader_batches(dataset):
 
     loader = torch.utils.data.DataLoader(dataset, batch_size=4, shuffle=True, collate_fn=lerobot_collate_fn)
     batch = next(iter(loader))
-    for name in ("simple_subgoal", "grounded_subgoal", "memory", "task"):
+    for name in ("simple_subgoal", "grounded_subgoal", "coarse_subgoal", "memory", "task"):
         assert isinstance(batch[name], list)
         assert all(isinstance(text, str) for text in batch[name])
     assert batch["checkpoint.completed"].shape == (4, 6)

@@ -30,7 +30,8 @@ COLUMNS = {
     "checkpoint.event": "a checkpoint is satisfied for the first time at this frame",
     "simple_subgoal": "text of the checkpoint being worked on, intermediate level",
     "grounded_subgoal": "the same at the fine level; once all are done, the last one's text stays",
-    "memory": "what has been done so far, empty at the start",
+    "coarse_subgoal": "the same at the coarse level",
+    "memory": "the checkpoints completed in order before this frame, as text (oracle memory); empty at the start",
     "language_persistent": "LeRobot's language rows, styles `subtask` and `memory`, for its training recipes",
 }
 

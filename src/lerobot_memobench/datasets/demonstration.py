@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.tasks.task import OPERATIONS, Task
+from lerobot_memobench.tasks.memory_text import memory_text
+from lerobot_memobench.tasks.task import LEVELS, OPERATIONS, Task
 
 FPS = 20
 """Control steps, and therefore frames, per second (paper, section 5.1)."""
@@ -30,8 +31,6 @@ CAMERAS = ("image", "wrist_image")
 
 PROMPT, EXECUTION = 0, 1
 """Values of ``phase``."""
-
-MEMORY_SEPARATOR = "; "
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,9 +144,9 @@ class Labels:
         event: (T,) bool, some checkpoint is satisfied for the first time at frame t.
         simple_subgoal: T strings, intermediate-level text of the checkpoint worked on. Once all are done the
             last one's text stays (``operation`` is -1 there), so the column is never empty.
-        grounded_subgoal: the same at the fine level.
+        grounded_subgoal, coarse_subgoal: the same at the fine and at the coarse level.
         memory: T strings, intermediate-level texts of the checkpoints completed in order before t, joined by
-            "; "; empty at the start.
+            "; "; empty at the start. The oracle memory of the paper (:mod:`lerobot_memobench.tasks.memory_text`).
         key_frames: (K,) int64, the frame at which checkpoint k was completed in order, -1 if it never was.
     """
 
@@ -158,6 +157,7 @@ class Labels:
     event: NDArray[np.bool_]
     simple_subgoal: list[str]
     grounded_subgoal: list[str]
+    coarse_subgoal: list[str]
     memory: list[str]
     key_frames: NDArray[np.int64]
 
@@ -171,6 +171,7 @@ class Labels:
             "checkpoint.event": self.event,
             "simple_subgoal": self.simple_subgoal,
             "grounded_subgoal": self.grounded_subgoal,
+            "coarse_subgoal": self.coarse_subgoal,
             "memory": self.memory,
         }
 
@@ -204,18 +205,20 @@ def labels(demo: Demonstration) -> Labels:
 
     # One entry per value of index, 0 ... K; the last stands for "none left". A code is a position in "SUC".
     codes = [OPERATIONS.index(c.operation) for c in checkpoints] + [-1]
-    simple = [c.language[1] for c in checkpoints] or [demo.task.language]
-    grounded = [c.language[2] for c in checkpoints] or [demo.task.language]
-    memories = [MEMORY_SEPARATOR.join(simple[:k]) for k in range(count + 1)]
-    simple, grounded = _with_last_kept(simple, count), _with_last_kept(grounded, count)
+    texts = {
+        level: _with_last_kept([c.language[k] for c in checkpoints] or [demo.task.language], count)
+        for k, level in enumerate(LEVELS)
+    }
+    memories = [memory_text(demo.task, k) for k in range(count + 1)]
     return Labels(
         phase=np.where(np.arange(length) < demo.exec_start, PROMPT, EXECUTION).astype(np.int64),
         index=index,
         operation=np.array(codes, dtype=np.int64)[index],
         completed=completed,
         event=np.asarray(first.any(axis=1), dtype=np.bool_),
-        simple_subgoal=[simple[k] for k in index],
-        grounded_subgoal=[grounded[k] for k in index],
+        simple_subgoal=[texts["intermediate"][k] for k in index],
+        grounded_subgoal=[texts["fine"][k] for k in index],
+        coarse_subgoal=[texts["coarse"][k] for k in index],
         memory=[memories[k] for k in index],
         key_frames=key_frames,
     )
@@ -239,10 +242,11 @@ def _with_last_kept(texts: Sequence[str], count: int) -> list[str]:
 
 
 def digest(demo: Demonstration) -> str:
-    """Return the sha256 (hex) of an episode: identity, states, actions and every label column.
+    """Return the sha256 (hex) of an episode: identity, states, actions and the label columns.
 
     Images are left out: they follow from the states, and a renderer may differ in a pixel where physics does
-    not.
+    not. So is ``coarse_subgoal``, which the other columns and the task decide: it came later than the first datasets,
+    and their hashes stay what they are.
     """
     found = labels(demo)
     identity = {
@@ -254,7 +258,7 @@ def digest(demo: Demonstration) -> str:
         "success": bool(demo.success),
     }
     columns: dict[str, NDArray | list[str]] = {"states": demo.states, "actions": demo.actions}
-    columns |= {f.name: getattr(found, f.name) for f in fields(found)}
+    columns |= {f.name: getattr(found, f.name) for f in fields(found) if f.name != "coarse_subgoal"}
     return digest_columns(identity, columns)
 
 

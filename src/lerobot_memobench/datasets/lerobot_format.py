@@ -93,6 +93,7 @@ def dataset_features(image_size: tuple[int, int] | None) -> dict[str, dict[str, 
         "checkpoint.event": feature("bool"),
         "simple_subgoal": feature("string"),
         "grounded_subgoal": feature("string"),
+        "coarse_subgoal": feature("string"),
         "memory": feature("string"),
         "language_persistent": feature("language"),
     }
@@ -372,6 +373,11 @@ def _table(columns: dict[str, Any], episode: StagedEpisode, meta: LeRobotDataset
         if field.name == "language_persistent":
             arrays.append(repeated)
             continue
+        if field.name not in columns:
+            raise MemobenchError(
+                f"{episode.folder} was staged by an older version, without the column {field.name}; delete that folder "
+                "and generate again to make this episode anew"
+            )
         values = columns[field.name]
         if values.ndim == 2:
             flat = pa.array(values.ravel(), type=field.type.value_type)
