@@ -1,8 +1,9 @@
-"""Make the environment ``memobench`` and the policies ``memobench_mem`` and ``memobench_expert`` known to LeRobot.
+"""Make the environment ``memobench`` and the policies ``memobench_*`` known to LeRobot.
 
 The configuration modules register themselves when imported; they import neither simulator nor model code nor GL.
 """
 
 import lerobot_memobench.envs.configuration_memobench
 import lerobot_memobench.policies.memobench_expert.configuration_memobench_expert
-import lerobot_memobench.policies.memobench_mem.configuration_memobench_mem  # noqa: F401
+import lerobot_memobench.policies.memobench_mem.configuration_memobench_mem
+import lerobot_memobench.policies.memobench_random.configuration_memobench_random  # noqa: F401

@@ -1,0 +1,1 @@
+"""Uniform random actions, seen as a LeRobot policy: the floor that every result is read against."""
