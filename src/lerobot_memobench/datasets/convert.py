@@ -24,7 +24,7 @@ from lerobot_memobench.datasets.lerobot_format import (
     is_dataset,
 )
 from lerobot_memobench.datasets.restore import NO_SEED, restore, task_of
-from lerobot_memobench.datasets.running import ProgressCallback, run_jobs, staged
+from lerobot_memobench.datasets.running import ProgressCallback, StagedJob, run_jobs, staged
 from lerobot_memobench.datasets.staging import EpisodeStage, clean_temporaries, stage_failure
 from lerobot_memobench.datasets.unfinished import check_request, compare_requests, locked
 from lerobot_memobench.errors import MemobenchError
@@ -51,7 +51,7 @@ class ConversionSummary:
 
 
 @dataclass(frozen=True)
-class ConversionJob:
+class ConversionJob(StagedJob):
     """One group of one file, to be staged in ``folder``. ``task_name`` is the file's name, for the progress."""
 
     file: Path

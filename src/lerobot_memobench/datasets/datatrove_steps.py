@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 from datatrove.pipeline.base import PipelineStep
 
-from lerobot_memobench.datasets.staging import read_staged
-
 if TYPE_CHECKING:
     from lerobot_memobench.datasets.running import Job
 
@@ -16,7 +14,7 @@ if TYPE_CHECKING:
 class JobsStep(PipelineStep):
     """Run the jobs of one rank: neighbours in the list, which are mostly of one task and share its scene."""
 
-    name = "episodes"
+    name = "jobs"
     type = "MEMOBench"
 
     def __init__(self, jobs: list[Job]) -> None:
@@ -24,18 +22,18 @@ class JobsStep(PipelineStep):
         self.jobs = jobs
 
     def run(self, data: Any = None, rank: int = 0, world_size: int = 1) -> Iterator[Any]:
-        """Make what is not there yet of every ``world_size``-th part of the list."""
+        """Do what is not finished yet of every ``world_size``-th part of the list."""
         yield from data or ()
         count = len(self.jobs)
         for job in self.jobs[rank * count // world_size : (rank + 1) * count // world_size]:
-            if read_staged(job.folder) is None:
-                with self.track_time("episode"):
+            if not job.finished():
+                with self.track_time("job"):
                     job.run()
-                self.stat_update("episodes")
+                self.stat_update("jobs")
 
 
 class FinishStep(PipelineStep):
-    """Do what remains once all episodes are there; a job of its own, depending on theirs."""
+    """Do what remains once all jobs are finished; a job of its own, depending on theirs."""
 
     name = "finish"
     type = "MEMOBench"

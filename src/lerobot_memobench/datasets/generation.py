@@ -32,7 +32,7 @@ from lerobot_memobench.datasets.lerobot_format import (
     is_dataset,
 )
 from lerobot_memobench.datasets.mjcf import model_file
-from lerobot_memobench.datasets.running import Advance, ProgressCallback, check_executor, run_jobs, staged
+from lerobot_memobench.datasets.running import Advance, ProgressCallback, StagedJob, check_executor, run_jobs, staged
 from lerobot_memobench.datasets.staging import (
     FORMATS,
     HDF5,
@@ -235,7 +235,7 @@ def _failure_reason(demo: Demonstration, episode: Episode) -> str | None:
 
 
 @dataclass(frozen=True)
-class RecordingJob:
+class RecordingJob(StagedJob):
     """One seed of one task, to be recorded and staged in ``folder``."""
 
     task: Task

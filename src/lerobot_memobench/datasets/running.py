@@ -1,7 +1,7 @@
-"""Run many independent jobs, each of which leaves one finished episode in its folder: here, on Slurm or on Ray.
+"""Run many independent jobs, such as the making of one episode, and find them finished again: here, on Slurm, on Ray.
 
-Whatever runs them, the result is the same, because a job depends on nothing but itself and its folder is complete or
-absent. So a killed run is continued by giving the same jobs again, and two workers at the same job do no harm.
+Whatever runs them, the result is the same, because a job depends on nothing but itself and knows from the disk whether
+it is finished. So a killed run is continued by giving the same jobs again.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ POLL_SECONDS = 1.0
 
 
 class Job(Protocol):
-    """One episode to be made. Pickled to other processes and machines, so ``folder`` is on a disk they share."""
+    """A piece of work. Pickled to other processes and machines, so ``folder`` is on a disk they share."""
 
     @property
     def folder(self) -> Path: ...
@@ -44,12 +44,30 @@ class Job(Protocol):
     def seed(self) -> int: ...
 
     def run(self) -> None:
-        """Leave the episode, or the reason why there is none, in ``folder``."""
+        """Leave the result, or the reason why there is none, in ``folder``."""
+
+    def finished(self) -> bool:
+        """Whether ``folder`` holds everything that the job had to leave there."""
+
+    def failure(self) -> str | None:
+        """Why a finished job has no result, or None."""
+
+
+class StagedJob:
+    """What jobs have in common that make one episode, complete or absent: two workers at the same one do no harm."""
+
+    folder: Path
+
+    def finished(self) -> bool:
+        return read_staged(self.folder) is not None
+
+    def failure(self) -> str | None:
+        return staged(self).failure
 
 
 @dataclass(frozen=True)
 class Advance:
-    """Told to the progress callback after each episode: how many are there, and the newest one's identity."""
+    """Told to the progress callback after each job: how many are finished, and the newest one's identity."""
 
     done: int
     total: int
@@ -70,20 +88,22 @@ def run_jobs(
     options: Mapping[str, Any] | None = None,
     logs: Path,
     finish: Callable[[], Any] | None = None,
+    jobs_per_rank: int = EPISODES_PER_RANK,
 ) -> bool:
-    """Run the jobs that are not staged yet; tell ``progress`` of every one, old or new.
+    """Run the jobs that are not finished yet; tell ``progress`` of every one, old or new.
 
     Args:
-        jobs: what to make.
+        jobs: what to do.
         workers: how many run at a time.
-        progress: called after each episode (on Slurm, for those that were there before).
+        progress: called after each job (on Slurm, for those that were finished before).
         executor: one of ``EXECUTORS``.
         options: further arguments of datatrove's executor, such as Slurm's ``partition`` and ``time``.
         logs: folder for datatrove's logs.
         finish: what is to be done when all jobs are; called only on Slurm, in a job of its own.
+        jobs_per_rank: how many a datatrove task runs, one after another.
 
     Returns:
-        Whether all episodes are there; False when they have been handed to Slurm.
+        Whether all jobs are finished; False when they have been handed to Slurm.
 
     Raises:
         MemobenchError: a worker was killed, or the executor is unknown, not installed or misses an option.
@@ -98,18 +118,18 @@ def run_jobs(
                 return
             done.add(job.folder)
             if progress is not None:
-                progress(Advance(len(done), len(jobs), job.task_name, job.seed, staged(job).failure))
+                progress(Advance(len(done), len(jobs), job.task_name, job.seed, job.failure()))
 
     waiting = []
     for job in jobs:
-        if read_staged(job.folder) is None:
-            waiting.append(job)
-        else:
+        if job.finished():
             tell(job)
+        else:
+            waiting.append(job)
     if not waiting:
         return True
     if executor != "processes":
-        return _run_by_datatrove(waiting, workers, executor, dict(options or {}), logs, finish, tell)
+        return _run_by_datatrove(waiting, workers, executor, dict(options or {}), logs, finish, tell, jobs_per_rank)
     if workers == 1 or len(waiting) == 1:
         for job in waiting:
             job.run()
@@ -119,7 +139,7 @@ def run_jobs(
     return True
 
 
-def staged(job: Job) -> StagedEpisode:
+def staged(job: StagedJob) -> StagedEpisode:
     """Return the finished episode of a job that has been run."""
     found = read_staged(job.folder)
     if found is None:
@@ -213,14 +233,15 @@ def _run_by_datatrove(
     logs: Path,
     finish: Callable[[], Any] | None,
     tell: Callable[[Job], None],
+    jobs_per_rank: int,
 ) -> bool:
     from datatrove import executor as executors
 
     from lerobot_memobench.datasets.datatrove_steps import FinishStep, JobsStep
 
-    # What is there is known from the staging folder, better than from datatrove's list of completed tasks.
+    # What is finished is known from the jobs' folders, better than from datatrove's list of completed tasks.
     common: dict[str, Any] = {"skip_completed": False, **options}
-    ranks = max(min(workers, len(waiting)), -(-len(waiting) // EPISODES_PER_RANK))
+    ranks = max(min(workers, len(waiting)), -(-len(waiting) // jobs_per_rank))
     steps = [JobsStep(list(waiting))]
     if executor == "slurm":
         making = executors.SlurmPipelineExecutor(
@@ -249,13 +270,13 @@ def _run_by_datatrove(
 
 @contextlib.contextmanager
 def _watching(jobs: Sequence[Job], tell: Callable[[Job], None]) -> Iterator[None]:
-    """Tell of finished episodes as they appear: datatrove has no such callback."""
+    """Tell of finished jobs as they appear: datatrove has no such callback."""
     over = threading.Event()
 
     def watch() -> None:
         waiting = list(jobs)
         while not over.wait(POLL_SECONDS):
-            for job in [job for job in waiting if read_staged(job.folder) is not None]:
+            for job in [job for job in waiting if job.finished()]:
                 waiting.remove(job)
                 tell(job)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,22 +13,27 @@ from lerobot_memobench.datasets.staging import LEROBOT, write_json
 from lerobot_memobench.errors import MemobenchError
 
 REQUEST_FILE = "request.json"
-LOCK_FILE = "lock"
 
 
 @contextlib.contextmanager
 def locked(staging: Path, out: Path) -> Iterator[None]:
-    """Let one run at a time write to ``out``. The lock is the kernel's and ends with the process."""
+    """Let one run at a time write to ``out``.
+
+    The lock is the kernel's, is held on the folder ``staging`` itself, leaves nothing behind and ends with the process.
+    """
     import fcntl
 
-    with open(staging / LOCK_FILE, "w") as file:
+    descriptor = os.open(staging, os.O_RDONLY)
+    try:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
             raise MemobenchError(
                 f"another run is writing to {out}; wait for it to end or name another folder"
             ) from None
         yield
+    finally:
+        os.close(descriptor)
 
 
 def check_request(staging: Path, request: dict[str, Any], out: Path, advice: str) -> None:

@@ -6,6 +6,7 @@ steps the environment, at its first reset.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing import get_context
@@ -60,9 +61,12 @@ class MemobenchEnvConfig(EnvConfig):
             of actions a policy executes per prediction: it looks at nothing else.
         replan_steps: that number, noted in the episode log.
         expert_action: offer the scripted expert's action as `observation.expert_action`.
+        oracle_memory: write what has been completed so far behind the instruction (the paper's oracle memory control),
+            word for word as the column `memory` of a dataset says it for the same frame.
         log_dir: where the episode log goes; LeRobot's output folder when left out.
         videos: film every episode into `<log_dir>/videos/<task>.<episode>.mp4`, annotated as `render()` is.
         seed_base: the seed that counts as episode 0.
+        resume: leave out the episodes that the log in `log_dir` holds already.
     """
 
     task: str | None = None
@@ -76,9 +80,11 @@ class MemobenchEnvConfig(EnvConfig):
     render_every: int = 1
     replan_steps: int | None = None
     expert_action: bool = False
+    oracle_memory: bool = False
     log_dir: str | None = None
     videos: bool = False
     seed_base: int = SEED_BASE
+    resume: bool = False
     features: dict[str, PolicyFeature] = field(default_factory=_features)
     features_map: dict[str, str] = field(default_factory=_features_map)
 
@@ -106,9 +112,17 @@ class MemobenchEnvConfig(EnvConfig):
             "render_every": self.render_every,
             "replan_steps": self.replan_steps,
             "expert_action": self.expert_action,
+            "oracle_memory": self.oracle_memory,
             "videos": self.videos,
             "seed_base": self.seed_base,
         }
+
+    @property
+    def protocol(self) -> dict[str, Any]:
+        """What must agree for two evaluations to be one, or to be compared."""
+        from lerobot_memobench.envs.protocol import SETTINGS
+
+        return {name: getattr(self, name) for name in SETTINGS}
 
     def selected(self) -> list[tuple[str, int, Path]]:
         """Return memory type, task id and folder of each chosen task; unknown names raise `MemobenchError`."""
@@ -128,16 +142,22 @@ class MemobenchEnvConfig(EnvConfig):
         from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 
         from lerobot_memobench.envs.memobench_env import MemobenchEnv, spaces_and_metadata
+        from lerobot_memobench.envs.protocol import check_protocol
+        from lerobot_memobench.envs.resuming import skip_logged
 
         chosen = self.selected()  # before anything is written: a wrong name leaves nothing behind
         if use_async_envs and n_envs > 1:
             # LeRobot's workers are forked from a server: it imports torch and the simulator once for all of them.
             get_context("forkserver").set_forkserver_preload([MemobenchEnv.__module__])
         log_dir = self.resolved_log_dir()
+        check_protocol(log_dir, self.protocol)  # now, not when the first episode has been simulated
         spaces = spaces_and_metadata(self.expert_action)
         suites: dict[str, dict[int, gym.vector.VectorEnv]] = {}
         for memory_type, task_id, folder in chosen:
+            make: Callable[[], gym.Env[Any, Any]]
             make = partial(MemobenchEnv, str(folder), log_dir=str(log_dir), **self.gym_kwargs)
+            if self.resume:
+                make = skip_logged(make, log_dir, self.referent, self.seed_base)
             if use_async_envs and n_envs > 1:
                 vector = _LazyAsyncVectorEnv([make] * n_envs, *spaces)
             else:
