@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 import typer
 
-from lerobot_memobench.cli import data
+from lerobot_memobench.cli import data, html
 from lerobot_memobench.cli.console import console
 from lerobot_memobench.errors import MemobenchError
 
@@ -191,6 +191,9 @@ def report(
         out.print(failure_line(summary))
         for note in notes:
             out.print(f"note: {note}")
+
+
+app.command()(html.html)
 
 
 # --- this machine ---

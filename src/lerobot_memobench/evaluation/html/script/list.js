@@ -1,0 +1,80 @@
+// The list of rollouts found. Rows are added as the reader gets near them, so thousands cost no more than a screenful.
+
+const CHUNK = 60;
+
+/** The checkpoints of a rollout in one glance: full = in order, hollow = held but not in order, dash = never. */
+function checkpointMarks(episode) {
+  return el(
+    "span",
+    { class: "marks", "aria-hidden": "true" },
+    episode.checkpoints.map(([operation, first, ordered]) => shape(operation, ordered !== null ? "full" : first !== null ? "hollow" : "none")),
+  );
+}
+
+function listRow(episode) {
+  return el(
+    "li",
+    {},
+    el(
+      "a",
+      { class: "row", "data-id": episode.id, href: address({ view: "episodes", ep: episode.id }) },
+      outcomeMark(episode.outcome),
+      el("span", { class: "name" }, `Episode ${episode.episode}${episode.referent === "fixed" ? "" : ` · ${episode.referent}`}`),
+      checkpointMarks(episode),
+      el("span", { class: "length" }, seconds(episode.prompt + episode.steps)),
+      episode.video ? null : el("span", { class: "visually-hidden" }, "no video"),
+    ),
+  );
+}
+
+const list = {
+  episodes: [],
+  shown: 0,
+  watcher: null,
+
+  /** Show these rollouts from the top. */
+  fill(episodes) {
+    this.episodes = episodes;
+    this.shown = 0;
+    this.task = null;
+    this.end = el("div", { class: "end", "aria-hidden": "true" });
+    byId("list").replaceChildren(this.end);
+    byId("list").scrollTop = 0;
+    this.watcher?.disconnect();
+    this.watcher = new IntersectionObserver((entries) => entries.some((entry) => entry.isIntersecting) && this.more(), { root: byId("list"), rootMargin: "600px" });
+    this.more();
+    if (!episodes.length) this.end.before(el("p", { class: "hint" }, "No episode matches these filters."));
+  },
+
+  /** Add the next rows; watched anew, the end tells again when it is still in sight. */
+  more(count = CHUNK) {
+    this.watcher.unobserve(this.end);
+    for (const episode of this.episodes.slice(this.shown, this.shown + count)) {
+      if (episode.task !== this.task) {
+        this.task = episode.task;
+        this.end.before(el("h3", {}, taskTitle(episode.task)), (this.group = el("ol")));
+      }
+      this.group.append(listRow(episode));
+    }
+    this.shown = Math.min(this.shown + count, this.episodes.length);
+    if (this.shown < this.episodes.length) this.watcher.observe(this.end);
+  },
+
+  /** Mark the selected row, adding rows up to it. */
+  mark(id) {
+    const place = this.episodes.findIndex((episode) => episode.id === id);
+    if (place >= this.shown) this.more(place - this.shown + CHUNK);
+    for (const row of byId("list").querySelectorAll("[aria-current]")) row.removeAttribute("aria-current");
+    const row = byId("list").querySelector(`[data-id="${CSS.escape(id)}"]`);
+    row?.setAttribute("aria-current", "true");
+    row?.scrollIntoView({ block: "nearest" });
+  },
+
+  /** Select the rollout that stands `distance` further down. */
+  move(distance) {
+    if (!this.episodes.length) return;
+    const place = this.episodes.findIndex((episode) => episode.id === detail.episode?.id);
+    const next = Math.min(Math.max(place + distance, 0), this.episodes.length - 1);
+    select({ view: "episodes", ep: this.episodes[next].id });
+  },
+};

@@ -1,0 +1,140 @@
+// Put the parts together: fill the controls, draw what the address selects, listen.
+
+function options(select, entries) {
+  select.replaceChildren(...entries.map(([value, words]) => el("option", { value }, words)));
+}
+
+function fillControls() {
+  for (const [key, { colour }] of Object.entries(DATA.operations)) document.documentElement.style.setProperty(`--${key}`, colour);
+  options(byId("run"), DATA.runs.map((run) => [run.name, run.name]));
+  options(byId("level"), DATA.levels.map((level) => [level, level]));
+  byId("run").parentElement.hidden = DATA.runs.length < 2;
+  const types = DATA.memory_types.filter((type) => Object.values(DATA.tasks).some((task) => task.memory_type === type));
+  options(byId("type"), [["", "all"], ...types.map((type) => [type, type])]);
+  const operations = Object.entries(DATA.operations);
+  options(byId("op"), [["", "all"], ...operations.map(([key, { name }]) => [key, `with ${name}`]), ...operations.map(([key, { name }]) => [`missed-${key}`, `missed ${name}`])]);
+  const outcomes = Object.entries(OUTCOMES).map(([key, { words }]) => [key, words]);
+  options(byId("outcome"), [["", "all"], outcomes[0], ["failed", "any failure"], ...outcomes.slice(1), ["no-video", "no video"]]);
+  byId("legend").append(
+    ...operations.map(([key, { name }]) => el("p", {}, shape(key, "full", true), name)),
+    el("p", {}, shape("S", "full"), "full: held with all earlier checkpoints complete"),
+    el("p", {}, shape("S", "hollow"), "hollow: first held, in whatever order"),
+    el("p", {}, shape("S", "none"), "dashed: never held"),
+    outcomeLegend(),
+  );
+}
+
+/** Tasks of the chosen memory type only. */
+function fillTasks(chosen) {
+  const names = Object.keys(DATA.tasks).filter((name) => !chosen.type || DATA.tasks[name].memory_type === chosen.type);
+  options(byId("task"), [["", "all"], ...names.map((name) => [name, taskTitle(name)])]);
+}
+
+let drawn = {};
+
+/** Draw what has changed since the last time. */
+function draw() {
+  const chosen = selection();
+  const run = currentRun();
+  const overview = chosen.view === "overview";
+  const changed = (...keys) => keys.some((key) => drawn[key] !== chosen[key]);
+  byId("overview").hidden = !overview;
+  byId("episodes").hidden = overview;
+  for (const [id, view] of [["to-overview", "overview"], ["to-episodes", "episodes"]]) {
+    byId(id).href = address({ view });
+    if (chosen.view === view) byId(id).setAttribute("aria-current", "page");
+    else byId(id).removeAttribute("aria-current");
+  }
+  if (changed("type")) fillTasks(chosen);
+  for (const key of ["run", "level", "type", "task", "op", "outcome"]) byId(key).value = chosen[key];
+  if (document.activeElement !== byId("q")) byId("q").value = chosen.q;
+  if (overview) {
+    detail.stage?.stop();
+    drawOverview(run, chosen);
+  } else {
+    drawEpisodes(run, chosen, changed("run", "view", "level", ...FILTERS));
+  }
+  document.title = `${overview ? run.name : detail.episode ? taskTitle(detail.episode.task) : run.name} · MEMOBench`;
+  drawn = chosen;
+}
+
+function drawEpisodes(run, chosen, refill) {
+  if (refill) {
+    const found = filtered(run, chosen);
+    const good = found.filter((episode) => episode.outcome === "success").length;
+    byId("count").textContent = `${found.length} of ${plural(run.episodes.length, "episode")}, ${good} succeeded`;
+    byId("clear").hidden = FILTERS.every((key) => !chosen[key]);
+    list.fill(found);
+  }
+  // A filter may have hidden the selected rollout; the first one found then stands for it.
+  const episode = list.episodes.find((it) => it.id === chosen.ep) ?? list.episodes[0];
+  if (!episode) return detail.clear();
+  list.mark(episode.id);
+  if (detail.episode !== episode) detail.stage?.stop();
+  detail.draw(run, episode, chosen);
+}
+
+function listen() {
+  addEventListener("hashchange", draw);
+  for (const key of ["run", "level", "task", "op", "outcome"]) byId(key).addEventListener("change", (event) => select({ [key]: event.target.value }, { keepHistory: true }));
+  byId("type").addEventListener("change", (event) => select({ type: event.target.value, task: "" }, { keepHistory: true }));
+  byId("q").addEventListener("input", (event) => select({ q: event.target.value }));
+  byId("filters").addEventListener("submit", (event) => event.preventDefault());
+  byId("filters").addEventListener("reset", (event) => {
+    event.preventDefault();
+    byId("q").value = "";
+    select(noFilters(), { keepHistory: true });
+  });
+  byId("help").addEventListener("click", () => byId("keys").showModal());
+  byId("theme").addEventListener("click", () => {
+    const now = document.documentElement.dataset.theme ?? (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
+    setTheme(now === "dark" ? "light" : "dark");
+  });
+  addEventListener("keydown", onKey);
+}
+
+function setTheme(theme) {
+  document.documentElement.dataset.theme = theme;
+  try {
+    localStorage.setItem("memobench-theme", theme);
+  } catch {
+    // Some browsers keep nothing for pages from disk.
+  }
+}
+
+function onKey(event) {
+  const typing = event.target.closest("input, select, textarea, dialog");
+  if (event.key === "Escape" && event.target === byId("q")) return byId("q").blur();
+  if (typing || event.ctrlKey || event.metaKey || event.altKey) return;
+  const player = selection().view === "episodes" && detail.episode;
+  const step = event.shiftKey ? DATA.fps : 1;
+  const actions = {
+    j: () => list.move(1),
+    k: () => list.move(-1),
+    o: () => select({ view: "overview" }, { keepHistory: true }),
+    e: () => select({ view: "episodes" }, { keepHistory: true }),
+    "/": () => (select({ view: "episodes" }), byId("q").focus()),
+    "?": () => byId("keys").showModal(),
+    ArrowRight: player && (() => detail.seek(detail.frame + step)),
+    ArrowLeft: player && (() => detail.seek(detail.frame - step)),
+    "[": player && (() => detail.jump(-1)),
+    "]": player && (() => detail.jump(1)),
+    " ": player && !event.target.closest("button, a") && (() => detail.stage.toggle()),
+  };
+  const action = actions[event.key];
+  if (!action) return;
+  event.preventDefault();
+  action();
+}
+
+let remembered = null;
+try {
+  remembered = localStorage.getItem("memobench-theme");
+} catch {
+  // as above
+}
+if (remembered === "light" || remembered === "dark") document.documentElement.dataset.theme = remembered;
+fillControls();
+enableTips();
+listen();
+draw();
