@@ -270,6 +270,7 @@ class Evaluator:
 
     def __init__(self, formulas: Iterable[Formula], hold_steps: int = HOLD_STEPS) -> None:
         self.formulas = tuple(formulas)
+        self._thens: list[_ThenNode] = []
         self._nodes = [self._build(formula, hold_steps) for formula in self.formulas]
         found = {atom for formula in self.formulas for atom in atoms(formula) if atom.predicate in LATCHES}
         self._sources = {atom: Atom(LATCHES[atom.predicate], atom.args) for atom in sorted(found, key=str)}
@@ -280,7 +281,8 @@ class Evaluator:
             return _AtomNode(formula)
         parts = [self._build(child, hold_steps) for child in children(formula)]
         if isinstance(formula, Then):
-            return _ThenNode(parts, hold_steps)
+            self._thens.append(_ThenNode(parts, hold_steps))
+            return self._thens[-1]
         gates: dict[type, Callable[[list[bool]], bool]] = {
             And: all,
             Or: any,
@@ -298,6 +300,11 @@ class Evaluator:
     def latched(self) -> frozenset[Atom]:
         """The latched atoms that are set."""
         return frozenset(self._latched)
+
+    @property
+    def memory(self) -> tuple[frozenset[Atom], tuple[tuple[int, int], ...]]:
+        """What of earlier steps decides later values: latches, and how far each ``Then`` has come. Hashable."""
+        return self.latched, tuple((node.done, node.held) for node in self._thens)
 
     def step(self, holds: Callable[[Atom], bool]) -> tuple[bool, ...]:
         """Take one control step of the world, answered by ``holds``, and return the value of each formula."""

@@ -1,0 +1,168 @@
+"""How far a policy without memory can come: aliased moments, chance and ceilings. Pure: no simulator.
+
+A *history* is one demonstrated episode seen as a row of decisions; a decision is the picture that is seen before it
+(as the number of a class of pictures that cannot be told apart) and the answer that is right in this history. A policy
+without memory is a map from pictures to answers, or to probabilities of answers. It passes a history when it gives the
+right answer at each of its decisions; one wrong answer fails (what a policy may gain by trying again is the subject of
+`necessity_search`).
+
+Histories of one scene are weighed together: they are what may lie behind the same pictures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+RESTARTS = 16
+"""Random starts of the search for the best probabilities, beside the even one."""
+ITERATIONS = 2000
+
+
+@dataclass(frozen=True)
+class Decision:
+    """A moment at which the demonstrator turned to something new.
+
+    Attributes:
+        picture: class of what is seen; equal numbers cannot be told apart.
+        answer: what is done next, e.g. ``Open wooden_cabinet_1_top_region``.
+    """
+
+    picture: int
+    answer: str
+
+
+History = tuple[Decision, ...]
+
+
+def classes(difference: NDArray[np.floating], tolerance: float) -> list[int]:
+    """Return a class number per picture: the connected parts of "differs by at most the tolerance".
+
+    Args:
+        difference: (n, n), symmetric.
+    """
+    count = len(difference)
+    found = list(range(count))
+    for i, j in combinations(range(count), 2):
+        if difference[i, j] <= tolerance and found[i] != found[j]:
+            old, new = max(found[i], found[j]), min(found[i], found[j])
+            found = [new if number == old else number for number in found]
+    return found
+
+
+def right_answers(histories: Sequence[History]) -> dict[int, list[str]]:
+    """Return per picture the answers that are right in some history, in order of appearance."""
+    answers: dict[int, list[str]] = {}
+    for history in histories:
+        for decision in history:
+            known = answers.setdefault(decision.picture, [])
+            if decision.answer not in known:
+                known.append(decision.answer)
+    return answers
+
+
+def aliased(histories: Sequence[History]) -> dict[int, list[str]]:
+    """Return the pictures at which more than one answer is right, and those answers."""
+    return {picture: answers for picture, answers in right_answers(histories).items() if len(answers) > 1}
+
+
+def chance(histories: Sequence[History]) -> float:
+    """Return the success of a policy that knows the routine and guesses evenly where the picture does not decide.
+
+    Histories are equally likely. Where every picture has one right answer this is 1.
+    """
+    answers = right_answers(histories)
+    return _mean(
+        float(np.prod([1.0 / len(answers[decision.picture]) for decision in history])) for history in histories
+    )
+
+
+def deterministic_ceiling(histories: Sequence[History]) -> float:
+    """Return the largest share of equally likely histories that one fixed map from pictures to answers passes."""
+    demands = [_demands(history) for history in histories]
+    possible = [(index, demand) for index, demand in enumerate(demands) if demand is not None]
+
+    def most(start: int, taken: dict[int, str]) -> int:
+        best = 0
+        for place in range(start, len(possible)):
+            demand = possible[place][1]
+            if all(taken.get(picture, answer) == answer for picture, answer in demand.items()):
+                best = max(best, 1 + most(place + 1, {**taken, **demand}))
+            if best == len(possible) - start:
+                break
+        return best
+
+    return most(0, {}) / len(histories)
+
+
+def _demands(history: History) -> dict[int, str] | None:
+    """Return which answer each picture must have; None when one picture would need two."""
+    demand: dict[int, str] = {}
+    for decision in history:
+        if demand.setdefault(decision.picture, decision.answer) != decision.answer:
+            return None
+    return demand
+
+
+def stochastic_ceiling(histories: Sequence[History], seed: int = 0) -> float:
+    """Return the success of the best probabilities of answers given the picture; each decision has one try.
+
+    For one history the maximum is known: answer each picture as often as it needs each answer. For several, it is
+    looked for by expectation maximisation from several starts (each round cannot do worse than the last), and is at
+    least the deterministic ceiling.
+    """
+    answers = right_answers(histories)
+    counts = [_counts(history) for history in histories]
+    rng = np.random.default_rng(seed)
+    best = deterministic_ceiling(histories)
+    for start in range(RESTARTS + 1):
+        policy = {
+            (picture, answer): p
+            for picture, known in answers.items()
+            for answer, p in zip(
+                known,
+                rng.dirichlet(np.ones(len(known))) if start else np.full(len(known), 1.0 / len(known)),
+                strict=True,
+            )
+        }
+        best = max(best, _climb(policy, answers, counts))
+    return best
+
+
+def _counts(history: History) -> dict[tuple[int, str], int]:
+    counts: dict[tuple[int, str], int] = {}
+    for decision in history:
+        key = (decision.picture, decision.answer)
+        counts[key] = counts.get(key, 0) + 1
+    return counts
+
+
+def _climb(
+    policy: dict[tuple[int, str], float],
+    answers: dict[int, list[str]],
+    counts: Sequence[dict[tuple[int, str], int]],
+) -> float:
+    value = 0.0
+    for _ in range(ITERATIONS):
+        passes = [float(np.prod([policy[key] ** n for key, n in count.items()])) for count in counts]
+        before, value = value, sum(passes) / len(passes)
+        if value - before < 1e-12:
+            break
+        used = dict.fromkeys(policy, 0.0)
+        for passed, count in zip(passes, counts, strict=True):
+            for key, n in count.items():
+                used[key] += passed * n
+        for picture, known in answers.items():
+            total = sum(used[picture, answer] for answer in known)
+            if total > 0:
+                policy.update({(picture, answer): used[picture, answer] / total for answer in known})
+    return value
+
+
+def _mean(values: Iterable[float]) -> float:
+    found = list(values)
+    return sum(found) / len(found)
