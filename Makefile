@@ -16,7 +16,7 @@ demo: ## evaluate the scripted expert on four tasks; videos and report in output
 	@.venv/bin/memobench demo $(ARGS)
 
 test: ## run the tests; ARGS are passed to pytest (ARGS="-m slow")
-	@scripts/setup
+	@scripts/setup --browser
 	@$(PYTHON) -m pytest $(ARGS)
 
 check: ## lint, formatting and types
