@@ -139,6 +139,7 @@ def _study(task: Task, referent: str, settings: Settings) -> tuple[dict[str, Any
         "settings": asdict(settings),
         "fingerprint": fingerprint(task, referent, settings),
         "variants": len(variants),
+        "has_variants": task.num_variants > 1,
         "expert": {"n": len(variants) * settings.episodes, "success": successes},
         "decisions": sum(len(h) for s in scenes for h in s.histories) / max(1, sum(len(s.histories) for s in scenes)),
         "aliased": _mean_of([scene.counts for scene in scenes if scene.histories]),
