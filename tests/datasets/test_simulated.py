@@ -257,6 +257,46 @@ def test_two_workers_killed_and_resumed(tmp_path):
 
 
 @pytest.mark.slow
+def test_killed_at_fifty_random_moments(tmp_path):
+    """However often and whenever a run is killed, going on gives the bytes of an undisturbed one.
+
+    Each attempt is a forked child, so that start-up does not take nine tenths of the moments. A run that finishes
+    between two kills is compared and begun anew.
+    """
+    task, episodes, kills = get_task(STOVE), 6, 50
+    generate([task], episodes, tmp_path / "undisturbed", images=False)
+    reference = tree_hash(tmp_path / "undisturbed")
+    rng = np.random.default_rng(0)
+    killed = finished = unfinished = 0
+    out = tmp_path / "ds"
+    while killed < kills or not finished:
+        pid = os.fork()
+        if not pid:
+            try:
+                generate([task], episodes, out, images=False)
+                os._exit(0)
+            except BaseException:
+                os._exit(1)
+        last = killed >= kills  # the last run may end in peace
+        until = time.monotonic() + (600 if last else rng.exponential(2.0))
+        while (done := os.waitpid(pid, os.WNOHANG))[0] == 0 and time.monotonic() < until:
+            time.sleep(0.002)
+        if done[0] == 0:
+            os.kill(pid, signal.SIGKILL)
+            os.waitpid(pid, 0)
+            killed += 1
+            unfinished += not is_dataset(out)
+            continue
+        assert os.waitstatus_to_exitcode(done[1]) == 0
+        assert tree_hash(out) == reference, f"after {killed} kills"
+        shutil.rmtree(out)
+        finished += 1
+    assert killed == kills
+    assert unfinished > kills // 2
+    print(f"{killed} kills, {unfinished} before the dataset was there, {finished} finished runs")
+
+
+@pytest.mark.slow
 def test_decoded_frames_are_what_the_simulator_shows(tmp_path):
     """Decode an episode's video and render its recorded states anew: the same pictures, frame by frame."""
     from lerobot.datasets import LeRobotDataset

@@ -1,4 +1,4 @@
-"""``memobench convert``, ``memobench validate`` and ``memobench push``: functions for the typer application.
+"""``memobench convert``, ``validate``, ``describe`` and ``push``: functions for the typer application.
 
 Register them with ``app.command()(convert)`` and so on; each returns the exit status.
 """
@@ -94,6 +94,18 @@ def push(
 
     address = run(folder, repo_id, private=private, hdf5=hdf5)
     console().print(f"dataset: {address}", soft_wrap=True)
+    return 0
+
+
+def describe(
+    folder: Annotated[Path, typer.Argument(help="Folder of a finished dataset.")],
+    out: Annotated[Path | None, typer.Option(help="Where to; DATASET/description when left out.")] = None,
+) -> int:
+    """Keep of a dataset what fits into a repository: figures, the card's tables, the hash of every episode."""
+    from lerobot_memobench.datasets.describe import describe as run
+
+    for file in run(folder, out or folder / "description"):
+        console().print(str(file), soft_wrap=True)
     return 0
 
 

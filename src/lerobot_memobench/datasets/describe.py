@@ -1,0 +1,166 @@
+"""What can be kept of a dataset without its data: pictures, the card's tables, the hash of every episode.
+
+The pictures show how long episodes are beside the paper's, and what a camera saw at each checkpoint.
+"""
+
+from __future__ import annotations
+
+import json
+import textwrap
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lerobot_memobench.datasets.lerobot_format import MANIFEST_FILE, image_key, is_dataset
+from lerobot_memobench.datasets.paper_figures import FAMILIES, LENGTH_BUCKETS
+from lerobot_memobench.errors import MemobenchError
+
+LENGTHS_FIGURE, STORYBOARD_FIGURE, TABLES_FILE = "lengths.png", "storyboard.png", "tables.md"
+OURS, THEIRS = "#0072B2", "#E69F00"
+"""Okabe and Ito's blue and orange: apart for the colour-blind, and one darker than the other in grey."""
+FRAME = 160
+"""Height and width of a storyboard's pictures, pixels."""
+MOST_FRAMES = 6
+
+
+def episode_rows(folder: Path) -> list[dict[str, Any]]:
+    """Return the rows of ``meta/episodes``, one per episode.
+
+    Raises:
+        MemobenchError: the folder is no dataset, or one without the benchmark's columns.
+    """
+    import pyarrow.parquet as pq
+
+    if not is_dataset(folder):
+        raise MemobenchError(f"{folder} is no dataset (there is no meta/info.json); name one that was generated")
+    rows: list[dict[str, Any]] = pq.read_table(folder / "meta" / "episodes").to_pylist()
+    missing = [key for key in ("task_name", "memory_type", "exec_start_index", "key_frames") if key not in rows[0]]
+    if missing:
+        raise MemobenchError(f"{folder} lacks {', '.join(missing)} in meta/episodes: this package did not make it")
+    return rows
+
+
+def describe(folder: Path, out: Path) -> list[Path]:
+    """Write pictures, tables and hashes of the dataset in ``folder`` to ``out``; return the files.
+
+    The storyboard needs images; a dataset of states and actions has none.
+    """
+    rows = episode_rows(folder)
+    out.mkdir(parents=True, exist_ok=True)
+    found = [draw_lengths(rows, out / LENGTHS_FIGURE)]
+    if (folder / "videos").is_dir():
+        found.append(draw_storyboard(folder, rows, out / STORYBOARD_FIGURE))
+    card, hashes = folder / "README.md", folder / MANIFEST_FILE
+    if card.is_file():
+        found.append(out / TABLES_FILE)
+        found[-1].write_text(card_tables(card.read_text(encoding="utf-8")), encoding="utf-8")
+    if hashes.is_file():
+        found.append(out / MANIFEST_FILE)
+        found[-1].write_text(short_manifest(json.loads(hashes.read_text(encoding="utf-8"))), encoding="utf-8")
+    return found
+
+
+def card_tables(card: str) -> str:
+    """Return the part of a dataset card that says how it was made, what failed, and its statistics."""
+    begin, end = card.find("## How it was made"), card.find("## Columns")
+    if begin < 0:
+        raise MemobenchError("the dataset's README.md has no section 'How it was made': this package did not write it")
+    return card[begin : end if end > begin else None].rstrip() + "\n"
+
+
+def short_manifest(manifest: Mapping[str, Any]) -> str:
+    """Return a manifest as JSON of one line per task: seed to the hash of its episode, or to why there is none."""
+    tasks: dict[str, dict[str, str]] = {}
+    for row in manifest["episodes"]:
+        tasks.setdefault(row["task_name"], {})[str(row["seed"])] = row["failure"] or row["digest"]
+    head = {key: value for key, value in manifest.items() if key != "episodes"}
+    lines = [f"{json.dumps(name)}: {json.dumps(seeds)}" for name, seeds in sorted(tasks.items())]
+    return json.dumps(head | {"tasks": None})[: -len("null}")] + "{\n" + ",\n".join(lines) + "\n}}\n"
+
+
+def draw_lengths(rows: Sequence[Mapping[str, Any]], path: Path) -> Path:
+    """Draw the distribution of episode lengths, and each memory type's mean and P95, beside the paper's."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    lengths = np.array([row["length"] for row in rows])
+    published = sum(LENGTH_BUCKETS.values())
+    with mpl.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
+        figure = Figure(figsize=(9, 3.2), layout="constrained")
+        left, right = figure.subplots(1, 2, width_ratios=(3, 2))
+        places = np.arange(len(LENGTH_BUCKETS))
+        ours = [100 * ((lengths >= low) & (lengths < (high or np.inf))).mean() for low, high in LENGTH_BUCKETS]
+        theirs = [100 * count / published for count in LENGTH_BUCKETS.values()]
+        left.bar(places - 0.2, ours, 0.38, color=OURS, label=f"here, {len(rows):,} episodes")
+        left.bar(places + 0.2, theirs, 0.38, color=THEIRS, hatch="//", edgecolor="white", label=f"paper, {published:,}")
+        names = [f"{low}+" if high is None else f"{low}–{high - 1}" for low, high in LENGTH_BUCKETS]
+        left.set_xticks(places, names, rotation=30, ha="right")
+        left.set_ylabel("episodes, %")
+        left.set_xlabel("length, control steps of 50 ms, prompt included")
+        left.legend(frameon=False)
+
+        types = [name for name in FAMILIES if any(row["memory_type"] == name for row in rows)]
+        for shift, colour, marker, source in ((-0.12, OURS, "o", "here"), (0.12, THEIRS, "s", "paper")):
+            for place, name in enumerate(types):
+                if source == "here":
+                    chosen = np.array([row["length"] for row in rows if row["memory_type"] == name])
+                    mean, high = chosen.mean(), np.percentile(chosen, 95)
+                else:
+                    mean, high = FAMILIES[name].mean, FAMILIES[name].p95
+                right.plot([place + shift] * 2, [mean, high], color=colour, lw=2, solid_capstyle="butt")
+                right.plot(place + shift, mean, marker, color=colour, ms=6, label=source if place == 0 else None)
+        right.set_xticks(range(len(types)), types)
+        right.set_ylim(bottom=0)
+        right.set_ylabel("steps: mean, line to P95")
+        right.legend(frameon=False)
+        figure.savefig(path, dpi=130)
+    return path
+
+
+def draw_storyboard(folder: Path, rows: Sequence[Mapping[str, Any]], path: Path) -> Path:
+    """Draw one episode per memory type: the prompt's middle, the start, and the frame of each checkpoint."""
+    from lerobot.datasets import LeRobotDataset
+    from PIL import Image, ImageDraw, ImageFont
+
+    dataset = LeRobotDataset("local/storyboard", root=folder)
+    chosen = [next(row for row in rows if row["memory_type"] == name) for name in _types(rows)]
+    caption, title = 40, 20
+    height = FRAME + caption + title
+    sheet = Image.new("RGB", (MOST_FRAMES * (FRAME + 6), len(chosen) * height), "white")
+    draw = ImageDraw.Draw(sheet)
+    font, bold = ImageFont.load_default(size=10), ImageFont.load_default(size=12)
+    for line, row in enumerate(chosen):
+        top = line * height
+        name = row["task_name"].replace("_", " ")
+        draw.text((2, top + 3), f"{row['memory_type']}: {name}", fill="black", font=bold)
+        for column, (frame, text) in enumerate(_moments(dataset, row)):
+            image = dataset[row["dataset_from_index"] + frame][image_key("image")].numpy()
+            pixels = (image.transpose(1, 2, 0) * 255).round().astype(np.uint8)
+            picture = Image.fromarray(pixels).resize((FRAME, FRAME), Image.Resampling.LANCZOS)
+            left = column * (FRAME + 6)
+            sheet.paste(picture, (left, top + title))
+            words = textwrap.fill(f"{frame}: {text}", 30, max_lines=3, placeholder=" …")
+            draw.multiline_text((left + 2, top + title + FRAME + 1), words, fill="black", font=font, spacing=1)
+    sheet.quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
+    return path
+
+
+def _types(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    there = {row["memory_type"] for row in rows}
+    return [name for name in FAMILIES if name in there]
+
+
+def _moments(dataset: Any, row: Mapping[str, Any]) -> list[tuple[int, str]]:
+    """Return frames of an episode worth seeing, each with what has just happened."""
+    begin, found = int(row["exec_start_index"]), []
+    if begin:
+        found.append((begin // 2, "prompt video"))
+    found.append((begin, "execution begins"))
+    last = begin
+    for frame in sorted(int(frame) for frame in row["key_frames"] if frame >= 0):
+        before = dataset.hf_dataset[row["dataset_from_index"] + max(frame - 1, last)]
+        found.append((frame, before["simple_subgoal"]))
+        last = frame
+    return found[: MOST_FRAMES - 1] + found[MOST_FRAMES - 1 :][-1:]
