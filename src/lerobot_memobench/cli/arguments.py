@@ -40,6 +40,9 @@ SHORT_FORMS: dict[str, dict[str, tuple[str, ...]]] = {
 #: Short forms that choose something rather than set a field.
 CHOOSING = ("policy", "env", "dataset")
 
+#: Words of `lerobot eval env=memobench` that are no settings of LeRobot's: how it is run (see `orders`).
+EVALUATION_WORDS = ("resume", "shard", "shards", "workers", "executor", "executor_option")
+
 
 @dataclass
 class Words:
@@ -96,6 +99,19 @@ def has_flag(flags: Sequence[str], key: str) -> bool:
     return any(flag == f"--{key}" or flag.startswith(f"--{key}=") for flag in flags)
 
 
+def without_flag(flags: Sequence[str], key: str) -> list[str]:
+    """Return the flags without ``--key`` and its value, in either spelling."""
+    kept, value_follows = [], False
+    for flag in flags:
+        if value_follows and not flag.startswith("--"):
+            value_follows = False
+            continue
+        value_follows = flag == f"--{key}"
+        if not value_follows and not flag.startswith(f"--{key}="):
+            kept.append(flag)
+    return kept
+
+
 @dataclass
 class Translation:
     """LeRobot's flags for a command line, and what it chooses.
@@ -121,6 +137,11 @@ class Translation:
         if not self.has(key):
             text = str(value).lower() if isinstance(value, bool) else str(value)
             self.flags.append(f"--{key}={text}")
+
+    def set(self, key: str, value: object) -> None:
+        """Set a field, whatever the user has set."""
+        self.flags = without_flag(self.flags, key)
+        self.add(key, value)
 
 
 def translate(command: str, words: Words, config: type | None, file: Mapping[str, Any]) -> Translation:
@@ -223,6 +244,7 @@ def _set(command: str, so_far: Translation, key: str, value: str) -> list[str]:
             annotation = fields.annotation_of(config, key, chosen)
         except KeyError:
             known = [*CHOOSING, *SHORT_FORMS.get(command, {}), *fields.all_keys(config, chosen)]
+            known += EVALUATION_WORDS if command == "eval" else ()
             raise MemobenchError(f"lerobot {command} has no setting {key!r}, {nearest(key, known)}") from None
         return [f"--{key}={fields.checked_value(key, annotation, value)}"]
     found = []

@@ -1,19 +1,19 @@
-"""``lerobot eval env=memobench``: the benchmark's defaults before LeRobot's run, its report after it."""
+"""``lerobot eval env=memobench``: the benchmark's defaults, and the choice of how it is run."""
 
 from __future__ import annotations
 
 import datetime as dt
-import logging
 import os
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 from lerobot_memobench.cli import preflight
 from lerobot_memobench.cli.arguments import Translation
-from lerobot_memobench.envs.episode_log import has_log
+from lerobot_memobench.cli.evaluation import Evaluation, make_grid
+from lerobot_memobench.cli.orders import Orders
+from lerobot_memobench.cli.running import run_evaluation
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.report import REPORT_MARKDOWN
+from lerobot_memobench.evaluation.protocol import CARD_FILE, read_card
 
 ENVIRONMENT = "memobench"
 EXPERT = "memobench_expert"
@@ -21,55 +21,49 @@ FIRST_SEED = 7
 """Episode i of the protocol uses seed 7 + i."""
 
 
-def evaluate(translation: Translation, run: Callable[[], int], say_where: bool = True) -> int:
+def evaluate(
+    translation: Translation, run: Callable[[], int], say_where: bool = True, orders: Orders | None = None
+) -> int:
     """Complete the flags of an evaluation, run it, write and print its report; return the exit status.
 
     An environment of LeRobot's own gets nothing but the checks.
     """
+    orders = orders or Orders()
     if not translation.has("env.type") and not translation.has("config_path"):
         raise MemobenchError("name an environment: env=memobench")
     if translation.get("env.type") != ENVIRONMENT:
+        if orders.any:
+            raise MemobenchError("resume=, shard= and shards= belong to the benchmark: name it with env=memobench")
         preflight.check_policy(translation)
         return run()
+    evaluation = prepare(translation, orders)
+    if orders.shards:
+        from lerobot_memobench.cli.shards import run_shards
+
+        return run_shards(evaluation)
+    return run_evaluation(evaluation, run, say_where)
+
+
+def prepare(translation: Translation, orders: Orders) -> Evaluation:
+    """Complete the flags and find out what they ask for; what is wrong with them is told here."""
+    if orders.resume and not translation.has("output_dir"):
+        raise MemobenchError("resume=true needs the folder of the evaluation to go on with: output_dir=<folder>")
+    if orders.shard is not None and translation.has("output_dir"):
+        translation.set("output_dir", Path(translation.get("output_dir") or "") / orders.shard.folder)
     add_policy(translation)
     preflight.check_policy(translation)
     policy = preflight.parse_choice(translation, "policy")
+    if orders.resume:
+        add_earlier_batch_size(translation)
+    if orders.shard is not None or orders.shards:
+        translation.add("eval.batch_size", 1)  # by cores, each machine would cut the evaluation differently
     add_protocol(translation, getattr(policy, "n_action_steps", None))
     environment = preflight.parse_choice(translation, "env")
-    if environment is not None:
-        environment.selected()  # unknown tasks are told here
+    if environment is None and orders.any:
+        raise MemobenchError("resume=, shard= and shards= cannot go with config_path=; give its settings on the line")
+    grid = make_grid(translation, environment) if environment is not None else None
     preflight.check_rendering()
-    output, log = Path(translation.get("output_dir") or ""), Path(translation.get("env.log_dir") or "")
-    preflight.check_output(output)
-    preflight.check_output(log)
-    existed = output.exists()
-    calm_output()
-    status = 1
-    try:
-        status = run()
-    finally:
-        if status and not existed:
-            preflight.remove_empty(output)
-        if status and has_log(log):
-            print(
-                f"the episodes that ended are in {log}; `memobench report {log}` reports them",
-                file=sys.stderr,
-            )
-    if status == 0:
-        print_report(log, int(translation.get("eval.n_episodes") or 0) or None)
-        if say_where:
-            print(f"report: {log / REPORT_MARKDOWN}")
-    return status
-
-
-def calm_output() -> None:
-    """Keep progress bars out of log files, and a library's farewell out of the end of a run."""
-    from lerobot.scripts import lerobot_eval
-
-    logging.getLogger("OpenGL").setLevel(logging.WARNING)
-    if not sys.stderr.isatty():
-        # The bar is redrawn at every step. LeRobot leaves it out where it takes itself to be in a batch job.
-        lerobot_eval.inside_slurm = lambda: True
+    return Evaluation(translation, orders, policy, environment, grid)
 
 
 def add_policy(translation: Translation) -> None:
@@ -110,9 +104,14 @@ def add_batch_size(translation: Translation) -> None:
         return
     episodes = int(translation.get("eval.n_episodes") or 50)
     limit = max(1, min(int((os.cpu_count() or 4) * 0.7), episodes, 64))
-    best = max(size for size in range(1, limit + 1) if episodes % size == 0)
-    translation.flags = [flag for flag in translation.flags if flag != "--eval.batch_size=0"]
-    translation.add("eval.batch_size", best)
+    translation.set("eval.batch_size", max(size for size in range(1, limit + 1) if episodes % size == 0))
+
+
+def add_earlier_batch_size(translation: Translation) -> None:
+    """Use the batch size of the evaluation that is gone on with: what a policy samples may depend on it."""
+    path = Path(translation.get("env.log_dir") or translation.get("output_dir") or "") / CARD_FILE
+    if path.is_file() and (translation.get("eval.batch_size") or "0") == "0":
+        translation.set("eval.batch_size", read_card(path)["runs"][-1]["batch_size"])
 
 
 def default_output(translation: Translation) -> Path:
@@ -126,17 +125,3 @@ def default_output(translation: Translation) -> Path:
         k += 1
         folder = base.with_name(f"{base.name}_{k}")
     return folder
-
-
-def print_report(folder: Path, episodes: int | None) -> None:
-    """Write the report of the log in ``folder`` beside it and print its table."""
-    from lerobot_memobench.cli.console import console
-    from lerobot_memobench.evaluation.report import failure_line, table, write_report
-
-    summary, notes = write_report(folder, episodes)
-    out = console()
-    out.print()
-    out.print(table(summary))
-    out.print(failure_line(summary))
-    for note in notes:
-        out.print(f"note: {note}")

@@ -15,6 +15,7 @@ from typing import Any
 
 from lerobot_memobench.cli.arguments import Words, flag_value, split_words, translate
 from lerobot_memobench.cli.errors import one_sentence
+from lerobot_memobench.cli.orders import take_orders
 from lerobot_memobench.errors import MemobenchError, nearest
 
 USAGE_ERROR = 2
@@ -47,6 +48,7 @@ def run(words: list[str], say_where: bool = True) -> int:
     if name not in commands:
         raise MemobenchError(f"there is no command {name!r}, {nearest(name, commands)}")
     check_tasks_early(rest)
+    orders = take_orders(rest, ["lerobot", *words]) if name == "eval" else None
     try:
         entry = commands[name].load()
     except ImportError as error:
@@ -59,7 +61,7 @@ def run(words: list[str], say_where: bool = True) -> int:
     if name == "eval":
         from lerobot_memobench.cli.evaluate import evaluate
 
-        return evaluate(translation, lambda: call(name, entry, translation.flags), say_where)
+        return evaluate(translation, lambda: call(name, entry, translation.flags), say_where, orders)
     if name == "train":
         from lerobot_memobench.cli.train import prepare_training
 
@@ -107,7 +109,8 @@ def overview(commands: Sequence[str] | dict[str, Any]) -> str:
             "",
             "short forms: policy= env= dataset= align= size= replan= tasks= referent= episodes= batch_size=",
             "device=; any other setting by its full name (policy.optimizer_lr=1e-4), as listed by",
-            "`lerobot <command> --help`.",
+            "`lerobot <command> --help`. How the benchmark's evaluation is run: resume=true, shard=1/8, shards=8",
+            "workers= executor= executor_option=.",
             "",
             "commands: " + ", ".join(sorted(commands)),
         ]
@@ -183,3 +186,7 @@ def read_config_file(words: Words) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise MemobenchError(f"config_path={given} holds no settings; expected a mapping such as 'policy: …'")
     return content
+
+
+if __name__ == "__main__":
+    sys.exit(main())

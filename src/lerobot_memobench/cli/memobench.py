@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 import typer
 
-from lerobot_memobench.cli import data, html
+from lerobot_memobench.cli import controls, data, html, merging
 from lerobot_memobench.cli.console import console
 from lerobot_memobench.errors import MemobenchError
 
@@ -171,6 +171,7 @@ def cache(
 
 app.command()(data.convert)
 app.command()(data.validate)
+app.command()(data.describe)
 app.command()(data.push)
 
 
@@ -194,6 +195,12 @@ def report(
 
 
 app.command()(html.html)
+app.command()(controls.necessity)
+app.add_typer(controls.app, name="controls")
+
+
+app.command()(merging.merge)
+app.command()(merging.rerun)
 
 
 # --- this machine ---

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +12,10 @@ from typing import Any
 from lerobot_memobench.cli.arguments import Translation
 from lerobot_memobench.cli.checkpoint import check_checkpoint
 from lerobot_memobench.envs.episode_log import has_log
+from lerobot_memobench.envs.protocol import PROTOCOL_FILE
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.card import extended
+from lerobot_memobench.evaluation.protocol import CARD_FILE, POLICY, differences, read_card, read_protocol
 
 INFO_FILE = Path("meta") / "info.json"
 
@@ -77,9 +81,66 @@ def check_dataset(translation: Translation) -> None:
 def check_output(folder: Path) -> None:
     """Refuse to mix an evaluation with an earlier one in the same folder."""
     if has_log(folder):
-        raise MemobenchError(f"{folder} already holds an evaluation; choose another output_dir= or remove the old one")
+        raise MemobenchError(
+            f"{folder} already holds an evaluation; choose another output_dir=, or go on with it by resume=true"
+        )
+    check_folder(folder)
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse to write into what is no folder."""
     if folder.exists() and not folder.is_dir():
         raise MemobenchError(f"output_dir={folder} is a file; name a folder")
+
+
+def check_resumed(folder: Path, card: dict[str, Any]) -> dict[str, Any]:
+    """Return the card for an evaluation that goes on with the one in ``folder``; refuse to mix two.
+
+    Tasks and episodes may be others: those that are there stay. A folder without an evaluation is begun.
+    """
+    check_folder(folder)
+    path = folder / CARD_FILE
+    if not has_log(folder):
+        return card
+    found = differences(read_protocol(folder), {**card["protocol"], POLICY: card[POLICY]}, policy=True)
+    if found:
+        raise MemobenchError(
+            f"{folder} holds an evaluation with another protocol ({'; '.join(found)}, there and now); repeat its "
+            "settings to go on with it, or choose another output_dir="
+        )
+    if not path.is_file():
+        warn(f"{folder} has no {CARD_FILE}: whether its episodes are this policy's cannot be checked")
+        return card
+    earlier = read_card(path)
+    edited = [name for name, value in card["task_files"].items() if earlier["task_files"].get(name, value) != value]
+    if edited:
+        raise MemobenchError(f"the files of {edited[0]} are not those that the episodes in {folder} were run with")
+    for name in ("batch_size", "versions", "gl"):
+        changed = _changed(earlier["runs"][-1][name], card["runs"][-1][name], name)
+        if changed:
+            warn(f"the episodes in {folder} were run otherwise ({changed}, there and now); numbers may depend on it")
+    return extended(earlier, card)
+
+
+def _changed(earlier: Any, now: Any, name: str) -> str:
+    """Return in what two runs differ, the first thing of several."""
+    if isinstance(earlier, dict):
+        return next(
+            (f"{key}: {earlier[key]} and {now[key]}" for key in now if earlier.get(key, now[key]) != now[key]), ""
+        )
+    return f"{name}: {earlier} and {now}" if earlier != now else ""
+
+
+def warn(text: str) -> None:
+    """Tell the user what may matter and stops nothing."""
+    print(f"note: {text}", file=sys.stderr)
+
+
+def remove_drafts(folder: Path) -> None:
+    """Remove what a killed run was writing: whole files have names of their own. The caller holds the folder."""
+    for pattern in (".*.part", "*.part", f".{PROTOCOL_FILE}.*", "videos/.*.part"):
+        for draft in folder.glob(pattern):
+            draft.unlink(missing_ok=True)
 
 
 def check_rendering() -> None:

@@ -60,6 +60,7 @@ __all__ = [
     "TaskSummary",
     "generate",
     "record_demonstration",
+    "task_hash",
 ]
 
 FIRST_SEED = 10_000
@@ -329,7 +330,7 @@ def generate(
         "episodes": episodes,
         "seed_base": seed_base,
         **asdict(settings),
-        "task_files": [_task_hash(task) for task in tasks],
+        "task_files": [task_hash(task) for task in tasks],
         "versions": _versions(),
     }
     if is_finished(out):
@@ -447,7 +448,7 @@ def _summarise(rows: Sequence[dict[str, Any]], tasks: Sequence[Task], out: Path)
     return GenerationSummary(out if made else None, tuple(summaries))
 
 
-def _task_hash(task: Task) -> str:
+def task_hash(task: Task) -> str:
     """Hash of a task's files: a run must not be continued with an edited task."""
     text = task.bddl_text + json.dumps(task.metadata, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]

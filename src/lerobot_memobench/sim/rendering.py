@@ -216,6 +216,14 @@ def get_renderer(key: Any, model: mujoco.MjModel, settings: RenderSettings) -> R
     return renderers[full]
 
 
+def renderer_name() -> str:
+    """Return what the driver calls the device that draws in this thread (``llvmpipe …``); opens the GL context."""
+    _thread.current()
+    from OpenGL import GL
+
+    return str(GL.glGetString(GL.GL_RENDERER).decode())
+
+
 def close_renderers() -> None:
     """Free the calling thread's renderers and GL context; the next frame opens them anew.
 
