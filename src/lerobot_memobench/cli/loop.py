@@ -68,19 +68,28 @@ def _only(run_one: Callable[..., Any], ranges: Mapping[tuple[str, int], list[Ran
 
 
 def _seeded(rollout: Callable[..., Any], seed: int) -> Callable[..., Any]:
+    """Wrap LeRobot's rollout of one batch: what the policy draws depends on the batch alone."""
+    first_seeds: dict[str, int] = {}  # of the policy's own generators: a setting of the policy's may have chosen them
+
     @functools.wraps(rollout)
     def run(env: Any, policy: Any, *args: Any, **settings: Any) -> Any:
         from lerobot.utils.random_utils import set_seed
+        from torch import Generator
 
         seeds = settings.get("seeds")
         if seeds and getattr(policy, "name", None) not in KEEPS_ITS_NOISE:
-            set_seed(batch_seed(seed, env.call("task")[0], seeds[0]))
+            task = env.call("task")[0]
+            set_seed(batch_seed(seed, task, seeds[0]))
+            for name, generator in vars(policy).items():
+                if isinstance(generator, Generator):
+                    own = first_seeds.setdefault(name, generator.initial_seed())
+                    generator.manual_seed(batch_seed(seed, task, seeds[0], own))
         return rollout(env, policy, *args, **settings)
 
     return run
 
 
-def batch_seed(seed: int, task: str, first: int) -> int:
+def batch_seed(seed: int, task: str, first: int, *more: int) -> int:
     """Return the seed (32 bits) of the batch that begins with the episode of the seed ``first``."""
-    digest = hashlib.blake2b(f"{seed} {task} {first}".encode(), digest_size=4)
-    return int.from_bytes(digest.digest(), "big")
+    text = " ".join(str(part) for part in (seed, task, first, *more))
+    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=4).digest(), "big")
