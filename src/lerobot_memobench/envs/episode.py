@@ -70,17 +70,12 @@ class Episode:
         self.seed = -1
 
     def _rng(self, stream: int) -> np.random.Generator:
-        """A generator of its own for each use, so that one cannot shift the other's draws."""
-        return np.random.default_rng([self.seed, zlib.crc32(self.published.name.encode()), stream])
+        return generator(self.published, self.seed, stream)
 
     def reset(self, seed: int) -> None:
         """Start the episode of a seed. Everything that follows is a function of task, settings, seed and actions."""
         self.seed = int(seed)
-        task = self.published
-        if self.referent == "random" and task.num_variants > 1:
-            choices = task.random_variants
-            task = task.variant(choices[int(self._rng(1).integers(len(choices)))])
-        self.task = task
+        self.task = task = referent_of(self.published, self.seed) if self.referent == "random" else self.published
         self.sim.reset(self.seed)
         self.scene_hash = self.sim.scene_hash()
         self._start = self.sim.snapshot()
@@ -172,6 +167,22 @@ class Episode:
             return self.task.language
         index = min(self.progress.index, len(self.task.checkpoints) - 1)
         return self.task.checkpoints[index].language[level]
+
+
+def referent_of(task: Task, seed: int) -> Task:
+    """Return the variant of a published task that a random referent shows in the episode of a seed.
+
+    Every admissible variant is equally likely, and which one it is says nothing about where things stand.
+    """
+    if task.num_variants == 1:
+        return task
+    choices = task.random_variants
+    return task.variant(choices[int(generator(task, seed, 1).integers(len(choices)))])
+
+
+def generator(task: Task, seed: int, stream: int) -> np.random.Generator:
+    """A generator of its own for each use, so that one cannot shift the other's draws."""
+    return np.random.default_rng([seed, zlib.crc32(task.name.encode()), stream])
 
 
 def _wrong_atoms(task: Task) -> Iterator[Atom]:

@@ -1,0 +1,91 @@
+"""A random referent is fair, and cannot be told from the seed by a rule. No physics."""
+
+from __future__ import annotations
+
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from lerobot_memobench.datasets.generation import FIRST_SEED as DEMONSTRATION_SEEDS
+from lerobot_memobench.envs.configuration_memobench import SEED_BASE as EVALUATION_SEEDS
+from lerobot_memobench.envs.episode import referent_of
+from lerobot_memobench.tasks.catalogue import get_task, task_names
+
+SEEDS = 400
+FAIR = 1e-6
+"""A fair draw fails a check less often than this."""
+
+WITH_VARIANTS = [name for name in task_names() if get_task(name).num_variants > 1]
+
+
+@cache
+def drawn(name: str, first: int, count: int = SEEDS) -> list[int]:
+    """The variants of consecutive seeds; drawn once for all tests."""
+    task = get_task(name)
+    return [referent_of(task, seed).variant_index for seed in range(first, first + count)]
+
+
+def test_object_and_procedural_tasks_have_variants_and_no_other() -> None:
+    assert task_names(["object", "procedural"]) == WITH_VARIANTS
+
+
+@pytest.mark.parametrize("name", [name for name in task_names() if name not in WITH_VARIANTS])
+def test_a_task_with_one_goal_keeps_it(name: str) -> None:
+    assert referent_of(get_task(name), 7) is get_task(name)
+
+
+@pytest.mark.parametrize("first", [EVALUATION_SEEDS, DEMONSTRATION_SEEDS])
+@pytest.mark.parametrize("name", WITH_VARIANTS)
+def test_every_admissible_variant_comes_about_equally_often(name: str, first: int) -> None:
+    admissible = get_task(name).random_variants
+    variants = drawn(name, first)
+    counts = [variants.count(k) for k in admissible]
+    assert sum(counts) == SEEDS, "a variant was drawn that is not admissible"
+    assert stats.chisquare(counts).pvalue > FAIR, dict(zip(admissible, counts, strict=True))
+
+
+@pytest.mark.parametrize("name", WITH_VARIANTS)
+def test_consecutive_seeds_do_not_follow_from_one_another(name: str) -> None:
+    """The next seed's variant is independent of this one's: no turns, no repetition with a period."""
+    admissible = list(get_task(name).random_variants)
+    variants = drawn(name, EVALUATION_SEEDS, SEEDS + 1)
+    table = np.zeros((len(admissible), len(admissible)))
+    for now, then in pairwise(variants):
+        table[admissible.index(now), admissible.index(then)] += 1
+    assert stats.chi2_contingency(table).pvalue > FAIR
+    for period in range(1, 17):
+        again = sum(variants[i] == variants[i + period] for i in range(SEEDS - period))
+        test = stats.binomtest(again, SEEDS - period, 1 / len(admissible))
+        assert test.pvalue > FAIR, f"seeds {period} apart agree {again} times of {SEEDS - period}"
+
+
+@pytest.mark.parametrize("name", WITH_VARIANTS)
+def test_evaluation_and_demonstration_seeds_share_no_pattern(name: str) -> None:
+    """Episode i of the evaluation and demonstration i agree as often as chance has it, whatever the offset."""
+    admissible = get_task(name).random_variants
+    evaluation = drawn(name, EVALUATION_SEEDS)
+    demonstrations = drawn(name, DEMONSTRATION_SEEDS)
+    for offset in range(5):
+        pairs = list(zip(evaluation[offset:], demonstrations, strict=False))
+        test = stats.binomtest(sum(a == b for a, b in pairs), len(pairs), 1 / len(admissible))
+        assert test.pvalue > FAIR
+
+
+def test_tasks_do_not_share_their_draws() -> None:
+    """Two tasks with as many variants do not show the same place at the same seed."""
+    two = [name for name in WITH_VARIANTS if len(get_task(name).random_variants) == 2]
+    assert len(two) > 2
+    places = {name: [get_task(name).random_variants.index(k) for k in drawn(name, EVALUATION_SEEDS)] for name in two}
+    for a, b in pairwise(two):
+        same = sum(x == y for x, y in zip(places[a], places[b], strict=True))
+        assert stats.binomtest(same, SEEDS, 1 / 2).pvalue > FAIR
+
+
+@pytest.mark.parametrize("name", WITH_VARIANTS)
+def test_the_first_fifty_episodes_show_every_variant_of_small_tasks(name: str) -> None:
+    """The protocol's 50 episodes hold every goal, so that a table of 50 means what it says."""
+    admissible = get_task(name).random_variants
+    assert set(drawn(name, EVALUATION_SEEDS, 50)) == set(admissible)
