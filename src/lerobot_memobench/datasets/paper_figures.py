@@ -1,12 +1,15 @@
 """Figures that the MEMOBench paper gives of its demonstrations, to stand beside those of a generated dataset.
 
 Source: the paper's appendix on dataset statistics, the tables "Family level statistics for the expert
-demonstrations" and "Distribution of expert demonstration lengths in action steps".
+demonstrations" and "Distribution of expert demonstration lengths in action steps"; the numbers are in
+``lerobot_memobench.paper``.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+
+from lerobot_memobench.paper import raw_tables
 
 
 @dataclass(frozen=True)
@@ -23,22 +26,28 @@ class FamilyFigures:
     storage: float
 
 
-FAMILIES: dict[str, FamilyFigures] = {
-    "temporal": FamilyFigures(10, 500, 198_099, 396.20, 400.50, 679.05, 779, 72.66),
-    "spatial": FamilyFigures(10, 500, 357_865, 715.73, 727.00, 1_101.10, 1_513, 131.58),
-    "object": FamilyFigures(5, 250, 121_276, 485.10, 492.00, 526.00, 556, 44.53),
-    "procedural": FamilyFigures(5, 250, 250_204, 1_000.82, 876.00, 1_649.50, 2_012, 91.79),
-    "total": FamilyFigures(30, 1_500, 927_444, 618.30, 489.00, 1_110.10, 2_012, 340.56),
-}
+def _families() -> dict[str, FamilyFigures]:
+    rows = raw_tables()["demo_statistics"]
+    order = ("temporal", "spatial", "object", "procedural", "total")
+    return {
+        name: FamilyFigures(
+            **{key: value for key, value in rows[name].items() if key != "gib"}, storage=rows[name]["gib"]
+        )
+        for name in order
+    }
+
+
+def _bucket(name: str) -> tuple[int, int | None]:
+    """Return [from, to) of a range as the paper writes it, ``200-399`` or ``1500+``."""
+    if name.endswith("+"):
+        return int(name[:-1]), None
+    low, _, high = name.partition("-")
+    return int(low), int(high) + 1
+
+
+FAMILIES: dict[str, FamilyFigures] = _families()
 
 LENGTH_BUCKETS: dict[tuple[int, int | None], int] = {
-    (0, 200): 50,
-    (200, 400): 199,
-    (400, 600): 687,
-    (600, 800): 108,
-    (800, 1000): 290,
-    (1000, 1200): 110,
-    (1200, 1500): 31,
-    (1500, None): 25,
+    _bucket(name): count for name, count in raw_tables()["length_buckets"].items()
 }
 """Steps [from, to) -> episodes of 1,500."""
