@@ -14,15 +14,15 @@ import select
 import shutil
 import subprocess
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
-PATIENCE = 60.0
+PATIENCE = 30.0
 """Seconds until an answer counts as lost; a shared core can take many."""
 
 KEYS = {" ": "Space", "/": "Slash"}
+ESCAPE = 27
 
 
 def find_chromium() -> str | None:
@@ -194,9 +194,11 @@ class Browser:
     def key(self, key: str, modifiers: int = 0) -> None:
         """Press a key on whatever has the focus; modifiers: 1 Alt, 2 Ctrl, 4 Meta, 8 Shift."""
         text = {"text": key} if len(key) == 1 else {}
-        code = KEYS.get(key, key)
-        self.call("Input.dispatchKeyEvent", type="keyDown", key=key, code=code, modifiers=modifiers, **text)
-        self.call("Input.dispatchKeyEvent", type="keyUp", key=key, code=code, modifiers=modifiers)
+        # Chromium closes dialogs by the key's number, everything else goes by its name.
+        number = {"windowsVirtualKeyCode": ESCAPE} if key == "Escape" else {}
+        event = {"key": key, "code": KEYS.get(key, key), "modifiers": modifiers, **number}
+        self.call("Input.dispatchKeyEvent", type="keyDown", **event, **text)
+        self.call("Input.dispatchKeyEvent", type="keyUp", **event)
 
     def write(self, selector: str, text: str) -> None:
         """Put the cursor into a field and write."""
@@ -230,9 +232,8 @@ class Browser:
 
     def close(self) -> None:
         """End the browser and all its processes."""
-        closing: Callable[[], Any] = lambda: self._call("Browser.close")  # noqa: E731
         try:
-            closing()
+            self._call("Browser.close")
         except (RuntimeError, OSError):
             self._process.terminate()
         try:

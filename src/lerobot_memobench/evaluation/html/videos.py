@@ -32,6 +32,9 @@ def find_videos(folder: Path, records: Sequence[Record]) -> tuple[dict[int, Path
     found: dict[int, Path] = {}
     misfits: list[str] = []
     for k, record in enumerate(records):
+        # A log is only text: a name that is a path must not lead out of the folders that are read and written here.
+        if Path(record["task"]).name != record["task"] or not record["task"].isprintable():
+            continue
         film = folder / VIDEOS / f"{record['task']}.{record['episode']}.mp4"
         if film.is_file():
             if _fits(frame_count(film), record, held=LAST_FRAMES + 1):

@@ -72,9 +72,15 @@ const detail = {
     this.now.dataset.key = key;
     this.now.className = `now ${now.phase}`;
     this.now.replaceChildren(
-      operation && !(now.phase === "end" && this.episode.outcome === "success") ? badge(operation) : "",
-      el("span", {}, el("span", { class: "quiet" }, now.phase === "prompt" ? "" : now.phase === "end" ? "At the end: " : "Now: "), subgoalWords(this.episode, now, this.level)),
+      operation ? badge(operation) : "",
+      el("span", {}, el("span", { class: "quiet" }, this.when(now)), subgoalWords(this.episode, now, this.level)),
     );
+  },
+
+  when({ phase, checkpoint }) {
+    if (phase === "prompt") return "";
+    if (phase === "execution") return "Now: ";
+    return checkpoint === null ? "At the end: " : "Still open at the end: ";
   },
 };
 
@@ -101,7 +107,7 @@ function stage(episode, moved) {
   const play = el("button", { type: "button", class: "play", "aria-label": "Play" }, "▶");
   const speed = el("select", { "aria-label": "Speed" }, [0.5, 1, 2, 4].map((rate) => el("option", { value: rate }, `${rate}×`)));
   const error = el("p", { class: "notice", hidden: true });
-  const root = el("div", { class: "stage" }, el("div", { class: "screen" }, video), error, el("div", { class: "buttons" }, play, speed, el("span", { class: "hint" }, "both cameras, the text burnt in by the environment")));
+  const root = el("div", { class: "stage" }, el("div", { class: "screen" }, video), error, el("div", { class: "buttons" }, play, speed, el("span", { class: "hint" }, "Space plays, ← → step, [ ] jump between checkpoints")));
 
   // Half a frame on, so that rounding cannot fall into the frame before.
   const seen = () => Math.floor(video.currentTime * DATA.fps + 1e-3);
@@ -158,11 +164,13 @@ function taskPanel(run, episode, level) {
       bar(numbers.prefix[k], operation, "hollow"),
     ),
   );
+  const head = rateHead(el("th", { scope: "col", class: "number" }, "n"));
+  head.append(el("th", { scope: "col", class: "ends" }, "Outcomes"));
   return el(
     "section",
     { class: "panel" },
     el("h3", {}, `This task in ${run.name}`),
-    el("div", { class: "scroll" }, el("table", { class: "rates" }, el("thead", {}, rateHead(el("th", { scope: "col", class: "number" }, "n"), el("th", { scope: "col" }, "Outcomes"))), el("tbody", {}, el("tr", {}, el("td", { class: "number" }, String(numbers.rates.SR[3])), el("td", { class: "ends" }, outcomeBar(numbers.outcomes, { task: episode.task })), rateCells(numbers.rates))))),
+    el("div", { class: "scroll" }, el("table", { class: "rates" }, el("thead", {}, head), el("tbody", {}, el("tr", {}, el("td", { class: "number" }, String(numbers.rates.SR[3])), rateCells(numbers.rates), el("td", {}, outcomeBar(numbers.outcomes, { task: episode.task })))))),
     el(
       "table",
       { class: "checkpoints" },

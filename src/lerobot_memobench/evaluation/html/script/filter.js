@@ -1,14 +1,23 @@
 // Which rollouts a selection finds.
 
-/** Everything that the search looks at, in small letters; made once per rollout. */
+/** Words in small letters, a space before and after each; "seed 8" counts as one. */
+function normal(text) {
+  const words = text.toLowerCase().replace(/[^\p{L}\p{N}]+/gu, " ");
+  return ` ${words.replace(/\b(seed|episode) (?=\d)/g, "$1").trim()} `;
+}
+
+/** Everything that the search looks at; made once per rollout. */
 function searchText(episode) {
-  episode.words ??= [
+  episode.words ??= normal([
     episode.task, DATA.tasks[episode.task].language, DATA.tasks[episode.task].memory_type, OUTCOMES[episode.outcome].words,
-    `episode ${episode.episode}`, `seed ${episode.seed}`, episode.scene,
+    `episode ${episode.episode}`, `seed ${episode.seed}`, episode.scene ?? "", episode.scene?.slice(0, 8) ?? "",
     ...(DATA.tasks[episode.task].variants[episode.variant]?.checkpoints.flatMap((checkpoint) => checkpoint.texts) ?? []),
-  ].join("\n").toLowerCase();
+  ].join(" "));
   return episode.words;
 }
+
+/** Every word must begin a word of the rollout; numbers must be whole, so that seed 1 is not seed 10. */
+const finds = (words, text) => words.every((word) => text.includes(/\d$/.test(word) ? ` ${word} ` : ` ${word}`));
 
 /** `op` is an operation that a checkpoint must have, or "missed-" and an operation of one that never held. */
 function hasOperation(episode, op) {
@@ -24,7 +33,7 @@ function hasOutcome(episode, outcome) {
 }
 
 function filtered(run, chosen) {
-  const words = chosen.q.toLowerCase().split(/\s+/).filter(Boolean);
+  const words = normal(chosen.q).split(" ").filter(Boolean);
   const order = Object.keys(DATA.tasks);
   return run.episodes
     .filter(
@@ -33,7 +42,7 @@ function filtered(run, chosen) {
         (!chosen.task || episode.task === chosen.task) &&
         (!chosen.op || hasOperation(episode, chosen.op)) &&
         (!chosen.outcome || hasOutcome(episode, chosen.outcome)) &&
-        words.every((word) => searchText(episode).includes(word)),
+        finds(words, searchText(episode)),
     )
     .sort((a, b) => order.indexOf(a.task) - order.indexOf(b.task) || a.episode - b.episode);
 }

@@ -80,7 +80,8 @@ function outcomeBar(counts, where) {
           "aria-label": `${counts[outcome]} of ${total}: ${OUTCOMES[outcome].words}`,
           "data-tip": `${counts[outcome]} of ${total}: ${OUTCOMES[outcome].words}\n${OUTCOMES[outcome].why}`,
         },
-        `${OUTCOMES[outcome].letter} ${counts[outcome]}`,
+        el("b", {}, OUTCOMES[outcome].letter),
+        el("span", {}, ` ${counts[outcome]}`),
       ),
     ),
   );

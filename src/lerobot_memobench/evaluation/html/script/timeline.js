@@ -65,7 +65,7 @@ function timeline(episode, level, seek) {
       marks.push(mark(end, `ending cause is-${episode.outcome}`, `${what}\nnever held: ${ending.words}`, "✕"));
     }
     from = from === null ? null : ordered;
-    const state = ordered !== null ? `step ${ordered}` : first !== null ? `step ${first}, not in order` : "never";
+    const state = ordered !== null ? `step ${ordered}` : first !== null ? `(step ${first})` : "never";
     return lane("checkpoint", [badge(operation), el("span", { class: "words", "data-tip": tip }, text), el("span", { class: "when" }, state)], active, marks);
   });
 
@@ -100,7 +100,7 @@ function timeline(episode, level, seek) {
 function subgoalWords(episode, now, level) {
   if (now.phase === "prompt") return "watch the prompt";
   if (now.phase === "end" && episode.outcome === "success") return "done";
-  if (now.checkpoint === null) return "every checkpoint is complete";
+  if (now.checkpoint === null) return now.phase === "end" ? "every checkpoint is complete, the goal does not hold" : "every checkpoint is complete";
   return checkpointText(episode.task, episode.variant, now.checkpoint, level);
 }
 
