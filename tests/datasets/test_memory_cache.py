@@ -23,6 +23,7 @@ from lerobot_memobench.datasets.memory_cache import (
 from lerobot_memobench.errors import MemobenchError
 
 CAMERA = "observation.images.image"
+SUBGOALS_1 = "open the top drawer; put the bowl in the drawer"
 
 
 def _synthetic():  # type: ignore[no-untyped-def]
@@ -108,8 +109,8 @@ def test_contents(root: Path) -> None:
     assert float(cache.text_embeddings[rows[0], 0]) == len(first)
     assert cache.texts[rows[3]] == first  # frame 3 has no text: the next frame's counts
     assert cache.texts[cache.text_rows("fine")[0]].endswith("(0.1, 0.2)")
-    with pytest.raises(MemobenchError, match="level 'coarse'"):
-        cache.text_rows("coarse")
+    assert cache.texts[cache.text_rows("coarse")[0]] == "pick it"
+    assert cache.memory_texts([0, 39, 62]) == ["", "pick up the cream cheese", SUBGOALS_1]
     with pytest.raises(MemobenchError, match="outside"):
         cache.locate(94)
 

@@ -21,8 +21,11 @@ SUBGOALS = (
 TASKS = ("put the cream cheese in the basket", "put the bowl away", "fetch cream cheese and butter")
 
 
-def make_dataset(root: Path, seed: int = 0) -> Path:
-    """Write a LeRobotDataset with this project's columns: three short episodes of coloured squares that move."""
+def make_dataset(root: Path, seed: int = 0, repeats: int = 1) -> Path:
+    """Write a LeRobotDataset with this project's columns: three short episodes of coloured squares that move.
+
+    With ``repeats`` each of the three tasks has that many episodes, one task after the other.
+    """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     image = {"dtype": "video", "shape": (SIZE, SIZE, 3), "names": ["height", "width", "channels"]}
@@ -40,11 +43,13 @@ def make_dataset(root: Path, seed: int = 0) -> Path:
             "phase": {"dtype": "int64", "shape": (1,), "names": None},
             "simple_subgoal": string,
             "grounded_subgoal": string,
+            "coarse_subgoal": string,
             "memory": string,
         },
     )
     rng = np.random.default_rng(seed)
-    for length, prompt, subgoals, task in zip(LENGTHS, PROMPTS, SUBGOALS, TASKS, strict=True):
+    kinds = list(zip(LENGTHS, PROMPTS, SUBGOALS, TASKS, strict=True))
+    for length, prompt, subgoals, task in [kind for kind in kinds for _ in range(repeats)]:
         colour = rng.integers(60, 255, 3)
         drift = rng.normal(size=7)
         for t in range(length):
@@ -62,7 +67,8 @@ def make_dataset(root: Path, seed: int = 0) -> Path:
                     # Some frames carry no text: the cache then looks at the next that does.
                     "simple_subgoal": "" if t % 7 == 3 else subgoals[k],
                     "grounded_subgoal": subgoals[k] + " at (0.1, 0.2)",
-                    "memory": ", then ".join(subgoals[:k]),
+                    "coarse_subgoal": subgoals[k].split()[0] + " it",
+                    "memory": "; ".join(subgoals[:k]),
                     "task": task,
                 }
             )
@@ -75,3 +81,9 @@ def make_dataset(root: Path, seed: int = 0) -> Path:
 def dataset_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The synthetic dataset, without a cache at first; tests that change it must copy it."""
     return make_dataset(tmp_path_factory.mktemp("data") / "synthetic")
+
+
+@pytest.fixture(scope="session")
+def twice_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same three tasks with two episodes each."""
+    return make_dataset(tmp_path_factory.mktemp("data") / "twice", repeats=2)

@@ -27,7 +27,6 @@ from lerobot_memobench.policies.memobench_mem.memory import sample_frames
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import (
     GatherMemoryProcessorStep,
-    shuffle_within_episodes,
 )
 from lerobot_memobench.policies.memobench_mem.text import WordTextEncoder, make_vocabulary, make_word_tokenizer
 
@@ -164,12 +163,6 @@ def test_a_batch_without_memory_is_refused(trained: Any) -> None:
         policy.forward(batch)
 
 
-def test_missing_subgoal_level_is_refused(dataset_root: Path) -> None:
-    _, before, _, dataset = _training(dataset_root, align="semantic", subgoal_level="coarse")
-    with pytest.raises(MemobenchError, match="coarse_subgoal"):
-        before(_batch(dataset, [3]))
-
-
 def test_stale_cache_stops_training(dataset_root: Path, tmp_path: Path) -> None:
     root = tmp_path / "data"
     shutil.copytree(dataset_root, root, ignore=shutil.ignore_patterns(FOLDER))
@@ -180,16 +173,6 @@ def test_stale_cache_stops_training(dataset_root: Path, tmp_path: Path) -> None:
     (folder / "meta.json").write_text(json.dumps(meta | {"frames_key": "another"}))
     with pytest.raises(MemobenchError, match=r"another vision tower.*memobench cache"):
         _training(root)
-
-
-def test_shuffled_subgoals_stay_in_their_episode_and_all_move() -> None:
-    rows = np.array([0, 0, 1, 2, -1, 5, 5, 7], np.int32)
-    shuffled = shuffle_within_episodes(rows, np.array([0, 5, 7, 8]))
-    assert set(shuffled[:4]) == {0, 1, 2}
-    assert (shuffled[:4] != rows[:4]).all()
-    assert shuffled[4:].tolist() == [-1, 5, 5, 7]
-    assert shuffled[0] == shuffled[1]
-    assert np.array_equal(shuffled, shuffle_within_episodes(rows, np.array([0, 5, 7, 8])))
 
 
 # -- rollout -------------------------------------------------------------------------------------------------------

@@ -74,6 +74,16 @@ def test_encoder_shapes_and_mask() -> None:
     assert token_mask.tolist() == [[True] * 32 + [False] * 16]
 
 
+def test_encoder_equals_its_formula_token_by_token() -> None:
+    """concat(image, SiLU(Linear(position))) -> Linear, although the code never builds the concatenations."""
+    encoder = MemoryEncoder(image_dim=6, memory_dim=10)
+    tokens, steps = torch.randn(2, 3, 16, 6), torch.tensor([[0, 4, 9], [100, 700, 1199]])
+    memory, _ = encoder(tokens, steps, torch.ones(2, 3, dtype=torch.bool))
+    position = torch.nn.functional.silu(encoder.position(position_features(steps)))
+    expected = encoder.project(torch.cat([tokens, position], dim=-1)).flatten(1, 2)
+    torch.testing.assert_close(memory, expected, rtol=1e-5, atol=1e-5)
+
+
 def _modulator() -> MemoryModulator:
     torch.manual_seed(0)
     modulator = MemoryModulator(32)

@@ -17,6 +17,7 @@ from typing import Annotated, Any
 import typer
 
 from lerobot_memobench.cli import controls, data, html, merging
+from lerobot_memobench.cli.study import study
 from lerobot_memobench.cli.console import console
 from lerobot_memobench.errors import MemobenchError
 
@@ -173,6 +174,7 @@ app.command()(data.convert)
 app.command()(data.validate)
 app.command()(data.describe)
 app.command()(data.push)
+app.command()(study)
 
 
 # --- reports ---

@@ -14,6 +14,7 @@ Layout of ``<dataset>/memory_cache/<name>/``::
     phase.npy       uint8 (frames,): 0 prompt, 1 execution
     subgoal-<level>.npy  int32 (frames,): row of texts.json for the frame's subgoal, -1 for none
     texts.json, texts.npy    the unique subgoals and their embeddings, float32 (texts, d_t)
+    memory.npy, memory.json    int32 (frames,): row of the frame's oracle memory text; the unique texts
 """
 
 from __future__ import annotations
@@ -38,8 +39,9 @@ from torch import Tensor
 from lerobot_memobench.errors import MemobenchError
 
 FOLDER = "memory_cache"
-FORMAT = 1
+FORMAT = 2
 LEVEL_COLUMNS = {"coarse": "coarse_subgoal", "intermediate": "simple_subgoal", "fine": "grounded_subgoal"}
+MEMORY_COLUMN = "memory"
 _SAMPLE = 1 << 16  # bytes of a video read for its fingerprint, at its start, middle and end
 
 Progress = Callable[[int, int], None]  # called as progress(episodes done, episodes in all)
@@ -83,6 +85,7 @@ class CacheMeta:
     dim: int
     slots: int
     levels: list[str]
+    oracle: bool  # the dataset has the column of oracle memory texts
     complete: bool
 
 
@@ -138,6 +141,7 @@ class _Frames:
     episodes: np.ndarray  # (E + 1,) int64: first frame of each episode
     phase: np.ndarray  # (N,) uint8
     subgoals: dict[str, list[str]]  # level -> (N,) texts
+    memory: list[str] | None  # (N,) oracle memory texts; None without the column
 
 
 def _read_frames(root: Path) -> _Frames:
@@ -150,7 +154,7 @@ def _read_frames(root: Path) -> _Frames:
     columns = ["index", "episode_index", "frame_index"]
     present = pq.read_schema(files[0]).names if files else []
     levels = {level: column for level, column in LEVEL_COLUMNS.items() if column in present}
-    optional = ["phase"] if "phase" in present else []
+    optional = [name for name in ("phase", MEMORY_COLUMN) if name in present]
     tables = [pq.read_table(path, columns=columns + optional + list(levels.values())) for path in files]
     if not tables:
         raise MemobenchError(f"{root} holds no frames: there is no parquet file below {root / 'data'}.")
@@ -168,14 +172,16 @@ def _read_frames(root: Path) -> _Frames:
         raise MemobenchError(
             f"The frames of {root} are not numbered 0, 1, 2, ... episode by episode; write the dataset again."
         )
-    texts = {
-        level: [text for table in tables for text in _strings(table.column(name).to_pylist())]
-        for level, name in levels.items()
-    }
+
+    def texts(name: str) -> list[str]:
+        found = [text for table in tables for text in _strings(table.column(name).to_pylist())]
+        return [found[i] for i in order]
+
     return _Frames(
         episodes=np.append(starts, len(index)).astype(np.int64),
-        phase=(column("phase")[order] if optional else np.ones(len(index))).astype(np.uint8),
-        subgoals={level: [values[i] for i in order] for level, values in texts.items()},
+        phase=(column("phase")[order] if "phase" in optional else np.ones(len(index))).astype(np.uint8),
+        subgoals={level: texts(name) for level, name in levels.items()},
+        memory=texts(MEMORY_COLUMN) if MEMORY_COLUMN in optional else None,
     )
 
 
@@ -219,6 +225,8 @@ class MemoryCache:
         }
         self.texts: list[str] = json.loads((folder / "texts.json").read_text())
         self.text_embeddings = torch.from_numpy(np.load(folder / "texts.npy"))
+        self._memory: np.ndarray | None = np.load(folder / "memory.npy") if meta.oracle else None
+        self.memories: list[str] = json.loads((folder / "memory.json").read_text()) if meta.oracle else []
 
     @classmethod
     def open(
@@ -276,6 +284,19 @@ class MemoryCache:
         """Tokens (n, P, D) bfloat16 of stored frames of an episode; slot k is its frame k * stride."""
         rows = np.asarray(slots, dtype=np.int64) + self.slots[episode]
         return torch.from_numpy(self._tokens[rows]).view(torch.bfloat16)
+
+    def memory_texts(self, indices: Sequence[int]) -> list[str]:
+        """Oracle memory texts of frames of the dataset, by their global indices.
+
+        Raises:
+            MemobenchError: the dataset has no such column.
+        """
+        if self._memory is None:
+            raise MemobenchError(
+                f"The dataset of {self.folder} has no column '{MEMORY_COLUMN}', which --policy.oracle_memory=true "
+                "reads; generate it again with this version."
+            )
+        return [self.memories[row] for row in self._memory[np.asarray(indices, dtype=np.int64)].tolist()]
 
     def text_rows(self, level: str) -> np.ndarray:
         """(N,) int32: row of :attr:`text_embeddings` for each frame of the dataset; -1 where there is none.
@@ -375,6 +396,7 @@ def build_memory_cache(
             dim=frames.dim,
             slots=int(_slot_starts(table.episodes, stride)[-1]),
             levels=list(table.subgoals),
+            oracle=table.memory is not None,
             complete=False,
         )
         try:
@@ -409,6 +431,11 @@ def _write_tables(folder: Path, table: _Frames, texts: TextEncoder) -> None:
         _save_array(folder / f"subgoal-{level}.npy", np.array([number.get(text, -1) for text in values], np.int32))
     _write_json(folder / "texts.json", unique)
     _save_array(folder / "texts.npy", embeddings)
+    if table.memory is not None:
+        memories = sorted(set(table.memory))
+        place = {text: row for row, text in enumerate(memories)}
+        _save_array(folder / "memory.npy", np.array([place[text] for text in table.memory], np.int32))
+        _write_json(folder / "memory.json", memories)
 
 
 def _write_tokens(

@@ -18,6 +18,7 @@ from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.envs.film import Film
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.tasks.failures import classify_failure
+from lerobot_memobench.tasks.memory_text import memory_text, with_memory
 from lerobot_memobench.tasks.task import load_task
 
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}
@@ -77,13 +78,16 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         render_every: int = 1,
         replan_steps: int | None = None,
         expert_action: bool = False,
+        oracle_memory: bool = False,
         videos: bool = False,
         seed_base: int = SEED_BASE,
     ) -> None:
         self.render_mode = "rgb_array"
         self._task = load_task(folder)
         self.task = self._task.name
-        self.task_description = self._task.language
+        self._episode: Episode | None = None
+        self._oracle_memory = oracle_memory
+        self._describe(0)
         self.observation_space = _observation_space(expert_action)
         self.action_space = _action_space()
         protocol = {
@@ -107,7 +111,6 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._render_every, self._replan_steps = render_every, replan_steps
         self._expert_action, self._seed_base = expert_action, seed_base
         self._next_seed = seed_base
-        self._episode: Episode | None = None
 
     @property
     def episode(self) -> Episode:
@@ -132,6 +135,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._started = time.monotonic()
         self._logged = False
         self.episode.reset(seed)
+        self._describe(0)
         self._images = self.episode.images()
         if self._film is not None:
             self._film.discard()
@@ -143,7 +147,10 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     def step(self, action: NDArray[np.float32]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Advance by one control step of 50 ms. The reward is 1 at success, else 0."""
         episode = self.episode
+        # A dataset's labels count what was completed before a frame; what this step completes is told one frame later.
+        completed = episode.progress.index
         episode.step(np.asarray(action, dtype=np.float32))
+        self._describe(completed)
         if episode.phase == PROMPT or episode.exec_steps % self._render_every == 0 or episode.done:
             self._images = episode.images()
         success = episode.success
@@ -158,6 +165,13 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             if self._log is not None:
                 self._log.append(self.record())
         return self._observation(), float(success), success, truncated, self._info()
+
+    def _describe(self, completed: int) -> None:
+        """Set the instruction, which LeRobot asks for at every step; the oracle's has the memory text behind it."""
+        task = self._task if self._episode is None else self._episode.task
+        self.task_description = task.language
+        if self._oracle_memory:
+            self.task_description = with_memory(task.language, memory_text(task, completed))
 
     def scene_hash(self) -> str:
         """Return the hash of the present scene: equal in two environments when all of their physics is."""

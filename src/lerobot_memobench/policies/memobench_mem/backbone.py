@@ -173,9 +173,11 @@ class MemoryPI05(SizedPI05):
     def __init__(self, config: MemobenchMemConfig, rtc_processor: Any = None) -> None:
         super().__init__(config, rtc_processor=rtc_processor)
         dims = config.dimensions
-        self.memory = MemoryEncoder(image_dim=dims.vlm.width, memory_dim=dims.vlm.width)
         self.memory_state = MemoryState()
         self.context: tuple[Tensor, Tensor] | None = None
+        if config.integration == "none":
+            return
+        self.memory = MemoryEncoder(image_dim=dims.vlm.width, memory_dim=dims.vlm.width)
         if config.integration == "modulation":
             self.memory_to_expert = nn.Linear(dims.vlm.width, dims.expert.width)
             for layer in self.paligemma_with_expert.gemma_expert.model.layers:

@@ -17,9 +17,11 @@ from lerobot_memobench.policies.memobench_mem.dimensions import SIZES, Dimension
 logger = logging.getLogger(__name__)
 
 ALIGN_WEIGHTS = {"none": 0.0, "semantic": 0.1, "contrastive": 0.1, "framewise": 0.05}
-INTEGRATIONS = ("modulation", "context")
+INTEGRATIONS = ("modulation", "context", "none")
 SUBGOAL_LEVELS = ("coarse", "intermediate", "fine")
 TOKENS_PER_FRAME = 16
+ORACLE_TOKENS = 128
+"""Room that oracle memory text needs in a prompt of the word tokenizer: six checkpoints of some ten words."""
 
 
 @LRSchedulerConfig.register_subclass("memobench_constant_with_warmup")
@@ -64,10 +66,17 @@ class MemobenchMemConfig(PI05Config):
     subgoal_level: str = "intermediate"
     shuffle_subgoals: bool = False
     """Control of the paper: the subgoal texts of an episode change places among themselves."""
+    shuffle_seed: int = 7
+    """Which shuffle; the same for every epoch and on every machine."""
     text_encoder: str | None = None
 
     # -- memory
     integration: str = "modulation"
+    """How actions read memory: ``modulation``, ``context`` (memory joins the prefix), or ``none``: plain pi0.5, the
+    baseline that never sees the past."""
+    oracle_memory: bool = False
+    """Control of the paper: ground-truth memory text stands in the prompt, from the dataset's column ``memory`` in
+    training and from the environment (``--env.oracle_memory=true``) at evaluation."""
     memory_camera: str = "observation.images.image"
     memory_frames: int = 32
     tokens_per_frame: int = TOKENS_PER_FRAME
@@ -108,6 +117,8 @@ class MemobenchMemConfig(PI05Config):
             self.image_resolution = (dims.vision.image, dims.vision.image)
         if self.tokenizer_max_length is None:
             self.tokenizer_max_length = dims.tokenizer_max_length
+            if self.oracle_memory and dims.tokenizer == "words":
+                self.tokenizer_max_length += ORACLE_TOKENS
         if self.optimizer_lr is None:
             self.optimizer_lr = dims.learning_rate
         self.tokenizer_name = self.tokenizer_name or dims.tokenizer
@@ -134,6 +145,16 @@ class MemobenchMemConfig(PI05Config):
             raise MemobenchError(
                 "--policy.freeze_vision_encoder=false cannot be used: memory tokens are cached from the frozen "
                 "vision tower, and would no longer match a tower that learns."
+            )
+        if self.align != "none" and self.integration == "none":
+            raise MemobenchError(
+                f"--policy.align={self.align} has no memory to align with --policy.integration=none; use modulation or "
+                "context, or --policy.align=none."
+            )
+        if self.shuffle_subgoals and self.align == "none":
+            raise MemobenchError(
+                "--policy.shuffle_subgoals=true changes nothing with --policy.align=none, which reads no subgoals; "
+                "name an alignment too."
             )
         patch = self.dimensions.vision.patch
         if any(side % patch or (side // patch) % 4 for side in self.image_size):

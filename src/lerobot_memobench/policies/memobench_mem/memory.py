@@ -41,19 +41,24 @@ def position_features(steps: Tensor) -> Tensor:
     Order: sin t, cos t, sin y, cos y, sin x, cos x, 128 frequencies each from 1 down to 1/base. Token i of a grid row
     lies at 4 i + 2 of the 16 patches (its middle), y runs over rows.
     """
-    exponents = torch.arange(_FREQUENCIES, dtype=torch.float32, device=steps.device) / (_FREQUENCIES - 1)
-    place = 4.0 * torch.arange(GRID, dtype=torch.float32, device=steps.device) + 2.0
-
-    def waves(values: Tensor, base: float) -> Tensor:
-        angles = values.to(torch.float32).unsqueeze(-1) * base**-exponents
-        return torch.cat([angles.sin(), angles.cos()], dim=-1)
-
     shape = (*steps.shape, GRID, GRID, 2 * _FREQUENCIES)
-    time = waves(steps, _TIME_BASE)[..., None, None, :].expand(shape)
-    grid = waves(place, _SPACE_BASE)
+    time = _waves(steps, _TIME_BASE)[..., None, None, :].expand(shape)
+    grid = _grid_waves(steps.device)
     rows = grid[:, None, :].expand(shape)
     columns = grid[None, :, :].expand(shape)
     return torch.cat([time, rows, columns], dim=-1).flatten(-3, -2)
+
+
+def _waves(values: Tensor, base: float) -> Tensor:
+    """Sines, then cosines, of values (...) at 128 frequencies from 1 down to 1/base: (..., 256) float32."""
+    exponents = torch.arange(_FREQUENCIES, dtype=torch.float32, device=values.device) / (_FREQUENCIES - 1)
+    angles = values.to(torch.float32).unsqueeze(-1) * base**-exponents
+    return torch.cat([angles.sin(), angles.cos()], dim=-1)
+
+
+def _grid_waves(device: torch.device) -> Tensor:
+    """Waves (4, 256) of the rows, or columns, of the token grid."""
+    return _waves(4.0 * torch.arange(GRID, dtype=torch.float32, device=device) + 2.0, _SPACE_BASE)
 
 
 def pool_tokens(tokens: Tensor) -> Tensor:
@@ -68,7 +73,11 @@ def pool_tokens(tokens: Tensor) -> Tensor:
 
 
 class MemoryEncoder(nn.Module):
-    """Vision tokens and their positions to memory tokens: concat(image, SiLU(Linear(position))) -> Linear."""
+    """Vision tokens and their positions to memory tokens: concat(image, SiLU(Linear(position))) -> Linear.
+
+    A Linear of a concatenation is the sum of its parts' Linears. The 16 tokens of a frame share their time and all
+    frames share their grid, so the first Linear is applied to F times and 4 + 4 places instead of F * 16 tokens.
+    """
 
     def __init__(self, image_dim: int, memory_dim: int) -> None:
         super().__init__()
@@ -81,9 +90,15 @@ class MemoryEncoder(nn.Module):
         Returns:
             H (B, F*P, d_m) float32 and its mask (B, F*P) bool, from ``frame_mask`` (B, F).
         """
-        position = F.silu(self.position(position_features(steps)))
-        image = tokens.to(position.dtype)
-        encoded = self.project(torch.cat([image, position], dim=-1))
+        weight = self.position.weight
+        of_time, of_row, of_column = weight.split(2 * _FREQUENCIES, dim=1)
+        grid = _grid_waves(steps.device).to(weight.dtype)
+        time = F.linear(_waves(steps, _TIME_BASE).to(weight.dtype), of_time, self.position.bias)
+        place = F.linear(grid, of_row)[:, None, :] + F.linear(grid, of_column)[None, :, :]
+        position = F.silu(time.unsqueeze(-2) + place.flatten(0, 1))
+        of_image, of_position = self.project.weight.split([tokens.shape[-1], POSITION_DIM], dim=1)
+        image = tokens.to(self.project.weight.dtype)
+        encoded = F.linear(image, of_image, self.project.bias) + F.linear(position, of_position)
         return encoded.flatten(1, 2), frame_mask.bool().repeat_interleave(tokens.shape[2], dim=1)
 
 
@@ -215,12 +230,15 @@ class RolloutMemory:
         """Forget everything."""
         self.rows = []
 
-    def observe(self, steps: Sequence[int], encode: Callable[[list[int]], Tensor]) -> tuple[list[bool], list[bool]]:
+    def observe(
+        self, steps: Sequence[int], encode: Callable[[list[int]], Tensor] | None
+    ) -> tuple[list[bool], list[bool]]:
         """Take in one observation per row.
 
         Args:
             steps: control step of each row since its episode began.
             encode: from row numbers (n,) to their frames' tokens (n, P, D); called once, for the rows that need it.
+                None remembers no frames and only follows the rows' clocks.
 
         Returns:
             Per row: whether a new episode began, and whether the row is frozen.
@@ -238,7 +256,7 @@ class RolloutMemory:
             if not frozen[-1] and (step % self.stride == 0 or not row.steps):
                 wanted.append(number)
             row.last_step = step
-        if wanted:
+        if wanted and encode is not None:
             for number, tokens in zip(wanted, encode(wanted).to("cpu", torch.bfloat16), strict=True):
                 self.rows[number].steps.append(steps[number])
                 self.rows[number].tokens.append(tokens)

@@ -120,7 +120,7 @@ class MemobenchMemPolicy(PI05Policy):
             require_statistics(source, revision)
         policy = cls(config, load_base=False)
         weights = load_file(path)
-        if not any(name.startswith("model.memory.") for name in weights):
+        if config.integration != "none" and not any(name.startswith("model.memory.") for name in weights):
             raise MemobenchError(
                 f"'{source}' holds weights without a memory; to start from pi0.5's weights pass "
                 "--policy.base_weights=<checkpoint> instead of a pretrained path."
@@ -232,17 +232,19 @@ class MemobenchMemPolicy(PI05Policy):
         Raises:
             MemobenchError: the batch has no memory.
         """
-        if TOKENS not in batch:
+        needed = PHASE if self.config.integration == "none" else TOKENS
+        if needed not in batch:
             raise MemobenchError(
-                f"The training batch has no '{TOKENS}': the preprocessor lacks the step memobench_gather_memory; to "
+                f"The training batch has no '{needed}': the preprocessor lacks the step memobench_gather_memory; to "
                 "start from pi0.5's weights pass --policy.base_weights instead of --policy.pretrained_path."
             )
         if self.config.ema_decay > 0 and self._average is None and self.training:
             self._average = WeightAverage(self._trained(), self.config.ema_decay)
         device = next(self.parameters()).device
-        memory, memory_mask = self.model.set_memory(
-            batch[TOKENS].to(device), batch[STEPS].to(device), batch[MASK].to(device)
-        )
+        if self.config.integration != "none":
+            memory, memory_mask = self.model.set_memory(
+                batch[TOKENS].to(device), batch[STEPS].to(device), batch[MASK].to(device)
+            )
         images, image_masks = self._preprocess_images(batch)
         actions = self.prepare_action(batch)
         losses = self.model.forward(
@@ -336,7 +338,8 @@ class MemobenchMemPolicy(PI05Policy):
         else:
             steps = [self._calls] * len(camera)  # an environment without a clock: one call is one step
         self._calls += 1
-        started, frozen = self._history.observe(steps, lambda rows: self._frames(camera[rows]))
+        encode = None if self.config.integration == "none" else lambda rows: self._frames(camera[rows])
+        started, frozen = self._history.observe(steps, encode)
         if len(self._noise_seeds) != len(camera):
             self._noise_seeds = [0] * len(camera)
         for row in np.flatnonzero(started):
@@ -368,11 +371,12 @@ class MemobenchMemPolicy(PI05Policy):
         keys = [*self.config.image_features, OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK]
         part = {key: batch[key][rows] for key in keys if key in batch}
         device = next(self.parameters()).device
-        tokens, steps, mask = (tensor.to(device) for tensor in self._history.gather(rows))
+        memory = None if self.config.integration == "none" else self._history.gather(rows)
         images, image_masks = self._preprocess_images(part)
 
         def sample() -> Tensor:
-            self.model.set_memory(tokens, steps, mask)
+            if memory is not None:
+                self.model.set_memory(*(tensor.to(device) for tensor in memory))
             return self.model.sample_actions(
                 images,
                 image_masks,

@@ -1,0 +1,214 @@
+"""The paper's controls: oracle memory in the prompt, shuffled subgoals, subgoal level, and pi0.5 without a memory."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+from lerobot.datasets.factory import resolve_delta_timestamps
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.policies import make_policy, make_pre_post_processors
+
+from lerobot_memobench.datasets.memory_cache import FOLDER, MemoryCache
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import shuffle_within_episodes
+from lerobot_memobench.policies.memobench_mem.text import WordTextEncoder
+from lerobot_memobench.tasks.memory_text import with_memory
+
+CHUNK = 6
+EPISODE_1 = 40  # first frame of the second episode, whose subgoals are:
+SUBGOALS = ("open the top drawer", "put the bowl in the drawer", "close the top drawer")
+
+
+def _config(**fields: Any) -> MemobenchMemConfig:
+    fields = {"chunk_size": CHUNK, "n_action_steps": CHUNK, "num_inference_steps": 2, "memory_frames": 8} | fields
+    return MemobenchMemConfig(device="cpu", push_to_hub=False, **fields)
+
+
+def _training(root: Path, **fields: Any):  # type: ignore[no-untyped-def]
+    config = _config(**fields)
+    meta = LeRobotDataset("memobench/synthetic", root=root).meta
+    dataset = LeRobotDataset("memobench/synthetic", root=root, delta_timestamps=resolve_delta_timestamps(config, meta))
+    torch.manual_seed(0)
+    policy = make_policy(config, ds_meta=dataset.meta)
+    before, after = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)
+    return policy, before, after, dataset
+
+
+def _batch(dataset: LeRobotDataset, indices: list[int]) -> dict[str, Any]:
+    return torch.utils.data.default_collate([dataset[index] for index in indices])
+
+
+def _observation(dataset: LeRobotDataset, frame: int, task: str) -> dict[str, Any]:
+    item = dataset[EPISODE_1 + frame]
+    keys = ("observation.images.image", "observation.images.wrist_image", "observation.state")
+    found = {key: item[key][None] for key in keys}
+    found |= {"observation.step": torch.tensor([[float(frame)]]), "observation.phase": torch.ones(1, 1)}
+    return found | {"task": [task]}
+
+
+def _prompt(before: Any, batch: dict[str, Any], row: int) -> str:
+    """What the policy reads, as words: tokens decoded by the pipeline's own tokenizer."""
+    step = next(step for step in before.steps if hasattr(step, "vocabulary"))
+    ids = batch["observation.language.tokens"][row][batch["observation.language.attention_mask"][row].bool()]
+    return " ".join(step.tokenizer.convert_ids_to_tokens(ids.tolist()))
+
+
+# -- oracle memory -------------------------------------------------------------------------------------------------
+
+
+def test_oracle_memory_stands_whole_in_the_training_prompt(dataset_root: Path, tmp_path: Path) -> None:
+    policy, before, after, dataset = _training(dataset_root, oracle_memory=True)
+    batch = before(_batch(dataset, [EPISODE_1, EPISODE_1 + 22]))
+    assert "put the bowl away memory : nothing yet , state :" in _prompt(before, batch, 0)
+    done = " ; ".join(SUBGOALS[:2])
+    assert f"put the bowl away memory : {done} , state :" in _prompt(before, batch, 1)
+    assert _prompt(before, batch, 1).endswith("action :")  # nothing was cut off
+    loss, _ = policy.forward(batch)
+    loss.backward()
+    # The saved pipeline asks for the memory too, and a rollout with it reads the same words.
+    for part in (policy, before, after):
+        part.save_pretrained(tmp_path)
+    evaluated = MemobenchMemPolicy.from_pretrained(tmp_path)
+    again, _ = make_pre_post_processors(evaluated.config, pretrained_path=str(tmp_path))
+    task = with_memory("put the bowl away", "; ".join(SUBGOALS[:2]))
+    seen = again(_observation(dataset, 22, task))
+    assert torch.equal(seen["observation.language.tokens"][0], batch["observation.language.tokens"][1])
+    assert torch.isfinite(evaluated.select_action(seen)).all()
+    with pytest.raises(MemobenchError, match=r"env\.oracle_memory=true"):
+        again(_observation(dataset, 22, "put the bowl away"))
+
+
+def test_plain_policies_read_no_memory_text(dataset_root: Path) -> None:
+    _, before, _, dataset = _training(dataset_root)
+    assert "put the bowl away , state :" in _prompt(before, before(_batch(dataset, [EPISODE_1 + 22])), 0)
+
+
+def test_six_checkpoints_fit_into_the_prompt() -> None:
+    """The longest memory of the catalogue is not cut off by the word tokenizer's length."""
+    from lerobot_memobench.policies.memobench_mem.text import words
+    from lerobot_memobench.tasks.catalogue import get_task, task_names
+    from lerobot_memobench.tasks.memory_text import memory_text
+
+    texts = [
+        with_memory(task.language, memory_text(task, len(task.checkpoints))) for task in map(get_task, task_names())
+    ]
+    frame = words("Task: , State: " + "255 " * 8 + ";\nAction: ")
+    assert max(len(words(text)) for text in texts) + len(frame) + 1 <= _config(oracle_memory=True).tokenizer_max_length
+
+
+# -- subgoals ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("level", "text"),
+    [
+        ("coarse", "put it"),
+        ("intermediate", "put the bowl in the drawer"),
+        ("fine", "put the bowl in the drawer at (0.1, 0.2)"),
+    ],
+)
+@pytest.mark.parametrize("align", ["semantic", "framewise"])
+def test_subgoal_level_chooses_the_text(dataset_root: Path, align: str, level: str, text: str) -> None:
+    policy, before, _, dataset = _training(dataset_root, align=align, subgoal_level=level)
+    batch = before(_batch(dataset, [EPISODE_1 + 12, 3]))
+    found = batch["memory.text"][0]
+    if align == "framewise":
+        found = found[batch["memory.mask"][0]][-1]  # the frame itself is the last of its history
+    torch.testing.assert_close(found, WordTextEncoder(64)([text])[0])
+    policy.forward(batch)[0].backward()
+
+
+def test_shuffled_subgoals_stay_in_their_episode_and_all_move() -> None:
+    rows = np.array([0, 0, 1, 2, -1, 5, 5, 7], np.int32)
+    episodes = np.array([0, 5, 7, 8])
+    shuffled = shuffle_within_episodes(rows, episodes)
+    assert set(shuffled[:4]) == {0, 1, 2}
+    assert (shuffled[:4] != rows[:4]).all()
+    assert shuffled[4:].tolist() == [-1, 5, 5, 7]
+    assert shuffled[0] == shuffled[1]
+    assert np.array_equal(shuffled, shuffle_within_episodes(rows, episodes))
+    others = [shuffle_within_episodes(rows, episodes, seed)[:4].tolist() for seed in range(8)]
+    assert len({tuple(other) for other in others}) == 2  # three subgoals can all move in two ways
+
+
+@pytest.mark.parametrize("align", ["contrastive", "framewise"])
+def test_shuffled_subgoals_reach_the_loss(dataset_root: Path, align: str) -> None:
+    """Every frame of an episode with several subgoals is taught another one of the same episode."""
+    indices = [EPISODE_1 + frame for frame in (1, 9, 20)]
+    found = {}
+    for shuffle in (False, True):
+        policy, before, _, dataset = _training(dataset_root, align=align, shuffle_subgoals=shuffle)
+        batch = before(_batch(dataset, indices))
+        found[shuffle] = batch["memory.text"]
+        policy.forward(batch)[0].backward()
+        again = before(_batch(dataset, indices))  # another epoch
+        assert torch.equal(batch["memory.text"], again["memory.text"])
+    known = WordTextEncoder(64)(list(SUBGOALS))
+    plain, shuffled = (
+        (found[key].reshape(-1, 64) @ known.T).argmax(dim=1)[batch["memory.text_mask"].reshape(-1)]
+        for key in (False, True)
+    )
+    assert (plain != shuffled).all()
+    assert set(shuffled.tolist()) == {0, 1, 2}
+
+
+def test_a_dataset_without_the_columns_is_refused(dataset_root: Path, tmp_path: Path) -> None:
+    root = tmp_path / "data"
+    shutil.copytree(dataset_root, root, ignore=shutil.ignore_patterns(FOLDER))
+    for path in (root / "data").rglob("*.parquet"):
+        pq.write_table(pq.read_table(path).drop_columns(["coarse_subgoal", "memory"]), path)
+    folder = cache_dataset(root, _config())
+    meta = json.loads((folder / "meta.json").read_text())
+    keys = {key: meta[key] for key in ("frames_key", "camera", "stride")}
+    cache = MemoryCache.open(root, folder.name, **keys)
+    with pytest.raises(MemobenchError, match=r"coarse_subgoal.*levels it has: intermediate, fine"):
+        cache.text_rows("coarse")
+    with pytest.raises(MemobenchError, match="no column 'memory'"):
+        cache.memory_texts([3])
+
+
+# -- pi0.5 without a memory ----------------------------------------------------------------------------------------
+
+
+def test_without_integration_it_is_plain_pi05(dataset_root: Path, tmp_path: Path) -> None:
+    from lerobot_memobench.policies.memobench_mem.backbone import SizedPI05
+
+    policy, before, after, dataset = _training(dataset_root, integration="none")
+    assert set(dict(policy.model.named_parameters())) == set(dict(SizedPI05(_config()).named_parameters()))
+    batch = before(_batch(dataset, [EPISODE_1 + 1, EPISODE_1 + 22]))
+    assert batch["phase"].tolist() == [0, 1]
+    assert not any(key.startswith("memory.") for key in batch)
+    policy.train()
+    loss, logged = policy.forward(batch)
+    loss.backward()
+    policy.update()
+    assert logged["loss"] == logged["action_loss"]
+    for part in (policy, before, after):
+        part.save_pretrained(tmp_path)
+    evaluated = MemobenchMemPolicy.from_pretrained(tmp_path)
+    for frame in range(3):
+        action = evaluated.select_action(before(_observation(dataset, frame, "put the bowl away")))
+        assert torch.isfinite(action).all()
+    assert all(not row.tokens for row in evaluated._history.rows)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"integration": "none", "align": "semantic"}, "no memory to align"),
+        ({"shuffle_subgoals": True}, "changes nothing"),
+    ],
+)
+def test_controls_without_effect_are_refused(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(MemobenchError, match=message):
+        _config(**fields)
