@@ -155,7 +155,7 @@ def test_the_overview_shows_rates_outcomes_and_tasks(browser: Any, report: Path)
     assert rows[0].startswith("Average mine 7")
     assert any(row.startswith("Temporal mine 4 66.7") for row in rows)  # the mean of 1 of 3 and 1 of 1, not 2 of 4
     assert browser.texts("#overview h2") == ["mine"]
-    assert browser.texts(".key li")[:2] == ["✓\nsuccess", "S\nstorage failure"]
+    assert browser.texts("#overview .key li")[:2] == ["✓\nsuccess\n4", "S\nstorage failure\n1"]
     chips = browser.texts(".tasks tbody tr:nth-child(2) .chip")
     assert [chip.split()[-1] for chip in chips] == ["67", "33"]
 

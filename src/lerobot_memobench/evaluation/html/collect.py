@@ -5,6 +5,7 @@ Every figure is computed here, by ``evaluation.metrics``; the page only draws an
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +17,7 @@ from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.failures import failure_counts, failure_of
 from lerobot_memobench.evaluation.metrics import Rate, Record, Row, Summary, by_task, mixtures, percent, summarise
+from lerobot_memobench.evaluation.protocol import CARD_FILE, read_card
 from lerobot_memobench.tasks.catalogue import find_tasks, get_task, task_names
 from lerobot_memobench.tasks.failures import FAILURES
 from lerobot_memobench.tasks.formula import format_formula
@@ -29,12 +31,15 @@ OPERATION_NAMES = {"S": "Storage", "U": "Update", "C": "Compression"}
 
 @dataclass(frozen=True)
 class Run:
-    """One evaluation: its name in the report, where it lies, its rollouts, what a reader must know about them."""
+    """One evaluation: its name in the report, where it lies, its rollouts, what a reader must know about them, and its
+    result card ({} where there is none).
+    """
 
     name: str
     folder: Path
     records: list[dict[str, Any]]
     notes: list[str] = field(default_factory=list)
+    card: dict[str, Any] = field(default_factory=dict)
 
 
 def read_runs(folders: Sequence[str | Path]) -> list[Run]:
@@ -45,7 +50,9 @@ def read_runs(folders: Sequence[str | Path]) -> list[Run]:
         records = read_episodes(folder, notes)
         if not records:
             raise MemobenchError(f"{folder} holds no rollout that can be read; run an evaluation first")
-        runs.append(Run(name, Path(folder), records, notes + mixtures(records)))
+        path = Path(folder) / CARD_FILE
+        card = read_card(path) if path.is_file() else {}
+        runs.append(Run(name, Path(folder), records, notes + mixtures(records), card))
     return runs
 
 
@@ -143,7 +150,8 @@ def run_data(run: Run, videos: Mapping[int, str]) -> dict[str, Any]:
     return {
         "name": run.name,
         "folder": str(run.folder),
-        "facts": facts(run.records),
+        "facts": facts(run.records, run.card),
+        "commands": [shlex.join(it["command"]) for it in run.card.get("runs", []) if it.get("command")],
         "notes": run.notes,
         "average": row_data(summary.average),
         "memory_types": {name: row_data(row) for name, row in summary.memory_types.items()},
@@ -152,17 +160,20 @@ def run_data(run: Run, videos: Mapping[int, str]) -> dict[str, Any]:
     }
 
 
-def facts(records: Sequence[Record]) -> list[str]:
-    """Return the protocol in words: rollouts, tasks, seeds, referent, replan interval."""
+def facts(records: Sequence[Record], card: Mapping[str, Any]) -> list[str]:
+    """Return the protocol in words: policy, rollouts, tasks, seeds, referent, replan interval, horizon."""
     seeds = sorted({record["seed"] for record in records if record.get("seed") is not None})
     replans = sorted({record["replan_steps"] for record in records if record.get("replan_steps") is not None})
-    result = [count_of(len(records), "rollout"), count_of(len({record["task"] for record in records}), "task")]
+    policy = card.get("policy", {}).get("type")
+    result = [f"policy {policy}"] if policy else []
+    result += [count_of(len(records), "rollout"), count_of(len({record["task"] for record in records}), "task")]
     if seeds:
         result.append(f"seed {seeds[0]}" if len(seeds) == 1 else f"seeds {seeds[0]} to {seeds[-1]}")
     result.append("referent " + ", ".join(sorted({str(record.get("referent", "fixed")) for record in records})))
     if replans:
         result.append("replan interval " + ", ".join(map(str, replans)))
-    return result
+    horizon = card.get("protocol", {}).get("horizon")
+    return result if horizon is None else [*result, f"horizon {horizon}"]
 
 
 def count_of(number: int, word: str) -> str:

@@ -23,7 +23,7 @@ const detail = {
       this.stage.root,
       this.now,
       this.line.root,
-      el("p", { class: "hint cause" }, episode.outcome === "success" ? "" : `${capital(OUTCOMES[episode.outcome].words)}. ${OUTCOMES[episode.outcome].why}`),
+      el("p", { class: "hint why" }, episode.outcome === "success" ? null : el("b", {}, `${capital(OUTCOMES[episode.outcome].words)}. ${OUTCOMES[episode.outcome].why}`), markLegend()),
       (this.others = el("nav", { class: "others", "aria-label": "The same episode in other runs" })),
       (this.panel = taskPanel(run, episode, chosen.level)),
     );
@@ -142,6 +142,9 @@ function stage(episode, moved) {
   const seek = (frame) => (video.currentTime = (frame + 0.5) / DATA.fps);
   return { root, seek, toggle, stop: () => video.pause() };
 }
+
+const markLegend = () =>
+  el("span", { class: "signs" }, [["hollow", "first held"], ["full", "held in order"]].map(([fill, words]) => el("span", {}, shape("S", fill), ` ${words}`)), el("span", {}, el("span", { class: "sample active op-S" }), " being worked on"), el("span", {}, el("span", { class: "sample open op-S" }), " never completed"));
 
 /** The task in this run: its checkpoints with texts, and how many rollouts got that far. */
 function taskPanel(run, episode, level) {

@@ -109,11 +109,13 @@ function outcomeTable(run) {
   );
 }
 
-const outcomeLegend = () =>
+const outcomeLegend = (counts) =>
   el(
     "ul",
     { class: "key" },
-    Object.entries(OUTCOMES).map(([outcome, { words, why }]) => el("li", { "data-tip": why }, outcomeMark(outcome), words)),
+    Object.entries(OUTCOMES).map(([outcome, { words, why }]) =>
+      el("li", { "data-tip": why }, outcomeMark(outcome), words, counts ? el("b", {}, String(counts[outcome] ?? 0)) : null),
+    ),
   );
 
 /** Each checkpoint with the share of rollouts that completed it and all before it in order. */
@@ -158,12 +160,13 @@ function drawOverview(run, chosen) {
   byId("overview").replaceChildren(
     el("h2", { id: "overview-title" }, run.name),
     el("p", { class: "facts" }, run.facts.map((words) => el("span", {}, words))),
+    run.commands.length ? el("details", {}, el("summary", {}, "How it was run"), run.commands.map((words) => el("pre", {}, el("code", {}, words)))) : "",
     ...run.notes.map((note) => el("p", { class: "notice" }, note)),
     el(
       "div",
       { class: "columns" },
       el("section", {}, el("h3", {}, "Rates"), el("div", { class: "scroll" }, summaryTable(run)), el("p", { class: "hint" }, "Per cent; the line is Wilson’s 95 % interval over n rollouts. A memory type is the mean over its tasks, the average over the memory types, as far as a metric applies.")),
-      el("section", {}, el("h3", {}, "How rollouts end"), outcomeTable(run), outcomeLegend()),
+      el("section", {}, el("h3", {}, "How rollouts end"), outcomeTable(run), outcomeLegend(countOutcomes(run, () => true))),
     ),
     el("h3", {}, "Tasks"),
     ...types.map((type) => tasksTable(run, type, chosen.level)),
