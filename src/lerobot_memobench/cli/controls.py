@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import os
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -9,10 +12,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lerobot_memobench.cli.console import console, progress_bar
-from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks, task_names
+from lerobot_memobench.tasks.task import LEVELS
 
 if TYPE_CHECKING:
+    from lerobot_memobench.evaluation.metrics import Record
     from lerobot_memobench.evaluation.necessity_report import Result
+    from lerobot_memobench.evaluation.tables import Report
 
 
 app = typer.Typer(
@@ -71,4 +78,157 @@ def necessity(
     screen.print(terminal_table(results))
     for path in written:
         screen.print(str(path), soft_wrap=True)
+    return 0
+
+
+# --- controls ---
+
+
+class Paper(StrEnum):
+    """Whose figures are put beside ours."""
+
+    PAPER = "paper"
+
+
+Beside = Annotated[Paper | None, typer.Option("--with", help="paper: the published figures beside ours.")]
+Out = Annotated[Path | None, typer.Option(help="Folder to write the table to, as Markdown, LaTeX and JSON.")]
+Draws = Annotated[int, typer.Option(min=100, help="Bootstrap draws of the intervals.")]
+
+
+@app.command()
+def oracle(
+    standard: Annotated[
+        list[Path], typer.Argument(help="Evaluations of the policy as it is; one per replan interval.")
+    ],
+    oracle: Annotated[
+        list[Path], typer.Option("--oracle", help="Evaluation of the policy with oracle memory text; repeatable.")
+    ],
+    beside: Beside = None,
+    draws: Draws = 2000,
+    out: Out = None,
+) -> int:
+    """Print which share of the gap to 100 % oracle memory closes: what a perfect memory would recover."""
+    from lerobot_memobench.evaluation.controls import contrasts, published_contrasts
+    from lerobot_memobench.evaluation.controls_report import oracle_report
+    from lerobot_memobench.paper import raw_tables
+
+    pairs, notes = _pairs(standard, oracle, ignore=("oracle_memory",))
+    found = {replan: contrasts(a, b, draws) for replan, (a, b) in pairs.items()}
+    published = raw_tables()["oracle_memory"]
+    paper = (published["replan_steps"], published_contrasts(published)) if beside else None
+    return _show(oracle_report(found, paper), notes, "oracle", out)
+
+
+@app.command()
+def shuffled(
+    normal: Annotated[Path, typer.Argument(help="Evaluation of the policy taught with subgoals in order.")],
+    shuffled: Annotated[Path, typer.Argument(help="Evaluation of the policy taught with shuffled subgoals.")],
+    beside: Beside = None,
+    draws: Draws = 2000,
+    out: Out = None,
+) -> int:
+    """Print how far rollouts come with normal and with shuffled memory, checkpoint by checkpoint."""
+    from lerobot_memobench.evaluation.controls import prefix_curves
+    from lerobot_memobench.evaluation.controls_report import shuffled_report
+    from lerobot_memobench.paper import shuffled_control
+
+    pairs, notes = _pairs([normal], [shuffled])
+    found = {replan: prefix_curves(a, b, draws) for replan, (a, b) in pairs.items()}
+    return _show(shuffled_report(found, shuffled_control() if beside else None), notes, "shuffled", out)
+
+
+@app.command()
+def granularity(
+    coarse: Annotated[Path, typer.Option(help="Evaluation of the policy taught with coarse subgoals.")],
+    intermediate: Annotated[Path, typer.Option(help="The same with intermediate subgoals.")],
+    fine: Annotated[Path, typer.Option(help="The same with fine subgoals.")],
+    beside: Beside = None,
+    out: Out = None,
+) -> int:
+    """Print the metrics by the language level of the subgoals that a policy was taught with."""
+    from lerobot_memobench.envs.episode_log import read_episodes
+    from lerobot_memobench.evaluation.controls import by_replan, relabelled
+    from lerobot_memobench.evaluation.controls_report import granularity_report
+
+    folders = dict(zip(LEVELS, (coarse, intermediate, fine), strict=True))
+    for folder in (intermediate, fine):
+        _refuse_unlike([coarse], [folder])
+    notes: list[str] = []
+    levels = {level: read_episodes(folder, notes) for level, folder in folders.items()}
+    for level, records in levels.items():
+        if len(by_replan(records)) > 1:
+            notes.append(f"{folders[level]} mixes replan intervals; its figures are over all of them")
+    own = {}
+    for index, (level, records) in enumerate(levels.items()):
+        labels = {
+            name: [checkpoint.operations_by_level[index] for checkpoint in get_task(name).checkpoints]
+            for name in {record["task"] for record in records} & set(task_names())
+        }
+        own[level] = relabelled(records, labels)
+    return _show(granularity_report(levels, own, paper=bool(beside)), notes, "granularity", out)
+
+
+def _pairs(
+    first: Sequence[Path], second: Sequence[Path], ignore: Sequence[str] = ()
+) -> tuple[dict[int | None, tuple[list[Record], list[Record]]], list[str]]:
+    """Return the paired rollouts of two sets of evaluations by replan interval, and what a reader must know."""
+    from lerobot_memobench.envs.episode_log import read_episodes
+    from lerobot_memobench.evaluation.controls import by_replan, paired
+
+    _refuse_unlike(first, second, ignore)
+    notes: list[str] = []
+    a, b = (
+        by_replan([record for folder in folders for record in read_episodes(folder, notes)])
+        for folders in (first, second)
+    )
+    common = [replan for replan in a if replan in b]
+    if not common:
+        raise MemobenchError(
+            f"the evaluations have no replan interval in common ({', '.join(map(str, a))} and "
+            f"{', '.join(map(str, b))}); evaluate both with the same replan="
+        )
+    for replan in [*a, *b]:
+        if replan not in common:
+            notes.append(f"replan interval {replan} is in one of them only and is left out")
+    found: dict[int | None, tuple[list[Record], list[Record]]] = {}
+    for replan in common:
+        left, right, alone = paired(a[replan], b[replan])
+        found[replan] = (left, right)
+        if alone:
+            notes.append(f"replan interval {replan}: {alone} rollouts have no partner and are left out")
+    return found, notes
+
+
+def _refuse_unlike(first: Sequence[Path], second: Sequence[Path], ignore: Sequence[str] = ()) -> None:
+    """Raise when evaluations differ in more than the policy, the replan interval and what is ignored."""
+    from lerobot_memobench.evaluation.protocol import differences, read_protocol
+
+    reference = read_protocol(first[0])
+    for folder in [*first[1:], *second]:
+        found = differences(reference, read_protocol(folder), ignore=("replan_steps", *ignore))
+        if found:
+            raise MemobenchError(
+                f"{first[0]} and {folder} were evaluated under different protocols ({'; '.join(found)}); evaluate both "
+                "under the same one"
+            )
+
+
+def _show(report: Report, notes: Sequence[str], name: str, out: Path | None) -> int:
+    """Print a report, and write it where asked; return the exit status."""
+    from lerobot_memobench.evaluation.formats import latex, markdown, terminal
+
+    screen = console()
+    screen.print(terminal(report))
+    for note in notes:
+        screen.print(f"note: {note}", markup=False)
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        data = {"title": report.title, "notes": list(notes), **report.data}
+        contents = {"md": markdown(report), "tex": latex(report), "json": json.dumps(data, indent=1) + "\n"}
+        for ending, content in contents.items():
+            path = out / f"{name}.{ending}"
+            draft = path.with_name(path.name + ".part")
+            draft.write_text(content)
+            os.replace(draft, path)
+            screen.print(str(path), soft_wrap=True)
     return 0

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.necessity_study import pictures_path
 
 JSON_FILE, MARKDOWN_FILE, FIGURE_FILE = "necessity.json", "necessity.md", "aliased_pairs.png"
 NOT_APPLICABLE = "–"
@@ -189,8 +190,10 @@ def figure(out: Path, results: Sequence[Result]) -> bytes | None:
 
     shown: list[tuple[Result, Any]] = []
     for result in results:
-        path = out / "pictures" / f"{result['task']}.{result['referent']}.png"
-        if not result["examples"] or not path.is_file():
+        if not result["examples"]:
+            continue
+        path = pictures_path(out, result["task"], result["referent"], result["examples"][0]["seed"])
+        if not path.is_file():
             continue
         if all(_kind(other) != _kind(result) for other, _ in shown):
             shown.append((result, Image.open(path).convert("RGB")))

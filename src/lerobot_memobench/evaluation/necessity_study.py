@@ -1,15 +1,16 @@
-"""Memory necessity of one task, from simulated episodes to a JSON object; resumable per task and referent setting."""
+"""Memory necessity of one task, from simulated episodes to a JSON object; resumable scene by scene."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,6 +28,9 @@ from lerobot_memobench.evaluation.necessity import (
 from lerobot_memobench.evaluation.necessity_search import best_map, best_probabilities
 from lerobot_memobench.tasks.formula import format_formula
 from lerobot_memobench.tasks.task import Task
+
+if TYPE_CHECKING:
+    from lerobot_memobench.sim.simulation import Simulation
 
 VERSION = 1
 """Raised when results change, so that old ones are made again."""
@@ -65,49 +69,31 @@ def variants_of(task: Task, referent: str) -> list[Task]:
 
 
 # --- results on disk ---
+# One file per scene and one per search, so that a killed run goes on, and a run of more scenes uses those there are.
 
 
-def result_path(out: Path, task: Task, referent: str) -> Path:
-    """Return where the result of a task under a referent setting lies."""
-    return out / "results" / f"{task.name}.{referent}.json"
-
-
-def pictures_path(out: Path, task: Task, referent: str) -> Path:
-    """Return where the first aliased pair's pictures lie: a strip of both moments, two cameras each."""
-    return out / "pictures" / f"{task.name}.{referent}.png"
+def pictures_path(out: Path, task: str, referent: str, seed: int) -> Path:
+    """Return where a scene's first aliased pair lies: a strip of both moments, two cameras each."""
+    return out / "pictures" / f"{task}.{referent}.{seed}.png"
 
 
 def fingerprint(task: Task, referent: str, settings: Settings) -> str:
     """Return what a result must carry to be taken for an answer to the same question."""
-    said = json.dumps([VERSION, referent, asdict(settings), task.bddl_text, task.metadata], sort_keys=True)
+    asked = {key: value for key, value in asdict(settings).items() if key not in ("episodes", "seed_base")}
+    said = json.dumps([VERSION, referent, asked, task.bddl_text, task.metadata], sort_keys=True)
     return hashlib.sha256(said.encode()).hexdigest()[:16]
 
 
-def read_result(out: Path, task: Task, referent: str, settings: Settings) -> dict[str, Any] | None:
-    """Return a result that is there and answers this question; None otherwise."""
+def _kept(path: Path, mark: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Return what ``path`` holds if it answers this question, else what ``make`` returns, written there."""
     try:
-        found = json.loads(result_path(out, task, referent).read_text())
+        found = json.loads(path.read_text())
+        if isinstance(found, dict) and found.get("fingerprint") == mark:
+            return found
     except (OSError, ValueError):
-        return None
-    same = isinstance(found, dict) and found.get("fingerprint") == fingerprint(task, referent, settings)
-    return found if same else None
-
-
-def study(task: Task, referent: str, settings: Settings, out: Path) -> dict[str, Any]:
-    """Return the result of a task under a referent setting, from disk or by simulating it."""
-    known = read_result(out, task, referent, settings)
-    if known is not None:
-        return known
-    result, strip = _study(task, referent, settings)
-    path, picture = result_path(out, task, referent), pictures_path(out, task, referent)
+        pass
+    result = {"fingerprint": mark, **make()}
     path.parent.mkdir(parents=True, exist_ok=True)
-    if strip is not None:
-        from PIL import Image
-
-        picture.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(strip).save(picture, optimize=True)
-    else:
-        picture.unlink(missing_ok=True)
     draft = path.with_name(f"{path.name}.{os.getpid()}.part")
     draft.write_text(json.dumps(result, indent=1) + "\n")
     os.replace(draft, path)
@@ -117,41 +103,57 @@ def study(task: Task, referent: str, settings: Settings, out: Path) -> dict[str,
 # --- one task ---
 
 
-def _study(task: Task, referent: str, settings: Settings) -> tuple[dict[str, Any], np.ndarray | None]:
-    from lerobot_memobench.sim.simulation import Simulation
+def study(task: Task, referent: str, settings: Settings, out: Path) -> dict[str, Any]:
+    """Return the result of a task under a referent setting; what is not on disk yet is simulated."""
+    variants, mark = variants_of(task, referent), fingerprint(task, referent, settings)
+    simulation: list[Simulation] = []
 
-    sim, variants = Simulation(task), variants_of(task, referent)
-    scenes, examples, strip, successes = [], [], None, 0
-    for seed in range(settings.seed_base, settings.seed_base + settings.episodes):
-        shown = [decisions.follow(variant, sim, seed, settings.horizon) for variant in variants]
-        successes += sum(demonstration.success for demonstration in shown)
+    def sim() -> Simulation:
+        from lerobot_memobench.sim.simulation import Simulation
+
+        if not simulation:
+            simulation.append(Simulation(task))
+        return simulation[0]
+
+    def observe(seed: int) -> dict[str, Any]:
+        shown = [decisions.follow(variant, sim(), seed, settings.horizon) for variant in variants]
         scene = _Scene(variants, shown, settings.tolerance)
-        scenes.append(scene)
-        found = scene.examples(seed)
-        if strip is None and found:
-            strip = scene.strip()
-        examples += found
-    in_order = _mean_of([scene.ceilings for scene in scenes if scene.histories])
-    result: dict[str, Any] = {
+        strip = scene.strip()
+        if strip is not None:
+            from PIL import Image
+
+            path = pictures_path(out, task.name, referent, seed)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(strip).save(path, optimize=True)
+        return scene.result(seed)
+
+    def search() -> dict[str, Any]:
+        return _any_order(Laboratory(variants, sim(), settings.seed_base), settings)
+
+    stem = out / "results" / f"{task.name}.{referent}"
+    seeds = range(settings.seed_base, settings.seed_base + settings.episodes)
+    scenes = [_kept(stem.with_name(f"{stem.name}.{seed}.json"), mark, partial(observe, seed)) for seed in seeds]
+    in_order = _mean_of([scene["in_order"] for scene in scenes if scene["in_order"]])
+    any_order = None
+    if in_order is not None and in_order["deterministic"] < 1.0 and settings.budget:
+        any_order = _kept(stem.with_name(f"{stem.name}.search.json"), mark, search)
+    solved = max(1, sum(scene["solved"] for scene in scenes))
+    return {
         "task": task.name,
         "memory_type": task.memory_type,
         "referent": referent,
         "settings": asdict(settings),
-        "fingerprint": fingerprint(task, referent, settings),
-        "variants": len(variants),
         "has_variants": task.num_variants > 1,
-        "expert": {"n": len(variants) * settings.episodes, "success": successes},
-        "decisions": sum(len(h) for s in scenes for h in s.histories) / max(1, sum(len(s.histories) for s in scenes)),
-        "aliased": _mean_of([scene.counts for scene in scenes if scene.histories]),
+        "variants": len(variants),
+        "expert": {"n": len(variants) * len(scenes), "success": sum(scene["solved"] for scene in scenes)},
+        "decisions": sum(scene["decisions"] for scene in scenes) / solved,
+        "aliased": _mean_of([scene["aliased"] for scene in scenes if scene["aliased"]]),
         "in_order": in_order,
-        "examples": examples[:EXAMPLES],
-        "largest_same": max((scene.gap[0] for scene in scenes), default=0.0),
-        "smallest_different": min((scene.gap[1] for scene in scenes), default=1.0),
-        "any_order": None,
+        "examples": [example for scene in scenes for example in scene["examples"]][:EXAMPLES],
+        "largest_same": max(scene["largest_same"] for scene in scenes),
+        "smallest_different": min(scene["smallest_different"] for scene in scenes),
+        "any_order": any_order,
     }
-    if in_order is not None and in_order["deterministic"] < 1.0 and settings.budget:
-        result["any_order"] = _any_order(Laboratory(variants, sim, settings.seed_base), settings)
-    return result, strip
 
 
 class _Scene:
@@ -210,8 +212,20 @@ class _Scene:
             if self._pictures[i] == self._pictures[j] and self._moments[i].answer != self._moments[j].answer
         ]
 
-    def examples(self, seed: int) -> list[dict[str, Any]]:
-        """Return the pairs as they are reported."""
+    def result(self, seed: int) -> dict[str, Any]:
+        """Return what is kept of a scene."""
+        return {
+            "seed": seed,
+            "solved": len(self.histories),
+            "decisions": sum(len(history) for history in self.histories),
+            "aliased": self.counts,
+            "in_order": self.ceilings,
+            "examples": self._examples(seed)[:EXAMPLES],
+            "largest_same": self.gap[0],
+            "smallest_different": self.gap[1],
+        }
+
+    def _examples(self, seed: int) -> list[dict[str, Any]]:
         return [
             {
                 "seed": seed,
@@ -230,8 +244,10 @@ class _Scene:
         moment = self._moments[index]
         return {"variant": self._owners[index], "step": moment.step, "answer": moment.answer}
 
-    def strip(self) -> np.ndarray:
-        """Return the pictures of the first pair side by side, (height, 4 × width, 3): cameras of a, cameras of b."""
+    def strip(self) -> np.ndarray | None:
+        """Return the first pair side by side, (height, 4 × width, 3): cameras of a, of b; None without a pair."""
+        if not self._pairs():
+            return None
         i, j = self._pairs()[0]
         return np.concatenate([*self._moments[i].at_home, *self._moments[j].at_home], axis=1)
 
