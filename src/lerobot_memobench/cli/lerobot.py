@@ -47,6 +47,10 @@ def run(words: list[str], say_where: bool = True) -> int:
     name, rest = words[0], split_words(words[1:])
     if name not in commands:
         raise MemobenchError(f"there is no command {name!r}, {nearest(name, commands)}")
+    if name == "train":
+        from lerobot_memobench.cli.recipes import resolve_recipe
+
+        rest = resolve_recipe(rest)
     check_tasks_early(rest)
     orders = take_orders(rest, ["lerobot", *words]) if name == "eval" else None
     try:
@@ -106,6 +110,7 @@ def overview(commands: Sequence[str] | dict[str, Any]) -> str:
             "  lerobot eval env=memobench                                   the scripted expert on all tasks",
             "  lerobot eval env=memobench policy=<checkpoint> tasks=object  a trained policy",
             "  lerobot train policy=memobench_mem align=contrastive dataset=<folder>",
+            "  lerobot train config=train_contrastive dataset=<folder>      the paper's recipe (memobench recipe)",
             "",
             "short forms: policy= env= dataset= align= size= replan= tasks= referent= episodes= batch_size=",
             "device=; any other setting by its full name (policy.optimizer_lr=1e-4), as listed by",

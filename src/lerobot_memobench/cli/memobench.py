@@ -16,9 +16,10 @@ from typing import Annotated, Any
 
 import typer
 
-from lerobot_memobench.cli import controls, data, html, merging
-from lerobot_memobench.cli.study import study
+from lerobot_memobench.cli import controls, data, html, merging, report
 from lerobot_memobench.cli.console import console
+from lerobot_memobench.cli.recipes import recipe
+from lerobot_memobench.cli.study import study
 from lerobot_memobench.errors import MemobenchError
 
 USAGE_ERROR = 2
@@ -174,28 +175,14 @@ app.command()(data.convert)
 app.command()(data.validate)
 app.command()(data.describe)
 app.command()(data.push)
+app.command()(recipe)
 app.command()(study)
 
 
 # --- reports ---
 
 
-@app.command()
-def report(
-    folders: Annotated[list[Path], typer.Argument(help="Folders that evaluations have written.")],
-) -> None:
-    """Print SR, MSR, MUR and MCR of evaluations; write report.json and report.md into each folder."""
-    from lerobot_memobench.evaluation.report import failure_line, table, write_report
-
-    out = console()
-    for folder in folders:
-        summary, notes = write_report(folder)
-        out.print(table(summary, title=str(folder) if len(folders) > 1 else None))
-        out.print(failure_line(summary))
-        for note in notes:
-            out.print(f"note: {note}")
-
-
+app.command()(report.report)
 app.command()(html.html)
 app.command()(controls.necessity)
 app.add_typer(controls.app, name="controls")
