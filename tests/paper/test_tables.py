@@ -1,4 +1,4 @@
-"""The paper's tables as shipped: the same as those that were handed over, and consistent with themselves and the text."""
+"""The paper's tables as shipped: the same as those handed over, and consistent with themselves and with the text."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_demonstration_statistics_add_up() -> None:
     assert sum(f.storage for f in families) == pytest.approx(total.storage, abs=0.01)
     for family in families:
         assert family.mean == pytest.approx(family.steps / family.episodes, abs=0.1)
-    assert list(LENGTH_BUCKETS)[0] == (0, 200)
+    assert next(iter(LENGTH_BUCKETS)) == (0, 200)
     assert list(LENGTH_BUCKETS)[-1] == (1500, None)
 
 

@@ -27,24 +27,32 @@ class Rate:
     """A rate and how many rollouts it rests on.
 
     Attributes:
-        value: fraction in [0, 1]; None when not applicable. n: rollouts. Checkpoints of one rollout depend on
-            one another, so rollouts, not checkpoints, are counted, which
+        value: fraction in [0, 1]; None when not applicable.
+        n: rollouts. Checkpoints of one rollout depend on one another, so rollouts, not checkpoints, are counted, which
             makes the interval the wider one.
+        effective: of a mean of rates, the number of rollouts of a plain rate with the same standard error; None where
+            it is n.
     """
 
     value: float | None
     n: int
+    effective: float | None = None
+
+    @property
+    def trials(self) -> float:
+        """The number of trials that the interval is computed with."""
+        return self.n if self.effective is None else self.effective
 
     @property
     def interval(self) -> tuple[float, float] | None:
         """Wilson's 95 % interval."""
-        return None if self.value is None else wilson(self.value, self.n)
+        return None if self.value is None else wilson(self.value, self.trials)
 
 
 Row = dict[str, Rate]
 
 
-def wilson(rate: float, n: int, z: float = 1.959963984540054) -> tuple[float, float]:
+def wilson(rate: float, n: float, z: float = 1.959963984540054) -> tuple[float, float]:
     """Return the Wilson score interval of a rate over ``n`` trials (95 % by default), within [0, 1]."""
     if n < 1 or not 0.0 <= rate <= 1.0:
         raise MemobenchError(f"a Wilson interval needs a rate in [0, 1] over at least one trial, got {rate} over {n}")
@@ -126,12 +134,25 @@ def task_row(records: Sequence[Record]) -> Row:
 def mean_row(rows: Iterable[Row]) -> Row:
     """Return the mean of several rows, metric by metric, over those to which the metric applies."""
     rows = list(rows)
-    result: Row = {}
-    for metric in METRICS:
-        rates = [row[metric] for row in rows if row[metric].value is not None]
-        values = [rate.value for rate in rates if rate.value is not None]
-        result[metric] = Rate(sum(values) / len(values), sum(rate.n for rate in rates)) if values else Rate(None, 0)
-    return result
+    return {metric: mean_rate([row[metric] for row in rows]) for metric in METRICS}
+
+
+def mean_rate(rates: Iterable[Rate]) -> Rate:
+    """Return the mean of the applicable rates, each of the same weight whatever its n.
+
+    A mean of m rates over n₁ … n_m rollouts has the variance p(1 − p) · Σ 1/(m² n_i) where they share p, which is that
+    of a plain rate over m² / Σ 1/n_i rollouts. With equal n_i this is their sum.
+    """
+    applicable = [rate for rate in rates if rate.value is not None]
+    if not applicable:
+        return Rate(None, 0)
+    count, n = len(applicable), sum(rate.n for rate in applicable)
+    mean = sum(rate.value for rate in applicable if rate.value is not None) / count
+    trials = [rate.trials for rate in applicable]
+    if 0 in trials:  # rates without rollouts, such as the paper's
+        return Rate(mean, n)
+    effective = count * count / sum(1 / each for each in trials)
+    return Rate(mean, n, None if math.isclose(effective, n) else effective)
 
 
 @dataclass(frozen=True)
@@ -139,23 +160,33 @@ class Summary:
     """All figures of a set of rollouts.
 
     Attributes:
-        tasks, memory_types: name -> metrics; a memory type is the mean over its applicable tasks. average:
-            mean over the applicable memory types. pooled: MSR, MUR, MCR over all checkpoint records of the
-            operation, whatever the task. prefix, ordered_prefix: task -> per checkpoint the rate of rollouts
-            in which it and all earlier ones were
+        tasks, memory_types: name -> metrics; a memory type is the mean over its applicable tasks.
+        average: mean over the applicable memory types.
+        pooled: MSR, MUR, MCR over all checkpoint records of the operation, whatever the task; n counts records.
+        pooled_checkpoints: the same over all checkpoint records, whatever the operation.
+        prefix, ordered_prefix: task -> per checkpoint the rate of rollouts in which it and all earlier ones were
             satisfied, in any order and in order.
         failures: class -> number of failed rollouts.
+        failures_of: the same by task.
         memory_type_of: task -> memory type.
+        operations_of: task -> its checkpoints' labels, such as "SUU".
     """
 
     tasks: dict[str, Row]
     memory_types: dict[str, Row]
     average: Row
     pooled: Row
+    pooled_checkpoints: Rate
     prefix: dict[str, list[Rate]]
     ordered_prefix: dict[str, list[Rate]]
     failures: dict[str, int]
+    failures_of: dict[str, dict[str, int]]
     memory_type_of: dict[str, str]
+    operations_of: dict[str, str]
+
+    @property
+    def rollouts(self) -> int:
+        return self.pooled["SR"].n
 
 
 def summarise(records: Iterable[Record]) -> Summary:
@@ -176,29 +207,34 @@ def summarise(records: Iterable[Record]) -> Summary:
         memory_types=memory_types,
         average=mean_row(memory_types.values()),
         pooled=pooled_row(records),
+        pooled_checkpoints=_pooled(records, "SUC"),
         prefix={name: _column_rates([prefix(satisfied(r)) for r in group]) for name, group in groups.items()},
         ordered_prefix={
             name: _column_rates([prefix(completed_in_order(r)) for r in group]) for name, group in groups.items()
         },
         failures=failure_counts(records),
+        failures_of={name: failure_counts(group) for name, group in groups.items()},
         memory_type_of=memory_type_of,
+        operations_of={name: _operations(group[0]) for name, group in groups.items()},
     )
 
 
 def pooled_row(records: Sequence[Record]) -> Row:
     """Return SR over all rollouts, and MSR, MUR, MCR over all checkpoint records of the operation."""
     row = {"SR": Rate(sum(bool(record["success"]) for record in records) / len(records), len(records))}
-    for metric, operation in METRICS.items():
-        if operation is None:
-            continue
-        values = [
-            done
-            for record in records
-            for checkpoint, done in zip(record["checkpoints"], satisfied(record), strict=True)
-            if checkpoint["operation"] == operation
-        ]
-        row[metric] = Rate(sum(values) / len(values) if values else None, len(values))
+    row |= {metric: _pooled(records, operation) for metric, operation in METRICS.items() if operation is not None}
     return row
+
+
+def _pooled(records: Sequence[Record], operations: str) -> Rate:
+    """Return the share of the checkpoint records of some operations that were satisfied; n counts records."""
+    values = [
+        done
+        for record in records
+        for checkpoint, done in zip(record["checkpoints"], satisfied(record), strict=True)
+        if checkpoint["operation"] in operations
+    ]
+    return Rate(sum(values) / len(values) if values else None, len(values))
 
 
 def _column_rates(rows: Sequence[Sequence[bool]]) -> list[Rate]:

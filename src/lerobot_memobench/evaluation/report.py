@@ -1,16 +1,23 @@
-"""The report of an evaluation: a table for the terminal, Markdown for people, JSON for programs."""
+"""The report of evaluations: for the terminal, Markdown, CSV, LaTeX, and JSON for programs.
+
+``report.json`` beside an evaluation's log holds exactly the keys of the benchmark's specification. As JSON among the
+formats the same keys stand with more beside them: intervals, prefix completion in order, pooled rates, protocol.
+"""
 
 from __future__ import annotations
 
 import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace as replace_fields
 from pathlib import Path
 from typing import Any
 
-from rich.table import Table
+from rich.table import Table as RichTable
 
 from lerobot_memobench.envs.episode_log import read_episodes, write_episodes
+from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.evaluation import formats, sections
 from lerobot_memobench.evaluation.metrics import (
     METRICS,
     Rate,
@@ -22,19 +29,46 @@ from lerobot_memobench.evaluation.metrics import (
     report,
     summarise,
 )
+from lerobot_memobench.evaluation.protocol import POLICY
+from lerobot_memobench.evaluation.runs import Run, sweeps
+from lerobot_memobench.evaluation.sections import failure_line
+from lerobot_memobench.evaluation.tables import Report, Section
+from lerobot_memobench.paper import published_rows
+
+__all__ = [
+    "FILES",
+    "REPORT_JSON",
+    "REPORT_MARKDOWN",
+    "build",
+    "failure_line",
+    "markdown",
+    "render",
+    "table",
+    "write_documents",
+    "write_report",
+]
 
 REPORT_JSON = "report.json"
 REPORT_MARKDOWN = "report.md"
-NOT_APPLICABLE = "–"
+
+FILES: dict[str, str] = {
+    "table": "report.txt",
+    "markdown": REPORT_MARKDOWN,
+    "csv": "report.csv",
+    "latex": "report.tex",
+    "json": REPORT_JSON,
+}
+"""Format -> file that it is written to."""
+
+
+# --- beside the log ---
 
 
 def write_report(directory: str | Path, episodes: int | None = None) -> tuple[Summary, list[str]]:
-    """Read the log under ``directory`` and write ``episodes.jsonl``, ``report.json`` and ``report.md`` into
-    it.
+    """Read the log under ``directory`` and write ``episodes.jsonl``, ``report.json`` and ``report.md`` into it.
 
     Args:
-        episodes: report episodes 0 to ``episodes`` − 1 of each task; None for all. LeRobot runs whole
-            batches, so its
+        episodes: report episodes 0 to ``episodes`` − 1 of each task; None for all. LeRobot runs whole batches, so its
             last one may hold more than were asked for.
 
     Returns:
@@ -48,131 +82,239 @@ def write_report(directory: str | Path, episodes: int | None = None) -> tuple[Su
     summary = summarise(records)
     notes += mixtures(records)
     write_episodes(directory, records)
-    _replace(directory / REPORT_JSON, json.dumps(report(summary), indent=2) + "\n")
-    _replace(directory / REPORT_MARKDOWN, markdown(summary, records, notes))
+    put(directory / REPORT_JSON, json.dumps(report(summary), indent=2) + "\n")
+    put(directory / REPORT_MARKDOWN, markdown(summary, records, notes))
     return summary, notes
 
 
-def _replace(path: Path, text: str) -> None:
-    draft = path.with_name(path.name + ".part")
-    draft.write_text(text)
+def put(path: Path, content: str | bytes) -> Path:
+    """Write a file whole or not at all."""
+    draft = path.with_name(f".{path.name}.part")
+    draft.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
     os.replace(draft, path)
+    return path
 
 
-# --- terminal ---
-
-
-def table(summary: Summary, title: str | None = None) -> Table:
-    """Return the table of SR, MSR, MUR, MCR per task, memory type and on average, in per cent."""
-    result = Table(title=title, title_justify="left", header_style="bold", pad_edge=False)
-    result.add_column("task", overflow="fold")
-    result.add_column("n", justify="right")
-    for metric in METRICS:
-        result.add_column(metric, justify="right")
-    for memory_type, row in summary.memory_types.items():
-        names = [name for name, its_type in summary.memory_type_of.items() if its_type == memory_type]
-        for name in names:
-            result.add_row(name, *_cells(summary.tasks[name]))
-        result.add_row(f"[bold]{memory_type}[/bold] ({_count(len(names), 'task')})", *_cells(row, "[bold]", "[/bold]"))
-        result.add_section()
-    result.add_row("[bold]average of memory types[/bold]", *_cells(summary.average, "[bold]", "[/bold]"))
-    return result
-
-
-def _count(number: int, word: str) -> str:
-    return f"{number} {word}" + ("" if number == 1 else "s")
-
-
-def _cells(row: Row, before: str = "", after: str = "") -> list[str]:
-    return [str(row["SR"].n), *(f"{before}{_figure(row[metric])}{after}" for metric in METRICS)]
-
-
-def _figure(rate: Rate) -> str:
-    value = percent(rate.value)
-    return NOT_APPLICABLE if value is None else f"{value:.1f}"
-
-
-def failure_line(summary: Summary) -> str:
-    """Return the failures in one line, for under the table."""
-    failed = {name: count for name, count in summary.failures.items() if count}
-    if not failed:
-        return "no failed rollouts"
-    return "failed rollouts: " + ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in failed.items())
-
-
-# --- Markdown ---
+def table(summary: Summary, title: str | None = None) -> RichTable:
+    """Return the table of SR, MSR, MUR, MCR per task, memory type and on average, for the terminal."""
+    found = formats.terminal_table(sections.rates(summary))
+    found.title = title
+    return found
 
 
 def markdown(summary: Summary, records: Iterable[Record], notes: Sequence[str] = ()) -> str:
-    """Return the report as Markdown, with Wilson intervals."""
-    records = list(records)
-    lines = ["# Evaluation report", "", _protocol_sentence(records), ""]
-    lines += [f"> {note}\n" for note in notes]
-    lines += [
-        "SR is success, MSR, MUR and MCR the rates at which checkpoints of Storage, Update and Compression",
-        "were satisfied at some step. Per cent, with the Wilson 95 % interval over n rollouts; – is not",
-        "applicable.",
-        "",
-    ]
-    lines += _rate_table("memory type", {**summary.memory_types, "**average**": summary.average})
-    lines += ["", "## Tasks", ""]
-    lines += _rate_table("task", {f"`{name}`": row for name, row in summary.tasks.items()})
-    pooled = ", ".join(
-        f"{metric} {_figure(summary.pooled[metric])} (n = {summary.pooled[metric].n})"
-        for metric in METRICS
-        if summary.pooled[metric].value is not None
+    """Return the report of one evaluation as Markdown."""
+    section = _section("", summary, list(records), notes)
+    return formats.markdown(Report("Evaluation report", (section,)))
+
+
+# --- documents ---
+
+
+def build(runs: Sequence[Run], paper: bool = False) -> Report:
+    """Return the report of one or several evaluations.
+
+    Args:
+        paper: stand the published figures beside.
+    """
+    found = []
+    if len(runs) > 1:
+        found.append(Section("Evaluations", (sections.overview(runs),)))
+    found += [sections.sweep(method, group) for method, group in sweeps(runs).items()]
+    for run in runs:
+        section = _section("", run.summary, run.records, run.notes)
+        if len(runs) > 1:
+            section = replace_fields(
+                section, title=run.name, sentences=(f"Evaluation in {run.folder}.", *section.sentences)
+            )
+        found.append(section)
+    if paper:
+        found.append(sections.beside_paper(runs))
+    return Report("Evaluation report", tuple(found), _data(runs, paper))
+
+
+def _section(title: str, summary: Summary, records: Sequence[Record], notes: Sequence[str]) -> Section:
+    return Section(
+        title,
+        (
+            sections.memory_types(summary),
+            sections.tasks(summary),
+            sections.prefix(summary),
+            sections.failures(summary),
+        ),
+        (sections.protocol_sentence(records), sections.pooled_sentence(summary)),
+        tuple(notes),
     )
-    lines += ["", f"Pooled over all rollouts and checkpoint records: {pooled}."]
-    lines += ["", "## Prefix completion", ""]
-    lines += [
-        "Rollouts in which a checkpoint and all before it were satisfied, in any order / in order, per cent.",
-        "",
+
+
+def render(found: Report, runs: Sequence[Run], format_: str, paper: bool = False) -> str:
+    """Return a report in one of the formats of ``FILES``."""
+    if format_ == "table":
+        return formats.text(found)
+    if format_ == "markdown":
+        return formats.markdown(found)
+    if format_ == "latex":
+        return formats.latex(_unique_keys(found))
+    if format_ == "json":
+        return json.dumps(found.data, indent=2) + "\n"
+    if format_ == "csv":
+        return formats.csv_text(_csv_rows(runs, paper), CSV_HEADER)
+    raise MemobenchError(f"found the format {format_!r}, {nearest(format_, FILES)}")
+
+
+def write_documents(runs: Sequence[Run], out: Path, wanted: Sequence[str], paper: bool = False) -> list[Path]:
+    """Write a report of evaluations into a folder in the formats wanted; return the files."""
+    found = build(runs, paper)
+    if out.exists() and not out.is_dir():
+        raise MemobenchError(f"--out {out} is a file; name a folder")
+    out.mkdir(parents=True, exist_ok=True)
+    return [put(out / FILES[name], render(found, runs, name, paper)) for name in wanted]
+
+
+def _unique_keys(found: Report) -> Report:
+    """Number the labels of tables that stand in several sections."""
+    if len(found.sections) < 2:
+        return found
+    numbered = [
+        replace_fields(
+            section,
+            tables=tuple(
+                replace_fields(
+                    each,
+                    key=f"{each.key}-{number}",
+                    title=f"{each.title}: {section.title}" if _repeats(each.key) and section.title else each.title,
+                )
+                for each in section.tables
+            ),
+        )
+        for number, section in enumerate(found.sections, start=1)
     ]
-    lines += _prefix_table(summary)
-    lines += ["", "## Failures", "", "| class | rollouts |", "|---|---:|"]
-    lines += [f"| {name.replace('_', ' ')} | {count} |" for name, count in summary.failures.items()]
-    return "\n".join(lines) + "\n"
+    return replace_fields(found, sections=tuple(numbered))
 
 
-def _protocol_sentence(records: Sequence[Mapping[str, Any]]) -> str:
-    seeds = sorted({record["seed"] for record in records if record.get("seed") is not None})
-    referents = sorted({str(record.get("referent", "fixed")) for record in records})
-    replans = sorted({str(r["replan_steps"]) for r in records if r.get("replan_steps") is not None})
-    tasks = {record["task"] for record in records}
-    parts = [f"{_count(len(records), 'rollout')} of {_count(len(tasks), 'task')}"]
-    if seeds:
-        parts.append(f"seeds {seeds[0]} to {seeds[-1]}" if len(seeds) > 1 else f"seed {seeds[0]}")
-    parts.append(f"referent {', '.join(referents)}")
-    if replans:
-        parts.append(f"replan interval {', '.join(replans)}")
-    return ", ".join(parts) + "."
+def _repeats(key: str) -> bool:
+    """Whether a table stands in the section of every evaluation."""
+    return key in ("memory-types", "tasks", "prefix", "failures")
 
 
-def _rate_table(first: str, rows: Mapping[str, Row]) -> list[str]:
-    lines = [
-        f"| {first} | n | " + " | ".join(METRICS) + " |",
-        "|---|---:|" + "---:|" * len(METRICS),
+# --- JSON ---
+
+
+def _data(runs: Sequence[Run], paper: bool) -> dict[str, Any]:
+    found: dict[str, Any]
+    if len(runs) == 1:
+        found = run_data(runs[0])
+    else:
+        found = {"evaluations": {run.name: run_data(run) for run in runs}}
+    if swept := sweeps(runs):
+        found["replan_sweep"] = {method: _sweep_data(group) for method, group in swept.items()}
+    if paper:
+        found["paper"] = [
+            {
+                "table": row.table,
+                "model": row.model,
+                "replan_steps": row.replan_steps,
+                "memory_types": {name: dict(figures) for name, figures in row.memory_types.items()},
+                "average": dict(row.average),
+            }
+            for row in published_rows()
+        ]
+    return found
+
+
+def run_data(run: Run) -> dict[str, Any]:
+    """Return the figures of one evaluation: the keys of ``report.json``, and more beside them."""
+    summary = run.summary
+    policy = run.protocol.get(POLICY) or {}
+    return {
+        **report(summary),
+        "name": run.name,
+        "method": run.method,
+        "replan_steps": run.replan_steps,
+        "protocol": {key: value for key, value in run.protocol.items() if key != POLICY},
+        "policy": {key: policy.get(key) for key in ("type", "sha256", "seed")},
+        "intervals": {
+            "tasks": {name: _intervals(row) for name, row in summary.tasks.items()},
+            "memory_types": {name: _intervals(row) for name, row in summary.memory_types.items()},
+            "average": _intervals(summary.average),
+        },
+        "ordered_prefix": {
+            name: [percent(rate.value) for rate in rates] for name, rates in summary.ordered_prefix.items()
+        },
+        "pooled": {
+            "checkpoints": _pooled(summary.pooled_checkpoints),
+            **{metric: _pooled(rate) for metric, rate in summary.pooled.items()},
+        },
+        "failures_by_task": {name: dict(counts) for name, counts in summary.failures_of.items()},
+        "notes": list(run.notes),
+    }
+
+
+def _intervals(row: Row) -> dict[str, list[float | None] | None]:
+    return {metric: _interval(row[metric]) for metric in METRICS}
+
+
+def _interval(rate: Rate) -> list[float | None] | None:
+    interval = rate.interval if rate.trials else None
+    return None if interval is None else [percent(bound) for bound in interval]
+
+
+def _pooled(rate: Rate) -> dict[str, Any]:
+    return {"percent": percent(rate.value), "n": rate.n}
+
+
+def _sweep_data(runs: Sequence[Run]) -> dict[str, Any]:
+    return {
+        "best": {metric: sections.best_interval(runs, metric)[0] for metric in METRICS},
+        "average": {
+            str(run.replan_steps): {metric: percent(run.summary.average[metric].value) for metric in METRICS}
+            for run in runs
+        },
+    }
+
+
+# --- CSV ---
+
+CSV_HEADER = ("evaluation", "replan_steps", "table", "name", "figure", "percent", "low", "high", "n")
+"""One figure a row: ``table`` is tasks, memory_types, average, pooled, prefix, ordered_prefix or failures."""
+
+
+def _csv_rows(runs: Sequence[Run], paper: bool) -> list[tuple[object, ...]]:
+    rows: list[tuple[object, ...]] = []
+    for run in runs:
+        for place, name, figure, rate in _figures(run.summary):
+            # Records of one rollout are not independent: an interval over them would be too narrow.
+            interval = None if place == "pooled" and figure != "SR" else _interval(rate)
+            low, high = interval or (None, None)
+            rows.append(
+                (run.name, run.replan_steps, place, name, figure, percent(rate.value), low, high, rate.n or None)
+            )
+    if paper:
+        for published in published_rows():
+            name = f"paper, {published.table}: {published.model}"
+            groups: list[tuple[str, str, Mapping[str, float | None]]] = [
+                *(("memory_types", key, figures) for key, figures in published.memory_types.items()),
+                ("average", "", published.average),
+            ]
+            rows += [
+                (name, published.replan_steps, place, key, metric, figures[metric], None, None, None)
+                for place, key, figures in groups
+                for metric in METRICS
+            ]
+    return rows
+
+
+def _figures(summary: Summary) -> list[tuple[str, str, str, Rate]]:
+    """Return (table, name, figure, rate) of everything in a summary."""
+    found = [("tasks", name, metric, row[metric]) for name, row in summary.tasks.items() for metric in METRICS]
+    found += [
+        ("memory_types", name, metric, row[metric]) for name, row in summary.memory_types.items() for metric in METRICS
     ]
-    for name, row in rows.items():
-        lines.append(f"| {name} | {row['SR'].n} | " + " | ".join(_with_interval(row[m]) for m in METRICS) + " |")
-    return lines
-
-
-def _with_interval(rate: Rate) -> str:
-    if rate.value is None or rate.interval is None:
-        return NOT_APPLICABLE
-    low, high = (percent(bound) for bound in rate.interval)
-    return f"{_figure(rate)} [{low:.1f}, {high:.1f}]"
-
-
-def _prefix_table(summary: Summary) -> list[str]:
-    width = max(len(rates) for rates in summary.prefix.values())
-    lines = [
-        "| task | " + " | ".join(f"c{k + 1}" for k in range(width)) + " |",
-        "|---|" + "---:|" * width,
-    ]
-    for name, rates in summary.prefix.items():
-        ordered = summary.ordered_prefix[name]
-        cells = [f"{_figure(a)} / {_figure(b)}" for a, b in zip(rates, ordered, strict=True)]
-        lines.append(f"| `{name}` | " + " | ".join(cells + [""] * (width - len(cells))) + " |")
-    return lines
+    found += [("average", "", metric, summary.average[metric]) for metric in METRICS]
+    found += [("pooled", "", metric, rate) for metric, rate in summary.pooled.items()]
+    found.append(("pooled", "", "checkpoints", summary.pooled_checkpoints))
+    for place, rates in (("prefix", summary.prefix), ("ordered_prefix", summary.ordered_prefix)):
+        found += [(place, name, f"c{k + 1}", rate) for name, row in rates.items() for k, rate in enumerate(row)]
+    total = summary.rollouts
+    found += [("failures", "", name, Rate(count / total, total)) for name, count in summary.failures.items()]
+    return found

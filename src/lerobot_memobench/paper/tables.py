@@ -113,7 +113,8 @@ class AgreementFigures:
 
     Attributes:
         confusion: released label -> pooled decisions of the raters for S, U, C.
-        exact, majority, pooled: (agreeing, of) templates, templates, decisions. per_rater: shares, in the paper's order.
+        exact, majority, pooled: (agreeing, of) templates, templates, decisions.
+        per_rater: shares, in the paper's order.
     """
 
     confusion: Mapping[str, tuple[int, int, int]]
