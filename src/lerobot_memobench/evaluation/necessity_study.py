@@ -77,9 +77,12 @@ def pictures_path(out: Path, task: str, referent: str, seed: int) -> Path:
     return out / "pictures" / f"{task}.{referent}.{seed}.png"
 
 
-def fingerprint(task: Task, referent: str, settings: Settings) -> str:
-    """Return what a result must carry to be taken for an answer to the same question."""
-    asked = {key: value for key, value in asdict(settings).items() if key not in ("episodes", "seed_base")}
+def fingerprint(task: Task, referent: str, settings: Settings, search: bool = False) -> str:
+    """Return what a scene's result, or that of the search, must carry to be an answer to the same question."""
+    other = ("episodes", "seed_base") if search else ("episodes", "seed_base", "budget")
+    asked = {key: value for key, value in asdict(settings).items() if key not in other}
+    if search:
+        asked["seed"] = settings.seed_base
     said = json.dumps([VERSION, referent, asked, task.bddl_text, task.metadata], sort_keys=True)
     return hashlib.sha256(said.encode()).hexdigest()[:16]
 
@@ -136,7 +139,8 @@ def study(task: Task, referent: str, settings: Settings, out: Path) -> dict[str,
     in_order = _mean_of([scene["in_order"] for scene in scenes if scene["in_order"]])
     any_order = None
     if in_order is not None and in_order["deterministic"] < 1.0 and settings.budget:
-        any_order = _kept(stem.with_name(f"{stem.name}.search.json"), mark, search)
+        found = fingerprint(task, referent, settings, search=True)
+        any_order = _kept(stem.with_name(f"{stem.name}.search.json"), found, search)
     solved = max(1, sum(scene["solved"] for scene in scenes))
     return {
         "task": task.name,
