@@ -1,0 +1,195 @@
+"""An evaluation killed twenty times and gone on with ends as one that nobody disturbed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import av
+import pytest
+
+from lerobot_memobench.envs.episode_log import has_log, read_episodes
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(3 * 3600)]
+
+TASKS = "turn_on_the_stove_and_turn_it_off,check_the_top_drawer_of_the_cabinet"
+KILLS = 20
+COMMON = ["env=memobench", f"tasks={TASKS}", "env.render=fast", "env.videos=true", "batch_size=2", "policy.device=cpu"]
+COMMON += ["eval.use_async_envs=false"]  # rows in one process: workers would start for longer than an episode lasts
+
+#: Within the horizon the expert reaches the stove's first checkpoint in some episodes. The random policy draws from a
+#: generator of its own; what it drew shows in the films.
+EXPERT = ["episodes=6", "horizon=70", "env.render_every=10"]
+RANDOM = ["policy=memobench_random", "episodes=6", "horizon=40"]
+
+#: The command in processes that are forked from one that has imported LeRobot, which takes longer than an episode. A
+#: line is a folder for the messages and the words of the command; the answer is the process's number.
+SERVER = """
+import json, os, signal, sys, traceback
+import lerobot.scripts.lerobot_eval, lerobot_memobench.envs.memobench_env, lerobot_memobench.datasets.generation
+from lerobot_memobench.cli.lerobot import main
+signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+for line in sys.stdin:
+    order = json.loads(line)
+    if "wait" in order:
+        found, status = os.waitpid(order["wait"], os.WNOHANG)
+        print(json.dumps(os.waitstatus_to_exitcode(status) if found else None), flush=True)
+        continue
+    pid = os.fork()
+    if pid == 0:
+        os.setsid()
+        messages = os.open(order["messages"], os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+        for stream in (1, 2):
+            os.dup2(messages, stream)
+        try:
+            os._exit(main(order["words"]))
+        except BaseException:
+            traceback.print_exc()
+            os._exit(70)
+    print(pid, flush=True)
+"""
+
+
+class Run:
+    """One start of the command."""
+
+    def __init__(self, server: subprocess.Popen[str], pid: int) -> None:
+        self.server, self.pid, self.status = server, pid, None
+
+    def poll(self) -> int | None:
+        """Exit status, None while it runs; negative for the signal that ended it."""
+        if self.status is None:
+            self.status = ask(self.server, {"wait": self.pid})
+        return self.status
+
+    def wait(self) -> int:
+        while self.poll() is None:
+            time.sleep(0.05)
+        assert self.status is not None
+        return self.status
+
+    def kill(self) -> None:
+        os.kill(self.pid, signal.SIGKILL)
+        assert self.wait() == -signal.SIGKILL
+
+
+def ask(server: subprocess.Popen[str], order: dict[str, Any]) -> Any:
+    assert server.stdin is not None
+    assert server.stdout is not None
+    server.stdin.write(json.dumps(order) + "\n")
+    server.stdin.flush()
+    return json.loads(server.stdout.readline())
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[subprocess.Popen[str]]:
+    with subprocess.Popen(
+        [sys.executable, "-c", SERVER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        yield process
+        assert process.stdin is not None
+        process.stdin.close()
+
+
+def start(server: subprocess.Popen[str], out: Path, settings: list[str], resume: bool = True) -> Run:
+    words = ["eval", *COMMON, *settings, f"output_dir={out}", *(["resume=true"] if resume else [])]
+    return Run(server, ask(server, {"words": words, "messages": str(out.with_suffix(".txt"))}))
+
+
+def episodes_in(out: Path) -> int:
+    return len(read_episodes(out)) if has_log(out) else 0
+
+
+def kill_sometime(process: Run, out: Path, rng: random.Random, run_s: float) -> bool:
+    """Kill a run at a random moment; return whether there still was one.
+
+    A third of the kills fall anywhere in the time that an undisturbed run takes, the others soon after an episode has
+    ended, where the writing is.
+    """
+    before = episodes_in(out)
+    if rng.random() < 1 / 3:
+        deadline = time.monotonic() + rng.uniform(0, run_s)
+    else:
+        while process.poll() is None and episodes_in(out) == before:
+            time.sleep(0.01)
+        deadline = time.monotonic() + rng.choice([0, rng.uniform(0, 0.1), rng.uniform(0, run_s / 4)])
+    while process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    if process.poll() is not None:
+        return False
+    process.kill()
+    return True
+
+
+def comparable(out: Path) -> list[dict[str, Any]]:
+    problems: list[str] = []
+    records = read_episodes(out, problems)
+    assert not problems
+    return [{key: value for key, value in record.items() if key != "wall_s"} for record in records]
+
+
+def film_hashes(out: Path) -> dict[str, str]:
+    """Film -> hash of its frames."""
+    found = {}
+    for path in sorted((out / "videos").glob("*.mp4")):
+        digest = hashlib.sha256()
+        with av.open(str(path)) as container:
+            for frame in container.decode(video=0):
+                digest.update(frame.to_ndarray(format="rgb24").tobytes())
+        found[path.name] = digest.hexdigest()
+    return found
+
+
+@pytest.mark.parametrize("settings", [EXPERT, RANDOM], ids=["expert", "random"])
+def test_killed_and_gone_on_with(server: subprocess.Popen[str], tmp_path: Path, settings: list[str]) -> None:
+    undisturbed, killed = tmp_path / "undisturbed", tmp_path / "killed"
+    began = time.monotonic()
+    assert start(server, undisturbed, settings, resume=False).wait() == 0
+    run_s = time.monotonic() - began
+    reference = comparable(undisturbed)
+
+    rng = random.Random(f"{settings}")
+    kills, history = 0, []
+    while kills < KILLS:
+        process = start(server, killed, settings)
+        if not kill_sometime(process, killed, rng, run_s):
+            assert process.wait() == 0
+            assert len(comparable(killed)) == len(reference)
+            # All was done: take some episodes away, as if the disk had been lost at an earlier kill.
+            forget(killed, rng.sample(range(len(reference)), len(reference) // 2))
+            continue
+        kills += 1
+        history.append(episodes_in(killed))
+        print(kills, history[-1], flush=True)
+    assert start(server, killed, settings).wait() == 0
+
+    print(f"{kills} kills of runs that take {run_s:.0f} s; episodes in the log after each: {history}")
+    assert comparable(killed) == reference
+    assert film_hashes(killed) == film_hashes(undisturbed)
+    report = json.loads((killed / "report.json").read_text())
+    assert report == json.loads((undisturbed / "report.json").read_text())
+    assert (
+        json.loads((killed / "card.json").read_text())["episodes"]
+        == json.loads((undisturbed / "card.json").read_text())["episodes"]
+    )
+    assert not [path for path in killed.rglob("*") if path.name.endswith(".part")]
+
+
+def forget(out: Path, numbers: list[int]) -> None:
+    """Take episodes out of a log."""
+    records = read_episodes(out)
+    kept = [record for number, record in enumerate(records) if number not in numbers]
+    for file in (out / "episodes").glob("*.jsonl"):
+        file.unlink()
+    (out / "episodes.jsonl").write_text("".join(json.dumps(record) + "\n" for record in kept))
+    for record in (records[number] for number in numbers):
+        (out / "videos" / f"{record['task']}.{record['episode']}.mp4").unlink()
