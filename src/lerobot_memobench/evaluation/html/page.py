@@ -16,7 +16,7 @@ from importlib import resources
 from typing import Any
 
 TEMPLATE, STYLE = "index.html", "style.css"
-SCRIPTS = ("dom", "address", "filter", "overview", "list", "timeline", "detail", "main")
+SCRIPTS = ("dom", "address", "filter", "overview", "list", "lanes", "timeline", "player", "panel", "detail", "main")
 """Parts of the one script, in ``script/``; a later part uses earlier ones."""
 MARK = "memobench html"
 """What the page's ``generator`` says; by it a folder is known as a report."""

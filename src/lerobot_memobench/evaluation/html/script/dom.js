@@ -2,7 +2,7 @@
 
 const byId = (id) => document.getElementById(id);
 
-/** Make an element. `style` sets CSS properties, `on` listeners, `class` and the rest attributes; null children fall out. */
+/** Make an element. `style` sets CSS properties, `on` listeners, the rest attributes; null children fall out. */
 function el(name, attributes = {}, ...children) {
   return dress(document.createElement(name), attributes, children);
 }
@@ -40,7 +40,11 @@ function shape(operation, fill = "full", letter = false) {
 }
 
 const badge = (operation) =>
-  el("span", { class: "badge", role: "img", "aria-label": operationName(operation), "data-tip": operationName(operation) }, shape(operation, "full", true));
+  el(
+    "span",
+    { class: "badge", role: "img", "aria-label": operationName(operation), "data-tip": operationName(operation) },
+    shape(operation, "full", true),
+  );
 
 const operationName = (operation) => DATA.operations[operation].name;
 
@@ -49,13 +53,29 @@ const OUTCOMES = {
   success: { words: "success", letter: "✓", why: "The goal holds at the end." },
   storage_failure: { words: "storage failure", letter: "S", why: "The first checkpoint that never held is a Storage." },
   stale_memory: { words: "stale memory", letter: "U", why: "The first checkpoint that never held is an Update." },
-  compression_collapse: { words: "compression collapse", letter: "C", why: "The first checkpoint that never held is a Compression." },
-  reference_drift: { words: "reference drift", letter: "R", why: "A wrong sibling of the referent or of its target took its place." },
-  execution_failure: { words: "execution failure", letter: "X", why: "Every checkpoint held at some step, the goal did not at the end." },
+  compression_collapse: {
+    words: "compression collapse",
+    letter: "C",
+    why: "The first checkpoint that never held is a Compression.",
+  },
+  reference_drift: {
+    words: "reference drift",
+    letter: "R",
+    why: "A wrong sibling of the referent or of its target took its place.",
+  },
+  execution_failure: {
+    words: "execution failure",
+    letter: "X",
+    why: "Every checkpoint held at some step, the goal did not at the end.",
+  },
 };
 
 const outcomeMark = (outcome) =>
-  el("span", { class: `outcome is-${outcome}`, role: "img", "aria-label": OUTCOMES[outcome].words }, OUTCOMES[outcome].letter);
+  el(
+    "span",
+    { class: `outcome is-${outcome}`, role: "img", "aria-label": OUTCOMES[outcome].words },
+    OUTCOMES[outcome].letter,
+  );
 
 const capital = (text) => text.charAt(0).toUpperCase() + text.slice(1);
 const taskTitle = (task) => capital(DATA.tasks[task].language);
@@ -87,6 +107,7 @@ function enableTips() {
     tip.style.top = `${above < 4 ? box.bottom + 8 : above}px`;
   };
   for (const event of ["pointerover", "focusin"]) document.addEventListener(event, show);
-  for (const event of ["focusout", "scroll", "pointerleave"]) document.addEventListener(event, () => (tip.hidden = true), true);
+  for (const event of ["focusout", "scroll", "pointerleave"])
+    document.addEventListener(event, () => (tip.hidden = true), true);
   document.addEventListener("keydown", (event) => event.key === "Escape" && (tip.hidden = true));
 }

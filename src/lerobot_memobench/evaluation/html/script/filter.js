@@ -8,11 +8,20 @@ function normal(text) {
 
 /** Everything that the search looks at; made once per rollout. */
 function searchText(episode) {
-  episode.words ??= normal([
-    episode.task, DATA.tasks[episode.task].language, DATA.tasks[episode.task].memory_type, OUTCOMES[episode.outcome].words,
-    `episode ${episode.episode}`, `seed ${episode.seed}`, episode.scene ?? "", episode.scene?.slice(0, 8) ?? "",
-    ...(DATA.tasks[episode.task].variants[episode.variant]?.checkpoints.flatMap((checkpoint) => checkpoint.texts) ?? []),
-  ].join(" "));
+  episode.words ??= normal(
+    [
+      episode.task,
+      DATA.tasks[episode.task].language,
+      DATA.tasks[episode.task].memory_type,
+      OUTCOMES[episode.outcome].words,
+      `episode ${episode.episode}`,
+      `seed ${episode.seed}`,
+      episode.scene ?? "",
+      episode.scene?.slice(0, 8) ?? "",
+      ...(DATA.tasks[episode.task].variants[episode.variant]?.checkpoints.flatMap((checkpoint) => checkpoint.texts) ??
+        []),
+    ].join(" "),
+  );
   return episode.words;
 }
 

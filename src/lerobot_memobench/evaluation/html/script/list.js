@@ -7,7 +7,9 @@ function checkpointMarks(episode) {
   return el(
     "span",
     { class: "marks", "aria-hidden": "true" },
-    episode.checkpoints.map(([operation, first, ordered]) => shape(operation, ordered !== null ? "full" : first !== null ? "hollow" : "none")),
+    episode.checkpoints.map(([operation, first, ordered]) =>
+      shape(operation, ordered !== null ? "full" : first !== null ? "hollow" : "none"),
+    ),
   );
 }
 
@@ -19,7 +21,11 @@ function listRow(episode) {
       "a",
       { class: "row", "data-id": episode.id, href: address({ view: "episodes", ep: episode.id }) },
       outcomeMark(episode.outcome),
-      el("span", { class: "name" }, `Episode ${episode.episode}${episode.referent === "fixed" ? "" : ` · ${episode.referent}`}`),
+      el(
+        "span",
+        { class: "name" },
+        `Episode ${episode.episode}${episode.referent === "fixed" ? "" : ` · ${episode.referent}`}`,
+      ),
       checkpointMarks(episode),
       el("span", { class: "length" }, seconds(episode.prompt + episode.steps)),
       episode.video ? null : el("span", { class: "visually-hidden" }, "no video"),
@@ -41,7 +47,10 @@ const list = {
     byId("list").replaceChildren(this.end);
     byId("list").scrollTop = 0;
     this.watcher?.disconnect();
-    this.watcher = new IntersectionObserver((entries) => entries.some((entry) => entry.isIntersecting) && this.more(), { root: byId("list"), rootMargin: "600px" });
+    this.watcher = new IntersectionObserver((entries) => entries.some((entry) => entry.isIntersecting) && this.more(), {
+      root: byId("list"),
+      rootMargin: "600px",
+    });
     this.more();
     if (!episodes.length) this.end.before(el("p", { class: "hint" }, "No episode matches these filters."));
   },

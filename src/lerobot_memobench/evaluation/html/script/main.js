@@ -5,16 +5,33 @@ function options(select, entries) {
 }
 
 function fillControls() {
-  for (const [key, { colour }] of Object.entries(DATA.operations)) document.documentElement.style.setProperty(`--${key}`, colour);
-  options(byId("run"), DATA.runs.map((run) => [run.name, run.name]));
-  options(byId("level"), DATA.levels.map((level) => [level, level]));
+  for (const [key, { colour }] of Object.entries(DATA.operations))
+    document.documentElement.style.setProperty(`--${key}`, colour);
+  options(
+    byId("run"),
+    DATA.runs.map((run) => [run.name, run.name]),
+  );
+  options(
+    byId("level"),
+    DATA.levels.map((level) => [level, level]),
+  );
   byId("run").parentElement.hidden = DATA.runs.length < 2;
   const types = DATA.memory_types.filter((type) => Object.values(DATA.tasks).some((task) => task.memory_type === type));
   options(byId("type"), [["", "all"], ...types.map((type) => [type, type])]);
   const operations = Object.entries(DATA.operations);
-  options(byId("op"), [["", "all"], ...operations.map(([key, { name }]) => [key, `with ${name}`]), ...operations.map(([key, { name }]) => [`missed-${key}`, `missed ${name}`])]);
+  options(byId("op"), [
+    ["", "all"],
+    ...operations.map(([key, { name }]) => [key, `with ${name}`]),
+    ...operations.map(([key, { name }]) => [`missed-${key}`, `missed ${name}`]),
+  ]);
   const outcomes = Object.entries(OUTCOMES).map(([key, { words }]) => [key, words]);
-  options(byId("outcome"), [["", "all"], outcomes[0], ["failed", "any failure"], ...outcomes.slice(1), ["no-video", "no video"]]);
+  options(byId("outcome"), [
+    ["", "all"],
+    outcomes[0],
+    ["failed", "any failure"],
+    ...outcomes.slice(1),
+    ["no-video", "no video"],
+  ]);
   byId("legend").append(
     ...operations.map(([key, { name }]) => el("p", {}, shape(key, "full", true), name)),
     el("p", {}, shape("S", "full"), "full: held with all earlier checkpoints complete"),
@@ -40,7 +57,10 @@ function draw() {
   const changed = (...keys) => keys.some((key) => drawn[key] !== chosen[key]);
   byId("overview").hidden = !overview;
   byId("episodes").hidden = overview;
-  for (const [id, view] of [["to-overview", "overview"], ["to-episodes", "episodes"]]) {
+  for (const [id, view] of [
+    ["to-overview", "overview"],
+    ["to-episodes", "episodes"],
+  ]) {
     byId(id).href = address({ view });
     if (chosen.view === view) byId(id).setAttribute("aria-current", "page");
     else byId(id).removeAttribute("aria-current");
@@ -76,8 +96,11 @@ function drawEpisodes(run, chosen, refill) {
 
 function listen() {
   addEventListener("hashchange", draw);
-  for (const key of ["run", "level", "task", "op", "outcome"]) byId(key).addEventListener("change", (event) => select({ [key]: event.target.value }, { keepHistory: true }));
-  byId("type").addEventListener("change", (event) => select({ type: event.target.value, task: "" }, { keepHistory: true }));
+  for (const key of ["run", "level", "task", "op", "outcome"])
+    byId(key).addEventListener("change", (event) => select({ [key]: event.target.value }, { keepHistory: true }));
+  byId("type").addEventListener("change", (event) =>
+    select({ type: event.target.value, task: "" }, { keepHistory: true }),
+  );
   byId("q").addEventListener("input", (event) => select({ q: event.target.value }));
   byId("filters").addEventListener("submit", (event) => event.preventDefault());
   byId("filters").addEventListener("reset", (event) => {
@@ -87,7 +110,8 @@ function listen() {
   });
   byId("help").addEventListener("click", () => byId("keys").showModal());
   byId("theme").addEventListener("click", () => {
-    const now = document.documentElement.dataset.theme ?? (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
+    const now =
+      document.documentElement.dataset.theme ?? (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
     setTheme(now === "dark" ? "light" : "dark");
   });
   addEventListener("keydown", onKey);

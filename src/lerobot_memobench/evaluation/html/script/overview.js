@@ -8,6 +8,10 @@ const METRIC_WORDS = {
   MCR: "memory compression rate: Compression checkpoints that held at some step",
 };
 
+const RATES_HINT =
+  "Per cent; the line is Wilson’s 95 % interval over n rollouts. A memory type is the mean over its tasks, the average " +
+  "over the memory types, as far as a metric applies.";
+
 /** A rate as a number above its interval on a scale from 0 to 100. */
 function rateCell(rate, metric) {
   if (!rate) return el("td", { class: "rate" }, el("span", { class: "absent", "aria-label": "not applicable" }, "–"));
@@ -29,7 +33,12 @@ function rateCell(rate, metric) {
 
 function rateHead(...before) {
   const metrics = Object.entries(METRIC_WORDS).map(([metric, words]) =>
-    el("th", { scope: "col", class: "rate", "data-tip": capital(words) }, METRICS[metric] ? shape(METRICS[metric]) : null, metric),
+    el(
+      "th",
+      { scope: "col", class: "rate", "data-tip": capital(words) },
+      METRICS[metric] ? shape(METRICS[metric]) : null,
+      metric,
+    ),
   );
   return el("tr", {}, before, metrics);
 }
@@ -48,7 +57,9 @@ function summaryTable(run) {
         "tr",
         { class: it === run && several ? "chosen" : null },
         k === 0 ? el("th", { scope: "rowgroup", rowspan: runs.length, class: "what" }, words) : null,
-        several ? el("th", { scope: "row", class: "run" }, el("a", { href: address({ run: it.name }) }, it.name)) : null,
+        several
+          ? el("th", { scope: "row", class: "run" }, el("a", { href: address({ run: it.name }) }, it.name))
+          : null,
         el("td", { class: "number" }, String(rowOf(it, key).SR[3])),
         rateCells(rowOf(it, key)),
       ),
@@ -103,8 +114,18 @@ function outcomeTable(run) {
     el(
       "tbody",
       {},
-      row("All", countOutcomes(run, () => true), {}),
-      types.map((type) => row(capital(type), countOutcomes(run, (e) => DATA.tasks[e.task].memory_type === type), { type })),
+      row(
+        "All",
+        countOutcomes(run, () => true),
+        {},
+      ),
+      types.map((type) =>
+        row(
+          capital(type),
+          countOutcomes(run, (e) => DATA.tasks[e.task].memory_type === type),
+          { type },
+        ),
+      ),
     ),
   );
 }
@@ -114,7 +135,13 @@ const outcomeLegend = (counts) =>
     "ul",
     { class: "key" },
     Object.entries(OUTCOMES).map(([outcome, { words, why }]) =>
-      el("li", { "data-tip": why }, outcomeMark(outcome), words, counts ? el("b", {}, String(counts[outcome] ?? 0)) : null),
+      el(
+        "li",
+        { "data-tip": why },
+        outcomeMark(outcome),
+        words,
+        counts ? el("b", {}, String(counts[outcome] ?? 0)) : null,
+      ),
     ),
   );
 
@@ -125,8 +152,14 @@ function prefixChips(task, numbers, level) {
     { class: "chips" },
     [...numbers.operations].map((operation, k) => {
       const [ordered, any] = [numbers.ordered_prefix[k][0], numbers.prefix[k][0]];
-      const tip = `${capital(checkpointText(task, anyVariant(task), k, level))}\n${ordered.toFixed(1)} % got here in order, ${any.toFixed(1)} % in any order`;
-      return el("span", { class: `chip op-${operation}`, "data-tip": tip }, shape(operation, "full", true), ordered.toFixed(0));
+      const rates = `${ordered.toFixed(1)} % got here in order, ${any.toFixed(1)} % in any order`;
+      const tip = `${capital(checkpointText(task, anyVariant(task), k, level))}\n${rates}`;
+      return el(
+        "span",
+        { class: `chip op-${operation}`, "data-tip": tip },
+        shape(operation, "full", true),
+        ordered.toFixed(0),
+      );
     }),
   );
 }
@@ -140,33 +173,75 @@ function tasksTable(run, type, level) {
     return el(
       "tr",
       {},
-      el("th", { scope: "row", class: "task" }, el("a", { href: address({ ...noFilters(), view: "episodes", task: name, ep: "" }) }, taskTitle(name))),
+      el(
+        "th",
+        { scope: "row", class: "task" },
+        el("a", { href: address({ ...noFilters(), view: "episodes", task: name, ep: "" }) }, taskTitle(name)),
+      ),
       el("td", { class: "number" }, String(numbers.rates.SR[3])),
       rateCells(numbers.rates),
       el("td", {}, prefixChips(name, numbers, level)),
       el("td", { class: "ends" }, outcomeBar(numbers.outcomes, { task: name })),
     );
   });
-  const head = rateHead(el("th", { scope: "col", class: "task" }, `${capital(type)} · ${plural(names.length, "task")}`), el("th", { scope: "col", class: "number" }, "n"));
+  const head = rateHead(
+    el("th", { scope: "col", class: "task" }, `${capital(type)} · ${plural(names.length, "task")}`),
+    el("th", { scope: "col", class: "number" }, "n"),
+  );
   head.append(
-    el("th", { scope: "col", class: "chipped", "data-tip": "Per checkpoint: rollouts, in per cent, that completed it and all before it in order" }, "Checkpoints"),
+    el(
+      "th",
+      {
+        scope: "col",
+        class: "chipped",
+        "data-tip": "Per checkpoint: rollouts, in per cent, that completed it and all before it in order",
+      },
+      "Checkpoints",
+    ),
     el("th", { scope: "col", class: "ends" }, "Outcomes"),
   );
-  return el("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": `${type} tasks` }, el("table", { class: "rates tasks" }, el("thead", {}, head), el("tbody", {}, rows)));
+  return el(
+    "div",
+    { class: "scroll", tabindex: "0", role: "region", "aria-label": `${type} tasks` },
+    el("table", { class: "rates tasks" }, el("thead", {}, head), el("tbody", {}, rows)),
+  );
 }
 
 function drawOverview(run, chosen) {
   const types = DATA.memory_types.filter((type) => run.memory_types[type]);
   byId("overview").replaceChildren(
     el("h2", { id: "overview-title" }, run.name),
-    el("p", { class: "facts" }, run.facts.map((words) => el("span", {}, words))),
-    run.commands.length ? el("details", {}, el("summary", {}, "How it was run"), run.commands.map((words) => el("pre", {}, el("code", {}, words)))) : "",
+    el(
+      "p",
+      { class: "facts" },
+      run.facts.map((words) => el("span", {}, words)),
+    ),
+    run.commands.length
+      ? el(
+          "details",
+          {},
+          el("summary", {}, "How it was run"),
+          run.commands.map((words) => el("pre", {}, el("code", {}, words))),
+        )
+      : "",
     ...run.notes.map((note) => el("p", { class: "notice" }, note)),
     el(
       "div",
       { class: "columns" },
-      el("section", {}, el("h3", {}, "Rates"), el("div", { class: "scroll" }, summaryTable(run)), el("p", { class: "hint" }, "Per cent; the line is Wilson’s 95 % interval over n rollouts. A memory type is the mean over its tasks, the average over the memory types, as far as a metric applies.")),
-      el("section", {}, el("h3", {}, "How rollouts end"), outcomeTable(run), outcomeLegend(countOutcomes(run, () => true))),
+      el(
+        "section",
+        {},
+        el("h3", {}, "Rates"),
+        el("div", { class: "scroll" }, summaryTable(run)),
+        el("p", { class: "hint" }, RATES_HINT),
+      ),
+      el(
+        "section",
+        {},
+        el("h3", {}, "How rollouts end"),
+        outcomeTable(run),
+        outcomeLegend(countOutcomes(run, () => true)),
+      ),
     ),
     el("h3", {}, "Tasks"),
     ...types.map((type) => tasksTable(run, type, chosen.level)),
