@@ -1,0 +1,235 @@
+"""What is seen at a decision: pictures compared, the arm brought home, one real task without memory and one with."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation import decisions, necessity_study
+from lerobot_memobench.evaluation.decisions import Demonstration, Home, Moment, Picture, unmatched
+from lerobot_memobench.evaluation.necessity_report import markdown, rows, verdict, write
+from lerobot_memobench.evaluation.necessity_study import Settings, study, variants_of
+from lerobot_memobench.sim.rendering import close_renderers, gl_backend
+from lerobot_memobench.sim.simulation import NO_OP, Simulation
+from lerobot_memobench.tasks.catalogue import get_task
+from lerobot_memobench.tasks.formula import Atom
+
+PAN = "turn_on_the_stove_and_turn_it_off_then_put_the_frying_pan_on_it"
+STACK = "stack_the_bowls_one_by_one_in_the_exact_sequence_shown_in_the_video"
+MILK = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
+
+
+@pytest.fixture
+def gl() -> Iterator[None]:
+    """Skip without a GL library; free what was opened afterwards."""
+    try:
+        gl_backend()
+    except MemobenchError as error:
+        pytest.skip(str(error))
+    before = os.environ.get("MUJOCO_GL")
+    yield
+    close_renderers()
+    if before is None:
+        os.environ.pop("MUJOCO_GL", None)
+
+
+# --- pictures ---
+
+
+def scene(**changes: Any) -> Picture:
+    """A grey wall with a red square of 10 pixels, moved by (dy, dx), or gone."""
+    picture = np.full((64, 64, 3), 128, dtype=np.uint8)
+    if not changes.get("gone"):
+        y, x = 20 + changes.get("dy", 0), 30 + changes.get("dx", 0)
+        picture[y : y + 10, x : x + 10] = changes.get("colour", (200, 30, 30))
+    return picture
+
+
+def test_equal_pictures_have_nothing_unmatched() -> None:
+    assert unmatched(scene(), scene()) == 0.0
+    assert unmatched(scene(), scene(colour=(200, 40, 40))) == 0.0, "a shade is no difference"
+
+
+@pytest.mark.parametrize("shift", [{"dy": 2}, {"dx": -2}, {"dy": 1, "dx": 2}])
+def test_what_moved_by_two_pixels_looks_the_same(shift: dict[str, int]) -> None:
+    assert unmatched(scene(), scene(**shift)) == 0.0
+
+
+def test_what_moved_further_or_went_does_not() -> None:
+    # Of a square moved by 6: 4 rows of red have no red near them, and of the wall now covered 4 rows of 6 no wall.
+    assert unmatched(scene(), scene(dy=6)) * 64 * 64 == 4 * 10 + 4 * 6
+    # Of one that is gone: all its red; the wall behind it counts in the other direction, where it is less.
+    assert unmatched(scene(), scene(gone=True)) * 64 * 64 == 100
+    assert unmatched(scene(gone=True), scene()) == unmatched(scene(), scene(gone=True))
+
+
+def test_differences_are_of_the_camera_that_differs_most() -> None:
+    table = decisions.differences([(scene(), scene()), (scene(), scene(gone=True)), (scene(gone=True), scene(dy=6))])
+    assert table[0, 1] == pytest.approx(100 / 4096)
+    assert table[0, 2] == pytest.approx(100 / 4096)
+    assert np.array_equal(table, table.T)
+    assert not table.diagonal().any()
+
+
+# --- the study, on demonstrations made by hand ---
+
+
+def demonstration(*moments: tuple[str, Picture, float], success: bool = True) -> Demonstration:
+    """Decisions with the picture at home, and where the hand was."""
+    return Demonstration(
+        tuple(
+            Moment(answer, 10 * k, (picture,), (picture,), np.full(8, hand, dtype=np.float32))
+            for k, (answer, picture, hand) in enumerate(moments)
+        ),
+        success,
+        100,
+    )
+
+
+def by_hand(monkeypatch: pytest.MonkeyPatch, shown: dict[int, Demonstration]) -> None:
+    monkeypatch.setattr(decisions, "follow", lambda task, sim, seed, horizon: shown[task.variant_index])
+    monkeypatch.setattr("lerobot_memobench.sim.simulation.Simulation", lambda task: None)
+
+
+def test_a_picture_met_twice_in_an_episode_is_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    by_hand(
+        monkeypatch, {0: demonstration(("on", scene(), 0.0), ("off", scene(gone=True), 0.1), ("pan", scene(dy=1), 0.2))}
+    )
+    result = study(get_task(PAN), "fixed", Settings(episodes=2, budget=0), tmp_path)
+    assert result["in_order"] == {
+        "chance": 0.25,
+        "deterministic": 0.0,
+        "stochastic": pytest.approx(0.25),
+        "pixel_exact": 1.0,  # a pixel of difference, if it could be used
+        "as_it_happens": 1.0,  # the hand is elsewhere
+    }
+    assert result["aliased"] == {"at_home": 1, "pixel_exact": 0, "as_it_happens": 0}
+    assert result["expert"] == {"n": 2, "success": 2}
+    assert [result["examples"][0][side]["answer"] for side in "ab"] == ["on", "pan"]
+    assert verdict(result) == "yes", "nothing was searched, so nothing was found"
+    files = write(tmp_path, [result])
+    assert [path.name for path in files] == ["necessity.json", "necessity.md", "aliased_pairs.png"]
+    assert "| 25.0 | 0.0 | 25.0 | 100.0 |" in files[1].read_text()
+
+
+def test_goals_behind_one_picture_are_weighed_together(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    task = get_task(STACK)
+    assert len(variants_of(task, "random")) == 6
+    assert variants_of(task, "fixed") == [task]
+    shown = {
+        k: demonstration((f"first {k}", scene(), 0.0), ("then", scene(dy=4 * k + 4, dx=4 * k), 0.1)) for k in range(5)
+    }
+    shown[5] = demonstration(("fumble", scene(), 0.0), success=False)
+    by_hand(monkeypatch, shown)
+    result = study(task, "random", Settings(episodes=1, budget=0), tmp_path)
+    assert result["expert"] == {"n": 6, "success": 5}
+    assert result["in_order"]["chance"] == pytest.approx(1 / 5), "a failed demonstration teaches no answer"
+    assert result["in_order"]["deterministic"] == pytest.approx(1 / 5)
+    assert result["in_order"]["as_it_happens"] == pytest.approx(1 / 5), "the arm is at home when the prompt ends"
+
+
+def test_an_expert_that_fails_leaves_no_figure(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    by_hand(monkeypatch, {0: demonstration(("on", scene(), 0.0), success=False)})
+    result = study(get_task(PAN), "fixed", Settings(episodes=1), tmp_path)
+    assert (result["in_order"], result["any_order"], verdict(result)) == (None, None, "unknown")
+    assert "unknown" in markdown([result])
+
+
+def test_scenes_are_kept_and_more_are_added(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    seen: list[int] = []
+    one = demonstration(("on", scene(), 0.0), ("off", scene(gone=True), 0.1))
+
+    def follow(task: Any, sim: Any, seed: int, horizon: int) -> Demonstration:
+        seen.append(seed)
+        return one
+
+    monkeypatch.setattr(decisions, "follow", follow)
+    monkeypatch.setattr("lerobot_memobench.sim.simulation.Simulation", lambda task: None)
+    task = get_task(PAN)
+    first = study(task, "fixed", Settings(episodes=1), tmp_path)
+    assert verdict(first) == "no"
+    study(task, "fixed", Settings(episodes=3), tmp_path)
+    study(task, "fixed", Settings(episodes=3), tmp_path)
+    assert seen == [7, 8, 9]
+    study(task, "fixed", Settings(episodes=1, tolerance=0.01), tmp_path)
+    assert seen == [7, 8, 9, 7], "another tolerance is another question"
+    damaged = next(path for path in (tmp_path / "results").iterdir() if path.name.endswith(".8.json"))
+    damaged.write_text(damaged.read_text()[:40])
+    study(task, "fixed", Settings(episodes=2, tolerance=0.01), tmp_path)
+    assert seen == [7, 8, 9, 7, 8]
+
+
+def test_a_task_with_one_goal_has_one_row(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    by_hand(monkeypatch, {0: demonstration(("on", scene(), 0.0))})
+    result = study(get_task(PAN), "fixed", Settings(episodes=1), tmp_path)
+    ((memory_type, task, cells),) = rows([result])
+    assert (memory_type, task, cells[0]) == ("temporal", PAN, "both")
+    # Of one with variants, the published goal is the fixed setting only.
+    result = study(get_task(MILK), "fixed", Settings(episodes=1), tmp_path)
+    assert rows([result])[0][2][0] == "fixed"
+
+
+# --- the simulator ---
+
+
+def test_the_arm_comes_home_and_the_simulation_goes_on_as_if_it_had_not(gl: None) -> None:
+    task = get_task(PAN)
+    runs = []
+    for look in (False, True):
+        sim = Simulation(task)
+        sim.reset(7)
+        home = Home(sim)
+        at_start = decisions.photograph(sim)
+        for _ in range(6):
+            sim.step(np.array([0.5, 0.5, 0.3, 0.0, 0.0, 0.2, 1.0]))
+        if look:
+            assert decisions.difference(decisions.photograph(sim), at_start) > 0.01, "the arm has moved"
+            assert decisions.largest_pixel_difference(home.look(), at_start) <= necessity_study.PIXEL_EXACT
+        for _ in range(3):
+            sim.step(NO_OP)
+        runs.append(sim.state())
+    np.testing.assert_array_equal(*runs)
+
+
+def test_answers_are_what_the_expert_does_in_some_variant() -> None:
+    assert decisions.answers_of([get_task(PAN)]) == [
+        Atom("turnon", ("flat_stove_1",)),
+        Atom("turnoff", ("flat_stove_1",)),
+        Atom("on", ("chefmate_8_frypan_1", "flat_stove_1_cook_region")),
+    ]
+    stacks = decisions.answers_of(variants_of(get_task(STACK), "random"))
+    assert len(stacks) == 6
+    assert {atom.predicate for atom in stacks} == {"on"}
+
+
+@pytest.mark.slow
+def test_stove_and_pan_in_the_simulator(gl: None, tmp_path: Path) -> None:
+    """The dark stove asks for two answers; putting the pan on the lit burner is a way that needs no memory."""
+    result = study(get_task(PAN), "fixed", Settings(episodes=1, budget=30), tmp_path)
+    assert result["expert"] == {"n": 1, "success": 1}
+    assert result["in_order"]["chance"] == 0.25
+    assert result["in_order"]["deterministic"] == 0.0
+    assert result["in_order"]["pixel_exact"] == 0.0
+    assert result["examples"][0]["largest_pixel_difference"] <= necessity_study.PIXEL_EXACT
+    found = result["any_order"]
+    assert (found["deterministic"], found["confirmed"], found["complete"]) == (1.0, 1, True)
+    assert verdict(result) == "order"
+
+
+@pytest.mark.slow
+def test_two_cartons_in_the_simulator(gl: None, tmp_path: Path) -> None:
+    """Which carton was highlighted cannot be seen when the policy may act, and a wrong one stays on the plate."""
+    result = study(get_task(MILK), "random", Settings(episodes=1, budget=12), tmp_path)
+    assert result["in_order"]["chance"] == 0.5
+    assert result["in_order"]["deterministic"] == 0.5
+    assert result["any_order"]["deterministic"] == 0.5
+    assert verdict(result) == "yes"
+    fixed = study(get_task(MILK), "fixed", Settings(episodes=1, budget=12), tmp_path)
+    assert fixed["in_order"]["deterministic"] == 1.0
+    assert verdict(fixed) == "no"
