@@ -1,4 +1,4 @@
-"""Make the environment ``memobench`` and the policies ``memobench_*`` known to LeRobot.
+"""Make the environment ``memobench`` and the policies ``memobench_*`` and ``remote`` known to LeRobot.
 
 The configuration modules register themselves when imported; they import neither simulator nor model code nor GL.
 """
@@ -6,4 +6,5 @@ The configuration modules register themselves when imported; they import neither
 import lerobot_memobench.envs.configuration_memobench
 import lerobot_memobench.policies.memobench_expert.configuration_memobench_expert
 import lerobot_memobench.policies.memobench_mem.configuration_memobench_mem
-import lerobot_memobench.policies.memobench_random.configuration_memobench_random  # noqa: F401
+import lerobot_memobench.policies.memobench_random.configuration_memobench_random
+import lerobot_memobench.policies.remote.configuration_remote  # noqa: F401

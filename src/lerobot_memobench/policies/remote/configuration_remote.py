@@ -1,0 +1,157 @@
+"""Configuration of the policy that runs in a server: ``lerobot eval env=memobench policy=remote host=… port=…``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from lerobot.configs import PreTrainedConfig
+from lerobot.optim import AdamWConfig, LRSchedulerConfig
+
+from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.policies.remote.dialects import DIALECTS, GRIPPERS, Dialect
+
+
+@PreTrainedConfig.register_subclass("remote")
+@dataclass
+class RemoteConfig(PreTrainedConfig):
+    """Where the server is, what it speaks, and what is done when it goes away.
+
+    Args:
+        host: name or address of the server's machine; ``ws://`` or ``wss://`` before it is understood.
+        port: its port; the dialect's usual one when left out.
+        servers: several servers, ``host:port,host:port``; environment i of a batch asks server i modulo their number.
+        dialect: what the server speaks, one of `DIALECTS`.
+        n_action_steps: actions executed of each answer (``replan=``).
+        keys: names of what is sent, ``theirs=ours,…`` with ours one of image, wrist_image, state, task or another
+            observation of the environment; replaces the dialect's.
+        image_size: side of the images that are sent, padded to a square, pixels; 0 for as rendered.
+        mirror: send images mirrored left to right, for checkpoints trained on LIBERO's images as openpi turns them.
+        gripper: meaning of the last number of an action, one of `GRIPPERS`; the dialect's when left out.
+        memory: whether the server remembers what it was sent; the dialect's when left out.
+        send_prompt: whether it sees the prompt video. Switch it off for a policy without memory, to save the time.
+        history_every: steps between the frames of the prompt that it sees; ``n_action_steps`` when left out. A server
+            that buffers frames (robomme) gets all of them.
+        connect_timeout: how long the first connection is waited for, s.
+        timeout: how long an answer is waited for, s; the first one may include compilation.
+        retry: how long a server that went away is waited for, s.
+        label: what is served, in your words; it goes onto the result card, since a server does not tell it.
+    """
+
+    device: str | None = "cpu"
+    push_to_hub: bool = False
+    host: str = "127.0.0.1"
+    port: int | None = None
+    servers: str | None = None
+    dialect: str = "openpi"
+    n_action_steps: int = 5
+    keys: str | None = None
+    image_size: int | None = None
+    mirror: bool = False
+    gripper: str | None = None
+    memory: bool | None = None
+    send_prompt: bool = True
+    history_every: int | None = None
+    connect_timeout: float = 60.0
+    timeout: float = 300.0
+    retry: float = 300.0
+    label: str | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.dialect not in DIALECTS:
+            raise MemobenchError(f"policy.dialect is {self.dialect!r}, {nearest(self.dialect, DIALECTS)}")
+        if self.gripper is not None and self.gripper not in GRIPPERS:
+            raise MemobenchError(f"policy.gripper is {self.gripper!r}, {nearest(self.gripper, GRIPPERS)}")
+        for name in ("n_action_steps", "history_every"):
+            number = getattr(self, name)
+            if number is not None and number < 1:
+                raise MemobenchError(f"policy.{name} is {number}; expected a whole number from 1 on")
+        for name in ("connect_timeout", "timeout", "retry"):
+            if getattr(self, name) <= 0:
+                raise MemobenchError(f"policy.{name} is {getattr(self, name)}; expected seconds above 0")
+        if self.image_size is not None and self.image_size < 0:
+            raise MemobenchError(f"policy.image_size is {self.image_size}; expected pixels, or 0 for as rendered")
+        self.addresses()
+        self.sent()
+
+    @property
+    def spoken(self) -> Dialect:
+        return DIALECTS[self.dialect]
+
+    @property
+    def remembers(self) -> bool:
+        """Whether the server has a memory."""
+        return self.spoken.memory if self.memory is None else self.memory
+
+    @property
+    def max_environments(self) -> int | None:
+        """How many environments can be stepped at once; None for any number."""
+        return len(self.addresses()) if self.spoken.shared else None
+
+    @property
+    def side(self) -> int | None:
+        """Side of the images that are sent, None for as rendered."""
+        return (self.spoken.image_size if self.image_size is None else self.image_size) or None
+
+    def addresses(self) -> list[str]:
+        """Return the addresses of the servers, ``scheme://host:port``.
+
+        Raises:
+            MemobenchError: one of them is no address.
+        """
+        given = self.servers.split(",") if self.servers else [f"{self.host}:{self.port or self.spoken.port}"]
+        return [self._address(text.strip()) for text in given]
+
+    def _address(self, text: str) -> str:
+        scheme, rest = text.split("://", 1) if "://" in text else ("", text)
+        known = ("ws", "wss") if self.spoken.transport == "websocket" else ("http", "https")
+        host, _, port = rest.rpartition(":")
+        if not host or not port.isdigit() or not 0 < int(port) < 65536 or set(host) & set("/ @?#"):
+            raise MemobenchError(
+                f"found {text!r} as the policy server's address; expected a host and a port, as in host=10.0.0.5 "
+                "port=8000 or policy.servers=gpu1:8000,gpu2:8000"
+            )
+        if scheme and scheme not in known:
+            raise MemobenchError(
+                f"found the address {text!r}; servers that speak {self.dialect} are reached by {known[0]}:// or "
+                f"{known[1]}://"
+            )
+        return f"{scheme or known[0]}://{host}:{port}"
+
+    def sent(self) -> dict[str, str]:
+        """Return the server's name -> our name of everything that is sent.
+
+        Raises:
+            MemobenchError: ``keys`` is not a list of pairs.
+        """
+        if self.keys is None:
+            return dict(self.spoken.keys)
+        pairs = [tuple(part.strip() for part in pair.split("=", 1)) for pair in self.keys.split(",")]
+        if not all(len(pair) == 2 and all(pair) for pair in pairs):
+            raise MemobenchError(
+                f"policy.keys is {self.keys!r}; expected pairs of the server's and our names, as in "
+                "'observation/image=image,observation/state=state,prompt=task'"
+            )
+        return {pair[0]: pair[1] for pair in pairs}
+
+    @property
+    def observation_delta_indices(self) -> None:
+        return None
+
+    @property
+    def action_delta_indices(self) -> None:
+        return None
+
+    @property
+    def reward_delta_indices(self) -> None:
+        return None
+
+    def get_optimizer_preset(self) -> AdamWConfig:
+        """LeRobot asks for one before it builds the policy; ``forward`` then refuses to train."""
+        return AdamWConfig()
+
+    def get_scheduler_preset(self) -> LRSchedulerConfig | None:
+        return None
+
+    def validate_features(self) -> None:
+        return None

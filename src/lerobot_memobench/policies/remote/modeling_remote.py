@@ -1,0 +1,145 @@
+"""A policy server as a LeRobot policy: each environment of a batch has a connection and an episode of its own."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.utils.constants import OBS_STATE
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
+from lerobot_memobench.policies.remote.observations import EXECUTION, Row
+from lerobot_memobench.policies.remote.session import ACTION_SIZE, Session
+
+Action = NDArray[np.float32]
+
+
+class Actor:
+    """One environment: when its episode begins, when the server is asked, which action is next.
+
+    The environment's ``step`` tells its rows' episodes apart: it goes back to 0 with each, and stands still once an
+    episode has ended. An environment that tells no step is taken to begin with the policy's reset and to go on.
+    """
+
+    def __init__(self, config: RemoteConfig, session: Session) -> None:
+        self.config, self.session = config, session
+        self.forget()
+
+    def forget(self) -> None:
+        """A rollout begins: whatever comes next is another episode."""
+        self._step: int | None = None
+        self._prompt = False
+        self._queue: deque[Action] = deque()
+
+    def act(self, row: Row) -> Action:
+        """Return the action (7,) for the present observation; the server may be asked."""
+        told = row.scalar("step")
+        step = told if told is not None else (0 if self._step is None else self._step + 1)
+        if step == self._step or (told is not None and row.blank):
+            self._step = step
+            return np.zeros(ACTION_SIZE, np.float32)  # the episode has ended, or was never run
+        if self._step is None or step < self._step:
+            self.session.begin()
+            self._queue.clear()
+            self._prompt = False
+        self._step = step
+        if row.scalar("phase") not in (None, EXECUTION):
+            return self._see_prompt(row, step)
+        if self._prompt:
+            self.session.execution_starts()
+            self._prompt = False
+        if self._queue:
+            self.session.watch(row)
+        else:
+            self._queue.extend(self.session.ask(row)[: self.config.n_action_steps])
+        return self._queue.popleft()
+
+    def _see_prompt(self, row: Row, step: int) -> Action:
+        """Show the server the prompt, in which actions have no effect."""
+        self._prompt = True
+        if self.config.send_prompt:
+            if self.config.spoken.buffers:
+                self.session.watch(row)
+            elif step % (self.config.history_every or self.config.n_action_steps) == 0:
+                self.session.ask(row)
+        return np.zeros(ACTION_SIZE, np.float32)
+
+
+class RemotePolicy(PreTrainedPolicy):
+    """Parameter-less policy that asks a server; see `RemoteConfig`. ``select_action`` returns (B, 7) float32."""
+
+    config_class = RemoteConfig
+    name = "remote"
+
+    def __init__(self, config: RemoteConfig, **kwargs: Any) -> None:
+        super().__init__(config)
+        self.config: RemoteConfig = config
+        self._actors: list[Actor] = []
+        self._pool: ThreadPoolExecutor | None = None
+        self._threads = 0
+
+    def get_optim_params(self) -> list[nn.Parameter]:
+        return []
+
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict | None]:
+        raise MemobenchError(
+            "The policy 'remote' runs in a server and cannot be trained here; choose a learning policy, for example "
+            "--policy.type=memobench_mem."
+        )
+
+    def reset(self) -> None:
+        """A rollout begins. Connections stay; a server that is not there is told before anything is simulated."""
+        if not self._actors:
+            self._add_actor()
+        self._actors[0].session.connect()
+        for actor in self._actors:
+            actor.forget()
+
+    def _add_actor(self) -> None:
+        addresses = self.config.addresses()
+        self._actors.append(Actor(self.config, Session(self.config, addresses[len(self._actors) % len(addresses)])))
+
+    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """Return the next action (B, 7) in [-1, 1] of each environment; servers are asked at the same time.
+
+        Raises:
+            MemobenchError: a server fails or stays away, or the batch is larger than its one memory can serve.
+        """
+        rows = _size(batch)
+        limit = self.config.max_environments
+        if limit is not None and rows > limit:
+            raise MemobenchError(
+                f"a {self.config.dialect} server keeps one memory for all who ask it, and {rows} environments would "
+                f"share {limit}; use batch_size={limit}, or name {rows} servers by policy.servers=host:port,…"
+            )
+        while len(self._actors) < rows:
+            self._add_actor()
+        jobs = [partial(actor.act, Row(batch, k)) for k, actor in enumerate(self._actors[:rows])]
+        return torch.from_numpy(np.stack([job() for job in jobs] if rows == 1 else self._together(jobs)))
+
+    def _together(self, jobs: list[partial[Action]]) -> list[Action]:
+        if self._pool is None or self._threads < len(jobs):
+            if self._pool is not None:
+                self._pool.shutdown()
+            self._pool, self._threads = ThreadPoolExecutor(len(jobs), "policy-server"), len(jobs)
+        return list(self._pool.map(lambda job: job(), jobs))
+
+    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """Ask for one action at a time, so the chunk is (B, 1, 7)."""
+        return self.select_action(batch).unsqueeze(1)
+
+
+def _size(batch: Mapping[str, Any]) -> int:
+    """Return how many environments a batch holds."""
+    if OBS_STATE in batch:
+        return len(batch[OBS_STATE])
+    return len(next(value for value in batch.values() if isinstance(value, Tensor) and value.ndim))

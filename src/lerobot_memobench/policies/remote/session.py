@@ -1,0 +1,222 @@
+"""One environment's talk with its server: episodes begin anew, and survive a server that goes away and comes back."""
+
+from __future__ import annotations
+
+import logging
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
+from lerobot_memobench.policies.remote.dialects import IMAGE, RLDS, STATE
+from lerobot_memobench.policies.remote.observations import Row, fit
+from lerobot_memobench.policies.remote.transports import TRANSPORTS, ServerAway, Transport
+
+logger = logging.getLogger(__name__)
+
+ACTION_SIZE = 7
+PAUSE = 0.5
+"""Between two attempts to reach a server, s."""
+FIRST_FRAME = "episode_first_frame"
+RESET = {"reset": True}
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is sent to a server, and whether its memory then holds it."""
+
+    content: dict[str, Any]
+    remembered: bool
+
+
+class Session:
+    """A connection to one server on behalf of one environment.
+
+    Args:
+        config: the policy's.
+        address: of the server.
+    """
+
+    def __init__(self, config: RemoteConfig, address: str) -> None:
+        self.config, self.address = config, address
+        self._dialect, self._keys = config.spoken, config.sent()
+        self._transport: Transport = TRANSPORTS[self._dialect.transport](address, config.timeout)
+        self._connected = False  # ever
+        self._fresh = False  # the connection has served no episode yet
+        self._begin_memory()
+
+    def _begin_memory(self) -> None:
+        self._told: list[Question] = []  # what a restarted server has to hear again
+        self._frames: list[tuple[NDArray[np.uint8], NDArray[np.float32]]] = []  # for the next message to a buffer
+        self._seen, self._execution_starts = 0, 0
+        self._first = True
+
+    # --- what the policy calls ---
+
+    def connect(self) -> None:
+        """Reach the server, so that one that is not there costs no simulation.
+
+        Raises:
+            MemobenchError: it does not answer within ``connect_timeout``.
+        """
+        if self._connected:
+            return
+        deadline, reason = time.monotonic() + self.config.connect_timeout, ""
+        told = False
+        while True:
+            left = deadline - time.monotonic()
+            if left <= 0:
+                raise MemobenchError(
+                    f"no policy server answered at {self.address} within {self.config.connect_timeout:g} s ({reason}); "
+                    "start it, or give its address by host= and port="
+                )
+            try:
+                metadata = self._transport.open(left)
+                break
+            except ServerAway as error:
+                reason = str(error)
+            if not told:
+                logger.warning("waiting for the policy server at %s (%s)", self.address, reason)
+                told = True
+            time.sleep(min(PAUSE, max(0.0, left)))
+        self._connected = self._fresh = True
+        logger.info("connected with the policy server at %s, which says: %s", self.address, metadata or "nothing")
+
+    def begin(self) -> None:
+        """Start an episode: a memory in the server, of the connection or of its own, forgets the last one."""
+        self.connect()
+        self._begin_memory()
+        if not self._fresh:
+            self._again(time.monotonic() + self.config.retry)
+        elif self._dialect.buffers:
+            self._deliver(Question(dict(RESET), remembered=False))
+
+    def watch(self, row: Row) -> None:
+        """Note a frame that is not asked about; a server that buffers frames gets it with the next question."""
+        if self._dialect.buffers:
+            self._frames.append((self._image(row, IMAGE), np.asarray(row.get(STATE), np.float32)))
+
+    def execution_starts(self) -> None:
+        """Note that the frames so far showed the prompt."""
+        self._execution_starts = self._seen + len(self._frames)
+
+    def ask(self, row: Row) -> NDArray[np.float32]:
+        """Return the server's actions for an observation, (H, 7).
+
+        Raises:
+            MemobenchError: the server failed, took too long, stays away, or answered something else.
+        """
+        if self._dialect.buffers:
+            self.watch(row)
+            self._deliver(self._buffer())
+        question = self._observation(row)
+        answer = self._deliver(Question(question, self.config.remembers and not self._dialect.buffers))
+        return self._actions(answer)
+
+    def close(self) -> None:
+        self._transport.close()
+
+    # --- questions ---
+
+    def _observation(self, row: Row) -> dict[str, Any]:
+        found = {theirs: self._image(row, ours) for theirs, ours in self._keys.items()}
+        if self._dialect.transport == "process_frame":
+            found[FIRST_FRAME] = str(self._first)  # 'True' and 'False', as MemoryVLA reads them
+            self._first = False
+        return found
+
+    def _image(self, row: Row, name: str) -> Any:
+        value = row.get(name)
+        if isinstance(value, np.ndarray) and value.ndim == 3:
+            return fit(value, self.config.side, self.config.mirror)
+        return value
+
+    def _buffer(self) -> Question:
+        images, states = zip(*self._frames, strict=True)
+        self._frames = []
+        self._seen += len(images)
+        content = {
+            "images": np.stack(images)[:, None],
+            "state": np.stack(states),
+            "add_buffer": True,
+            "exec_start_idx": self._execution_starts,
+        }
+        return Question(content, self.config.remembers)
+
+    # --- answers ---
+
+    def _actions(self, answer: dict[str, Any]) -> NDArray[np.float32]:
+        if "actions" not in answer:
+            raise self._wrong(f"an answer without 'actions' (it holds {', '.join(map(str, answer)) or 'nothing'})")
+        try:
+            actions = np.array(answer["actions"], dtype=np.float32, ndmin=2)
+        except (TypeError, ValueError) as error:
+            raise self._wrong("actions that are no numbers") from error
+        if actions.ndim != 2 or actions.shape[1] != ACTION_SIZE:
+            raise self._wrong(f"actions of shape {actions.shape}")
+        if len(actions) < self.config.n_action_steps:
+            raise MemobenchError(
+                f"the policy server at {self.address} answers {len(actions)} actions at a time, fewer than the "
+                f"{self.config.n_action_steps} to be executed; choose replan={len(actions)} or less"
+            )
+        if not np.isfinite(actions).all():
+            raise self._wrong("actions that are NaN or infinite")
+        if (self.config.gripper or self._dialect.gripper) == RLDS:
+            actions[:, -1] = -np.sign(2 * actions[:, -1] - 1)
+        return actions
+
+    def _wrong(self, what: str) -> MemobenchError:
+        return MemobenchError(
+            f"the policy server at {self.address} gave {what}; expected finite numbers of shape "
+            f"(steps, {ACTION_SIZE}): six of the end effector's displacement and one of the gripper"
+        )
+
+    # --- delivery ---
+
+    def _deliver(self, question: Question) -> dict[str, Any]:
+        """Send a question until it is answered; a server that went away is waited for and told the episode again."""
+        deadline = 0.0
+        while True:
+            try:
+                answer = self._transport.ask(question.content)
+                break
+            except ServerAway as error:
+                if deadline:  # it came back and broke over the same question
+                    time.sleep(PAUSE)
+                deadline = deadline or time.monotonic() + self.config.retry
+                logger.warning("the policy server at %s went away (%s); waiting for it", self.address, error)
+                self._again(deadline, str(error))
+        self._fresh = False
+        if question.remembered:
+            self._told.append(question)
+        return answer
+
+    def _again(self, deadline: float, reason: str = "") -> None:
+        """Connect anew and bring the server to where the episode is.
+
+        Raises:
+            MemobenchError: it stays away until the deadline.
+        """
+        while True:
+            left = deadline - time.monotonic()
+            if left <= 0:
+                raise MemobenchError(
+                    f"the policy server at {self.address} went away and did not come back within "
+                    f"{self.config.retry:g} s ({reason}); the episode that was running is not counted: start "
+                    "the server and go on with resume=true output_dir=<this run's folder>"
+                )
+            try:
+                self._transport.open(left)
+                if self._dialect.buffers:
+                    self._transport.ask(dict(RESET))
+                for question in self._told:
+                    self._transport.ask(question.content)
+                self._fresh = not self._told
+                return
+            except ServerAway as error:
+                reason = str(error)
+            time.sleep(min(PAUSE, max(0.0, left)))
