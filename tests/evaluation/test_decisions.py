@@ -112,7 +112,7 @@ def test_a_picture_met_twice_in_an_episode_is_found(monkeypatch: pytest.MonkeyPa
     assert result["aliased"] == {"at_home": 1, "pixel_exact": 0, "as_it_happens": 0}
     assert result["expert"] == {"n": 2, "success": 2}
     assert [result["examples"][0][side]["answer"] for side in "ab"] == ["on", "pan"]
-    assert verdict(result) == "yes", "nothing was searched, so nothing was found"
+    assert verdict(result) == "order?", "nothing was searched"
     files = write(tmp_path, [result])
     assert [path.name for path in files] == ["necessity.json", "necessity.md", "aliased_pairs.png"]
     assert "| 25.0 | 0.0 | 25.0 | 100.0 |" in files[1].read_text()
@@ -211,7 +211,7 @@ def test_answers_are_what_the_expert_does_in_some_variant() -> None:
 @pytest.mark.slow
 def test_stove_and_pan_in_the_simulator(gl: None, tmp_path: Path) -> None:
     """The dark stove asks for two answers; putting the pan on the lit burner is a way that needs no memory."""
-    result = study(get_task(PAN), "fixed", Settings(episodes=1, budget=30), tmp_path)
+    result = study(get_task(PAN), "fixed", Settings(episodes=1, budget=3000), tmp_path)
     assert result["expert"] == {"n": 1, "success": 1}
     assert result["in_order"]["chance"] == 0.25
     assert result["in_order"]["deterministic"] == 0.0
@@ -225,11 +225,11 @@ def test_stove_and_pan_in_the_simulator(gl: None, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_two_cartons_in_the_simulator(gl: None, tmp_path: Path) -> None:
     """Which carton was highlighted cannot be seen when the policy may act, and a wrong one stays on the plate."""
-    result = study(get_task(MILK), "random", Settings(episodes=1, budget=12), tmp_path)
+    result = study(get_task(MILK), "random", Settings(episodes=1, budget=1500), tmp_path)
     assert result["in_order"]["chance"] == 0.5
     assert result["in_order"]["deterministic"] == 0.5
     assert result["any_order"]["deterministic"] == 0.5
     assert verdict(result) == "yes"
-    fixed = study(get_task(MILK), "fixed", Settings(episodes=1, budget=12), tmp_path)
+    fixed = study(get_task(MILK), "fixed", Settings(episodes=1, budget=1500), tmp_path)
     assert fixed["in_order"]["deterministic"] == 1.0
     assert verdict(fixed) == "no"

@@ -42,8 +42,8 @@ def necessity(
     ] = WhichReferent.BOTH,
     episodes: Annotated[int, typer.Option(min=1, help="Scenes per task, from seed 7 on.")] = 3,
     budget: Annotated[
-        int, typer.Option(min=0, help="Moves simulated per task in search of other ways to the goal; 0: no search.")
-    ] = 60,
+        int, typer.Option(min=0, help="Steps simulated per task in search of other ways to the goal; 0: no search.")
+    ] = 10_000,
     tolerance: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Share of differing pixels up to which pictures look the same.")
     ] = 0.005,

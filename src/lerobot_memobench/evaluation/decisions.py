@@ -308,20 +308,21 @@ class Exploration:
     Attributes:
         graph: states and moves; pictures are numbered by node until somebody groups them.
         pictures: what is seen at each node. true: which atoms of the goals hold there.
-        moves: how many were simulated.
+        moves, steps: how many of either were simulated.
     """
 
     graph: Graph
     pictures: list[tuple[Picture, ...]]
     true: list[frozenset[Atom]]
     moves: int = 0
+    steps: int = 0
 
 
 def explore(laboratory: Laboratory, budget: int, horizon: int = HORIZON) -> Exploration:
     """Try every answer at every state that can be reached before the horizon, nearest states first.
 
     Args:
-        budget: moves that are simulated at most; states beyond them stay without moves.
+        budget: control steps after which no further state is begun; those that are left stay without moves.
     """
     sim = laboratory.sim
     sim.restore(laboratory.start)
@@ -331,7 +332,7 @@ def explore(laboratory: Laboratory, budget: int, horizon: int = HORIZON) -> Expl
     places, cost = [laboratory.place()], [0]
     while True:
         waiting = [node for node in range(len(snapshots)) if node not in graph.moves and cost[node] < horizon]
-        if not waiting or found.moves + len(laboratory.answers) > budget:
+        if not waiting or found.steps >= budget:
             return found
         node = min(waiting, key=lambda k: cost[k])
         moves: dict[str, Move] = {}
@@ -346,7 +347,8 @@ def explore(laboratory: Laboratory, budget: int, horizon: int = HORIZON) -> Expl
                     trace.append((true, 1))
 
             steps = laboratory.do(answer, listen, horizon - cost[node])
-            found.moves += steps > SETTLE
+            if steps > SETTLE:
+                found.moves, found.steps = found.moves + 1, found.steps + steps
             place = laboratory.place()
             to = next((k for k, known in enumerate(places) if known.same(place)), len(places))
             if to == len(places):

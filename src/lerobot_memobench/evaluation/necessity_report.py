@@ -24,6 +24,7 @@ VERDICTS = {
     "no": "pictures decide every step of the demonstrated routine: no memory is needed",
     "order": "the demonstrated order needs memory; another order that the goal accepts does not",
     "yes": "no order found reaches the goal from pictures alone: memory is needed",
+    "order?": "the demonstrated order needs memory; other ways were not looked for",
     "unknown": "the expert solved none of the scenes, so nothing can be said",
 }
 
@@ -35,8 +36,9 @@ def verdict(result: Result) -> str:
         return "unknown"
     if in_order["deterministic"] >= 1.0:
         return "no"
-    confirmed = any_order is not None and any_order["confirmed"] == any_order["of"]
-    return "order" if confirmed else "yes"
+    if any_order is None:
+        return "order?"
+    return "order" if any_order["confirmed"] == any_order["of"] else "yes"
 
 
 @dataclass(frozen=True)

@@ -50,14 +50,14 @@ class Settings:
         episodes: scenes (seeds) per task; with `referent=random` each is demonstrated once per variant.
         seed_base: the first of their seeds.
         tolerance: share of pixels without a like pixel within two, up to which pictures look the same.
-        budget: moves simulated in search of other ways to the goal; 0 leaves the search out.
+        budget: control steps after which the search for other ways to the goal begins no new state; 0 leaves it out.
         horizon: execution steps.
     """
 
     episodes: int = 3
     seed_base: int = 7
     tolerance: float = 0.005
-    budget: int = 60
+    budget: int = 10_000
     horizon: int = decisions.HORIZON
 
 
@@ -287,6 +287,7 @@ def _any_order(laboratory: Laboratory, settings: Settings) -> dict[str, Any]:
         "states": len(graph.pictures),
         "pictures": len(set(graph.pictures)),
         "moves": found.moves,
+        "steps": found.steps,
         "complete": graph.complete,
         "policy": [
             {
