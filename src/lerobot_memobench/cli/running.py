@@ -15,8 +15,8 @@ from lerobot_memobench.cli.loop import calm_output, steered
 from lerobot_memobench.cli.plan import Range, task_names
 from lerobot_memobench.datasets.unfinished import locked
 from lerobot_memobench.envs.episode_log import has_log, read_episodes
-from lerobot_memobench.evaluation.card import CARD_MARKDOWN, with_episodes, write_card
-from lerobot_memobench.evaluation.protocol import CARD_FILE, POLICY, read_protocol
+from lerobot_memobench.evaluation.card import remove_card, with_episodes, write_card
+from lerobot_memobench.evaluation.protocol import POLICY, read_protocol
 from lerobot_memobench.evaluation.report import REPORT_MARKDOWN
 
 CONTINUED = "continued-{}"
@@ -81,8 +81,7 @@ def folder_of(evaluation: Evaluation) -> Iterator[None]:
             yield
     finally:
         if not has_log(log):
-            for name in (CARD_FILE, CARD_MARKDOWN):
-                (log / name).unlink(missing_ok=True)
+            remove_card(log)
             for folder in new:
                 preflight.remove_empty(folder)
 

@@ -37,7 +37,10 @@ PACKAGES = ("lerobot_policy_memobench", "lerobot", "mujoco", "robosuite", "torch
 NOT_THE_CHECKPOINT = ("train_config.json", "README.md", "training_weights.safetensors", ".gitattributes")
 """Files of a checkpoint folder on which what the policy does at evaluation does not depend."""
 
-ELSEWHERE = ("device", "pretrained_path", "repo_id", "private", "tags", "license", "push_to_hub", "use_peft")
+ELSEWHERE = (
+    *("device", "pretrained_path", "repo_id", "private", "tags", "license", "push_to_hub", "use_peft"),
+    *("host", "port", "servers", "connect_timeout", "timeout", "retry"),
+)
 """Settings of a policy that say where it runs or where it goes, not what it does."""
 
 OUTCOME = ("success", "steps", "prompt_steps", "variant", "checkpoints", "failure", "scene_hash")
@@ -253,6 +256,12 @@ def write_card(folder: Path, card: Mapping[str, Any]) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.replace(draft, folder / name)
+
+
+def remove_card(folder: Path) -> None:
+    """Remove the card of a folder, if there is one."""
+    for name in (CARD_FILE, CARD_MARKDOWN):
+        (folder / name).unlink(missing_ok=True)
 
 
 def _json(card: Mapping[str, Any]) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 from lerobot_memobench.envs.episode_log import has_log, read_episodes, write_episodes
 from lerobot_memobench.envs.protocol import EXTENT, SETTINGS, write_protocol
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.card import disagreement, extended, key_of, with_episodes, write_card
+from lerobot_memobench.evaluation.card import disagreement, extended, key_of, remove_card, with_episodes, write_card
 from lerobot_memobench.evaluation.protocol import (
     CARD_FILE,
     POLICY,
@@ -66,6 +66,8 @@ def merge(out: Path, folders: Sequence[Path]) -> list[tuple[str, int]]:
     write_episodes(out, joined)
     if card is not None:
         write_card(out, with_episodes(card, joined))
+    else:
+        remove_card(out)
     return [cell for cell in wanted if cell not in present]
 
 
