@@ -9,10 +9,12 @@ start, sees only pictures, and succeeds when the goal comes true within the hori
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lerobot_memobench.tasks.formula import Atom, Evaluator, Formula
 
@@ -145,18 +147,23 @@ def _after(watch: GoalWatch, memory: int, move: Move, left: int) -> int | None:
 
 _State = tuple[int, int, int]
 """Node, memory, steps used / `STRIDE`."""
+_SUCCESS, _FAILURE = -2, -1
+"""Where an answer leads beside to other states; they are the last two places of an array over states."""
 
 
 @dataclass
 class _Walk:
-    """All that can happen under one goal: states in the order of steps used, and where each answer leads."""
+    """All that can happen under one goal.
 
-    states: list[_State]
-    ways: list[dict[str, int]]
-    """Per state: answer → index of the next state, `_SUCCESS` or `_FAILURE`."""
+    Attributes:
+        pictures: (S,) what is seen at each state, as a row of the policy.
+        to: (S, A) where each answer leads: a state, `_SUCCESS` or `_FAILURE`.
+        layers: runs of states that have used the same time, in its order: an answer leads to a later one.
+    """
 
-
-_SUCCESS, _FAILURE = -1, -2
+    pictures: NDArray[np.intp]
+    to: NDArray[np.intp]
+    layers: list[slice]
 
 
 def best_probabilities(graph: Graph, goals: Sequence[Formula], horizon: int, seed: int = 0) -> float:
@@ -165,102 +172,80 @@ def best_probabilities(graph: Graph, goals: Sequence[Formula], horizon: int, see
     Looked for by expectation maximisation over walks that succeed, from an even start, from the best map made a little
     uncertain, and from random ones: a bound that is reached, not one that is proven to be the largest.
     """
-    walks = [_unfold(graph, GoalWatch(goal), horizon) for goal in goals]
     value, policy = best_map(graph, goals, horizon)
     answers, pictures = graph.answers, sorted(set(graph.pictures))
     if not answers:
         return 0.0
+    walks = [_unfold(graph, GoalWatch(goal), horizon, answers, pictures) for goal in goals]
     rng = np.random.default_rng(seed)
-    place = {picture: row for row, picture in enumerate(pictures)}
-    column = {answer: k for k, answer in enumerate(answers)}
     even = np.full((len(pictures), len(answers)), 1.0 / len(answers))
     likely = 0.05 * even
-    for picture in pictures:
-        likely[place[picture], column[policy.get(picture, answers[0])]] += 0.95
+    for row, picture in enumerate(pictures):
+        likely[row, answers.index(policy.get(picture, answers[0]))] += 0.95
     starts = [even, likely, *(rng.dirichlet(np.ones(len(answers)), len(pictures)) for _ in range(RESTARTS))]
-    row_of = [[place[graph.pictures[node]] for node, _, _ in walk.states] for walk in walks]
-    return max(value, *(_climb(start.copy(), walks, row_of, column) for start in starts))
+    return max(value, *(_climb(start, walks) for start in starts))
 
 
-def _unfold(graph: Graph, watch: GoalWatch, horizon: int) -> _Walk:
-    """Return every state that can be reached before the horizon."""
-    limit = horizon // STRIDE
-    number: dict[_State, int] = {(0, 0, 0): 0}
-    layers: list[list[_State]] = [[] for _ in range(limit + 1)]
-    layers[0].append((0, 0, 0))
-    leads: dict[_State, dict[str, _State | int]] = {}
+def _unfold(graph: Graph, watch: GoalWatch, horizon: int, answers: Sequence[str], pictures: Sequence[int]) -> _Walk:
+    """Return every state that can be reached before the horizon and from which the goal can be."""
+    layers: list[dict[_State, dict[str, _State | int]]] = [{} for _ in range(horizon // STRIDE + 1)]
+    layers[0][0, 0, 0] = {}
     for layer in layers:
-        for state in layer:  # grows only in later layers: a move takes at least one stride
-            node, memory, used = state
-            leads[state] = {}
+        for (node, memory, used), leads in layer.items():  # only later layers grow: a move takes a stride or more
             for answer, move in graph.moves.get(node, {}).items():
                 after, step = watch.advance(memory, move)
-                if step is not None:
-                    leads[state][answer] = _SUCCESS if used * STRIDE + step <= horizon else _FAILURE
-                    continue
                 later = (move.to, after, used + max(1, -(-move.steps // STRIDE)))
-                if later[2] > limit:
-                    leads[state][answer] = _FAILURE
-                    continue
-                if later not in number:
-                    number[later] = len(number)
-                    layers[later[2]].append(later)
-                leads[state][answer] = later
-    states = [state for layer in layers for state in layer]
-    index = {state: k for k, state in enumerate(states)}
-    ways = [
-        {answer: index[to] if isinstance(to, tuple) else to for answer, to in leads[state].items()} for state in states
-    ]
-    return _pruned(_Walk(states, ways))
-
-
-def _pruned(walk: _Walk) -> _Walk:
-    """Return the walk without states from which the goal is out of reach; the start stays."""
-    alive = [False] * len(walk.states)
-    for k in range(len(alive) - 1, -1, -1):
-        alive[k] = any(to == _SUCCESS or (to >= 0 and alive[to]) for to in walk.ways[k].values())
-    kept = [k for k, lives in enumerate(alive) if lives or k == 0]
-    index = {k: new for new, k in enumerate(kept)}
+                if step is not None:
+                    leads[answer] = _SUCCESS if used * STRIDE + step <= horizon else _FAILURE
+                elif later[2] < len(layers):
+                    layers[later[2]].setdefault(later, {})
+                    leads[answer] = later
+    alive: set[_State] = {(0, 0, 0)}
+    for layer in reversed(layers):
+        alive |= {
+            state for state, leads in layer.items() if any(to == _SUCCESS or to in alive for to in leads.values())
+        }
+    kept = [[state for state in layer if state in alive] for layer in layers]
+    index = {state: k for k, state in enumerate(state for layer in kept for state in layer)}
+    to = np.full((len(index), len(answers)), _FAILURE, dtype=np.intp)
+    for layer in layers:
+        for state, leads in layer.items():
+            for answer, lead in leads.items() if state in index else ():
+                place = lead if isinstance(lead, int) else index.get(lead, _FAILURE)
+                to[index[state], answers.index(answer)] = place
+    ends = np.cumsum([0, *(len(layer) for layer in kept)]).tolist()
     return _Walk(
-        [walk.states[k] for k in kept],
-        [{answer: index.get(to, _FAILURE) if to >= 0 else to for answer, to in walk.ways[k].items()} for k in kept],
+        np.array([pictures.index(graph.pictures[node]) for node, _, _ in index], dtype=np.intp),
+        to,
+        [slice(begin, end) for begin, end in pairwise(ends) if end > begin],
     )
 
 
-def _climb(
-    policy: np.ndarray, walks: Sequence[_Walk], rows: Sequence[Sequence[int]], column: Mapping[str, int]
-) -> float:
+def _climb(policy: NDArray[np.float64], walks: Sequence[_Walk]) -> float:
     """Raise the success of ``policy`` (pictures, answers) until it stands still; return it."""
     value = 0.0
     for _ in range(ITERATIONS):
-        used = np.zeros_like(policy)
-        total = 0.0
-        for walk, row in zip(walks, rows, strict=True):
-            total += _expect(policy, walk, row, column, used)
-        before, value = value, total / len(walks)
+        expected = [_expect(policy, walk) for walk in walks]
+        before, value = value, sum(success for success, _ in expected) / len(walks)
         if value - before < 1e-9:
             break
+        used = np.sum([counts for _, counts in expected], axis=0)
         weight = used.sum(axis=1, keepdims=True)
         policy = np.where(weight > 0, used / np.maximum(weight, 1e-300), policy)
     return value
 
 
-def _expect(policy: np.ndarray, walk: _Walk, row: Sequence[int], column: Mapping[str, int], used: np.ndarray) -> float:
-    """Add how often each answer is given in walks that succeed to ``used``; return the probability of success."""
-    hope = np.zeros(len(walk.states))
-    for k in range(len(walk.states) - 1, -1, -1):
-        hope[k] = sum(
-            policy[row[k], column[answer]] * (1.0 if to == _SUCCESS else hope[to] if to >= 0 else 0.0)
-            for answer, to in walk.ways[k].items()
-        )
-    reach = np.zeros(len(walk.states))
+def _expect(policy: NDArray[np.float64], walk: _Walk) -> tuple[float, NDArray[np.float64]]:
+    """Return the probability of success, and how often each answer is given in walks that succeed, (pictures, A)."""
+    chosen = policy[walk.pictures]
+    hope = np.zeros(len(walk.to) + 2)
+    hope[_SUCCESS] = 1.0
+    for layer in reversed(walk.layers):
+        hope[layer] = (chosen[layer] * hope[walk.to[layer]]).sum(axis=1)
+    reach = np.zeros(len(walk.to) + 2)
     reach[0] = 1.0
-    for k, ways in enumerate(walk.ways):
-        if reach[k] == 0.0:
-            continue
-        for answer, to in ways.items():
-            flow = reach[k] * policy[row[k], column[answer]]
-            used[row[k], column[answer]] += flow * (1.0 if to == _SUCCESS else hope[to] if to >= 0 else 0.0)
-            if to >= 0:
-                reach[to] += flow
-    return float(hope[0])
+    for layer in walk.layers:
+        np.add.at(reach, walk.to[layer], reach[layer, None] * chosen[layer])
+    counts = np.zeros_like(policy)
+    np.add.at(counts, walk.pictures, reach[:-2, None] * chosen * hope[walk.to])
+    return float(hope[0]), counts
