@@ -367,6 +367,14 @@ def test_the_command(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert not (tmp_path / "other").exists()
 
 
+def test_setup_looks_for_the_browsers_that_the_tests_use() -> None:
+    folder = Path(__file__)
+    script = (folder.parents[2] / "scripts" / "setup").read_text()
+    names = re.search(r"^NAMES = \((.*)\)$", folder.with_name("browser.py").read_text(), re.MULTILINE)
+    assert names
+    assert f"for name in {' '.join(re.findall('[a-z-]+', names[1]))}; do" in script
+
+
 def test_the_wheel_holds_the_template(tmp_path: Path) -> None:
     import zipfile
 

@@ -51,12 +51,20 @@ const operationName = (operation) => DATA.operations[operation].name;
 /** Outcomes: what the log calls them, what people do, and the letter that stands for them where room is short. */
 const OUTCOMES = {
   success: { words: "success", letter: "✓", why: "The goal holds at the end." },
-  storage_failure: { words: "storage failure", letter: "S", why: "The first checkpoint that never held is a Storage." },
-  stale_memory: { words: "stale memory", letter: "U", why: "The first checkpoint that never held is an Update." },
+  storage_failure: {
+    words: "storage failure",
+    letter: "S",
+    why: "The first checkpoint that never held is a Storage checkpoint.",
+  },
+  stale_memory: {
+    words: "stale memory",
+    letter: "U",
+    why: "The first checkpoint that never held is an Update checkpoint.",
+  },
   compression_collapse: {
     words: "compression collapse",
     letter: "C",
-    why: "The first checkpoint that never held is a Compression.",
+    why: "The first checkpoint that never held is a Compression checkpoint.",
   },
   reference_drift: {
     words: "reference drift",
