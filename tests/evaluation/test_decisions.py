@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation import decisions, necessity_study
 from lerobot_memobench.evaluation.decisions import Demonstration, Home, Moment, Picture, unmatched
@@ -173,6 +175,24 @@ def test_a_task_with_one_goal_has_one_row(monkeypatch: pytest.MonkeyPatch, tmp_p
     # Of one with variants, the published goal is the fixed setting only.
     result = study(get_task(MILK), "fixed", Settings(episodes=1), tmp_path)
     assert rows([result])[0][2][0] == "fixed"
+
+
+def test_the_command_shows_a_table_and_names_its_files(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shown = {k: demonstration((f"take {k}", scene(), 0.0)) for k in range(2)}
+    by_hand(monkeypatch, shown)
+    words = ["necessity", "--tasks", f"{PAN},{MILK}", "--episodes", "1", "--budget", "0", "--out", str(tmp_path)]
+    assert main(words) == 0
+    out = capsys.readouterr().out
+    assert "3/3" in out, "the stove once, the milk under both settings"
+    assert all(str(tmp_path / name) in out for name in ("necessity.json", "necessity.md", "aliased_pairs.png"))
+    results = json.loads((tmp_path / "necessity.json").read_text())
+    assert [(r["referent"], r["memory_needed"]) for r in results] == [
+        ("fixed", "no"),
+        ("fixed", "no"),
+        ("random", "order?"),
+    ]
 
 
 # --- the simulator ---

@@ -197,15 +197,21 @@ def follow(task: Task, sim: Simulation, seed: int, horizon: int = HORIZON) -> De
     progress.reset()
     expert = _expert(task, sim, seed)
     moments: list[Moment] = []
+    turned: list[Atom] = []
     while not progress.success and progress.steps < horizon and not expert.done:
         action = expert.act()
         turned_to: Atom | None = getattr(expert, "turned_to", None)
         if turned_to is not None and not expert.done:
             seen, proprio = photograph(sim), sim.proprio()
+            turned.append(turned_to)
             moments.append(Moment(str(turned_to), progress.steps, seen, home.look(), proprio))
             expert.turned_to = None  # type: ignore[attr-defined]
         sim.step(action)
         progress.step(sim.holds)
+    # While a `Then` still counts how long its last part holds, the expert may turn to something that is not asked for.
+    while progress.success and moments and not sim.holds(turned[-1]):
+        moments.pop()
+        turned.pop()
     return Demonstration(tuple(moments), progress.success, progress.steps)
 
 
