@@ -1,0 +1,169 @@
+"""A policy server for tests, written from the deployed ones and not from our client: openpi's websocket, REST.
+
+The frames are packed here on their own, so that an error in the client's packing does not cancel out. Run as a script
+(``python policy_server.py PORT [question over which it dies]``) it is a server in a process of its own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import sys
+import threading
+from collections.abc import Callable
+from email.parser import BytesParser
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+
+import msgpack
+import numpy as np
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.server import ServerConnection, serve
+
+Answer = Callable[[dict[str, Any]], Any]
+
+
+def to_wire(value: Any) -> Any:
+    return {b"__ndarray__": True, b"data": value.tobytes(), b"dtype": value.dtype.str, b"shape": value.shape}
+
+
+def from_wire(found: dict[Any, Any]) -> Any:
+    if b"__ndarray__" not in found:
+        return found
+    return np.ndarray(buffer=found[b"data"], dtype=np.dtype(found[b"dtype"]), shape=found[b"shape"])
+
+
+def zeros(question: dict[str, Any], steps: int = 10) -> dict[str, Any]:
+    return {"actions": np.zeros((steps, 7))}
+
+
+def robomme(question: dict[str, Any]) -> dict[str, Any]:
+    """Answer as RoboMME's server does: two orders besides questions."""
+    if question.get("reset"):
+        return {"reset_finished": True, "reset_time_ms": 0.1}
+    if question.get("add_buffer"):
+        return {"add_buffer_finished": True, "add_buffer_time_ms": 0.1}
+    return zeros(question, 16)
+
+
+class PolicyServer:
+    """openpi's server: metadata first, then frames; a failure is a traceback as text, then the connection closes.
+
+    Args:
+        answer: question -> answer; a `str` is sent as text, as a traceback would be. die_at: the question (from 0) over
+            which the server dies. port: 0 for a free one.
+
+    Attributes:
+        heard: (number of the connection, question), in the order of arrival.
+    """
+
+    def __init__(self, answer: Answer = zeros, *, die_at: int | None = None, port: int = 0) -> None:
+        self.answer, self.die_at = answer, die_at
+        self.heard: list[tuple[int, dict[str, Any]]] = []
+        self.connections: list[ServerConnection] = []
+        self._server = serve(self._talk, "127.0.0.1", port, compression=None, max_size=None)
+        self.port = int(self._server.socket.getsockname()[1])
+        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+        self._thread.start()
+
+    def _talk(self, connection: ServerConnection) -> None:
+        number = len(self.connections)
+        self.connections.append(connection)
+        try:
+            connection.send(msgpack.packb({"served": "zeros"}))
+            while True:
+                question = msgpack.unpackb(connection.recv(), object_hook=from_wire)
+                if self.die_at is not None and len(self.heard) >= self.die_at:
+                    self.die()
+                    return
+                self.heard.append((number, question))
+                answer = self.answer(question)
+                if isinstance(answer, str):
+                    connection.send(answer)
+                    connection.close(1011, "Internal server error. Traceback included in previous frame.")
+                    return
+                connection.send(msgpack.packb(answer, default=to_wire))
+        except (ConnectionClosed, OSError):
+            pass
+
+    @property
+    def questions(self) -> list[dict[str, Any]]:
+        return [question for _, question in self.heard]
+
+    def die(self) -> None:
+        """Stop listening and cut every connection, without a farewell."""
+        # Its own shutdown waits for every conversation, and this may be called from one.
+        threading.Thread(target=self._server.shutdown, daemon=True).start()
+        self._thread.join()
+        for connection in self.connections:
+            with contextlib.suppress(OSError):
+                connection.socket.shutdown(socket.SHUT_RDWR)
+
+    def __enter__(self) -> PolicyServer:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.die()
+
+
+class RestServer:
+    """A REST server: POST bodies are parsed as their type says; ``answer`` gives state and text.
+
+    Attributes:
+        heard: (path, question) in the order of arrival; the parts of a form are bytes.
+    """
+
+    def __init__(self, answer: Callable[[dict[str, Any]], tuple[int, str]], *, port: int = 0) -> None:
+        server = self
+        self.heard: list[tuple[str, Any]] = []
+
+        class Handler(BaseHTTPRequestHandler):
+            protocol_version = "HTTP/1.1"
+
+            def do_GET(self) -> None:
+                self._reply(404, "{}")
+
+            def do_POST(self) -> None:
+                body = self.rfile.read(int(self.headers["Content-Length"]))
+                kind = self.headers["Content-Type"]
+                question = form(kind, body) if kind.startswith("multipart") else {"json": body.decode()}
+                server.heard.append((self.path, question))
+                self._reply(*answer(question))
+
+            def _reply(self, state: int, text: str) -> None:
+                self.send_response(state)
+                self.send_header("Content-Length", str(len(text.encode())))
+                self.end_headers()
+                self.wfile.write(text.encode())
+
+            def log_message(self, *words: Any) -> None:
+                pass
+
+        self._server = ThreadingHTTPServer(("127.0.0.1", port), Handler)
+        self._server.daemon_threads = True
+        self.port = self._server.server_address[1]
+        threading.Thread(target=self._server.serve_forever, args=(0.05,), daemon=True).start()
+
+    def __enter__(self) -> RestServer:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+
+
+def form(kind: str, body: bytes) -> dict[str, bytes]:
+    """Return the parts of a multipart form."""
+    message = BytesParser().parsebytes(b"Content-Type: " + kind.encode() + b"\r\n\r\n" + body)
+    return {
+        str(part.get_param("name", header="content-disposition")): bytes(part.get_payload(decode=True) or b"")  # type: ignore[arg-type]
+        for part in message.get_payload()  # type: ignore[union-attr]
+    }
+
+
+if __name__ == "__main__":
+    lone = PolicyServer(port=int(sys.argv[1]), die_at=int(sys.argv[2]) if len(sys.argv) > 2 else None)
+    lone.die = lambda: os._exit(1)  # type: ignore[method-assign]
+    print("listening", flush=True)
+    lone._thread.join()
