@@ -57,6 +57,8 @@ def prepare(translation: Translation, orders: Orders) -> Evaluation:
         add_earlier_batch_size(translation)
     if orders.shard is not None or orders.shards:
         translation.add("eval.batch_size", 1)  # by cores, each machine would cut the evaluation differently
+    if getattr(policy, "max_environments", None) is not None:
+        add_batch_size(translation, policy.max_environments)  # its servers keep one memory each
     add_protocol(translation, getattr(policy, "n_action_steps", None))
     environment = preflight.parse_choice(translation, "env")
     if environment is None and orders.any:
@@ -95,15 +97,15 @@ def add_protocol(translation: Translation, n_action_steps: int | None) -> None:
     translation.add("env.log_dir", translation.get("output_dir"))
 
 
-def add_batch_size(translation: Translation) -> None:
-    """Choose the largest batch that LeRobot would choose and that divides the episodes.
+def add_batch_size(translation: Translation, most: int = 64) -> None:
+    """Choose the largest batch that LeRobot would choose and that divides the episodes; at most ``most``.
 
     LeRobot runs whole batches and throws the surplus of the last one away, after simulating it.
     """
     if (translation.get("eval.batch_size") or "0") != "0":
         return
     episodes = int(translation.get("eval.n_episodes") or 50)
-    limit = max(1, min(int((os.cpu_count() or 4) * 0.7), episodes, 64))
+    limit = max(1, min(int((os.cpu_count() or 4) * 0.7), episodes, most))
     translation.set("eval.batch_size", max(size for size in range(1, limit + 1) if episodes % size == 0))
 
 
