@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 import typer
 
-from lerobot_memobench.cli import controls, data, html, merging, report
+from lerobot_memobench.cli import controls, data, figures, html, merging, report
 from lerobot_memobench.cli.console import console
 from lerobot_memobench.cli.recipes import recipe
 from lerobot_memobench.cli.study import study
@@ -183,6 +183,7 @@ app.command()(study)
 
 
 app.command()(report.report)
+app.add_typer(figures.app, name="figures")
 app.command()(html.html)
 app.command()(controls.necessity)
 app.add_typer(controls.app, name="controls")

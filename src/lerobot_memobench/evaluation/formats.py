@@ -6,6 +6,7 @@ import csv
 import io
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 
 from rich import box
 from rich.console import Console, Group, RenderableType
@@ -26,7 +27,7 @@ def terminal(report: Report, headings: bool = True) -> RenderableType:
     for section in report.sections:
         if headings and section.title:
             parts.append(Text(f"\n{section.title}", style="bold underline"))
-        parts += [terminal_table(table) for table in section.tables]
+        parts += [terminal_table(part) for table in section.tables for part in _narrow(table)]
         parts += [Text(sentence) for sentence in section.sentences]
         parts += [Text(f"note: {note}") for note in section.notes]
     return Group(*parts)
@@ -37,9 +38,11 @@ def terminal_table(table: Table) -> RichTable:
     result = RichTable(
         title=table.title or None, title_justify="left", header_style="bold", pad_edge=False, box=box.SIMPLE_HEAD
     )
-    for column, name in enumerate(_full_header(table)):
-        text = table.is_text(column)
-        result.add_column(name, justify="left" if text else "right", overflow="fold")
+    titles = [title for title, span in table.groups for _ in range(span)] or [""] * len(table.header)
+    for column, (title, name) in enumerate(zip(titles, table.header, strict=True)):
+        # Rates are so narrow that a group's whole title does not fit over them.
+        header = f"{title[:4]}.\n{name}" if title else name
+        result.add_column(header, justify="left" if table.is_text(column) else "right", overflow="fold")
     for index, row in enumerate(table.rows):
         if index in table.rules:
             result.add_section()
@@ -56,6 +59,43 @@ def terminal_table(table: Table) -> RichTable:
         result.caption = "* best of its column"
         result.caption_justify = "left"
     return result
+
+
+MOST_COLUMNS = 14
+"""Columns of a table with groups that fit beside one another in a terminal."""
+
+
+def _narrow(table: Table) -> list[Table]:
+    """Cut a table with groups of columns into several that fit; each keeps the columns before the first group."""
+    leading = 0
+    for title, span in table.groups:
+        if title:
+            break
+        leading += span
+    parts: list[list[int]] = [[]]
+    column = leading
+    for _, span in [group for group in table.groups if group[0]]:
+        if parts[-1] and leading + len(parts[-1]) + span > MOST_COLUMNS:
+            parts.append([])
+        parts[-1] += range(column, column + span)
+        column += span
+    if len(parts) == 1:
+        return [table]
+    return [_columns(table, [*range(leading), *part], first=k == 0) for k, part in enumerate(parts)]
+
+
+def _columns(table: Table, chosen: Sequence[int], first: bool) -> Table:
+    """Return some columns of a table; the title is kept on the first part."""
+    titles = [title for title, span in table.groups for _ in range(span)]
+    groups = tuple((titles[column], 1) for column in chosen)
+    return replace(
+        table,
+        title=table.title if first else f"{table.title}, continued",
+        header=tuple(table.header[column] for column in chosen),
+        rows=tuple(tuple(row[column] for column in chosen) for row in table.rows),
+        groups=groups,
+        best=frozenset((row, chosen.index(column)) for row, column in table.best if column in chosen),
+    )
 
 
 def _terminal_cell(cell: Cell, intervals: bool) -> str:

@@ -112,7 +112,10 @@ def prefix(summary: Summary) -> Table:
         "Prefix completion, in any order / in order",
         ("task", "operations", *(f"c{k + 1}" for k in range(width))),
         tuple(rows),
-        note="Rollouts in which a checkpoint and all before it were satisfied, at whatever steps / one after another. Per cent.",
+        note=(
+            "Rollouts in which a checkpoint and all before it were satisfied, at whatever steps / one after another, "
+            "per cent."
+        ),
     )
 
 

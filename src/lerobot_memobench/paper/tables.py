@@ -34,7 +34,7 @@ LABELS: Mapping[str, str] = MappingProxyType(
         "Contrastive Memory Alignment": "contrastive alignment",
         "Semantic Memory Alignment": "semantic alignment",
         "Framewise Memory Alignment": "framewise alignment",
-        "Memory module": "memory module",
+        "Memory module": "π0.5 + memory module",
         "standard_pi05": "π0.5",
         "oracle_pi05": "π0.5 + oracle memory",
         "memer": "MemER",

@@ -1,0 +1,174 @@
+"""``memobench figures …``: one command per figure of the paper, from evaluations, from its tables, or from both."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from lerobot_memobench.cli.console import console
+from lerobot_memobench.cli.report import Beside, With
+from lerobot_memobench.errors import MemobenchError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from lerobot_memobench.evaluation.runs import Run
+
+app = typer.Typer(
+    help="Draw figures of evaluations (DIR, or NAME=DIR) and of the paper's tables (--with paper), as PDF and PNG.",
+    no_args_is_help=True,
+)
+
+Folders = Annotated[
+    list[str] | None,
+    typer.Argument(
+        help="Folders that evaluations have written, or NAME=FOLDER; the same name for one policy at several replan "
+        "intervals. None with --with paper: the paper's figure.",
+        metavar="[DIR...]",
+    ),
+]
+Out = Annotated[
+    Path, typer.Option(help="A file ending in .pdf, .png or .svg, or a folder that gets the PDF and the PNG.")
+]
+DEFAULT_OUT = Path("outputs/figures")
+
+
+class Axes(StrEnum):
+    """What the axes of a radar are."""
+
+    AVERAGE = "average"
+    TYPES = "types"
+
+
+class Grouping(StrEnum):
+    """What one point, bar or row of panels is about."""
+
+    TYPES = "types"
+    TASKS = "tasks"
+
+
+@app.command()
+def radar(
+    folders: Folders = None,
+    with_: With = None,
+    axes: Annotated[
+        Axes, typer.Option(help="average: SR, MSR, MUR, MCR; types: those of each memory type.")
+    ] = Axes.AVERAGE,
+    out: Out = DEFAULT_OUT,
+) -> None:
+    """Per method the best value over replan intervals, each axis normalised by its highest."""
+    from lerobot_memobench.evaluation.figures import entries, radar
+
+    runs, paper = _given(folders, with_)
+    ours = entries.entries_of(runs)
+    chosen = entries.average_axes() if axes is Axes.AVERAGE else entries.type_axes()
+    panels = [("", ours)]
+    if paper:
+        panels = [
+            ("Main results", [*ours, *entries.published_entries("main")]),
+            ("Memory alignment", [*ours, *entries.published_entries("alignment")]),
+        ]
+    _save(radar.draw(panels, chosen), out, "radar" if axes is Axes.AVERAGE else "radar_types")
+
+
+@app.command()
+def correlations(
+    folders: Folders = None,
+    with_: With = None,
+    by: Annotated[
+        Grouping | None,
+        typer.Option(help="One point per memory type or per task; per task where only evaluations are drawn."),
+    ] = None,
+    out: Out = DEFAULT_OUT,
+) -> None:
+    """MSR, MUR and MCR against SR with Pearson's r."""
+    from lerobot_memobench.evaluation.figures import correlations, entries
+
+    runs, paper = _given(folders, with_)
+    if paper and by is Grouping.TASKS:
+        raise MemobenchError("the paper publishes no figures per task; leave out --by tasks or --with paper")
+    rows = [*(entries.published_entries("main") if paper else ()), *entries.entries_of(runs)]
+    by_task = by is Grouping.TASKS or (by is None and not paper)
+    _save(correlations.draw(rows, by_task), out, "correlations")
+
+
+@app.command()
+def failures(
+    folders: Folders = None,
+    with_: With = None,
+    by: Annotated[Grouping, typer.Option(help="One bar per memory type or per task.")] = Grouping.TYPES,
+    out: Out = DEFAULT_OUT,
+) -> None:
+    """How rollouts ended: success and the classes of failure, as bars."""
+    from lerobot_memobench.evaluation.figures import failures
+
+    runs, paper = _given(folders, with_)
+    bars = [*failures.bars(runs, by is Grouping.TASKS), *([failures.paper_bar()] if paper else [])]
+    _save(failures.draw(bars), out, "failures")
+
+
+@app.command()
+def prefix(
+    folders: Folders = None,
+    with_: With = None,
+    tasks: Annotated[
+        str | None, typer.Option(help="Tasks to draw: memory types or names, separated by commas; all by default.")
+    ] = None,
+    out: Out = DEFAULT_OUT,
+) -> None:
+    """Prefix completion per checkpoint, in any order and in order, one panel per task."""
+    from lerobot_memobench.evaluation.figures import prefix
+
+    runs, paper = _given(folders, with_)
+    panels = prefix.panels(runs, None if tasks is None else _chosen(tasks, runs))
+    _save(prefix.draw([*panels, *([prefix.paper_panel()] if paper else [])]), out, "prefix")
+
+
+@app.command()
+def replan(
+    folders: Folders = None,
+    with_: With = None,
+    by: Annotated[
+        Grouping | None, typer.Option(help="types: rows of panels for the memory types, under the average.")
+    ] = None,
+    out: Out = DEFAULT_OUT,
+) -> None:
+    """SR, MSR, MUR and MCR by replan interval."""
+    from lerobot_memobench.evaluation.figures import replan
+
+    runs, paper = _given(folders, with_)
+    if by is Grouping.TASKS:
+        raise MemobenchError("found --by tasks; expected types: replan curves are drawn of averages and memory types")
+    _save(replan.draw(runs, paper, by is Grouping.TYPES), out, "replan")
+
+
+def _given(folders: list[str] | None, with_: Beside | None) -> tuple[list[Run], bool]:
+    """Return the evaluations and whether the paper's figures are drawn; one of both is needed."""
+    from lerobot_memobench.evaluation.runs import read_runs
+
+    paper = with_ is Beside.PAPER
+    if not folders and not paper:
+        raise MemobenchError("there is nothing to draw; name folders of evaluations, or --with paper, or both")
+    return (read_runs(folders) if folders else []), paper
+
+
+def _chosen(spec: str, runs: list[Run]) -> list[str]:
+    """Return task names; those of the evaluations, which may be a user's own, go before the catalogue's words."""
+    from lerobot_memobench.tasks.catalogue import resolve_tasks
+
+    there = {name: memory_type for run in runs for name, memory_type in run.summary.memory_type_of.items()}
+    if spec in there:
+        return [spec]
+    chosen = resolve_tasks(spec)
+    return [name for name in chosen if name in there] or chosen
+
+
+def _save(figure: Figure, out: Path, name: str) -> None:
+    from lerobot_memobench.evaluation.figures.style import look, save
+
+    with look():
+        for path in save(figure, out, name):
+            console().print(str(path), soft_wrap=True)

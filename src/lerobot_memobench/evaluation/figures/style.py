@@ -1,0 +1,152 @@
+"""One look for all figures: safe for the colour-blind, and told apart in grey by marker, line and hatch.
+
+Operations keep the colours they have in videos and in the HTML report (Okabe and Ito's palette); what else needs colour
+takes others.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lerobot_memobench.errors import MemobenchError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+OPERATION_COLOURS = {"S": "#56b4e9", "U": "#e69f00", "C": "#009e73"}
+METRIC_NAMES = {
+    "SR": "success",
+    "MSR": "storage",
+    "MUR": "update",
+    "MCR": "compression",
+}
+
+INK, FAINT, GRID = "#222222", "#777777", "#d9d9d9"
+
+
+@dataclass(frozen=True)
+class Look:
+    """How one kind of rollouts is filled: colour, and hatch for print in grey."""
+
+    colour: str
+    hatch: str = ""
+
+
+OUTCOMES: dict[str, Look] = {
+    "success": Look("#e8e8e8"),
+    "storage_failure": Look(OPERATION_COLOURS["S"], "////"),
+    "stale_memory": Look(OPERATION_COLOURS["U"], "\\\\\\\\"),
+    "compression_collapse": Look(OPERATION_COLOURS["C"], "...."),
+    "reference_drift": Look("#f0e442", "||||"),
+    "execution_failure": Look("#d55e00", "xxxx"),
+}
+"""Outcome -> look; the colours are those of the HTML report."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """How one method is drawn."""
+
+    colour: str
+    marker: str
+    dashes: Any
+
+
+_COLOURS = (
+    "#0072b2", "#d55e00", "#000000", "#cc79a7", "#882255", "#999933", "#777777", "#332288", "#44aa99", "#aa4499",
+)  # fmt: skip
+"""Okabe and Ito's without those of the operations, then Paul Tol's muted ones."""
+_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<", "h")
+_DASHES: tuple[Any, ...] = (
+    "-", "--", "-.", ":",
+    (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)), (0, (4, 1, 1, 1, 1, 1)), (0, (2, 2)),
+)  # fmt: skip
+
+
+def lines(names: Sequence[str]) -> dict[str, Line]:
+    """Return a look for each method: no two of ten share colour, marker or dashes, no two of a hundred all three."""
+    distinct = list(dict.fromkeys(names))
+    count = len(_COLOURS)
+    return {
+        name: Line(_COLOURS[k % count], _MARKERS[(k + k // count) % count], _DASHES[(k + k // count) % count])
+        for k, name in enumerate(distinct)
+    }
+
+
+@contextmanager
+def look() -> Iterator[None]:
+    """Set fonts and lines for everything drawn inside."""
+    import matplotlib as mpl
+
+    settings = {
+        "font.size": 8,
+        "axes.titlesize": 8.5,
+        "axes.labelsize": 8,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.edgecolor": FAINT,
+        "axes.linewidth": 0.7,
+        "axes.titleweight": "bold",
+        "xtick.color": INK,
+        "ytick.color": INK,
+        "xtick.major.width": 0.7,
+        "ytick.major.width": 0.7,
+        "text.color": INK,
+        "legend.frameon": False,
+        "legend.fontsize": 8,
+        "hatch.linewidth": 0.4,
+        "pdf.fonttype": 42,  # text stays text
+        "svg.fonttype": "none",
+    }
+    with mpl.rc_context(settings):
+        yield
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure of a size in inches, laid out so that nothing overlaps."""
+    from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+    return Figure(figsize=(width, height), layout=ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.06))
+
+
+def words(name: str) -> str:
+    """Return a name as matplotlib sets it: the models π0 and π0.5 with an index, everything else literally."""
+    literal = name.replace("$", r"\$")
+    return re.sub(r"π(\d(?:\.\d)?)", r"$\\pi_{\1}$", literal)
+
+
+def legend_below(figure: Figure, handles: Sequence[Any], labels: Sequence[str], columns: int) -> None:
+    """Put one legend under all panels."""
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, handlelength=3.2, columnspacing=1.6)
+
+
+FORMATS = (".pdf", ".png", ".svg")
+
+
+def save(figure: Figure, out: Path, name: str) -> list[Path]:
+    """Write a figure to a file whose ending says as what, or as NAME.pdf and NAME.png into a folder; return the files.
+
+    Raises:
+        MemobenchError: the ending is none of .pdf, .png, .svg.
+    """
+    if out.suffix and not out.is_dir():
+        if out.suffix.lower() not in FORMATS:
+            raise MemobenchError(f"--out {out} ends in {out.suffix}; expected {', '.join(FORMATS)}, or a folder")
+        paths = [out]
+    else:
+        paths = [out / f"{name}.pdf", out / f"{name}.png"]
+    for path in paths:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        draft = path.with_name(f".{path.stem}.part{path.suffix}")
+        # Without its date, the same figures give the same file.
+        metadata = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}.get(path.suffix.lower())
+        figure.savefig(draft, dpi=200, metadata=metadata)
+        os.replace(draft, path)
+    return paths
