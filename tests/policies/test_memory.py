@@ -158,3 +158,31 @@ def test_stride_and_sampling_of_a_long_history() -> None:
     assert [float(t[0, 0]) for t in tokens[0]] == [0, 6, 12, 18]
     memory.reset()
     assert memory.rows == []
+
+
+def test_keys_are_computed_once_per_memory_and_only_without_gradients() -> None:
+    from lerobot_memobench.policies.memobench_mem.memory import MemoryState, ModulatedNorm
+
+    class Plain(torch.nn.Module):
+        def forward(self, x: torch.Tensor, cond: torch.Tensor | None = None) -> tuple[torch.Tensor, None]:
+            return x, None
+
+    modulator, state = _modulator(), MemoryState()
+    norm = ModulatedNorm(Plain(), modulator, state)
+    calls: list[int] = []
+    keys = modulator.keys
+    modulator.keys = lambda memory: calls.append(1) or keys(memory)  # type: ignore[method-assign]
+    actions, mask = torch.randn(2, 5, 32), torch.ones(2, 9, dtype=torch.bool)
+    memories = torch.randn(3, 2, 9, 32)
+    fresh = []
+    for memory in memories:
+        state.set(memory, mask)
+        fresh.append(norm(actions)[0].detach())
+        norm(actions)
+    assert len(calls) == 6  # with gradients: every time, as checkpointing runs layers again
+    with torch.no_grad():
+        for memory, expected in zip(memories, fresh, strict=True):
+            state.set(memory, mask)
+            for _ in range(3):
+                torch.testing.assert_close(norm(actions)[0], expected)
+    assert len(calls) == 9

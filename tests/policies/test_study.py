@@ -36,7 +36,7 @@ def test_arrays_are_the_dataset(work: Study, twice_root: Path) -> None:
     indices = np.array([3, 38, 39, 81])  # 39 is the last frame of its episode: its chunk is padded
     batch = work.frames.batch(indices, 3)
     items = [dataset[int(index)] for index in indices]
-    for key in ("action", "action_is_pad", "observation.state", "observation.images.wrist_image"):
+    for key in ("action", "action_is_pad", "observation.state", "observation.images.image"):
         torch.testing.assert_close(batch[key], torch.stack([item[key] for item in items]), atol=2e-3, rtol=0)
     assert batch["task"] == [item["task"] for item in items]
 

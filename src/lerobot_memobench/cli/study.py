@@ -19,7 +19,7 @@ COLOURS = {"none": "#7f7f7f", "semantic": "#56b4e9", "contrastive": "#e69f00", "
 def study(
     dataset: Annotated[Path, typer.Argument(help="Folder of a generated dataset of eight tasks or more.")],
     out: Annotated[Path, typer.Option(help="Folder of runs, table and figure; the same command goes on there.")],
-    steps: Annotated[int, typer.Option(min=1, help="Updates per run.")] = 200,
+    steps: Annotated[int, typer.Option(min=1, help="Updates per run.")] = 300,
     batch_size: Annotated[int, typer.Option(min=2, help="Samples per update.")] = 16,
     seeds: Annotated[int, typer.Option(min=1, help="Runs per alignment.")] = 3,
     held_out: Annotated[int, typer.Option(min=1, help="Episodes per task that are never trained on.")] = 2,

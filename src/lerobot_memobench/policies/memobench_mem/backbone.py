@@ -201,7 +201,7 @@ class MemoryPI05(SizedPI05):
         """
         memory, mask = self.memory(tokens, steps, frame_mask)
         if self.config.integration == "modulation":
-            self.memory_state.memory, self.memory_state.mask = self.memory_to_expert(memory), mask
+            self.memory_state.set(self.memory_to_expert(memory), mask)
         else:
             self.context = memory, mask
         return memory, mask

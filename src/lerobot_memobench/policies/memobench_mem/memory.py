@@ -145,20 +145,25 @@ class MemoryModulator(nn.Module):
         nn.init.zeros_(self.modulation.weight)
         nn.init.zeros_(self.modulation.bias)
 
-    def forward(self, actions: Tensor, memory: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+    def keys(self, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Rotated keys and values, both (B, 1, L, head_dim), of memory (B, L, W)."""
+        normed = self.memory_norm(memory)
+        key = _rotate(self.key(normed).unsqueeze(1), torch.arange(memory.shape[1], device=memory.device))
+        return key, self.value(normed).unsqueeze(1)
+
+    def forward(
+        self, actions: Tensor, memory: Tensor, mask: Tensor, keys: tuple[Tensor, Tensor] | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Scale and shift, both (B, T, W), for actions (B, T, W) from memory (B, L, W) with mask (B, L).
 
-        A row whose memory is all masked reads zeros.
+        ``keys`` are those of the same memory, if they have been computed before. A row whose memory is all masked
+        reads zeros.
         """
         batch, count, _ = actions.shape
         length = memory.shape[1]
-        normed = self.memory_norm(memory)
+        key, value = self.keys(memory) if keys is None else keys
         query = self.query(self.action_norm(actions)).view(batch, count, self.heads, self.head_dim).transpose(1, 2)
-        key = self.key(normed).unsqueeze(1)
-        value = self.value(normed).unsqueeze(1)
-        positions = torch.arange(length + count, device=actions.device)
-        query = _rotate(query, positions[length:])
-        key = _rotate(key, positions[:length])
+        query = _rotate(query, torch.arange(length, length + count, device=actions.device))
         # A finite bias keeps the softmax of an all-masked row finite; its result is then set to zero.
         bias = torch.zeros_like(mask, dtype=query.dtype).masked_fill(~mask, torch.finfo(query.dtype).min / 2)
         read = F.scaled_dot_product_attention(
@@ -177,11 +182,27 @@ class MemoryModulator(nn.Module):
 class MemoryState:
     """What every modulated layer reads during one forward pass: memory at the expert's width, and its mask.
 
-    It is kept until the next pass replaces it, because gradient checkpointing runs layers again in ``backward``.
+    It is kept until the next pass replaces it, because gradient checkpointing runs layers again in ``backward``. In a
+    rollout the layers' keys of this memory are kept as well: all denoising steps of a plan read the same memory.
     """
 
     memory: Tensor | None = None  # (B, L, W)
     mask: Tensor | None = None  # (B, L) bool
+    keys: dict[nn.Module, tuple[Tensor, Tensor]] = field(default_factory=dict)
+
+    def set(self, memory: Tensor, mask: Tensor) -> None:
+        """Begin a pass over another memory."""
+        self.memory, self.mask = memory, mask
+        self.keys.clear()
+
+    def keys_of(self, modulator: MemoryModulator) -> tuple[Tensor, Tensor]:
+        """Keys and values of a layer; computed once per memory where no gradients are wanted."""
+        assert self.memory is not None
+        if torch.is_grad_enabled():
+            return modulator.keys(self.memory)
+        if modulator not in self.keys:
+            self.keys[modulator] = modulator.keys(self.memory)
+        return self.keys[modulator]
 
 
 class ModulatedNorm(nn.Module):
@@ -202,7 +223,8 @@ class ModulatedNorm(nn.Module):
         normed, gate = self.norm(x, cond=cond)
         if self.state.memory is None or self.state.mask is None:
             return normed, gate
-        scale, shift = self.modulator(x, self.state.memory, self.state.mask)
+        keys = self.state.keys_of(self.modulator)
+        scale, shift = self.modulator(x, self.state.memory, self.state.mask, keys)
         return (normed * (1.0 + scale) + shift).to(normed.dtype), gate
 
 

@@ -19,8 +19,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from lerobot.configs import PolicyFeature
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.utils.feature_utils import dataset_to_policy_features
 from torch import Tensor
 
 from lerobot_memobench.datasets.memory_cache import MemoryCache, dataset_fingerprint
@@ -44,7 +46,7 @@ Say = Callable[[str], None]
 class StudySettings:
     """What a study does; two studies with equal settings and dataset give equal numbers."""
 
-    steps: int = 200
+    steps: int = 300
     batch_size: int = 16
     seeds: int = 3
     held_out: int = 2
@@ -58,9 +60,12 @@ class StudySettings:
     action_batches: int = 8
     """Batches of held-out frames on which the action loss is measured, each with fixed noise."""
 
-    def config(self, align: str) -> MemobenchMemConfig:
-        """The policy that is trained."""
+    def config(self, align: str, features: dict[str, PolicyFeature] | None = None) -> MemobenchMemConfig:
+        """The policy that is trained; of the dataset's ``features`` it sees the state and the remembered camera."""
+        camera = MemobenchMemConfig.memory_camera
+        seen = {key: feature for key, feature in (features or {}).items() if key in (camera, "observation.state")}
         return MemobenchMemConfig(
+            input_features=seen,
             size=self.size,
             align=align,
             subgoal_level=self.level,
@@ -88,7 +93,12 @@ class Frames:
         self.task_texts = {int(row.task_index): str(text) for text, row in self.meta.tasks.iterrows()}
         starts = [int(first) for first in self.meta.episodes["dataset_from_index"]]
         self.episodes = np.array([*starts, len(self.states)])
-        self.images = {key: self._decode(key, folder, say) for key in self.meta.camera_keys}
+        self.features = dataset_to_policy_features(self.meta.features)
+        self.images = {
+            key: self._decode(key, folder, say)
+            for key in self.meta.camera_keys
+            if key == MemobenchMemConfig.memory_camera
+        }
 
     def _decode(self, key: str, folder: Path, say: Say) -> np.ndarray:
         from lerobot_memobench.datasets.memory_cache import _reader
@@ -269,7 +279,7 @@ class Study:
 
     def _train(self, align: str, seed: int) -> tuple[MemobenchMemPolicy, Any, Any, list[dict[str, float]]]:
         """Train one policy; returns it, its processors, and what was logged every twentieth of the run."""
-        settings, config = self.settings, self.settings.config(align)
+        settings, config = self.settings, self.settings.config(align, self.frames.features)
         torch.manual_seed(seed)
         policy = make_policy(config, ds_meta=self.frames.meta)
         before, after = make_pre_post_processors(config, dataset_stats=self.frames.meta.stats)
@@ -395,7 +405,7 @@ class Study:
         for name, column in (("tower_history", 0), ("tower_last_frame", 1)):
             found[name] = self._readout_scores(raw["fit"][column], raw["test"][column])
         torch.manual_seed(0)
-        policy = make_policy(self.settings.config("none"), ds_meta=self.frames.meta)
+        policy = make_policy(self.settings.config("none", self.frames.features), ds_meta=self.frames.meta)
         fit, test = self._vectors(policy, self.fit), self._vectors(policy, self.test)
         for name in ("memory", "last_frame"):
             found[f"untrained_{name}"] = self._readout_scores(fit[name], test[name])

@@ -1,0 +1,116 @@
+"""History for training samples: gathered from the memory cache, beside decoding the same frames from the videos.
+
+    python benchmarks/history_loading.py [DATASET] [--frames 1 8 32] [--samples 16] [--repeats 5]
+
+The other side is what LeRobot does for delta timestamps: ``decode_video_frames`` of the sample's timestamps, here
+those of exactly the frames that the memory would hold (delta timestamps themselves are fixed offsets and cannot say
+that). It yields pixels; running the image tower over them, which the cache has behind it, is not counted. Without a
+dataset two episodes are recorded and encoded first, 256x256 as generated ones are.
+
+Prints one JSON line: samples/s of both sides and their ratio per number of frames, and how far the resident memory
+rose while each side worked. The cache is memory-mapped: it can never take more than its file's size, which is stated,
+and those pages belong to the system, which takes them back when it needs them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import tempfile
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+import torch
+from turns import medians, peak, reset_peak, resident
+
+from lerobot_memobench.datasets.memory_cache import MemoryCache
+from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.memory import sample_frames
+from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import GatherMemoryProcessorStep
+
+CAMERA = "observation.images.image"
+TASK = "put_the_tomato_into_the_top_drawer_of_the_cabinet"
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("dataset", type=Path, nargs="?")
+    parser.add_argument("--frames", type=int, nargs="+", default=[1, 8, 32])
+    parser.add_argument("--samples", type=int, default=16, help="samples per turn")
+    parser.add_argument("--repeats", type=int, default=5)
+    asked = parser.parse_args()
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory() as name:
+        root = asked.dataset or record(Path(name) / "dataset")
+        print(json.dumps(measure(root, asked.frames, asked.samples, asked.repeats)))
+
+
+def record(root: Path) -> Path:
+    """Record two episodes and write them as a dataset."""
+    from lerobot_memobench.datasets.generation import FIRST_SEED, record_demonstration
+    from lerobot_memobench.datasets.lerobot_format import write_dataset
+    from lerobot_memobench.tasks import get_task
+
+    task = get_task(TASK)
+    return write_dataset((record_demonstration(task, FIRST_SEED + i, images=True) for i in range(2)), root)
+
+
+def measure(root: Path, numbers: list[int], samples: int, repeats: int) -> dict[str, object]:
+    """Measure both sides on a dataset, whose memory cache is made first."""
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+    from lerobot.datasets.video_utils import decode_video_frames
+
+    config = MemobenchMemConfig(size="tiny", device="cpu")
+    folder = cache_dataset(root, config)
+    keys = json.loads((folder / "meta.json").read_text())
+    cache = MemoryCache.open(root, folder.name, **{key: keys[key] for key in ("frames_key", "camera", "stride")})
+    meta = LeRobotDatasetMetadata(root.name, root=root)
+    rng = np.random.default_rng(0)
+    length = int(np.diff(cache.episodes).max())
+    # Frames late in their episodes: histories are as long and as spread as they get.
+    indices = [int(i) for i in rng.choice(cache.num_frames, samples) if cache.locate(int(i))[1] >= 32]
+    height, width, _ = meta.features[CAMERA]["shape"]
+    result: dict[str, object] = {
+        "benchmark": "history_loading",
+        "image": f"{height}x{width}",
+        "longest_episode": length,
+        "samples": len(indices),
+        "token_file_mib": round((folder / "tokens.bin").stat().st_size / 2**20, 1),
+    }
+
+    def decode(frames: int) -> None:
+        for index in indices:
+            episode, frame = cache.locate(index)
+            row = meta.episodes[episode]
+            start = row[f"videos/{CAMERA}/from_timestamp"]
+            times = [start + number / meta.fps for number in sample_frames(frame, frames)]
+            decode_video_frames(root / meta.get_video_file_path(episode, CAMERA), times, tolerance_s=1e-4)
+
+    for frames in numbers:
+        step = GatherMemoryProcessorStep(frames=frames, cache=cache)
+        sides = {"cache": lambda step=step: step.gather(cache, indices), "lerobot": lambda n=frames: decode(n)}
+        rise = {}
+        for name, side in sides.items():
+            side()
+            before = resident()
+            reset_peak()
+            side()
+            rise[name] = round((peak() - before) / 2**20, 1)
+        seconds = medians(sides, repeats, warm_up=0)
+        result[f"frames_{frames}"] = {
+            "ratio": round(seconds["lerobot"] / seconds["cache"], 1),
+            **{f"{name}_samples_per_s": round(len(indices) / seconds[name], 1) for name in sides},
+            **{f"{name}_peak_rise_mib": rise[name] for name in sides},
+        }
+    last = result[f"frames_{numbers[-1]}"]
+    assert isinstance(last, dict)
+    return result | {"ratio": last["ratio"]}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,72 @@
+"""Policies and batches for the benchmarks of memobench_mem: with a memory, and plain pi0.5, of the same dimensions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
+
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.dimensions import SIZES, Gemma, Vision
+
+# A size between tiny and pi05 that a CPU can train, with the full size's proportions: 256 patches per image, a VLM
+# that is wider than its expert, a chunk of 50, memory of 512 tokens.
+SIZES.setdefault(
+    "middle",
+    replace(
+        SIZES["tiny"],
+        vlm=Gemma(width=512, depth=6, mlp_dim=4096, num_heads=8, num_kv_heads=1, head_dim=64),
+        expert=Gemma(width=256, depth=6, mlp_dim=1024, num_heads=8, num_kv_heads=1, head_dim=64),
+        vision=Vision(width=288, depth=6, mlp_dim=1076, num_heads=8, patch=14, image=224),
+        tokenizer_max_length=200,
+    ),
+)
+
+
+def config(size: str, **fields: Any) -> MemobenchMemConfig:
+    """A configuration with the dataset's features."""
+    side = SIZES[size].vision.image
+    image = PolicyFeature(type=FeatureType.VISUAL, shape=(3, side, side))
+    return MemobenchMemConfig(
+        size=size,
+        push_to_hub=False,
+        input_features={
+            "observation.images.image": image,
+            "observation.images.wrist_image": image,
+            "observation.state": PolicyFeature(type=FeatureType.STATE, shape=(8,)),
+        },
+        output_features={"action": PolicyFeature(type=FeatureType.ACTION, shape=(7,))},
+        **fields,
+    )
+
+
+def observation(settings: MemobenchMemConfig, rows: int) -> dict[str, torch.Tensor]:
+    """What the preprocessor hands to the policy in a rollout."""
+    height, width = settings.image_size
+    assert settings.tokenizer_max_length is not None
+    length = settings.tokenizer_max_length
+    tokens = torch.randint(4, 250, (rows, length))
+    return {
+        "observation.images.image": torch.rand(rows, 3, height, width),
+        "observation.images.wrist_image": torch.rand(rows, 3, height, width),
+        "observation.state": torch.rand(rows, 8),
+        OBS_LANGUAGE_TOKENS: tokens,
+        OBS_LANGUAGE_ATTENTION_MASK: torch.arange(length).expand(rows, -1) < min(length, 60),
+    }
+
+
+def training_batch(settings: MemobenchMemConfig, rows: int) -> dict[str, torch.Tensor]:
+    """A preprocessed training batch with full histories."""
+    dims, frames = settings.dimensions, settings.memory_frames
+    return observation(settings, rows) | {
+        "action": torch.rand(rows, settings.chunk_size, 7),
+        "phase": torch.ones(rows, dtype=torch.int64),
+        "memory.tokens": torch.randn(rows, frames, 16, dims.vlm.width).to(torch.bfloat16),
+        "memory.steps": torch.arange(frames).expand(rows, -1) * 11,
+        "memory.mask": torch.ones(rows, frames, dtype=torch.bool),
+        "memory.text": torch.nn.functional.normalize(torch.randn(rows, dims.text_dim), dim=-1),
+        "memory.text_mask": torch.ones(rows, dtype=torch.bool),
+    }
