@@ -183,6 +183,8 @@ app.command()(study)
 
 
 app.command()(report.report)
+app.command()(report.compare)
+app.command()(report.agreement)
 app.add_typer(figures.app, name="figures")
 app.command()(html.html)
 app.command()(controls.necessity)

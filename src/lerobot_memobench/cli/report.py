@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lerobot_memobench.cli.console import console
+from lerobot_memobench.errors import MemobenchError
+
+if TYPE_CHECKING:
+    from lerobot_memobench.evaluation.tables import Report
 
 
 class ReportFormat(StrEnum):
@@ -78,3 +83,100 @@ def report(
             screen.print(formats.terminal(found))
         else:
             print(render(found, runs, name, paper), end="")
+
+
+def compare(
+    a: Annotated[str, typer.Argument(help="Folder of an evaluation, or NAME=FOLDER.", metavar="A")],
+    b: Annotated[str, typer.Argument(help="The one that is compared with it.", metavar="B")],
+    allow: Annotated[
+        list[str] | None,
+        typer.Option(help="A setting that is meant to differ, such as replan_steps; repeatable.", metavar="NAME"),
+    ] = None,
+    format_: Annotated[
+        list[ReportFormat] | None,
+        typer.Option("--format", help="table (default), markdown, latex or json; repeatable."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for compare.md, compare.tex, compare.json and so on.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random signs.")] = 0,
+    permutations: Annotated[int, typer.Option(min=100, help="Random signs where not all can be tried.")] = 10_000,
+) -> None:
+    """Compare two evaluations of the same episodes, pair by pair: McNemar for success, sign-flip for the rates."""
+    from lerobot_memobench.evaluation import comparison
+    from lerobot_memobench.evaluation.runs import read_runs
+
+    first, second = read_runs([a, b])
+    found = comparison.compare(first, second, allow=allow or (), seed=seed, permutations=permutations)
+    _show(comparison.report(found), "compare", format_, out)
+
+
+def agreement(
+    labels: Annotated[
+        Path | None, typer.Argument(help="CSV: a row per template, a column per rater.", metavar="[LABELS.CSV]")
+    ] = None,
+    paper: Annotated[
+        bool, typer.Option("--paper", help="Recompute the paper's study from what it publishes of it instead.")
+    ] = False,
+    template: Annotated[
+        Path | None, typer.Option(help="Write a blank sheet of the 84 templates for a new study instead.")
+    ] = None,
+    raters: Annotated[int, typer.Option(min=2, help="Columns of the blank sheet.")] = 3,
+    format_: Annotated[
+        list[ReportFormat] | None,
+        typer.Option("--format", help="table (default), markdown, latex or json; repeatable."),
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for agreement.md, agreement.json and so on.")] = None,
+) -> None:
+    """Agreement of raters with one another and with the released operation labels."""
+    from lerobot_memobench.evaluation import agreement as statistics
+    from lerobot_memobench.evaluation.labels import blank_sheet, read_labels
+    from lerobot_memobench.evaluation.report import put
+    from lerobot_memobench.paper import annotator_agreement
+
+    if sum([labels is not None, paper, template is not None]) != 1:
+        raise MemobenchError("expected one of LABELS.CSV, --paper and --template FILE")
+    if template is not None:
+        if template.exists():
+            raise MemobenchError(f"--template {template} exists; name a new file, raters may have filled in that one")
+        template.parent.mkdir(parents=True, exist_ok=True)
+        console().print(str(put(template, blank_sheet(raters))), soft_wrap=True)
+    elif labels is not None:
+        _show(statistics.report(statistics.study(read_labels(labels))), "agreement", format_, out)
+    else:
+        _show(statistics.published_report(annotator_agreement()), "agreement_paper", format_, out)
+
+
+ENDINGS = {
+    ReportFormat.TABLE: "txt",
+    ReportFormat.MARKDOWN: "md",
+    ReportFormat.LATEX: "tex",
+    ReportFormat.JSON: "json",
+}
+
+
+def _show(found: Report, name: str, formats_: list[ReportFormat] | None, out: Path | None) -> None:
+    """Print a report in the formats wanted, or write it to a folder."""
+    from lerobot_memobench.evaluation import formats
+    from lerobot_memobench.evaluation.report import put
+
+    wanted = list(dict.fromkeys(formats_ or [ReportFormat.TABLE]))
+    if ReportFormat.CSV in wanted:
+        raise MemobenchError(f"found --format csv; expected {', '.join(ENDINGS)}: what is told here is no one table")
+    screen = console()
+    for each in wanted:
+        if each is ReportFormat.TABLE and out is None:
+            screen.print(found.title, style="bold")
+            screen.print(formats.terminal(found))
+            continue
+        write = {
+            ReportFormat.TABLE: formats.text,
+            ReportFormat.MARKDOWN: formats.markdown,
+            ReportFormat.LATEX: formats.latex,
+            ReportFormat.JSON: lambda report: json.dumps(report.data, indent=2) + "\n",
+        }[each]
+        if out is None:
+            print(write(found), end="")
+        else:
+            out.mkdir(parents=True, exist_ok=True)
+            screen.print(str(put(out / f"{name}.{ENDINGS[each]}", write(found))), soft_wrap=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +21,8 @@ Point = tuple[float, float, str]
 
 HIGH_STORAGE, LOW_SUCCESS = 50.0, 20.0
 """What is shaded: much was stored, little was done with it. The paper shades such cases without giving bounds."""
+
+SHADE = "#ebebeb"
 
 LOOKS = dict(zip(MEMORY_TYPES, (("#0072b2", "o"), ("#d55e00", "s"), ("#000000", "^"), ("#cc79a7", "D")), strict=True))
 
@@ -82,12 +83,13 @@ def draw(entries: Sequence[Entry], by_task: bool = False) -> Figure:
                 _shade(place)
         places[0].set_ylabel("SR, % (success)")
         from matplotlib.lines import Line2D
+        from matplotlib.patches import Patch
 
         there = [
             name for name in MEMORY_TYPES if any(p[2] == name for m in metrics for p in points(entries, m, by_task))
         ]
         open_ = all(entry.published for entry in entries)
-        handles = [
+        handles: list[Any] = [
             Line2D([], [], ls="", color=LOOKS[name][0], marker=LOOKS[name][1], ms=5, mfc="none" if open_ else None)
             for name in there
         ]
@@ -97,6 +99,9 @@ def draw(entries: Sequence[Entry], by_task: bool = False) -> Figure:
                 Line2D([], [], ls="", marker="o", ms=5, mec=style.INK, mfc=fill) for fill in ("none", style.INK)
             ]
             names += ["paper", "here"]
+        if "MSR" in metrics:
+            handles.append(Patch(facecolor=SHADE))
+            names.append("high MSR, low SR")
         style.legend_below(figure, handles, names, len(handles))
         return figure
 
@@ -125,10 +130,8 @@ def _shade(place: Any) -> None:
 
     corner = (HIGH_STORAGE, -4)
     place.add_patch(
-        Rectangle(corner, 104 - HIGH_STORAGE, LOW_SUCCESS + 4, facecolor="#efefef", edgecolor="none", zorder=-1)
+        Rectangle(corner, 104 - HIGH_STORAGE, LOW_SUCCESS + 4, facecolor=SHADE, edgecolor="none", zorder=-1)
     )
-    text = textwrap.fill("stored, not acted on", 12)
-    place.text(77, LOW_SUCCESS + 3, text, ha="center", va="bottom", fontsize=7, color=style.FAINT)
 
 
 def _text(found: Sequence[Point], before: str) -> str:

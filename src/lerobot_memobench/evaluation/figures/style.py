@@ -60,17 +60,19 @@ class Line:
 
 _COLOURS = (
     "#0072b2", "#d55e00", "#000000", "#cc79a7", "#882255", "#999933", "#777777", "#332288", "#44aa99", "#aa4499",
+    "#661100",
 )  # fmt: skip
 """Okabe and Ito's without those of the operations, then Paul Tol's muted ones."""
-_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<", "h")
+_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<", "h", ">")
 _DASHES: tuple[Any, ...] = (
     "-", "--", "-.", ":",
     (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)), (0, (4, 1, 1, 1, 1, 1)), (0, (2, 2)),
+    (0, (6, 1, 1, 1)),
 )  # fmt: skip
 
 
 def lines(names: Sequence[str]) -> dict[str, Line]:
-    """Return a look for each method: no two of ten share colour, marker or dashes, no two of a hundred all three."""
+    """Return a look for each method: no two of eleven share colour, marker or dashes, no two of a hundred all three."""
     distinct = list(dict.fromkeys(names))
     count = len(_COLOURS)
     return {

@@ -1,0 +1,115 @@
+"""Tests and power for paired rollouts: the same episodes under two policies.
+
+A pair gives a difference d in [-1, 1]: of success (-1, 0, 1) or of the share of checkpoints satisfied. A difference of
+averages is the sum of w_i d_i, where the weights sum to 1 (equal for one task; for averages, each memory type, and in
+it each task, weighs the same).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+EXACT_UP_TO = 16
+"""Pairs that differ up to which all assignments of signs are enumerated: 2^16 = 65,536."""
+
+PERMUTATIONS = 10_000
+
+Z_TWO_SIDED = 1.959963984540054
+"""Of the normal distribution: 5 %, two-sided."""
+Z_POWER = 0.8416212335729143
+"""80 % power."""
+
+_TOLERANCE = 1e-12
+
+
+def mcnemar(only_a: int, only_b: int) -> float:
+    """Return the exact two-sided p of McNemar's test: under the null, each discordant pair falls either way evenly.
+
+    Args:
+        only_a, only_b: pairs in which only one of both succeeded.
+    """
+    discordant = only_a + only_b
+    tail = sum(math.comb(discordant, k) for k in range(min(only_a, only_b) + 1))
+    return min(1.0, 2.0 * tail / 2.0**discordant) if discordant < 1000 else _mcnemar_large(only_a, only_b)
+
+
+def _mcnemar_large(only_a: int, only_b: int) -> float:
+    from scipy.stats import binomtest
+
+    return float(binomtest(min(only_a, only_b), only_a + only_b).pvalue)
+
+
+def sign_flip(
+    differences: Sequence[float] | NDArray[np.float64],
+    weights: Sequence[float] | NDArray[np.float64],
+    rng: np.random.Generator,
+    permutations: int = PERMUTATIONS,
+) -> tuple[float, bool]:
+    """Return the two-sided p of the weighted sum of differences under random signs, and whether it is exact.
+
+    Under the null, who is who in a pair is arbitrary. With at most ``EXACT_UP_TO`` pairs that differ, every assignment
+    of signs is looked at; else ``permutations`` random ones and the one observed, p = (1 + as extreme) / (1 + drawn).
+    """
+    terms = np.asarray(differences, dtype=np.float64) * np.asarray(weights, dtype=np.float64)
+    terms = terms[np.abs(terms) > _TOLERANCE]
+    observed = abs(float(terms.sum())) - _TOLERANCE
+    if terms.size == 0:
+        return 1.0, True
+    if terms.size <= EXACT_UP_TO:
+        codes = np.arange(2**terms.size)
+        signs = 1 - 2 * ((codes[:, None] >> np.arange(terms.size)) & 1)
+        return float(np.mean(np.abs(signs @ terms) >= observed)), True
+    extreme = 0
+    for start in range(0, permutations, 1000):  # in parts: 1,500 pairs by 10,000 signs would be 120 MB
+        count = min(1000, permutations - start)
+        signs = rng.integers(0, 2, (count, terms.size)) * 2 - 1
+        extreme += int(np.count_nonzero(np.abs(signs @ terms) >= observed))
+    return (1 + extreme) / (1 + permutations), False
+
+
+def detectable(
+    differences: Sequence[float] | NDArray[np.float64], weights: Sequence[float] | NDArray[np.float64]
+) -> float | None:
+    """Return the smallest true difference that so many pairs show with 80 % power at 5 % two-sided; None for above 1.
+
+    It is the δ with  n δ² = (1.96 √m + 0.84 √(m − δ²))²  (Connor 1987 for McNemar's test, where m is the share of
+    discordant pairs). Here m is the mean square of the differences, taken from the pairs with one more that differs
+    and one more that does not, so that it is not 0 where no pair differs (as in Agresti and Min 2005), and at least δ:
+    a mean difference δ of values in [-1, 1] cannot come with a smaller mean square than δ². n is 1 / Σ w_i², the
+    number of pairs of equal weight with the same standard error.
+    """
+    d = np.asarray(differences, dtype=np.float64)
+    w = np.asarray(weights, dtype=np.float64)
+    if d.size == 0:
+        return None
+    pairs = 1.0 / float(np.sum(w**2))
+    # The mean square that enters the variance of the weighted sum weighs pairs by the squares of their weights.
+    square = (float(np.sum(w**2 * d**2)) * pairs * d.size + 1.0) / (d.size + 2.0)
+
+    def missing(delta: float) -> float:
+        m = max(square, delta)
+        spread = Z_TWO_SIDED * math.sqrt(m) + Z_POWER * math.sqrt(max(0.0, m - delta * delta))
+        return delta * math.sqrt(pairs) - spread
+
+    if missing(1.0) < 0:
+        return None
+    low, high = 0.0, 1.0
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (low, middle) if missing(middle) >= 0 else (middle, high)
+    return high
+
+
+def holm(values: Sequence[float]) -> list[float]:
+    """Return p-values adjusted for their number (Holm 1979), in the same order."""
+    order = sorted(range(len(values)), key=lambda k: values[k])
+    adjusted = [0.0] * len(values)
+    so_far = 0.0
+    for rank, k in enumerate(order):
+        so_far = max(so_far, min(1.0, (len(values) - rank) * values[k]))
+        adjusted[k] = so_far
+    return adjusted
