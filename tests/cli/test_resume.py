@@ -105,6 +105,7 @@ def test_more_episodes_and_tasks_may_follow(fake_lerobot: Any) -> None:
         (["env.render=fast"], "render: default and fast"),
         (["env.render_every=5"], "render_every: 1 and 5"),
         (["prompt_video=false"], "prompt_video: True and False"),
+        (["env.oracle_memory=true"], "oracle_memory: False and True"),
         (["env.seed_base=100"], "seed_base: 7 and 100"),
         (["env.replan_steps=5"], "replan_steps: None and 5"),
         (["seed=8"], "policy.seed: 7 and 8"),

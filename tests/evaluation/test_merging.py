@@ -23,6 +23,7 @@ SETTINGS = {
     "replan_steps": None,
     "render": "default",
     "render_every": 1,
+    "oracle_memory": False,
 }
 
 

@@ -21,6 +21,7 @@ SETTINGS: dict[str, Any] = {
     "replan_steps": None,
     "render": "default",
     "render_every": 1,
+    "oracle_memory": False,
 }
 
 

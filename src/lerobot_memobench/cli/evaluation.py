@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.cli.arguments import Translation, without_flag
-from lerobot_memobench.cli.checkpoint import checkpoint_folder
+from lerobot_memobench.cli.checkpoint import checkpoint_folder, looks_local
 from lerobot_memobench.cli.orders import Orders
 from lerobot_memobench.cli.plan import Grid, Place
 from lerobot_memobench.envs.episode_log import has_log, read_episodes
@@ -176,6 +176,8 @@ def policy_folder(path: str | None) -> Path | None:
     here = checkpoint_folder(path)
     if here is not None:
         return here
+    if looks_local(path):
+        return None
     from huggingface_hub import try_to_load_from_cache
 
     cached = try_to_load_from_cache(path, "config.json")

@@ -98,6 +98,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             "replan_steps": replan_steps,
             "render": render,
             "render_every": render_every,
+            "oracle_memory": oracle_memory,
         }
         self._log = EpisodeLog(log_dir, protocol) if log_dir is not None else None
         self._videos = Path(log_dir) / "videos" if log_dir is not None and videos else None

@@ -16,7 +16,16 @@ from lerobot_memobench.errors import MemobenchError
 
 PROTOCOL_FILE = "protocol.json"
 
-SETTINGS = ("seed_base", "referent", "prompt_video", "horizon", "replan_steps", "render", "render_every")
+SETTINGS = (
+    "seed_base",
+    "referent",
+    "prompt_video",
+    "horizon",
+    "replan_steps",
+    "render",
+    "render_every",
+    "oracle_memory",
+)
 """What must agree for two evaluations to be one, or to be compared."""
 
 EXTENT = ("tasks", "episodes")

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.envs.episode_log import has_log, read_episodes, write_episodes
-from lerobot_memobench.envs.protocol import EXTENT, SETTINGS, write_protocol
+from lerobot_memobench.envs.protocol import EXTENT, read_protocol_file, write_protocol
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.card import disagreement, extended, key_of, remove_card, with_episodes, write_card
 from lerobot_memobench.evaluation.protocol import (
@@ -58,7 +58,7 @@ def merge(out: Path, folders: Sequence[Path]) -> list[tuple[str, int]]:
 
     out.mkdir(parents=True, exist_ok=True)
     settings = {key: protocol[key] for key in protocol if key not in (*EXTENT, POLICY)}
-    if set(SETTINGS) <= set(settings):
+    if all(read_protocol_file(source) for source in sources):
         write_protocol(out, settings)
     for source in folders:
         if source != out:
