@@ -15,7 +15,15 @@ from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation import decisions, necessity_study
 from lerobot_memobench.evaluation.decisions import Demonstration, Home, Moment, Picture, unmatched
-from lerobot_memobench.evaluation.necessity_report import markdown, rows, verdict, write
+from lerobot_memobench.evaluation.necessity_report import (
+    PAGE_BEGIN,
+    PAGE_END,
+    markdown,
+    put_into_page,
+    rows,
+    verdict,
+    write,
+)
 from lerobot_memobench.evaluation.necessity_study import Settings, study, variants_of
 from lerobot_memobench.sim.rendering import close_renderers, gl_backend
 from lerobot_memobench.sim.simulation import NO_OP, Simulation
@@ -193,6 +201,20 @@ def test_the_command_shows_a_table_and_names_its_files(
         ("fixed", "no"),
         ("random", "order?"),
     ]
+
+
+def test_a_page_gets_the_table_between_its_marks(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(f"before\n{PAGE_BEGIN}\nold\n{PAGE_END}\nafter\n")
+    text = put_into_page(page, []).read_text()
+    assert text.startswith(f"before\n{PAGE_BEGIN}\n\n| task |")
+    assert text.endswith(f"{PAGE_END}\nafter\n")
+    assert "old" not in text
+    assert put_into_page(page, []).read_text() == text
+    page.write_text("no marks")
+    with pytest.raises(MemobenchError, match="put them where the table goes"):
+        put_into_page(page, [])
+    assert page.read_text() == "no marks"
 
 
 # --- the simulator ---

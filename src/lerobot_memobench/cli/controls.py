@@ -50,9 +50,12 @@ def necessity(
     out: Annotated[Path, typer.Option(help="Folder of the results; the same command goes on there.")] = Path(
         "outputs/necessity"
     ),
+    page: Annotated[
+        Path | None, typer.Option(help="Markdown page whose table is made anew, between its marks.")
+    ] = None,
 ) -> int:
     """Find moments that look the same and need different answers; print what a policy without memory can reach."""
-    from lerobot_memobench.evaluation.necessity_report import terminal_table, write
+    from lerobot_memobench.evaluation.necessity_report import put_into_page, terminal_table, write
     from lerobot_memobench.evaluation.necessity_study import REFERENTS, Settings, study
 
     settings = Settings(episodes=episodes, budget=budget, tolerance=tolerance)
@@ -75,6 +78,8 @@ def necessity(
             if not screen.is_terminal:
                 progress.console.print(f"{len(results)}/{len(jobs)} {task.name}, referent {setting}")
     written = write(out, results)
+    if page is not None:
+        written.append(put_into_page(page, results))
     screen.print(terminal_table(results))
     for path in written:
         screen.print(str(path), soft_wrap=True)

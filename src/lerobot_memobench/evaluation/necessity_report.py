@@ -136,7 +136,7 @@ def markdown(results: Sequence[Result]) -> str:
         f"Moments that count as looking the same differ in at most {100 * same:.2f} % of the pixels of a camera, those "
         f"that count as different in at least {100 * other:.2f} %.",
         "",
-        "## Ways to the goal that need no memory",
+        "### Ways to the goal that need no memory",
         "",
     ]
     lines += _ways(results) or ["None was found beside the demonstrated ones."]
@@ -155,6 +155,29 @@ def _ways(results: Sequence[Result]) -> list[str]:
 
 
 # --- files ---
+
+PAGE_BEGIN, PAGE_END = "<!-- made by `memobench necessity --page`: -->", "<!-- end of what it made -->"
+
+
+def put_into_page(page: Path, results: Sequence[Result]) -> Path:
+    """Put the table into a Markdown page, between its two marks; return the page.
+
+    Raises:
+        MemobenchError: there is no such page, or it lacks the marks.
+    """
+    try:
+        text = page.read_text(encoding="utf-8")
+    except OSError as error:
+        raise MemobenchError(
+            f"the page {page} cannot be read ({error.strerror or error}); name a Markdown file"
+        ) from None
+    before, begin, rest = text.partition(PAGE_BEGIN)
+    _, end, after = rest.partition(PAGE_END)
+    if not begin or not end:
+        raise MemobenchError(
+            f"the page {page} lacks the lines {PAGE_BEGIN!r} and {PAGE_END!r}; put them where the table goes"
+        )
+    return _replace(page, f"{before}{begin}\n\n{markdown(results)}\n{end}{after}".encode())
 
 
 def write(out: Path, results: Sequence[Result]) -> list[Path]:
