@@ -29,7 +29,7 @@ def write_video(path: Path, frames: int = 12) -> None:
 def fake_evaluation(output: Path) -> int:
     for name in demo.TASKS:
         write_video(output / "videos" / f"{name}.0.mp4")
-    for name in ("episodes.jsonl", "report.json", "report.md"):
+    for name in ("episodes.jsonl", "report.json", "report.md", "protocol.json", "card.json", "card.md"):
         (output / name).write_text(name)
     return 0
 

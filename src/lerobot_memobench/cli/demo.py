@@ -13,7 +13,10 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.cli.console import console
 from lerobot_memobench.envs.episode_log import MERGED_FILE
+from lerobot_memobench.envs.protocol import PROTOCOL_FILE
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.card import CARD_MARKDOWN
+from lerobot_memobench.evaluation.protocol import CARD_FILE
 from lerobot_memobench.evaluation.report import REPORT_JSON, REPORT_MARKDOWN
 
 #: One task of each memory type.
@@ -29,8 +32,11 @@ FRAMES_PER_VIDEO = 6
 COLUMN_WIDTH = 320
 """Width of a frame in the contact sheet, pixels."""
 
+#: What is taken over from the evaluation.
+RESULTS = (MERGED_FILE, REPORT_JSON, REPORT_MARKDOWN, PROTOCOL_FILE, CARD_FILE, CARD_MARKDOWN)
+
 #: All that a demo writes, and so all that a new one removes.
-PRODUCTS = (MERGED_FILE, REPORT_JSON, REPORT_MARKDOWN, VIDEOS, CONTACT_SHEET)
+PRODUCTS = (*RESULTS, VIDEOS, CONTACT_SHEET)
 
 Frame = NDArray[np.uint8]
 
@@ -52,7 +58,7 @@ def run_demo(out: Path) -> int:
         contact_sheet(list(videos.values())).save(Path(scratch) / CONTACT_SHEET, optimize=True)
         for name in PRODUCTS:
             _remove(out / name)
-        for name in (MERGED_FILE, REPORT_JSON, REPORT_MARKDOWN):
+        for name in RESULTS:
             shutil.move(work / name, out / name)
         shutil.move(Path(scratch) / VIDEOS, out / VIDEOS)
         shutil.move(Path(scratch) / CONTACT_SHEET, out / CONTACT_SHEET)
