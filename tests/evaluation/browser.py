@@ -164,11 +164,15 @@ class Browser:
             time.sleep(0.05)
 
     def box(self, selector: str) -> dict[str, float]:
-        """Return x, y, width and height of an element on the screen, scrolled into sight."""
+        """Return x, y, width and height of an element on the screen, scrolled into sight.
+
+        The scrolling's own event comes with the next drawn frame; a person's hand comes after it.
+        """
         return self.js(
-            f"(() => {{ const e = document.querySelector({json.dumps(selector)}); "
-            "e.scrollIntoView({block: 'center', behavior: 'instant'}); const b = e.getBoundingClientRect(); "
-            "return {x: b.x, y: b.y, width: b.width, height: b.height}; })()"
+            f"(async () => {{ const e = document.querySelector({json.dumps(selector)}); "
+            "e.scrollIntoView({block: 'center', behavior: 'instant'}); "
+            "await new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done))); "
+            "const b = e.getBoundingClientRect(); return {x: b.x, y: b.y, width: b.width, height: b.height}; })()"
         )
 
     def click(self, selector: str, across: float = 0.5, down: float = 0.5) -> None:

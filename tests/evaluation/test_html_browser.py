@@ -7,6 +7,7 @@ browser really shows.
 from __future__ import annotations
 
 import importlib.util
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -252,7 +253,8 @@ def test_the_subgoal_changes_at_each_ordered_step(browser: Any, report: Path) ->
     assert "every checkpoint is complete" in seen[30]
     assert seen[40].endswith("done")
     browser.choose("#level", "fine")
-    browser.wait("location.hash.includes('level=fine')")
+    browser.wait(f"document.querySelector('.lane.checkpoint .words').textContent === {json.dumps(first[2])}")
+    assert browser.js("location.hash.includes('level=fine')")
     browser.js("document.querySelector('[role=slider]').focus()")
     browser.key("Home")
     assert playhead(browser) == 0
@@ -279,6 +281,7 @@ def test_hover_and_focus_tell_the_texts_of_all_levels(browser: Any, report: Path
     show(browser, report, f"view=episodes&ep={STOVE}.0")
     box = browser.box(".span.active")
     browser.mouse("mouseMoved", box["x"] + box["width"] / 3, box["y"] + box["height"] / 2)
+    browser.wait("!document.querySelector('#tip').hidden")
     (tip,) = browser.texts("#tip")
     assert all(text in tip for text in get_task(STOVE).checkpoints[0].language)
     browser.js("document.querySelector('.cause, .ending').focus()")
@@ -374,8 +377,8 @@ def test_keys_go_through_the_episodes(browser: Any, report: Path) -> None:
 def test_another_run_keeps_the_episode(browser: Any, report: Path) -> None:
     show(browser, report, f"view=episodes&ep={STOVE}.0")
     browser.click(".others a")
-    browser.wait("location.hash.includes('run=other')")
-    assert browser.texts("#detail .facts b") == ["Storage failure"]
+    browser.wait("document.querySelector('#detail .facts b').innerText === 'Storage failure'")
+    assert browser.js("location.hash.includes('run=other')")
     assert browser.texts("#count") == ["1 of 1 episode, 0 succeeded"]
     browser.choose("#run", "mine")
     browser.wait("document.querySelector('#detail .facts b').innerText === 'Success'")
