@@ -139,7 +139,8 @@ def markdown(results: Sequence[Result]) -> str:
         "### Ways to the goal that need no memory",
         "",
     ]
-    lines += _ways(results) or ["None was found beside the demonstrated ones."]
+    searched = any(result["any_order"] is not None for result in results)
+    lines += _ways(results) or ["None was found." if searched else "They were not looked for."]
     return "\n".join(lines) + "\n"
 
 
