@@ -152,6 +152,26 @@ def test_a_killed_build_goes_on(root: Path) -> None:
     assert whole.read_bytes() == resumed
 
 
+def test_the_number_of_threads_changes_nothing(root: Path) -> None:
+    whole = root / FOLDER / "test" / "tokens.bin"
+    contents = []
+    for workers in (1, 4):
+        shutil.rmtree(root / FOLDER, ignore_errors=True)
+        build_memory_cache(root, "test", _Frames(), _Texts(), batch_size=7, workers=workers)
+        contents.append(whole.read_bytes())
+    assert contents[0] == contents[1]
+    assert any(contents[0])
+
+
+def test_a_decoder_that_fails_stops_the_build(root: Path) -> None:
+    next((root / "videos" / CAMERA).rglob("*.mp4")).write_bytes(b"no video")
+    with pytest.raises((RuntimeError, ValueError, OSError)):
+        build_memory_cache(root, "test", _Frames(), _Texts(), workers=3)
+    meta = read_meta(root, "test")
+    assert meta is not None
+    assert not meta.complete
+
+
 def test_refusals_name_reason_and_fix(root: Path) -> None:
     with pytest.raises(MemobenchError, match=r"no memory cache.*memobench cache"):
         _open(root)

@@ -54,7 +54,16 @@ def _summary_table(summary: GenerationSummary) -> Table:
     return table
 
 
-def cache(dataset: Path, *, size: str, stride: int, weights: str | None, device: str | None, batch_size: int) -> None:
+def cache(
+    dataset: Path,
+    *,
+    size: str,
+    stride: int,
+    weights: str | None,
+    device: str | None,
+    batch_size: int,
+    workers: int | None = None,
+) -> None:
     """Make the memory cache of a dataset and print where it is."""
     from lerobot_memobench.cli.preflight import quiet
     from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
@@ -70,6 +79,7 @@ def cache(dataset: Path, *, size: str, stride: int, weights: str | None, device:
             config,
             weights=weights,
             batch_size=batch_size,
+            workers=workers,
             progress=lambda done, total: progress.update(bar, completed=done, total=total),
         )
     screen.print(f"memory cache: {folder}", soft_wrap=True)

@@ -164,11 +164,14 @@ def cache(
     ] = None,
     device: Annotated[str | None, typer.Option(help="cuda or cpu; the best there is by default.")] = None,
     batch_size: Annotated[int, typer.Option(min=1, help="Frames per pass of the image tower.")] = 64,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Threads that decode videos; as many as there are cores by default.")
+    ] = None,
 ) -> None:
     """Encode a dataset's frames and subgoals once, for policies with a memory."""
     from lerobot_memobench.cli.generate import cache as run
 
-    run(dataset, size=size, stride=stride, weights=weights, device=device, batch_size=batch_size)
+    run(dataset, size=size, stride=stride, weights=weights, device=device, batch_size=batch_size, workers=workers)
 
 
 app.command()(data.convert)

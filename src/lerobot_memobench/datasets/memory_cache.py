@@ -25,7 +25,10 @@ import itertools
 import json
 import os
 import shutil
+import threading
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -360,6 +363,7 @@ def build_memory_cache(
     camera: str = "observation.images.image",
     stride: int = 1,
     batch_size: int = 64,
+    workers: int | None = None,
     progress: Progress | None = None,
 ) -> Path:
     """Build, or finish building, the cache ``<root>/memory_cache/<name>``; a fitting complete one is left alone.
@@ -371,6 +375,7 @@ def build_memory_cache(
         frames: the frozen vision tower. texts: the frozen text encoder.
         camera: image column that memory shows. stride: every how many frames one is stored.
         batch_size: frames per pass of the tower.
+        workers: threads that decode videos ahead of the tower; as many as there are cores, up to 8, by default.
         progress: called with (episodes done, episodes in all), first with what is done already.
 
     Returns:
@@ -416,7 +421,8 @@ def build_memory_cache(
             with (folder / "tokens.bin").open("wb") as file:
                 file.truncate(2 * meta.slots * meta.tokens_per_frame * meta.dim)
             _write_json(folder / "meta.json", asdict(meta))
-        _write_tokens(folder, meta, table, frames, reader, batch_size, progress)
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        _write_tokens(folder, meta, table, frames, reader, batch_size, workers or min(cores, 8), progress)
         _write_json(folder / "meta.json", asdict(meta) | {"complete": True})
     return folder
 
@@ -445,9 +451,14 @@ def _write_tokens(
     frames: FrameEncoder,
     read: Callable[[int, list[int]], Tensor],
     batch_size: int,
+    workers: int,
     progress: Progress | None,
 ) -> None:
-    """Encode every episode that is not marked done; its mark is written after its tokens have reached the file."""
+    """Encode every episode that is not marked done; its mark is written after its tokens have reached the file.
+
+    Videos are decoded in threads, a few parts ahead; the tower takes the parts in their order, so that the file is the
+    same whatever the number of threads, and a killed build has finished the first so many episodes.
+    """
     slots = _slot_starts(table.episodes, meta.stride)
     shape = (meta.slots, meta.tokens_per_frame, meta.dim)
     tokens = np.memmap(folder / "tokens.bin", dtype=np.uint16, mode="r+", shape=shape)
@@ -455,25 +466,52 @@ def _write_tokens(
     count = len(done)
     if progress:
         progress(int(done.sum()), count)
-    for episode in np.flatnonzero(done == 0).tolist():
-        length = int(table.episodes[episode + 1] - table.episodes[episode])
-        wanted = list(range(0, length, meta.stride))
-        for first in range(0, len(wanted), batch_size):
-            part = wanted[first : first + batch_size]
-            encoded = frames(read(episode, part)).to("cpu", torch.bfloat16).contiguous()
+
+    def parts() -> Iterator[tuple[int, int, list[int], bool]]:
+        """Episode, first slot in it, frames, and whether they are its last."""
+        for episode in np.flatnonzero(done == 0).tolist():
+            length = int(table.episodes[episode + 1] - table.episodes[episode])
+            wanted = list(range(0, length, meta.stride))
+            for first in range(0, len(wanted), batch_size):
+                yield episode, first, wanted[first : first + batch_size], first + batch_size >= len(wanted)
+
+    with ThreadPoolExecutor(workers, thread_name_prefix="decode") as pool:
+        for (episode, first, part, last), images in _ahead(pool, 2 * workers, parts(), lambda p: read(p[0], p[2])):
+            encoded = frames(images).to("cpu", torch.bfloat16).contiguous()
             place = int(slots[episode]) + first
             tokens[place : place + len(part)] = encoded.view(torch.uint16).numpy()
-        tokens.flush()
-        done[episode] = 1
-        done.flush()
-        if progress:
-            progress(int(done.sum()), count)
+            if not last:
+                continue
+            tokens.flush()
+            done[episode] = 1
+            done.flush()
+            if progress:
+                progress(int(done.sum()), count)
+
+
+def _ahead[Item, Result](
+    pool: ThreadPoolExecutor, number: int, items: Iterator[Item], work: Callable[[Item], Result]
+) -> Iterator[tuple[Item, Result]]:
+    """Yield (item, work(item)) in order, with at most ``number`` items begun before they are asked for."""
+    waiting: deque[tuple[Item, Future[Result]]] = deque()
+    try:
+        for item in items:
+            waiting.append((item, pool.submit(work, item)))
+            if len(waiting) >= number:
+                oldest, future = waiting.popleft()
+                yield oldest, future.result()
+        while waiting:
+            oldest, future = waiting.popleft()
+            yield oldest, future.result()
+    finally:
+        for _, future in waiting:
+            future.cancel()
 
 
 def _reader(root: Path, camera: str) -> Callable[[int, list[int]], Tensor]:
     """Function from (episode, frame numbers) to images (n, 3, H, W) float32 in [0, 1], decoded in one sweep."""
+    from lerobot.datasets import video_utils
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-    from lerobot.datasets.video_utils import decode_video_frames
 
     meta = LeRobotDatasetMetadata(root.name, root=root)
     if camera not in meta.camera_keys:
@@ -484,12 +522,24 @@ def _reader(root: Path, camera: str) -> Callable[[int, list[int]], Tensor]:
     if camera not in meta.video_keys:
         return _image_reader(root, camera, meta)
 
+    backend = video_utils.get_safe_default_video_backend()
+    own = threading.local()
+    table_lock = threading.Lock()
+
     def read(episode: int, numbers: list[int]) -> Tensor:
-        row = meta.episodes[episode]
+        with table_lock:
+            row = meta.episodes[episode]
+            path = root / meta.get_video_file_path(episode, camera)
         start = row[f"videos/{camera}/from_timestamp"]
         times = [start + number / meta.fps for number in numbers]
-        path = root / meta.get_video_file_path(episode, camera)
-        return decode_video_frames(path, times, tolerance_s=1e-4).reshape(len(numbers), *_CHW(meta, camera))
+        if backend == "torchcodec":
+            # LeRobot's decoders are shared within a process, and none may be used by two threads at a time.
+            if not hasattr(own, "decoders"):
+                own.decoders = video_utils.VideoDecoderCache(max_size=1)
+            images = video_utils.decode_video_frames_torchcodec(path, times, 1e-4, decoder_cache=own.decoders)
+        else:
+            images = video_utils.decode_video_frames(path, times, tolerance_s=1e-4, backend=backend)
+        return images.reshape(len(numbers), *_CHW(meta, camera))
 
     return read
 
@@ -505,8 +555,10 @@ def _image_reader(root: Path, camera: str, meta: Any) -> Callable[[int, list[int
 
     dataset = LeRobotDataset(root.name, root=root)
     starts = meta.episodes["dataset_from_index"]
+    lock = threading.Lock()
 
     def read(episode: int, numbers: list[int]) -> Tensor:
-        return torch.stack([dataset[starts[episode] + number][camera] for number in numbers])
+        with lock:
+            return torch.stack([dataset[starts[episode] + number][camera] for number in numbers])
 
     return read

@@ -51,6 +51,7 @@ def cache_dataset(
     *,
     weights: str | Path | None = None,
     batch_size: int = 64,
+    workers: int | None = None,
     progress: Progress | None = None,
 ) -> Path:
     """Make (or finish) the cache that ``config`` reads beside the dataset at ``root``.
@@ -58,6 +59,7 @@ def cache_dataset(
     Args:
         config: a policy configuration, for example ``MemobenchMemConfig(size="tiny", memory_stride=1)``.
         weights: checkpoint whose image tower is used, see :func:`load_frame_encoder`.
+        workers: threads that decode videos ahead of the tower; by the cores of the machine when None.
         progress: called with (episodes done, episodes in all).
 
     Returns:
@@ -73,5 +75,6 @@ def cache_dataset(
         camera=config.memory_camera,
         stride=config.memory_stride,
         batch_size=batch_size,
+        workers=workers,
         progress=progress,
     )
