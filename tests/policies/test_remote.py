@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import re
 import socket
 import subprocess
 import sys
@@ -501,6 +502,19 @@ def test_memoryvla_that_comes_back_sees_the_episode_again() -> None:
         policy.select_action(batch(4))
     assert [question["episode_first_frame"] for _, question in second.heard] == [b"True", b"False", b"False"]
     assert [question["image"] for _, question in second.heard[:2]] == [question["image"] for _, question in first.heard]
+
+
+def test_the_server_in_the_docs_serves() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "remote.md").read_text()
+    (program,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    port = free_port()
+    server = subprocess.Popen([sys.executable, "-c", program.replace("8000", str(port))])
+    try:
+        policy = make(port, connect_timeout=60.0, n_action_steps=50)
+        assert not policy.select_action(batch(0)).any()
+    finally:
+        server.kill()
+        server.wait()
 
 
 # --- settings ---

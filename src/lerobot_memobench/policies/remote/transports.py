@@ -210,8 +210,9 @@ class ProcessFrame(Rest):
 
     def encode(self, question: dict[str, Any]) -> dict[str, Any]:
         texts = {key: str(value) for key, value in question.items() if not isinstance(value, np.ndarray)}
-        images = {key: (key, jpeg(value)) for key, value in question.items() if isinstance(value, np.ndarray)}
-        return {"data": texts, "files": images}
+        arrays = {key: value for key, value in question.items() if isinstance(value, np.ndarray)}
+        files = {key: (key, jpeg(value) if value.ndim == 3 else value.tobytes()) for key, value in arrays.items()}
+        return {"data": texts, "files": files}
 
     def decode(self, text: str) -> NDArray[np.floating]:
         answer = wire.from_json(text)
