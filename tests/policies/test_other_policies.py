@@ -1,0 +1,230 @@
+"""LeRobot's own policies here: a step of training on our columns, a rollout in our environment, without a rename map.
+
+Weights are random and small. Where LeRobot fixes sizes or fetches a tokenizer inside the policy, the test hands it
+smaller numbers or a tokenizer built here; the policy's own code runs unchanged.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from safetensors import safe_open
+
+from lerobot_memobench.cli.lerobot import main
+from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.lerobot_format import write_dataset
+from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.policies.memobench_mem.text import make_vocabulary, make_word_tokenizer
+from lerobot_memobench.tasks.catalogue import get_task
+
+TASK = "turn_on_the_stove_and_turn_it_off"
+LENGTH, PROMPT, SIDE = 12, 4, 256
+INPUTS = {"observation.images.image", "observation.images.wrist_image", "observation.state"}
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two short demonstrations with every column that `memobench generate` writes, and images of the real size."""
+    task = get_task(TASK)
+    rng = np.random.default_rng(3)
+    satisfied = np.zeros((LENGTH, len(task.checkpoints)), np.bool_)
+    satisfied[7:] = True
+    shade = np.linspace(0, 200, SIDE, dtype=np.uint8)
+    frames = np.stack([np.broadcast_to(np.roll(shade, 9 * t)[None, :, None], (SIDE, SIDE, 3)) for t in range(LENGTH)])
+
+    def demonstration(seed: int) -> Demonstration:
+        return Demonstration(
+            task=task,
+            seed=seed,
+            referent="fixed",
+            variant=0,
+            states=rng.normal(size=(LENGTH, 5)),
+            actions=rng.uniform(-1, 1, size=(LENGTH, 7)).astype(np.float32),
+            proprio=rng.normal(size=(LENGTH, 8)).astype(np.float32),
+            images=dict.fromkeys(("image", "wrist_image"), frames),
+            exec_start=PROMPT,
+            satisfied=satisfied,
+            success=True,
+            fixture_poses={},
+            scene_hash="abc",
+        )
+
+    root = tmp_path_factory.mktemp("others") / "demonstrations"
+    return write_dataset((demonstration(seed) for seed in (10_000, 10_001)), root)
+
+
+def train_and_roll_out(dataset: Path, out: Path, *policy: str) -> None:
+    """One optimiser step and one short episode by the two commands, as a user types them; check what came of both."""
+    run = out / "train"
+    words = ("steps=1", "batch_size=2", "num_workers=0", "save_freq=1", f"output_dir={run}", "policy.device=cpu")
+    assert main(["train", *policy, f"dataset={dataset}", *words]) == 0
+    checkpoint = run / "checkpoints" / "last" / "pretrained_model"
+    config = json.loads((checkpoint / "config.json").read_text())
+    # Phase, checkpoints, subgoals and language rows are for memory policies: to others they are no input.
+    assert set(config["input_features"]) == INPUTS
+    assert set(config["output_features"]) == {"action"}
+    assert normalised(checkpoint) <= {*INPUTS, "action"} | KEPT
+    words = (f"tasks={TASK}", "episodes=1", "horizon=3", "env.render=fast", f"output_dir={out / 'eval'}")
+    assert main(["eval", "env=memobench", f"policy={run}", *words]) == 0
+    (record,) = read_episodes(out / "eval")
+    assert record["steps"] == 3
+
+
+#: LeRobot keeps the statistics of every column in the file; which of them are used its step's features say.
+KEPT = {
+    "phase",
+    "checkpoint.index",
+    "checkpoint.operation",
+    "checkpoint.completed",
+    "checkpoint.event",
+    *("timestamp", "frame_index", "episode_index", "index", "task_index"),
+}
+
+
+def normalised(checkpoint: Path) -> set[str]:
+    """Return the columns whose statistics a checkpoint's preprocessor holds; check which of them it applies."""
+    steps = json.loads((checkpoint / "policy_preprocessor.json").read_text())["steps"]
+    (step,) = [step for step in steps if step.get("registry_name") == "normalizer_processor"]
+    assert set(step["config"]["features"]) == {*INPUTS, "action"}
+    with safe_open(checkpoint / step["state_file"], framework="numpy") as file:
+        return {name.rpartition(".")[0] for name in file.keys()}  # noqa: SIM118
+
+
+def test_act(dataset: Path, tmp_path: Path) -> None:
+    train_and_roll_out(
+        dataset,
+        tmp_path,
+        *("policy=act", "policy.pretrained_backbone_weights=null", "policy.dim_model=32", "policy.n_heads=2"),
+        *("policy.dim_feedforward=64", "policy.n_encoder_layers=1", "policy.n_vae_encoder_layers=1"),
+        *("policy.chunk_size=4", "policy.n_action_steps=4", "policy.latent_dim=8"),
+    )
+
+
+def test_diffusion(dataset: Path, tmp_path: Path) -> None:
+    train_and_roll_out(
+        dataset,
+        tmp_path,
+        *("policy=diffusion", "policy.down_dims=[16,32]", "policy.num_inference_steps=2", "policy.horizon=8"),
+        *("policy.diffusion_step_embed_dim=16", "policy.n_groups=4", "policy.n_action_steps=2"),
+        *(
+            "policy.pretrained_backbone_weights=null",
+            "policy.crop_shape=[84,84]",
+            "policy.spatial_softmax_num_keypoints=8",
+        ),
+    )
+
+
+# --- those with a language model ---
+
+
+def word_tokenizer(**special: str) -> Any:
+    """Return a tokenizer of whole words; ``special`` names tokens as SmolVLM's tokenizer does."""
+    from transformers import PreTrainedTokenizerFast
+
+    plain = make_word_tokenizer(make_vocabulary([get_task(TASK).language], 400))
+    return PreTrainedTokenizerFast(
+        tokenizer_object=plain.backend_tokenizer,
+        extra_special_tokens=special,
+        pad_token="<pad>",
+        unk_token="<unk>",
+        bos_token="<bos>",
+        eos_token="<eos>",
+    )
+
+
+@pytest.fixture
+def _tiny_paligemma(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Give pi0 and pi0.5 small dimensions and a tokenizer that needs no hub."""
+    from lerobot.policies.pi0 import modeling_pi0
+    from lerobot.policies.pi05 import modeling_pi05
+    from lerobot.processor import tokenizer_processor
+
+    class Tokenizers:
+        @staticmethod
+        def from_pretrained(name: str, **options: Any) -> Any:
+            assert name == "google/paligemma-3b-pt-224"
+            return word_tokenizer()
+
+    monkeypatch.setattr(tokenizer_processor, "AutoTokenizer", Tokenizers)
+
+    def shrink(module: Any) -> None:
+        whole = module.PaliGemmaForConditionalGenerationWithPiGemma
+        gemma = module.get_gemma_config("gemma_300m")
+
+        def small(config: Any) -> Any:
+            vision = config.vision_config
+            vision.hidden_size, vision.intermediate_size = 32, 64
+            vision.num_hidden_layers, vision.num_attention_heads = 1, 2
+            vision.projection_dim = config.projection_dim = config.text_config.hidden_size
+            return whole(config=config)
+
+        sizes = {"width": 32, "depth": 2, "mlp_dim": 64, "num_heads": 8, "num_kv_heads": 1, "head_dim": 8}
+        monkeypatch.setattr(module, "PaliGemmaForConditionalGenerationWithPiGemma", small)
+        monkeypatch.setattr(module, "get_gemma_config", lambda variant: type(gemma)(**sizes))
+
+    shrink(modeling_pi0)
+    shrink(modeling_pi05)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_tiny_paligemma")
+@pytest.mark.parametrize("name", ["pi0", "pi05"])
+def test_pi(dataset: Path, tmp_path: Path, name: str) -> None:
+    train_and_roll_out(
+        dataset,
+        tmp_path,
+        *(f"policy={name}", "policy.chunk_size=4", "policy.n_action_steps=4", "policy.num_inference_steps=2"),
+        *("policy.dtype=float32", "policy.tokenizer_max_length=64"),
+    )
+
+
+@pytest.fixture
+def tiny_smolvlm(tmp_path: Path) -> Path:
+    """A folder with a small SmolVLM's configuration and processor, as the hub has the large one's."""
+    from transformers import SmolVLMConfig, SmolVLMImageProcessor, SmolVLMProcessor, SmolVLMVideoProcessor
+
+    folder = tmp_path / "smolvlm"
+    tokenizer = word_tokenizer(
+        fake_image_token="<fake_token_around_image>",
+        image_token="<image>",
+        end_of_utterance_token="<end_of_utterance>",
+        global_image_token="<global-img>",
+        video_token="<video>",
+    )
+    text = {
+        "hidden_size": 48,
+        "intermediate_size": 64,
+        "num_hidden_layers": 2,
+        "num_attention_heads": 4,
+        "num_key_value_heads": 2,
+        "head_dim": 12,
+        "vocab_size": len(tokenizer),
+        "pad_token_id": tokenizer.pad_token_id,
+        "max_position_embeddings": 512,
+    }
+    vision = {
+        "hidden_size": 32,
+        "intermediate_size": 64,
+        "num_hidden_layers": 1,
+        "num_attention_heads": 2,
+        "image_size": 512,
+        "patch_size": 16,
+    }
+    image = tokenizer.convert_tokens_to_ids("<image>")
+    SmolVLMConfig(text_config=text, vision_config=vision, scale_factor=4, image_token_id=image).save_pretrained(folder)
+    SmolVLMProcessor(SmolVLMImageProcessor(), tokenizer, SmolVLMVideoProcessor()).save_pretrained(folder)
+    return folder
+
+
+@pytest.mark.slow
+def test_smolvla(dataset: Path, tmp_path: Path, tiny_smolvlm: Path) -> None:
+    train_and_roll_out(
+        dataset,
+        tmp_path,
+        *("policy=smolvla", f"policy.vlm_model_name={tiny_smolvlm}", "policy.num_vlm_layers=2", "policy.num_steps=2"),
+        *("policy.chunk_size=4", "policy.n_action_steps=4"),
+    )
