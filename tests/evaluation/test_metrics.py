@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,6 +14,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import (
     Rate,
     by_task,
+    mean_rate,
     mean_row,
     mixtures,
     percent,
@@ -23,8 +23,7 @@ from lerobot_memobench.evaluation.metrics import (
     summarise,
     wilson,
 )
-
-PAPER_TABLES = Path(__file__).parents[3] / "shared" / "spec" / "paper_tables.json"
+from lerobot_memobench.paper import published_rows
 
 
 def rollout(
@@ -124,23 +123,6 @@ def test_tasks_are_ordered_by_memory_type_and_name() -> None:
     assert list(by_task(reversed(LOG))) == ["t1", "t2", "s1", "o1"]
 
 
-def test_200_episodes_with_known_answers() -> None:
-    """Per task: success in every other episode; checkpoint k is satisfied in all but the first 5 (k + 1) of 25."""
-    log = []
-    for memory_type, operations in (("temporal", "SUC"), ("spatial", "SC"), ("object", "S"), ("procedural", "SU")):
-        for task in ("x", "y"):
-            for episode in range(25):
-                first = [None if episode < 5 * (k + 1) else episode for k in range(len(operations))]
-                log.append(rollout(f"{memory_type}_{task}", memory_type, operations, first, episode % 2 == 0, episode))
-    assert len(log) == 200
-    content = report(summarise(log))
-    assert content["average"] == {"n": 200, "SR": 52.0, "MSR": 80.0, "MUR": 60.0, "MCR": 50.0}
-    assert content["memory_types"]["temporal"] == {"n": 50, "SR": 52.0, "MSR": 80.0, "MUR": 60.0, "MCR": 40.0}
-    assert content["memory_types"]["spatial"]["MCR"] == 60.0
-    assert content["prefix"]["temporal_x"] == [80.0, 60.0, 40.0]
-    assert sum(content["failures"].values()) == 96
-
-
 def test_an_empty_log_is_an_error() -> None:
     with pytest.raises(MemobenchError, match="no rollouts"):
         summarise([])
@@ -191,26 +173,24 @@ def test_percentages_have_one_decimal() -> None:
     assert percent(None) is None
 
 
+def test_a_mean_has_the_interval_of_its_standard_error() -> None:
+    # Var = p(1 - p)(1/80 + 3/40) / 16, that of a plain rate over 16 / 0.0875 rollouts.
+    mean = mean_rate([Rate(0.5, 80), Rate(0.5, 40), Rate(0.5, 40), Rate(0.5, 40), Rate(None, 0)])
+    assert mean.n == 200
+    assert mean.trials == pytest.approx(16 / 0.0875)
+    assert mean.interval == pytest.approx(wilson(0.5, 16 / 0.0875))
+    assert mean_rate([Rate(0.25, 50), Rate(0.75, 50)]) == Rate(0.5, 100)
+
+
 # --- the paper's own tables ---
 
 
-def published_rows() -> list[tuple[str, dict[str, Any]]]:
-    tables = json.loads(PAPER_TABLES.read_text())
-    rows = [(f"{r['model']} k={r['replan_steps']}", r) for r in tables["main_results"]]
-    rows += [(f"{r['model']} k={r['replan_steps']}", r) for r in tables["alignment_results"]]
-    rows += [(name, tables["oracle_memory"][name]) for name in ("standard_pi05", "oracle_pi05")]
-    return [*rows, ("memer", tables["memer"])]
-
-
-@pytest.mark.skipif(not PAPER_TABLES.is_file(), reason="the paper's tables are not on this machine")
-def test_published_averages_are_the_mean_of_applicable_memory_types() -> None:
-    def row(entry: dict[str, float | None]) -> dict[str, Rate]:
-        return {metric: Rate(None if value is None else value / 100, 0) for metric, value in entry.items()}
-
-    rows = published_rows()
-    assert len(rows) >= 40
-    for name, published in rows:
-        types = [row(published[t]) for t in ("temporal", "spatial", "object", "procedural")]
-        for metric, rate in mean_row(types).items():
+def test_the_papers_averages_follow_from_its_memory_types() -> None:
+    for published in published_rows():
+        rows = [
+            {metric: Rate(None if value is None else value / 100, 0) for metric, value in figures.items()}
+            for figures in published.memory_types.values()
+        ]
+        for metric, rate in mean_row(rows).items():
             assert rate.value is not None
-            assert 100 * rate.value == pytest.approx(published["average"][metric], abs=0.1001), (name, metric)
+            assert 100 * rate.value == pytest.approx(published.average[metric], abs=0.1001), (published.model, metric)

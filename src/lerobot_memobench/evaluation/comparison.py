@@ -10,7 +10,7 @@ import numpy as np
 
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.evaluation import paired
-from lerobot_memobench.evaluation.metrics import METRICS, Record, satisfied
+from lerobot_memobench.evaluation.metrics import METRICS, Record, percent, satisfied
 from lerobot_memobench.evaluation.protocol import SETTINGS, differences
 from lerobot_memobench.evaluation.runs import Run
 from lerobot_memobench.evaluation.sections import AVERAGE, count_of
@@ -208,7 +208,9 @@ def _difference(
     weights = np.array(
         [1 / (len(groups) * len(group) * len(values)) for group in groups.values() for values in group for _ in values]
     )
-    a, b = (float(weights @ table[:, k]) for k in (0, 1))
+    a, b = (
+        _mean([_mean([_mean([pair[k] for pair in values]) for values in g]) for g in groups.values()]) for k in (0, 1)
+    )
     d = table[:, 1] - table[:, 0]
     smallest = paired.detectable(d, weights)
     if metric == "SR":
@@ -217,6 +219,11 @@ def _difference(
         return Difference(scope, metric, len(d), a, b, p, True, smallest, only_a, only_b)
     p, exact = paired.sign_flip(d, weights, rng, permutations)
     return Difference(scope, metric, len(d), a, b, p, exact, smallest)
+
+
+def _mean(values: Sequence[float]) -> float:
+    """Return the mean as the report computes it, so that both print the same digits."""
+    return sum(values) / len(values)
 
 
 def _adjusted(rows: Sequence[Difference]) -> list[Difference]:
@@ -274,7 +281,7 @@ def _table(key: str, title: str, found: Comparison, rows: Sequence[Difference], 
 
 
 def _points(value: float, signed: bool = False) -> Numbers:
-    text = f"{100 * value:+.1f}" if signed else f"{100 * value:.1f}"
+    text = f"{percent(value):{'+' if signed else ''}.1f}"
     return Numbers(text.replace("-", "−"))
 
 

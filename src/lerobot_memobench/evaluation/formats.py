@@ -197,6 +197,8 @@ _LATEX = {
     ">": r"\textgreater{}",
     "|": r"\textbar{}",
     '"': r"\textquotedbl{}",
+    "[": "{[}",  # after the end of a row it would be taken as an option, as would a star
+    "*": "{*}",
     "–": "--",
     "κ": r"$\kappa$",
     "π": r"$\pi$",

@@ -23,6 +23,9 @@ Z_TWO_SIDED = 1.959963984540054
 Z_POWER = 0.8416212335729143
 """80 % power."""
 
+FEWEST_PAIRS = 6
+"""2 / 2^6 is under 5 %, 2 / 2^5 is not."""
+
 _TOLERANCE = 1e-12
 
 
@@ -74,17 +77,18 @@ def sign_flip(
 def detectable(
     differences: Sequence[float] | NDArray[np.float64], weights: Sequence[float] | NDArray[np.float64]
 ) -> float | None:
-    """Return the smallest true difference that so many pairs show with 80 % power at 5 % two-sided; None for above 1.
+    """Return the smallest true difference that so many pairs show with 80 % power at 5 % two-sided; None for none.
 
     It is the δ with  n δ² = (1.96 √m + 0.84 √(m − δ²))²  (Connor 1987 for McNemar's test, where m is the share of
     discordant pairs). Here m is the mean square of the differences, taken from the pairs with one more that differs
     and one more that does not, so that it is not 0 where no pair differs (as in Agresti and Min 2005), and at least δ:
     a mean difference δ of values in [-1, 1] cannot come with a smaller mean square than δ². n is 1 / Σ w_i², the
-    number of pairs of equal weight with the same standard error.
+    number of pairs of equal weight with the same standard error. With fewer than six pairs no outcome of an exact test
+    is under 5 %.
     """
     d = np.asarray(differences, dtype=np.float64)
     w = np.asarray(weights, dtype=np.float64)
-    if d.size == 0:
+    if d.size < FEWEST_PAIRS:
         return None
     pairs = 1.0 / float(np.sum(w**2))
     # The mean square that enters the variance of the weighted sum weighs pairs by the squares of their weights.

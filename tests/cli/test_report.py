@@ -1,0 +1,104 @@
+"""``memobench report``, ``compare``, ``agreement`` and ``figures`` as they are typed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from lerobot_memobench.cli.memobench import main
+from lerobot_memobench.envs.episode_log import write_episodes
+
+
+def evaluation(folder: Path, replan_steps: int = 5, successes: int = 2) -> str:
+    records = [
+        {
+            "task": "a_task",
+            "memory_type": "temporal",
+            "episode": k,
+            "seed": 7 + k,
+            "referent": "fixed",
+            "replan_steps": replan_steps,
+            "success": k < successes,
+            "checkpoints": [
+                {"operation": "S", "first_step": 3, "ordered_step": 3},
+                {"operation": "U", "first_step": 5 if k < successes else None, "ordered_step": None},
+            ],
+        }
+        for k in range(4)
+    ]
+    write_episodes(folder, records)
+    return str(folder)
+
+
+def test_report_in_several_formats_to_a_folder(tmp_path: Path) -> None:
+    a = evaluation(tmp_path / "a")
+    out = tmp_path / "out"
+    words = ["report", a, "--format", "json", "--format", "latex", "--with", "paper", "--out", str(out)]
+    assert main(words) == 0
+    assert sorted(path.name for path in out.iterdir()) == ["report.json", "report.tex"]
+    assert len(json.loads((out / "report.json").read_text())["paper"]) == 43
+    beside = json.loads((tmp_path / "a" / "report.json").read_text())
+    assert set(beside) == {"tasks", "memory_types", "average", "failures", "prefix"}
+
+
+def test_report_prints_json_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["report", evaluation(tmp_path / "a"), "--format", "json"]) == 0
+    assert json.loads(capsys.readouterr().out)["average"]["SR"] == 50.0
+
+
+def test_report_prints_intervals_and_the_best_replan_interval(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    a, b = evaluation(tmp_path / "a"), evaluation(tmp_path / "b", 20, 3)
+    assert main(["report", f"p={a}", f"p={b}"]) == 0
+    out = capsys.readouterr().out
+    assert "Best replan interval by average: SR 75.0 at 20" in out
+    assert "75.0 [30.1–95.4]" in out
+
+
+def test_compare(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    a, b = evaluation(tmp_path / "a"), evaluation(tmp_path / "b", 20, 3)
+    assert main(["compare", a, b]) == 2
+    assert "replan_steps: 5 and 20" in capsys.readouterr().err
+    assert main(["compare", a, b, "--allow", "replan_steps", "--format", "json"]) == 0
+    assert json.loads(capsys.readouterr().out)["differences"][0]["difference"] == 25.0
+    assert main(["compare", a, b, "--allow", "replan_steps", "--format", "csv"]) == 2
+
+
+def test_agreement(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sheet = tmp_path / "labels.csv"
+    sheet.write_text("template,released,x,y\na,S,S,S\nb,U,U,C\n")
+    assert main(["agreement", str(sheet)]) == 0
+    assert "3/4" in capsys.readouterr().out
+    assert main(["agreement", str(sheet), "--format", "markdown", "--out", str(tmp_path / "out")]) == 0
+    assert (tmp_path / "out" / "agreement.md").is_file()
+    assert main(["agreement", "--paper"]) == 0
+    assert capsys.readouterr().out.count("equal") >= 7
+    blank = tmp_path / "new" / "blank.csv"
+    assert main(["agreement", "--template", str(blank)]) == 0
+    assert len(blank.read_text().splitlines()) == 85
+    assert main(["agreement", "--template", str(blank)]) == 2  # raters may have filled it in
+    assert main(["agreement"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["figures", "radar"], "nothing to draw"),
+        (["figures", "correlations", "--with", "paper", "--by", "tasks"], "no figures per task"),
+        (["figures", "failures", "--with", "paper", "--out", "x.gif"], ".gif"),
+        (["figures", "prefix", "--with", "paper", "--tasks", "temporal"], "was not evaluated"),
+        (["figures", "replan", "--with", "paper", "--by", "tasks"], "expected types"),
+    ],
+)
+def test_figures_that_cannot_be_drawn(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(words) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_figure_to_a_file(tmp_path: Path) -> None:
+    a = evaluation(tmp_path / "a")
+    assert main(["figures", "failures", a, "--by", "tasks", "--out", str(tmp_path / "f.pdf")]) == 0
+    assert (tmp_path / "f.pdf").read_bytes().startswith(b"%PDF")
