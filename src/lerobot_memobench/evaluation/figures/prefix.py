@@ -111,9 +111,9 @@ def draw(found: Sequence[Panel]) -> Figure:
             for look in looks.values()
         ]
         labels = [style.words(name) for name in names]
-        if any(curve.ordered is not None for panel in found for curve in panel.curves):
+        if any(curve.ordered not in (None, curve.plain) for panel in found for curve in panel.curves):
             handles.append(Line2D([], [], color=style.FAINT, marker="o", mfc="white", ls=":", ms=4, lw=1.0))
-            labels.append("the same, in order")
+            labels.append("in order, where it differs")
         style.legend_below(figure, handles, labels, min(len(handles), 2 if columns < 3 else 4))
         return figure
 
@@ -135,7 +135,7 @@ def _draw_panel(place: Any, panel: Panel, looks: dict[str, style.Line]) -> None:
             zorder=3,
             clip_on=False,
         )
-        if curve.ordered is not None:
+        if curve.ordered is not None and curve.ordered != curve.plain:
             place.plot(
                 steps,
                 curve.ordered,
