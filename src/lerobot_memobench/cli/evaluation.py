@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.cli.arguments import Translation, without_flag
-from lerobot_memobench.cli.checkpoint import checkpoint_folder, looks_local
+from lerobot_memobench.cli.checkpoint import ADAPTER_FILE, WEIGHTS_FILE, checkpoint_folder, looks_local
 from lerobot_memobench.cli.orders import Orders
 from lerobot_memobench.cli.plan import Grid, Place
 from lerobot_memobench.envs.episode_log import has_log, read_episodes
@@ -125,21 +125,16 @@ def describe(evaluation: Evaluation) -> dict[str, Any]:
     """Return the card of an evaluation before it has found anything. Hashes the checkpoint, opens a GL context."""
     from lerobot_memobench.datasets.generation import task_hash
 
-    folder = policy_folder(evaluation.translation.get("policy.path"))
     grid = evaluation.grid
     protocol: dict[str, Any] = {}
     if grid is not None:
         protocol = {"tasks": sorted(place.task.name for place in grid.places), "episodes": grid.runs}
         protocol |= evaluation.environment.protocol
-    files = checkpoint_files(folder) if folder is not None else {}
-    policy = policy_facts(encoded(evaluation.policy), evaluation.seed) if evaluation.policy is not None else {}
-    if files:
-        policy["sha256"] = tree_hash(files)
-    return new_card(
+    card = new_card(
         protocol=protocol,
-        policy=policy,
-        checkpoint={"path": evaluation.translation.get("policy.path"), "files": files} if folder is not None else None,
-        trained_on=training_facts(folder) if folder is not None else None,
+        policy=policy_facts(encoded(evaluation.policy), evaluation.seed) if evaluation.policy is not None else {},
+        checkpoint=None,
+        trained_on=None,
         task_files={place.task.name: task_hash(place.task) for place in grid.places} if grid is not None else {},
         flags=evaluation.flags,
         runs=[
@@ -151,6 +146,24 @@ def describe(evaluation: Evaluation) -> dict[str, Any]:
         ],
         shard=str(evaluation.orders.shard) if evaluation.orders.shard is not None else None,
     )
+    return with_checkpoint(card, evaluation.translation.get("policy.path"))
+
+
+def with_checkpoint(card: dict[str, Any], path: str | None) -> dict[str, Any]:
+    """Return a card with what is known of the checkpoint; a repository's is known once LeRobot has fetched it."""
+    folder = policy_folder(path)
+    if path is None or folder is None or "sha256" in card["policy"]:
+        return card
+    files = checkpoint_files(folder)
+    if not any(name in files for name in (WEIGHTS_FILE, ADAPTER_FILE)):
+        return card
+    revision = folder.name if folder.parent.name == "snapshots" else None
+    return {
+        **card,
+        "policy": {**card["policy"], "sha256": tree_hash(files)},
+        "checkpoint": {"path": path, "revision": revision, "files": files},
+        "trained_on": training_facts(folder),
+    }
 
 
 def gl_facts() -> dict[str, str]:

@@ -10,7 +10,7 @@ from typing import Any
 
 from lerobot_memobench.cli import preflight
 from lerobot_memobench.cli.arguments import Translation
-from lerobot_memobench.cli.evaluation import Evaluation, describe, logged
+from lerobot_memobench.cli.evaluation import Evaluation, describe, logged, with_checkpoint
 from lerobot_memobench.cli.loop import calm_output, steered
 from lerobot_memobench.cli.plan import Range, task_names
 from lerobot_memobench.datasets.unfinished import locked
@@ -115,7 +115,8 @@ def finish(evaluation: Evaluation, card: dict[str, Any], say_where: bool) -> int
     limit = None if grid is None else grid.first + max(grid.runs, protocol["episodes"])
     print_report(log, limit)
     records = [record for record in read_episodes(log) if limit is None or record["episode"] < limit]
-    write_card(log, with_episodes({**card, "protocol": protocol}, records))
+    card = with_checkpoint({**card, "protocol": protocol}, evaluation.translation.get("policy.path"))
+    write_card(log, with_episodes(card, records))
     if say_where:
         print(f"report: {log / REPORT_MARKDOWN}")
     return 0
