@@ -98,7 +98,7 @@ function ticks(end) {
   const steps = [1, 2, 5, 10, 20, 30, 60, 120, 300].map((s) => s * DATA.fps);
   const step = steps.find((it) => end / it <= 7) ?? steps.at(-1);
   const all = Array.from({ length: Math.floor(end / step) + 1 }, (_, k) => k * step);
-  return all.filter((frame) => frame === 0 || frame <= end * 0.96); // the last label must not leave the track
+  return all.filter((frame) => frame === 0 || frame <= end * 0.94); // the last label must not leave the track
 }
 
 /** What the signs on a timeline mean. */
