@@ -22,9 +22,10 @@ from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.envs.film import Film
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.html import write_html
-from lerobot_memobench.evaluation.html.collect import page_data, read_runs, run_names, task_source
+from lerobot_memobench.evaluation.html.collect import page_data, read_runs, task_source
 from lerobot_memobench.evaluation.html.page import inline_json, page
 from lerobot_memobench.evaluation.html.videos import find_videos, frame_count
+from lerobot_memobench.evaluation.runs import folder_names
 from lerobot_memobench.tasks.catalogue import get_task, task_index
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
@@ -159,12 +160,12 @@ def test_a_folder_in_the_published_format_brings_its_texts(tmp_path: Path) -> No
     [(["/a/expert", "/a/random"], ["expert", "random"]), (["/a/x/eval", "/a/y/eval"], ["x/eval", "y/eval"])],
 )
 def test_runs_are_named_after_what_tells_them_apart(folders: list[str], names: list[str]) -> None:
-    assert run_names(folders) == names
+    assert folder_names(folders) == names
 
 
 def test_an_evaluation_is_given_once(tmp_path: Path) -> None:
     with pytest.raises(MemobenchError, match="given twice"):
-        run_names([tmp_path, tmp_path / "." / "x" / ".."])
+        folder_names([tmp_path, tmp_path / "." / "x" / ".."])
 
 
 # --- page ---

@@ -18,6 +18,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.failures import failure_counts, failure_of
 from lerobot_memobench.evaluation.metrics import Rate, Record, Row, Summary, by_task, mixtures, percent, summarise
 from lerobot_memobench.evaluation.protocol import CARD_FILE, read_card
+from lerobot_memobench.evaluation.runs import folder_names
 from lerobot_memobench.tasks.catalogue import find_tasks, get_task, task_names
 from lerobot_memobench.tasks.failures import FAILURES
 from lerobot_memobench.tasks.formula import format_formula
@@ -45,7 +46,7 @@ class Run:
 def read_runs(folders: Sequence[str | Path]) -> list[Run]:
     """Read the logs of several evaluations and name them after their folders."""
     runs = []
-    for folder, name in zip(folders, run_names(folders), strict=True):
+    for folder, name in zip(folders, folder_names(folders), strict=True):
         notes: list[str] = []
         records = read_episodes(folder, notes)
         if not records:
@@ -54,18 +55,6 @@ def read_runs(folders: Sequence[str | Path]) -> list[Run]:
         card = read_card(path) if path.is_file() else {}
         runs.append(Run(name, Path(folder), records, notes + mixtures(records), card))
     return runs
-
-
-def run_names(folders: Sequence[str | Path]) -> list[str]:
-    """Return the shortest ends of the folders' paths that tell them apart."""
-    paths = [Path(folder).resolve() for folder in folders]
-    if len(set(paths)) < len(paths):
-        twice = next(path for path in paths if paths.count(path) > 1)
-        raise MemobenchError(f"{twice} is given twice; name each evaluation once")
-    depth = 1
-    while len({path.parts[-depth:] for path in paths}) < len(paths):
-        depth += 1
-    return ["/".join(path.parts[-depth:]) for path in paths]
 
 
 def task_source(task_dir: str | Path | None) -> dict[str, Task]:
