@@ -244,6 +244,14 @@ def test_granularity_command(tmp_path: Path) -> None:
     assert "paper" in (tmp_path / "granularity.md").read_text()
 
 
+def test_levels_at_different_replan_intervals_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = []
+    for level, replan in (("coarse", 5), ("intermediate", 5), ("fine", 20)):
+        words += [f"--{level}", folder(tmp_path / level, rollouts([1], replan_steps=replan))]
+    assert main(["controls", "granularity", *words]) == 2
+    assert "fine 20" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [({"replan_steps": 50}, "no replan interval in common"), ({"referent": "random"}, "different protocols")],

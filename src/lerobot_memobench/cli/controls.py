@@ -160,9 +160,12 @@ def granularity(
         _refuse_unlike([coarse], [folder])
     notes: list[str] = []
     levels = {level: read_episodes(folder, notes) for level, folder in folders.items()}
-    for level, records in levels.items():
-        if len(by_replan(records)) > 1:
-            notes.append(f"{folders[level]} mixes replan intervals; its figures are over all of them")
+    intervals = {level: list(by_replan(records)) for level, records in levels.items()}
+    if len({tuple(found) for found in intervals.values()}) > 1:
+        told = ", ".join(f"{level} {'/'.join(map(str, found))}" for level, found in intervals.items())
+        raise MemobenchError(f"the levels were evaluated at different replan intervals ({told}); use the same replan=")
+    if len(intervals[LEVELS[0]]) > 1:
+        notes.append("the evaluations mix replan intervals; the figures are over all of them")
     own = {}
     for index, (level, records) in enumerate(levels.items()):
         labels = {
