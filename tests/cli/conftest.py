@@ -110,5 +110,8 @@ class FakeLeRobot:
 @pytest.fixture
 def fake_lerobot(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeLeRobot:
     """LeRobot is replaced, and the present folder is an empty one."""
+    import lerobot_policy_memobench  # noqa: F401 - what LeRobot would find by looking through all that is installed
+
+    monkeypatch.setattr("lerobot_memobench.cli.lerobot.register_plugins", lambda: None)
     monkeypatch.chdir(tmp_path)
     return FakeLeRobot(monkeypatch)
