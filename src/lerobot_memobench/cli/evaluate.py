@@ -57,8 +57,9 @@ def prepare(translation: Translation, orders: Orders) -> Evaluation:
         add_earlier_batch_size(translation)
     if orders.shard is not None or orders.shards:
         translation.add("eval.batch_size", 1)  # by cores, each machine would cut the evaluation differently
-    if getattr(policy, "max_environments", None) is not None:
-        add_batch_size(translation, policy.max_environments)  # its servers keep one memory each
+    most = getattr(policy, "max_environments", None)
+    if most is not None:
+        add_batch_size(translation, most)  # its servers keep one memory each
     add_protocol(translation, getattr(policy, "n_action_steps", None))
     environment = preflight.parse_choice(translation, "env")
     if environment is None and orders.any:
