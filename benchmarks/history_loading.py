@@ -1,15 +1,17 @@
 """History for training samples: gathered from the memory cache, beside decoding the same frames from the videos.
 
-    python benchmarks/history_loading.py [DATASET] [--frames 1 8 32] [--samples 16] [--repeats 5]
+    python benchmarks/history_loading.py [DATASET] [--size pi05] [--frames 1 8 32] [--samples 16] [--repeats 5]
 
 The other side is what LeRobot does for delta timestamps: ``decode_video_frames`` of the sample's timestamps, here
 those of exactly the frames that the memory would hold (delta timestamps themselves are fixed offsets and cannot say
 that). It yields pixels; running the image tower over them, which the cache has behind it, is not counted. Without a
-dataset two episodes are recorded and encoded first, 256x256 as generated ones are.
+dataset two episodes are recorded first, 256x256 as generated ones are. The cache holds random tokens of the size's
+width, because loading does not depend on their values: ``pi05`` reads 64 KiB per frame without a tower of 400 million
+parameters.
 
-Prints one JSON line: samples/s of both sides and their ratio per number of frames, and how far the resident memory
-rose while each side worked. The cache is memory-mapped: it can never take more than its file's size, which is stated,
-and those pages belong to the system, which takes them back when it needs them.
+Prints one JSON line: samples/s of both sides (CPU seconds) and their ratio per number of frames, how far the resident
+memory rose while each side worked for the first time, and its upper bound for the cache: the tensors of a batch, and
+the memory-mapped file, whose pages belong to the system, which takes them back when it needs them.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 import tempfile
 from pathlib import Path
 
@@ -26,20 +29,34 @@ import numpy as np
 import torch
 from turns import medians, peak, reset_peak, resident
 
-from lerobot_memobench.datasets.memory_cache import MemoryCache
-from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.datasets.memory_cache import FOLDER, MemoryCache, build_memory_cache
+from lerobot_memobench.policies.memobench_mem.dimensions import SIZES
 from lerobot_memobench.policies.memobench_mem.memory import sample_frames
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import GatherMemoryProcessorStep
+from lerobot_memobench.policies.memobench_mem.text import WordTextEncoder
 
 CAMERA = "observation.images.image"
 TASK = "put_the_tomato_into_the_top_drawer_of_the_cabinet"
+CACHE = "benchmark"
+
+
+class RandomTokens:
+    """Stands for the image tower: tokens of the right shape, whatever the images."""
+
+    key, tokens_per_frame = "random", 16
+
+    def __init__(self, dim: int) -> None:
+        self.dim = dim
+
+    def __call__(self, images: torch.Tensor) -> torch.Tensor:
+        return torch.randn(len(images), self.tokens_per_frame, self.dim).to(torch.bfloat16)
 
 
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("dataset", type=Path, nargs="?")
+    parser.add_argument("--size", choices=list(SIZES), default="pi05", help="whose token width is loaded")
     parser.add_argument("--frames", type=int, nargs="+", default=[1, 8, 32])
     parser.add_argument("--samples", type=int, default=16, help="samples per turn")
     parser.add_argument("--repeats", type=int, default=5)
@@ -47,7 +64,11 @@ def main() -> None:
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as name:
         root = asked.dataset or record(Path(name) / "dataset")
-        print(json.dumps(measure(root, asked.frames, asked.samples, asked.repeats)))
+        try:
+            print(json.dumps(measure(root, asked.size, asked.frames, asked.samples, asked.repeats)))
+        finally:
+            shutil.rmtree(root / FOLDER / CACHE, ignore_errors=True)
+            (root / FOLDER / f"{CACHE}.lock").unlink(missing_ok=True)
 
 
 def record(root: Path) -> Path:
@@ -60,15 +81,14 @@ def record(root: Path) -> Path:
     return write_dataset((record_demonstration(task, FIRST_SEED + i, images=True) for i in range(2)), root)
 
 
-def measure(root: Path, numbers: list[int], samples: int, repeats: int) -> dict[str, object]:
-    """Measure both sides on a dataset, whose memory cache is made first."""
+def measure(root: Path, size: str, numbers: list[int], samples: int, repeats: int) -> dict[str, object]:
+    """Measure both sides on a dataset, for which a cache is made first."""
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.datasets.video_utils import decode_video_frames
 
-    config = MemobenchMemConfig(size="tiny", device="cpu")
-    folder = cache_dataset(root, config)
-    keys = json.loads((folder / "meta.json").read_text())
-    cache = MemoryCache.open(root, folder.name, **{key: keys[key] for key in ("frames_key", "camera", "stride")})
+    dim = SIZES[size].vlm.width
+    folder = build_memory_cache(root, CACHE, RandomTokens(dim), WordTextEncoder(8), camera=CAMERA)
+    cache = MemoryCache.open(root, CACHE, frames_key=RandomTokens.key, camera=CAMERA, stride=1)
     meta = LeRobotDatasetMetadata(root.name, root=root)
     rng = np.random.default_rng(0)
     length = int(np.diff(cache.episodes).max())
@@ -77,6 +97,7 @@ def measure(root: Path, numbers: list[int], samples: int, repeats: int) -> dict[
     height, width, _ = meta.features[CAMERA]["shape"]
     result: dict[str, object] = {
         "benchmark": "history_loading",
+        "size": size,
         "image": f"{height}x{width}",
         "longest_episode": length,
         "samples": len(indices),
@@ -96,7 +117,6 @@ def measure(root: Path, numbers: list[int], samples: int, repeats: int) -> dict[
         sides = {"cache": lambda step=step: step.gather(cache, indices), "lerobot": lambda n=frames: decode(n)}
         rise = {}
         for name, side in sides.items():
-            side()
             before = resident()
             reset_peak()
             side()
@@ -106,6 +126,7 @@ def measure(root: Path, numbers: list[int], samples: int, repeats: int) -> dict[
             "ratio": round(seconds["lerobot"] / seconds["cache"], 1),
             **{f"{name}_samples_per_s": round(len(indices) / seconds[name], 1) for name in sides},
             **{f"{name}_peak_rise_mib": rise[name] for name in sides},
+            "batch_tensors_mib": round(len(indices) * frames * 16 * dim * 2 / 2**20, 1),
         }
     last = result[f"frames_{numbers[-1]}"]
     assert isinstance(last, dict)

@@ -18,9 +18,9 @@ SIZES.setdefault(
     "middle",
     replace(
         SIZES["tiny"],
-        vlm=Gemma(width=512, depth=6, mlp_dim=4096, num_heads=8, num_kv_heads=1, head_dim=64),
-        expert=Gemma(width=256, depth=6, mlp_dim=1024, num_heads=8, num_kv_heads=1, head_dim=64),
-        vision=Vision(width=288, depth=6, mlp_dim=1076, num_heads=8, patch=14, image=224),
+        vlm=Gemma(width=512, depth=4, mlp_dim=2048, num_heads=8, num_kv_heads=1, head_dim=64),
+        expert=Gemma(width=256, depth=4, mlp_dim=1024, num_heads=8, num_kv_heads=1, head_dim=64),
+        vision=Vision(width=288, depth=4, mlp_dim=1076, num_heads=8, patch=14, image=224),
         tokenizer_max_length=200,
     ),
 )

@@ -32,6 +32,7 @@ HORIZON = 12
         ({"integration": "context"}, []),
         ({"integration": "none", "oracle_memory": True}, ["env.oracle_memory=true"]),
     ],
+    ids=["none", "semantic", "contrastive", "framewise", "context", "oracle"],
 )
 def test_a_trained_checkpoint_evaluates(
     fields: dict[str, Any], settings: list[str], dataset_root: Path, tmp_path: Path

@@ -42,7 +42,7 @@ def study(
     # Seed by seed, so that an unfinished study already compares all objectives.
     runs = [work.run(align, seed) for seed in range(seeds) for align in ALIGNMENTS]
     summary = {
-        "settings": json.loads((out / "settings.json").read_text()),
+        "settings": json.loads((out / "settings.json").read_text()) | {"seeds": seeds},
         "tasks": len(set(work.frames.tasks.tolist())),
         "episodes": len(work.frames.episodes) - 1,
         "candidates": len(work.candidates),

@@ -236,8 +236,9 @@ class Study:
         self.gather = GatherMemoryProcessorStep(frames=config.memory_frames, align="none", cache=self.cache)
 
     def _check_folder(self) -> None:
-        """A folder belongs to one dataset and one set of settings."""
-        wanted = {"dataset": dataset_fingerprint(self.root, "observation.images.image"), **asdict(self.settings)}
+        """A folder belongs to one dataset and one set of settings; more seeds may be added to it."""
+        wanted = {"dataset": dataset_fingerprint(self.root, MemobenchMemConfig.memory_camera), **asdict(self.settings)}
+        del wanted["seeds"]
         path = self.out / "settings.json"
         if path.is_file():
             there = json.loads(path.read_text())
