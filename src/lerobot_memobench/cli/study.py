@@ -142,7 +142,7 @@ def draw(summary: dict[str, Any], path: Path) -> None:
         for place, align in enumerate(aligns):
             measure = summary["alignments"][align].get(name)
             if measure is None:
-                axis.text(place, 1.0, "no head", ha="center", va="bottom", fontsize=8, color="#555555")
+                axis.text(place, 7.0, "no head", ha="center", va="bottom", fontsize=8, color="#555555")
                 continue
             axis.bar(place, factor * measure["mean"], 0.7, color=COLOURS.get(align, "#444444"), alpha=0.85)
             values = [factor * value for value in measure["values"]]
@@ -151,7 +151,7 @@ def draw(summary: dict[str, Any], path: Path) -> None:
         axis.set_xticks(range(len(aligns)), aligns, rotation=25, fontsize=9)
         axis.spines[["top", "right"]].set_visible(False)
         if name == "action loss":
-            axis.set_ylabel("flow-matching loss, held-out frames")
+            axis.set_ylabel("flow-matching loss")
             continue
         axis.set_ylim(0, 100)
         axis.set_ylabel("held-out top-1, %")
@@ -162,7 +162,7 @@ def draw(summary: dict[str, Any], path: Path) -> None:
             axis.axhline(
                 100 * base[source][key], color="#cc79a7", linestyle="--", linewidth=1.2, label="untrained weights"
             )
-        axis.legend(fontsize=7, loc="lower right", framealpha=0.9)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8, frameon=False)
     settings = summary["settings"]
     figure.suptitle(
         f"{summary['tasks']} tasks, {summary['candidates']} subgoals, {summary['frames']['test']} held-out frames; "
