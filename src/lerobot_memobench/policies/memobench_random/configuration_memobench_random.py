@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from lerobot.configs import PreTrainedConfig
-from lerobot.optim import AdamWConfig, LRSchedulerConfig
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.untrained import UntrainedConfig
 
 
 @PreTrainedConfig.register_subclass("memobench_random")
 @dataclass
-class MemobenchRandomConfig(PreTrainedConfig):
+class MemobenchRandomConfig(UntrainedConfig):
     """How the actions are drawn.
 
     Args:
@@ -21,8 +21,6 @@ class MemobenchRandomConfig(PreTrainedConfig):
             arm trembles about one place; towards 1 it wanders.
     """
 
-    device: str | None = "cpu"
-    push_to_hub: bool = False
     seed: int = 0
     smoothing: float = 0.0
 
@@ -32,25 +30,3 @@ class MemobenchRandomConfig(PreTrainedConfig):
             raise MemobenchError(f"policy.seed is {self.seed}; expected a whole number from 0 on")
         if not 0.0 <= self.smoothing < 1.0:
             raise MemobenchError(f"policy.smoothing is {self.smoothing}; expected a number from 0 to below 1")
-
-    @property
-    def observation_delta_indices(self) -> None:
-        return None
-
-    @property
-    def action_delta_indices(self) -> None:
-        return None
-
-    @property
-    def reward_delta_indices(self) -> None:
-        return None
-
-    def get_optimizer_preset(self) -> AdamWConfig:
-        """LeRobot asks for one before it builds the policy; ``forward`` then refuses to train."""
-        return AdamWConfig()
-
-    def get_scheduler_preset(self) -> LRSchedulerConfig | None:
-        return None
-
-    def validate_features(self) -> None:
-        return None

@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from lerobot.configs import PreTrainedConfig
-from lerobot.optim import AdamWConfig, LRSchedulerConfig
 
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.remote.dialects import DIALECTS, GRIPPERS, Dialect
+from lerobot_memobench.policies.untrained import UntrainedConfig
 
 
 @PreTrainedConfig.register_subclass("remote")
 @dataclass
-class RemoteConfig(PreTrainedConfig):
+class RemoteConfig(UntrainedConfig):
     """Where the server is, what it speaks, and what is done when it goes away.
 
     Args:
@@ -37,8 +37,6 @@ class RemoteConfig(PreTrainedConfig):
         label: what is served, in your words; it goes onto the result card, since a server does not tell it.
     """
 
-    device: str | None = "cpu"
-    push_to_hub: bool = False
     host: str = "127.0.0.1"
     port: int | None = None
     servers: str | None = None
@@ -133,25 +131,3 @@ class RemoteConfig(PreTrainedConfig):
                 "'observation/image=image,observation/state=state,prompt=task'"
             )
         return {pair[0]: pair[1] for pair in pairs}
-
-    @property
-    def observation_delta_indices(self) -> None:
-        return None
-
-    @property
-    def action_delta_indices(self) -> None:
-        return None
-
-    @property
-    def reward_delta_indices(self) -> None:
-        return None
-
-    def get_optimizer_preset(self) -> AdamWConfig:
-        """LeRobot asks for one before it builds the policy; ``forward`` then refuses to train."""
-        return AdamWConfig()
-
-    def get_scheduler_preset(self) -> LRSchedulerConfig | None:
-        return None
-
-    def validate_features(self) -> None:
-        return None

@@ -1,0 +1,38 @@
+"""What the configurations of policies without weights share: the expert, the random policy, one in a server."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from lerobot.configs import PreTrainedConfig
+from lerobot.optim import AdamWConfig, LRSchedulerConfig
+
+
+@dataclass
+class UntrainedConfig(PreTrainedConfig):
+    """Answers to what LeRobot asks every policy's configuration, of one that is never trained."""
+
+    device: str | None = "cpu"
+    push_to_hub: bool = False
+
+    @property
+    def observation_delta_indices(self) -> None:
+        return None
+
+    @property
+    def action_delta_indices(self) -> None:
+        return None
+
+    @property
+    def reward_delta_indices(self) -> None:
+        return None
+
+    def get_optimizer_preset(self) -> AdamWConfig:
+        """LeRobot asks for one before it builds the policy; ``forward`` then refuses to train."""
+        return AdamWConfig()
+
+    def get_scheduler_preset(self) -> LRSchedulerConfig | None:
+        return None
+
+    def validate_features(self) -> None:
+        return None
