@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 import torch
 
 torch.set_num_threads(1)
+sys.path.insert(0, str(Path(__file__).parent))  # for small_policy.py: pytest imports tests by their paths
 
 SIZE = 48  # pixels of the synthetic cameras
 LENGTHS = (40, 23, 31)

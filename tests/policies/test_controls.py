@@ -11,41 +11,20 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
-from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.policies import make_pre_post_processors
+from small_policy import batch_of, made_for_training, small_config
 
 from lerobot_memobench.datasets.memory_cache import FOLDER, MemoryCache
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import shuffle_within_episodes
 from lerobot_memobench.policies.memobench_mem.text import WordTextEncoder
 from lerobot_memobench.tasks.memory_text import with_memory
 
-CHUNK = 6
 EPISODE_1 = 40  # first frame of the second episode, whose subgoals are:
 SUBGOALS = ("open the top drawer", "put the bowl in the drawer", "close the top drawer")
-
-
-def _config(**fields: Any) -> MemobenchMemConfig:
-    fields = {"chunk_size": CHUNK, "n_action_steps": CHUNK, "num_inference_steps": 2, "memory_frames": 8} | fields
-    return MemobenchMemConfig(device="cpu", push_to_hub=False, **fields)
-
-
-def _training(root: Path, **fields: Any):  # type: ignore[no-untyped-def]
-    config = _config(**fields)
-    meta = LeRobotDataset("memobench/synthetic", root=root).meta
-    dataset = LeRobotDataset("memobench/synthetic", root=root, delta_timestamps=resolve_delta_timestamps(config, meta))
-    torch.manual_seed(0)
-    policy = make_policy(config, ds_meta=dataset.meta)
-    before, after = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)
-    return policy, before, after, dataset
-
-
-def _batch(dataset: LeRobotDataset, indices: list[int]) -> dict[str, Any]:
-    return torch.utils.data.default_collate([dataset[index] for index in indices])
 
 
 def _observation(dataset: LeRobotDataset, frame: int, task: str) -> dict[str, Any]:
@@ -67,8 +46,8 @@ def _prompt(before: Any, batch: dict[str, Any], row: int) -> str:
 
 
 def test_oracle_memory_stands_whole_in_the_training_prompt(dataset_root: Path, tmp_path: Path) -> None:
-    policy, before, after, dataset = _training(dataset_root, oracle_memory=True)
-    batch = before(_batch(dataset, [EPISODE_1, EPISODE_1 + 22]))
+    policy, before, after, dataset = made_for_training(dataset_root, oracle_memory=True)
+    batch = before(batch_of(dataset, [EPISODE_1, EPISODE_1 + 22]))
     assert "put the bowl away memory : nothing yet , state :" in _prompt(before, batch, 0)
     done = " ; ".join(SUBGOALS[:2])
     assert f"put the bowl away memory : {done} , state :" in _prompt(before, batch, 1)
@@ -89,8 +68,8 @@ def test_oracle_memory_stands_whole_in_the_training_prompt(dataset_root: Path, t
 
 
 def test_plain_policies_read_no_memory_text(dataset_root: Path) -> None:
-    _, before, _, dataset = _training(dataset_root)
-    assert "put the bowl away , state :" in _prompt(before, before(_batch(dataset, [EPISODE_1 + 22])), 0)
+    _, before, _, dataset = made_for_training(dataset_root)
+    assert "put the bowl away , state :" in _prompt(before, before(batch_of(dataset, [EPISODE_1 + 22])), 0)
 
 
 def test_six_checkpoints_fit_into_the_prompt() -> None:
@@ -103,7 +82,10 @@ def test_six_checkpoints_fit_into_the_prompt() -> None:
         with_memory(task.language, memory_text(task, len(task.checkpoints))) for task in map(get_task, task_names())
     ]
     frame = words("Task: , State: " + "255 " * 8 + ";\nAction: ")
-    assert max(len(words(text)) for text in texts) + len(frame) + 1 <= _config(oracle_memory=True).tokenizer_max_length
+    assert (
+        max(len(words(text)) for text in texts) + len(frame) + 1
+        <= small_config(oracle_memory=True).tokenizer_max_length
+    )
 
 
 # -- subgoals ------------------------------------------------------------------------------------------------------
@@ -119,8 +101,8 @@ def test_six_checkpoints_fit_into_the_prompt() -> None:
 )
 @pytest.mark.parametrize("align", ["semantic", "framewise"])
 def test_subgoal_level_chooses_the_text(dataset_root: Path, align: str, level: str, text: str) -> None:
-    policy, before, _, dataset = _training(dataset_root, align=align, subgoal_level=level)
-    batch = before(_batch(dataset, [EPISODE_1 + 12, 3]))
+    policy, before, _, dataset = made_for_training(dataset_root, align=align, subgoal_level=level)
+    batch = before(batch_of(dataset, [EPISODE_1 + 12, 3]))
     found = batch["memory.text"][0]
     if align == "framewise":
         found = found[batch["memory.mask"][0]][-1]  # the frame itself is the last of its history
@@ -147,11 +129,11 @@ def test_shuffled_subgoals_reach_the_loss(dataset_root: Path, align: str) -> Non
     indices = [EPISODE_1 + frame for frame in (1, 9, 20)]
     found = {}
     for shuffle in (False, True):
-        policy, before, _, dataset = _training(dataset_root, align=align, shuffle_subgoals=shuffle)
-        batch = before(_batch(dataset, indices))
+        policy, before, _, dataset = made_for_training(dataset_root, align=align, shuffle_subgoals=shuffle)
+        batch = before(batch_of(dataset, indices))
         found[shuffle] = batch["memory.text"]
         policy.forward(batch)[0].backward()
-        again = before(_batch(dataset, indices))  # another epoch
+        again = before(batch_of(dataset, indices))  # another epoch
         assert torch.equal(batch["memory.text"], again["memory.text"])
     known = WordTextEncoder(64)(list(SUBGOALS))
     plain, shuffled = (
@@ -167,7 +149,7 @@ def test_a_dataset_without_the_columns_is_refused(dataset_root: Path, tmp_path: 
     shutil.copytree(dataset_root, root, ignore=shutil.ignore_patterns(FOLDER))
     for path in (root / "data").rglob("*.parquet"):
         pq.write_table(pq.read_table(path).drop_columns(["coarse_subgoal", "memory"]), path)
-    folder = cache_dataset(root, _config())
+    folder = cache_dataset(root, small_config())
     meta = json.loads((folder / "meta.json").read_text())
     keys = {key: meta[key] for key in ("frames_key", "camera", "stride")}
     cache = MemoryCache.open(root, folder.name, **keys)
@@ -183,9 +165,9 @@ def test_a_dataset_without_the_columns_is_refused(dataset_root: Path, tmp_path: 
 def test_without_integration_it_is_plain_pi05(dataset_root: Path, tmp_path: Path) -> None:
     from lerobot_memobench.policies.memobench_mem.backbone import SizedPI05
 
-    policy, before, after, dataset = _training(dataset_root, integration="none")
-    assert set(dict(policy.model.named_parameters())) == set(dict(SizedPI05(_config()).named_parameters()))
-    batch = before(_batch(dataset, [EPISODE_1 + 1, EPISODE_1 + 22]))
+    policy, before, after, dataset = made_for_training(dataset_root, integration="none")
+    assert set(dict(policy.model.named_parameters())) == set(dict(SizedPI05(small_config()).named_parameters()))
+    batch = before(batch_of(dataset, [EPISODE_1 + 1, EPISODE_1 + 22]))
     assert batch["phase"].tolist() == [0, 1]
     assert not any(key.startswith("memory.") for key in batch)
     policy.train()
@@ -211,4 +193,4 @@ def test_without_integration_it_is_plain_pi05(dataset_root: Path, tmp_path: Path
 )
 def test_controls_without_effect_are_refused(fields: dict[str, Any], message: str) -> None:
     with pytest.raises(MemobenchError, match=message):
-        _config(**fields)
+        small_config(**fields)

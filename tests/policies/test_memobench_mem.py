@@ -14,15 +14,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.policies import make_pre_post_processors
 from safetensors.torch import load_file, save_file
+from small_policy import CHUNK, batch_of, made_for_training, small_config
 
 from lerobot_memobench.datasets.memory_cache import FOLDER, MemoryCache
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory import sample_frames
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import (
@@ -30,33 +29,11 @@ from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import (
 )
 from lerobot_memobench.policies.memobench_mem.text import WordTextEncoder, make_vocabulary, make_word_tokenizer
 
-CHUNK = 6
-
-
-def _config(**fields: Any) -> MemobenchMemConfig:
-    fields = {"chunk_size": CHUNK, "n_action_steps": CHUNK, "num_inference_steps": 2, "memory_frames": 8} | fields
-    return MemobenchMemConfig(device="cpu", push_to_hub=False, **fields)
-
-
-def _training(root: Path, **fields: Any):  # type: ignore[no-untyped-def]
-    """Policy, preprocessor, postprocessor and dataset, as lerobot-train makes them."""
-    config = _config(**fields)
-    meta = LeRobotDataset("memobench/synthetic", root=root).meta
-    dataset = LeRobotDataset("memobench/synthetic", root=root, delta_timestamps=resolve_delta_timestamps(config, meta))
-    torch.manual_seed(0)
-    policy = make_policy(config, ds_meta=dataset.meta)
-    before, after = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)
-    return policy, before, after, dataset
-
-
-def _batch(dataset: LeRobotDataset, indices: list[int]) -> dict[str, Any]:
-    return torch.utils.data.default_collate([dataset[index] for index in indices])
-
 
 @pytest.fixture(scope="module")
 def trained(dataset_root: Path, tmp_path_factory: pytest.TempPathFactory):  # type: ignore[no-untyped-def]
     """A policy after four updates, its processors, dataset, optimiser, and the checkpoint it was saved to."""
-    policy, before, after, dataset = _training(dataset_root, align="contrastive")
+    policy, before, after, dataset = made_for_training(dataset_root, align="contrastive")
     with torch.no_grad():
         for name, parameter in policy.named_parameters():
             if ".modulation." in name:
@@ -64,7 +41,7 @@ def trained(dataset_root: Path, tmp_path_factory: pytest.TempPathFactory):  # ty
     optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
     policy.train()
     for step in range(4):
-        loss, logged = policy.forward(before(_batch(dataset, [step * 7, 45 + step, 70 + step, 90])))
+        loss, logged = policy.forward(before(batch_of(dataset, [step * 7, 45 + step, 70 + step, 90])))
         loss.backward()
         optimizer.step()
         optimizer.zero_grad()
@@ -80,8 +57,8 @@ def trained(dataset_root: Path, tmp_path_factory: pytest.TempPathFactory):  # ty
 
 
 def test_batch_gathers_the_history_of_its_frames(dataset_root: Path) -> None:
-    policy, before, _, dataset = _training(dataset_root, align="framewise", memory_stride=2)
-    batch = before(_batch(dataset, [0, 39, 40 + 22, 45]))
+    policy, before, _, dataset = made_for_training(dataset_root, align="framewise", memory_stride=2)
+    batch = before(batch_of(dataset, [0, 39, 40 + 22, 45]))
     steps = [[2 * slot for slot in sample_frames(frame // 2, 8)] for frame in (0, 39, 22, 5)]
     assert [row[mask].tolist() for row, mask in zip(batch["memory.steps"], batch["memory.mask"], strict=True)] == steps
     assert batch["phase"].tolist() == [1, 1, 1, 0]
@@ -100,17 +77,19 @@ def test_losses_and_what_is_logged(trained: Any) -> None:
     assert logged["loss"] == pytest.approx(logged["action_loss"] + 0.1 * logged["align_loss"], rel=1e-5)
     assert logged["align_grad_norm"] > 0
     assert 0 <= logged["align_top1"] <= 1
-    per_sample, _ = policy.forward(before(_batch(dataset, [3, 50, 80])), reduction="none")
+    per_sample, _ = policy.forward(before(batch_of(dataset, [3, 50, 80])), reduction="none")
     assert per_sample.shape == (3,)
 
 
 @pytest.mark.parametrize("integration", ["modulation", "context"])
 def test_half_precision_and_both_integrations_train_and_act(dataset_root: Path, integration: str) -> None:
     """The full size trains in bfloat16 under autocast, as LeRobot runs it."""
-    policy, before, _, dataset = _training(dataset_root, align="framewise", integration=integration, dtype="bfloat16")
+    policy, before, _, dataset = made_for_training(
+        dataset_root, align="framewise", integration=integration, dtype="bfloat16"
+    )
     policy.train()
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        loss, logged = policy.forward(before(_batch(dataset, [3, 50, 80])))
+        loss, logged = policy.forward(before(batch_of(dataset, [3, 50, 80])))
     loss.backward()
     policy.update()
     assert np.isfinite(logged["loss"])
@@ -119,8 +98,8 @@ def test_half_precision_and_both_integrations_train_and_act(dataset_root: Path, 
 
 
 def test_prompt_frames_do_not_count_unless_asked(dataset_root: Path) -> None:
-    policy, before, _, dataset = _training(dataset_root)
-    batch = before(_batch(dataset, [41, 43, 60, 5]))
+    policy, before, _, dataset = made_for_training(dataset_root)
+    batch = before(batch_of(dataset, [41, 43, 60, 5]))
     assert batch["phase"].tolist() == [0, 0, 1, 1]
     torch.manual_seed(3)
     loss, _ = policy.forward(batch)
@@ -128,7 +107,7 @@ def test_prompt_frames_do_not_count_unless_asked(dataset_root: Path) -> None:
     per_sample, _ = policy.forward(batch, reduction="none")
     assert per_sample[:2].tolist() == [0, 0]
     assert loss.item() == pytest.approx(per_sample[2:].mean().item(), rel=1e-5)
-    prompts, _ = policy.forward(before(_batch(dataset, [41, 42])))
+    prompts, _ = policy.forward(before(batch_of(dataset, [41, 42])))
     assert prompts.item() == 0.0
     policy.config.prompt_loss = True
     torch.manual_seed(3)
@@ -138,7 +117,7 @@ def test_prompt_frames_do_not_count_unless_asked(dataset_root: Path) -> None:
 
 def test_training_moves_memory_expert_and_vlm_and_not_the_tower(trained: Any, dataset_root: Path) -> None:
     policy = trained[0]
-    fresh, *_ = _training(dataset_root, align="contrastive")
+    fresh, *_ = made_for_training(dataset_root, align="contrastive")
     moved = {
         name
         for (name, now), before in zip(policy.named_parameters(), fresh.parameters(), strict=True)
@@ -158,7 +137,7 @@ def test_training_moves_memory_expert_and_vlm_and_not_the_tower(trained: Any, da
 
 def test_a_batch_without_memory_is_refused(trained: Any) -> None:
     policy, before, _, dataset, _, _ = trained
-    batch = {key: value for key, value in before(_batch(dataset, [3])).items() if not key.startswith("memory.")}
+    batch = {key: value for key, value in before(batch_of(dataset, [3])).items() if not key.startswith("memory.")}
     with pytest.raises(MemobenchError, match="base_weights"):
         policy.forward(batch)
 
@@ -166,13 +145,13 @@ def test_a_batch_without_memory_is_refused(trained: Any) -> None:
 def test_stale_cache_stops_training(dataset_root: Path, tmp_path: Path) -> None:
     root = tmp_path / "data"
     shutil.copytree(dataset_root, root, ignore=shutil.ignore_patterns(FOLDER))
-    folder = cache_dataset(root, _config())
+    folder = cache_dataset(root, small_config())
     assert folder == root / FOLDER / "tiny-stride1"
-    _training(root)  # the policy's own tower reads what `memobench cache` wrote
+    made_for_training(root)  # the policy's own tower reads what `memobench cache` wrote
     meta = json.loads((folder / "meta.json").read_text())
     (folder / "meta.json").write_text(json.dumps(meta | {"frames_key": "another"}))
     with pytest.raises(MemobenchError, match=r"another vision tower.*memobench cache"):
-        _training(root)
+        made_for_training(root)
 
 
 # -- rollout -------------------------------------------------------------------------------------------------------
@@ -204,7 +183,7 @@ def test_rollout_memory_equals_the_gathered_one(trained: Any) -> None:
     for frame in range(23):
         policy._observe(before(_join(_observation(dataset, 1, frame), _observation(dataset, 2, frame))))
     tokens, steps, mask = policy._history.gather([0, 1])
-    batch = before(_batch(dataset, [40 + 22, 63 + 22]))
+    batch = before(batch_of(dataset, [40 + 22, 63 + 22]))
     assert torch.equal(steps, batch["memory.steps"])
     assert torch.equal(mask, batch["memory.mask"])
     # The same tower, in batches of other sizes: equal up to the last bit of bfloat16.
@@ -377,7 +356,7 @@ def test_evaluation_loads_the_average_and_training_both(trained: Any) -> None:
         assert torch.equal(_rollout(policy, before, frames), _rollout(evaluated, before, frames))
     assert torch.equal(next(iter(policy.get_optim_params())), next(iter(resumed.get_optim_params())))
     policy.train()
-    policy.forward(before(_batch(dataset, [3, 50])))[0].backward()
+    policy.forward(before(batch_of(dataset, [3, 50])))[0].backward()
     policy.zero_grad()
 
 
@@ -402,9 +381,9 @@ def test_average_follows_its_formula() -> None:
 
 
 def test_no_average_when_it_is_off(dataset_root: Path, tmp_path: Path) -> None:
-    policy, before, _, dataset = _training(dataset_root, ema_decay=0.0)
+    policy, before, _, dataset = made_for_training(dataset_root, ema_decay=0.0)
     policy.train()
-    policy.forward(before(_batch(dataset, [3])))
+    policy.forward(before(batch_of(dataset, [3])))
     policy.update()
     assert policy._average is None
     policy.save_pretrained(tmp_path)
@@ -417,7 +396,7 @@ def test_resuming_rebuilds_the_pipeline_and_finds_the_cache(trained: Any) -> Non
     again, _ = make_pre_post_processors(policy.config, pretrained_path=str(folder))
     step = next(step for step in again.steps if isinstance(step, GatherMemoryProcessorStep))
     assert (step.frames, step.align, step.cache) == (8, "contrastive", None)
-    raw = _batch(dataset, [3, 50])
+    raw = batch_of(dataset, [3, 50])
     first, second = before(copy.deepcopy(raw)), again(copy.deepcopy(raw))
     for key in ("memory.tokens", "memory.text", "observation.language.tokens", "action"):
         assert torch.equal(first[key], second[key]), key
@@ -427,7 +406,7 @@ def test_changing_the_objective_keeps_the_rest(trained: Any, dataset_root: Path)
     dataset, folder = trained[3], trained[4]
     policy = MemobenchMemPolicy.from_pretrained(
         folder,
-        config=_config(
+        config=small_config(
             align="framewise",
             input_features=trained[0].config.input_features,
             output_features=trained[0].config.output_features,
@@ -456,7 +435,9 @@ def test_missing_statistics_are_refused(trained: Any, tmp_path: Path) -> None:
     (broken / "policy_preprocessor.json").unlink()
     with pytest.raises(MemobenchError, match=r"policy_preprocessor.json"):
         MemobenchMemPolicy.from_pretrained(broken)
-    config = _config(input_features=trained[0].config.input_features, output_features=trained[0].config.output_features)
+    config = small_config(
+        input_features=trained[0].config.input_features, output_features=trained[0].config.output_features
+    )
     with pytest.raises(MemobenchError, match=r"never|no dataset statistics"):
         make_pre_post_processors(config)
 
@@ -479,7 +460,7 @@ def test_pi05_weights_as_a_start(trained: Any, tmp_path: Path) -> None:
     from lerobot_memobench.policies.memobench_mem.backbone import SizedPI05
 
     torch.manual_seed(11)
-    plain = SizedPI05(_config())
+    plain = SizedPI05(small_config())
     with torch.no_grad():
         for parameter in plain.parameters():
             parameter.add_(0.1)
@@ -488,7 +469,7 @@ def test_pi05_weights_as_a_start(trained: Any, tmp_path: Path) -> None:
         "input_features": trained[0].config.input_features,
         "output_features": trained[0].config.output_features,
     }
-    policy = MemobenchMemPolicy(_config(base_weights=str(tmp_path), **features))
+    policy = MemobenchMemPolicy(small_config(base_weights=str(tmp_path), **features))
     memory = policy.model.memory_parameters()
     own = {
         name.replace("post_attention_layernorm.norm.", "post_attention_layernorm."): tensor
@@ -500,8 +481,8 @@ def test_pi05_weights_as_a_start(trained: Any, tmp_path: Path) -> None:
     # The tower alone, as `memobench cache --weights` reads it, is the same tower.
     from lerobot_memobench.policies.memobench_mem.caching import load_frame_encoder
 
-    assert load_frame_encoder(_config(), tmp_path).key == policy._frames.key
-    assert load_frame_encoder(_config()).key == trained[0]._frames.key != policy._frames.key
+    assert load_frame_encoder(small_config(), tmp_path).key == policy._frames.key
+    assert load_frame_encoder(small_config()).key == trained[0]._frames.key != policy._frames.key
 
 
 # -- words ---------------------------------------------------------------------------------------------------------

@@ -1,0 +1,35 @@
+"""A small memory policy with its processors and dataset, as lerobot-train makes them; shared by tests."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from lerobot.datasets.factory import resolve_delta_timestamps
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.policies import make_policy, make_pre_post_processors
+
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+
+CHUNK = 6
+
+
+def small_config(**fields: Any) -> MemobenchMemConfig:
+    fields = {"chunk_size": CHUNK, "n_action_steps": CHUNK, "num_inference_steps": 2, "memory_frames": 8} | fields
+    return MemobenchMemConfig(device="cpu", push_to_hub=False, **fields)
+
+
+def made_for_training(root: Path, **fields: Any):  # type: ignore[no-untyped-def]
+    """Policy, preprocessor, postprocessor and dataset, as lerobot-train makes them."""
+    config = small_config(**fields)
+    meta = LeRobotDataset("memobench/synthetic", root=root).meta
+    dataset = LeRobotDataset("memobench/synthetic", root=root, delta_timestamps=resolve_delta_timestamps(config, meta))
+    torch.manual_seed(0)
+    policy = make_policy(config, ds_meta=dataset.meta)
+    before, after = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)
+    return policy, before, after, dataset
+
+
+def batch_of(dataset: LeRobotDataset, indices: list[int]) -> dict[str, Any]:
+    return torch.utils.data.default_collate([dataset[index] for index in indices])
