@@ -10,8 +10,21 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from lerobot_memobench.experts.grasping import ATTEMPTS, HOVER
-from lerobot_memobench.experts.hand import CLOSED, DOWN, EASY_CLOSING, OPEN, UP, Array, Hand, cross, frame, length, unit
-from lerobot_memobench.experts.leaning import far
+from lerobot_memobench.experts.hand import (
+    CLOSED,
+    DOWN,
+    EASY_CLOSING,
+    OPEN,
+    STRETCHED,
+    UP,
+    Array,
+    Hand,
+    cross,
+    frame,
+    length,
+    unit,
+)
+from lerobot_memobench.experts.leaning import far, leaning, reach_lean
 from lerobot_memobench.experts.travel import LOST, Doing, let_go, rise
 from lerobot_memobench.sim.assets.base import Articulation
 
@@ -22,6 +35,9 @@ EDGE_INSET, EDGE_DEPTH = 0.012, 0.018
 """Where a door's upper edge is taken: so far from the handle towards the hinge and so deep, m."""
 SWING_LEAD = 0.13
 """Angle by which the hand leads a door along its arc, rad."""
+EASE = 0.04
+"""The same where the door is as far open as it should be, rad: a hand that arrives fast throws the door on, out of
+reach."""
 PUSH_GAP = 0.06
 """Distance in front of a handle from which the closed fingers come to push it, m."""
 
@@ -142,11 +158,13 @@ def _swing_door(hand: Hand, name: str, opening: bool) -> Generator[NDArray[np.fl
     way = float(np.sign(goal - start))
     flip = np.sign(_door(hand, name, (goal - start) / 2).outward @ EASY_CLOSING) or 1.0
 
-    def at(height: float, ahead: float = 0.0) -> Callable[[], Array]:
-        return lambda: _door(hand, name, ahead).edge + height * UP
-
     def turned(ahead: float = 0.0) -> Array:
-        return frame(DOWN, flip * _door(hand, name, ahead).outward)
+        # A door that stands wide open is taken with the fingers pointing outwards: upright, the hand is too short.
+        door = _door(hand, name, ahead)
+        return leaning(flip * door.outward, reach_lean(hand, door.edge, STRETCHED))
+
+    def at(back: float, ahead: float = 0.0) -> Callable[[], Array]:
+        return lambda: _door(hand, name, ahead).edge - back * turned(ahead)[:, 2]
 
     yield from rise(hand, OPEN, 0.26)
     yield from hand.move(at(HOVER), turned, OPEN, tolerance=0.012, turn_tolerance=0.08)
@@ -160,7 +178,7 @@ def _swing_door(hand: Hand, name: str, opening: bool) -> Generator[NDArray[np.fl
             break
         if length(hand.position - door.edge) > LOST + EDGE_DEPTH:
             break
-        lead = way * SWING_LEAD
+        lead = way * min(SWING_LEAD, abs(goal - door.q) + EASE)
         yield hand.toward(at(-EDGE_DEPTH, lead)(), turned(lead / 2), CLOSED, speed=0.8)
     yield from let_go(hand)
 
