@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lerobot_memobench.cli.console import console, progress_bar
+from lerobot_memobench.cli.console import console, counting
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks, task_names
 from lerobot_memobench.tasks.task import LEVELS
@@ -70,13 +70,10 @@ def necessity(
     ]
     screen = console()
     results: list[Result] = []
-    with progress_bar(screen) as progress:
-        bar = progress.add_task("tasks", total=len(jobs))
+    with counting(screen, "tasks", len(jobs)) as count:
         for task, setting in jobs:
             results.append(study(task, setting if task.num_variants > 1 else REFERENTS[0], settings, out))
-            progress.update(bar, advance=1)
-            if not screen.is_terminal:
-                progress.console.print(f"{len(results)}/{len(jobs)} {task.name}, referent {setting}")
+            count(len(results), len(jobs), f"{task.name}, referent {setting}")
     written = write(out, results)
     if page is not None:
         written.append(put_into_page(page, results))

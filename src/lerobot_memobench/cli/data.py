@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lerobot_memobench.cli.console import console, progress_bar
+from lerobot_memobench.cli.console import console, counting
 from lerobot_memobench.errors import MemobenchError
 
 if TYPE_CHECKING:
@@ -33,13 +33,10 @@ def convert(
     from lerobot_memobench.datasets.convert import convert as run
 
     screen = console()
-    with progress_bar(screen) as progress:
-        bar = progress.add_task("episodes", total=None)
+    with counting(screen, "episodes") as count:
 
         def advance(news: Advance) -> None:
-            progress.update(bar, completed=news.done, total=news.total)
-            if not screen.is_terminal:
-                progress.console.print(f"{news.done}/{news.total} {news.task_name}, demo_{news.seed}")
+            count(news.done, news.total, f"{news.task_name}, demo_{news.seed}", found=news.found)
 
         summary = run(
             source,
@@ -67,13 +64,10 @@ def validate(
     from lerobot_memobench.datasets.validate import validate as run
 
     screen = console()
-    with progress_bar(screen) as progress:
-        bar = progress.add_task("episodes", total=None)
+    with counting(screen, "episodes") as count:
 
         def advance(done: int, total: int, verdict: Verdict) -> None:
-            progress.update(bar, completed=done, total=total)
-            if verdict.disagreement is not None:
-                progress.console.print(f"{verdict.episode}: {verdict.disagreement}", soft_wrap=True, markup=False)
+            count(done, total, verdict.episode, trouble=verdict.disagreement)
 
         verdicts = run(folder, workers=workers, progress=advance)
     wrong = sum(verdict.disagreement is not None for verdict in verdicts)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
 
-from lerobot_memobench.cli.console import console, progress_bar
+from lerobot_memobench.cli.console import console, counting
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 
 if TYPE_CHECKING:
@@ -20,15 +20,11 @@ def generate(tasks: str, episodes: int, out: Path, **settings: Any) -> int:
     from lerobot_memobench.datasets.generation import generate as run
 
     screen = console()
-    with progress_bar(screen) as progress:
-        bar = progress.add_task("episodes", total=len(chosen) * episodes)
+    with counting(screen, "episodes", len(chosen) * episodes) as count:
 
         def advance(news: Advance) -> None:
-            progress.update(bar, completed=news.done)
-            if news.failure is not None:
-                progress.console.print(f"{news.task_name}, seed {news.seed}: {news.failure}")
-            elif not screen.is_terminal:
-                progress.console.print(f"{news.done}/{news.total} {news.task_name}, seed {news.seed}")
+            what = f"{news.task_name}, seed {news.seed}"
+            count(news.done, news.total, what, trouble=news.failure, found=news.found)
 
         summary = run(chosen, episodes, out, progress=advance, **settings)
     screen.print(_summary_table(summary))
@@ -72,14 +68,6 @@ def cache(
     with quiet():
         config = MemobenchMemConfig(size=size, memory_stride=stride, device=device)
     screen = console()
-    with progress_bar(screen) as progress:
-        bar = progress.add_task("episodes", total=None)
-        folder = cache_dataset(
-            dataset,
-            config,
-            weights=weights,
-            batch_size=batch_size,
-            workers=workers,
-            progress=lambda done, total: progress.update(bar, completed=done, total=total),
-        )
+    with counting(screen, "episodes") as count:
+        folder = cache_dataset(dataset, config, weights=weights, batch_size=batch_size, workers=workers, progress=count)
     screen.print(f"memory cache: {folder}", soft_wrap=True)

@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 
 from lerobot_memobench.cli import preflight
-from lerobot_memobench.cli.console import console, progress_bar
+from lerobot_memobench.cli.console import console, counting
 from lerobot_memobench.cli.evaluation import Evaluation, describe, logged
 from lerobot_memobench.cli.merging import merge_and_report
 from lerobot_memobench.cli.orders import Shard
@@ -138,13 +138,10 @@ def run_shards(evaluation: Evaluation) -> int:
         for folder in (out, *out.glob("shard-*-of-*")):
             preflight.check_output(folder)
     screen = console()
-    with progress_bar(screen) as progress:
-        bar = progress.add_task("parts", total=len(jobs))
+    with counting(screen, "parts", len(jobs)) as count:
 
         def advance(news: Advance) -> None:
-            progress.update(bar, completed=news.done)
-            if not screen.is_terminal:
-                progress.console.print(f"{news.done}/{news.total} {news.task_name}")
+            count(news.done, news.total, news.task_name, found=news.found)
 
         folders = [job.folder for job in jobs]
         complete = run_jobs(

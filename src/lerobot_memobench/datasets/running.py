@@ -67,13 +67,17 @@ class StagedJob:
 
 @dataclass(frozen=True)
 class Advance:
-    """Told to the progress callback after each job: how many are finished, and the newest one's identity."""
+    """Told to the progress callback after each job: how many are finished, and the newest one's identity.
+
+    ``found`` of those finished were so before this run began.
+    """
 
     done: int
     total: int
     task_name: str
     seed: int
     failure: str | None
+    found: int = 0
 
 
 ProgressCallback = Callable[[Advance], None]
@@ -118,14 +122,14 @@ def run_jobs(
                 return
             done.add(job.folder)
             if progress is not None:
-                progress(Advance(len(done), len(jobs), job.task_name, job.seed, job.failure()))
+                progress(Advance(len(done), len(jobs), job.task_name, job.seed, job.failure(), found))
 
-    waiting = []
+    waiting = [job for job in jobs if not job.finished()]
+    found = len(jobs) - len(waiting)
+    unfinished = {job.folder for job in waiting}
     for job in jobs:
-        if job.finished():
+        if job.folder not in unfinished:
             tell(job)
-        else:
-            waiting.append(job)
     if not waiting:
         return True
     if executor != "processes":
