@@ -144,7 +144,7 @@ def test_generate_tells_what_became_of_every_seed(
     monkeypatch.setattr(generation, "generate", generate)
     out = tmp_path / "demos"
     words = ["generate", "--tasks", TASK, "--episodes", "2", "--out", str(out), "--no-images", "--referent", "random"]
-    words += ["--format", "lerobot", "--format", "hdf5", "--executor", "local", "--executor-option", "tasks=4"]
+    words += ["--format", "lerobot", "--format", "hdf5", "--executor", "local", "--executor-option", "local_tasks=4"]
     assert main(words) == (0 if solved == 2 else 1)
     assert asked == {
         "tasks": [TASK],
@@ -158,7 +158,7 @@ def test_generate_tells_what_became_of_every_seed(
         "workers": 1,
         "formats": ("lerobot", "hdf5"),
         "executor": "local",
-        "executor_options": {"tasks": 4},
+        "executor_options": {"local_tasks": 4},
     }
     printed = capsys.readouterr().out
     assert ("no dataset was written" in printed) == (solved == 0)

@@ -261,6 +261,10 @@ def test_hdf5_killed_at_every_change_to_the_disk(tasks, recorded, tmp_path):
         ({"formats": ["hdf5"], "images": False}, "'hdf5' was asked for without images"),
         ({"executor": "condor"}, "found executor 'condor', known are"),
         ({"executor": "processes", "executor_options": {"partition": "cpu"}}, "takes none"),
+        (
+            {"executor": "local", "executor_options": {"tasks": 4}},
+            "found option 'tasks' for executor 'local', did you mean 'local_tasks'",
+        ),
         ({"executor": "slurm"}, "executor 'slurm' needs (partition and time|datatrove)"),
     ],
 )

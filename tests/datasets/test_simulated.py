@@ -40,7 +40,7 @@ def test_the_committed_run_is_whole():
     assert set(tasks) == set(task_names())
     assert all(list(seeds) == [str(SEED + i) for i in range(50)] for seeds in tasks.values())
     hashes = [entry for seeds in tasks.values() for entry in seeds.values() if re.fullmatch("[0-9a-f]{64}", entry)]
-    assert len(set(hashes)) == len(hashes) == 1499
+    assert len(set(hashes)) == len(hashes) == 1500
 
 
 @pytest.fixture(scope="module")
@@ -110,6 +110,18 @@ def test_random_referent_decides_the_variant():
     assert replay(demo) is None
     with pytest.raises(MemobenchError, match="choose variants with 'fixed'"):
         record_demonstration(task, SEED, images=False, referent="random", variant=1)
+
+
+@pytest.mark.slow
+def test_ray_makes_the_same(tmp_path):
+    ray = pytest.importorskip("ray", reason="ray has no wheel for this machine")
+    asked = {"episodes": 2, "images": False}
+    try:
+        generate([get_task(STOVE)], out=tmp_path / "there", executor="ray", workers=2, **asked)
+    finally:
+        ray.shutdown()
+    generate([get_task(STOVE)], out=tmp_path / "here", **asked)
+    assert tree_hash(tmp_path / "there") == tree_hash(tmp_path / "here")
 
 
 def test_replay_agrees(stove, butter):

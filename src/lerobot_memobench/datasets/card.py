@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -137,7 +137,7 @@ def _front_matter(count: int) -> str:
 
 
 def _memory_types(infos: Sequence[dict[str, Any]]) -> str:
-    return ", ".join(_ordered_types(infos))
+    return ", ".join(ordered_types(infos))
 
 
 def _failures(failed: Sequence[StagedEpisode], asked: int) -> str:
@@ -165,14 +165,15 @@ def _storage(folder: Path, episodes: Sequence[StagedEpisode]) -> dict[str, float
     return found
 
 
-def _ordered_types(infos: Sequence[dict[str, Any]]) -> list[str]:
+def ordered_types(infos: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the memory types of episodes, each once: the paper's in its order, then a user's own."""
     there = {info["memory_type"] for info in infos}
     return [name for name in FAMILIES if name in there] + sorted(there - set(FAMILIES))
 
 
 def _statistics(infos: Sequence[dict[str, Any]], storage: dict[str, float]) -> str:
     rows = []
-    for name in [*_ordered_types(infos), "total"]:
+    for name in [*ordered_types(infos), "total"]:
         chosen = [info for info in infos if name in (info["memory_type"], "total")]
         lengths = np.array([info["frames"] for info in chosen])
         tasks = len({info["task_name"] for info in chosen})
@@ -195,7 +196,7 @@ def _bytes(size: float) -> str:
 
 def _prompts(infos: Sequence[dict[str, Any]]) -> str:
     parts = []
-    for name in _ordered_types(infos):
+    for name in ordered_types(infos):
         lengths = [info["exec_start_index"] for info in infos if info["memory_type"] == name]
         if any(lengths):
             parts.append(f"{np.mean(lengths):.1f} in {name} tasks")

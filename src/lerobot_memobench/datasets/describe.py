@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_memobench.datasets.card import ordered_types
 from lerobot_memobench.datasets.lerobot_format import MANIFEST_FILE, image_key, is_dataset
 from lerobot_memobench.datasets.paper_figures import FAMILIES, LENGTH_BUCKETS
 from lerobot_memobench.errors import MemobenchError
@@ -125,7 +126,7 @@ def draw_storyboard(folder: Path, rows: Sequence[Mapping[str, Any]], path: Path)
     from PIL import Image, ImageDraw, ImageFont
 
     dataset = LeRobotDataset("local/storyboard", root=folder)
-    chosen = [next(row for row in rows if row["memory_type"] == name) for name in _types(rows)]
+    chosen = [next(row for row in rows if row["memory_type"] == name) for name in ordered_types(rows)]
     caption, title = 40, 20
     height = FRAME + caption + title
     sheet = Image.new("RGB", (MOST_FRAMES * (FRAME + 6), len(chosen) * height), "white")
@@ -145,11 +146,6 @@ def draw_storyboard(folder: Path, rows: Sequence[Mapping[str, Any]], path: Path)
             draw.multiline_text((left + 2, top + title + FRAME + 1), words, fill="black", font=font, spacing=1)
     sheet.quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
     return path
-
-
-def _types(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    there = {row["memory_type"] for row in rows}
-    return [name for name in FAMILIES if name in there]
 
 
 def _moments(dataset: Any, row: Mapping[str, Any]) -> list[tuple[int, str]]:

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from inspect import signature
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any, Protocol
@@ -24,6 +25,10 @@ from lerobot_memobench.errors import MemobenchError, nearest
 
 EXECUTORS = ("processes", "local", "slurm", "ray")
 """``processes``: this package's own; the others are datatrove's."""
+
+DATATROVE = {"local": "LocalPipelineExecutor", "slurm": "SlurmPipelineExecutor", "ray": "RayPipelineExecutor"}
+SET_HERE = ("pipeline", "tasks", "workers", "depends")
+"""Arguments of datatrove's executors that follow from the jobs and from ``workers``."""
 
 EPISODES_PER_RANK = 10
 """Episodes that a datatrove task makes, one after another: neighbours share a compiled scene."""
@@ -172,11 +177,22 @@ def check_executor(executor: str, options: Mapping[str, Any] | None) -> None:
             f"executor {executor!r} needs {error.name}, which is not installed: pip install "
             f"{'datatrove ray' if executor == 'ray' else 'datatrove'}"
         ) from None
+    takes = [name for name in signature(_executor_class(executor)).parameters if name not in SET_HERE]
+    for name in options or {}:
+        if name not in takes:
+            raise MemobenchError(f"found option {name!r} for executor {executor!r}, {nearest(name, takes)}")
     missing = [name for name in ("partition", "time") if executor == "slurm" and name not in (options or {})]
     if missing:
         raise MemobenchError(
             f"executor 'slurm' needs {' and '.join(missing)}: pass e.g. partition=cpu and time=08:00:00 as options"
         )
+
+
+def _executor_class(executor: str) -> Callable[..., Any]:
+    from datatrove import executor as executors
+
+    found: Callable[..., Any] = getattr(executors, DATATROVE[executor])
+    return found
 
 
 # --- processes of this machine ------------------------------------------------------------------------------
@@ -239,16 +255,15 @@ def _run_by_datatrove(
     tell: Callable[[Job], None],
     jobs_per_rank: int,
 ) -> bool:
-    from datatrove import executor as executors
-
     from lerobot_memobench.datasets.datatrove_steps import FinishStep, JobsStep
 
     # What is finished is known from the jobs' folders, better than from datatrove's list of completed tasks.
     common: dict[str, Any] = {"skip_completed": False, **options}
     ranks = max(min(workers, len(waiting)), -(-len(waiting) // jobs_per_rank))
     steps = [JobsStep(list(waiting))]
+    pipeline = _executor_class(executor)
     if executor == "slurm":
-        making = executors.SlurmPipelineExecutor(
+        making = pipeline(
             steps,
             tasks=ranks,
             workers=workers,
@@ -257,16 +272,15 @@ def _run_by_datatrove(
         if finish is None:
             making.run()
         else:
-            executors.SlurmPipelineExecutor(
+            pipeline(
                 [FinishStep(finish)],
                 tasks=1,
                 depends=making,
                 **{"job_name": "memobench-finish", **common, "logging_dir": str(logs / "finish")},
             ).run()
         return False
-    kind = executors.LocalPipelineExecutor if executor == "local" else executors.RayPipelineExecutor
     with _watching(waiting, tell):
-        kind(steps, tasks=ranks, workers=workers, **{"logging_dir": str(logs / "make"), **common}).run()
+        pipeline(steps, tasks=ranks, workers=workers, **{"logging_dir": str(logs / "make"), **common}).run()
     for job in waiting:
         tell(job)
     return True
