@@ -18,7 +18,7 @@ from lerobot_memobench.datasets.lerobot_format import MANIFEST_FILE, image_key, 
 from lerobot_memobench.datasets.paper_figures import FAMILIES, LENGTH_BUCKETS
 from lerobot_memobench.errors import MemobenchError
 
-LENGTHS_FIGURE, STORYBOARD_FIGURE, TABLES_FILE = "lengths.png", "storyboard.png", "tables.md"
+LENGTHS_FIGURE, STORYBOARD_FIGURE, TABLES_FILE = "lengths.png", "storyboard.jpg", "tables.md"
 OURS, THEIRS = "#0072B2", "#E69F00"
 """Okabe and Ito's blue and orange: apart for the colour-blind, and one darker than the other in grey."""
 FRAME = 160
@@ -144,7 +144,7 @@ def draw_storyboard(folder: Path, rows: Sequence[Mapping[str, Any]], path: Path)
             sheet.paste(picture, (left, top + title))
             words = textwrap.fill(f"{frame}: {text}", 30, max_lines=3, placeholder=" …")
             draw.multiline_text((left + 2, top + title + FRAME + 1), words, fill="black", font=font, spacing=1)
-    sheet.quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
+    sheet.save(path, quality=88, optimize=True)
     return path
 
 
