@@ -113,6 +113,13 @@ def test_failures_are_reported_everywhere(tasks, recorded, tmp_path):
     assert [row["episode_index"] for row in manifest["episodes"]] == [0, 1, None, 2, 3, 4]
 
 
+@pytest.mark.parametrize("prompt_video", [True, False])
+def test_the_card_says_whether_prompts_are_in_it(tasks, recorded, tmp_path, prompt_video):
+    run(tasks, tmp_path / "ds", prompt_video=prompt_video)
+    card = (tmp_path / "ds" / "README.md").read_text()
+    assert ("referent fixed, prompt videos left out." in card) == (not prompt_video)
+
+
 def test_nothing_but_failures_makes_no_dataset(tasks, recorded, tmp_path):
     summary = run(tasks[:1], tmp_path / "ds", episodes=1, seed_base=FAILING_SEED)
     assert summary.folder is None

@@ -376,13 +376,14 @@ def generate(
         episodes_staged = [staged(job) for job in jobs]
         summary = _summarise([_row(episode) for episode in episodes_staged], tasks, out)
         if summary.folder is not None:
-            made_by = f"`memobench generate`, {episodes} seeds per task from {seed_base} on, referent {referent}. "
+            prompts = "" if prompt_video else ", prompt videos left out"
+            made_by = f"`memobench generate`, {episodes} seeds per task from {seed_base} on, referent {referent}"
             assemble(
                 episodes_staged,
                 out,
                 formats=formats,
                 repo_id=repo_id,
-                made_by=made_by + SCRIPTED,
+                made_by=f"{made_by}{prompts}. {SCRIPTED}",
                 manifest={"request": request},
             )
             shutil.rmtree(staging)
