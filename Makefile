@@ -17,7 +17,7 @@ demo: ## evaluate the scripted expert on four tasks; videos and report in output
 
 test: ## run the tests; ARGS are passed to pytest (ARGS="-m slow")
 	@scripts/setup --browser
-	@OMP_NUM_THREADS=1 $(PYTHON) -m pytest -n logical --maxprocesses 8 --dist loadfile $(ARGS)
+	@$(PYTHON) -m pytest -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 check: ## lint, formatting and types
 	@scripts/setup

@@ -2,14 +2,28 @@
 
 from __future__ import annotations
 
+import logging
 import os
+from collections.abc import Iterator
 
 # Before torch or LeRobot is imported by any test. Two cores are shared by the tests' own worker processes.
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
 
+import pytest
 from hypothesis import settings
 
 settings.register_profile("memobench", deadline=None, derandomize=bool(os.environ.get("CI")))
 settings.load_profile("memobench")
+
+
+@pytest.fixture(autouse=True)
+def log_handlers_end_with_the_test() -> Iterator[None]:
+    """LeRobot's commands log to the stream of the test that ran them; a server's thread may outlive that stream."""
+    root = logging.getLogger()
+    before = list(root.handlers)
+    yield
+    for handler in list(root.handlers):
+        if type(handler) is logging.StreamHandler and handler not in before:
+            root.removeHandler(handler)
