@@ -1,6 +1,6 @@
 """How fast demonstrations become a LeRobotDataset, beside LeRobot's own recording loop on the same frames.
 
-    python benchmarks/dataset_writing.py [--episodes 2] [--repeats 3]
+    python benchmarks/dataset_writing.py [--episodes 2] [--repeats 3] [--ways write convert generate] [--workers 1]
 
 Episodes of the benchmark are recorded once, with images. Three ways to a dataset are timed, each in turn with
 LeRobot's plain loop (``create``, ``add_frame`` per frame, ``save_episode``, ``finalize``; its default encoder):
@@ -9,7 +9,8 @@ LeRobot's plain loop (``create``, ``add_frame`` per frame, ``save_episode``, ``f
 - ``convert``: from an HDF5 file in the published layout, proprioception and checks included; the loop reads its frames
   from the same file;
 - ``generate``: the scripted expert, the simulator and the renderer as well; the loop's time is added to that of
-  recording the same episodes.
+  recording the same episodes. With ``--workers 2`` in as many processes, their start included, so ask for more
+  episodes; the loop has one process and its encoder's threads.
 
 Prints one JSON line: the ratios of the best times (above 1: faster than the loop), and for both the image quality
 (PSNR of decoded frames against rendered ones, dB) and the video bytes per frame.
@@ -41,6 +42,7 @@ from lerobot_memobench.datasets.staging import stage_demonstration
 from lerobot_memobench.tasks import get_task
 
 TASK = "turn_on_the_stove_and_turn_it_off"
+WAYS = ("write", "convert", "generate")
 
 
 def main() -> None:
@@ -48,6 +50,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--episodes", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=WAYS)
+    parser.add_argument("--workers", type=int, default=1, help="processes that generate")
     asked = parser.parse_args()
     import lerobot.datasets  # noqa: F401  (its import is nobody's time)
 
@@ -74,13 +78,14 @@ def main() -> None:
             ),
             "convert": (lambda out: convert(source, out), loop_from_file, 0.0),
             "generate": (
-                lambda out: generate([task], asked.episodes, out),
+                lambda out: generate([task], asked.episodes, out, workers=asked.workers),
                 lambda out: plain_loop(((demo, frames(demo)) for demo in demos), out),
                 recording,
             ),
         }
         result: dict[str, Any] = {"benchmark": "dataset_writing", "frames": sum(map(len, demos))}
-        for way, (ours, theirs, added) in ways.items():
+        for way in asked.ways:
+            ours, theirs, added = ways[way]
             best = {"ours": np.inf, "lerobot": np.inf}
             for _ in range(asked.repeats):
                 for side, run in (("ours", ours), ("lerobot", theirs)):
@@ -93,7 +98,7 @@ def main() -> None:
             result[way] |= {f"{side}_s": round(seconds, 3) for side, seconds in best.items()}
         for side in ("ours", "lerobot"):
             result[side] = quality(folder / side, demos)
-        result["ratio"] = min(result[way]["ratio"] for way in ways)
+        result["ratio"] = min(result[way]["ratio"] for way in asked.ways)
     print(json.dumps(result))
 
 

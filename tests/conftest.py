@@ -21,9 +21,8 @@ settings.load_profile("memobench")
 @pytest.fixture(autouse=True)
 def log_handlers_end_with_the_test() -> Iterator[None]:
     """LeRobot's commands log to the stream of the test that ran them; a server's thread may outlive that stream."""
-    root = logging.getLogger()
-    before = list(root.handlers)
     yield
+    root = logging.getLogger()
     for handler in list(root.handlers):
-        if type(handler) is logging.StreamHandler and handler not in before:
+        if type(handler) is logging.StreamHandler:
             root.removeHandler(handler)
