@@ -19,11 +19,12 @@ test: ## run the tests; ARGS are passed to pytest (ARGS="-m slow")
 	@scripts/setup --browser
 	@$(PYTHON) -m pytest -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder $(ARGS)
 
-check: ## lint, formatting and types
+check: ## lint, formatting, types and declared dependencies
 	@scripts/setup
 	@.venv/bin/ruff check .
 	@.venv/bin/ruff format --check .
 	@.venv/bin/mypy
+	@.venv/bin/deptry src
 
 lock: ## resolve pyproject.toml again into requirements.lock
 	@scripts/setup

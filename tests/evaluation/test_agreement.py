@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.agreement import (
+from lerobot_memobench.evaluation.agreement.kappa import (
     Labels,
     cohen_kappa,
     confusion_kappa,
@@ -20,8 +20,8 @@ from lerobot_memobench.evaluation.agreement import (
     report,
     study,
 )
-from lerobot_memobench.evaluation.formats import markdown
-from lerobot_memobench.evaluation.labels import blank_sheet, read_labels
+from lerobot_memobench.evaluation.agreement.label_sheet import blank_sheet, read_labels
+from lerobot_memobench.evaluation.documents.formats import markdown
 from lerobot_memobench.paper import annotator_agreement
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 

@@ -10,10 +10,10 @@ import pytest
 
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.comparison import Comparison, Difference, compare, report, value_of
-from lerobot_memobench.evaluation.formats import markdown
-from lerobot_memobench.evaluation.runs import read_runs
-from lerobot_memobench.evaluation.sections import AVERAGE
+from lerobot_memobench.evaluation.comparison.differences import Comparison, Difference, compare, report, value_of
+from lerobot_memobench.evaluation.documents.formats import markdown
+from lerobot_memobench.evaluation.documents.report_sections import AVERAGE
+from lerobot_memobench.evaluation.records.runs import read_runs
 
 from . import logs
 

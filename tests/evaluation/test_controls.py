@@ -12,7 +12,7 @@ import pytest
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.controls import (
+from lerobot_memobench.evaluation.comparison.controls import (
     by_replan,
     contrasts,
     gap_closed,
@@ -21,7 +21,7 @@ from lerobot_memobench.evaluation.controls import (
     published_contrasts,
     relabelled,
 )
-from lerobot_memobench.evaluation.metrics import summarise
+from lerobot_memobench.evaluation.metrics.rates import summarise
 from lerobot_memobench.paper import raw_tables
 
 STOVE = "turn_on_the_stove_and_turn_it_off_then_put_the_frying_pan_on_it"

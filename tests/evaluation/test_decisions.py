@@ -13,9 +13,10 @@ import pytest
 
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation import decisions, necessity_study
-from lerobot_memobench.evaluation.decisions import Demonstration, Home, Moment, Picture, unmatched
-from lerobot_memobench.evaluation.necessity_report import (
+from lerobot_memobench.evaluation.necessity import decisions
+from lerobot_memobench.evaluation.necessity import study as necessity_study
+from lerobot_memobench.evaluation.necessity.decisions import Demonstration, Home, Moment, Picture, unmatched
+from lerobot_memobench.evaluation.necessity.report import (
     PAGE_BEGIN,
     PAGE_END,
     markdown,
@@ -24,7 +25,7 @@ from lerobot_memobench.evaluation.necessity_report import (
     verdict,
     write,
 )
-from lerobot_memobench.evaluation.necessity_study import Settings, study, variants_of
+from lerobot_memobench.evaluation.necessity.study import Settings, study, variants_of
 from lerobot_memobench.sim.rendering import close_renderers, gl_backend
 from lerobot_memobench.sim.simulation import NO_OP, Simulation
 from lerobot_memobench.tasks.catalogue import get_task

@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation import formats
-from lerobot_memobench.evaluation.metrics import Rate, report
-from lerobot_memobench.evaluation.report import FILES, build, render, write_documents
-from lerobot_memobench.evaluation.runs import Run, read_runs
-from lerobot_memobench.evaluation.sections import best_interval, departures
-from lerobot_memobench.evaluation.tables import Name, Report, Section, Table, best_in_columns
+from lerobot_memobench.evaluation.documents import formats
+from lerobot_memobench.evaluation.documents.report import FILES, build, render, write_documents
+from lerobot_memobench.evaluation.documents.report_sections import best_interval, departures
+from lerobot_memobench.evaluation.documents.tables import Name, Report, Section, Table, best_in_columns
+from lerobot_memobench.evaluation.metrics.rates import Rate, report
+from lerobot_memobench.evaluation.records.runs import Run, read_runs
 
 from . import logs
 

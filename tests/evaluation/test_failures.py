@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.failures import failure_counts, failure_of
+from lerobot_memobench.evaluation.metrics.failures import failure_counts, failure_of
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.failures import FAILURES, classify, classify_failure
 

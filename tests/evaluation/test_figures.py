@@ -10,8 +10,8 @@ import pytest
 
 from lerobot_memobench.envs.annotate import OPERATION_COLOURS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.figures import correlations, entries, failures, prefix, radar, replan, style
-from lerobot_memobench.evaluation.runs import Run, read_runs
+from lerobot_memobench.evaluation.documents.figures import correlations, entries, failures, prefix, radar, replan, style
+from lerobot_memobench.evaluation.records.runs import Run, read_runs
 from lerobot_memobench.paper import published_rows
 from lerobot_memobench.tasks.failures import FAILURES
 

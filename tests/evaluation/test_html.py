@@ -21,11 +21,11 @@ from lerobot_memobench.envs.annotate import OPERATION_COLOURS
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.envs.film import Film
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.html import write_html
-from lerobot_memobench.evaluation.html.collect import page_data, read_runs, task_source
-from lerobot_memobench.evaluation.html.page import inline_json, page
-from lerobot_memobench.evaluation.html.videos import find_videos, frame_count
-from lerobot_memobench.evaluation.runs import folder_names
+from lerobot_memobench.evaluation.documents.html import write_html
+from lerobot_memobench.evaluation.documents.html.collect import page_data, read_runs, task_source
+from lerobot_memobench.evaluation.documents.html.page import inline_json, page
+from lerobot_memobench.evaluation.documents.html.videos import find_videos, frame_count
+from lerobot_memobench.evaluation.records.runs import folder_names
 from lerobot_memobench.tasks.catalogue import get_task, task_index
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
@@ -384,7 +384,7 @@ def test_the_wheel_holds_the_template(tmp_path: Path) -> None:
     subprocess.run(command, cwd=root, check=True, capture_output=True)
     (wheel,) = tmp_path.glob("*.whl")
     names = set(zipfile.ZipFile(wheel).namelist())
-    folder = root / "src" / "lerobot_memobench" / "evaluation" / "html"
+    folder = root / "src" / "lerobot_memobench" / "evaluation" / "documents" / "html"
     files = {path.relative_to(root / "src").as_posix() for path in folder.rglob("*") if path.suffix != ".pyc"}
     wanted = {name for name in files if Path(name).suffix}
     assert len(wanted) > 10

@@ -19,7 +19,7 @@ import pytest
 from lerobot_memobench.envs.annotate import OPERATION_COLOURS
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.envs.film import Film
-from lerobot_memobench.evaluation.html import write_html
+from lerobot_memobench.evaluation.documents.html import write_html
 from lerobot_memobench.tasks.catalogue import get_task
 
 STOVE = "turn_on_the_stove_and_turn_it_off"

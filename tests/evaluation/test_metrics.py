@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.metrics import (
+from lerobot_memobench.evaluation.metrics.rates import (
     Rate,
     by_task,
     mean_rate,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lerobot_memobench.evaluation.necessity import (
+from lerobot_memobench.evaluation.necessity.aliasing import (
     Decision,
     History,
     aliased,
@@ -14,7 +14,7 @@ from lerobot_memobench.evaluation.necessity import (
     deterministic_ceiling,
     stochastic_ceiling,
 )
-from lerobot_memobench.evaluation.necessity_search import Graph, Move, best_map, best_probabilities
+from lerobot_memobench.evaluation.necessity.search import Graph, Move, best_map, best_probabilities
 from lerobot_memobench.tasks.formula import And, Atom, Formula, Not, Then
 
 

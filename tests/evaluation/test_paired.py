@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lerobot_memobench.evaluation.paired import detectable, holm, mcnemar, sign_flip
+from lerobot_memobench.evaluation.comparison.paired_tests import detectable, holm, mcnemar, sign_flip
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 from lerobot_memobench.envs.episode_log import EpisodeLog, has_log, write_episodes
 from lerobot_memobench.envs.protocol import PROTOCOL_FILE
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.protocol import CARD_FILE, differences, read_protocol
+from lerobot_memobench.evaluation.records.protocol import CARD_FILE, differences, read_protocol
 
 SETTINGS: dict[str, Any] = {
     "seed_base": 7,

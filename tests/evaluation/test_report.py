@@ -9,7 +9,7 @@ from typing import Any
 from rich.console import Console
 
 from lerobot_memobench.envs.episode_log import EpisodeLog
-from lerobot_memobench.evaluation.report import failure_line, markdown, table, write_report
+from lerobot_memobench.evaluation.documents.report import failure_line, markdown, table, write_report
 
 
 def record(task: str, memory_type: str, episode: int, success: bool, **changes: Any) -> dict[str, Any]:

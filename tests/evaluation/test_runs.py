@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.runs import by_method, read_runs, sweeps
+from lerobot_memobench.evaluation.records.runs import by_method, read_runs, sweeps
 
 from . import logs
 

@@ -11,7 +11,7 @@ import torch
 
 from lerobot_memobench.cli.study import markdown_table, study
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem.study import ALIGNMENTS, Study, StudySettings
+from lerobot_memobench.studies.alignment.study import ALIGNMENTS, Study, StudySettings
 
 SETTINGS = StudySettings(steps=2, batch_size=4, seeds=1, held_out=1, frames_per_episode=6, action_batches=1)
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.cli import fields
-from lerobot_memobench.cli.checkpoint import checkpoint_folder, checkpoint_type, looks_local
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.policies.checkpoint import checkpoint_folder, checkpoint_type, looks_local
 
 #: Short form -> the fields it sets, of which those that exist are set. ``policy``, ``env`` and ``dataset``
 #: are special.

@@ -17,9 +17,9 @@ from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks, task_name
 from lerobot_memobench.tasks.task import LEVELS
 
 if TYPE_CHECKING:
-    from lerobot_memobench.evaluation.metrics import Record
-    from lerobot_memobench.evaluation.necessity_report import Result
-    from lerobot_memobench.evaluation.tables import Report
+    from lerobot_memobench.evaluation.documents.tables import Report
+    from lerobot_memobench.evaluation.metrics.rates import Record
+    from lerobot_memobench.evaluation.necessity.report import Result
 
 
 app = typer.Typer(
@@ -55,8 +55,8 @@ def necessity(
     ] = None,
 ) -> int:
     """Find moments that look the same and need different answers; print what a policy without memory can reach."""
-    from lerobot_memobench.evaluation.necessity_report import put_into_page, terminal_table, write
-    from lerobot_memobench.evaluation.necessity_study import REFERENTS, Settings, study
+    from lerobot_memobench.evaluation.necessity.report import put_into_page, terminal_table, write
+    from lerobot_memobench.evaluation.necessity.study import REFERENTS, Settings, study
 
     settings = Settings(episodes=episodes, budget=budget, tolerance=tolerance)
     settings_of = REFERENTS if referent is WhichReferent.BOTH else (referent.value,)
@@ -110,8 +110,8 @@ def oracle(
     out: Out = None,
 ) -> int:
     """Print which share of the gap to 100 % oracle memory closes: what a perfect memory would recover."""
-    from lerobot_memobench.evaluation.controls import contrasts, published_contrasts
-    from lerobot_memobench.evaluation.controls_report import oracle_report
+    from lerobot_memobench.evaluation.comparison.controls import contrasts, published_contrasts
+    from lerobot_memobench.evaluation.comparison.controls_report import oracle_report
     from lerobot_memobench.paper import raw_tables
 
     pairs, notes = _pairs(standard, oracle, ignore=("oracle_memory",))
@@ -130,8 +130,8 @@ def shuffled(
     out: Out = None,
 ) -> int:
     """Print how far rollouts come with normal and with shuffled memory, checkpoint by checkpoint."""
-    from lerobot_memobench.evaluation.controls import prefix_curves
-    from lerobot_memobench.evaluation.controls_report import shuffled_report
+    from lerobot_memobench.evaluation.comparison.controls import prefix_curves
+    from lerobot_memobench.evaluation.comparison.controls_report import shuffled_report
     from lerobot_memobench.paper import shuffled_control
 
     pairs, notes = _pairs([normal], [shuffled])
@@ -149,8 +149,8 @@ def granularity(
 ) -> int:
     """Print the metrics by the language level of the subgoals that a policy was taught with."""
     from lerobot_memobench.envs.episode_log import read_episodes
-    from lerobot_memobench.evaluation.controls import by_replan, relabelled
-    from lerobot_memobench.evaluation.controls_report import granularity_report
+    from lerobot_memobench.evaluation.comparison.controls import by_replan, relabelled
+    from lerobot_memobench.evaluation.comparison.controls_report import granularity_report
 
     folders = dict(zip(LEVELS, (coarse, intermediate, fine), strict=True))
     for folder in (intermediate, fine):
@@ -178,7 +178,7 @@ def _pairs(
 ) -> tuple[dict[int | None, tuple[list[Record], list[Record]]], list[str]]:
     """Return the paired rollouts of two sets of evaluations by replan interval, and what a reader must know."""
     from lerobot_memobench.envs.episode_log import read_episodes
-    from lerobot_memobench.evaluation.controls import by_replan, paired
+    from lerobot_memobench.evaluation.comparison.controls import by_replan, paired
 
     _refuse_unlike(first, second, ignore)
     notes: list[str] = []
@@ -206,7 +206,7 @@ def _pairs(
 
 def _refuse_unlike(first: Sequence[Path], second: Sequence[Path], ignore: Sequence[str] = ()) -> None:
     """Raise when evaluations differ in more than the policy, the replan interval and what is ignored."""
-    from lerobot_memobench.evaluation.protocol import differences, read_protocol
+    from lerobot_memobench.evaluation.records.protocol import differences, read_protocol
 
     reference = read_protocol(first[0])
     for folder in [*first[1:], *second]:
@@ -220,7 +220,7 @@ def _refuse_unlike(first: Sequence[Path], second: Sequence[Path], ignore: Sequen
 
 def _show(report: Report, notes: Sequence[str], name: str, out: Path | None) -> int:
     """Print a report, and write it where asked; return the exit status."""
-    from lerobot_memobench.evaluation.formats import latex, markdown, terminal
+    from lerobot_memobench.evaluation.documents.formats import latex, markdown, terminal
 
     screen = console()
     screen.print(terminal(report))

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.cli.console import console
+from lerobot_memobench.engine.card import CARD_MARKDOWN
 from lerobot_memobench.envs.episode_log import MERGED_FILE
 from lerobot_memobench.envs.protocol import PROTOCOL_FILE
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.card import CARD_MARKDOWN
-from lerobot_memobench.evaluation.protocol import CARD_FILE
-from lerobot_memobench.evaluation.report import REPORT_JSON, REPORT_MARKDOWN
+from lerobot_memobench.evaluation.documents.report import REPORT_JSON, REPORT_MARKDOWN
+from lerobot_memobench.evaluation.records.protocol import CARD_FILE
 
 #: One task of each memory type.
 TASKS = (

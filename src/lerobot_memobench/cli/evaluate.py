@@ -13,7 +13,7 @@ from lerobot_memobench.cli.evaluation import Evaluation, make_grid
 from lerobot_memobench.cli.orders import Orders
 from lerobot_memobench.cli.running import run_evaluation
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.protocol import CARD_FILE, read_card
+from lerobot_memobench.evaluation.records.protocol import CARD_FILE, read_card
 
 ENVIRONMENT = "memobench"
 EXPERT = "memobench_expert"

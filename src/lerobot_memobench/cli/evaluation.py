@@ -9,12 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.cli.arguments import Translation, without_flag
-from lerobot_memobench.cli.checkpoint import ADAPTER_FILE, WEIGHTS_FILE, checkpoint_folder, looks_local
 from lerobot_memobench.cli.orders import Orders
 from lerobot_memobench.cli.plan import Grid, Place
-from lerobot_memobench.envs.episode_log import has_log, read_episodes
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.card import (
+from lerobot_memobench.engine.card import (
     checkpoint_files,
     new_card,
     policy_facts,
@@ -22,6 +19,9 @@ from lerobot_memobench.evaluation.card import (
     training_facts,
     tree_hash,
 )
+from lerobot_memobench.envs.episode_log import has_log, read_episodes
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.checkpoint import ADAPTER_FILE, WEIGHTS_FILE, checkpoint_folder, looks_local
 
 FOLDERS = ("output_dir", "env.log_dir")
 PATHS = ("policy.path", "env.task_dir", "config_path")

@@ -15,7 +15,7 @@ from lerobot_memobench.errors import MemobenchError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from lerobot_memobench.evaluation.runs import Run
+    from lerobot_memobench.evaluation.records.runs import Run
 
 app = typer.Typer(
     help="Draw figures of evaluations (DIR, or NAME=DIR) and of the paper's tables (--with paper), as PDF and PNG.",
@@ -60,7 +60,7 @@ def radar(
     out: Out = DEFAULT_OUT,
 ) -> None:
     """Per method the best value over replan intervals, each axis normalised by its highest."""
-    from lerobot_memobench.evaluation.figures import entries, radar
+    from lerobot_memobench.evaluation.documents.figures import entries, radar
 
     runs, paper = _given(folders, with_)
     ours = entries.entries_of(runs)
@@ -85,7 +85,7 @@ def correlations(
     out: Out = DEFAULT_OUT,
 ) -> None:
     """MSR, MUR and MCR against SR with Pearson's r."""
-    from lerobot_memobench.evaluation.figures import correlations, entries
+    from lerobot_memobench.evaluation.documents.figures import correlations, entries
 
     runs, paper = _given(folders, with_)
     if paper and by is Grouping.TASKS:
@@ -103,7 +103,7 @@ def failures(
     out: Out = DEFAULT_OUT,
 ) -> None:
     """How rollouts ended: success and the classes of failure, as bars."""
-    from lerobot_memobench.evaluation.figures import failures
+    from lerobot_memobench.evaluation.documents.figures import failures
 
     runs, paper = _given(folders, with_)
     bars = [*failures.bars(runs, by is Grouping.TASKS), *([failures.paper_bar()] if paper else [])]
@@ -120,7 +120,7 @@ def prefix(
     out: Out = DEFAULT_OUT,
 ) -> None:
     """Prefix completion per checkpoint, in any order and in order, one panel per task."""
-    from lerobot_memobench.evaluation.figures import prefix
+    from lerobot_memobench.evaluation.documents.figures import prefix
 
     runs, paper = _given(folders, with_)
     panels = prefix.panels(runs, None if tasks is None else _chosen(tasks, runs))
@@ -137,7 +137,7 @@ def replan(
     out: Out = DEFAULT_OUT,
 ) -> None:
     """SR, MSR, MUR and MCR by replan interval."""
-    from lerobot_memobench.evaluation.figures import replan
+    from lerobot_memobench.evaluation.documents.figures import replan
 
     runs, paper = _given(folders, with_)
     if by is Grouping.TASKS:
@@ -147,7 +147,7 @@ def replan(
 
 def _given(folders: list[str] | None, with_: Beside | None) -> tuple[list[Run], bool]:
     """Return the evaluations and whether the paper's figures are drawn; one of both is needed."""
-    from lerobot_memobench.evaluation.runs import read_runs
+    from lerobot_memobench.evaluation.records.runs import read_runs
 
     paper = with_ is Beside.PAPER
     if not folders and not paper:
@@ -167,7 +167,7 @@ def _chosen(spec: str, runs: list[Run]) -> list[str]:
 
 
 def _save(figure: Figure, out: Path, name: str) -> None:
-    from lerobot_memobench.evaluation.figures.style import look, save
+    from lerobot_memobench.evaluation.documents.figures.style import look, save
 
     with look():
         for path in save(figure, out, name):

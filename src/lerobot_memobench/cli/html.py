@@ -25,7 +25,7 @@ def html(
     ] = None,
 ) -> None:
     """Make a report for the browser: rates, failures, and each episode's video over its timeline."""
-    from lerobot_memobench.evaluation.html import write_html
+    from lerobot_memobench.evaluation.documents.html import write_html
 
     written = write_html(folders, out, link=link, task_dir=task_dir)
     screen = console()

@@ -11,13 +11,13 @@ import typer
 
 from lerobot_memobench.cli.console import console
 from lerobot_memobench.cli.orders import parse_shard
+from lerobot_memobench.engine.card import checkpoint_files, disagreement, key_of, tree_hash, versions
+from lerobot_memobench.engine.merging import merge as merge_parts
+from lerobot_memobench.engine.merging import part_folders
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.card import checkpoint_files, disagreement, key_of, tree_hash, versions
-from lerobot_memobench.evaluation.merging import merge as merge_parts
-from lerobot_memobench.evaluation.merging import part_folders
-from lerobot_memobench.evaluation.protocol import CARD_FILE, read_card
-from lerobot_memobench.evaluation.report import REPORT_MARKDOWN
+from lerobot_memobench.evaluation.documents.report import REPORT_MARKDOWN
+from lerobot_memobench.evaluation.records.protocol import CARD_FILE, read_card
 
 
 def merge(

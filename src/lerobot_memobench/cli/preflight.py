@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.cli.arguments import Translation
-from lerobot_memobench.cli.checkpoint import check_checkpoint
+from lerobot_memobench.engine.card import extended
 from lerobot_memobench.envs.episode_log import has_log
 from lerobot_memobench.envs.protocol import PROTOCOL_FILE
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.card import extended
-from lerobot_memobench.evaluation.protocol import CARD_FILE, POLICY, differences, read_card, read_protocol
+from lerobot_memobench.evaluation.records.protocol import CARD_FILE, POLICY, differences, read_card, read_protocol
+from lerobot_memobench.policies.checkpoint import check_checkpoint
 
 INFO_FILE = Path("meta") / "info.json"
 

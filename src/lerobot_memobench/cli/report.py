@@ -14,7 +14,7 @@ from lerobot_memobench.cli.console import console
 from lerobot_memobench.errors import MemobenchError
 
 if TYPE_CHECKING:
-    from lerobot_memobench.evaluation.tables import Report
+    from lerobot_memobench.evaluation.documents.tables import Report
 
 
 class ReportFormat(StrEnum):
@@ -59,9 +59,9 @@ def report(
 
     report.json and report.md of each evaluation are written beside its log as well.
     """
-    from lerobot_memobench.evaluation import formats
-    from lerobot_memobench.evaluation.report import build, render, write_documents, write_report
-    from lerobot_memobench.evaluation.runs import read_runs
+    from lerobot_memobench.evaluation.documents import formats
+    from lerobot_memobench.evaluation.documents.report import build, render, write_documents, write_report
+    from lerobot_memobench.evaluation.records.runs import read_runs
 
     runs = read_runs(folders)
     wanted = list(dict.fromkeys(each.value for each in format_ or [ReportFormat.TABLE]))
@@ -103,8 +103,8 @@ def compare(
     permutations: Annotated[int, typer.Option(min=100, help="Random signs where not all can be tried.")] = 10_000,
 ) -> None:
     """Compare two evaluations of the same episodes, pair by pair: McNemar for success, sign-flip for the rates."""
-    from lerobot_memobench.evaluation import comparison
-    from lerobot_memobench.evaluation.runs import read_runs
+    from lerobot_memobench.evaluation.comparison import differences as comparison
+    from lerobot_memobench.evaluation.records.runs import read_runs
 
     first, second = read_runs([a, b])
     found = comparison.compare(first, second, allow=allow or (), seed=seed, permutations=permutations)
@@ -129,9 +129,9 @@ def agreement(
     out: Annotated[Path | None, typer.Option(help="Folder for agreement.md, agreement.json and so on.")] = None,
 ) -> None:
     """Agreement of raters with one another and with the released operation labels."""
-    from lerobot_memobench.evaluation import agreement as statistics
-    from lerobot_memobench.evaluation.labels import blank_sheet, read_labels
-    from lerobot_memobench.evaluation.report import put
+    from lerobot_memobench.evaluation.agreement import kappa as statistics
+    from lerobot_memobench.evaluation.agreement.label_sheet import blank_sheet, read_labels
+    from lerobot_memobench.evaluation.documents.report import put
     from lerobot_memobench.paper import annotator_agreement
 
     if sum([labels is not None, paper, template is not None]) != 1:
@@ -157,8 +157,8 @@ ENDINGS = {
 
 def _show(found: Report, name: str, formats_: list[ReportFormat] | None, out: Path | None) -> None:
     """Print a report in the formats wanted, or write it to a folder."""
-    from lerobot_memobench.evaluation import formats
-    from lerobot_memobench.evaluation.report import put
+    from lerobot_memobench.evaluation.documents import formats
+    from lerobot_memobench.evaluation.documents.report import put
 
     wanted = list(dict.fromkeys(formats_ or [ReportFormat.TABLE]))
     if ReportFormat.CSV in wanted:

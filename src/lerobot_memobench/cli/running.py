@@ -14,10 +14,10 @@ from lerobot_memobench.cli.evaluation import Evaluation, describe, logged, with_
 from lerobot_memobench.cli.loop import calm_output, steered
 from lerobot_memobench.cli.plan import Range, task_names
 from lerobot_memobench.datasets.unfinished import locked
+from lerobot_memobench.engine.card import remove_card, with_episodes, write_card
 from lerobot_memobench.envs.episode_log import has_log, read_episodes
-from lerobot_memobench.evaluation.card import remove_card, with_episodes, write_card
-from lerobot_memobench.evaluation.protocol import POLICY, read_protocol
-from lerobot_memobench.evaluation.report import REPORT_MARKDOWN
+from lerobot_memobench.evaluation.documents.report import REPORT_MARKDOWN
+from lerobot_memobench.evaluation.records.protocol import POLICY, read_protocol
 
 CONTINUED = "continued-{}"
 """Folder of LeRobot's own files of a run that goes on: it would write over those of the first."""
@@ -125,7 +125,7 @@ def finish(evaluation: Evaluation, card: dict[str, Any], say_where: bool) -> int
 def print_report(folder: Path, episodes: int | None) -> None:
     """Write the report of the log in ``folder`` beside it and print its table."""
     from lerobot_memobench.cli.console import console
-    from lerobot_memobench.evaluation.report import failure_line, table, write_report
+    from lerobot_memobench.evaluation.documents.report import failure_line, table, write_report
 
     summary, notes = write_report(folder, episodes)
     out = console()

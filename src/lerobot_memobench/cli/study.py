@@ -29,7 +29,7 @@ def study(
     """Train with none, semantic, contrastive and framewise alignment from the same seeds, and compare what a memory
     tells about the active subgoal on held-out episodes: one table and one figure. A killed run is continued.
     """
-    from lerobot_memobench.policies.memobench_mem.study import ALIGNMENTS, Study, StudySettings
+    from lerobot_memobench.studies.alignment.study import ALIGNMENTS, Study, StudySettings
 
     screen = console()
 
@@ -74,7 +74,7 @@ MEASURES = {
 
 def summarise(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return per measure the values of all seeds, their mean and their sample standard deviation."""
-    from lerobot_memobench.policies.memobench_mem.retrieval import mean_and_deviation
+    from lerobot_memobench.studies.alignment.retrieval import mean_and_deviation
 
     found: dict[str, Any] = {}
     for name, path in MEASURES.items():

@@ -1,1 +1,1 @@
-"""What did it learn? Metrics, failures and reports from the episode log. No simulator, no torch."""
+"""What did it learn? Metrics, failures, comparisons, documents, from the episode log. No simulator, no torch."""

@@ -1,0 +1,1 @@
+"""How is an evaluation run, gone on with, shared out, merged, repeated?"""

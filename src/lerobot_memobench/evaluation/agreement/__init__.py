@@ -1,0 +1,1 @@
+"""Do annotators agree on which operation a checkpoint is?"""

@@ -1,0 +1,1 @@
+"""How are results written down: tables, sections, formats, figures, pages for the browser."""

@@ -1,0 +1,109 @@
+"""Radar: per method the best value over replan intervals, each axis normalised by its highest (paper, appendix)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.documents.figures import style
+from lerobot_memobench.evaluation.documents.figures.entries import Axis, Entry, best_over_replan
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FEWEST_AXES = 3
+
+
+def normalised(
+    entries: Sequence[Entry], axes: Sequence[Axis]
+) -> tuple[list[Axis], list[float], dict[str, list[float]]]:
+    """Return the axes that apply to any method, their highest values in per cent, and method -> shares of these.
+
+    A method to which an axis does not apply, such as one that was not evaluated on its tasks, gets 0 there.
+    """
+    best = best_over_replan(entries, axes)
+    highest = [max((row[k] for row in best.values() if row[k] is not None), default=None) for k in range(len(axes))]  # type: ignore[type-var]
+    kept = [k for k, value in enumerate(highest) if value is not None]
+    tops = [float(highest[k] or 0.0) for k in kept]
+    shares = {
+        method: [(row[k] or 0.0) / top if top else 0.0 for k, top in zip(kept, tops, strict=True)]
+        for method, row in best.items()
+    }
+    return [axes[k] for k in kept], tops, shares
+
+
+def draw(panels: Sequence[tuple[str, Sequence[Entry]]], axes: Sequence[Axis]) -> Figure:
+    """Draw one radar per panel (title, rows).
+
+    Raises:
+        MemobenchError: fewer than three axes apply.
+    """
+    with style.look():
+        height = 3.7 if len(axes) <= 4 else 4.3
+        figure = style.new_figure(3.6 * len(panels) if len(axes) <= 4 else 4.5 * len(panels), height)
+        places = figure.subplots(1, len(panels), subplot_kw={"projection": "polar"}, squeeze=False)[0]
+        looks = style.lines([entry.method for _, entries in panels for entry in entries])
+        for place, (title, entries) in zip(places, panels, strict=True):
+            _draw_panel(place, title, entries, axes, looks)
+        return figure
+
+
+def _draw_panel(
+    place: Any, title: str, entries: Sequence[Entry], axes: Sequence[Axis], looks: Mapping[str, style.Line]
+) -> None:
+    kept, tops, shares = normalised(entries, axes)
+    if len(kept) < FEWEST_AXES:
+        raise MemobenchError(
+            f"a radar needs {FEWEST_AXES} axes and only {len(kept)} apply to these evaluations; evaluate more memory "
+            "types, or use --axes types"
+        )
+    angles = [2 * math.pi * k / len(kept) for k in range(len(kept))]
+    closed = [*angles, angles[0]]
+    place.set_theta_offset(math.pi / 2)
+    place.set_theta_direction(-1)
+    place.set_ylim(0, 1.0)
+    place.set_xticks([])
+    place.set_yticks([])
+    place.spines["polar"].set_visible(False)
+    for ring in (0.25, 0.5, 0.75, 1.0):
+        place.plot(closed, [ring] * len(closed), color=style.GRID if ring < 1 else style.FAINT, lw=0.6, zorder=1)
+    for angle in angles:
+        place.plot([angle, angle], [0, 1], color=style.GRID, lw=0.6, zorder=1)
+    published = {entry.method for entry in entries if entry.published}
+    for method, values in shares.items():
+        line = looks[method]
+        place.plot(
+            closed,
+            [*values, values[0]],
+            color=line.colour,
+            ls=line.dashes,
+            marker=line.marker,
+            ms=4,
+            lw=1.3 if method in published else 2.0,
+            label=style.words(method),
+            zorder=3,
+            clip_on=False,
+        )
+    for angle, axis, top in zip(angles, kept, tops, strict=True):
+        memory_type, metric = axis
+        name = metric if memory_type is None else f"{memory_type}\n{metric}"
+        across, up = math.sin(angle), math.cos(angle)
+        place.text(
+            angle,
+            1.08,
+            f"{name}\n{top:.1f}",
+            ha="center" if abs(across) < 0.3 else ("left" if across > 0 else "right"),
+            va="center" if abs(up) < 0.3 else ("bottom" if up > 0 else "top"),
+            fontsize=8 if memory_type is None else 7,
+            linespacing=1.1,
+        )
+    place.set_title(title, pad=30 if len(kept) <= 4 else 34)
+    place.legend(
+        loc="upper center",
+        bbox_to_anchor=(0.5, -0.16 if len(kept) <= 4 else -0.2),
+        ncols=2,
+        handlelength=3.2,
+        columnspacing=1.2,
+    )

@@ -1,0 +1,127 @@
+"""Rates by replan interval: one line per method, with Wilson's intervals where n is known (paper, main results)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.documents.figures import style
+from lerobot_memobench.evaluation.documents.report_sections import published_rate
+from lerobot_memobench.evaluation.metrics.rates import METRICS, Rate
+from lerobot_memobench.evaluation.records.runs import Run, sweeps
+from lerobot_memobench.paper import published_rows
+from lerobot_memobench.tasks.task import MEMORY_TYPES
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+AVERAGE = "average"
+
+Curve = tuple[str, list[int], list[Rate], bool]
+"""Method, replan intervals, rates there, whether they are the paper's."""
+
+
+def curves(runs: Sequence[Run], paper: bool, memory_type: str, metric: str) -> list[Curve]:
+    """Return the lines of one panel; ``memory_type`` may be "average"."""
+    found: list[Curve] = []
+    for method, group in sweeps(runs).items():
+        steps, rates = [], []
+        for run in group:
+            row = run.summary.average if memory_type == AVERAGE else run.summary.memory_types.get(memory_type)
+            if row is not None and row[metric].value is not None and run.replan_steps is not None:
+                steps.append(run.replan_steps)
+                rates.append(row[metric])
+        if steps:
+            found.append((method, steps, rates, False))
+    if paper:
+        models: dict[str, dict[int, float]] = {}
+        for published in published_rows("main"):
+            figures = published.average if memory_type == AVERAGE else published.memory_types[memory_type]
+            value = figures[metric]
+            if value is not None and published.replan_steps is not None:
+                models.setdefault(published.label, {})[published.replan_steps] = value
+        found += [(name, list(at), [published_rate(v) for v in at.values()], True) for name, at in models.items()]
+    return found
+
+
+def draw(runs: Sequence[Run], paper: bool = False, by_type: bool = False) -> Figure:
+    """Draw SR, MSR, MUR and MCR over replan intervals, on average or per memory type as well.
+
+    Raises:
+        MemobenchError: no method was evaluated at several intervals.
+    """
+    if not paper and not sweeps(runs):
+        raise MemobenchError(
+            "no policy was evaluated at several replan intervals; name evaluations with replan=5, replan=20 and so on "
+            "(NAME=FOLDER with the same name where their policies are not known)"
+        )
+    groups = [AVERAGE, *(MEMORY_TYPES if by_type else ())]
+    grid = [[curves(runs, paper, group, metric) for metric in METRICS] for group in groups]
+    names = list(dict.fromkeys(curve[0] for row in grid for cell in row for curve in cell))
+    looks = style.lines(names)
+    with style.look():
+        from matplotlib.lines import Line2D
+
+        figure = style.new_figure(7.4, 1.75 * len(groups) + 0.75)
+        places = figure.subplots(len(groups), len(METRICS), sharex=True, squeeze=False)
+        ours = {curve[0] for row in grid for cell in row for curve in cell if not curve[3]}
+        for row, group in enumerate(groups):
+            for column, metric in enumerate(METRICS):
+                place = places[row][column]
+                if not grid[row][column]:
+                    place.set_visible(False)
+                    continue
+                for curve in grid[row][column]:
+                    _draw_curve(place, curve, looks[curve[0]])
+                _frame(place, grid[row][column])
+                if row == 0:
+                    place.set_title(f"{metric} ({style.METRIC_NAMES[metric]})", fontsize=7.5)
+                if column == 0:
+                    place.set_ylabel(f"{group}, %")
+                if row == len(groups) - 1 or not grid[row + 1][column]:
+                    place.set_xlabel("replan interval, steps")
+                    place.tick_params(labelbottom=True)
+        handles = [
+            Line2D(
+                [], [], color=looks[n].colour, marker=looks[n].marker, ls=looks[n].dashes, ms=4, lw=_width(n in ours)
+            )
+            for n in names
+        ]
+        marks = [style.words(name) if name in ours or not ours else f"paper: {style.words(name)}" for name in names]
+        style.legend_below(figure, handles, marks, 4 if max(map(len, names)) < 20 else 3)
+        return figure
+
+
+def _width(ours: bool) -> float:
+    return 1.9 if ours else 1.1
+
+
+def _draw_curve(place: Any, curve: Curve, look: style.Line) -> None:
+    _, steps, rates, published = curve
+    values = [100 * (rate.value or 0.0) for rate in rates]
+    if not published:
+        intervals = [rate.interval or (0.0, 1.0) for rate in rates]
+        low, high = ([100 * bounds[k] for bounds in intervals] for k in (0, 1))
+        place.fill_between(steps, low, high, color=look.colour, alpha=0.15, lw=0, zorder=1)
+    place.plot(
+        steps,
+        values,
+        color=look.colour,
+        marker=look.marker,
+        ls=look.dashes,
+        ms=4,
+        lw=_width(not published),
+        zorder=2 if published else 3,
+        clip_on=False,
+    )
+
+
+def _frame(place: Any, found: Sequence[Curve]) -> None:
+    steps = sorted({step for _, its_steps, _, _ in found for step in its_steps})
+    place.set_xticks(steps)
+    place.set_ylim(bottom=0)
+    # Room for markers at the top, and at least ten points of scale: noise is not to look like a trend.
+    place.set_ylim(top=min(102.0, max(10.0, place.get_ylim()[1])))
+    place.grid(axis="y", color=style.GRID, lw=0.5)
+    place.locator_params(axis="y", nbins=5)

@@ -1,0 +1,221 @@
+"""From episode logs to the data of the page: rates, texts and timelines, as plain JSON values.
+
+Every figure is computed here, by ``evaluation.metrics``; the page only draws and filters.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lerobot_memobench import __version__
+from lerobot_memobench.envs.annotate import OPERATION_COLOURS
+from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.metrics.failures import failure_counts, failure_of
+from lerobot_memobench.evaluation.metrics.rates import Rate, Record, Row, Summary, by_task, mixtures, percent, summarise
+from lerobot_memobench.evaluation.records.protocol import CARD_FILE, read_card
+from lerobot_memobench.evaluation.records.runs import folder_names
+from lerobot_memobench.tasks.catalogue import find_tasks, get_task, task_names
+from lerobot_memobench.tasks.failures import FAILURES
+from lerobot_memobench.tasks.formula import format_formula
+from lerobot_memobench.tasks.task import LEVELS, MEMORY_TYPES, Task, load_task
+
+FPS = 20
+"""Control steps per second (paper, section 5.1), and frames per second of the films."""
+
+OPERATION_NAMES = {"S": "Storage", "U": "Update", "C": "Compression"}
+
+
+@dataclass(frozen=True)
+class Run:
+    """One evaluation: its name in the report, where it lies, its rollouts, what a reader must know about them, and its
+    result card ({} where there is none).
+    """
+
+    name: str
+    folder: Path
+    records: list[dict[str, Any]]
+    notes: list[str] = field(default_factory=list)
+    card: dict[str, Any] = field(default_factory=dict)
+
+
+def read_runs(folders: Sequence[str | Path]) -> list[Run]:
+    """Read the logs of several evaluations and name them after their folders."""
+    runs = []
+    for folder, name in zip(folders, folder_names(folders), strict=True):
+        notes: list[str] = []
+        records = read_episodes(folder, notes)
+        if not records:
+            raise MemobenchError(f"{folder} holds no rollout that can be read; run an evaluation first")
+        path = Path(folder) / CARD_FILE
+        card = read_card(path) if path.is_file() else {}
+        runs.append(Run(name, Path(folder), records, notes + mixtures(records), card))
+    return runs
+
+
+def task_source(task_dir: str | Path | None) -> dict[str, Task]:
+    """Return the tasks whose texts are known: the catalogue's, and those of a folder in the published format."""
+    known = {name: get_task(name) for name in task_names()}
+    if task_dir is not None:
+        known |= {folder.name: load_task(folder) for folder in find_tasks(task_dir)}
+    return known
+
+
+def page_data(runs: Sequence[Run], videos: Sequence[Mapping[int, str]], known: Mapping[str, Task]) -> dict[str, Any]:
+    """Return everything that the page shows.
+
+    Args:
+        videos: per run, position of a rollout in its records -> address of its video, relative to the page.
+        known: task name -> task, for language and checkpoint texts.
+    """
+    return {
+        "version": __version__,
+        "fps": FPS,
+        "levels": list(LEVELS),
+        "memory_types": list(MEMORY_TYPES),
+        "operations": {
+            key: {"name": OPERATION_NAMES[key], "colour": "#" + bytes(colour).hex()}
+            for key, colour in OPERATION_COLOURS.items()
+        },
+        "failures": list(FAILURES),
+        "tasks": tasks_data([record for run in runs for record in run.records], known),
+        "runs": [run_data(run, addresses) for run, addresses in zip(runs, videos, strict=True)],
+    }
+
+
+# --- tasks ---
+
+
+def tasks_data(records: Iterable[Record], known: Mapping[str, Task]) -> dict[str, Any]:
+    """Return per task of the rollouts, by memory type and name, its language, and the texts of each variant."""
+    order = {memory_type: k for k, memory_type in enumerate(MEMORY_TYPES)}
+    sample = {record["task"]: record for record in records}
+    seen = {(record["task"], _variant(record)) for record in records}
+    result: dict[str, Any] = {}
+    for name, record in sorted(sample.items(), key=lambda item: (order.get(item[1]["memory_type"], 9), item[0])):
+        task = known.get(name)
+        result[name] = {
+            "memory_type": record["memory_type"],
+            "language": task.language if task else name.replace("_", " "),
+            "variants": {
+                str(k): variant_data(task.variant(k))
+                for k in sorted(variant for its_name, variant in seen if its_name == name)
+                if task and k < task.num_variants and task.operations == _operations(record)
+            },
+        }
+    return result
+
+
+def variant_data(task: Task) -> dict[str, Any]:
+    """Return goal and checkpoints of one variant; texts are coarse, intermediate, fine."""
+    return {
+        "goal": format_formula(task.goal),
+        "checkpoints": [
+            {"goal": format_formula(checkpoint.goal), "texts": list(checkpoint.language)}
+            for checkpoint in task.checkpoints
+        ],
+    }
+
+
+def _variant(record: Record) -> int:
+    return int(record.get("variant") or 0)
+
+
+def _operations(record: Record) -> str:
+    return "".join(checkpoint["operation"] for checkpoint in record["checkpoints"])
+
+
+# --- runs ---
+
+
+def run_data(run: Run, videos: Mapping[int, str]) -> dict[str, Any]:
+    """Return one evaluation: protocol, rates, failures and rollouts."""
+    summary = summarise(run.records)
+    groups = by_task(run.records)
+    return {
+        "name": run.name,
+        "folder": str(run.folder),
+        "facts": facts(run.records, run.card),
+        "commands": [shlex.join(it["command"]) for it in run.card.get("runs", []) if it.get("command")],
+        "notes": run.notes,
+        "average": row_data(summary.average),
+        "memory_types": {name: row_data(row) for name, row in summary.memory_types.items()},
+        "tasks": {name: task_data(name, groups[name], summary) for name in groups},
+        "episodes": [episode_data(record, videos.get(k)) for k, record in enumerate(run.records)],
+    }
+
+
+def facts(records: Sequence[Record], card: Mapping[str, Any]) -> list[str]:
+    """Return the protocol in words: policy, rollouts, tasks, seeds, referent, replan interval, horizon."""
+    seeds = sorted({record["seed"] for record in records if record.get("seed") is not None})
+    replans = sorted({record["replan_steps"] for record in records if record.get("replan_steps") is not None})
+    policy = card.get("policy", {}).get("type")
+    result = [f"policy {policy}"] if policy else []
+    result += [count_of(len(records), "rollout"), count_of(len({record["task"] for record in records}), "task")]
+    if seeds:
+        result.append(f"seed {seeds[0]}" if len(seeds) == 1 else f"seeds {seeds[0]} to {seeds[-1]}")
+    result.append("referent " + ", ".join(sorted({str(record.get("referent", "fixed")) for record in records})))
+    if replans:
+        result.append("replan interval " + ", ".join(map(str, replans)))
+    horizon = card.get("protocol", {}).get("horizon")
+    return result if horizon is None else [*result, f"horizon {horizon}"]
+
+
+def count_of(number: int, word: str) -> str:
+    return f"{number:,} {word}" + ("" if number == 1 else "s")
+
+
+def task_data(name: str, records: Sequence[Record], summary: Summary) -> dict[str, Any]:
+    """Return the rates of one task and, per checkpoint, how many rollouts got that far."""
+    return {
+        "rates": row_data(summary.tasks[name]),
+        "operations": _operations(records[0]),
+        "prefix": [rate_data(rate) for rate in summary.prefix[name]],
+        "ordered_prefix": [rate_data(rate) for rate in summary.ordered_prefix[name]],
+        "outcomes": {"success": sum(record["success"] for record in records), **failure_counts(records)},
+    }
+
+
+def row_data(row: Row) -> dict[str, Any]:
+    return {metric: rate_data(rate) for metric, rate in row.items()}
+
+
+def rate_data(rate: Rate) -> list[float | int | None] | None:
+    """Return [per cent, lower, upper bound of Wilson's 95 % interval, n]; None where not applicable."""
+    if rate.value is None or rate.interval is None:
+        return None
+    low, high = rate.interval
+    return [percent(rate.value), percent(low), percent(high), rate.n]
+
+
+def episode_data(record: Record, video: str | None) -> dict[str, Any]:
+    """Return one rollout. Checkpoints are [operation, first step, ordered step], execution steps counted from 1."""
+    return {
+        "id": episode_id(record),
+        "task": record["task"],
+        "episode": record["episode"],
+        "seed": record.get("seed"),
+        "referent": record.get("referent", "fixed"),
+        "variant": _variant(record),
+        "prompt": int(record.get("prompt_steps") or 0),
+        "steps": int(record.get("steps") or _last_step(record)),
+        "checkpoints": [[c["operation"], c["first_step"], c.get("ordered_step")] for c in record["checkpoints"]],
+        "outcome": failure_of(record) or "success",
+        "scene": record.get("scene_hash"),
+        "video": video,
+    }
+
+
+def episode_id(record: Record) -> str:
+    """Return a name that is the same in every run: task, episode, and the referent where it is not the published."""
+    referent = record.get("referent", "fixed")
+    return f"{record['task']}.{record['episode']}" + ("" if referent == "fixed" else f".{referent}")
+
+
+def _last_step(record: Record) -> int:
+    """The last step known of a log that does not say how long its rollouts were."""
+    return max([1, *(c["first_step"] for c in record["checkpoints"] if c["first_step"] is not None)])

@@ -1,0 +1,265 @@
+"""Memory necessity: a table for the terminal, Markdown for people, JSON for programs, a figure of aliased pairs."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.necessity.study import pictures_path
+
+JSON_FILE, MARKDOWN_FILE, FIGURE_FILE = "necessity.json", "necessity.md", "aliased_pairs.png"
+NOT_APPLICABLE = "–"
+LARGEST_FIGURE = 300_000
+"""Bytes: the figure of the documentation is kept in the repository."""
+
+Result = Mapping[str, Any]
+
+VERDICTS = {
+    "no": "pictures decide every step of the demonstrated routine: no memory is needed",
+    "order": "the demonstrated order needs memory; another order that the goal accepts does not",
+    "yes": "no order found reaches the goal from pictures alone: memory is needed",
+    "order?": "the demonstrated order needs memory; other ways were not looked for",
+    "unknown": "the expert solved none of the scenes, so nothing can be said",
+}
+
+
+def verdict(result: Result) -> str:
+    """Return which of `VERDICTS` holds."""
+    in_order, any_order = result["in_order"], result["any_order"]
+    if in_order is None:
+        return "unknown"
+    if in_order["deterministic"] >= 1.0:
+        return "no"
+    if any_order is None:
+        return "order?"
+    return "order" if any_order["confirmed"] == any_order["of"] else "yes"
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column: its heading, and what it says under the table."""
+
+    name: str
+    meaning: str
+
+
+COLUMNS = (
+    Column("referent", "what the goal is; *both*: the task has one goal, so the settings are the same"),
+    Column("goals", "goals that may lie behind the same start"),
+    Column("decisions", "times per episode at which the expert turns to something new"),
+    Column("aliased", "pictures at which more than one answer is right: arm at home / as it happens"),
+    Column("chance", "knows the routine, guesses evenly where the picture does not decide; one try each"),
+    Column("fixed map", "best map from pictures to answers, in the demonstrated order"),
+    Column("probabilities", "best probabilities of answers given the picture, same order, one try each"),
+    Column("exact", "fixed map if every pixel could be used (differences above 2 of 255)"),
+    Column("any order", "best map if any order will do that the goal accepts: found, and confirmed in the simulator"),
+    Column(
+        "any order, prob.", "best probabilities found, wrong answers mended as the scene allows, within the horizon"
+    ),
+    Column("expert", "the expert's episodes that reached the goal"),
+    Column("memory needed", "see below"),
+)
+
+
+def _percent(value: float | None) -> str:
+    return NOT_APPLICABLE if value is None else f"{100.0 * value:.1f}"
+
+
+def cells(result: Result, referent: str) -> list[str]:
+    """Return a row of the table, without the task."""
+    in_order, any_order, counts = result["in_order"], result["any_order"], result["aliased"]
+    found = NOT_APPLICABLE
+    if any_order is not None:
+        found = f"{_percent(any_order['deterministic'])} ({any_order['confirmed']}/{any_order['of']})"
+        found += "" if any_order["complete"] else " ≥"
+    expert = result["expert"]
+    return [
+        referent,
+        str(result["variants"]),
+        f"{result['decisions']:.1f}",
+        NOT_APPLICABLE if counts is None else f"{counts['at_home']:.1f} / {counts['as_it_happens']:.1f}",
+        *(
+            NOT_APPLICABLE if in_order is None else _percent(in_order[key])
+            for key in ("chance", "deterministic", "stochastic", "pixel_exact")
+        ),
+        found,
+        NOT_APPLICABLE if any_order is None else _percent(any_order["stochastic"]),
+        f"{expert['success']}/{expert['n']}",
+        verdict(result),
+    ]
+
+
+def rows(results: Sequence[Result]) -> list[tuple[str, str, list[str]]]:
+    """Return memory type, task and cells per row; a task with one goal has one row for both settings."""
+    table = []
+    for result in results:
+        alone = result["referent"] == "fixed" and not result.get("has_variants", True)
+        table.append((result["memory_type"], result["task"], cells(result, "both" if alone else result["referent"])))
+    return table
+
+
+def terminal_table(results: Sequence[Result]) -> Any:
+    """Return the table for the terminal, a `rich.table.Table`."""
+    from rich.table import Table
+
+    table = Table(header_style="bold", pad_edge=False)
+    table.add_column("task", overflow="fold")
+    for column in COLUMNS:
+        table.add_column(column.name, justify="left" if column.name in ("referent", "memory needed") else "right")
+    before = None
+    for memory_type, task, row in rows(results):
+        if before not in (None, memory_type):
+            table.add_section()
+        before = memory_type
+        table.add_row(task, *row)
+    return table
+
+
+def markdown(results: Sequence[Result]) -> str:
+    """Return the table, what its columns mean, what follows, and the best maps that were found."""
+    lines = ["| task | " + " | ".join(column.name for column in COLUMNS) + " |"]
+    lines.append("|---|" + "---|" * len(COLUMNS))
+    lines += [f"| {memory_type}: `{task}` | " + " | ".join(row) + " |" for memory_type, task, row in rows(results)]
+    lines += ["", "Per cent, means over scenes. Columns:", ""]
+    lines += [f"- **{column.name}**: {column.meaning}." for column in COLUMNS[:-1]]
+    lines += ["- **memory needed**: " + "; ".join(f"*{word}*: {meaning}" for word, meaning in VERDICTS.items()) + "."]
+    same = max((result["largest_same"] for result in results), default=0.0)
+    other = min((result["smallest_different"] for result in results), default=1.0)
+    lines += [
+        "",
+        f"Moments that count as looking the same differ in at most {100 * same:.2f} % of the pixels of a camera, those "
+        f"that count as different in at least {100 * other:.2f} %.",
+        "",
+        "### Ways to the goal that need no memory",
+        "",
+    ]
+    searched = any(result["any_order"] is not None for result in results)
+    lines += _ways(results) or ["None was found." if searched else "They were not looked for."]
+    return "\n".join(lines) + "\n"
+
+
+def _ways(results: Sequence[Result]) -> list[str]:
+    lines = []
+    for result in results:
+        if verdict(result) == "order":
+            lines.append(f"- `{result['task']}` ({result['referent']}):")
+            for rule in result["any_order"]["policy"]:
+                when = " or ".join(f"`{text}`" if text else "*nothing of the goal*" for text in rule["when"])
+                lines.append(f"  - seeing {when}: `{rule['do']}`")
+    return lines
+
+
+# --- files ---
+
+PAGE_BEGIN, PAGE_END = "<!-- made by `memobench necessity --page`: -->", "<!-- end of what it made -->"
+
+
+def put_into_page(page: Path, results: Sequence[Result]) -> Path:
+    """Put the table into a Markdown page, between its two marks; return the page.
+
+    Raises:
+        MemobenchError: there is no such page, or it lacks the marks.
+    """
+    try:
+        text = page.read_text(encoding="utf-8")
+    except OSError as error:
+        raise MemobenchError(
+            f"the page {page} cannot be read ({error.strerror or error}); name a Markdown file"
+        ) from None
+    before, begin, rest = text.partition(PAGE_BEGIN)
+    _, end, after = rest.partition(PAGE_END)
+    if not begin or not end:
+        raise MemobenchError(
+            f"the page {page} lacks the lines {PAGE_BEGIN!r} and {PAGE_END!r}; put them where the table goes"
+        )
+    return _replace(page, f"{before}{begin}\n\n{markdown(results)}\n{end}{after}".encode())
+
+
+def write(out: Path, results: Sequence[Result]) -> list[Path]:
+    """Write JSON, Markdown and, where a pair of moments looks the same, the figure; return their paths."""
+    out.mkdir(parents=True, exist_ok=True)
+    content = [{**result, "memory_needed": verdict(result)} for result in results]
+    written = [
+        _replace(out / JSON_FILE, (json.dumps(content, indent=1) + "\n").encode()),
+        _replace(out / MARKDOWN_FILE, ("# Memory necessity\n\n" + markdown(results)).encode()),
+    ]
+    picture = figure(out, results)
+    if picture is not None:
+        written.append(_replace(out / FIGURE_FILE, picture))
+    return written
+
+
+def _replace(path: Path, content: bytes) -> Path:
+    draft = path.with_name(path.name + ".part")
+    draft.write_bytes(content)
+    os.replace(draft, path)
+    return path
+
+
+FIGURE_PAIRS = 2
+_CAMERAS = ("third person", "wrist")
+
+
+def figure(out: Path, results: Sequence[Result]) -> bytes | None:
+    """Return a PNG of up to two aliased pairs: both moments side by side, and what is right at each; None without any.
+
+    One pair within an episode and one between goals are preferred: the two ways in which memory is needed.
+    """
+    from matplotlib.figure import Figure
+    from PIL import Image
+
+    shown: list[tuple[Result, Any]] = []
+    for result in results:
+        if not result["examples"]:
+            continue
+        path = pictures_path(out, result["task"], result["referent"], result["examples"][0]["seed"])
+        if not path.is_file():
+            continue
+        if all(_kind(other) != _kind(result) for other, _ in shown):
+            shown.append((result, Image.open(path).convert("RGB")))
+    if not shown:
+        return None
+    plot = Figure(figsize=(10, 3.1 * len(shown)), layout="constrained")
+    grid = plot.subplots(len(shown), 4, squeeze=False)
+    for axes, (result, strip) in zip(grid, shown, strict=True):
+        pair, side = result["examples"][0], strip.height
+        for k, axis in enumerate(axes):
+            axis.imshow(strip.crop((k * side, 0, (k + 1) * side, side)))
+            axis.set_xticks([])
+            axis.set_yticks([])
+            axis.set_xlabel(_CAMERAS[k % 2], fontsize=8)
+        for axis, moment in ((axes[0], pair["a"]), (axes[2], pair["b"])):
+            axis.set_title(f"step {moment['step']}: {_short(moment['answer'])}", fontsize=9, loc="left")
+        axes[0].set_ylabel(_wrapped(result["task"]), fontsize=8)
+    buffer = io.BytesIO()
+    plot.savefig(buffer, dpi=110, format="png")
+    small = Image.open(buffer).convert("RGB").quantize(192, dither=Image.Dither.NONE)
+    buffer = io.BytesIO()
+    small.save(buffer, "PNG", optimize=True)
+    if buffer.tell() > LARGEST_FIGURE:
+        raise MemobenchError(
+            f"the figure has {buffer.tell()} bytes, expected at most {LARGEST_FIGURE}; draw it smaller"
+        )
+    return buffer.getvalue()
+
+
+def _kind(result: Result) -> bool:
+    """Whether the first pair lies within one episode."""
+    pair = result["examples"][0]
+    return bool(pair["a"]["variant"] == pair["b"]["variant"])
+
+
+def _short(answer: str) -> str:
+    return answer.strip("()").replace("_1", "").replace("_", " ")
+
+
+def _wrapped(name: str, width: int = 26) -> str:
+    import textwrap
+
+    return "\n".join(textwrap.wrap(name.replace("_", " "), width))

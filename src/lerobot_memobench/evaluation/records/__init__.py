@@ -1,0 +1,1 @@
+"""What was run, read back from the folders of evaluations."""

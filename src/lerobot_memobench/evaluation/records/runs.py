@@ -1,0 +1,150 @@
+"""Evaluations as reports and figures see them: what each is called, its rollouts, its rates, whose they are.
+
+An evaluation is given as its folder, or as ``NAME=FOLDER``. Evaluations of the same name are one method at several
+replan intervals; without names, those of the same policy are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.metrics.rates import Record, Summary, mixtures, summarise
+from lerobot_memobench.evaluation.records.protocol import POLICY, read_protocol
+
+HASH_DIGITS = 8
+
+
+@dataclass(frozen=True)
+class Run:
+    """One evaluation.
+
+    Attributes:
+        name: unique in a report. method: whose result it is; several runs of one method differ in the replan interval.
+        notes: what a reader must know, such as lines that could not be read.
+    """
+
+    name: str
+    method: str
+    folder: Path
+    records: Sequence[Record]
+    protocol: Mapping[str, Any]
+    notes: Sequence[str] = field(default_factory=tuple)
+
+    @cached_property
+    def summary(self) -> Summary:
+        return summarise(self.records)
+
+    @cached_property
+    def replan_steps(self) -> int | None:
+        """The one interval of all rollouts; the policy's own where none was asked for; None where nobody knows."""
+        found = {record.get("replan_steps") for record in self.records}
+        if len(found) > 1:
+            return None
+        (steps,) = found
+        if steps is None:
+            steps = (self.protocol.get(POLICY) or {}).get("settings", {}).get("n_action_steps")
+        return steps if isinstance(steps, int) else None
+
+
+def read_runs(words: Sequence[str | Path]) -> list[Run]:
+    """Read evaluations given as ``FOLDER`` or ``NAME=FOLDER``.
+
+    Raises:
+        MemobenchError: a folder holds no rollouts, is given twice, or one method has two results at one interval.
+    """
+    given = [_split(word) for word in words]
+    if not given:
+        raise MemobenchError("no evaluation was given; expected folders that evaluations have written")
+    names = folder_names([folder for _, folder in given])
+    runs = []
+    for (label, folder), name in zip(given, names, strict=True):
+        notes: list[str] = []
+        records = read_episodes(folder, notes)
+        if not records:
+            raise MemobenchError(f"{folder} holds no rollout that can be read; run an evaluation first")
+        notes += mixtures(records)
+        runs.append(Run(name, label or "", folder, records, read_protocol(folder), notes))
+    return _with_methods(runs)
+
+
+def _split(word: str | Path) -> tuple[str | None, Path]:
+    """Take ``NAME=FOLDER`` apart; a folder whose own name holds an equals sign is still one."""
+    if isinstance(word, Path) or Path(word).exists():
+        return None, Path(word)
+    label, equals, folder = word.partition("=")
+    if not equals or "/" in label:
+        return None, Path(word)
+    if not label.strip() or not folder:
+        raise MemobenchError(f"found {word!r}; expected a folder, or NAME=FOLDER")
+    return label.strip(), Path(folder)
+
+
+def folder_names(folders: Sequence[str | Path]) -> list[str]:
+    """Return the shortest ends of the folders' paths that tell them apart."""
+    paths = [Path(folder).resolve() for folder in folders]
+    if len(set(paths)) < len(paths):
+        twice = next(path for path in paths if paths.count(path) > 1)
+        raise MemobenchError(f"{twice} is given twice; name each evaluation once")
+    depth = 1
+    while len({path.parts[-depth:] for path in paths}) < len(paths):
+        depth += 1
+    return ["/".join(path.parts[-depth:]) for path in paths]
+
+
+def _with_methods(runs: Sequence[Run]) -> list[Run]:
+    """Name the methods of runs that were not given a name, and the runs of named methods after them."""
+    unnamed = [run for run in runs if not run.method]
+    policies = [_policy(run) for run in unnamed]
+    types = [kind for kind, _ in dict.fromkeys(policies)]
+    methods: dict[int, str] = {}
+    for run, (kind, digest) in zip(unnamed, policies, strict=True):
+        alone = types.count(kind) == 1
+        methods[id(run)] = kind if alone else f"{kind} {digest[:HASH_DIGITS]}".strip()
+    chosen = [run.method or methods[id(run)] for run in runs]
+    # Where policies are not told, or several results of one stand at the same interval, folders are what is known.
+    places = [(method, run.replan_steps) for run, method in zip(runs, chosen, strict=True)]
+    repeated = {method for method, steps in places if places.count((method, steps)) > 1}
+    taken = {run.method for run in runs if run.method} & repeated
+    if taken:
+        name = min(taken)
+        raise MemobenchError(
+            f"two evaluations named {name!r} have the same replan interval; give them names of their own"
+        )
+    final = [run.name if method in repeated else method for run, method in zip(runs, chosen, strict=True)]
+    result = []
+    for run, method in zip(runs, final, strict=True):
+        name = run.name
+        if run.method:
+            steps = "" if final.count(method) == 1 else f" k={run.replan_steps}"
+            name = f"{method}{steps}"
+        result.append(Run(name, method, run.folder, run.records, run.protocol, run.notes))
+    return result
+
+
+def _policy(run: Run) -> tuple[str, str]:
+    """Return type and hash of a run's policy, "" as far as they are unknown."""
+    policy = run.protocol.get(POLICY) or {}
+    return str(policy.get("type") or "policy"), str(policy.get("sha256") or "")
+
+
+def by_method(runs: Sequence[Run]) -> dict[str, list[Run]]:
+    """Return method -> its runs, by replan interval; runs without one come last."""
+    grouped: dict[str, list[Run]] = {}
+    for run in runs:
+        grouped.setdefault(run.method, []).append(run)
+    return {
+        method: sorted(group, key=lambda run: (run.replan_steps is None, run.replan_steps or 0))
+        for method, group in grouped.items()
+    }
+
+
+def sweeps(runs: Sequence[Run]) -> dict[str, list[Run]]:
+    """Return the methods that were evaluated at several replan intervals."""
+    known = {name: [run for run in group if run.replan_steps is not None] for name, group in by_method(runs).items()}
+    return {name: group for name, group in known.items() if len({run.replan_steps for run in group}) > 1}

@@ -1,0 +1,1 @@
+"""Does a mechanism help? Policies trained and compared under one budget."""

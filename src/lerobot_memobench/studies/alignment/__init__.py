@@ -1,0 +1,1 @@
+"""What does each alignment do to a memory?"""
