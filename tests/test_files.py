@@ -1,0 +1,73 @@
+"""A file is there whole or not at all, and a name out of data names a file in its folder or nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files import draft_of, file_name, remove_drafts, write_file
+from lerobot_memobench.tasks.catalogue import task_names
+
+
+@pytest.mark.parametrize("durable", [False, True])
+def test_a_file_is_replaced_whole(tmp_path: Path, durable: bool) -> None:
+    path = tmp_path / "report.json"
+    write_file(path, "äöü\n", durable=durable)
+    assert path.read_text(encoding="utf-8") == "äöü\n"
+    write_file(path, b"\x00\x01", durable=durable)
+    assert path.read_bytes() == b"\x00\x01"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_failure_leaves_the_earlier_file_and_no_draft(tmp_path: Path) -> None:
+    path = write_file(tmp_path / "card.json", "earlier")
+    with pytest.raises(ZeroDivisionError), draft_of(path) as draft:
+        draft.write_text("half" * (draft.write_text("half") // 0))
+    assert path.read_text() == "earlier"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_writers_of_one_file_have_drafts_of_their_own(tmp_path: Path) -> None:
+    path = tmp_path / "log.jsonl"
+    with draft_of(path) as first, draft_of(path) as second:
+        assert first != second
+        assert first.suffix == second.suffix == path.suffix
+        first.write_text("first")
+        second.write_text("second")
+    assert path.read_text() == "first"  # the outer block ends last
+
+
+def test_what_killed_processes_left_is_removed(tmp_path: Path) -> None:
+    keep = write_file(tmp_path / "kept.part.txt", "")
+    with draft_of(tmp_path / "film.mp4") as draft:
+        (tmp_path / draft.name.replace("film", "other")).write_text("")
+        draft.write_text("")
+    remove_drafts(tmp_path)
+    assert sorted(tmp_path.iterdir()) == [tmp_path / "film.mp4", keep]
+
+
+@pytest.mark.parametrize(
+    "name", ["", ".", "..", "../x", "a/b", "a\\b", ".hidden", "a\0b", "a\nb", "C:x", "x" * 256, 3, None]
+)
+def test_a_name_that_leads_elsewhere_is_refused(name: object) -> None:
+    with pytest.raises(MemobenchError, match="the task's name"):
+        file_name(name, "the task's name")
+
+
+def test_the_names_of_tasks_are_names_of_files() -> None:
+    assert [file_name(name, "a task") for name in task_names()] == list(task_names())
+
+
+@given(st.text())
+def test_an_accepted_name_stays_in_its_folder(name: str) -> None:
+    base = Path("/some/folder")
+    try:
+        accepted = file_name(name, "a name")
+    except MemobenchError:
+        return
+    assert (base / accepted).parent == base
+    assert (base / accepted).name == name

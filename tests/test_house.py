@@ -1,0 +1,89 @@
+"""What docs/develop.md promises of the house, read from the source: floors, circles, private names, sizes."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import statistics
+import sys
+from collections.abc import Collection, Iterator
+from pathlib import Path
+
+import numpy as np
+
+SCRIPT = Path(__file__).parents[1] / "scripts" / "house.py"
+spec = importlib.util.spec_from_file_location("house", SCRIPT)
+assert spec is not None
+assert spec.loader is not None
+house = importlib.util.module_from_spec(spec)
+sys.modules["house"] = house
+spec.loader.exec_module(house)
+
+PACKAGE = house.PACKAGE
+IMPORTS = house.read_imports()
+TREES = {name: ast.parse(path.read_text()) for name, path in house.modules().items()}
+
+
+def test_the_plan_names_every_package() -> None:
+    listed = set(house.plan())
+    there = {house.package_of(name) for name in IMPORTS} - {""}
+    assert listed == there, "docs/develop.md lists the packages, lowest first"
+
+
+def test_imports_go_down_the_plan_only() -> None:
+    order = list(house.plan())
+    upwards = [
+        f"{name} imports {target}"
+        for name, targets in IMPORTS.items()
+        for target in targets
+        if house.package_of(name) and order.index(house.package_of(target)) > order.index(house.package_of(name))
+    ]
+    assert not upwards
+
+
+def test_no_files_import_each_other_in_a_circle() -> None:
+    assert house.circle(IMPORTS) == []
+
+
+def test_a_circle_is_found() -> None:
+    assert house.circle({"a": {"b"}, "b": {"c"}, "c": set()}) == []
+    assert set(house.circle({"a": {"b"}, "b": {"c"}, "c": {"b"}})) == {"b", "c"}
+
+
+def private_names(tree: ast.AST, known: Collection[str]) -> Iterator[str]:
+    """Yield what a file takes by ``from module import _name``, and what it reads as ``module._name``."""
+    froms = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module]
+    taken = [(node.module, alias) for node in froms for alias in node.names if str(node.module).startswith(PACKAGE)]
+    yield from (f"{module}.{alias.name}" for module, alias in taken if alias.name.startswith("_"))
+    bound = {alias.asname or alias.name for module, alias in taken if f"{module}.{alias.name}" in known}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in bound:
+            yield from (f"{node.value.id}.{name}" for name in [node.attr] if name.startswith("_") and name[1] != "_")
+
+
+def test_no_private_name_crosses_modules() -> None:
+    assert [(name, found) for name, tree in TREES.items() for found in private_names(tree, TREES)] == []
+
+
+def test_a_private_name_is_found() -> None:
+    source = f"from {PACKAGE}.sim import world\nfrom {PACKAGE}.files import _to_disk\nworld._x, world.__doc__"
+    assert list(private_names(ast.parse(source), TREES)) == [f"{PACKAGE}.files._to_disk", "world._x"]
+
+
+def test_the_picture_shows_the_imports_of_today() -> None:
+    wanted = {here: targets for here, targets in house.direct(house.arrows(IMPORTS)).items() if targets}
+    assert house.drawn() == wanted, "draw it anew: python scripts/house.py"
+
+
+def test_files_and_functions_are_short() -> None:
+    files = [len(path.read_text().splitlines()) for path in house.modules().values()]
+    functions = [
+        node.end_lineno - node.lineno + 1
+        for tree in TREES.values()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.end_lineno
+    ]
+    assert statistics.median(files) <= 120
+    assert np.percentile(files, 90) <= 350
+    assert statistics.median(functions) <= 9
+    assert np.percentile(functions, 90) <= 25
