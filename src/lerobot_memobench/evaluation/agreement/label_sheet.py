@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.agreement.kappa import Labels
+from lerobot_memobench.evaluation.agreement.study import Labels
 from lerobot_memobench.evaluation.documents.formats import csv_text
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import format_formula

@@ -60,22 +60,12 @@ def _draw_panel(
             "types, or use --axes types"
         )
     angles = [2 * math.pi * k / len(kept) for k in range(len(kept))]
-    closed = [*angles, angles[0]]
-    place.set_theta_offset(math.pi / 2)
-    place.set_theta_direction(-1)
-    place.set_ylim(0, 1.0)
-    place.set_xticks([])
-    place.set_yticks([])
-    place.spines["polar"].set_visible(False)
-    for ring in (0.25, 0.5, 0.75, 1.0):
-        place.plot(closed, [ring] * len(closed), color=style.GRID if ring < 1 else style.FAINT, lw=0.6, zorder=1)
-    for angle in angles:
-        place.plot([angle, angle], [0, 1], color=style.GRID, lw=0.6, zorder=1)
+    _draw_web(place, angles)
     published = {entry.method for entry in entries if entry.published}
     for method, values in shares.items():
         line = looks[method]
         place.plot(
-            closed,
+            [*angles, angles[0]],
             [*values, values[0]],
             color=line.colour,
             ls=line.dashes,
@@ -87,18 +77,7 @@ def _draw_panel(
             clip_on=False,
         )
     for angle, axis, top in zip(angles, kept, tops, strict=True):
-        memory_type, metric = axis
-        name = metric if memory_type is None else f"{memory_type}\n{metric}"
-        across, up = math.sin(angle), math.cos(angle)
-        place.text(
-            angle,
-            1.08,
-            f"{name}\n{top:.1f}",
-            ha="center" if abs(across) < 0.3 else ("left" if across > 0 else "right"),
-            va="center" if abs(up) < 0.3 else ("bottom" if up > 0 else "top"),
-            fontsize=8 if memory_type is None else 7,
-            linespacing=1.1,
-        )
+        _name_axis(place, angle, axis, top)
     place.set_title(title, pad=30 if len(kept) <= 4 else 34)
     place.legend(
         loc="upper center",
@@ -106,4 +85,35 @@ def _draw_panel(
         ncols=2,
         handlelength=3.2,
         columnspacing=1.2,
+    )
+
+
+def _draw_web(place: Any, angles: Sequence[float]) -> None:
+    """Draw rings and spokes, the first axis upwards, the others clockwise."""
+    place.set_theta_offset(math.pi / 2)
+    place.set_theta_direction(-1)
+    place.set_ylim(0, 1.0)
+    place.set_xticks([])
+    place.set_yticks([])
+    place.spines["polar"].set_visible(False)
+    for ring in (0.25, 0.5, 0.75, 1.0):
+        colour = style.GRID if ring < 1 else style.FAINT
+        place.plot([*angles, angles[0]], [ring] * (len(angles) + 1), color=colour, lw=0.6, zorder=1)
+    for angle in angles:
+        place.plot([angle, angle], [0, 1], color=style.GRID, lw=0.6, zorder=1)
+
+
+def _name_axis(place: Any, angle: float, axis: Axis, top: float) -> None:
+    """Write the name of an axis and its highest value outside the web."""
+    memory_type, metric = axis
+    name = metric if memory_type is None else f"{memory_type}\n{metric}"
+    across, up = math.sin(angle), math.cos(angle)
+    place.text(
+        angle,
+        1.08,
+        f"{name}\n{top:.1f}",
+        ha="center" if abs(across) < 0.3 else ("left" if across > 0 else "right"),
+        va="center" if abs(up) < 0.3 else ("bottom" if up > 0 else "top"),
+        fontsize=8 if memory_type is None else 7,
+        linespacing=1.1,
     )

@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.envs.film import LAST_FRAMES
-from lerobot_memobench.evaluation.metrics.rates import Record
+from lerobot_memobench.evaluation.metrics.rollouts import Record
+from lerobot_memobench.files import draft_of
 
 VIDEOS = "videos"
 LEROBOT_INFO = "eval_info.json"
@@ -127,16 +128,18 @@ def place_videos(chosen: Mapping[Path, Path], link: bool) -> None:
         if _is_same(source, target, link):
             continue
         target.parent.mkdir(parents=True, exist_ok=True)
-        draft = target.with_name(f".{target.name}.{os.getpid()}.part")
-        draft.unlink(missing_ok=True)
-        if link:
-            draft.symlink_to(source.resolve())
-        else:
-            try:
-                os.link(source.resolve(), draft)
-            except OSError:  # another file system, or one without hard links
-                shutil.copy2(source, draft)
-        os.replace(draft, target)
+        with draft_of(target) as draft:
+            _bring(source.resolve(), draft, link)
+
+
+def _bring(source: Path, target: Path, link: bool) -> None:
+    if link:
+        target.symlink_to(source)
+        return
+    try:
+        os.link(source, target)
+    except OSError:  # another file system, or one without hard links
+        shutil.copy2(source, target)
 
 
 def _is_same(source: Path, target: Path, link: bool) -> bool:

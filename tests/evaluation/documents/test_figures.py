@@ -1,0 +1,192 @@
+"""Figures: the numbers that are drawn, and that every figure can be drawn and saved."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lerobot_memobench.envs.annotate import OPERATION_COLOURS
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.documents.figures import correlations, entries, failures, prefix, radar, replan, style
+from lerobot_memobench.evaluation.records.runs import Run, read_runs
+from lerobot_memobench.paper import published_rows
+from lerobot_memobench.tasks.failures import FAILURES
+
+from .. import logs
+
+MODULE = "π0.5 + memory module"
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> list[Run]:
+    for k, successes in ((5, 1), (20, 3)):
+        logs.evaluation(tmp_path / f"k{k}", successes, replan_steps=k)
+    return read_runs([f"mine_$={tmp_path}/k{k}" for k in (5, 20)])
+
+
+# --- radar ---
+
+
+def best(table: str) -> dict[str, str]:
+    """Metric -> the method with the highest average over its best replan interval."""
+    axes = entries.average_axes()
+    found = entries.best_over_replan(entries.published_entries(table), axes)
+    return {metric: max(found, key=lambda name: found[name][k] or 0.0) for k, (_, metric) in enumerate(axes)}
+
+
+def test_the_papers_radar_says_what_its_text_says() -> None:
+    """Appendix "Radar Summaries": who is highest on each axis of both radars."""
+    assert best("main") == {"SR": MODULE, "MSR": MODULE, "MUR": "MemoryVLA", "MCR": "HiF-VLA"}
+    contrastive, semantic = "contrastive alignment", "semantic alignment"
+    assert best("alignment") == {"SR": contrastive, "MSR": semantic, "MUR": contrastive, "MCR": contrastive}
+
+
+def test_axes_are_normalised_by_their_highest() -> None:
+    kept, tops, shares = radar.normalised(entries.published_entries("main"), entries.average_axes())
+    assert tops == [31.9, 58.1, 49.9, 32.1]
+    assert len(kept) == 4
+    assert shares["MemoryVLA"] == pytest.approx([29.2 / 31.9, 55.1 / 58.1, 1.0, 14.1 / 32.1])
+    assert max(value for row in shares.values() for value in row) == 1.0
+
+
+def test_axes_that_apply_to_nobody_are_left_out() -> None:
+    kept, _, _ = radar.normalised(entries.published_entries("main"), entries.type_axes())
+    assert len(kept) == 13  # object has no U, C; procedural no C
+    assert ("object", "MUR") not in kept
+
+
+def test_a_radar_of_two_axes_is_refused(tmp_path: Path) -> None:
+    from lerobot_memobench.envs.episode_log import write_episodes
+
+    write_episodes(tmp_path, [logs.rollout("o", "object", "S", [True], True, 0)])
+    ours = entries.entries_of(read_runs([tmp_path]))
+    with pytest.raises(MemobenchError, match="only 2 apply"):
+        radar.draw([("", ours)], entries.average_axes())
+
+
+# --- correlations ---
+
+
+def test_the_papers_points_and_r() -> None:
+    rows = entries.published_entries("main")
+    counts = {metric: len(correlations.points(rows, metric)) for metric in ("MSR", "MUR", "MCR")}
+    assert counts == {"MSR": 24 * 4, "MUR": 24 * 3, "MCR": 24 * 2}
+    for metric in counts:
+        pairs = [
+            (figures[metric], figures["SR"])
+            for row in published_rows("main")
+            for figures in row.memory_types.values()
+            if figures[metric] is not None
+        ]
+        x, y = np.array(pairs, dtype=float).T
+        by_hand = np.sum((x - x.mean()) * (y - y.mean())) / np.sqrt(
+            np.sum((x - x.mean()) ** 2) * np.sum((y - y.mean()) ** 2)
+        )
+        assert correlations.pearson(correlations.points(rows, metric)) == pytest.approx(by_hand)
+
+
+@pytest.mark.parametrize(
+    ("found", "r"),
+    [
+        ([(0, 0, "object"), (1, 2, "object"), (2, 4, "object")], 1.0),
+        ([(0, 4, "object"), (1, 2, "object"), (2, 0, "object")], -1.0),
+        ([(1, 0, "object"), (1, 2, "object"), (1, 4, "object")], None),
+        ([(0, 0, "object"), (1, 1, "object")], None),
+    ],
+)
+def test_pearson(found: Sequence[correlations.Point], r: float | None) -> None:
+    value = correlations.pearson(found)
+    assert value is None if r is None else value == pytest.approx(r)
+
+
+def test_points_per_task(runs: list[Run]) -> None:
+    found = correlations.points(entries.entries_of(runs), "MCR", by_task=True)
+    assert found == [(25.0, 25.0, "spatial"), (75.0, 75.0, "spatial")]
+
+
+# --- bars and curves ---
+
+
+def test_bars_add_up(runs: list[Run]) -> None:
+    found = failures.bars(runs)
+    assert [bar.heading for bar in found] == ["all rollouts"] * 2 + ["temporal"] * 2 + ["spatial"] * 2
+    assert found[0].parts[:3] == (("success", 2, ""), ("storage_failure", 0, ""), ("stale_memory", 3, ""))
+    assert {bar.rollouts for bar in found} == {8, 4}
+    assert failures.paper_bar().rollouts == 150
+
+
+def test_prefix_panels(runs: list[Run]) -> None:
+    one, two = prefix.panels(runs)
+    assert (one.title, one.operations, two.operations) == ("one", "SU", "SUC")
+    assert one.curves[0].plain == (100.0, 25.0)
+    assert one.curves[1].ordered == (100.0, 75.0)
+    assert [panel.title for panel in prefix.panels(runs, ["one"])] == ["one"]
+    with pytest.raises(MemobenchError, match="'three' was not evaluated"):
+        prefix.panels(runs, ["three"])
+
+
+def test_replan_curves(runs: list[Run]) -> None:
+    ours, *theirs = replan.curves(runs, True, "average", "SR")
+    assert ours[0] == "mine_$"
+    assert ours[1] == [5, 20]
+    assert [rate.value for rate in ours[2]] == [0.25, 0.75]
+    assert len(theirs) == 6
+    assert all(curve[1] == [5, 20, 35, 50] for curve in theirs)
+    assert not replan.curves(runs, True, "object", "MCR")
+    with pytest.raises(MemobenchError, match="several replan intervals"):
+        replan.draw(runs[:1])
+
+
+# --- drawing ---
+
+
+def test_operations_have_the_colours_of_the_videos() -> None:
+    assert {key: "#" + bytes(colour).hex() for key, colour in OPERATION_COLOURS.items()} == style.OPERATION_COLOURS
+    assert list(style.OUTCOMES) == ["success", *FAILURES]
+    assert len({look.hatch for look in style.OUTCOMES.values()}) == len(style.OUTCOMES)
+
+
+def test_methods_look_different_in_colour_and_in_grey() -> None:
+    looks = list(style.lines([f"method {k}" for k in range(11)]).values())
+    for values in ([x.colour for x in looks], [x.marker for x in looks], [str(x.dashes) for x in looks]):
+        assert len(set(values)) == 11
+    many = style.lines([str(k) for k in range(30)]).values()
+    assert len({(x.colour, x.marker, str(x.dashes)) for x in many}) == 30
+    assert not {x.colour for x in looks} & set(style.OPERATION_COLOURS.values())
+
+
+def test_names_are_set_literally_but_for_the_models() -> None:
+    assert style.words("π0.5 + $x_1$") == r"$\pi_{0.5}$ + \$x_1\$"
+
+
+@pytest.mark.parametrize("name", ["radar", "correlations", "failures", "prefix", "replan"])
+def test_every_figure_of_ours_beside_the_papers(name: str, runs: list[Run], tmp_path: Path) -> None:
+    ours, theirs = entries.entries_of(runs), entries.published_entries("main")
+    drawn = {
+        "radar": lambda: radar.draw([("both", [*ours, *theirs])], entries.average_axes()),
+        "correlations": lambda: correlations.draw([*ours, *theirs]),
+        "failures": lambda: failures.draw([*failures.bars(runs), failures.paper_bar()]),
+        "prefix": lambda: prefix.draw([*prefix.panels(runs), prefix.paper_panel()]),
+        "replan": lambda: replan.draw(runs, paper=True),
+    }[name]()
+    (path,) = style.save(drawn, tmp_path / "out" / f"{name}.png", name)
+    from PIL import Image
+
+    with Image.open(path) as image:
+        colours = image.convert("RGB").getcolors(1_000_000)
+    assert colours is not None
+    assert len(colours) > 20
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+
+
+def test_a_folder_gets_pdf_and_png_and_the_same_figure_the_same_pdf(tmp_path: Path) -> None:
+    bars = [failures.paper_bar()]
+    first = style.save(failures.draw(bars), tmp_path / "a", "f")
+    again = style.save(failures.draw(bars), tmp_path / "b", "f")
+    assert [path.name for path in first] == ["f.pdf", "f.png"]
+    assert first[0].read_bytes() == again[0].read_bytes()
+    with pytest.raises(MemobenchError, match=r"\.gif"):
+        style.save(failures.draw(bars), tmp_path / "f.gif", "f")
