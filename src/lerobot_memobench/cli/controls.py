@@ -111,8 +111,7 @@ def oracle(
     out: Out = None,
 ) -> int:
     """Print which share of the gap to 100 % oracle memory closes: what a perfect memory would recover."""
-    from lerobot_memobench.evaluation.comparison.oracle_memory import contrasts, published_contrasts
-    from lerobot_memobench.evaluation.comparison.oracle_memory_report import oracle_report
+    from lerobot_memobench.evaluation.comparison.oracle_memory import contrasts, oracle_report, published_contrasts
     from lerobot_memobench.paper import raw_tables
 
     pairs, notes = _pairs(standard, oracle, ignore=("oracle_memory",))
@@ -131,8 +130,7 @@ def shuffled(
     out: Out = None,
 ) -> int:
     """Print how far rollouts come with normal and with shuffled memory, checkpoint by checkpoint."""
-    from lerobot_memobench.evaluation.comparison.shuffled_memory import prefix_curves
-    from lerobot_memobench.evaluation.comparison.shuffled_memory_report import shuffled_report
+    from lerobot_memobench.evaluation.comparison.shuffled_memory import prefix_curves, shuffled_report
     from lerobot_memobench.paper import shuffled_control
 
     pairs, notes = _pairs([normal], [shuffled])

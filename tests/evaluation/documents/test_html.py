@@ -255,6 +255,14 @@ def write_frames(path: Path, count: int) -> None:
         container.mux(stream.encode())
 
 
+def test_a_referent_that_is_a_path_leads_nowhere(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    evaluation(run, [record(referent="x/../../../outside")])
+    film(run / "videos" / f"{STOVE}.0.mp4", 13)
+    assert write_html([run], tmp_path / "out").videos == 0
+    assert not list(tmp_path.rglob("outside*"))
+
+
 @pytest.mark.parametrize("name", ["../outside", "/outside", "a\nb", "a/b"])
 def test_a_task_that_is_a_path_leads_nowhere(tmp_path: Path, name: str) -> None:
     run = tmp_path / "run"

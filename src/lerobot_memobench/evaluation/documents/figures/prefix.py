@@ -111,9 +111,7 @@ def draw(found: Sequence[Panel]) -> Figure:
 def _legend(figure: Figure, found: Sequence[Panel], looks: Mapping[str, style.Line], columns: int) -> None:
     from matplotlib.lines import Line2D
 
-    handles = [
-        Line2D([], [], color=look.colour, marker=look.marker, ls=look.dashes, ms=4, lw=1.3) for look in looks.values()
-    ]
+    handles = [Line2D([], [], **look.drawn, ms=4, lw=1.3) for look in looks.values()]
     labels = [style.words(name) for name in looks]
     if any(curve.ordered not in (None, curve.plain) for panel in found for curve in panel.curves):
         handles.append(Line2D([], [], color=style.FAINT, marker="o", mfc="white", ls=":", ms=4, lw=1.0))
@@ -142,7 +140,7 @@ def _draw_curve(place: Any, curve: Curve, look: style.Line, shaded: bool) -> Non
     steps = range(len(curve.plain))
     if curve.low is not None and curve.high is not None and shaded:
         place.fill_between(steps, curve.low, curve.high, color=look.colour, alpha=0.12, lw=0, zorder=1)
-    common = {"color": look.colour, "marker": look.marker, "clip_on": False}
-    place.plot(steps, curve.plain, ls=look.dashes, ms=4, lw=1.3, zorder=3, **common)
+    place.plot(steps, curve.plain, **look.drawn, ms=4, lw=1.3, zorder=3, clip_on=False)
     if curve.ordered is not None and curve.ordered != curve.plain:
-        place.plot(steps, curve.ordered, mfc="white", ls=":", ms=3, lw=0.9, zorder=4, **common)
+        dotted = look.drawn | {"ls": ":"}
+        place.plot(steps, curve.ordered, **dotted, mfc="white", ms=3, lw=0.9, zorder=4, clip_on=False)

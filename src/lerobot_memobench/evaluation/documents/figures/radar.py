@@ -63,19 +63,9 @@ def _draw_panel(
     _draw_web(place, angles)
     published = {entry.method for entry in entries if entry.published}
     for method, values in shares.items():
-        line = looks[method]
-        place.plot(
-            [*angles, angles[0]],
-            [*values, values[0]],
-            color=line.colour,
-            ls=line.dashes,
-            marker=line.marker,
-            ms=4,
-            lw=1.3 if method in published else 2.0,
-            label=style.words(method),
-            zorder=3,
-            clip_on=False,
-        )
+        width, label = 1.3 if method in published else 2.0, style.words(method)
+        drawn = looks[method].drawn
+        place.plot(_closed(angles), _closed(values), **drawn, ms=4, lw=width, label=label, zorder=3, clip_on=False)
     for angle, axis, top in zip(angles, kept, tops, strict=True):
         _name_axis(place, angle, axis, top)
     place.set_title(title, pad=30 if len(kept) <= 4 else 34)
@@ -88,6 +78,10 @@ def _draw_panel(
     )
 
 
+def _closed(values: Sequence[float]) -> list[float]:
+    return [*values, values[0]]
+
+
 def _draw_web(place: Any, angles: Sequence[float]) -> None:
     """Draw rings and spokes, the first axis upwards, the others clockwise."""
     place.set_theta_offset(math.pi / 2)
@@ -98,7 +92,7 @@ def _draw_web(place: Any, angles: Sequence[float]) -> None:
     place.spines["polar"].set_visible(False)
     for ring in (0.25, 0.5, 0.75, 1.0):
         colour = style.GRID if ring < 1 else style.FAINT
-        place.plot([*angles, angles[0]], [ring] * (len(angles) + 1), color=colour, lw=0.6, zorder=1)
+        place.plot(_closed(angles), [ring] * (len(angles) + 1), color=colour, lw=0.6, zorder=1)
     for angle in angles:
         place.plot([angle, angle], [0, 1], color=style.GRID, lw=0.6, zorder=1)
 

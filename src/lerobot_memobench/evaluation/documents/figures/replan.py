@@ -90,10 +90,7 @@ def _legend(figure: Figure, found: Sequence[Curve], looks: Mapping[str, style.Li
     from matplotlib.lines import Line2D
 
     ours = {name for name, _, _, published in found if not published}
-    handles = [
-        Line2D([], [], color=look.colour, marker=look.marker, ls=look.dashes, ms=4, lw=_width(name in ours))
-        for name, look in looks.items()
-    ]
+    handles = [Line2D([], [], **look.drawn, ms=4, lw=_width(name in ours)) for name, look in looks.items()]
     marks = [style.words(name) if name in ours or not ours else f"paper: {style.words(name)}" for name in looks]
     style.legend_below(figure, handles, marks, 4 if max(map(len, looks)) < 20 else 3)
 
@@ -109,17 +106,8 @@ def _draw_curve(place: Any, curve: Curve, look: style.Line) -> None:
         intervals = [rate.interval or (0.0, 1.0) for rate in rates]
         low, high = ([100 * bounds[k] for bounds in intervals] for k in (0, 1))
         place.fill_between(steps, low, high, color=look.colour, alpha=0.15, lw=0, zorder=1)
-    place.plot(
-        steps,
-        values,
-        color=look.colour,
-        marker=look.marker,
-        ls=look.dashes,
-        ms=4,
-        lw=_width(not published),
-        zorder=2 if published else 3,
-        clip_on=False,
-    )
+    order = 2 if published else 3
+    place.plot(steps, values, **look.drawn, ms=4, lw=_width(not published), zorder=order, clip_on=False)
 
 
 def _frame(place: Any, found: Sequence[Curve]) -> None:

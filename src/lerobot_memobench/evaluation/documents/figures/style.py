@@ -57,6 +57,11 @@ class Line:
     marker: str
     dashes: Any
 
+    @property
+    def drawn(self) -> dict[str, Any]:
+        """The same as matplotlib's keywords."""
+        return {"color": self.colour, "marker": self.marker, "ls": self.dashes}
+
 
 _COLOURS = (
     "#0072b2", "#d55e00", "#000000", "#cc79a7", "#882255", "#999933", "#777777", "#332288", "#44aa99", "#aa4499",

@@ -14,6 +14,7 @@ from typing import Any
 from lerobot_memobench import __version__
 from lerobot_memobench.envs.annotate import OPERATION_COLOURS
 from lerobot_memobench.evaluation.documents.evaluation_tables import outcomes
+from lerobot_memobench.evaluation.documents.html.videos import episode_id
 from lerobot_memobench.evaluation.documents.sentences import count_of, settings_phrases
 from lerobot_memobench.evaluation.documents.tables import OPERATION_NAMES
 from lerobot_memobench.evaluation.metrics.failures import failure_of
@@ -195,12 +196,6 @@ def episode_data(record: Record, video: str | None) -> dict[str, Any]:
         "scene": record.get("scene_hash"),
         "video": video,
     }
-
-
-def episode_id(record: Record) -> str:
-    """Return a name that is the same in every run: task, episode, and the referent where it is not the published."""
-    referent = record.get("referent", "fixed")
-    return f"{record['task']}.{record['episode']}" + ("" if referent == "fixed" else f".{referent}")
 
 
 def _last_step(record: Record) -> int:

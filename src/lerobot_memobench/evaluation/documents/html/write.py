@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.documents.html.collect import Run, episode_id, page_data, read_runs, task_source
+from lerobot_memobench.evaluation.documents.html.collect import Run, page_data, read_runs, task_source
 from lerobot_memobench.evaluation.documents.html.page import MARK, page
-from lerobot_memobench.evaluation.documents.html.videos import VIDEOS, find_videos, place_videos
+from lerobot_memobench.evaluation.documents.html.videos import VIDEOS, episode_id, find_videos, place_videos
 from lerobot_memobench.files import write_file
 
 PAGE = "index.html"
