@@ -1,7 +1,8 @@
 """Figures with bootstrap intervals, and how they are written: in cells in per cent, in JSON with one decimal.
 
 Intervals are percentiles of a bootstrap that draws episodes within each task and keeps the pairs together, so that what
-both share (an easy scene) does not widen them. Rates are fractions here.
+both share (an easy scene) does not widen them; `scipy.stats.bootstrap` draws from one sample and knows no tasks. Rates
+are fractions here.
 """
 
 from __future__ import annotations

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.comparison.control_tables import PAPER_TASK, prefix_header, prefix_row
 from lerobot_memobench.evaluation.comparison.estimates import as_percent
-from lerobot_memobench.evaluation.comparison.prefix_rows import PAPER_TASK, prefix_header, prefix_row
 from lerobot_memobench.evaluation.documents.tables import Cell, Name, Report, Section, Table
 from lerobot_memobench.evaluation.metrics.rates import METRICS, PROCESS_METRICS, Rate, Row
 from lerobot_memobench.evaluation.metrics.rollouts import Record

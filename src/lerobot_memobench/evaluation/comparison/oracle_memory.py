@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_memobench.evaluation.comparison.control_tables import PAPER, replan_title
 from lerobot_memobench.evaluation.comparison.estimates import (
     DRAWS,
     Array,
@@ -21,7 +22,6 @@ from lerobot_memobench.evaluation.comparison.estimates import (
     number,
     percentiles,
 )
-from lerobot_memobench.evaluation.comparison.prefix_rows import PAPER, replan_title
 from lerobot_memobench.evaluation.documents.tables import NOT_APPLICABLE, Cell, Report, Section, Table
 from lerobot_memobench.evaluation.metrics.rates import METRICS, value_of
 from lerobot_memobench.evaluation.metrics.rollouts import Record, by_task

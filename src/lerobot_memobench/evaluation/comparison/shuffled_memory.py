@@ -8,6 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_memobench.evaluation.comparison.control_tables import (
+    PAPER,
+    PAPER_TASK,
+    prefix_header,
+    prefix_row,
+    replan_title,
+)
 from lerobot_memobench.evaluation.comparison.estimates import (
     DRAWS,
     Array,
@@ -16,13 +23,6 @@ from lerobot_memobench.evaluation.comparison.estimates import (
     estimate,
     number,
     percentiles,
-)
-from lerobot_memobench.evaluation.comparison.prefix_rows import (
-    PAPER,
-    PAPER_TASK,
-    prefix_header,
-    prefix_row,
-    replan_title,
 )
 from lerobot_memobench.evaluation.documents.tables import Cell, Name, Report, Section, Table
 from lerobot_memobench.evaluation.metrics.rates import Rate

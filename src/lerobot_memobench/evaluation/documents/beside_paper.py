@@ -14,7 +14,6 @@ from lerobot_memobench.tasks.task import MEMORY_TYPES
 PAPER_PROTOCOL = {"referent": "fixed", "prompt_video": True, "horizon": 1200, "seed_base": 7}
 PAPER_TASKS, PAPER_EPISODES = 30, 50
 
-
 TABLES = (
     ("paper-main", "Beside the paper's main results", ("main",)),
     ("paper-alignment", "Beside the paper's memory alignment results", ("alignment",)),

@@ -19,7 +19,6 @@ VISITS = 300_000
 Policy = dict[int, str]
 """Picture → answer."""
 
-
 Memories = tuple[int | None, ...]
 """Per goal what it remembers, None once it held in time."""
 

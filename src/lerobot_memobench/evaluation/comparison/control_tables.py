@@ -1,4 +1,4 @@
-"""Rows of prefix completion: a task's checkpoints and then its success, as wide as the widest task asks for."""
+"""What the tables of the controls share: titles, and rows of prefix completion as wide as the widest task asks for."""
 
 from __future__ import annotations
 
