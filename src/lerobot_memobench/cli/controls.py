@@ -18,8 +18,8 @@ from lerobot_memobench.tasks.task import LEVELS
 
 if TYPE_CHECKING:
     from lerobot_memobench.evaluation.documents.tables import Report
-    from lerobot_memobench.evaluation.metrics.rates import Record
-    from lerobot_memobench.evaluation.necessity.report import Result
+    from lerobot_memobench.evaluation.metrics.rollouts import Record
+    from lerobot_memobench.evaluation.necessity.study import Result
 
 
 app = typer.Typer(
@@ -55,8 +55,9 @@ def necessity(
     ] = None,
 ) -> int:
     """Find moments that look the same and need different answers; print what a policy without memory can reach."""
+    from lerobot_memobench.evaluation.necessity.question import REFERENTS, Settings
     from lerobot_memobench.evaluation.necessity.report import put_into_page, terminal_table, write
-    from lerobot_memobench.evaluation.necessity.study import REFERENTS, Settings, study
+    from lerobot_memobench.evaluation.necessity.study import study
 
     settings = Settings(episodes=episodes, budget=budget, tolerance=tolerance)
     settings_of = REFERENTS if referent is WhichReferent.BOTH else (referent.value,)
@@ -110,8 +111,7 @@ def oracle(
     out: Out = None,
 ) -> int:
     """Print which share of the gap to 100 % oracle memory closes: what a perfect memory would recover."""
-    from lerobot_memobench.evaluation.comparison.controls import contrasts, published_contrasts
-    from lerobot_memobench.evaluation.comparison.controls_report import oracle_report
+    from lerobot_memobench.evaluation.comparison.oracle_memory import contrasts, oracle_report, published_contrasts
     from lerobot_memobench.paper import raw_tables
 
     pairs, notes = _pairs(standard, oracle, ignore=("oracle_memory",))
@@ -130,8 +130,7 @@ def shuffled(
     out: Out = None,
 ) -> int:
     """Print how far rollouts come with normal and with shuffled memory, checkpoint by checkpoint."""
-    from lerobot_memobench.evaluation.comparison.controls import prefix_curves
-    from lerobot_memobench.evaluation.comparison.controls_report import shuffled_report
+    from lerobot_memobench.evaluation.comparison.shuffled_memory import prefix_curves, shuffled_report
     from lerobot_memobench.paper import shuffled_control
 
     pairs, notes = _pairs([normal], [shuffled])
@@ -149,8 +148,8 @@ def granularity(
 ) -> int:
     """Print the metrics by the language level of the subgoals that a policy was taught with."""
     from lerobot_memobench.envs.episode_log import read_episodes
-    from lerobot_memobench.evaluation.comparison.controls import by_replan, relabelled
-    from lerobot_memobench.evaluation.comparison.controls_report import granularity_report
+    from lerobot_memobench.evaluation.comparison.granularity import granularity_report, relabelled
+    from lerobot_memobench.evaluation.comparison.pairing import by_replan
 
     folders = dict(zip(LEVELS, (coarse, intermediate, fine), strict=True))
     for folder in (intermediate, fine):
@@ -178,7 +177,7 @@ def _pairs(
 ) -> tuple[dict[int | None, tuple[list[Record], list[Record]]], list[str]]:
     """Return the paired rollouts of two sets of evaluations by replan interval, and what a reader must know."""
     from lerobot_memobench.envs.episode_log import read_episodes
-    from lerobot_memobench.evaluation.comparison.controls import by_replan, paired
+    from lerobot_memobench.evaluation.comparison.pairing import by_replan, paired
 
     _refuse_unlike(first, second, ignore)
     notes: list[str] = []

@@ -103,12 +103,13 @@ def compare(
     permutations: Annotated[int, typer.Option(min=100, help="Random signs where not all can be tried.")] = 10_000,
 ) -> None:
     """Compare two evaluations of the same episodes, pair by pair: McNemar for success, sign-flip for the rates."""
-    from lerobot_memobench.evaluation.comparison import differences as comparison
+    from lerobot_memobench.evaluation.comparison import differences_report
+    from lerobot_memobench.evaluation.comparison.differences import compare as compared
     from lerobot_memobench.evaluation.records.runs import read_runs
 
     first, second = read_runs([a, b])
-    found = comparison.compare(first, second, allow=allow or (), seed=seed, permutations=permutations)
-    _show(comparison.report(found), "compare", format_, out)
+    found = compared(first, second, allow=allow or (), seed=seed, permutations=permutations)
+    _show(differences_report.report(found), "compare", format_, out)
 
 
 def agreement(
@@ -129,9 +130,11 @@ def agreement(
     out: Annotated[Path | None, typer.Option(help="Folder for agreement.md, agreement.json and so on.")] = None,
 ) -> None:
     """Agreement of raters with one another and with the released operation labels."""
-    from lerobot_memobench.evaluation.agreement import kappa as statistics
     from lerobot_memobench.evaluation.agreement.label_sheet import blank_sheet, read_labels
-    from lerobot_memobench.evaluation.documents.report import put
+    from lerobot_memobench.evaluation.agreement.published import published_report
+    from lerobot_memobench.evaluation.agreement.report import report as study_report
+    from lerobot_memobench.evaluation.agreement.study import study
+    from lerobot_memobench.files import write_file
     from lerobot_memobench.paper import annotator_agreement
 
     if sum([labels is not None, paper, template is not None]) != 1:
@@ -140,11 +143,11 @@ def agreement(
         if template.exists():
             raise MemobenchError(f"--template {template} exists; name a new file, raters may have filled in that one")
         template.parent.mkdir(parents=True, exist_ok=True)
-        console().print(str(put(template, blank_sheet(raters))), soft_wrap=True)
+        console().print(str(write_file(template, blank_sheet(raters))), soft_wrap=True)
     elif labels is not None:
-        _show(statistics.report(statistics.study(read_labels(labels))), "agreement", format_, out)
+        _show(study_report(study(read_labels(labels))), "agreement", format_, out)
     else:
-        _show(statistics.published_report(annotator_agreement()), "agreement_paper", format_, out)
+        _show(published_report(annotator_agreement()), "agreement_paper", format_, out)
 
 
 ENDINGS = {
@@ -158,7 +161,7 @@ ENDINGS = {
 def _show(found: Report, name: str, formats_: list[ReportFormat] | None, out: Path | None) -> None:
     """Print a report in the formats wanted, or write it to a folder."""
     from lerobot_memobench.evaluation.documents import formats
-    from lerobot_memobench.evaluation.documents.report import put
+    from lerobot_memobench.files import write_file
 
     wanted = list(dict.fromkeys(formats_ or [ReportFormat.TABLE]))
     if ReportFormat.CSV in wanted:
@@ -179,4 +182,4 @@ def _show(found: Report, name: str, formats_: list[ReportFormat] | None, out: Pa
             print(write(found), end="")
         else:
             out.mkdir(parents=True, exist_ok=True)
-            screen.print(str(put(out / f"{name}.{ENDINGS[each]}", write(found))), soft_wrap=True)
+            screen.print(str(write_file(out / f"{name}.{ENDINGS[each]}", write(found))), soft_wrap=True)

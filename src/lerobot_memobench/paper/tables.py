@@ -131,6 +131,7 @@ def annotator_agreement() -> AgreementFigures:
     raw = raw_tables()["annotator_agreement"]
 
     def count(key: str) -> tuple[int, int]:
+        """Take ``part/whole`` apart."""
         part, whole = raw[key].split("/")
         return int(part), int(whole)
 

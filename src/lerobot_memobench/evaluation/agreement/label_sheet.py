@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.agreement.kappa import Labels
+from lerobot_memobench.evaluation.agreement.study import Labels
 from lerobot_memobench.evaluation.documents.formats import csv_text
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import format_formula
@@ -37,18 +37,7 @@ def read_labels(path: Path) -> Labels:
     Raises:
         MemobenchError: it cannot be read or is malformed; the message names file, line and column.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise MemobenchError(f"{path} cannot be read ({error.strerror or error})") from None
-    except UnicodeDecodeError as error:
-        raise MemobenchError(f"{path} is not UTF-8 at byte {error.start}; save it as CSV in UTF-8") from None
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-    try:
-        header = [name.strip() for name in next(reader, [])]
-        lines = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
-    except csv.Error as error:
-        raise MemobenchError(f"{path}, line {reader.line_num}: {error}; expected comma-separated values") from None
+    header, lines = _read(path)
     raters = _raters(path, header)
     names: list[str] = []
     released: list[str] = []
@@ -74,6 +63,23 @@ def read_labels(path: Path) -> Labels:
     return Labels(
         tuple(names), {name: tuple(labels) for name, labels in given.items()}, tuple(released) if released else None
     )
+
+
+def _read(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Return the header of a CSV file and its rows that are not empty, each with the number of its line."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise MemobenchError(f"{path} cannot be read ({error.strerror or error})") from None
+    except UnicodeDecodeError as error:
+        raise MemobenchError(f"{path} is not UTF-8 at byte {error.start}; save it as CSV in UTF-8") from None
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    try:
+        header = [name.strip() for name in next(reader, [])]
+        lines = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+    except csv.Error as error:
+        raise MemobenchError(f"{path}, line {reader.line_num}: {error}; expected comma-separated values") from None
+    return header, lines
 
 
 def _raters(path: Path, header: list[str]) -> list[str]:

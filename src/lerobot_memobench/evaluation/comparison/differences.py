@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.evaluation.comparison import paired_tests as paired
-from lerobot_memobench.evaluation.documents.report_sections import AVERAGE, count_of
-from lerobot_memobench.evaluation.documents.tables import Cell, Count, Name, Numbers, Report, Section, Table
-from lerobot_memobench.evaluation.metrics.rates import METRICS, Record, percent, satisfied
-from lerobot_memobench.evaluation.records.protocol import SETTINGS, differences
+from lerobot_memobench.evaluation.comparison import paired_tests
+from lerobot_memobench.evaluation.comparison.pairing import ALLOWED, Pair, common_episodes
+from lerobot_memobench.evaluation.documents.evaluation_tables import AVERAGE
+from lerobot_memobench.evaluation.documents.sentences import count_of
+from lerobot_memobench.evaluation.metrics.rates import METRICS, value_of
+from lerobot_memobench.evaluation.records.protocol import differences
 from lerobot_memobench.evaluation.records.runs import Run
 from lerobot_memobench.tasks.task import MEMORY_TYPES
-
-SCENES = "scene_hash"
-ALLOWED = (*SETTINGS, SCENES)
-"""What may differ between both when asked for by name."""
-
-Pair = tuple[Record, Record]
 
 
 @dataclass(frozen=True)
@@ -50,7 +44,13 @@ class Difference:
 
     @property
     def value(self) -> float:
+        """The second rate less the first."""
         return self.b - self.a
+
+    @property
+    def of_a_task(self) -> bool:
+        """Whether the scope is a task."""
+        return self.scope not in (AVERAGE, *MEMORY_TYPES)
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def compare(
     *,
     allow: Collection[str] = (),
     seed: int = 0,
-    permutations: int = paired.PERMUTATIONS,
+    permutations: int = paired_tests.PERMUTATIONS,
 ) -> Comparison:
     """Compare two evaluations over the episodes that both hold.
 
@@ -81,6 +81,20 @@ def compare(
     Raises:
         MemobenchError: the protocols differ in something else, or no episode is in both.
     """
+    _refuse_unlike(a, b, allow)
+    pairs = common_episodes(a, b, allow)
+    rng = np.random.default_rng(seed)
+    rows = [
+        row
+        for scope, members in _scopes(pairs).items()
+        for metric in METRICS
+        if (row := _difference(scope, metric, members, rng, permutations)) is not None
+    ]
+    return Comparison(a.name, b.name, len(pairs), tuple(_adjusted(rows)), tuple(_notes(a, b, len(pairs))))
+
+
+def _refuse_unlike(a: Run, b: Run, allow: Collection[str]) -> None:
+    """Raise where the protocols differ in something that was not allowed."""
     for name in allow:
         if name not in ALLOWED:
             raise MemobenchError(
@@ -93,67 +107,14 @@ def compare(
             "not the policies' alone; evaluate again, or name what is meant to differ: "
             f"--allow {found[0].split(':')[0]}"
         )
-    pairs = _pairs(a, b, allow)
+
+
+def _notes(a: Run, b: Run, pairs: int) -> list[str]:
+    """Return what a reader must know: what differs, what was left out, what the logs lack."""
     notes = [f"compared although {note}" for note in differences(a.protocol, b.protocol)]
-    left = {run.name: len(run.records) - len(pairs) for run in (a, b)}
+    left = {run.name: len(run.records) - pairs for run in (a, b)}
     notes += [f"{count_of(count, 'episode')} only in {name} left out" for name, count in left.items() if count]
-    notes += [f"{run.name}: {note}" for run in (a, b) for note in run.notes]
-    rng = np.random.default_rng(seed)
-    rows = [
-        row
-        for scope, members in _scopes(pairs).items()
-        for metric in METRICS
-        if (row := _difference(scope, metric, members, rng, permutations)) is not None
-    ]
-    return Comparison(a.name, b.name, len(pairs), tuple(_adjusted(rows)), tuple(notes))
-
-
-# --- pairs ---
-
-
-def _pairs(a: Run, b: Run, allow: Collection[str]) -> list[Pair]:
-    """Return the episodes that both hold: same task, number and referent."""
-
-    def key(record: Record) -> tuple[str, int, str]:
-        referent = "" if "referent" in allow else str(record.get("referent", "fixed"))
-        return record["task"], record["episode"], referent
-
-    others = {key(record): record for record in b.records}
-    pairs = [(record, others[key(record)]) for record in a.records if key(record) in others]
-    if not pairs:
-        raise MemobenchError(
-            f"{a.folder} and {b.folder} have no episode in common; expected evaluations of the same tasks, episodes "
-            "and referent"
-        )
-    if "seed_base" not in allow:
-        _refuse(pairs, "seed", "seed_base", "seeds")
-        if SCENES not in allow:
-            _refuse(pairs, "scene_hash", SCENES, "initial scenes")
-    for mine, other in pairs:
-        if _operations(mine) != _operations(other):
-            raise MemobenchError(
-                f"{mine['task']!r} has other checkpoints in {a.folder} ({_operations(mine)}) than in {b.folder} "
-                f"({_operations(other)}); compare evaluations of one version of the task"
-            )
-    return pairs
-
-
-def _refuse(pairs: Sequence[Pair], field: str, name: str, what: str) -> None:
-    """Refuse pairs that differ in a field that makes an episode; a side that does not tell it does not differ."""
-    different = [
-        (x, y) for x, y in pairs if x.get(field) is not None and y.get(field) is not None and x[field] != y[field]
-    ]
-    if different:
-        x, y = different[0]
-        raise MemobenchError(
-            f"{len(different)} of {len(pairs)} pairs do not have the same {what}, the first is {x['task']}, episode "
-            f"{x['episode']} ({field} {x[field]} and {y[field]}); these are different episodes. If that is meant: "
-            f"--allow {name}"
-        )
-
-
-def _operations(record: Record) -> str:
-    return "".join(checkpoint["operation"] for checkpoint in record["checkpoints"])
+    return notes + [f"{run.name}: {note}" for run in (a, b) for note in run.notes]
 
 
 def _scopes(pairs: Sequence[Pair]) -> dict[str, dict[str, list[Pair]]]:
@@ -174,26 +135,36 @@ def _scopes(pairs: Sequence[Pair]) -> dict[str, dict[str, list[Pair]]]:
     return scopes
 
 
-# --- differences ---
-
-
-def value_of(record: Record, metric: str) -> float | None:
-    """Return what a rollout gives to a metric: success, or the share of its operation's checkpoints satisfied."""
-    operation = METRICS[metric]
-    if operation is None:
-        return float(record["success"])
-    places = [k for k, checkpoint in enumerate(record["checkpoints"]) if checkpoint["operation"] == operation]
-    if not places:
-        return None
-    done = satisfied(record)
-    return sum(done[k] for k in places) / len(places)
+# --- one metric in one scope ---
 
 
 def _difference(
     scope: str, metric: str, tasks: Mapping[str, Sequence[Pair]], rng: np.random.Generator, permutations: int
 ) -> Difference | None:
     """Return the difference of one metric in one scope, weighed as the report weighs; None where not applicable."""
-    groups: dict[str, list[list[tuple[float, float]]]] = {}  # memory type -> tasks -> values of the pairs
+    groups = _values(metric, tasks)
+    if not groups:
+        return None
+    table = np.array([pair for group in groups for values in group for pair in values])
+    weights = np.array(
+        [1 / (len(groups) * len(group) * len(values)) for group in groups for values in group for _ in values]
+    )
+    a, b = (
+        _mean([_mean([_mean([pair[k] for pair in values]) for values in group]) for group in groups]) for k in (0, 1)
+    )
+    d = table[:, 1] - table[:, 0]
+    smallest = paired_tests.detectable(d, weights)
+    if metric == "SR":
+        only_a, only_b = int(np.sum(d < 0)), int(np.sum(d > 0))
+        p = paired_tests.mcnemar(only_a, only_b)
+        return Difference(scope, metric, len(d), a, b, p, True, smallest, only_a, only_b)
+    p, exact = paired_tests.sign_flip(d, weights, rng, permutations)
+    return Difference(scope, metric, len(d), a, b, p, exact, smallest)
+
+
+def _values(metric: str, tasks: Mapping[str, Sequence[Pair]]) -> list[list[list[tuple[float, float]]]]:
+    """Return memory types of tasks of what both rollouts of a pair give to a metric, where it applies."""
+    groups: dict[str, list[list[tuple[float, float]]]] = {}
     for pairs in tasks.values():
         values = [
             (x, y)
@@ -202,23 +173,7 @@ def _difference(
         ]
         if values:
             groups.setdefault(pairs[0][0]["memory_type"], []).append(values)
-    if not groups:
-        return None
-    table = np.array([pair for group in groups.values() for values in group for pair in values])
-    weights = np.array(
-        [1 / (len(groups) * len(group) * len(values)) for group in groups.values() for values in group for _ in values]
-    )
-    a, b = (
-        _mean([_mean([_mean([pair[k] for pair in values]) for values in g]) for g in groups.values()]) for k in (0, 1)
-    )
-    d = table[:, 1] - table[:, 0]
-    smallest = paired.detectable(d, weights)
-    if metric == "SR":
-        only_a, only_b = int(np.sum(d < 0)), int(np.sum(d > 0))
-        p = paired.mcnemar(only_a, only_b)
-        return Difference(scope, metric, len(d), a, b, p, True, smallest, only_a, only_b)
-    p, exact = paired.sign_flip(d, weights, rng, permutations)
-    return Difference(scope, metric, len(d), a, b, p, exact, smallest)
+    return list(groups.values())
 
 
 def _mean(values: Sequence[float]) -> float:
@@ -228,93 +183,9 @@ def _mean(values: Sequence[float]) -> float:
 
 def _adjusted(rows: Sequence[Difference]) -> list[Difference]:
     """Adjust the p-values of the tasks, per metric, for their number."""
-    from dataclasses import replace
-
     result = list(rows)
     for metric in METRICS:
-        places = [k for k, row in enumerate(rows) if row.metric == metric and row.scope not in (AVERAGE, *MEMORY_TYPES)]
-        for k, p in zip(places, paired.holm([rows[k].p for k in places]), strict=True):
+        places = [k for k, row in enumerate(rows) if row.metric == metric and row.of_a_task]
+        for k, p in zip(places, paired_tests.holm([rows[k].p for k in places]), strict=True):
             result[k] = replace(result[k], adjusted=p)
     return result
-
-
-# --- what is written ---
-
-NOTE = (
-    "Difference is the second less the first, in points. p: exact McNemar for SR (pairs of which only one succeeded "
-    "are given as first / second), sign-flip permutation for the others; for tasks also adjusted for their number "
-    "(Holm). "
-    "Detectable: the smallest true difference that so many pairs would show with 80 % power at 5 %."
-)
-
-
-def report(found: Comparison) -> Report:
-    """Return a comparison as tables and JSON values."""
-    overall = [row for row in found.differences if row.scope in (AVERAGE, *MEMORY_TYPES)]
-    by_task = [row for row in found.differences if row.scope not in (AVERAGE, *MEMORY_TYPES)]
-    tables = (
-        _table("difference", "Average and memory types", found, overall, tasks=False),
-        _table("difference-tasks", "Tasks", found, by_task, tasks=True),
-    )
-    sentence = f"{count_of(found.pairs, 'episode')} in both, paired by task, episode and referent."
-    title = f"{found.b} against {found.a}"
-    return Report(title, (Section("", tables, (sentence, NOTE), found.notes),), data(found))
-
-
-def _table(key: str, title: str, found: Comparison, rows: Sequence[Difference], tasks: bool) -> Table:
-    header = ["task" if tasks else "scope", "metric", "pairs", found.a, found.b, "difference", "only one", "p"]
-    header += ["p (Holm)"] * tasks + ["detectable"]
-    cells: list[tuple[Cell, ...]] = []
-    rules = set()
-    for k, row in enumerate(rows):
-        first = k == 0 or rows[k - 1].scope != row.scope
-        if first and k:
-            rules.add(k)
-        name: Cell = (Name(row.scope) if tasks else row.scope) if first else ""
-        only = "" if row.only_a is None else f"{row.only_a} / {row.only_b}"
-        line: list[Cell] = [name, row.metric, Count(row.n), _points(row.a), _points(row.b), _points(row.value, True)]
-        line += [Numbers(only), _p(row.p)]
-        line += [_p(row.adjusted)] * tasks
-        line.append(Numbers("> 100") if row.detectable is None else _points(row.detectable))
-        cells.append(tuple(line))
-    return Table(key, title, tuple(header), tuple(cells), rules=frozenset(rules))
-
-
-def _points(value: float, signed: bool = False) -> Numbers:
-    text = f"{percent(value):{'+' if signed else ''}.1f}"
-    return Numbers(text.replace("-", "−"))
-
-
-def _p(value: float | None) -> Numbers:
-    if value is None:
-        return Numbers("")
-    return Numbers("< 0.001" if value < 0.001 else f"{value:.3f}")
-
-
-def data(found: Comparison) -> dict[str, Any]:
-    """Return a comparison as JSON values; rates in per cent, p as they are."""
-
-    def entry(row: Difference) -> dict[str, Any]:
-        return {
-            "scope": row.scope,
-            "metric": row.metric,
-            "pairs": row.n,
-            "a": round(100 * row.a, 2),
-            "b": round(100 * row.b, 2),
-            "difference": round(100 * row.value, 2),
-            "only_a": row.only_a,
-            "only_b": row.only_b,
-            "test": "mcnemar_exact" if row.metric == "SR" else "sign_flip",
-            "exact": row.exact,
-            "p": row.p,
-            "p_holm": row.adjusted,
-            "detectable": None if row.detectable is None else round(100 * row.detectable, 2),
-        }
-
-    return {
-        "a": found.a,
-        "b": found.b,
-        "pairs": found.pairs,
-        "differences": [entry(row) for row in found.differences],
-        "notes": list(found.notes),
-    }

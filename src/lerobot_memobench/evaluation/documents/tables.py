@@ -9,6 +9,8 @@ from lerobot_memobench.evaluation.metrics.rates import Rate, percent
 
 NOT_APPLICABLE = "–"
 
+OPERATION_NAMES = {"S": "Storage", "U": "Update", "C": "Compression"}
+
 
 class Name(str):
     """Text that is an identifier, such as a task's name: Markdown and LaTeX set it in typewriter."""
@@ -55,6 +57,11 @@ class Table:
             if len(row) != len(self.header):
                 raise ValueError(f"a row of the table {self.key!r} has {len(row)} cells for {len(self.header)} columns")
 
+    @property
+    def titles(self) -> list[str]:
+        """The title of the group over each column, "" for none."""
+        return [title for title, span in self.groups for _ in range(span)] or [""] * len(self.header)
+
     def is_text(self, column: int) -> bool:
         """Return whether a column holds text and is therefore set flush left."""
         return any(isinstance(row[column], str) and not isinstance(row[column], Numbers) for row in self.rows)
@@ -80,6 +87,7 @@ class Report:
 
     @property
     def tables(self) -> list[Table]:
+        """The tables of all sections."""
         return [table for section in self.sections for table in section.tables]
 
 
@@ -89,11 +97,14 @@ def figure(value: float | None) -> str:
     return NOT_APPLICABLE if found is None else f"{found:.1f}"
 
 
+def plain(cell: Cell) -> str:
+    """Return a cell that is no rate as text."""
+    return NOT_APPLICABLE if cell is None else str(cell)
+
+
 def bounds(rate: Rate) -> tuple[str, str] | None:
     """Return the interval of a rate in per cent, None where it has none."""
-    if rate.value is None or rate.trials == 0:
-        return None
-    interval = rate.interval
+    interval = rate.interval if rate.trials else None
     return None if interval is None else (figure(interval[0]), figure(interval[1]))
 
 

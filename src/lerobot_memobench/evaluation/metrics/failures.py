@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections import Counter
+from collections.abc import Iterable
 
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.evaluation.metrics.rollouts import Record
 from lerobot_memobench.tasks.failures import FAILURES, classify
 
 
-def failure_of(record: Mapping[str, Any]) -> str | None:
+def failure_of(record: Record) -> str | None:
     """Return the failure class of a logged rollout, None for a success.
 
     A log without the class gets it from its checkpoints. Drift cannot be told from them, so it is then never
@@ -29,11 +30,7 @@ def failure_of(record: Mapping[str, Any]) -> str | None:
     return str(logged)
 
 
-def failure_counts(records: Iterable[Mapping[str, Any]]) -> dict[str, int]:
+def failure_counts(records: Iterable[Record]) -> dict[str, int]:
     """Return class -> number of failed rollouts, every class in the report's order."""
-    counts = dict.fromkeys(FAILURES, 0)
-    for record in records:
-        failure = failure_of(record)
-        if failure is not None:
-            counts[failure] += 1
-    return counts
+    found = Counter(failure_of(record) for record in records)
+    return {name: found[name] for name in FAILURES}

@@ -4,16 +4,16 @@ A *history* is one demonstrated episode seen as a row of decisions; a decision i
 (as the number of a class of pictures that cannot be told apart) and the answer that is right in this history. A policy
 without memory is a map from pictures to answers, or to probabilities of answers. It passes a history when it gives the
 right answer at each of its decisions; one wrong answer fails (what a policy may gain by trying again is the subject of
-`necessity_search`).
+`best_map` and `best_probabilities`).
 
 Histories of one scene are weighed together: they are what may lie behind the same pictures.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,13 +45,11 @@ def classes(difference: NDArray[np.floating], tolerance: float) -> list[int]:
     Args:
         difference: (n, n), symmetric.
     """
-    count = len(difference)
-    found = list(range(count))
-    for i, j in combinations(range(count), 2):
-        if difference[i, j] <= tolerance and found[i] != found[j]:
-            old, new = max(found[i], found[j]), min(found[i], found[j])
-            found = [new if number == old else number for number in found]
-    return found
+    from scipy.sparse.csgraph import connected_components
+
+    _, parts = connected_components(difference <= tolerance, directed=False)
+    _, first = np.unique(parts, return_index=True)
+    return [int(first[part]) for part in parts]
 
 
 def right_answers(histories: Sequence[History]) -> dict[int, list[str]]:
@@ -116,7 +114,7 @@ def stochastic_ceiling(histories: Sequence[History], seed: int = 0) -> float:
     least the deterministic ceiling.
     """
     answers = right_answers(histories)
-    counts = [_counts(history) for history in histories]
+    counts = [Counter((decision.picture, decision.answer) for decision in history) for history in histories]
     rng = np.random.default_rng(seed)
     best = deterministic_ceiling(histories)
     for start in range(RESTARTS + 1):
@@ -133,18 +131,10 @@ def stochastic_ceiling(histories: Sequence[History], seed: int = 0) -> float:
     return best
 
 
-def _counts(history: History) -> dict[tuple[int, str], int]:
-    counts: dict[tuple[int, str], int] = {}
-    for decision in history:
-        key = (decision.picture, decision.answer)
-        counts[key] = counts.get(key, 0) + 1
-    return counts
-
-
 def _climb(
     policy: dict[tuple[int, str], float],
     answers: dict[int, list[str]],
-    counts: Sequence[dict[tuple[int, str], int]],
+    counts: Sequence[Counter[tuple[int, str]]],
 ) -> float:
     value = 0.0
     for _ in range(ITERATIONS):

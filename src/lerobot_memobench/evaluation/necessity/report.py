@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import io
 import json
-import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.necessity.study import pictures_path
+from lerobot_memobench.evaluation.documents.tables import NOT_APPLICABLE, figure
+from lerobot_memobench.evaluation.necessity.aliased_pairs import figure as pairs_figure
+from lerobot_memobench.evaluation.necessity.study import Result
+from lerobot_memobench.files import write_file
 
 JSON_FILE, MARKDOWN_FILE, FIGURE_FILE = "necessity.json", "necessity.md", "aliased_pairs.png"
-NOT_APPLICABLE = "–"
-LARGEST_FIGURE = 300_000
-"""Bytes: the figure of the documentation is kept in the repository."""
-
-Result = Mapping[str, Any]
 
 VERDICTS = {
     "no": "pictures decide every step of the demonstrated routine: no memory is needed",
@@ -67,16 +63,12 @@ COLUMNS = (
 )
 
 
-def _percent(value: float | None) -> str:
-    return NOT_APPLICABLE if value is None else f"{100.0 * value:.1f}"
-
-
 def cells(result: Result, referent: str) -> list[str]:
     """Return a row of the table, without the task."""
     in_order, any_order, counts = result["in_order"], result["any_order"], result["aliased"]
     found = NOT_APPLICABLE
     if any_order is not None:
-        found = f"{_percent(any_order['deterministic'])} ({any_order['confirmed']}/{any_order['of']})"
+        found = f"{figure(any_order['deterministic'])} ({any_order['confirmed']}/{any_order['of']})"
         found += "" if any_order["complete"] else " ≥"
     expert = result["expert"]
     return [
@@ -85,11 +77,11 @@ def cells(result: Result, referent: str) -> list[str]:
         f"{result['decisions']:.1f}",
         NOT_APPLICABLE if counts is None else f"{counts['at_home']:.1f} / {counts['as_it_happens']:.1f}",
         *(
-            NOT_APPLICABLE if in_order is None else _percent(in_order[key])
+            NOT_APPLICABLE if in_order is None else figure(in_order[key])
             for key in ("chance", "deterministic", "stochastic", "pixel_exact")
         ),
         found,
-        NOT_APPLICABLE if any_order is None else _percent(any_order["stochastic"]),
+        NOT_APPLICABLE if any_order is None else figure(any_order["stochastic"]),
         f"{expert['success']}/{expert['n']}",
         verdict(result),
     ]
@@ -178,7 +170,7 @@ def put_into_page(page: Path, results: Sequence[Result]) -> Path:
         raise MemobenchError(
             f"the page {page} lacks the lines {PAGE_BEGIN!r} and {PAGE_END!r}; put them where the table goes"
         )
-    return _replace(page, f"{before}{begin}\n\n{markdown(results)}\n{end}{after}".encode())
+    return write_file(page, f"{before}{begin}\n\n{markdown(results)}\n{end}{after}")
 
 
 def write(out: Path, results: Sequence[Result]) -> list[Path]:
@@ -186,80 +178,10 @@ def write(out: Path, results: Sequence[Result]) -> list[Path]:
     out.mkdir(parents=True, exist_ok=True)
     content = [{**result, "memory_needed": verdict(result)} for result in results]
     written = [
-        _replace(out / JSON_FILE, (json.dumps(content, indent=1) + "\n").encode()),
-        _replace(out / MARKDOWN_FILE, ("# Memory necessity\n\n" + markdown(results)).encode()),
+        write_file(out / JSON_FILE, json.dumps(content, indent=1) + "\n"),
+        write_file(out / MARKDOWN_FILE, "# Memory necessity\n\n" + markdown(results)),
     ]
-    picture = figure(out, results)
+    picture = pairs_figure(out, results)
     if picture is not None:
-        written.append(_replace(out / FIGURE_FILE, picture))
+        written.append(write_file(out / FIGURE_FILE, picture))
     return written
-
-
-def _replace(path: Path, content: bytes) -> Path:
-    draft = path.with_name(path.name + ".part")
-    draft.write_bytes(content)
-    os.replace(draft, path)
-    return path
-
-
-FIGURE_PAIRS = 2
-_CAMERAS = ("third person", "wrist")
-
-
-def figure(out: Path, results: Sequence[Result]) -> bytes | None:
-    """Return a PNG of up to two aliased pairs: both moments side by side, and what is right at each; None without any.
-
-    One pair within an episode and one between goals are preferred: the two ways in which memory is needed.
-    """
-    from matplotlib.figure import Figure
-    from PIL import Image
-
-    shown: list[tuple[Result, Any]] = []
-    for result in results:
-        if not result["examples"]:
-            continue
-        path = pictures_path(out, result["task"], result["referent"], result["examples"][0]["seed"])
-        if not path.is_file():
-            continue
-        if all(_kind(other) != _kind(result) for other, _ in shown):
-            shown.append((result, Image.open(path).convert("RGB")))
-    if not shown:
-        return None
-    plot = Figure(figsize=(10, 3.1 * len(shown)), layout="constrained")
-    grid = plot.subplots(len(shown), 4, squeeze=False)
-    for axes, (result, strip) in zip(grid, shown, strict=True):
-        pair, side = result["examples"][0], strip.height
-        for k, axis in enumerate(axes):
-            axis.imshow(strip.crop((k * side, 0, (k + 1) * side, side)))
-            axis.set_xticks([])
-            axis.set_yticks([])
-            axis.set_xlabel(_CAMERAS[k % 2], fontsize=8)
-        for axis, moment in ((axes[0], pair["a"]), (axes[2], pair["b"])):
-            axis.set_title(f"step {moment['step']}: {_short(moment['answer'])}", fontsize=9, loc="left")
-        axes[0].set_ylabel(_wrapped(result["task"]), fontsize=8)
-    buffer = io.BytesIO()
-    plot.savefig(buffer, dpi=110, format="png")
-    small = Image.open(buffer).convert("RGB").quantize(192, dither=Image.Dither.NONE)
-    buffer = io.BytesIO()
-    small.save(buffer, "PNG", optimize=True)
-    if buffer.tell() > LARGEST_FIGURE:
-        raise MemobenchError(
-            f"the figure has {buffer.tell()} bytes, expected at most {LARGEST_FIGURE}; draw it smaller"
-        )
-    return buffer.getvalue()
-
-
-def _kind(result: Result) -> bool:
-    """Whether the first pair lies within one episode."""
-    pair = result["examples"][0]
-    return bool(pair["a"]["variant"] == pair["b"]["variant"])
-
-
-def _short(answer: str) -> str:
-    return answer.strip("()").replace("_1", "").replace("_", " ")
-
-
-def _wrapped(name: str, width: int = 26) -> str:
-    import textwrap
-
-    return "\n".join(textwrap.wrap(name.replace("_", " "), width))

@@ -6,15 +6,17 @@ replan intervals; without names, those of the same policy are.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.metrics.rates import Record, Summary, mixtures, summarise
+from lerobot_memobench.evaluation.metrics.rollouts import Record, mixtures
+from lerobot_memobench.evaluation.metrics.summary import Summary, summarise
 from lerobot_memobench.evaluation.records.protocol import POLICY, read_protocol
 
 HASH_DIGITS = 8
@@ -38,6 +40,7 @@ class Run:
 
     @cached_property
     def summary(self) -> Summary:
+        """Every figure of its rollouts."""
         return summarise(self.records)
 
     @cached_property
@@ -64,13 +67,22 @@ def read_runs(words: Sequence[str | Path]) -> list[Run]:
     names = folder_names([folder for _, folder in given])
     runs = []
     for (label, folder), name in zip(given, names, strict=True):
-        notes: list[str] = []
-        records = read_episodes(folder, notes)
-        if not records:
-            raise MemobenchError(f"{folder} holds no rollout that can be read; run an evaluation first")
-        notes += mixtures(records)
+        records, notes = read_rollouts(folder)
         runs.append(Run(name, label or "", folder, records, read_protocol(folder), notes))
     return _with_methods(runs)
+
+
+def read_rollouts(folder: str | Path) -> tuple[list[dict[str, Any]], list[str]]:
+    """Return the rollouts of an evaluation, and what a reader must know: unreadable lines, mixed protocols.
+
+    Raises:
+        MemobenchError: there are none.
+    """
+    notes: list[str] = []
+    records = read_episodes(folder, notes)
+    if not records:
+        raise MemobenchError(f"{folder} holds no rollout that can be read; run an evaluation first")
+    return records, notes + mixtures(records)
 
 
 def _split(word: str | Path) -> tuple[str | None, Path]:
@@ -99,32 +111,35 @@ def folder_names(folders: Sequence[str | Path]) -> list[str]:
 
 def _with_methods(runs: Sequence[Run]) -> list[Run]:
     """Name the methods of runs that were not given a name, and the runs of named methods after them."""
-    unnamed = [run for run in runs if not run.method]
-    policies = [_policy(run) for run in unnamed]
-    types = [kind for kind, _ in dict.fromkeys(policies)]
-    methods: dict[int, str] = {}
-    for run, (kind, digest) in zip(unnamed, policies, strict=True):
-        alone = types.count(kind) == 1
-        methods[id(run)] = kind if alone else f"{kind} {digest[:HASH_DIGITS]}".strip()
-    chosen = [run.method or methods[id(run)] for run in runs]
-    # Where policies are not told, or several results of one stand at the same interval, folders are what is known.
-    places = [(method, run.replan_steps) for run, method in zip(runs, chosen, strict=True)]
-    repeated = {method for method, steps in places if places.count((method, steps)) > 1}
-    taken = {run.method for run in runs if run.method} & repeated
-    if taken:
-        name = min(taken)
-        raise MemobenchError(
-            f"two evaluations named {name!r} have the same replan interval; give them names of their own"
-        )
-    final = [run.name if method in repeated else method for run, method in zip(runs, chosen, strict=True)]
+    methods = _methods(runs)
     result = []
-    for run, method in zip(runs, final, strict=True):
+    for run, method in zip(runs, methods, strict=True):
         name = run.name
         if run.method:
-            steps = "" if final.count(method) == 1 else f" k={run.replan_steps}"
-            name = f"{method}{steps}"
-        result.append(Run(name, method, run.folder, run.records, run.protocol, run.notes))
+            name = method if methods.count(method) == 1 else f"{method} k={run.replan_steps}"
+        result.append(replace(run, name=name, method=method))
     return result
+
+
+def _methods(runs: Sequence[Run]) -> list[str]:
+    """Return whose result each run is: the name that it was given, else its policy's, else its folder's."""
+    policies = dict.fromkeys(_policy(run) for run in runs if not run.method)
+    kinds = Counter(kind for kind, _ in policies)
+    chosen = [run.method or _policy_name(run, kinds) for run in runs]
+    # Where policies are not told, or several results of one stand at the same interval, folders are what is known.
+    places = Counter((method, run.replan_steps) for run, method in zip(runs, chosen, strict=True))
+    repeated = {method for (method, _), count in places.items() if count > 1}
+    taken = {run.method for run in runs if run.method} & repeated
+    if taken:
+        raise MemobenchError(
+            f"two evaluations named {min(taken)!r} have the same replan interval; give them names of their own"
+        )
+    return [run.name if method in repeated else method for run, method in zip(runs, chosen, strict=True)]
+
+
+def _policy_name(run: Run, kinds: Mapping[str, int]) -> str:
+    kind, digest = _policy(run)
+    return kind if kinds[kind] == 1 else f"{kind} {digest[:HASH_DIGITS]}".strip()
 
 
 def _policy(run: Run) -> tuple[str, str]:

@@ -10,7 +10,7 @@ import numpy as np
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.figures import style
 from lerobot_memobench.evaluation.documents.figures.entries import Entry
-from lerobot_memobench.evaluation.metrics.rates import METRICS
+from lerobot_memobench.evaluation.metrics.rates import PROCESS_METRICS
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 
 if TYPE_CHECKING:
@@ -24,7 +24,9 @@ HIGH_STORAGE, LOW_SUCCESS = 50.0, 20.0
 
 SHADE = "#ebebeb"
 
-LOOKS = dict(zip(MEMORY_TYPES, (("#0072b2", "o"), ("#d55e00", "s"), ("#000000", "^"), ("#cc79a7", "D")), strict=True))
+LOOKS = dict[str, tuple[str, str]](
+    zip(MEMORY_TYPES, (("#0072b2", "o"), ("#d55e00", "s"), ("#000000", "^"), ("#cc79a7", "D")), strict=True)
+)
 
 
 def points(entries: Sequence[Entry], metric: str, by_task: bool = False) -> list[Point]:
@@ -55,55 +57,60 @@ def draw(entries: Sequence[Entry], by_task: bool = False) -> Figure:
     Raises:
         MemobenchError: there is nothing to draw.
     """
-    metrics = [metric for metric in METRICS if metric != "SR" and points(entries, metric, by_task)]
+    metrics = [metric for metric in PROCESS_METRICS if points(entries, metric, by_task)]
     if not metrics:
         raise MemobenchError("no process metric applies to these evaluations; there is nothing to correlate")
-    both = {entry.published for entry in entries} == {True, False}
     with style.look():
         figure = style.new_figure(2.45 * len(metrics) + 0.4, 3.1)
         places = figure.subplots(1, len(metrics), sharey=True, squeeze=False)[0]
         for place, metric in zip(places, metrics, strict=True):
-            texts = []
-            for published in (True, False):
-                chosen = [entry for entry in entries if entry.published is published]
-                found = points(chosen, metric, by_task)
-                if not found:
-                    continue
-                _scatter(place, found, published)
-                texts.append(_text(found, ("paper: " if published else "here: ") if both else ""))
-            place.set_title("\n".join(texts), fontsize=8, fontweight="normal")
-            place.set_xlabel(f"{metric}, % ({style.METRIC_NAMES[metric]})")
-            place.set_xlim(-4, 104)
-            place.set_ylim(-4, 104)
-            place.set_xticks(range(0, 101, 25))
-            place.set_yticks(range(0, 101, 25))
-            place.set_aspect("equal")
-            place.plot([0, 100], [0, 100], color=style.GRID, lw=0.7, zorder=0)
-            if metric == "MSR":
-                _shade(place)
+            _draw_panel(place, entries, metric, by_task)
         places[0].set_ylabel("SR, % (success)")
-        from matplotlib.lines import Line2D
-        from matplotlib.patches import Patch
-
-        there = [
-            name for name in MEMORY_TYPES if any(p[2] == name for m in metrics for p in points(entries, m, by_task))
-        ]
-        open_ = all(entry.published for entry in entries)
-        handles: list[Any] = [
-            Line2D([], [], ls="", color=LOOKS[name][0], marker=LOOKS[name][1], ms=5, mfc="none" if open_ else None)
-            for name in there
-        ]
-        names: list[str] = [*there]
-        if both:
-            handles += [
-                Line2D([], [], ls="", marker="o", ms=5, mec=style.INK, mfc=fill) for fill in ("none", style.INK)
-            ]
-            names += ["paper", "here"]
-        if "MSR" in metrics:
-            handles.append(Patch(facecolor=SHADE))
-            names.append("high MSR, low SR")
-        style.legend_below(figure, handles, names, len(handles))
+        there = {kind for metric in metrics for _, _, kind in points(entries, metric, by_task)}
+        _legend(figure, entries, [name for name in MEMORY_TYPES if name in there], shaded="MSR" in metrics)
         return figure
+
+
+def _both(entries: Sequence[Entry]) -> bool:
+    """Whether some entries are the paper's and some are not."""
+    return {entry.published for entry in entries} == {True, False}
+
+
+def _draw_panel(place: Any, entries: Sequence[Entry], metric: str, by_task: bool) -> None:
+    texts = []
+    for published in (True, False):
+        found = points([entry for entry in entries if entry.published is published], metric, by_task)
+        if found:
+            _scatter(place, found, published)
+            whose = "paper: " if published else "here: "
+            texts.append(_text(found, whose if _both(entries) else ""))
+    place.set_title("\n".join(texts), fontsize=8, fontweight="normal")
+    place.set_xlabel(f"{metric}, % ({style.METRIC_NAMES[metric]})")
+    place.set_xlim(-4, 104)
+    place.set_ylim(-4, 104)
+    place.set_xticks(range(0, 101, 25))
+    place.set_yticks(range(0, 101, 25))
+    place.set_aspect("equal")
+    place.plot([0, 100], [0, 100], color=style.GRID, lw=0.7, zorder=0)
+    if metric == "MSR":
+        _shade(place)
+
+
+def _legend(figure: Figure, entries: Sequence[Entry], memory_types: Sequence[str], shaded: bool) -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    fill = "none" if all(entry.published for entry in entries) else None
+    handles: dict[str, Any] = {}
+    for name in memory_types:
+        colour, marker = LOOKS[name]
+        handles[name] = Line2D([], [], ls="", color=colour, marker=marker, ms=5, mfc=fill)
+    if _both(entries):
+        handles["paper"] = Line2D([], [], ls="", marker="o", ms=5, mec=style.INK, mfc="none")
+        handles["here"] = Line2D([], [], ls="", marker="o", ms=5, mec=style.INK, mfc=style.INK)
+    if shaded:
+        handles["high MSR, low SR"] = Patch(facecolor=SHADE)
+    style.legend_below(figure, list(handles.values()), list(handles), len(handles))
 
 
 def _scatter(place: Any, found: Sequence[Point], published: bool) -> None:

@@ -74,8 +74,10 @@ def best_over_replan(entries: Iterable[Entry], axes: Sequence[Axis]) -> dict[str
 
 
 def average_axes() -> list[Axis]:
+    """Return the metrics of the average."""
     return [(None, metric) for metric in METRICS]
 
 
 def type_axes() -> list[Axis]:
+    """Return the metrics of each memory type."""
     return [(memory_type, metric) for memory_type in MEMORY_TYPES for metric in METRICS]

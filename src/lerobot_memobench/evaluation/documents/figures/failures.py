@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, Any
 
+from lerobot_memobench.evaluation.documents.evaluation_tables import outcomes
 from lerobot_memobench.evaluation.documents.figures import style
 from lerobot_memobench.evaluation.records.runs import Run
 from lerobot_memobench.paper import failure_taxonomy
-from lerobot_memobench.tasks.failures import FAILURES
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -43,6 +44,7 @@ class Bar:
 
     @property
     def rollouts(self) -> int:
+        """How many rollouts it stands for."""
         return sum(count for _, count, _ in self.parts)
 
 
@@ -63,10 +65,7 @@ def bars(runs: Sequence[Run], by_task: bool = False) -> list[Bar]:
 
 
 def _parts(run: Run, tasks: Sequence[str]) -> tuple[Part, ...]:
-    summary = run.summary
-    failed = {name: sum(summary.failures_of[task][name] for task in tasks) for name in FAILURES}
-    total = sum(summary.tasks[task]["SR"].n for task in tasks)
-    return tuple((name, n, "") for name, n in {"success": total - sum(failed.values()), **failed}.items())
+    return tuple((name, count, "") for name, count in outcomes(run.summary, tasks).items())
 
 
 def paper_bar() -> Bar:
@@ -78,30 +77,35 @@ def paper_bar() -> Bar:
 
 def draw(found: Sequence[Bar]) -> Figure:
     """Draw bars, those of one heading together."""
+    places = _places(found)
     with style.look():
-        places, at = [], 0.0
-        for k, bar in enumerate(found):
-            at += 0.0 if k == 0 else (1.0 if bar.heading == found[k - 1].heading else 1.45)
-            places.append(at)
-        figure = style.new_figure(7.0, 1.35 + 0.27 * (at + 1))
+        figure = style.new_figure(7.0, 1.35 + 0.27 * (places[-1] + 1))
         axis = figure.subplots()
         for bar, place in zip(found, places, strict=True):
             _draw_bar(axis, bar, place)
-        axis.set_ylim(at + 0.6, -0.6)
+        axis.set_ylim(places[-1] + 0.6, -0.6)
         axis.set_xlim(0, 100)
         axis.set_xlabel("rollouts, %")
         axis.set_yticks(places, [_label(found, k) for k in range(len(found))])
         axis.tick_params(axis="y", length=0)
         axis.spines["left"].set_visible(False)
-        used = [name for name in style.OUTCOMES if any(part == name and n for bar in found for part, n, _ in bar.parts)]
-        from matplotlib.patches import Patch
-
-        handles = [
-            Patch(facecolor=style.OUTCOMES[name].colour, hatch=style.OUTCOMES[name].hatch, edgecolor=style.INK, lw=0.5)
-            for name in used
-        ]
-        style.legend_below(figure, handles, [name.replace("_", " ") for name in used], 3)
+        _legend(figure, found)
         return figure
+
+
+def _places(found: Sequence[Bar]) -> list[float]:
+    """Return where each bar lies, from the top."""
+    steps = [1.0 if a.heading == b.heading else 1.45 for a, b in pairwise(found)]
+    return list(accumulate(steps, initial=0.0))
+
+
+def _legend(figure: Figure, found: Sequence[Bar]) -> None:
+    from matplotlib.patches import Patch
+
+    there = {name for bar in found for name, count, _ in bar.parts if count}
+    looks = {name: look for name, look in style.OUTCOMES.items() if name in there}
+    handles = [Patch(facecolor=look.colour, hatch=look.hatch, edgecolor=style.INK, lw=0.5) for look in looks.values()]
+    style.legend_below(figure, handles, [name.replace("_", " ") for name in looks], 3)
 
 
 def _draw_bar(axis: Any, bar: Bar, place: float) -> None:

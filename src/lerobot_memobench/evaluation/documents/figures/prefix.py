@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
 from lerobot_memobench.errors import MemobenchError
@@ -90,72 +91,56 @@ def paper_panel() -> Panel:
 
 def draw(found: Sequence[Panel]) -> Figure:
     """Draw the panels, at most five in a row."""
-    names = list(dict.fromkeys(curve.name for panel in found for curve in panel.curves))
-    looks = style.lines(names)
+    looks = style.lines([curve.name for panel in found for curve in panel.curves])
     columns = min(COLUMNS, len(found))
     rows = math.ceil(len(found) / columns)
     with style.look():
-        from matplotlib.lines import Line2D
-
         figure = style.new_figure(max(2.1 * columns, 3.6), 1.9 * rows + 0.6)
         places = figure.subplots(rows, columns, sharey=True, squeeze=False)
-        for k, place in enumerate(places.flat):
-            if k < len(found):
-                _draw_panel(place, found[k], looks)
-                if k % columns == 0:
-                    place.set_ylabel("prefix, %")
-            else:
+        for place, panel in zip_longest(places.flat, found):
+            if panel is None:
                 place.set_visible(False)
-        handles = [
-            Line2D([], [], color=look.colour, marker=look.marker, ls=look.dashes, ms=4, lw=1.3)
-            for look in looks.values()
-        ]
-        labels = [style.words(name) for name in names]
-        if any(curve.ordered not in (None, curve.plain) for panel in found for curve in panel.curves):
-            handles.append(Line2D([], [], color=style.FAINT, marker="o", mfc="white", ls=":", ms=4, lw=1.0))
-            labels.append("in order, where it differs")
-        style.legend_below(figure, handles, labels, min(len(handles), 2 if columns < 3 else 4))
+            else:
+                _draw_panel(place, panel, looks)
+        for place in places[:, 0]:
+            place.set_ylabel("prefix, %")
+        _legend(figure, found, looks, columns)
         return figure
 
 
-def _draw_panel(place: Any, panel: Panel, looks: dict[str, style.Line]) -> None:
-    steps = range(len(panel.operations))
+def _legend(figure: Figure, found: Sequence[Panel], looks: Mapping[str, style.Line], columns: int) -> None:
+    from matplotlib.lines import Line2D
+
+    handles = [Line2D([], [], **look.drawn, ms=4, lw=1.3) for look in looks.values()]
+    labels = [style.words(name) for name in looks]
+    if any(curve.ordered not in (None, curve.plain) for panel in found for curve in panel.curves):
+        handles.append(Line2D([], [], color=style.FAINT, marker="o", mfc="white", ls=":", ms=4, lw=1.0))
+        labels.append("in order, where it differs")
+    style.legend_below(figure, handles, labels, min(len(handles), 2 if columns < 3 else 4))
+
+
+def _draw_panel(place: Any, panel: Panel, looks: Mapping[str, style.Line]) -> None:
     for curve in panel.curves:
-        look = looks[curve.name]
-        if curve.low is not None and curve.high is not None and len(panel.curves) <= 3:
-            place.fill_between(steps, curve.low, curve.high, color=look.colour, alpha=0.12, lw=0, zorder=1)
-        place.plot(
-            steps,
-            curve.plain,
-            color=look.colour,
-            marker=look.marker,
-            ls=look.dashes,
-            ms=4,
-            lw=1.3,
-            zorder=3,
-            clip_on=False,
-        )
-        if curve.ordered is not None and curve.ordered != curve.plain:
-            place.plot(
-                steps,
-                curve.ordered,
-                color=look.colour,
-                marker=look.marker,
-                mfc="white",
-                ls=":",
-                ms=3,
-                lw=0.9,
-                zorder=4,
-                clip_on=False,
-            )
+        _draw_curve(place, curve, looks[curve.name], shaded=len(panel.curves) <= 3)
     place.set_title(textwrap.fill(panel.title, 34, max_lines=3, placeholder=" …"), fontsize=6.5, fontweight="normal")
     place.set_ylim(0, 102)
     place.set_yticks(range(0, 101, 25))
     place.grid(axis="y", color=style.GRID, lw=0.5)
     place.set_xlim(-0.4, len(panel.operations) - 0.6)
-    place.set_xticks(list(steps), list(panel.operations))
+    place.set_xticks(range(len(panel.operations)), list(panel.operations))
     for label, operation in zip(place.get_xticklabels(), panel.operations, strict=True):
         label.set_bbox(
             {"boxstyle": "round,pad=0.2", "facecolor": style.OPERATION_COLOURS[operation], "edgecolor": "none"}
         )
     place.tick_params(axis="x", length=0, pad=5)
+
+
+def _draw_curve(place: Any, curve: Curve, look: style.Line, shaded: bool) -> None:
+    """Draw the rates, their intervals where ``shaded``, and the rates in order where they differ."""
+    steps = range(len(curve.plain))
+    if curve.low is not None and curve.high is not None and shaded:
+        place.fill_between(steps, curve.low, curve.high, color=look.colour, alpha=0.12, lw=0, zorder=1)
+    place.plot(steps, curve.plain, **look.drawn, ms=4, lw=1.3, zorder=3, clip_on=False)
+    if curve.ordered is not None and curve.ordered != curve.plain:
+        dotted = look.drawn | {"ls": ":"}
+        place.plot(steps, curve.ordered, **dotted, mfc="white", ms=3, lw=0.9, zorder=4, clip_on=False)

@@ -60,45 +60,14 @@ def _draw_panel(
             "types, or use --axes types"
         )
     angles = [2 * math.pi * k / len(kept) for k in range(len(kept))]
-    closed = [*angles, angles[0]]
-    place.set_theta_offset(math.pi / 2)
-    place.set_theta_direction(-1)
-    place.set_ylim(0, 1.0)
-    place.set_xticks([])
-    place.set_yticks([])
-    place.spines["polar"].set_visible(False)
-    for ring in (0.25, 0.5, 0.75, 1.0):
-        place.plot(closed, [ring] * len(closed), color=style.GRID if ring < 1 else style.FAINT, lw=0.6, zorder=1)
-    for angle in angles:
-        place.plot([angle, angle], [0, 1], color=style.GRID, lw=0.6, zorder=1)
+    _draw_web(place, angles)
     published = {entry.method for entry in entries if entry.published}
     for method, values in shares.items():
-        line = looks[method]
-        place.plot(
-            closed,
-            [*values, values[0]],
-            color=line.colour,
-            ls=line.dashes,
-            marker=line.marker,
-            ms=4,
-            lw=1.3 if method in published else 2.0,
-            label=style.words(method),
-            zorder=3,
-            clip_on=False,
-        )
+        width, label = 1.3 if method in published else 2.0, style.words(method)
+        drawn = looks[method].drawn
+        place.plot(_closed(angles), _closed(values), **drawn, ms=4, lw=width, label=label, zorder=3, clip_on=False)
     for angle, axis, top in zip(angles, kept, tops, strict=True):
-        memory_type, metric = axis
-        name = metric if memory_type is None else f"{memory_type}\n{metric}"
-        across, up = math.sin(angle), math.cos(angle)
-        place.text(
-            angle,
-            1.08,
-            f"{name}\n{top:.1f}",
-            ha="center" if abs(across) < 0.3 else ("left" if across > 0 else "right"),
-            va="center" if abs(up) < 0.3 else ("bottom" if up > 0 else "top"),
-            fontsize=8 if memory_type is None else 7,
-            linespacing=1.1,
-        )
+        _name_axis(place, angle, axis, top)
     place.set_title(title, pad=30 if len(kept) <= 4 else 34)
     place.legend(
         loc="upper center",
@@ -106,4 +75,39 @@ def _draw_panel(
         ncols=2,
         handlelength=3.2,
         columnspacing=1.2,
+    )
+
+
+def _closed(values: Sequence[float]) -> list[float]:
+    return [*values, values[0]]
+
+
+def _draw_web(place: Any, angles: Sequence[float]) -> None:
+    """Draw rings and spokes, the first axis upwards, the others clockwise."""
+    place.set_theta_offset(math.pi / 2)
+    place.set_theta_direction(-1)
+    place.set_ylim(0, 1.0)
+    place.set_xticks([])
+    place.set_yticks([])
+    place.spines["polar"].set_visible(False)
+    for ring in (0.25, 0.5, 0.75, 1.0):
+        colour = style.GRID if ring < 1 else style.FAINT
+        place.plot(_closed(angles), [ring] * (len(angles) + 1), color=colour, lw=0.6, zorder=1)
+    for angle in angles:
+        place.plot([angle, angle], [0, 1], color=style.GRID, lw=0.6, zorder=1)
+
+
+def _name_axis(place: Any, angle: float, axis: Axis, top: float) -> None:
+    """Write the name of an axis and its highest value outside the web."""
+    memory_type, metric = axis
+    name = metric if memory_type is None else f"{memory_type}\n{metric}"
+    across, up = math.sin(angle), math.cos(angle)
+    place.text(
+        angle,
+        1.08,
+        f"{name}\n{top:.1f}",
+        ha="center" if abs(across) < 0.3 else ("left" if across > 0 else "right"),
+        va="center" if abs(up) < 0.3 else ("bottom" if up > 0 else "top"),
+        fontsize=8 if memory_type is None else 7,
+        linespacing=1.1,
     )

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.documents.beside_paper import published_rate
 from lerobot_memobench.evaluation.documents.figures import style
-from lerobot_memobench.evaluation.documents.report_sections import published_rate
 from lerobot_memobench.evaluation.metrics.rates import METRICS, Rate
 from lerobot_memobench.evaluation.records.runs import Run, sweeps
 from lerobot_memobench.paper import published_rows
@@ -26,23 +26,24 @@ def curves(runs: Sequence[Run], paper: bool, memory_type: str, metric: str) -> l
     """Return the lines of one panel; ``memory_type`` may be "average"."""
     found: list[Curve] = []
     for method, group in sweeps(runs).items():
-        steps, rates = [], []
+        rates = {}
         for run in group:
             row = run.summary.average if memory_type == AVERAGE else run.summary.memory_types.get(memory_type)
             if row is not None and row[metric].value is not None and run.replan_steps is not None:
-                steps.append(run.replan_steps)
-                rates.append(row[metric])
-        if steps:
-            found.append((method, steps, rates, False))
-    if paper:
-        models: dict[str, dict[int, float]] = {}
-        for published in published_rows("main"):
-            figures = published.average if memory_type == AVERAGE else published.memory_types[memory_type]
-            value = figures[metric]
-            if value is not None and published.replan_steps is not None:
-                models.setdefault(published.label, {})[published.replan_steps] = value
-        found += [(name, list(at), [published_rate(v) for v in at.values()], True) for name, at in models.items()]
-    return found
+                rates[run.replan_steps] = row[metric]
+        if rates:
+            found.append((method, list(rates), list(rates.values()), False))
+    return found + (_published_curves(memory_type, metric) if paper else [])
+
+
+def _published_curves(memory_type: str, metric: str) -> list[Curve]:
+    models: dict[str, dict[int, Rate]] = {}
+    for row in published_rows("main"):
+        figures = row.average if memory_type == AVERAGE else row.memory_types[memory_type]
+        value = figures[metric]
+        if value is not None and row.replan_steps is not None:
+            models.setdefault(row.label, {})[row.replan_steps] = published_rate(value)
+    return [(name, list(rates), list(rates.values()), True) for name, rates in models.items()]
 
 
 def draw(runs: Sequence[Run], paper: bool = False, by_type: bool = False) -> Figure:
@@ -57,40 +58,41 @@ def draw(runs: Sequence[Run], paper: bool = False, by_type: bool = False) -> Fig
             "(NAME=FOLDER with the same name where their policies are not known)"
         )
     groups = [AVERAGE, *(MEMORY_TYPES if by_type else ())]
-    grid = [[curves(runs, paper, group, metric) for metric in METRICS] for group in groups]
-    names = list(dict.fromkeys(curve[0] for row in grid for cell in row for curve in cell))
-    looks = style.lines(names)
+    grid = {(g, metric): curves(runs, paper, g, metric) for g in groups for metric in METRICS}
+    looks = style.lines([curve[0] for cell in grid.values() for curve in cell])
     with style.look():
-        from matplotlib.lines import Line2D
-
         figure = style.new_figure(7.4, 1.75 * len(groups) + 0.75)
         places = figure.subplots(len(groups), len(METRICS), sharex=True, squeeze=False)
-        ours = {curve[0] for row in grid for cell in row for curve in cell if not curve[3]}
-        for row, group in enumerate(groups):
-            for column, metric in enumerate(METRICS):
-                place = places[row][column]
-                if not grid[row][column]:
-                    place.set_visible(False)
-                    continue
-                for curve in grid[row][column]:
-                    _draw_curve(place, curve, looks[curve[0]])
-                _frame(place, grid[row][column])
-                if row == 0:
-                    place.set_title(f"{metric} ({style.METRIC_NAMES[metric]})", fontsize=7.5)
-                if column == 0:
-                    place.set_ylabel(f"{group}, %")
-                if row == len(groups) - 1 or not grid[row + 1][column]:
-                    place.set_xlabel("replan interval, steps")
-                    place.tick_params(labelbottom=True)
-        handles = [
-            Line2D(
-                [], [], color=looks[n].colour, marker=looks[n].marker, ls=looks[n].dashes, ms=4, lw=_width(n in ours)
-            )
-            for n in names
-        ]
-        marks = [style.words(name) if name in ours or not ours else f"paper: {style.words(name)}" for name in names]
-        style.legend_below(figure, handles, marks, 4 if max(map(len, names)) < 20 else 3)
+        for (group, metric), place in zip(grid, places.flat, strict=True):
+            below = None if group == groups[-1] else grid[groups[groups.index(group) + 1], metric]
+            _draw_panel(place, grid[group, metric], looks)
+            if group == groups[0]:
+                place.set_title(f"{metric} ({style.METRIC_NAMES[metric]})", fontsize=7.5)
+            if metric == METRICS[0]:
+                place.set_ylabel(f"{group}, %")
+            if not below:
+                place.set_xlabel("replan interval, steps")
+                place.tick_params(labelbottom=True)
+        _legend(figure, [curve for cell in grid.values() for curve in cell], looks)
         return figure
+
+
+def _draw_panel(place: Any, found: Sequence[Curve], looks: Mapping[str, style.Line]) -> None:
+    if not found:
+        place.set_visible(False)
+        return
+    for curve in found:
+        _draw_curve(place, curve, looks[curve[0]])
+    _frame(place, found)
+
+
+def _legend(figure: Figure, found: Sequence[Curve], looks: Mapping[str, style.Line]) -> None:
+    from matplotlib.lines import Line2D
+
+    ours = {name for name, _, _, published in found if not published}
+    handles = [Line2D([], [], **look.drawn, ms=4, lw=_width(name in ours)) for name, look in looks.items()]
+    marks = [style.words(name) if name in ours or not ours else f"paper: {style.words(name)}" for name in looks]
+    style.legend_below(figure, handles, marks, 4 if max(map(len, looks)) < 20 else 3)
 
 
 def _width(ours: bool) -> float:
@@ -104,17 +106,8 @@ def _draw_curve(place: Any, curve: Curve, look: style.Line) -> None:
         intervals = [rate.interval or (0.0, 1.0) for rate in rates]
         low, high = ([100 * bounds[k] for bounds in intervals] for k in (0, 1))
         place.fill_between(steps, low, high, color=look.colour, alpha=0.15, lw=0, zorder=1)
-    place.plot(
-        steps,
-        values,
-        color=look.colour,
-        marker=look.marker,
-        ls=look.dashes,
-        ms=4,
-        lw=_width(not published),
-        zorder=2 if published else 3,
-        clip_on=False,
-    )
+    order = 2 if published else 3
+    place.plot(steps, values, **look.drawn, ms=4, lw=_width(not published), zorder=order, clip_on=False)
 
 
 def _frame(place: Any, found: Sequence[Curve]) -> None:

@@ -6,7 +6,6 @@ takes others.
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files import draft_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -56,6 +56,11 @@ class Line:
     colour: str
     marker: str
     dashes: Any
+
+    @property
+    def drawn(self) -> dict[str, Any]:
+        """The same as matplotlib's keywords."""
+        return {"color": self.colour, "marker": self.marker, "ls": self.dashes}
 
 
 _COLOURS = (
@@ -146,9 +151,8 @@ def save(figure: Figure, out: Path, name: str) -> list[Path]:
         paths = [out / f"{name}.pdf", out / f"{name}.png"]
     for path in paths:
         path.parent.mkdir(parents=True, exist_ok=True)
-        draft = path.with_name(f".{path.stem}.part{path.suffix}")
         # Without its date, the same figures give the same file.
         metadata = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}.get(path.suffix.lower())
-        figure.savefig(draft, dpi=200, metadata=metadata)
-        os.replace(draft, path)
+        with draft_of(path) as draft:
+            figure.savefig(draft, dpi=200, metadata=metadata)
     return paths

@@ -13,12 +13,16 @@ from typing import Any
 
 from lerobot_memobench import __version__
 from lerobot_memobench.envs.annotate import OPERATION_COLOURS
-from lerobot_memobench.envs.episode_log import read_episodes
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.metrics.failures import failure_counts, failure_of
-from lerobot_memobench.evaluation.metrics.rates import Rate, Record, Row, Summary, by_task, mixtures, percent, summarise
+from lerobot_memobench.evaluation.documents.evaluation_tables import outcomes
+from lerobot_memobench.evaluation.documents.html.videos import episode_id
+from lerobot_memobench.evaluation.documents.sentences import count_of, settings_phrases
+from lerobot_memobench.evaluation.documents.tables import OPERATION_NAMES
+from lerobot_memobench.evaluation.metrics.failures import failure_of
+from lerobot_memobench.evaluation.metrics.rates import Rate, Row, percent
+from lerobot_memobench.evaluation.metrics.rollouts import Record, operations
+from lerobot_memobench.evaluation.metrics.summary import Summary, summarise
 from lerobot_memobench.evaluation.records.protocol import CARD_FILE, read_card
-from lerobot_memobench.evaluation.records.runs import folder_names
+from lerobot_memobench.evaluation.records.runs import folder_names, read_rollouts
 from lerobot_memobench.tasks.catalogue import find_tasks, get_task, task_names
 from lerobot_memobench.tasks.failures import FAILURES
 from lerobot_memobench.tasks.formula import format_formula
@@ -26,8 +30,6 @@ from lerobot_memobench.tasks.task import LEVELS, MEMORY_TYPES, Task, load_task
 
 FPS = 20
 """Control steps per second (paper, section 5.1), and frames per second of the films."""
-
-OPERATION_NAMES = {"S": "Storage", "U": "Update", "C": "Compression"}
 
 
 @dataclass(frozen=True)
@@ -47,13 +49,10 @@ def read_runs(folders: Sequence[str | Path]) -> list[Run]:
     """Read the logs of several evaluations and name them after their folders."""
     runs = []
     for folder, name in zip(folders, folder_names(folders), strict=True):
-        notes: list[str] = []
-        records = read_episodes(folder, notes)
-        if not records:
-            raise MemobenchError(f"{folder} holds no rollout that can be read; run an evaluation first")
+        records, notes = read_rollouts(folder)
         path = Path(folder) / CARD_FILE
         card = read_card(path) if path.is_file() else {}
-        runs.append(Run(name, Path(folder), records, notes + mixtures(records), card))
+        runs.append(Run(name, Path(folder), records, notes, card))
     return runs
 
 
@@ -104,7 +103,7 @@ def tasks_data(records: Iterable[Record], known: Mapping[str, Task]) -> dict[str
             "variants": {
                 str(k): variant_data(task.variant(k))
                 for k in sorted(variant for its_name, variant in seen if its_name == name)
-                if task and k < task.num_variants and task.operations == _operations(record)
+                if task and k < task.num_variants and task.operations == operations(record)
             },
         }
     return result
@@ -125,17 +124,12 @@ def _variant(record: Record) -> int:
     return int(record.get("variant") or 0)
 
 
-def _operations(record: Record) -> str:
-    return "".join(checkpoint["operation"] for checkpoint in record["checkpoints"])
-
-
 # --- runs ---
 
 
 def run_data(run: Run, videos: Mapping[int, str]) -> dict[str, Any]:
     """Return one evaluation: protocol, rates, failures and rollouts."""
     summary = summarise(run.records)
-    groups = by_task(run.records)
     return {
         "name": run.name,
         "folder": str(run.folder),
@@ -144,43 +138,37 @@ def run_data(run: Run, videos: Mapping[int, str]) -> dict[str, Any]:
         "notes": run.notes,
         "average": row_data(summary.average),
         "memory_types": {name: row_data(row) for name, row in summary.memory_types.items()},
-        "tasks": {name: task_data(name, groups[name], summary) for name in groups},
+        "tasks": {name: task_data(name, summary) for name in summary.tasks},
         "episodes": [episode_data(record, videos.get(k)) for k, record in enumerate(run.records)],
     }
 
 
 def facts(records: Sequence[Record], card: Mapping[str, Any]) -> list[str]:
     """Return the protocol in words: policy, rollouts, tasks, seeds, referent, replan interval, horizon."""
-    seeds = sorted({record["seed"] for record in records if record.get("seed") is not None})
-    replans = sorted({record["replan_steps"] for record in records if record.get("replan_steps") is not None})
     policy = card.get("policy", {}).get("type")
-    result = [f"policy {policy}"] if policy else []
-    result += [count_of(len(records), "rollout"), count_of(len({record["task"] for record in records}), "task")]
-    if seeds:
-        result.append(f"seed {seeds[0]}" if len(seeds) == 1 else f"seeds {seeds[0]} to {seeds[-1]}")
-    result.append("referent " + ", ".join(sorted({str(record.get("referent", "fixed")) for record in records})))
-    if replans:
-        result.append("replan interval " + ", ".join(map(str, replans)))
     horizon = card.get("protocol", {}).get("horizon")
-    return result if horizon is None else [*result, f"horizon {horizon}"]
+    return [
+        *([f"policy {policy}"] if policy else []),
+        count_of(len(records), "rollout"),
+        count_of(len({record["task"] for record in records}), "task"),
+        *settings_phrases(records),
+        *([] if horizon is None else [f"horizon {horizon}"]),
+    ]
 
 
-def count_of(number: int, word: str) -> str:
-    return f"{number:,} {word}" + ("" if number == 1 else "s")
-
-
-def task_data(name: str, records: Sequence[Record], summary: Summary) -> dict[str, Any]:
+def task_data(name: str, summary: Summary) -> dict[str, Any]:
     """Return the rates of one task and, per checkpoint, how many rollouts got that far."""
     return {
         "rates": row_data(summary.tasks[name]),
-        "operations": _operations(records[0]),
+        "operations": summary.operations_of[name],
         "prefix": [rate_data(rate) for rate in summary.prefix[name]],
         "ordered_prefix": [rate_data(rate) for rate in summary.ordered_prefix[name]],
-        "outcomes": {"success": sum(record["success"] for record in records), **failure_counts(records)},
+        "outcomes": outcomes(summary, [name]),
     }
 
 
 def row_data(row: Row) -> dict[str, Any]:
+    """Return metric -> rate as `rate_data` writes it."""
     return {metric: rate_data(rate) for metric, rate in row.items()}
 
 
@@ -208,12 +196,6 @@ def episode_data(record: Record, video: str | None) -> dict[str, Any]:
         "scene": record.get("scene_hash"),
         "video": video,
     }
-
-
-def episode_id(record: Record) -> str:
-    """Return a name that is the same in every run: task, episode, and the referent where it is not the published."""
-    referent = record.get("referent", "fixed")
-    return f"{record['task']}.{record['episode']}" + ("" if referent == "fixed" else f".{referent}")
 
 
 def _last_step(record: Record) -> int:

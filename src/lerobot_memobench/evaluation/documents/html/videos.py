@@ -17,10 +17,18 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.envs.film import LAST_FRAMES
-from lerobot_memobench.evaluation.metrics.rates import Record
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.metrics.rollouts import Record
+from lerobot_memobench.files import draft_of, file_name
 
 VIDEOS = "videos"
 LEROBOT_INFO = "eval_info.json"
+
+
+def episode_id(record: Record) -> str:
+    """Return a name that is the same in every run: task, episode, and the referent where it is not the published."""
+    referent = record.get("referent", "fixed")
+    return f"{record['task']}.{record['episode']}" + ("" if referent == "fixed" else f".{referent}")
 
 
 def find_videos(folder: Path, records: Sequence[Record]) -> tuple[dict[int, Path], list[str]]:
@@ -32,8 +40,7 @@ def find_videos(folder: Path, records: Sequence[Record]) -> tuple[dict[int, Path
     found: dict[int, Path] = {}
     misfits: list[str] = []
     for k, record in enumerate(records):
-        # A log is only text: a name that is a path must not lead out of the folders that are read and written here.
-        if Path(record["task"]).name != record["task"] or not record["task"].isprintable():
+        if not _names_a_file(record):
             continue
         film = folder / VIDEOS / f"{record['task']}.{record['episode']}.mp4"
         if film.is_file():
@@ -52,6 +59,14 @@ def find_videos(folder: Path, records: Sequence[Record]) -> tuple[dict[int, Path
         return found, []
     named = ", ".join(misfits[:3]) + (f" and {len(misfits) - 3} more" if len(misfits) > 3 else "")
     return found, [f"Videos that do not clearly belong to a logged rollout were left out: {named}."]
+
+
+def _names_a_file(record: Record) -> bool:
+    """Whether a rollout's name may be a file's: a log is only text, which must not lead out of these folders."""
+    try:
+        return bool(file_name(episode_id(record), "a rollout's name"))
+    except MemobenchError:
+        return False
 
 
 def _fits(frames: int | None, record: Record, held: int) -> bool:
@@ -127,16 +142,18 @@ def place_videos(chosen: Mapping[Path, Path], link: bool) -> None:
         if _is_same(source, target, link):
             continue
         target.parent.mkdir(parents=True, exist_ok=True)
-        draft = target.with_name(f".{target.name}.{os.getpid()}.part")
-        draft.unlink(missing_ok=True)
-        if link:
-            draft.symlink_to(source.resolve())
-        else:
-            try:
-                os.link(source.resolve(), draft)
-            except OSError:  # another file system, or one without hard links
-                shutil.copy2(source, draft)
-        os.replace(draft, target)
+        with draft_of(target) as draft:
+            _bring(source.resolve(), draft, link)
+
+
+def _bring(source: Path, target: Path, link: bool) -> None:
+    if link:
+        target.symlink_to(source)
+        return
+    try:
+        os.link(source, target)
+    except OSError:  # another file system, or one without hard links
+        shutil.copy2(source, target)
 
 
 def _is_same(source: Path, target: Path, link: bool) -> bool:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.documents.html.collect import Run, episode_id, page_data, read_runs, task_source
+from lerobot_memobench.evaluation.documents.html.collect import Run, page_data, read_runs, task_source
 from lerobot_memobench.evaluation.documents.html.page import MARK, page
-from lerobot_memobench.evaluation.documents.html.videos import VIDEOS, find_videos, place_videos
+from lerobot_memobench.evaluation.documents.html.videos import VIDEOS, episode_id, find_videos, place_videos
+from lerobot_memobench.files import write_file
 
 PAGE = "index.html"
 UNFINISHED = f'''<!doctype html><meta charset="utf-8"><meta name="generator" content="{MARK}"><title>Unfinished</title>
@@ -55,9 +55,9 @@ def write_html(
     text = page(page_data(runs, addresses, task_source(task_dir)), title=", ".join(run.name for run in runs))
     out.mkdir(parents=True, exist_ok=True)
     if not (out / PAGE).exists():
-        _write_page(out, UNFINISHED)  # the folder is known as ours from now on
+        write_file(out / PAGE, UNFINISHED)  # the folder is known as ours from now on
     place_videos(chosen, link)
-    _write_page(out, text)
+    write_file(out / PAGE, text)
     _remove_others(out / VIDEOS, chosen)
     return Written(
         page=out / PAGE,
@@ -65,12 +65,6 @@ def write_html(
         videos=len(chosen),
         notes=[f"{run.name}: {note}" for run in runs for note in run.notes],
     )
-
-
-def _write_page(out: Path, text: str) -> None:
-    draft = out / f".{PAGE}.{os.getpid()}.part"
-    draft.write_text(text, encoding="utf-8")
-    os.replace(draft, out / PAGE)
 
 
 def _with_slugs(runs: list[Run]) -> tuple[list[Run], list[str]]:

@@ -255,6 +255,14 @@ def write_frames(path: Path, count: int) -> None:
         container.mux(stream.encode())
 
 
+def test_a_referent_that_is_a_path_leads_nowhere(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    evaluation(run, [record(referent="x/../../../outside")])
+    film(run / "videos" / f"{STOVE}.0.mp4", 13)
+    assert write_html([run], tmp_path / "out").videos == 0
+    assert not list(tmp_path.rglob("outside*"))
+
+
 @pytest.mark.parametrize("name", ["../outside", "/outside", "a\nb", "a/b"])
 def test_a_task_that_is_a_path_leads_nowhere(tmp_path: Path, name: str) -> None:
     run = tmp_path / "run"
@@ -283,7 +291,7 @@ def test_the_folder_holds_page_and_videos(run: Path, tmp_path: Path) -> None:
     assert video.samefile(run / "videos" / f"{STOVE}.0.mp4")  # a hard link costs no space
     episodes = content(written.page.read_text())["runs"][0]["episodes"]
     assert [episode["video"] for episode in episodes] == [f"videos/run/{STOVE}.0.mp4", None]
-    assert not list((tmp_path / "out").rglob("*.part"))
+    assert not list((tmp_path / "out").rglob("*.part*"))
 
 
 def test_videos_are_copied_where_links_are_not_possible(
@@ -370,7 +378,7 @@ def test_the_command(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 def test_setup_looks_for_the_browsers_that_the_tests_use() -> None:
     folder = Path(__file__)
-    script = (folder.parents[2] / "scripts" / "setup").read_text()
+    script = (folder.parents[3] / "scripts" / "setup").read_text()
     names = re.search(r"^NAMES = \((.*)\)$", folder.with_name("browser.py").read_text(), re.MULTILINE)
     assert names
     assert f"for name in {' '.join(re.findall('[a-z-]+', names[1]))}; do" in script
@@ -379,7 +387,7 @@ def test_setup_looks_for_the_browsers_that_the_tests_use() -> None:
 def test_the_wheel_holds_the_template(tmp_path: Path) -> None:
     import zipfile
 
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[3]
     command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
     subprocess.run(command, cwd=root, check=True, capture_output=True)
     (wheel,) = tmp_path.glob("*.whl")

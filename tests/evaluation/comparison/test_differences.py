@@ -10,12 +10,14 @@ import pytest
 
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.comparison.differences import Comparison, Difference, compare, report, value_of
+from lerobot_memobench.evaluation.comparison.differences import Comparison, Difference, compare
+from lerobot_memobench.evaluation.comparison.differences_report import report
+from lerobot_memobench.evaluation.documents.evaluation_tables import AVERAGE
 from lerobot_memobench.evaluation.documents.formats import markdown
-from lerobot_memobench.evaluation.documents.report_sections import AVERAGE
+from lerobot_memobench.evaluation.metrics.rates import value_of
 from lerobot_memobench.evaluation.records.runs import read_runs
 
-from . import logs
+from .. import logs
 
 
 def compared(a: Path, b: Path, **options: Any) -> Comparison:

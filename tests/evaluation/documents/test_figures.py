@@ -15,7 +15,7 @@ from lerobot_memobench.evaluation.records.runs import Run, read_runs
 from lerobot_memobench.paper import published_rows
 from lerobot_memobench.tasks.failures import FAILURES
 
-from . import logs
+from .. import logs
 
 MODULE = "π0.5 + memory module"
 

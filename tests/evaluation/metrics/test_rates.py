@@ -11,18 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.metrics.rates import (
-    Rate,
-    by_task,
-    mean_rate,
-    mean_row,
-    mixtures,
-    percent,
-    prefix,
-    report,
-    summarise,
-    wilson,
-)
+from lerobot_memobench.evaluation.metrics.rates import Rate, mean_rate, mean_row, percent, wilson
+from lerobot_memobench.evaluation.metrics.rollouts import by_task, mixtures, prefix
+from lerobot_memobench.evaluation.metrics.summary import report, summarise
 from lerobot_memobench.paper import published_rows
 
 
@@ -152,6 +143,14 @@ def test_mixed_protocols_are_said() -> None:
 )
 def test_wilson_intervals_of_the_literature(successes: int, n: int, low: float, high: float) -> None:
     assert wilson(successes / n, n) == pytest.approx((low, high), abs=5e-5)
+
+
+@pytest.mark.parametrize("n", [1, 7, 40, 1500])
+def test_wilson_intervals_are_those_of_statsmodels(n: int) -> None:
+    from statsmodels.stats.proportion import proportion_confint
+
+    for successes in range(0, n + 1, max(1, n // 20)):
+        assert wilson(successes / n, n) == pytest.approx(proportion_confint(successes, n, method="wilson"), abs=1e-12)
 
 
 @given(st.integers(1, 500), st.data())

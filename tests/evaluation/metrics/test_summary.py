@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from lerobot_memobench.evaluation.metrics.rates import Summary, report, summarise
+from lerobot_memobench.evaluation.metrics.summary import Summary, report, summarise
 
 Steps = tuple[int | None, ...]
 

@@ -12,13 +12,18 @@ import pytest
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents import formats
+from lerobot_memobench.evaluation.documents.beside_paper import departures
+from lerobot_memobench.evaluation.documents.latex import latex_text
+from lerobot_memobench.evaluation.documents.markdown import markdown_table
+from lerobot_memobench.evaluation.documents.replan_sweep import best_interval
 from lerobot_memobench.evaluation.documents.report import FILES, build, render, write_documents
-from lerobot_memobench.evaluation.documents.report_sections import best_interval, departures
 from lerobot_memobench.evaluation.documents.tables import Name, Report, Section, Table, best_in_columns
-from lerobot_memobench.evaluation.metrics.rates import Rate, report
+from lerobot_memobench.evaluation.documents.terminal import WIDTH
+from lerobot_memobench.evaluation.metrics.rates import Rate
+from lerobot_memobench.evaluation.metrics.summary import report
 from lerobot_memobench.evaluation.records.runs import Run, read_runs
 
-from . import logs
+from .. import logs
 
 
 @pytest.fixture
@@ -100,14 +105,14 @@ def test_latex_is_balanced_and_escaped(sweep: list[Run]) -> None:
 
 
 def test_every_character_that_latex_takes_as_a_command_is_escaped() -> None:
-    assert formats.latex_text(r"a_b & 5% $x$ #1 {y} \z ~ ^") == (
+    assert latex_text(r"a_b & 5% $x$ #1 {y} \z ~ ^") == (
         r"a\_b \& 5\% \$x\$ \#1 \{y\} \textbackslash{}z \textasciitilde{} \textasciicircum{}"
     )
 
 
 def test_markdown_escapes_what_would_break_a_table() -> None:
     table = Table("t", "", ("a", "b"), (("x|y*", Name("p_q")),))
-    assert formats.markdown_table(table)[2] == r"| x\|y\* | `p_q` |"
+    assert markdown_table(table)[2] == r"| x\|y\* | `p_q` |"
 
 
 def test_the_paper_stands_beside_with_what_differs(sweep: list[Run]) -> None:
@@ -135,7 +140,7 @@ def test_tables_are_as_wide_as_their_header_and_mark_the_best() -> None:
 
 def test_the_terminal_keeps_every_rate_in_one_piece(sweep: list[Run]) -> None:
     text = rendered(sweep, "table", paper=True)
-    assert max(map(len, text.splitlines())) <= formats.TERMINAL_WIDTH
+    assert max(map(len, text.splitlines())) <= WIDTH
     assert "75.0 [30.1–95.4]" in text
     (line,) = [line for line in text.splitlines() if "paper: MemER" in line and "62.4" in line]
     assert line.split()[3:] == [

@@ -10,7 +10,7 @@ import pytest
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records.runs import by_method, read_runs, sweeps
 
-from . import logs
+from .. import logs
 
 
 def card(folder: Path, **policy: object) -> None:

@@ -1,10 +1,8 @@
-"""What is seen at a decision: pictures compared, the arm brought home, one real task without memory and one with."""
+"""The study, on demonstrations made by hand; one real task without memory and one with."""
 
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,83 +10,19 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.cli.memobench import main
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.necessity import decisions
-from lerobot_memobench.evaluation.necessity import study as necessity_study
-from lerobot_memobench.evaluation.necessity.decisions import Demonstration, Home, Moment, Picture, unmatched
-from lerobot_memobench.evaluation.necessity.report import (
-    PAGE_BEGIN,
-    PAGE_END,
-    markdown,
-    put_into_page,
-    rows,
-    verdict,
-    write,
-)
-from lerobot_memobench.evaluation.necessity.study import Settings, study, variants_of
-from lerobot_memobench.sim.rendering import close_renderers, gl_backend
-from lerobot_memobench.sim.simulation import NO_OP, Simulation
+from lerobot_memobench.evaluation.necessity.demonstrations import Demonstration, Moment
+from lerobot_memobench.evaluation.necessity.pictures import Picture
+from lerobot_memobench.evaluation.necessity.question import Settings, variants_of
+from lerobot_memobench.evaluation.necessity.report import markdown, rows, verdict, write
+from lerobot_memobench.evaluation.necessity.scene import PIXEL_EXACT
+from lerobot_memobench.evaluation.necessity.study import study
 from lerobot_memobench.tasks.catalogue import get_task
-from lerobot_memobench.tasks.formula import Atom
+
+from .drawn import scene
 
 PAN = "turn_on_the_stove_and_turn_it_off_then_put_the_frying_pan_on_it"
 STACK = "stack_the_bowls_one_by_one_in_the_exact_sequence_shown_in_the_video"
 MILK = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
-
-
-@pytest.fixture
-def gl() -> Iterator[None]:
-    """Skip without a GL library; free what was opened afterwards."""
-    try:
-        gl_backend()
-    except MemobenchError as error:
-        pytest.skip(str(error))
-    before = os.environ.get("MUJOCO_GL")
-    yield
-    close_renderers()
-    if before is None:
-        os.environ.pop("MUJOCO_GL", None)
-
-
-# --- pictures ---
-
-
-def scene(**changes: Any) -> Picture:
-    """A grey wall with a red square of 10 pixels, moved by (dy, dx), or gone."""
-    picture = np.full((64, 64, 3), 128, dtype=np.uint8)
-    if not changes.get("gone"):
-        y, x = 20 + changes.get("dy", 0), 30 + changes.get("dx", 0)
-        picture[y : y + 10, x : x + 10] = changes.get("colour", (200, 30, 30))
-    return picture
-
-
-def test_equal_pictures_have_nothing_unmatched() -> None:
-    assert unmatched(scene(), scene()) == 0.0
-    assert unmatched(scene(), scene(colour=(200, 40, 40))) == 0.0, "a shade is no difference"
-
-
-@pytest.mark.parametrize("shift", [{"dy": 2}, {"dx": -2}, {"dy": 1, "dx": 2}])
-def test_what_moved_by_two_pixels_looks_the_same(shift: dict[str, int]) -> None:
-    assert unmatched(scene(), scene(**shift)) == 0.0
-
-
-def test_what_moved_further_or_went_does_not() -> None:
-    # Of a square moved by 6: 4 rows of red have no red near them, and of the wall now covered 4 rows of 6 no wall.
-    assert unmatched(scene(), scene(dy=6)) * 64 * 64 == 4 * 10 + 4 * 6
-    # Of one that is gone: all its red; the wall behind it counts in the other direction, where it is less.
-    assert unmatched(scene(), scene(gone=True)) * 64 * 64 == 100
-    assert unmatched(scene(gone=True), scene()) == unmatched(scene(), scene(gone=True))
-
-
-def test_differences_are_of_the_camera_that_differs_most() -> None:
-    table = decisions.differences([(scene(), scene()), (scene(), scene(gone=True)), (scene(gone=True), scene(dy=6))])
-    assert table[0, 1] == pytest.approx(100 / 4096)
-    assert table[0, 2] == pytest.approx(100 / 4096)
-    assert np.array_equal(table, table.T)
-    assert not table.diagonal().any()
-
-
-# --- the study, on demonstrations made by hand ---
 
 
 def demonstration(*moments: tuple[str, Picture, float], success: bool = True) -> Demonstration:
@@ -104,7 +38,10 @@ def demonstration(*moments: tuple[str, Picture, float], success: bool = True) ->
 
 
 def by_hand(monkeypatch: pytest.MonkeyPatch, shown: dict[int, Demonstration]) -> None:
-    monkeypatch.setattr(decisions, "follow", lambda task, sim, seed, horizon: shown[task.variant_index])
+    monkeypatch.setattr(
+        "lerobot_memobench.evaluation.necessity.study.follow",
+        lambda task, sim, seed, horizon: shown[task.variant_index],
+    )
     monkeypatch.setattr("lerobot_memobench.sim.simulation.Simulation", lambda task: None)
 
 
@@ -160,7 +97,7 @@ def test_scenes_are_kept_and_more_are_added(monkeypatch: pytest.MonkeyPatch, tmp
         seen.append(seed)
         return one
 
-    monkeypatch.setattr(decisions, "follow", follow)
+    monkeypatch.setattr("lerobot_memobench.evaluation.necessity.study.follow", follow)
     monkeypatch.setattr("lerobot_memobench.sim.simulation.Simulation", lambda task: None)
     task = get_task(PAN)
     first = study(task, "fixed", Settings(episodes=1), tmp_path)
@@ -204,51 +141,7 @@ def test_the_command_shows_a_table_and_names_its_files(
     ]
 
 
-def test_a_page_gets_the_table_between_its_marks(tmp_path: Path) -> None:
-    page = tmp_path / "page.md"
-    page.write_text(f"before\n{PAGE_BEGIN}\nold\n{PAGE_END}\nafter\n")
-    text = put_into_page(page, []).read_text()
-    assert text.startswith(f"before\n{PAGE_BEGIN}\n\n| task |")
-    assert text.endswith(f"{PAGE_END}\nafter\n")
-    assert "old" not in text
-    assert put_into_page(page, []).read_text() == text
-    page.write_text("no marks")
-    with pytest.raises(MemobenchError, match="put them where the table goes"):
-        put_into_page(page, [])
-    assert page.read_text() == "no marks"
-
-
 # --- the simulator ---
-
-
-def test_the_arm_comes_home_and_the_simulation_goes_on_as_if_it_had_not(gl: None) -> None:
-    task = get_task(PAN)
-    runs = []
-    for look in (False, True):
-        sim = Simulation(task)
-        sim.reset(7)
-        home = Home(sim)
-        at_start = decisions.photograph(sim)
-        for _ in range(6):
-            sim.step(np.array([0.5, 0.5, 0.3, 0.0, 0.0, 0.2, 1.0]))
-        if look:
-            assert decisions.difference(decisions.photograph(sim), at_start) > 0.01, "the arm has moved"
-            assert decisions.largest_pixel_difference(home.look(), at_start) <= necessity_study.PIXEL_EXACT
-        for _ in range(3):
-            sim.step(NO_OP)
-        runs.append(sim.state())
-    np.testing.assert_array_equal(*runs)
-
-
-def test_answers_are_what_the_expert_does_in_some_variant() -> None:
-    assert decisions.answers_of([get_task(PAN)]) == [
-        Atom("turnon", ("flat_stove_1",)),
-        Atom("turnoff", ("flat_stove_1",)),
-        Atom("on", ("chefmate_8_frypan_1", "flat_stove_1_cook_region")),
-    ]
-    stacks = decisions.answers_of(variants_of(get_task(STACK), "random"))
-    assert len(stacks) == 6
-    assert {atom.predicate for atom in stacks} == {"on"}
 
 
 @pytest.mark.slow
@@ -259,7 +152,7 @@ def test_stove_and_pan_in_the_simulator(gl: None, tmp_path: Path) -> None:
     assert result["in_order"]["chance"] == 0.25
     assert result["in_order"]["deterministic"] == 0.0
     assert result["in_order"]["pixel_exact"] == 0.0
-    assert result["examples"][0]["largest_pixel_difference"] <= necessity_study.PIXEL_EXACT
+    assert result["examples"][0]["largest_pixel_difference"] <= PIXEL_EXACT
     found = result["any_order"]
     assert (found["deterministic"], found["confirmed"], found["complete"]) == (1.0, 1, True)
     assert verdict(result) == "order"

@@ -12,16 +12,11 @@ import pytest
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.comparison.controls import (
-    by_replan,
-    contrasts,
-    gap_closed,
-    paired,
-    prefix_curves,
-    published_contrasts,
-    relabelled,
-)
-from lerobot_memobench.evaluation.metrics.rates import summarise
+from lerobot_memobench.evaluation.comparison.granularity import relabelled
+from lerobot_memobench.evaluation.comparison.oracle_memory import contrasts, gap_closed, published_contrasts
+from lerobot_memobench.evaluation.comparison.pairing import by_replan, paired
+from lerobot_memobench.evaluation.comparison.shuffled_memory import prefix_curves
+from lerobot_memobench.evaluation.metrics.summary import summarise
 from lerobot_memobench.paper import raw_tables
 
 STOVE = "turn_on_the_stove_and_turn_it_off_then_put_the_frying_pan_on_it"

@@ -1,0 +1,106 @@
+"""Reports as the terminal shows them, and the same as text for a file."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import replace
+
+from rich import box
+from rich.console import Console, Group, RenderableType
+from rich.table import Table as RichTable
+from rich.text import Text
+
+from lerobot_memobench.evaluation.documents.tables import Cell, Report, Table, bounds, figure, plain
+from lerobot_memobench.evaluation.metrics.rates import Rate
+
+WIDTH = 140
+"""Columns of a report that is written to a file."""
+
+MOST_COLUMNS = 14
+"""Columns of a table with groups that fit beside one another in a terminal."""
+
+
+def terminal(report: Report, headings: bool = True) -> RenderableType:
+    """Return a report for the terminal."""
+    parts: list[RenderableType] = []
+    for section in report.sections:
+        if headings and section.title:
+            parts.append(Text(f"\n{section.title}", style="bold underline"))
+        parts += [terminal_table(part) for table in section.tables for part in _narrow(table)]
+        parts += [Text(sentence) for sentence in section.sentences]
+        parts += [Text(f"note: {note}") for note in section.notes]
+    return Group(*parts)
+
+
+def text(report: Report) -> str:
+    """Return what the terminal shows, as text for a file."""
+    out = io.StringIO()
+    Console(file=out, width=WIDTH, highlight=False).print(terminal(report))
+    return "\n".join(line.rstrip() for line in out.getvalue().splitlines()).strip("\n") + "\n"
+
+
+def terminal_table(table: Table) -> RichTable:
+    """Return a table for the terminal; an interval goes to a line of its own where it is narrow."""
+    result = RichTable(
+        title=table.title or None, title_justify="left", header_style="bold", pad_edge=False, box=box.SIMPLE_HEAD
+    )
+    for column, (title, name) in enumerate(zip(table.titles, table.header, strict=True)):
+        # Rates are so narrow that a group's whole title does not fit over them.
+        header = f"{title[:4]}.\n{name}" if title else name
+        result.add_column(header, justify="left" if table.is_text(column) else "right", overflow="fold")
+    for index in range(len(table.rows)):
+        if index in table.rules:
+            result.add_section()
+        result.add_row(*_row(table, index))
+    if table.best:
+        result.caption = "* best of its column"
+        result.caption_justify = "left"
+    return result
+
+
+def _row(table: Table, index: int) -> list[Text]:
+    cells = []
+    for column, cell in enumerate(table.rows[index]):
+        best = (index, column) in table.best
+        style = "bold" if best or index in table.strong else ""
+        cells.append(Text(_cell(cell, table.intervals) + "*" * best, style=style))
+    return cells
+
+
+def _cell(cell: Cell, intervals: bool) -> str:
+    if isinstance(cell, Rate):
+        interval = bounds(cell) if intervals else None
+        return figure(cell.value) + ("" if interval is None else f" [{interval[0]}–{interval[1]}]")
+    return plain(cell)
+
+
+def _narrow(table: Table) -> list[Table]:
+    """Cut a table with groups of columns into several that fit; each keeps the columns before the first group."""
+    leading = 0
+    for title, span in table.groups:
+        if title:
+            break
+        leading += span
+    parts: list[list[int]] = [[]]
+    column = leading
+    for _, span in [group for group in table.groups if group[0]]:
+        if parts[-1] and leading + len(parts[-1]) + span > MOST_COLUMNS:
+            parts.append([])
+        parts[-1] += range(column, column + span)
+        column += span
+    if len(parts) == 1:
+        return [table]
+    return [_columns(table, [*range(leading), *part], first=k == 0) for k, part in enumerate(parts)]
+
+
+def _columns(table: Table, chosen: Sequence[int], first: bool) -> Table:
+    """Return some columns of a table; the title is kept on the first part."""
+    return replace(
+        table,
+        title=table.title if first else f"{table.title}, continued",
+        header=tuple(table.header[column] for column in chosen),
+        rows=tuple(tuple(row[column] for column in chosen) for row in table.rows),
+        groups=tuple((table.titles[column], 1) for column in chosen),
+        best=frozenset((row, chosen.index(column)) for row, column in table.best if column in chosen),
+    )

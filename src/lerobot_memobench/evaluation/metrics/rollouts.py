@@ -1,0 +1,76 @@
+"""What rollouts did: checkpoint by checkpoint, task by task, under one protocol or several."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.tasks.task import MEMORY_TYPES
+
+Record = Mapping[str, Any]
+"""A rollout: one line of the episode log."""
+
+
+def operations(record: Record) -> str:
+    """Return the labels of a rollout's checkpoints, such as "SUU"."""
+    return "".join(checkpoint["operation"] for checkpoint in record["checkpoints"])
+
+
+def satisfied(record: Record) -> list[bool]:
+    """Return per checkpoint whether its predicate held at some step of the execution, (K,)."""
+    return [checkpoint["first_step"] is not None for checkpoint in record["checkpoints"]]
+
+
+def completed_in_order(record: Record) -> list[bool]:
+    """Return per checkpoint whether it held while all earlier ones were complete, (K,)."""
+    return [checkpoint.get("ordered_step") is not None for checkpoint in record["checkpoints"]]
+
+
+def prefix(values: Sequence[bool]) -> list[bool]:
+    """Return per checkpoint whether it and all earlier ones are true, (K,)."""
+    return [all(values[: k + 1]) for k in range(len(values))]
+
+
+def by_task(records: Iterable[Record]) -> dict[str, list[Record]]:
+    """Group records by task, in the order of memory types and then of names."""
+    grouped: dict[str, list[Record]] = {}
+    for record in records:
+        grouped.setdefault(record["task"], []).append(record)
+    for name, group in grouped.items():
+        _check_one_version(name, group)
+    order = {memory_type: k for k, memory_type in enumerate(MEMORY_TYPES)}
+    return dict(sorted(grouped.items(), key=lambda item: (order[item[1][0]["memory_type"]], item[0])))
+
+
+def _check_one_version(name: str, group: Sequence[Record]) -> None:
+    """Refuse rollouts of one task that do not agree on what the task is."""
+    for what, found in (
+        ("memory_type", {record["memory_type"] for record in group}),
+        ("operations", {operations(record) for record in group}),
+    ):
+        if len(found) > 1:
+            raise MemobenchError(
+                f"rollouts of {name!r} disagree on their {what} ({', '.join(sorted(found))}); "
+                "report logs of different versions of a task separately"
+            )
+    if group[0]["memory_type"] not in MEMORY_TYPES:
+        raise MemobenchError(
+            f"rollouts of {name!r} have the memory type {group[0]['memory_type']!r}; expected one of "
+            + ", ".join(MEMORY_TYPES)
+        )
+
+
+PROTOCOL = {"referent": "referent settings", "replan_steps": "replan intervals"}
+"""Fields of a record that should agree within one report, and what they are called."""
+
+
+def mixtures(records: Iterable[Record]) -> list[str]:
+    """Return a sentence for each part of the protocol in which rollouts differ: their mean mixes unlike things."""
+    records = list(records)
+    notes = []
+    for field, words in PROTOCOL.items():
+        found = sorted({str(record.get(field)) for record in records})
+        if len(found) > 1:
+            notes.append(f"The rollouts mix {words} ({', '.join(found)}); the figures are over all of them.")
+    return notes

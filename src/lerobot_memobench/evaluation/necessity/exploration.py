@@ -1,0 +1,129 @@
+"""What else could be done than what the expert does? Every answer is tried at every state that can be reached."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import groupby
+from typing import TYPE_CHECKING
+
+from lerobot_memobench.evaluation.necessity.demonstrations import HORIZON
+from lerobot_memobench.evaluation.necessity.graph import Graph, Move
+from lerobot_memobench.evaluation.necessity.home import SETTLE
+from lerobot_memobench.evaluation.necessity.laboratory import Laboratory, Place
+from lerobot_memobench.evaluation.necessity.pictures import Picture, photograph
+from lerobot_memobench.tasks.formula import Atom
+from lerobot_memobench.tasks.progress import Progress
+from lerobot_memobench.tasks.task import Task
+
+if TYPE_CHECKING:
+    from lerobot_memobench.sim.simulation import Snapshot
+
+
+@dataclass
+class Exploration:
+    """What was found.
+
+    Attributes:
+        graph: states and moves; pictures are numbered by node until somebody groups them.
+        pictures: what is seen at each node. true: which atoms of the goals hold there.
+        moves, steps: how many of either were simulated.
+    """
+
+    graph: Graph
+    pictures: list[tuple[Picture, ...]]
+    true: list[frozenset[Atom]]
+    moves: int = 0
+    steps: int = 0
+
+
+def explore(laboratory: Laboratory, budget: int, horizon: int = HORIZON) -> Exploration:
+    """Try every answer at every state that can be reached before the horizon, nearest states first.
+
+    Args:
+        budget: control steps after which no further state is begun; those that are left stay without moves.
+    """
+    explorer = _Explorer(laboratory, horizon)
+    while (node := explorer.nearest()) is not None and explorer.found.steps < budget:
+        explorer.expand(node)
+    return explorer.found
+
+
+class _Explorer:
+    """Grows an exploration state by state; it begins with the start.
+
+    Attributes:
+        found: what is known so far.
+    """
+
+    def __init__(self, laboratory: Laboratory, horizon: int) -> None:
+        self._laboratory, self._horizon = laboratory, horizon
+        laboratory.sim.restore(laboratory.start)
+        self._snapshots: list[Snapshot] = []
+        self._places: list[Place] = []
+        self._cost: list[int] = []
+        """Least control steps known in which each node is reached."""
+        self.found = Exploration(Graph([]), [], [])
+        self._reach(0)
+
+    def nearest(self) -> int | None:
+        """Return the node that is reached soonest of those that are not explored and lie before the horizon."""
+        moves = self.found.graph.moves
+        waiting = [node for node, cost in enumerate(self._cost) if node not in moves and cost < self._horizon]
+        return min(waiting, key=self._cost.__getitem__, default=None)
+
+    def expand(self, node: int) -> None:
+        """Try every answer at a node."""
+        self.found.graph.moves[node] = {answer: self._try(node, answer) for answer in self._laboratory.answers}
+
+    def _try(self, node: int, answer: str) -> Move:
+        self._laboratory.sim.restore(self._snapshots[node])
+        held: list[frozenset[Atom]] = []
+        steps = self._laboratory.do(answer, held.append, self._horizon - self._cost[node])
+        if steps > SETTLE:
+            self.found.moves += 1
+            self.found.steps += steps
+        trace = tuple((true, len(list(run))) for true, run in groupby(held))
+        return Move(self._reach(self._cost[node] + steps), steps, trace)
+
+    def _reach(self, cost: int) -> int:
+        """Return the node of the present state, a new one where it is not known."""
+        place = self._laboratory.place()
+        node = next((k for k, known in enumerate(self._places) if known.same(place)), len(self._places))
+        if node == len(self._places):
+            self.found.graph.pictures.append(node)
+            self.found.pictures.append(photograph(self._laboratory.sim))
+            self.found.true.append(place.true)
+            self._snapshots.append(self._laboratory.sim.snapshot())
+            self._places.append(place)
+            self._cost.append(cost)
+        self._cost[node] = min(self._cost[node], cost)
+        return node
+
+
+def walk(
+    laboratory: Laboratory,
+    task: Task,
+    policy: Callable[[tuple[Picture, ...]], str | None],
+    horizon: int = HORIZON,
+) -> bool:
+    """Let a policy without memory act from pictures alone; return whether the task's goal came true in time.
+
+    Args:
+        policy: pictures with the arm at home → answer; None where it has none.
+    """
+    laboratory.sim.restore(laboratory.start)
+    progress = Progress(task)
+    progress.reset()
+    done = False
+
+    def listen(_: frozenset[Atom]) -> None:
+        nonlocal done
+        done = done or (progress.step(laboratory.sim.holds) and progress.steps <= horizon)
+
+    while not done and progress.steps < horizon:
+        answer = policy(photograph(laboratory.sim))
+        if answer is None:
+            return False
+        laboratory.do(answer, listen, horizon - progress.steps)
+    return done

@@ -1,0 +1,113 @@
+"""One scene in which answers are tried out: from any state, with the arm at home before and after."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.evaluation.necessity.demonstrations import HORIZON, answer_of, expert_of
+from lerobot_memobench.evaluation.necessity.home import Home
+from lerobot_memobench.tasks.formula import Atom, Formula, atoms
+from lerobot_memobench.tasks.task import Task
+
+if TYPE_CHECKING:
+    from lerobot_memobench.sim.simulation import Simulation
+
+SAME_PLACE = 0.02
+"""Distance up to which an object is where it was when states of the exploration are told apart, m."""
+SAME_JOINT = {"slide": 0.02, "hinge": 0.2}
+"""The same for drawers (m) and for doors and knobs (rad)."""
+
+
+def answers_of(variants: Sequence[Task]) -> list[Atom]:
+    """Return everything the expert brings about in some variant: the decision set."""
+    from lerobot_memobench.experts.expert import steps_of
+
+    found: dict[Atom, None] = {}
+    for task in variants:
+        for formula in (*(checkpoint.goal for checkpoint in task.checkpoints), task.goal):
+            found.update((answer_of(atom), None) for atom in steps_of(formula))
+    return list(found)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where things are, for telling states apart."""
+
+    true: frozenset[Atom]
+    objects: NDArray[np.float64]
+    joints: NDArray[np.float64]
+    reach: NDArray[np.float64]
+
+    def same(self, other: Place) -> bool:
+        """Whether nothing of note lies or stands elsewhere."""
+        return (
+            self.true == other.true
+            and bool(np.all(np.linalg.norm(self.objects - other.objects, axis=-1) < SAME_PLACE))
+            and bool(np.all(np.abs(self.joints - other.joints) < self.reach))
+        )
+
+
+class Laboratory:
+    """One scene in which answers are tried out, from states with the arm at home.
+
+    Args:
+        variants: the task and its variants, which share the scene.
+        sim: its simulation.
+        seed: of the start.
+    """
+
+    def __init__(self, variants: Sequence[Task], sim: Simulation, seed: int) -> None:
+        self.variants, self.sim, self.seed = variants, sim, seed
+        self.answers = {str(atom): atom for atom in answers_of(variants)}
+        goals: list[Formula] = [task.goal for task in variants]
+        self._atoms = sorted({answer_of(atom) for goal in goals for atom in atoms(goal)}, key=str)
+        sim.reset(seed)
+        self.home = Home(sim)
+        self.start = sim.snapshot()
+
+    def true(self) -> frozenset[Atom]:
+        """Return the atoms of the goals that hold now."""
+        return frozenset(atom for atom in self._atoms if self.sim.holds(atom))
+
+    def do(self, answer: str, listen: Callable[[frozenset[Atom]], None], limit: int = HORIZON) -> int:
+        """Let the expert carry out an answer, come home, and settle; return the steps it took.
+
+        Args:
+            listen: told the atoms that hold after each step.
+            limit: steps after which the answer is broken off.
+        """
+        atom = self.answers[answer]
+        steps = 0
+        if not self.sim.holds(atom):
+            expert = expert_of(self.variants[0], self.sim, self.seed)
+            for action in expert.achieve(atom):
+                if steps >= limit:
+                    break
+                self.sim.step(np.clip(action, -1.0, 1.0))
+                steps += 1
+                listen(self.true())
+        for _ in self.home.settle():
+            steps += 1
+            listen(self.true())
+        return steps
+
+    def place(self) -> Place:
+        """Return where things are now."""
+        sim = self.sim
+        objects = [sim.body_pose(name)[0] for name, asset in sim.assets.items() if asset.kind != "fixture"]
+        articulations = [
+            sim.world.articulation(f"{name}_{region}" if region else name)
+            for name, asset in sim.assets.items()
+            for region in asset.articulations
+        ]
+        return Place(
+            self.true(),
+            np.array(objects).reshape(-1, 3),
+            np.array([q for _, q in articulations]),
+            np.array([SAME_JOINT["slide" if a.kind == "drawer" else "hinge"] for a, _ in articulations]),
+        )

@@ -1,0 +1,55 @@
+"""What is asked of a task: under which referent, over which scenes, how closely pictures are looked at."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass
+
+from lerobot_memobench.evaluation.necessity.demonstrations import HORIZON
+from lerobot_memobench.tasks.task import Task
+
+VERSION = 1
+"""Raised when results change, so that old ones are made again."""
+REFERENTS = ("fixed", "random")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a result depends on, besides the task.
+
+    Attributes:
+        episodes: scenes (seeds) per task; with `referent=random` each is demonstrated once per variant.
+        seed_base: the first of their seeds.
+        tolerance: share of pixels without a like pixel within two, up to which pictures look the same.
+        budget: control steps after which the search for other ways to the goal begins no new state; 0 leaves it out.
+        horizon: execution steps.
+    """
+
+    episodes: int = 3
+    seed_base: int = 7
+    tolerance: float = 0.005
+    budget: int = 10_000
+    horizon: int = HORIZON
+
+    @property
+    def seeds(self) -> range:
+        """The seeds of the scenes."""
+        return range(self.seed_base, self.seed_base + self.episodes)
+
+
+def variants_of(task: Task, referent: str) -> list[Task]:
+    """Return the goals that may lie behind the same start: the published one, or all that a random referent draws."""
+    if referent == "fixed" or task.num_variants == 1:
+        return [task]
+    return [task.variant(k) for k in task.random_variants]
+
+
+def fingerprint(task: Task, referent: str, settings: Settings, search: bool = False) -> str:
+    """Return what a scene's result, or that of the search, must carry to be an answer to the same question."""
+    other = ("episodes", "seed_base") if search else ("episodes", "seed_base", "budget")
+    asked = {key: value for key, value in asdict(settings).items() if key not in other}
+    if search:
+        asked["seed"] = settings.seed_base
+    said = json.dumps([VERSION, referent, asked, task.bddl_text, task.metadata], sort_keys=True)
+    return hashlib.sha256(said.encode()).hexdigest()[:16]

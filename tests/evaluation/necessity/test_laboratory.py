@@ -1,0 +1,22 @@
+"""What can be tried: everything the expert does in some variant."""
+
+from __future__ import annotations
+
+from lerobot_memobench.evaluation.necessity.laboratory import answers_of
+from lerobot_memobench.evaluation.necessity.question import variants_of
+from lerobot_memobench.tasks.catalogue import get_task
+from lerobot_memobench.tasks.formula import Atom
+
+PAN = "turn_on_the_stove_and_turn_it_off_then_put_the_frying_pan_on_it"
+STACK = "stack_the_bowls_one_by_one_in_the_exact_sequence_shown_in_the_video"
+
+
+def test_answers_are_what_the_expert_does_in_some_variant() -> None:
+    assert answers_of([get_task(PAN)]) == [
+        Atom("turnon", ("flat_stove_1",)),
+        Atom("turnoff", ("flat_stove_1",)),
+        Atom("on", ("chefmate_8_frypan_1", "flat_stove_1_cook_region")),
+    ]
+    stacks = answers_of(variants_of(get_task(STACK), "random"))
+    assert len(stacks) == 6
+    assert {atom.predicate for atom in stacks} == {"on"}

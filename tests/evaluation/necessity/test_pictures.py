@@ -1,0 +1,36 @@
+"""Pictures compared as an eye does."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lerobot_memobench.evaluation.necessity.pictures import differences, unmatched
+
+from .drawn import scene
+
+
+def test_equal_pictures_have_nothing_unmatched() -> None:
+    assert unmatched(scene(), scene()) == 0.0
+    assert unmatched(scene(), scene(colour=(200, 40, 40))) == 0.0, "a shade is no difference"
+
+
+@pytest.mark.parametrize("shift", [{"dy": 2}, {"dx": -2}, {"dy": 1, "dx": 2}])
+def test_what_moved_by_two_pixels_looks_the_same(shift: dict[str, int]) -> None:
+    assert unmatched(scene(), scene(**shift)) == 0.0
+
+
+def test_what_moved_further_or_went_does_not() -> None:
+    # Of a square moved by 6: 4 rows of red have no red near them, and of the wall now covered 4 rows of 6 no wall.
+    assert unmatched(scene(), scene(dy=6)) * 64 * 64 == 4 * 10 + 4 * 6
+    # Of one that is gone: all its red; the wall behind it counts in the other direction, where it is less.
+    assert unmatched(scene(), scene(gone=True)) * 64 * 64 == 100
+    assert unmatched(scene(gone=True), scene()) == unmatched(scene(), scene(gone=True))
+
+
+def test_differences_are_of_the_camera_that_differs_most() -> None:
+    table = differences([(scene(), scene()), (scene(), scene(gone=True)), (scene(gone=True), scene(dy=6))])
+    assert table[0, 1] == pytest.approx(100 / 4096)
+    assert table[0, 2] == pytest.approx(100 / 4096)
+    assert np.array_equal(table, table.T)
+    assert not table.diagonal().any()
