@@ -14,7 +14,6 @@ from lerobot_memobench.policies.memobench_mem.averaging import WeightAverage
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory_pi05 import MemoryPI05
 from lerobot_memobench.policies.memobench_mem.weights import (
-    MODEL_FILE,
     TRAINING_FILE,
     checkpoint_file,
     load_exactly,
@@ -36,18 +35,6 @@ def read_config(source: str | Path, config: PreTrainedConfig | None, revision: s
     return found
 
 
-def find_weights(source: str | Path, revision: str | None) -> Path:
-    """Return the file of a checkpoint's weights.
-
-    Raises:
-        MemobenchError: it has none.
-    """
-    path = checkpoint_file(source, MODEL_FILE, revision)
-    if path is None:
-        raise MemobenchError(f"The checkpoint '{source}' has no {MODEL_FILE}; give a pretrained_model folder.")
-    return path
-
-
 def load_weights(policy: nn.Module, path: Path, source: str | Path, *, remembers: bool) -> None:
     """Load the weights of checkpoint ``source`` into a policy of this kind; its alignment heads may be missing.
 
@@ -63,18 +50,6 @@ def load_weights(policy: nn.Module, path: Path, source: str | Path, *, remembers
     # A run may change the objective of the one it goes on from; its heads then start anew.
     heads = {name for name in policy.state_dict() if name.startswith("alignment.")}
     load_exactly(policy, weights, source, optional=heads)
-
-
-def read_base_weights(source: str) -> dict[str, Tensor]:
-    """Return the weights of a pi0.5 checkpoint.
-
-    Raises:
-        MemobenchError: there are none.
-    """
-    path = checkpoint_file(source, MODEL_FILE)
-    if path is None:
-        raise MemobenchError(f"--policy.base_weights='{source}' has no {MODEL_FILE}; give a pi0.5 checkpoint.")
-    return load_file(path)
 
 
 def load_base_weights(model: MemoryPI05, weights: dict[str, Tensor], source: str) -> None:

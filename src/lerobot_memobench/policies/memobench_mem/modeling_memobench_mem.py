@@ -13,6 +13,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies.pi05.modeling_pi05 import PI05Policy
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from lerobot_memobench.errors import MemobenchError
@@ -21,10 +22,8 @@ from lerobot_memobench.policies.memobench_mem.alignment.objectives import make_a
 from lerobot_memobench.policies.memobench_mem.averaging import WeightAverage
 from lerobot_memobench.policies.memobench_mem.caching import open_cache
 from lerobot_memobench.policies.memobench_mem.checkpoints import (
-    find_weights,
     load_base_weights,
     load_weights,
-    read_base_weights,
     read_config,
     restore_average,
     save_training_weights,
@@ -37,7 +36,7 @@ from lerobot_memobench.policies.memobench_mem.memory_pi05 import MemoryPI05
 from lerobot_memobench.policies.memobench_mem.noise import EpisodeNoise
 from lerobot_memobench.policies.memobench_mem.plans import RowPlans
 from lerobot_memobench.policies.memobench_mem.processing.training_cache import set_training_cache
-from lerobot_memobench.policies.memobench_mem.weights import require_statistics
+from lerobot_memobench.policies.memobench_mem.weights import require_statistics, weights_file
 
 # A saved pipeline is built right after its policy, by the names under which its steps register when imported.
 from lerobot_memobench.policies.memobench_mem import processor_memobench_mem  # noqa: F401  # isort: skip
@@ -79,8 +78,7 @@ class MemobenchMemPolicy(PI05Policy):
             config.align, dims.vlm.width, dims.text_dim, config.memory_frames, config.tokens_per_frame
         )
         if config.base_weights and load_base:
-            weights = self._fix_pytorch_state_dict_keys(read_base_weights(config.base_weights), config)
-            load_base_weights(self.model, weights, config.base_weights)
+            self._load_base_weights(config.base_weights)
         if config.gradient_checkpointing:
             self.model.gradient_checkpointing_enable()
         self.to(config.device)
@@ -110,6 +108,10 @@ class MemobenchMemPolicy(PI05Policy):
 
     # -- checkpoints -----------------------------------------------------------------------------------------------
 
+    def _load_base_weights(self, source: str) -> None:
+        path = weights_file(source, named=f"--policy.base_weights='{source}'", fix="give a pi0.5 checkpoint")
+        load_base_weights(self.model, self._fix_pytorch_state_dict_keys(load_file(path), self.config), source)
+
     @classmethod
     def from_pretrained(
         cls,
@@ -129,7 +131,7 @@ class MemobenchMemPolicy(PI05Policy):
         """
         source = pretrained_name_or_path
         config = read_config(source, config, revision)
-        path = find_weights(source, revision)
+        path = weights_file(source, revision, named=f"The checkpoint '{source}'", fix="give a pretrained_model folder")
         if dataset_meta is None:
             require_statistics(source, revision)
         policy = cls(config, load_base=False)

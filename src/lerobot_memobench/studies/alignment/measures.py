@@ -90,6 +90,7 @@ class Measures:
         asked, candidates = self.questions.test, self.questions.candidates
 
         def within(task: int) -> float:
+            """Top-1 of a task's frames, among its own subgoals."""
             own = asked.tasks == task
             return top1(embeddings[own], asked.labels[own], candidates, asked.allowed[own])
 

@@ -55,6 +55,7 @@ def make_questions(cache: MemoryCache, level: str, split: Split, tasks: np.ndarr
         by_task[tasks[frames], labels] = True
 
     def asked(frames: np.ndarray, labels: np.ndarray) -> Asked:
+        """Ask about these frames."""
         return Asked(
             indices=frames,
             labels=torch.from_numpy(labels),

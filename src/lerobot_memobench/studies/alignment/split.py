@@ -37,6 +37,7 @@ def split_frames(frames: Frames, phase: np.ndarray, settings: StudySettings) -> 
     episode = np.repeat(np.arange(len(held)), np.diff(frames.episodes))
 
     def asked(held_out: bool) -> np.ndarray:
+        """Execution frames, evenly spaced, of episodes that are held out or not."""
         chosen = np.flatnonzero(held == held_out)
         acting = (np.flatnonzero((episode == number) & (phase == 1)) for number in chosen)
         return np.concatenate([_spaced(own, settings.frames_per_episode) for own in acting])

@@ -27,9 +27,6 @@ class FrameSampling(MemoryMechanism):
     name = "frame_sampling"
     capacity = None
 
-    def __init__(self, frames: int) -> None:
-        self.frames = frames
-
     def write(self, kept: list[Frame], frame: Frame) -> None:
         """Keep the frame."""
         kept.append(frame)

@@ -42,8 +42,10 @@ class MemoryMechanism(ABC):
     """
 
     name: ClassVar[str]
-    frames: int
     capacity: int | None
+
+    def __init__(self, frames: int) -> None:
+        self.frames = frames
 
     @abstractmethod
     def write(self, kept: list[Frame], frame: Frame) -> None:

@@ -11,11 +11,10 @@ class NoMemory(MemoryMechanism):
     """The baseline that never sees the past."""
 
     name = "none"
-    frames = 0
     capacity = 0
 
     def __init__(self, frames: int = 0) -> None:
-        """Ignore ``frames``, which other mechanisms read."""
+        super().__init__(frames=0)  # whatever others would read
 
     def write(self, kept: list[Frame], frame: Frame) -> None:
         """Forget the frame."""

@@ -6,9 +6,7 @@ from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import Frame
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryMechanism
 from lerobot_memobench.policies.memobench_mem.memory.none import NoMemory
 
-MECHANISMS: dict[str, type[NoMemory] | type[FrameSampling]] = {
-    mechanism.name: mechanism for mechanism in (NoMemory, FrameSampling)
-}
+MECHANISMS: dict[str, type[MemoryMechanism]] = {NoMemory.name: NoMemory, FrameSampling.name: FrameSampling}
 
 
 def make_mechanism(name: str, frames: int) -> MemoryMechanism:
