@@ -69,7 +69,7 @@ class Actor:
         self.batch["observation.phase"] = torch.ones(rows, 1)
         for _ in range(SEEN):
             self._tick()
-            self.policy._observe(self.batch)
+            self.policy.observe(self.batch)
 
     def _tick(self) -> None:
         self.batch["observation.step"] = torch.full((self.rows, 1), float(self.step))
@@ -77,7 +77,7 @@ class Actor:
 
     def replan(self) -> None:
         """One call that takes in an observation and plans."""
-        for queue in self.policy._queues_by_row:
+        for queue in self.policy.plans.queues:
             queue.clear()
         self._tick()
         self.policy.select_action(self.batch)
@@ -86,15 +86,15 @@ class Actor:
 
     def between(self) -> None:
         """One call that acts by the plan it has."""
-        if not self.policy._queues_by_row[0]:
+        if not self.policy.plans.queues[0]:
             self.replan()
         self._tick()
         self.policy.select_action(self.batch)
 
     def bytes_per_frame(self) -> float:
         """Bytes one remembered frame takes, as held."""
-        row = self.policy._history.rows[0]
-        return sum(tokens.nbytes for tokens in row.tokens) / len(row.tokens)
+        kept = self.policy.history.rows[0].kept
+        return sum(frame.tokens.nbytes for frame in kept) / len(kept)
 
 
 if __name__ == "__main__":

@@ -31,9 +31,9 @@ from turns import medians, peak, reset_peak, resident
 
 from lerobot_memobench.datasets.memory_cache import FOLDER, MemoryCache, build_memory_cache
 from lerobot_memobench.policies.memobench_mem.dimensions import SIZES
-from lerobot_memobench.policies.memobench_mem.memory import sample_frames
-from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import GatherMemoryProcessorStep
-from lerobot_memobench.policies.memobench_mem.text import WordTextEncoder
+from lerobot_memobench.policies.memobench_mem.language.text_encoders import WordTextEncoder
+from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import sample_frames
+from lerobot_memobench.policies.memobench_mem.processing.gather_memory import GatherMemoryProcessorStep
 
 CAMERA = "observation.images.image"
 TASK = "put_the_tomato_into_the_top_drawer_of_the_cabinet"

@@ -12,8 +12,8 @@ import json
 
 import torch
 
-from lerobot_memobench.policies.memobench_mem.alignment import make_alignment
-from lerobot_memobench.policies.memobench_mem.backbone import MemoryPI05
+from lerobot_memobench.policies.memobench_mem.alignment.objectives import make_alignment
+from lerobot_memobench.policies.memobench_mem.memory_pi05 import MemoryPI05
 from policies import config
 
 

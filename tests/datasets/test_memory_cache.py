@@ -27,8 +27,8 @@ SUBGOALS_1 = "open the top drawer; put the bowl in the drawer"
 
 
 def _synthetic():  # type: ignore[no-untyped-def]
-    """The policy tests' writer of a small dataset."""
-    path = Path(__file__).parents[1] / "policies" / "conftest.py"
+    """The writer of a small dataset that policies and studies are tested with too."""
+    path = Path(__file__).parents[1] / "synthetic_dataset.py"
     spec = importlib.util.spec_from_file_location("synthetic_dataset", path)
     assert spec is not None
     assert spec.loader is not None

@@ -1,91 +1,21 @@
-"""Small synthetic datasets and configurations shared by the policy and cache tests."""
+"""The synthetic dataset that policies are trained on."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
 torch.set_num_threads(1)
-sys.path.insert(0, str(Path(__file__).parent))  # for small_policy.py: pytest imports tests by their paths
-
-SIZE = 48  # pixels of the synthetic cameras
-LENGTHS = (40, 23, 31)
-PROMPTS = (0, 8, 0)
-SUBGOALS = (
-    ("pick up the cream cheese", "put it in the basket"),
-    ("open the top drawer", "put the bowl in the drawer", "close the top drawer"),
-    ("pick up the cream cheese", "pick up the butter", "put both in the basket"),
-)
-TASKS = ("put the cream cheese in the basket", "put the bowl away", "fetch cream cheese and butter")
-
-
-def make_dataset(root: Path, seed: int = 0, repeats: int = 1) -> Path:
-    """Write a LeRobotDataset with this project's columns: three short episodes of coloured squares that move.
-
-    With ``repeats`` each of the three tasks has that many episodes, one task after the other.
-    """
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    image = {"dtype": "video", "shape": (SIZE, SIZE, 3), "names": ["height", "width", "channels"]}
-    string = {"dtype": "string", "shape": (1,), "names": None}
-    dataset = LeRobotDataset.create(
-        "memobench/synthetic",
-        fps=20,
-        root=root,
-        use_videos=True,
-        features={
-            "observation.images.image": image,
-            "observation.images.wrist_image": image,
-            "observation.state": {"dtype": "float32", "shape": (8,), "names": None},
-            "action": {"dtype": "float32", "shape": (7,), "names": None},
-            "phase": {"dtype": "int64", "shape": (1,), "names": None},
-            "simple_subgoal": string,
-            "grounded_subgoal": string,
-            "coarse_subgoal": string,
-            "memory": string,
-        },
-    )
-    rng = np.random.default_rng(seed)
-    kinds = list(zip(LENGTHS, PROMPTS, SUBGOALS, TASKS, strict=True))
-    for length, prompt, subgoals, task in [kind for kind in kinds for _ in range(repeats)]:
-        colour = rng.integers(60, 255, 3)
-        drift = rng.normal(size=7)
-        for t in range(length):
-            frame = np.full((SIZE, SIZE, 3), 30, np.uint8)
-            corner = 2 + (t * (SIZE - 16)) // length
-            frame[corner : corner + 12, corner : corner + 12] = colour
-            k = min(t * len(subgoals) // length, len(subgoals) - 1)
-            dataset.add_frame(
-                {
-                    "observation.images.image": frame,
-                    "observation.images.wrist_image": frame[::-1].copy(),
-                    "observation.state": (np.sin(t / 5 + np.arange(8)) + 0.05 * rng.normal(size=8)).astype(np.float32),
-                    "action": np.tanh(drift + np.sin(t / 5 + np.arange(7))).astype(np.float32),
-                    "phase": np.array([int(t >= prompt)]),
-                    # Some frames carry no text: the cache then looks at the next that does.
-                    "simple_subgoal": "" if t % 7 == 3 else subgoals[k],
-                    "grounded_subgoal": subgoals[k] + " at (0.1, 0.2)",
-                    "coarse_subgoal": subgoals[k].split()[0] + " it",
-                    "memory": "; ".join(subgoals[:k]),
-                    "task": task,
-                }
-            )
-        dataset.save_episode()
-    dataset.finalize()
-    return root
+# For small_policy.py and synthetic_dataset.py: pytest imports tests by their paths.
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
 
 
 @pytest.fixture(scope="session")
 def dataset_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The synthetic dataset, without a cache at first; tests that change it must copy it."""
+    from synthetic_dataset import make_dataset
+
     return make_dataset(tmp_path_factory.mktemp("data") / "synthetic")
-
-
-@pytest.fixture(scope="session")
-def twice_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same three tasks with two episodes each."""
-    return make_dataset(tmp_path_factory.mktemp("data") / "twice", repeats=2)

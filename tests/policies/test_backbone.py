@@ -7,8 +7,9 @@ import torch
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from lerobot.policies.pi05.modeling_pi05 import PI05Pytorch
 
-from lerobot_memobench.policies.memobench_mem.backbone import MemoryPI05, SizedPI05
+from lerobot_memobench.policies.memobench_mem.backbone import SizedPI05
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.memory_pi05 import MemoryPI05
 
 CHUNK, BATCH, FRAMES = 6, 2, 5
 
@@ -204,9 +205,9 @@ def test_full_size_runs_in_shape(integration: str) -> None:
 
 def test_the_tower_without_weights_is_the_same_every_time() -> None:
     torch.manual_seed(5)
-    first = SizedPI05(_config()).paligemma_with_expert.frame_encoder((96, 96))
+    first = SizedPI05(_config()).paligemma_with_expert.perception
     torch.manual_seed(6)
-    second = SizedPI05(_config()).paligemma_with_expert.frame_encoder((96, 96))
+    second = SizedPI05(_config()).paligemma_with_expert.perception
     assert first.key == second.key
     images = torch.rand(3, 3, 64, 80)
     tokens = first(images)

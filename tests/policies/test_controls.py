@@ -18,9 +18,9 @@ from small_policy import batch_of, made_for_training, small_config
 from lerobot_memobench.datasets.memory_cache import FOLDER, MemoryCache
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
+from lerobot_memobench.policies.memobench_mem.language.text_encoders import WordTextEncoder
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import shuffle_within_episodes
-from lerobot_memobench.policies.memobench_mem.text import WordTextEncoder
+from lerobot_memobench.policies.memobench_mem.processing.subgoals import shuffle_within_episodes
 from lerobot_memobench.tasks.memory_text import with_memory
 
 EPISODE_1 = 40  # first frame of the second episode, whose subgoals are:
@@ -74,7 +74,7 @@ def test_plain_policies_read_no_memory_text(dataset_root: Path) -> None:
 
 def test_six_checkpoints_fit_into_the_prompt() -> None:
     """The longest memory of the catalogue is not cut off by the word tokenizer's length."""
-    from lerobot_memobench.policies.memobench_mem.text import words
+    from lerobot_memobench.policies.memobench_mem.language.tokenizer import words
     from lerobot_memobench.tasks.catalogue import get_task, task_names
     from lerobot_memobench.tasks.memory_text import memory_text
 
@@ -181,7 +181,7 @@ def test_without_integration_it_is_plain_pi05(dataset_root: Path, tmp_path: Path
     for frame in range(3):
         action = evaluated.select_action(before(_observation(dataset, frame, "put the bowl away")))
         assert torch.isfinite(action).all()
-    assert all(not row.tokens for row in evaluated._history.rows)
+    assert all(not row.kept for row in evaluated.history.rows)
 
 
 @pytest.mark.parametrize(

@@ -22,12 +22,11 @@ from small_policy import CHUNK, batch_of, made_for_training, small_config
 from lerobot_memobench.datasets.memory_cache import FOLDER, MemoryCache
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
-from lerobot_memobench.policies.memobench_mem.memory import sample_frames
+from lerobot_memobench.policies.memobench_mem.language.text_encoders import WordTextEncoder
+from lerobot_memobench.policies.memobench_mem.language.tokenizer import make_vocabulary, make_word_tokenizer
+from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import sample_frames
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import (
-    GatherMemoryProcessorStep,
-)
-from lerobot_memobench.policies.memobench_mem.text import WordTextEncoder, make_vocabulary, make_word_tokenizer
+from lerobot_memobench.policies.memobench_mem.processing.gather_memory import GatherMemoryProcessorStep
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +61,7 @@ def test_batch_gathers_the_history_of_its_frames(dataset_root: Path) -> None:
     steps = [[2 * slot for slot in sample_frames(frame // 2, 8)] for frame in (0, 39, 22, 5)]
     assert [row[mask].tolist() for row, mask in zip(batch["memory.steps"], batch["memory.mask"], strict=True)] == steps
     assert batch["phase"].tolist() == [1, 1, 1, 0]
-    expected = policy._frames(torch.stack([dataset[40 + step]["observation.images.image"] for step in steps[2]]))
+    expected = policy.perception(torch.stack([dataset[40 + step]["observation.images.image"] for step in steps[2]]))
     torch.testing.assert_close(batch["memory.tokens"][2, : len(steps[2])], expected)
     assert batch["memory.text"].shape == (4, 8, 64)
     assert batch["memory.text_mask"].equal(batch["memory.mask"])
@@ -181,8 +180,8 @@ def test_rollout_memory_equals_the_gathered_one(trained: Any) -> None:
     policy.eval()
     policy.reset()
     for frame in range(23):
-        policy._observe(before(_join(_observation(dataset, 1, frame), _observation(dataset, 2, frame))))
-    tokens, steps, mask = policy._history.gather([0, 1])
+        policy.observe(before(_join(_observation(dataset, 1, frame), _observation(dataset, 2, frame))))
+    tokens, steps, mask = policy.history.gather([0, 1])
     batch = before(batch_of(dataset, [40 + 22, 63 + 22]))
     assert torch.equal(steps, batch["memory.steps"])
     assert torch.equal(mask, batch["memory.mask"])
@@ -235,8 +234,8 @@ def test_actions_depend_on_what_was_seen_long_ago(trained: Any) -> None:
 def test_plans_begin_with_the_execution_phase(trained: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     policy, before, _, dataset, _, _ = trained
     planned: list[tuple[int, list[int]]] = []
-    original = policy._plan
-    monkeypatch.setattr(policy, "_plan", lambda b, rows, *a: planned.append((t, rows)) or original(b, rows, *a))
+    original = policy.plan
+    monkeypatch.setattr(policy, "plan", lambda b, rows, *a: planned.append((t, rows)) or original(b, rows, *a))
     policy.eval()
     policy.reset()
     for t in range(16):
@@ -335,20 +334,20 @@ def test_lerobots_rollout_loop_runs_on_a_checkpoint(trained: Any) -> None:
 
 def test_evaluation_loads_the_average_and_training_both(trained: Any) -> None:
     policy, before, _, dataset, folder, _ = trained
-    average = policy._average
+    average = policy.average
     assert average is not None
     assert average.updates == 4
     evaluated = MemobenchMemPolicy.from_pretrained(folder)
     for name, parameter in evaluated.named_parameters():
         expected = average.average.get(name, dict(policy.named_parameters())[name])
         assert torch.equal(parameter, expected), name
-    assert evaluated._average is None
+    assert evaluated.average is None
     resumed = MemobenchMemPolicy.from_pretrained(folder, dataset_meta=dataset.meta)
-    assert resumed._average is not None
-    assert resumed._average.updates == 4
+    assert resumed.average is not None
+    assert resumed.average.updates == 4
     for name, parameter in resumed.named_parameters():
         assert torch.equal(parameter, dict(policy.named_parameters())[name]), name
-    for name, tensor in resumed._average.average.items():
+    for name, tensor in resumed.average.average.items():
         assert torch.equal(tensor, average.average[name]), name
     # Evaluation during training uses the average too, and gives the trained weights back.
     frames = [[_observation(dataset, 0, t)] for t in range(2)]
@@ -361,7 +360,7 @@ def test_evaluation_loads_the_average_and_training_both(trained: Any) -> None:
 
 
 def test_average_follows_its_formula() -> None:
-    from lerobot_memobench.policies.memobench_mem.ema import WeightAverage
+    from lerobot_memobench.policies.memobench_mem.averaging import WeightAverage
 
     parameter = torch.nn.Parameter(torch.tensor([1.0]))
     average = WeightAverage({"w": parameter}, decay=0.15)
@@ -385,7 +384,7 @@ def test_no_average_when_it_is_off(dataset_root: Path, tmp_path: Path) -> None:
     policy.train()
     policy.forward(before(batch_of(dataset, [3])))
     policy.update()
-    assert policy._average is None
+    assert policy.average is None
     policy.save_pretrained(tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["config.json", "model.safetensors"]
 
@@ -479,10 +478,10 @@ def test_pi05_weights_as_a_start(trained: Any, tmp_path: Path) -> None:
     for name, tensor in plain.named_parameters():
         assert torch.equal(own[name], tensor), name
     # The tower alone, as `memobench cache --weights` reads it, is the same tower.
-    from lerobot_memobench.policies.memobench_mem.caching import load_frame_encoder
+    from lerobot_memobench.policies.memobench_mem.caching import load_perception
 
-    assert load_frame_encoder(small_config(), tmp_path).key == policy._frames.key
-    assert load_frame_encoder(small_config()).key == trained[0]._frames.key != policy._frames.key
+    assert load_perception(small_config(), tmp_path).key == policy.perception.key
+    assert load_perception(small_config()).key == trained[0].perception.key != policy.perception.key
 
 
 # -- words ---------------------------------------------------------------------------------------------------------
@@ -514,7 +513,7 @@ def test_cache_of_one_dataset_is_not_used_for_another(trained: Any) -> None:
     cache = MemoryCache.open(
         Path(trained[3].root),
         "tiny-stride1",
-        frames_key=trained[0]._frames.key,
+        frames_key=trained[0].perception.key,
         camera="observation.images.image",
         stride=1,
     )

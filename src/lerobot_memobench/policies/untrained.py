@@ -17,14 +17,17 @@ class UntrainedConfig(PreTrainedConfig):
 
     @property
     def observation_delta_indices(self) -> None:
+        """No observations of other steps."""
         return None
 
     @property
     def action_delta_indices(self) -> None:
+        """No actions of other steps."""
         return None
 
     @property
     def reward_delta_indices(self) -> None:
+        """No rewards of other steps."""
         return None
 
     def get_optimizer_preset(self) -> AdamWConfig:
@@ -32,7 +35,9 @@ class UntrainedConfig(PreTrainedConfig):
         return AdamWConfig()
 
     def get_scheduler_preset(self) -> LRSchedulerConfig | None:
+        """No schedule."""
         return None
 
     def validate_features(self) -> None:
+        """Take the environment's features as they are."""
         return None

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
-from lerobot.policies.pretrained import PreTrainedPolicy
-from torch import Tensor, nn
+from torch import Tensor
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_expert.configuration_memobench_expert import MemobenchExpertConfig
+from lerobot_memobench.policies.untrained_policy import UntrainedPolicy
 
 EXPERT_ACTION = "observation.expert_action"
 
 
-class MemobenchExpertPolicy(PreTrainedPolicy):
+class MemobenchExpertPolicy(UntrainedPolicy):
     """Parameter-less policy. ``select_action`` returns ``batch["observation.expert_action"]``, (B, 7) float32."""
 
     config_class = MemobenchExpertConfig
@@ -23,17 +23,8 @@ class MemobenchExpertPolicy(PreTrainedPolicy):
         super().__init__(config)
         self.config = config
 
-    def get_optim_params(self) -> list[nn.Parameter]:
-        return []
-
     def reset(self) -> None:
         """The expert lives in the environment, so there is no state to clear."""
-
-    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict | None]:
-        raise MemobenchError(
-            "The policy 'memobench_expert' has no parameters and cannot be trained; choose a learning policy, "
-            "for example --policy.type=memobench_mem."
-        )
 
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Return the expert's action (B, 7) in [-1, 1] for the current observation.
@@ -47,7 +38,3 @@ class MemobenchExpertPolicy(PreTrainedPolicy):
                 "--env.expert_action=true, or use `lerobot eval env=memobench`, which sets it."
             )
         return batch[EXPERT_ACTION]
-
-    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """The expert plans one step at a time, so its chunk is (B, 1, 7)."""
-        return self.select_action(batch).unsqueeze(1)

@@ -1,21 +1,32 @@
-"""Making the memory cache of a dataset with the frozen towers of a policy (``memobench cache``)."""
+"""The memory cache of a dataset, made and opened with the frozen towers of a policy."""
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import torch
 
-from lerobot_memobench.datasets.memory_cache import Progress, build_memory_cache
+from lerobot_memobench.datasets.memory_cache import MemoryCache, Progress, build_memory_cache, read_meta
+from lerobot_memobench.policies.memobench_mem.backbone import SizedPaliGemmaWithExpert
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.text import make_text_encoder
+from lerobot_memobench.policies.memobench_mem.language.text_encoders import (
+    SiglipTextEncoder,
+    WordTextEncoder,
+    make_text_encoder,
+)
+from lerobot_memobench.policies.memobench_mem.perception.frozen import VISION_SEED, seed_parameters
+from lerobot_memobench.policies.memobench_mem.perception.perception import Perception
+from lerobot_memobench.policies.memobench_mem.perception.pixels import PixelPerception
 from lerobot_memobench.policies.memobench_mem.weights import load_exactly, read_weights
+
+logger = logging.getLogger(__name__)
 
 _VISION_PREFIX = "paligemma_with_expert.paligemma.model."
 
 
-def load_frame_encoder(config: MemobenchMemConfig, weights: str | Path | None = None):  # type: ignore[no-untyped-def]
-    """The frozen image tower of ``config``'s size alone, without the rest of the model, as a ``FrameEncoder``.
+def load_perception(config: MemobenchMemConfig, weights: str | Path | None = None) -> Perception:
+    """Load the frozen image tower of ``config``'s size alone, without the rest of the model.
 
     Args:
         weights: folder or repository of a pi0.5 or memobench_mem checkpoint; None takes ``config.base_weights``, or
@@ -24,15 +35,8 @@ def load_frame_encoder(config: MemobenchMemConfig, weights: str | Path | None = 
     Raises:
         MemobenchError: the weights cannot be read or do not fit.
     """
-    from lerobot_memobench.policies.memobench_mem.backbone import (
-        VISION_SEED,
-        FrameEncoder,
-        SizedPaliGemmaWithExpert,
-        seed_parameters,
-    )
-
     with torch.device("meta"):
-        model = SizedPaliGemmaWithExpert(config.dimensions, config).paligemma.model
+        model = SizedPaliGemmaWithExpert(config).paligemma.model
     towers = type(model.vision_tower)(model.config.vision_config), type(model.multi_modal_projector)(model.config)
     tower, projector = (part.to(torch.float32).eval().requires_grad_(False) for part in towers)
     for part, name in ((tower, "vision_tower."), (projector, "multi_modal_projector.")):
@@ -42,7 +46,7 @@ def load_frame_encoder(config: MemobenchMemConfig, weights: str | Path | None = 
         else:
             load_exactly(part, read_weights(source, _VISION_PREFIX + name), source, optional=set())
         part.to(config.device)
-    return FrameEncoder(tower, projector, config.image_size)
+    return PixelPerception(tower, projector, config.image_size, config.memory_camera)
 
 
 def cache_dataset(
@@ -58,23 +62,54 @@ def cache_dataset(
 
     Args:
         config: a policy configuration, for example ``MemobenchMemConfig(size="tiny", memory_stride=1)``.
-        weights: checkpoint whose image tower is used, see :func:`load_frame_encoder`.
+        weights: checkpoint whose image tower is used, see :func:`load_perception`.
         workers: threads that decode videos ahead of the tower; by the cores of the machine when None.
         progress: called with (episodes done, episodes in all).
 
     Returns:
         The cache's folder, ``<root>/memory_cache/<size>-stride<n>``.
     """
-    assert config.text_encoder is not None  # set by the configuration
-    texts = make_text_encoder(config.text_encoder, config.dimensions.text_dim, str(config.device))
     return build_memory_cache(
         root,
         config.cache_name,
-        load_frame_encoder(config, weights),
-        texts,
+        load_perception(config, weights),
+        _text_encoder(config),
         camera=config.memory_camera,
         stride=config.memory_stride,
         batch_size=batch_size,
         workers=workers,
         progress=progress,
     )
+
+
+def open_cache(root: Path, config: MemobenchMemConfig, perception: Perception) -> MemoryCache:
+    """Open the cache that ``config`` reads beside the dataset at ``root``; make it when there is none.
+
+    Raises:
+        MemobenchError: the cache there is stale, or made by another perception or text encoder.
+    """
+    texts = _text_encoder(config)
+    if read_meta(root, config.cache_name) is None:
+        logger.info("No memory cache beside %s yet: encoding its frames once.", root)
+        build_memory_cache(
+            root,
+            config.cache_name,
+            perception,
+            texts,
+            camera=perception.remembers,
+            stride=config.memory_stride,
+            progress=lambda done, count: logger.info("memory cache: %d of %d episodes", done, count),
+        )
+    return MemoryCache.open(
+        root,
+        config.cache_name,
+        frames_key=perception.key,
+        camera=perception.remembers,
+        stride=config.memory_stride,
+        texts_key=None if config.align == "none" else texts.key,
+    )
+
+
+def _text_encoder(config: MemobenchMemConfig) -> WordTextEncoder | SiglipTextEncoder:
+    assert config.text_encoder is not None  # set by the configuration
+    return make_text_encoder(config.text_encoder, config.dimensions.text_dim, str(config.device))

@@ -6,39 +6,20 @@ import logging
 from dataclasses import dataclass
 
 from lerobot.configs import PreTrainedConfig
-from lerobot.optim import LRSchedulerConfig
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
-from torch.optim import Optimizer
-from torch.optim.lr_scheduler import LambdaLR
 
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.policies.memobench_mem.dimensions import SIZES, Dimensions
+from lerobot_memobench.policies.memobench_mem.dimensions import GRID, SIZES, Dimensions
+from lerobot_memobench.policies.memobench_mem.schedule import WarmupFractionSchedulerConfig
 
 logger = logging.getLogger(__name__)
 
 ALIGN_WEIGHTS = {"none": 0.0, "semantic": 0.1, "contrastive": 0.1, "framewise": 0.05}
 INTEGRATIONS = ("modulation", "context", "none")
 SUBGOAL_LEVELS = ("coarse", "intermediate", "fine")
-TOKENS_PER_FRAME = 16
+TOKENS_PER_FRAME = GRID**2
 ORACLE_TOKENS = 128
 """Room that oracle memory text needs in a prompt of the word tokenizer: six checkpoints of some ten words."""
-
-
-@LRSchedulerConfig.register_subclass("memobench_constant_with_warmup")
-@dataclass
-class WarmupFractionSchedulerConfig(LRSchedulerConfig):
-    """Linear warm-up over a fraction of the run, then constant (paper: 5 %).
-
-    LeRobot's own constant schedule counts warm-up steps, which would have to change with ``--steps``.
-    """
-
-    num_warmup_steps: int | None = None
-    warmup_fraction: float = 0.05
-
-    def build(self, optimizer: Optimizer, num_training_steps: int) -> LambdaLR:
-        steps = self.num_warmup_steps
-        warmup = max(1, round(self.warmup_fraction * num_training_steps) if steps is None else steps)
-        return LambdaLR(optimizer, lambda step: min(1.0, (step + 1) / warmup))
 
 
 def _choose(field: str, given: str, known: tuple[str, ...]) -> None:
@@ -126,27 +107,39 @@ class MemobenchMemConfig(PI05Config):
         if self.align_weight is None:
             self.align_weight = ALIGN_WEIGHTS[self.align]
         super().__post_init__()
-        self._check()
+        self._check_numbers()
+        self._check_perception()
+        self._check_alignment()
 
-    def _check(self) -> None:
+    def _check_numbers(self) -> None:
         for field in ("memory_frames", "memory_stride", "n_action_steps"):
             if getattr(self, field) < 1:
                 raise MemobenchError(f"--policy.{field}={getattr(self, field)} must be at least 1.")
+        if not 0.0 <= self.ema_decay < 1.0:
+            raise MemobenchError(f"--policy.ema_decay={self.ema_decay} must be in [0, 1); 0 turns it off.")
+        if self.align_weight is not None and self.align_weight < 0:
+            raise MemobenchError(f"--policy.align_weight={self.align_weight} must not be negative.")
+
+    def _check_perception(self) -> None:
         if self.tokens_per_frame != TOKENS_PER_FRAME:
             raise MemobenchError(
                 f"--policy.tokens_per_frame={self.tokens_per_frame} is not supported: frames are pooled to a "
                 f"4x4 grid, so leave it at {TOKENS_PER_FRAME}."
             )
-        if not 0.0 <= self.ema_decay < 1.0:
-            raise MemobenchError(f"--policy.ema_decay={self.ema_decay} must be in [0, 1); 0 turns it off.")
-        if self.align_weight is not None and self.align_weight < 0:
-            raise MemobenchError(f"--policy.align_weight={self.align_weight} must not be negative.")
         if not self.freeze_vision_encoder:
             raise MemobenchError(
                 "--policy.freeze_vision_encoder=false cannot be used: memory tokens are cached from the frozen "
                 "vision tower, and would no longer match a tower that learns."
             )
-        if self.align != "none" and self.integration == "none":
+        patch = self.dimensions.vision.patch
+        if any(side % patch or (side // patch) % GRID for side in self.image_size):
+            raise MemobenchError(
+                f"--policy.image_resolution={self.image_resolution} must be a multiple of {GRID * patch} pixels at "
+                f"size {self.size}, so that its patches pool to a 4x4 grid."
+            )
+
+    def _check_alignment(self) -> None:
+        if self.align != "none" and self.memory == "none":
             raise MemobenchError(
                 f"--policy.align={self.align} has no memory to align with --policy.integration=none; use modulation or "
                 "context, or --policy.align=none."
@@ -155,12 +148,6 @@ class MemobenchMemConfig(PI05Config):
             raise MemobenchError(
                 "--policy.shuffle_subgoals=true changes nothing with --policy.align=none, which reads no subgoals; "
                 "name an alignment too."
-            )
-        patch = self.dimensions.vision.patch
-        if any(side % patch or (side // patch) % 4 for side in self.image_size):
-            raise MemobenchError(
-                f"--policy.image_resolution={self.image_resolution} must be a multiple of {4 * patch} pixels at "
-                f"size {self.size}, so that its patches pool to a 4x4 grid."
             )
 
     @property
@@ -175,9 +162,15 @@ class MemobenchMemConfig(PI05Config):
         return tuple(self.image_resolution)  # type: ignore[return-value]  # a checkpoint gives a list
 
     @property
+    def memory(self) -> str:
+        """Name of the memory mechanism, one of ``memory.registry.MECHANISMS``."""
+        return "none" if self.integration == "none" else "frame_sampling"
+
+    @property
     def cache_name(self) -> str:
         """Name of the memory cache this policy reads, below ``<dataset>/memory_cache``."""
         return f"{self.size}-stride{self.memory_stride}"
 
     def get_scheduler_preset(self) -> WarmupFractionSchedulerConfig:
+        """Return the schedule that lerobot-train takes."""
         return WarmupFractionSchedulerConfig(warmup_fraction=self.warmup_fraction)

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+GRID = 4
+"""A remembered picture is pooled to GRID x GRID tokens."""
+
 
 @dataclass(frozen=True)
 class Gemma:

@@ -2,47 +2,44 @@
 
 from __future__ import annotations
 
-import hashlib
+import contextlib
 import logging
-import re
-from collections import deque
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
+from einops import rearrange, reduce
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.pi05.modeling_pi05 import PI05Policy
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
-from safetensors import safe_open
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from lerobot_memobench.datasets.memory_cache import MemoryCache, build_memory_cache, read_meta
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem.alignment import make_alignment, retrieval_accuracy
-from lerobot_memobench.policies.memobench_mem.backbone import MemoryPI05
+from lerobot_memobench.policies.memobench_mem.alignment.loss import alignment_loss
+from lerobot_memobench.policies.memobench_mem.alignment.objectives import make_alignment
+from lerobot_memobench.policies.memobench_mem.averaging import WeightAverage
+from lerobot_memobench.policies.memobench_mem.caching import open_cache
+from lerobot_memobench.policies.memobench_mem.checkpoints import (
+    load_base_weights,
+    load_weights,
+    read_config,
+    restore_average,
+    save_training_weights,
+)
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.ema import WeightAverage
-from lerobot_memobench.policies.memobench_mem.memory import RolloutMemory
-from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import (
-    MASK,
-    PHASE,
-    STEPS,
-    TEXT,
-    TEXT_MASK,
-    TOKENS,
-    set_training_cache,
-)
-from lerobot_memobench.policies.memobench_mem.text import make_text_encoder
-from lerobot_memobench.policies.memobench_mem.weights import (
-    MODEL_FILE,
-    TRAINING_FILE,
-    checkpoint_file,
-    load_exactly,
-    require_statistics,
-)
+from lerobot_memobench.policies.memobench_mem.memory.batch import MASK, PHASE, STEPS, TOKENS, MemoryBatch
+from lerobot_memobench.policies.memobench_mem.memory.registry import make_mechanism
+from lerobot_memobench.policies.memobench_mem.memory.rollout import RolloutMemory
+from lerobot_memobench.policies.memobench_mem.memory_pi05 import MemoryPI05
+from lerobot_memobench.policies.memobench_mem.noise import EpisodeNoise
+from lerobot_memobench.policies.memobench_mem.plans import RowPlans
+from lerobot_memobench.policies.memobench_mem.processing.training_cache import set_training_cache
+from lerobot_memobench.policies.memobench_mem.weights import require_statistics, weights_file
+
+# A saved pipeline is built right after its policy, by the names under which its steps register when imported.
+from lerobot_memobench.policies.memobench_mem import processor_memobench_mem  # noqa: F401  # isort: skip
 
 logger = logging.getLogger(__name__)
 
@@ -50,7 +47,13 @@ OBS_STEP, OBS_PHASE = "observation.step", "observation.phase"
 
 
 class MemobenchMemPolicy(PI05Policy):
-    """pi0.5 plus memory. ``forward`` trains, ``select_action`` acts; both see the same history for the same frame."""
+    """pi0.5 plus memory. ``forward`` trains, ``select_action`` acts; both see the same history for the same frame.
+
+    Attributes:
+        average: moving average of the trained weights, which evaluation uses; None before training, or without one.
+        history: what the rows of a rollout remember.
+        plans: what they are about to do.
+    """
 
     config_class = MemobenchMemConfig
     name = "memobench_mem"
@@ -79,14 +82,35 @@ class MemobenchMemPolicy(PI05Policy):
         if config.gradient_checkpointing:
             self.model.gradient_checkpointing_enable()
         self.to(config.device)
-        self._frames = self.model.paligemma_with_expert.frame_encoder(config.image_size)
-        self._history = RolloutMemory(config.memory_frames, config.memory_stride)
-        self._average: WeightAverage | None = None
+        self.perception = self.model.paligemma_with_expert.perception
+        self.average: WeightAverage | None = None
+        self.history = RolloutMemory(make_mechanism(config.memory, config.memory_frames), config.memory_stride)
+        self.plans, self.noise = RowPlans(self._action_dim), EpisodeNoise()
         self.reset()
         if dataset_meta is not None:
             self._attach_dataset(Path(dataset_meta.root))
 
+    @property
+    def _action_dim(self) -> int:
+        assert self.config.output_features is not None
+        return self.config.output_features[ACTION].shape[0]
+
+    @property
+    def _device(self) -> torch.device:
+        return next(self.parameters()).device
+
+    @property
+    def _remembers(self) -> bool:
+        return self.history.mechanism.frames > 0
+
+    def _attach_dataset(self, root: Path) -> None:
+        set_training_cache(open_cache(root, self.config, self.perception))
+
     # -- checkpoints -----------------------------------------------------------------------------------------------
+
+    def _load_base_weights(self, source: str) -> None:
+        path = weights_file(source, named=f"--policy.base_weights='{source}'", fix="give a pi0.5 checkpoint")
+        load_base_weights(self.model, self._fix_pytorch_state_dict_keys(load_file(path), self.config), source)
 
     @classmethod
     def from_pretrained(
@@ -106,75 +130,38 @@ class MemobenchMemPolicy(PI05Policy):
             MemobenchError: weights that do not fit, or, for evaluation, missing statistics.
         """
         source = pretrained_name_or_path
-        if config is None:
-            config = PreTrainedConfig.from_pretrained(source, revision=revision)
-        if not isinstance(config, MemobenchMemConfig):
-            raise MemobenchError(
-                f"'{source}' is a '{config.type}' checkpoint and not memobench_mem; to start from pi0.5's weights "
-                "pass --policy.type=memobench_mem --policy.base_weights=<checkpoint>."
-            )
-        path = checkpoint_file(source, MODEL_FILE, revision)
-        if path is None:
-            raise MemobenchError(f"The checkpoint '{source}' has no {MODEL_FILE}; give a pretrained_model folder.")
+        config = read_config(source, config, revision)
+        path = weights_file(source, revision, named=f"The checkpoint '{source}'", fix="give a pretrained_model folder")
         if dataset_meta is None:
             require_statistics(source, revision)
         policy = cls(config, load_base=False)
-        weights = load_file(path)
-        if config.integration != "none" and not any(name.startswith("model.memory.") for name in weights):
-            raise MemobenchError(
-                f"'{source}' holds weights without a memory; to start from pi0.5's weights pass "
-                "--policy.base_weights=<checkpoint> instead of a pretrained path."
-            )
-        # A run may change the objective of the one it goes on from; its heads then start anew.
-        heads = {name for name in policy.state_dict() if name.startswith("alignment.")}
-        load_exactly(policy, weights, source, optional=heads)
+        load_weights(policy, path, source, remembers=config.memory != "none")
         policy.to(config.device)
         policy.eval()
         if dataset_meta is not None:
-            policy._restore_average(source, revision)
+            if config.ema_decay > 0:
+                policy.average = restore_average(policy._new_average(), source, revision)
             policy._attach_dataset(Path(dataset_meta.root))
         return policy
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
         """Save the averaged weights as the model, and the trained ones beside it for going on."""
-        if self._average is None or state_dict is not None:
-            if self._average is not None:
+        if self.average is None or state_dict is not None:
+            if self.average is not None:
                 logger.warning("Sharded training: the checkpoint holds the trained weights, not their average.")
             super()._save_pretrained(save_directory, state_dict=state_dict)
             return
-        with self._average.applied():
+        with self.average.applied():
             super()._save_pretrained(save_directory)
-        tensors, metadata = self._average.state()
-        save_file(tensors, save_directory / TRAINING_FILE, metadata=metadata)
+        save_training_weights(self.average, save_directory)
 
-    def _restore_average(self, source: str | Path, revision: str | None) -> None:
-        path = checkpoint_file(source, TRAINING_FILE, revision)
-        if path is None or self.config.ema_decay == 0:
-            return
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata()
-        tensors = load_file(path)
-        average = WeightAverage(self._trained(), self.config.ema_decay)
-        if all(f"weights.{name}" in tensors for name in average.parameters):
-            average.restore(tensors, metadata)
-            self._average = average
-
-    def _load_base_weights(self, source: str) -> None:
-        """Start from a pi0.5 checkpoint; only the memory's own parameters stay at their initial values."""
-        path = checkpoint_file(source, MODEL_FILE)
-        if path is None:
-            raise MemobenchError(f"--policy.base_weights='{source}' has no {MODEL_FILE}; give a pi0.5 checkpoint.")
-        weights = self._fix_pytorch_state_dict_keys(load_file(path), self.config)
-        renamed = {}
-        for name, tensor in weights.items():
-            name = name.removeprefix("model.")
-            if self.config.integration == "modulation" and ".gemma_expert." in name:
-                name = re.sub(r"post_attention_layernorm\.(dense|weight)", r"post_attention_layernorm.norm.\1", name)
-            renamed[name] = tensor
-        load_exactly(self.model, renamed, source, optional=set(self.model.memory_parameters()))
+    # -- training --------------------------------------------------------------------------------------------------
 
     def _trained(self) -> dict[str, nn.Parameter]:
         return {name: parameter for name, parameter in self.named_parameters() if parameter.requires_grad}
+
+    def _new_average(self) -> WeightAverage:
+        return WeightAverage(self._trained(), self.config.ema_decay)
 
     def get_optim_params(self) -> list[nn.Parameter]:
         """Parameters that learn: all but the image tower and what pi0.5 never uses."""
@@ -182,40 +169,8 @@ class MemobenchMemPolicy(PI05Policy):
 
     def update(self) -> None:
         """Called by lerobot-train after each optimiser step: move the average of the weights."""
-        if self._average is not None:
-            self._average.update()
-
-    # -- training --------------------------------------------------------------------------------------------------
-
-    def _attach_dataset(self, root: Path) -> None:
-        """Open the dataset's memory cache for the preprocessor; make it when there is none.
-
-        Raises:
-            MemobenchError: the cache there is stale or foreign.
-        """
-        config = self.config
-        assert config.text_encoder is not None  # set by the configuration
-        texts = make_text_encoder(config.text_encoder, config.dimensions.text_dim, str(config.device))
-        if read_meta(root, config.cache_name) is None:
-            logger.info("No memory cache beside %s yet: encoding its frames once.", root)
-            build_memory_cache(
-                root,
-                config.cache_name,
-                self._frames,
-                texts,
-                camera=config.memory_camera,
-                stride=config.memory_stride,
-                progress=lambda done, count: logger.info("memory cache: %d of %d episodes", done, count),
-            )
-        cache = MemoryCache.open(
-            root,
-            config.cache_name,
-            frames_key=self._frames.key,
-            camera=config.memory_camera,
-            stride=config.memory_stride,
-            texts_key=None if config.align == "none" else texts.key,
-        )
-        set_training_cache(cache)
+        if self.average is not None:
+            self.average.update()
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, Any]]:
         """Flow-matching loss plus weighted alignment on a preprocessed training batch.
@@ -232,19 +187,35 @@ class MemobenchMemPolicy(PI05Policy):
         Raises:
             MemobenchError: the batch has no memory.
         """
-        needed = PHASE if self.config.integration == "none" else TOKENS
+        self._require_memory(batch)
+        if self.config.ema_decay > 0 and self.average is None and self.training:
+            self.average = self._new_average()
+        memory = self._read_memory(batch)
+        per_sample, total, logged = self._action_loss(batch)
+        if self.alignment is not None and memory is not None:
+            assert self.config.align_weight is not None
+            encoder = list(self.model.memory.parameters())
+            weighted, numbers = alignment_loss(self.alignment, self.config.align_weight, batch, *memory, encoder)
+            per_sample, total, logged = per_sample + weighted, total + weighted, logged | numbers
+        logged["loss"] = total.item()
+        return (per_sample, logged) if reduction == "none" else (total, logged)
+
+    def _require_memory(self, batch: dict[str, Tensor]) -> None:
+        needed = TOKENS if self._remembers else PHASE
         if needed not in batch:
             raise MemobenchError(
                 f"The training batch has no '{needed}': the preprocessor lacks the step memobench_gather_memory; to "
                 "start from pi0.5's weights pass --policy.base_weights instead of --policy.pretrained_path."
             )
-        if self.config.ema_decay > 0 and self._average is None and self.training:
-            self._average = WeightAverage(self._trained(), self.config.ema_decay)
-        device = next(self.parameters()).device
-        if self.config.integration != "none":
-            memory, memory_mask = self.model.set_memory(
-                batch[TOKENS].to(device), batch[STEPS].to(device), batch[MASK].to(device)
-            )
+
+    def _read_memory(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor] | None:
+        """Hand a batch's memory to the model; return its tokens (B, L, d_m) and their mask (B, L)."""
+        if not self._remembers:
+            return None
+        return self.model.set_memory(*MemoryBatch(batch[TOKENS], batch[STEPS], batch[MASK]).to(self._device))
+
+    def _action_loss(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor, dict[str, Any]]:
+        """Flow-matching loss per sample (B,), zero where its actions do not count, its mean, and numbers to log."""
         images, image_masks = self._preprocess_images(batch)
         actions = self.prepare_action(batch)
         losses = self.model.forward(
@@ -255,28 +226,13 @@ class MemobenchMemPolicy(PI05Policy):
             actions,
             self.model.sample_noise(actions.shape, actions.device),
             self.model.sample_time(actions.shape[0], actions.device),
-        )
-        losses = losses[:, :, : self._action_dim]
+        )[:, :, : self._action_dim]
         weights = self._sample_weights(batch, losses)
-        per_sample = losses.mean(dim=(1, 2)) * weights
-        action_loss = per_sample.sum() / weights.sum().clamp(min=1.0)
-        per_dim = (losses.mean(dim=1) * weights[:, None]).sum(dim=0) / weights.sum().clamp(min=1.0)
-        logged: dict[str, Any] = {
-            "action_loss": action_loss.item(),
-            "loss_per_dim": per_dim.detach().cpu().tolist(),
-        }
-        total = action_loss
-        if self.alignment is not None:
-            weighted = self._alignment_loss(batch, memory, memory_mask, logged)
-            total = action_loss + weighted
-            per_sample = per_sample + weighted
-        logged["loss"] = total.item()
-        return (per_sample, logged) if reduction == "none" else (total, logged)
-
-    @property
-    def _action_dim(self) -> int:
-        assert self.config.output_features is not None
-        return self.config.output_features[ACTION].shape[0]
+        count = weights.sum().clamp(min=1.0)
+        per_sample = reduce(losses, "b t a -> b", "mean") * weights
+        per_dim = (reduce(losses, "b t a -> b a", "mean") * rearrange(weights, "b -> b 1")).sum(dim=0) / count
+        mean = per_sample.sum() / count
+        return per_sample, mean, {"action_loss": mean.item(), "loss_per_dim": per_dim.detach().cpu().tolist()}
 
     def _sample_weights(self, batch: dict[str, Tensor], losses: Tensor) -> Tensor:
         """(B,) 1 for samples whose actions count: those of the execution phase."""
@@ -284,114 +240,54 @@ class MemobenchMemPolicy(PI05Policy):
             return torch.ones(len(losses), device=losses.device)
         return (batch[PHASE].reshape(-1) != 0).to(losses)
 
-    def _alignment_loss(self, batch: dict[str, Tensor], memory: Tensor, mask: Tensor, logged: dict[str, Any]) -> Tensor:
-        """Weighted alignment loss (scalar); fills ``logged``."""
-        assert self.alignment is not None
-        assert self.config.align_weight is not None
-        memory = memory.to(torch.float32)  # means over hundreds of tokens and cosines, under mixed precision too
-        text, text_mask = batch[TEXT].to(memory), batch[TEXT_MASK].to(memory.device)
-        if self.config.align == "framewise":
-            arguments: tuple[Tensor, ...] = (memory, mask, text, text_mask)
-        else:
-            # Samples of an episode without any text have nothing to align to.
-            arguments = (memory[text_mask], mask[text_mask], text[text_mask])
-        if not bool(text_mask.any()):
-            # Still touch every parameter, so that distributed training sees the same graph on all ranks.
-            return 0.0 * sum(parameter.sum() for parameter in self.alignment.parameters())
-        with torch.autocast(memory.device.type, enabled=False):
-            loss = self.alignment(*arguments)
-        weighted = self.config.align_weight * loss
-        logged["align_loss"] = loss.item()
-        if memory.requires_grad and torch.is_grad_enabled():
-            # Two matrix products: cheap, and comparable with the gradient norm that LeRobot logs.
-            gradients = torch.autograd.grad(weighted, list(self.model.memory.parameters()), retain_graph=True)
-            logged["align_grad_norm"] = torch.stack([gradient.norm() for gradient in gradients]).norm().item()
-        with torch.no_grad():
-            logged["align_top1"] = retrieval_accuracy(*self.alignment.pairs(*arguments))
-        if hasattr(self.alignment, "log_temperature"):
-            logged["align_temperature"] = self.alignment.log_temperature.exp().item()
-        return weighted
-
     # -- rollout ---------------------------------------------------------------------------------------------------
 
     def reset(self) -> None:
         """Forget histories and planned actions. LeRobot calls it once per batch of episodes."""
         super().reset()
-        if hasattr(self, "_history"):
-            self._history.reset()
-        self._queues_by_row: list[deque[Tensor]] = []
-        self._last_actions: list[Tensor] = []
-        self._noise_seeds: list[int] = []
+        for part in (self.history, self.plans, self.noise):
+            part.reset()
         self._calls = 0
 
-    def _observe(self, batch: dict[str, Tensor]) -> tuple[list[int], list[bool], list[bool]]:
-        """Take the current frames of all rows into their histories; returns steps, new episodes and frozen rows."""
-        if self.config.memory_camera not in batch:
+    def observe(self, batch: dict[str, Tensor]) -> tuple[list[int], list[bool], list[bool]]:
+        """Take the current frames of all rows into their histories; return steps, new episodes and frozen rows."""
+        seen = self.perception.remembers
+        if seen not in batch:
             cameras = ", ".join(key for key in batch if key.startswith("observation.images.")) or "none"
             raise MemobenchError(
-                f"The observation has no '{self.config.memory_camera}', which this policy remembers; it has {cameras}. "
+                f"The observation has no '{seen}', which this policy remembers; it has {cameras}. "
                 "Map its names with --rename_map."
             )
-        camera = batch[self.config.memory_camera]
+        count = len(batch[seen])
         if OBS_STEP in batch:
-            steps = [round(step) for step in batch[OBS_STEP].reshape(len(camera), -1)[:, 0].tolist()]
+            steps = [round(step) for step in batch[OBS_STEP].reshape(count, -1)[:, 0].tolist()]
         else:
-            steps = [self._calls] * len(camera)  # an environment without a clock: one call is one step
+            steps = [self._calls] * count  # an environment without a clock: one call is one step
         self._calls += 1
-        encode = None if self.config.integration == "none" else lambda rows: self._frames(camera[rows])
-        started, frozen = self._history.observe(steps, encode)
-        if len(self._noise_seeds) != len(camera):
-            self._noise_seeds = [0] * len(camera)
-        for row in np.flatnonzero(started):
-            self._noise_seeds[row] = self._episode_seed(batch, int(row))
+        started, frozen = self.history.observe(steps, lambda rows: self.perception(batch[seen][rows]))
+        self.noise.resize(count)
+        for row in range(count):
+            if started[row]:
+                told = (key for key in (seen, OBS_STATE, OBS_LANGUAGE_TOKENS) if key in batch)
+                self.noise.begin(row, (batch[key][row] for key in told))
         return steps, started, frozen
 
-    def _episode_seed(self, batch: dict[str, Tensor], row: int) -> int:
-        """Seed of one episode's sampling noise, from its first observation and the process's seed.
-
-        Noise drawn from a common generator would make a row's actions depend on how many rows run beside it.
-        """
-        digest = hashlib.blake2b(str(torch.initial_seed()).encode(), digest_size=7)
-        for key in (self.config.memory_camera, OBS_STATE, OBS_LANGUAGE_TOKENS):
-            if key in batch:
-                digest.update(batch[key][row].detach().to("cpu").contiguous().numpy().tobytes())
-        return int.from_bytes(digest.digest(), "big")
-
-    def _noise(self, rows: list[int], steps: list[int]) -> Tensor:
-        """Sampling noise (n, chunk, max_action_dim) of some rows, each from its own episode's seed and step."""
-        shape = (self.config.chunk_size, self.config.max_action_dim)
-        drawn = [
-            torch.randn(shape, generator=torch.Generator().manual_seed(self._noise_seeds[row] + steps[row]))
-            for row in rows
-        ]
-        return torch.stack(drawn).to(next(self.parameters()).device)
-
-    def _plan(self, batch: dict[str, Tensor], rows: list[int], noise: Tensor, **kwargs: Any) -> Tensor:
-        """Actions (n, chunk, A) for some rows of the batch, with their histories."""
+    def plan(self, batch: dict[str, Tensor], rows: list[int], noise: Tensor, **kwargs: Any) -> Tensor:
+        """Actions (n, chunk, A) for some rows of the batch, with their histories and sampling noise."""
         keys = [*self.config.image_features, OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK]
         part = {key: batch[key][rows] for key in keys if key in batch}
-        device = next(self.parameters()).device
-        memory = None if self.config.integration == "none" else self._history.gather(rows)
         images, image_masks = self._preprocess_images(part)
-
-        def sample() -> Tensor:
-            if memory is not None:
-                self.model.set_memory(*(tensor.to(device) for tensor in memory))
-            return self.model.sample_actions(
-                images,
-                image_masks,
-                part[OBS_LANGUAGE_TOKENS],
-                part[OBS_LANGUAGE_ATTENTION_MASK],
-                noise=noise,
-                **kwargs,
-            )
-
-        if self._average is None:
-            actions = sample()
-        else:  # evaluation during training
-            with self._average.applied():
-                actions = sample()
+        words = part[OBS_LANGUAGE_TOKENS], part[OBS_LANGUAGE_ATTENTION_MASK]
+        # With an average: evaluation during training.
+        with contextlib.nullcontext() if self.average is None else self.average.applied():
+            if self._remembers:
+                self.model.set_memory(*self.history.gather(rows).to(self._device))
+            noise = noise.to(self._device)
+            actions = self.model.sample_actions(images, image_masks, *words, noise=noise, **kwargs)
         return actions[:, :, : self._action_dim]
+
+    def _noise(self, rows: list[int], steps: list[int]) -> Tensor:
+        return self.noise.draw(rows, steps, (self.config.chunk_size, self.config.max_action_dim))
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
@@ -401,10 +297,10 @@ class MemobenchMemPolicy(PI05Policy):
         (B, chunk, max_action_dim) replaces the episodes' own; other keywords are LeRobot's real-time chunking ones.
         """
         self.eval()
-        steps, _, _ = self._observe(batch)
+        steps, _, _ = self.observe(batch)
         rows = list(range(len(steps)))
         noise = kwargs.pop("noise", None)
-        return self._plan(batch, rows, self._noise(rows, steps) if noise is None else noise, **kwargs)
+        return self.plan(batch, rows, self._noise(rows, steps) if noise is None else noise, **kwargs)
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
@@ -415,24 +311,19 @@ class MemobenchMemPolicy(PI05Policy):
         effect, and for frozen rows nothing is planned.
         """
         self.eval()
-        steps, started, frozen = self._observe(batch)
+        steps, started, frozen = self.observe(batch)
         count = len(steps)
-        if len(self._queues_by_row) != count:
-            self._queues_by_row = [deque() for _ in range(count)]
-            self._last_actions = [torch.zeros(self._action_dim) for _ in range(count)]
+        self.plans.resize(count)
         prompt = [False] * count
         if OBS_PHASE in batch:
             prompt = (batch[OBS_PHASE].reshape(count, -1)[:, 0] < 0.5).tolist()
         for row in range(count):
             if started[row] or prompt[row]:
-                self._queues_by_row[row].clear()
-                self._last_actions[row] = torch.zeros(self._action_dim)
+                self.plans.drop(row)
         acting = [row for row in range(count) if not prompt[row] and not frozen[row]]
-        wanting = [row for row in acting if not self._queues_by_row[row]]
+        wanting = self.plans.wanting(acting)
         if wanting:
-            plans = self._plan(batch, wanting, self._noise(wanting, steps))
+            plans = self.plan(batch, wanting, self._noise(wanting, steps))
             for row, plan in zip(wanting, plans[:, : self.config.n_action_steps].float().cpu(), strict=True):
-                self._queues_by_row[row].extend(plan)
-        for row in acting:
-            self._last_actions[row] = self._queues_by_row[row].popleft()
-        return torch.stack(self._last_actions).to(next(self.parameters()).device)
+                self.plans.queues[row].extend(plan)
+        return self.plans.step(acting).to(self._device)

@@ -36,6 +36,18 @@ def checkpoint_file(source: str | Path, name: str, revision: str | None = None) 
         raise MemobenchError(f"'{source}' is neither a folder nor a repository that can be read.") from error
 
 
+def weights_file(source: str | Path, revision: str | None = None, *, named: str, fix: str) -> Path:
+    """The file of a checkpoint's weights.
+
+    Raises:
+        MemobenchError: it has none; the message calls it ``named`` and ends with ``fix``.
+    """
+    path = checkpoint_file(source, MODEL_FILE, revision)
+    if path is None:
+        raise MemobenchError(f"{named} has no {MODEL_FILE}; {fix}.")
+    return path
+
+
 def require_statistics(source: str | Path, revision: str | None = None) -> None:
     """Check that a checkpoint brings the statistics that normalise states and actions.
 
@@ -72,9 +84,7 @@ def read_weights(source: str | Path, prefix: str = "") -> dict[str, Tensor]:
     Raises:
         MemobenchError: no weights there.
     """
-    path = checkpoint_file(source, MODEL_FILE)
-    if path is None:
-        raise MemobenchError(f"'{source}' has no {MODEL_FILE}; give the folder or repository of a pi0.5 checkpoint.")
+    path = weights_file(source, named=f"'{source}'", fix="give the folder or repository of a pi0.5 checkpoint")
     with safe_open(path, framework="pt") as tensors:
         found = {}
         for name in tensors.keys():  # noqa: SIM118 (not a dict)

@@ -5,16 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from lerobot.policies.pretrained import PreTrainedPolicy
-from torch import Tensor, nn
+from torch import Tensor
 
-from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_random.configuration_memobench_random import MemobenchRandomConfig
+from lerobot_memobench.policies.untrained_policy import UntrainedPolicy
 
 ACTION_SIZE = 7
 
 
-class MemobenchRandomPolicy(PreTrainedPolicy):
+class MemobenchRandomPolicy(UntrainedPolicy):
     """Parameter-less policy. ``select_action`` draws (B, 7) float32 in [-1, 1].
 
     One generator, seeded once, serves all rows and rollouts: the same command with the same batch size draws the same
@@ -31,18 +30,9 @@ class MemobenchRandomPolicy(PreTrainedPolicy):
         self._generator = torch.Generator().manual_seed(config.seed)
         self.reset()
 
-    def get_optim_params(self) -> list[nn.Parameter]:
-        return []
-
     def reset(self) -> None:
         """Forget the last action, which smoothing would carry into the next rollout; the generator goes on."""
         self._last: Tensor | None = None
-
-    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict | None]:
-        raise MemobenchError(
-            "The policy 'memobench_random' has no parameters and cannot be trained; choose a learning policy, "
-            "for example --policy.type=memobench_mem."
-        )
 
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Return the next action (B, 7) in [-1, 1], one row per environment of ``batch``."""
@@ -52,7 +42,3 @@ class MemobenchRandomPolicy(PreTrainedPolicy):
             draw = self.config.smoothing * self._last + (1 - self.config.smoothing) * draw
         self._last = draw
         return draw.to(rows.device)
-
-    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """One step at a time, so the chunk is (B, 1, 7)."""
-        return self.select_action(batch).unsqueeze(1)

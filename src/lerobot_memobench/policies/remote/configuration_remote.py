@@ -74,6 +74,7 @@ class RemoteConfig(UntrainedConfig):
 
     @property
     def spoken(self) -> Dialect:
+        """What the server expects."""
         return DIALECTS[self.dialect]
 
     @property

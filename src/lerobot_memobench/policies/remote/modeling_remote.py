@@ -10,15 +10,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import OBS_STATE
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.remote.answers import ACTION_SIZE
 from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
 from lerobot_memobench.policies.remote.observations import EXECUTION, Row
-from lerobot_memobench.policies.remote.session import ACTION_SIZE, Session
+from lerobot_memobench.policies.remote.session import Session
+from lerobot_memobench.policies.untrained_policy import UntrainedPolicy
 
 Action = NDArray[np.float32]
 
@@ -74,11 +75,12 @@ class Actor:
         return np.zeros(ACTION_SIZE, np.float32)
 
 
-class RemotePolicy(PreTrainedPolicy):
+class RemotePolicy(UntrainedPolicy):
     """Parameter-less policy that asks a server; see `RemoteConfig`. ``select_action`` returns (B, 7) float32."""
 
     config_class = RemoteConfig
     name = "remote"
+    why_not_trained = "runs in a server and cannot be trained here"
 
     def __init__(self, config: RemoteConfig, **kwargs: Any) -> None:
         super().__init__(config)
@@ -86,15 +88,6 @@ class RemotePolicy(PreTrainedPolicy):
         self._actors: list[Actor] = []
         self._pool: ThreadPoolExecutor | None = None
         self._threads = 0
-
-    def get_optim_params(self) -> list[nn.Parameter]:
-        return []
-
-    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict | None]:
-        raise MemobenchError(
-            "The policy 'remote' runs in a server and cannot be trained here; choose a learning policy, for example "
-            "--policy.type=memobench_mem."
-        )
 
     def reset(self) -> None:
         """A rollout begins. Connections stay; a server that is not there is told before anything is simulated."""
@@ -132,10 +125,6 @@ class RemotePolicy(PreTrainedPolicy):
                 self._pool.shutdown()
             self._pool, self._threads = ThreadPoolExecutor(len(jobs), "policy-server"), len(jobs)
         return list(self._pool.map(lambda job: job(), jobs))
-
-    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Ask for one action at a time, so the chunk is (B, 1, 7)."""
-        return self.select_action(batch).unsqueeze(1)
 
 
 def _size(batch: Mapping[str, Any]) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,14 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.remote.answers import read_actions
 from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
-from lerobot_memobench.policies.remote.dialects import IMAGE, RLDS, STATE
+from lerobot_memobench.policies.remote.dialects import IMAGE, STATE
 from lerobot_memobench.policies.remote.observations import Row, fit
-from lerobot_memobench.policies.remote.transports import TRANSPORTS, ServerAway, Transport
+from lerobot_memobench.policies.remote.transport import ServerAway, Transport
+from lerobot_memobench.policies.remote.transports import TRANSPORTS
 
 logger = logging.getLogger(__name__)
 
-ACTION_SIZE = 7
 PAUSE = 0.5
 """Between two attempts to reach a server, s."""
 FIRST_FRAME = "episode_first_frame"
@@ -65,24 +67,15 @@ class Session:
         """
         if self._connected:
             return
-        deadline, reason = time.monotonic() + self.config.connect_timeout, ""
-        told = False
-        while True:
-            left = deadline - time.monotonic()
-            if left <= 0:
-                raise MemobenchError(
-                    f"no policy server answered at {self.address} within {self.config.connect_timeout:g} s ({reason}); "
-                    "start it, or give its address by host= and port="
-                )
-            try:
-                metadata = self._transport.open(left)
-                break
-            except ServerAway as error:
-                reason = str(error)
-            if not told:
-                logger.warning("waiting for the policy server at %s (%s)", self.address, reason)
-                told = True
-            time.sleep(min(PAUSE, max(0.0, left)))
+        metadata = self._until(
+            time.monotonic() + self.config.connect_timeout,
+            self._transport.open,
+            lambda reason: (
+                f"no policy server answered at {self.address} within {self.config.connect_timeout:g} s ({reason}); "
+                "start it, or give its address by host= and port="
+            ),
+            on_wait=lambda reason: logger.warning("waiting for the policy server at %s (%s)", self.address, reason),
+        )
         self._connected = self._fresh = True
         logger.info("connected with the policy server at %s, which says: %s", self.address, metadata or "nothing")
 
@@ -115,9 +108,10 @@ class Session:
             self._deliver(self._buffer())
         question = self._observation(row)
         answer = self._deliver(Question(question, self.config.remembers and not self._dialect.buffers))
-        return self._actions(answer)
+        return read_actions(answer, self.config, self.address)
 
     def close(self) -> None:
+        """Hang up."""
         self._transport.close()
 
     # --- questions ---
@@ -147,34 +141,6 @@ class Session:
         }
         return Question(content, self.config.remembers)
 
-    # --- answers ---
-
-    def _actions(self, answer: dict[str, Any]) -> NDArray[np.float32]:
-        if "actions" not in answer:
-            raise self._wrong(f"an answer without 'actions' (it holds {', '.join(map(str, answer)) or 'nothing'})")
-        try:
-            actions = np.array(answer["actions"], dtype=np.float32, ndmin=2)
-        except (TypeError, ValueError) as error:
-            raise self._wrong("actions that are no numbers") from error
-        if actions.ndim != 2 or actions.shape[1] != ACTION_SIZE:
-            raise self._wrong(f"actions of shape {actions.shape}")
-        if len(actions) < self.config.n_action_steps:
-            raise MemobenchError(
-                f"the policy server at {self.address} answers {len(actions)} actions at a time, fewer than the "
-                f"{self.config.n_action_steps} to be executed; choose replan={len(actions)} or less"
-            )
-        if not np.isfinite(actions).all():
-            raise self._wrong("actions that are NaN or infinite")
-        if (self.config.gripper or self._dialect.gripper) == RLDS:
-            actions[:, -1] = -np.sign(2 * actions[:, -1] - 1)
-        return actions
-
-    def _wrong(self, what: str) -> MemobenchError:
-        return MemobenchError(
-            f"the policy server at {self.address} gave {what}; expected finite numbers of shape "
-            f"(steps, {ACTION_SIZE}): six of the end effector's displacement and one of the gripper"
-        )
-
     # --- delivery ---
 
     def _deliver(self, question: Question) -> dict[str, Any]:
@@ -201,22 +167,48 @@ class Session:
         Raises:
             MemobenchError: it stays away until the deadline.
         """
+        self._until(
+            deadline,
+            self._tell_again,
+            lambda reason: (
+                f"the policy server at {self.address} went away and did not come back within "
+                f"{self.config.retry:g} s ({reason}); the episode that was running is not counted: start "
+                "the server and go on with resume=true output_dir=<this run's folder>"
+            ),
+            reason=reason,
+        )
+
+    def _tell_again(self, patience: float) -> None:
+        self._transport.open(patience)
+        if self._dialect.buffers:
+            self._transport.ask(dict(RESET))
+        for question in self._told:
+            self._transport.ask(question.content)
+        self._fresh = not self._told
+
+    def _until[Result](
+        self,
+        deadline: float,
+        attempt: Callable[[float], Result],
+        failed: Callable[[str], str],
+        *,
+        reason: str = "",
+        on_wait: Callable[[str], None] | None = None,
+    ) -> Result:
+        """Return what ``attempt`` gives, called with the seconds left, as soon as the server is there for it.
+
+        Args:
+            failed: words for the last reason, when the deadline has passed. on_wait: told the first reason.
+        """
         while True:
             left = deadline - time.monotonic()
             if left <= 0:
-                raise MemobenchError(
-                    f"the policy server at {self.address} went away and did not come back within "
-                    f"{self.config.retry:g} s ({reason}); the episode that was running is not counted: start "
-                    "the server and go on with resume=true output_dir=<this run's folder>"
-                )
+                raise MemobenchError(failed(reason))
             try:
-                self._transport.open(left)
-                if self._dialect.buffers:
-                    self._transport.ask(dict(RESET))
-                for question in self._told:
-                    self._transport.ask(question.content)
-                self._fresh = not self._told
-                return
+                return attempt(left)
             except ServerAway as error:
                 reason = str(error)
+            if on_wait is not None:
+                on_wait(reason)
+                on_wait = None
             time.sleep(min(PAUSE, max(0.0, left)))

@@ -54,6 +54,7 @@ def choose_readout(vectors: Tensor, labels: Tensor, candidates: Tensor, episodes
     folds = episodes % FOLDS
 
     def score(penalty: float) -> float:
+        """How many frames of left-out episodes are told right."""
         right = 0.0
         for fold in range(FOLDS):
             out = folds == fold

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_memobench.cli.study import markdown_table, study
+from lerobot_memobench.cli.study import study
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.studies.alignment.study import ALIGNMENTS, Study, StudySettings
+from lerobot_memobench.studies.alignment.settings import ALIGNMENTS, StudySettings
+from lerobot_memobench.studies.alignment.study import Study
+from lerobot_memobench.studies.alignment.summary import markdown_table
 
 SETTINGS = StudySettings(steps=2, batch_size=4, seeds=1, held_out=1, frames_per_episode=6, action_batches=1)
 
@@ -47,18 +49,20 @@ def test_runs_are_measured_and_read_back(work: Study, monkeypatch: pytest.Monkey
     assert all(0 <= found[name]["all"] <= found[name]["own_task"] <= 1 for name in ("memory", "last_frame", "head"))
     assert found["action_loss"] > 0
     assert (work.out / "checkpoints" / "framewise" / "pretrained_model" / "model.safetensors").is_file()
-    monkeypatch.setattr(Study, "_train", lambda *_: pytest.fail("a finished run was trained again"))
+    monkeypatch.setattr(
+        "lerobot_memobench.studies.alignment.study.train", lambda *_: pytest.fail("a finished run was trained again")
+    )
     assert work.run("framewise", 0) == found
     plain = work.baselines()
-    assert plain["chance"]["all"] == pytest.approx(1 / len(work.candidates))
+    assert plain["chance"]["all"] == pytest.approx(1 / len(work.questions.candidates))
 
 
 def test_own_task_scores_ask_among_the_tasks_subgoals(work: Study) -> None:
-    for row, index in enumerate(work.test.indices.tolist()):
-        texts = {work.texts[k] for k in work.test.allowed[row].nonzero().flatten().tolist()}
+    for row, index in enumerate(work.questions.test.indices.tolist()):
+        texts = {work.questions.texts[k] for k in work.questions.test.allowed[row].nonzero().flatten().tolist()}
         task = work.frames.task_texts[int(work.frames.tasks[index])]
         assert (task == "put the bowl away") == ("put the bowl in the drawer" in texts)
-        assert work.texts[int(work.test.labels[row])] in texts
+        assert work.questions.texts[int(work.questions.test.labels[row])] in texts
 
 
 def test_another_study_in_the_same_folder_is_refused(work: Study, twice_root: Path) -> None:

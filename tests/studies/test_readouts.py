@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from lerobot_memobench.studies.alignment.retrieval import choose_readout, fit_readout, mean_and_deviation, top1
+from lerobot_memobench.studies.alignment.readouts import choose_readout, fit_readout, mean_and_deviation, top1
 
 
 def _data(informative: bool, count: int = 240) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:

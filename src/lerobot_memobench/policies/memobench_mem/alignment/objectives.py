@@ -7,9 +7,11 @@ embeddings of width d_t. Vectors with a hat in the paper are L2-normalised; so a
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 
 import torch
 import torch.nn.functional as F
+from einops import rearrange
 from torch import Tensor, nn
 
 from lerobot_memobench.errors import MemobenchError, nearest
@@ -20,7 +22,7 @@ INITIAL_TEMPERATURE = 0.07
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
     """Mean of ``values`` (..., N, D) over N where ``mask`` (..., N); zero where nothing is marked."""
-    weights = mask.to(values.dtype).unsqueeze(-1)
+    weights = rearrange(mask.to(values.dtype), "... n -> ... n 1")
     return (values * weights).sum(dim=-2) / weights.sum(dim=-2).clamp(min=1.0)
 
 
@@ -29,20 +31,47 @@ def same_text(text: Tensor) -> Tensor:
     return text @ text.T > POSITIVE_SIMILARITY
 
 
-class SemanticAlignment(nn.Module):
-    """Cosine distance between the pooled memory, projected, and its text: mean of 1 - z.T over the batch."""
+class Alignment(nn.Module, ABC):
+    """An objective with a head, ``project``: memory vectors to the width of text embeddings."""
 
     def __init__(self, memory_dim: int, text_dim: int) -> None:
         super().__init__()
         self.project = nn.Linear(memory_dim, text_dim)
+
+    def usable(self, memory: Tensor, memory_mask: Tensor, text: Tensor, text_mask: Tensor) -> tuple[Tensor, ...]:
+        """Return the arguments of `forward` and `pairs` for a batch; ``text_mask`` marks what has a text.
+
+        Samples of an episode without any text have nothing to align to, and are left out.
+        """
+        return memory[text_mask], memory_mask[text_mask], text[text_mask]
+
+    @abstractmethod
+    def pairs(self, *usable: Tensor) -> tuple[Tensor, Tensor]:
+        """Memory vectors and the texts they belong to, both (N, d_t) and normalised."""
+
+    @abstractmethod
+    def answer(self, memory: Tensor, memory_mask: Tensor, newest: Tensor) -> Tensor:
+        """What the head says (B, d_t) of the present, whose frame's tokens ``newest`` (B, L) marks."""
+
+    def numbers(self) -> dict[str, float]:
+        """What else is worth a line in the log."""
+        return {}
+
+
+class SemanticAlignment(Alignment):
+    """Cosine distance between the pooled memory, projected, and its text: mean of 1 - z.T over the batch."""
 
     def embed(self, memory: Tensor, memory_mask: Tensor) -> Tensor:
         """Normalised projection (B, d_t) of the masked mean over memory tokens."""
         return F.normalize(self.project(masked_mean(memory, memory_mask)), dim=-1)
 
     def pairs(self, memory: Tensor, memory_mask: Tensor, text: Tensor) -> tuple[Tensor, Tensor]:
-        """Memory vectors and the texts they belong to, both (N, d_t) and normalised."""
+        """Pooled memories and their texts."""
         return self.embed(memory, memory_mask), F.normalize(text, dim=-1)
+
+    def answer(self, memory: Tensor, memory_mask: Tensor, newest: Tensor) -> Tensor:
+        """What all of the memory says."""
+        return self.embed(memory, memory_mask)
 
     def forward(self, memory: Tensor, memory_mask: Tensor, text: Tensor) -> Tensor:
         """Loss (scalar) from memory (B, L, d_m), memory_mask (B, L), text (B, d_t)."""
@@ -68,21 +97,26 @@ class ContrastiveAlignment(SemanticAlignment):
         text_to_memory = -(target * F.log_softmax(logits, dim=0)).sum() / len(z)
         return 0.5 * (memory_to_text + text_to_memory)
 
+    def numbers(self) -> dict[str, float]:
+        """The learned temperature."""
+        return {"align_temperature": self.log_temperature.exp().item()}
 
-class FramewiseAlignment(nn.Module):
+
+class FramewiseAlignment(Alignment):
     """Cosine distance per remembered frame to that frame's own text, recent frames weighing up to twice as much."""
 
     def __init__(self, memory_dim: int, text_dim: int, frames: int, tokens_per_frame: int) -> None:
-        super().__init__()
-        self.project = nn.Linear(memory_dim, text_dim)
-        self.frames = frames
-        self.tokens_per_frame = tokens_per_frame
+        super().__init__(memory_dim, text_dim)
+        self.frames, self.tokens_per_frame = frames, tokens_per_frame
+
+    def usable(self, memory: Tensor, memory_mask: Tensor, text: Tensor, text_mask: Tensor) -> tuple[Tensor, ...]:
+        """All of it: each frame has a text of its own, or is left out by itself."""
+        return memory, memory_mask, text, text_mask
 
     def _frames(self, memory: Tensor, memory_mask: Tensor, text_mask: Tensor) -> tuple[Tensor, Tensor]:
         """Frame vectors (B, F, d_t), normalised, and which frames count (B, F): real ones that have a text."""
-        batch = memory.shape[0]
-        tokens = memory.reshape(batch, self.frames, self.tokens_per_frame, -1)
-        token_mask = memory_mask.reshape(batch, self.frames, self.tokens_per_frame)
+        tokens = rearrange(memory, "b (f p) d -> b f p d", f=self.frames, p=self.tokens_per_frame)
+        token_mask = rearrange(memory_mask, "b (f p) -> b f p", f=self.frames, p=self.tokens_per_frame)
         z = F.normalize(self.project(masked_mean(tokens, token_mask)), dim=-1)
         return z, token_mask.bool().any(dim=-1) & text_mask.bool()
 
@@ -94,15 +128,19 @@ class FramewiseAlignment(nn.Module):
         return (0.5 + 0.5 * rank / (count - 1).clamp(min=1)) * valid
 
     def pairs(self, memory: Tensor, memory_mask: Tensor, text: Tensor, text_mask: Tensor) -> tuple[Tensor, Tensor]:
-        """Valid frame vectors and their texts, both (N, d_t) and normalised."""
+        """Valid frames and their texts."""
         z, valid = self._frames(memory, memory_mask, text_mask)
         return z[valid], F.normalize(text, dim=-1)[valid]
+
+    def answer(self, memory: Tensor, memory_mask: Tensor, newest: Tensor) -> Tensor:
+        """What the newest frame says."""
+        return self.project(masked_mean(memory, newest))
 
     def forward(self, memory: Tensor, memory_mask: Tensor, text: Tensor, text_mask: Tensor) -> Tensor:
         """Loss (scalar) from memory (B, F*P, d_m), memory_mask (B, F*P), text (B, F, d_t), text_mask (B, F)."""
         z, valid = self._frames(memory, memory_mask, text_mask)
         # A frame without text may hold any numbers, not-a-number too, so they are replaced before they are used.
-        text = F.normalize(torch.where(valid[..., None], text, torch.ones_like(text)), dim=-1)
+        text = F.normalize(torch.where(rearrange(valid, "b f -> b f 1"), text, torch.ones_like(text)), dim=-1)
         weights = self.weights(valid)
         return (weights * (1.0 - (z * text).sum(dim=-1))).sum() / weights.sum().clamp(min=0.5)
 
@@ -115,11 +153,11 @@ def retrieval_accuracy(memory: Tensor, text: Tensor) -> float:
     return float(same_text(text).gather(1, nearest_text[:, None]).float().mean())
 
 
-def make_alignment(name: str, memory_dim: int, text_dim: int, frames: int, tokens_per_frame: int) -> nn.Module | None:
+def make_alignment(name: str, memory_dim: int, text_dim: int, frames: int, tokens_per_frame: int) -> Alignment | None:
     """Build the objective ``name``; ``none`` gives None.
 
-    Call semantic and contrastive as ``module(memory, memory_mask, text)`` with text (B, d_t), framewise as
-    ``module(memory, memory_mask, text, text_mask)`` with text (B, F, d_t) and text_mask (B, F).
+    Its `Alignment.usable` takes texts (B, d_t) and text_mask (B,) with semantic and contrastive, (B, F, d_t) and
+    (B, F) with framewise.
 
     Raises:
         MemobenchError: unknown name.

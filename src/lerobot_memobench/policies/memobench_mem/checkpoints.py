@@ -1,0 +1,78 @@
+"""Checkpoints of the policy: what may be loaded into it, and its averaged weights beside the trained ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lerobot.configs import PreTrainedConfig
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.memobench_mem.averaging import WeightAverage
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.memory_pi05 import MemoryPI05
+from lerobot_memobench.policies.memobench_mem.weights import (
+    TRAINING_FILE,
+    checkpoint_file,
+    load_exactly,
+)
+
+
+def read_config(source: str | Path, config: PreTrainedConfig | None, revision: str | None) -> MemobenchMemConfig:
+    """Return the configuration that a checkpoint is loaded with: ``config``, or its own.
+
+    Raises:
+        MemobenchError: it is another policy's.
+    """
+    found = PreTrainedConfig.from_pretrained(source, revision=revision) if config is None else config
+    if not isinstance(found, MemobenchMemConfig):
+        raise MemobenchError(
+            f"'{source}' is a '{found.type}' checkpoint and not memobench_mem; to start from pi0.5's weights "
+            "pass --policy.type=memobench_mem --policy.base_weights=<checkpoint>."
+        )
+    return found
+
+
+def load_weights(policy: nn.Module, path: Path, source: str | Path, *, remembers: bool) -> None:
+    """Load the weights of checkpoint ``source`` into a policy of this kind; its alignment heads may be missing.
+
+    Raises:
+        MemobenchError: they do not fit, or bring no memory to a policy that ``remembers``.
+    """
+    weights = load_file(path)
+    if remembers and not any(name.startswith("model.memory.") for name in weights):
+        raise MemobenchError(
+            f"'{source}' holds weights without a memory; to start from pi0.5's weights pass "
+            "--policy.base_weights=<checkpoint> instead of a pretrained path."
+        )
+    # A run may change the objective of the one it goes on from; its heads then start anew.
+    heads = {name for name in policy.state_dict() if name.startswith("alignment.")}
+    load_exactly(policy, weights, source, optional=heads)
+
+
+def load_base_weights(model: MemoryPI05, weights: dict[str, Tensor], source: str) -> None:
+    """Start from pi0.5's weights; only the memory's own parameters stay at their initial values."""
+    placed = {model.place_of(name.removeprefix("model.")): tensor for name, tensor in weights.items()}
+    load_exactly(model, placed, source, optional=set(model.memory_parameters()))
+
+
+def save_training_weights(average: WeightAverage, folder: Path) -> None:
+    """Write the trained weights beside a model file that holds their average, for going on."""
+    tensors, metadata = average.state()
+    save_file(tensors, folder / TRAINING_FILE, metadata=metadata)
+
+
+def restore_average(average: WeightAverage, source: str | Path, revision: str | None) -> WeightAverage | None:
+    """Go on with a checkpoint's trained weights and their average; None where it has none that fit."""
+    path = checkpoint_file(source, TRAINING_FILE, revision)
+    if path is None:
+        return None
+    with safe_open(path, framework="pt") as file:
+        metadata = file.metadata()
+    tensors = load_file(path)
+    if not all(f"weights.{name}" in tensors for name in average.parameters):
+        return None
+    average.restore(tensors, metadata)
+    return average

@@ -1,0 +1,1 @@
+"""How do actions read memory? One file per integration."""

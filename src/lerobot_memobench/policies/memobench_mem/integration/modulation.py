@@ -1,0 +1,173 @@
+"""Modulation: memory scales and shifts what every layer of the action expert feeds forward (RoboMME's modulator).
+
+Shapes: B rows, L memory tokens, W width of the action expert, T action tokens.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+
+import torch
+import torch.nn.functional as F
+from einops import rearrange, repeat
+from torch import Tensor, nn
+
+from lerobot_memobench.policies.memobench_mem.integration.integration import Integration
+
+_ROPE_BASE = 10_000.0
+
+
+class RMSNorm(nn.Module):
+    """Root-mean-square norm with a learned scale that starts at one (Gemma's form)."""
+
+    def __init__(self, width: int, eps: float = 1e-6) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(width))
+        self.eps = eps
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Norm of x (..., W), in float32."""
+        x = x.to(torch.float32)
+        return x * torch.rsqrt(x.square().mean(dim=-1, keepdim=True) + self.eps) * (1.0 + self.weight)
+
+
+def _rotate(x: Tensor, positions: Tensor) -> Tensor:
+    """Rotary position embedding of x (B, heads, N, d) at positions (N,), halves paired as in Gemma."""
+    half = x.shape[-1] // 2
+    frequencies = _ROPE_BASE ** -(torch.arange(half, dtype=torch.float32, device=x.device) / half)
+    angles = torch.outer(positions.to(torch.float32), frequencies)
+    cos, sin = angles.cos().to(x.dtype), angles.sin().to(x.dtype)
+    first, second = x.chunk(2, dim=-1)
+    return torch.cat([first * cos - second * sin, second * cos + first * sin], dim=-1)
+
+
+class MemoryModulator(nn.Module):
+    """Action tokens look into memory and come back with a scale and a shift for one feed-forward's input.
+
+    Multi-query attention: ``heads`` query heads of width W / heads, one key-value head; rotary positions 0 ... L-1 for
+    memory, L ... L+T-1 for actions. The last Linear starts at zero, so that training starts from plain pi0.5.
+    """
+
+    def __init__(self, width: int, heads: int = 4) -> None:
+        super().__init__()
+        self.heads, self.head_dim = heads, width // heads
+        self.action_norm = RMSNorm(width)
+        self.memory_norm = RMSNorm(width)
+        self.query = nn.Linear(width, heads * self.head_dim, bias=False)
+        self.key = nn.Linear(width, self.head_dim, bias=False)
+        self.value = nn.Linear(width, self.head_dim, bias=False)
+        self.out = nn.Linear(heads * self.head_dim, width, bias=False)
+        self.modulation = nn.Linear(width, 2 * width)
+        nn.init.zeros_(self.modulation.weight)
+        nn.init.zeros_(self.modulation.bias)
+
+    def keys(self, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Rotated keys and values, both (B, 1, L, head_dim), of memory (B, L, W)."""
+        normed = self.memory_norm(memory)
+        key, value = (rearrange(linear(normed), "b l d -> b 1 l d") for linear in (self.key, self.value))
+        return _rotate(key, torch.arange(memory.shape[1], device=memory.device)), value
+
+    def forward(
+        self, actions: Tensor, memory: Tensor, mask: Tensor, keys: tuple[Tensor, Tensor] | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Scale and shift, both (B, T, W), for actions (B, T, W) from memory (B, L, W) with mask (B, L).
+
+        ``keys`` are those of the same memory, if they have been computed before. A row whose memory is all masked
+        reads zeros.
+        """
+        count, length = actions.shape[1], memory.shape[1]
+        key, value = self.keys(memory) if keys is None else keys
+        query = rearrange(self.query(self.action_norm(actions)), "b t (h d) -> b h t d", h=self.heads)
+        query = _rotate(query, torch.arange(length, length + count, device=actions.device))
+        # A finite bias keeps the softmax of an all-masked row finite; its result is then set to zero.
+        bias = torch.zeros_like(mask, dtype=query.dtype).masked_fill(~mask, torch.finfo(query.dtype).min / 2)
+        read = F.scaled_dot_product_attention(
+            query,
+            repeat(key, "b 1 l d -> b h l d", h=self.heads),
+            repeat(value, "b 1 l d -> b h l d", h=self.heads).to(query.dtype),
+            attn_mask=repeat(bias, "b l -> b h t l", h=self.heads, t=count),
+        )
+        read = read * rearrange(mask.any(dim=1).to(read.dtype), "b -> b 1 1 1")
+        read = self.out(rearrange(read, "b h t d -> b t (h d)"))
+        scale, shift = self.modulation(read).chunk(2, dim=-1)
+        return scale, shift
+
+
+@dataclass
+class SharedMemory:
+    """What every modulated layer reads during one forward pass: memory at the expert's width, and its mask.
+
+    It is kept until the next pass replaces it, because gradient checkpointing runs layers again in ``backward``. In a
+    rollout the layers' keys of this memory are kept as well: all denoising steps of a plan read the same memory.
+    """
+
+    memory: Tensor | None = None  # (B, L, W)
+    mask: Tensor | None = None  # (B, L) bool
+    keys: dict[nn.Module, tuple[Tensor, Tensor]] = field(default_factory=dict)
+
+    def set(self, memory: Tensor, mask: Tensor) -> None:
+        """Begin a pass over another memory."""
+        self.memory, self.mask = memory, mask
+        self.keys.clear()
+
+    def keys_of(self, modulator: MemoryModulator) -> tuple[Tensor, Tensor]:
+        """Keys and values of a layer; computed once per memory where no gradients are wanted."""
+        assert self.memory is not None
+        if torch.is_grad_enabled():
+            return modulator.keys(self.memory)
+        if modulator not in self.keys:
+            self.keys[modulator] = modulator.keys(self.memory)
+        return self.keys[modulator]
+
+
+class ModulatedNorm(nn.Module):
+    """LeRobot's norm before an expert layer's feed-forward, followed by the memory's modulation.
+
+    Both of pi0.5's paths (joint training and denoising over cached keys) call ``norm(x, cond=...)`` right before the
+    feed-forward and keep the residual outside, so x <- norm(x) * (1 + scale) + shift here touches nothing else.
+    """
+
+    def __init__(self, norm: nn.Module, modulator: MemoryModulator, state: SharedMemory) -> None:
+        super().__init__()
+        self.norm = norm
+        self.modulator = modulator
+        self.state = state
+
+    def forward(self, x: Tensor, cond: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
+        """Normalised and modulated x (B, T, W), and LeRobot's gate."""
+        normed, gate = self.norm(x, cond=cond)
+        if self.state.memory is None or self.state.mask is None:
+            return normed, gate
+        keys = self.state.keys_of(self.modulator)
+        scale, shift = self.modulator(x, self.state.memory, self.state.mask, keys)
+        return (normed * (1.0 + scale) + shift).to(normed.dtype), gate
+
+
+class Modulation(Integration):
+    """Memory at the expert's width, and a modulated norm in each of the expert's layers.
+
+    Wrapped norms are one level deeper than in plain pi0.5.
+    """
+
+    def __init__(self, model: nn.Module, memory_dim: int, expert_dim: int) -> None:
+        self.model, self.shared = model, SharedMemory()
+        model.memory_to_expert = nn.Linear(memory_dim, expert_dim)
+        for layer in model.paligemma_with_expert.gemma_expert.model.layers:
+            layer.post_attention_layernorm = ModulatedNorm(
+                layer.post_attention_layernorm, MemoryModulator(expert_dim), self.shared
+            )
+
+    def hand_over(self, memory: Tensor, mask: Tensor) -> None:
+        """Begin a pass over this memory in every layer."""
+        self.shared.set(self.model.memory_to_expert(memory), mask)
+
+    def owns(self, name: str) -> bool:
+        """Say whether a parameter is the projection's or a modulator's."""
+        return name.startswith("memory_to_expert.") or ".modulator." in name
+
+    def place_of(self, name: str) -> str:
+        """Return a wrapped norm's parameters under their name here."""
+        if ".gemma_expert." not in name:
+            return name
+        return re.sub(r"post_attention_layernorm\.(dense|weight)", r"post_attention_layernorm.norm.\1", name)

@@ -1,0 +1,77 @@
+"""From frames to memory tokens: the tokens of a frame, joined with where and when they were seen.
+
+Source: spec policy.md, which follows RoboMME's pi0.5 memory module. Shapes: B rows, F frames, P = 16 tokens per frame,
+D width of the vision tokens, d_m width of memory tokens.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from einops import rearrange, repeat
+from torch import Tensor, nn
+
+from lerobot_memobench.policies.memobench_mem.dimensions import GRID
+
+POSITION_DIM = 768
+_FREQUENCIES = 128
+_TIME_BASE, _SPACE_BASE = 10_000.0, 1_000.0
+
+
+def position_features(steps: Tensor) -> Tensor:
+    """Sinusoids of control step and grid place: (..., ) int steps -> (..., 16, 768) float32.
+
+    Order: sin t, cos t, sin y, cos y, sin x, cos x, 128 frequencies each from 1 down to 1/base. Token i of a grid row
+    lies at 4 i + 2 of the 16 patches (its middle), y runs over rows.
+    """
+    grid = _grid_waves(steps.device)
+    time = rearrange(_waves(steps, _TIME_BASE), "... d -> ... 1 d")
+    rows, columns = repeat(grid, "y d -> (y x) d", x=GRID), repeat(grid, "x d -> (y x) d", y=GRID)
+    return torch.cat(torch.broadcast_tensors(time, rows, columns), dim=-1)
+
+
+def _waves(values: Tensor, base: float) -> Tensor:
+    """Sines, then cosines, of values (...) at 128 frequencies from 1 down to 1/base: (..., 256) float32."""
+    exponents = torch.arange(_FREQUENCIES, dtype=torch.float32, device=values.device) / (_FREQUENCIES - 1)
+    angles = rearrange(values.to(torch.float32), "... -> ... 1") * base**-exponents
+    return torch.cat([angles.sin(), angles.cos()], dim=-1)
+
+
+def _grid_waves(device: torch.device) -> Tensor:
+    """Waves (4, 256) of the rows, or columns, of the token grid."""
+    return _waves(4.0 * torch.arange(GRID, dtype=torch.float32, device=device) + 2.0, _SPACE_BASE)
+
+
+class MemoryEncoder(nn.Module):
+    """Vision tokens and their positions to memory tokens: concat(image, SiLU(Linear(position))) -> Linear.
+
+    A Linear of a concatenation is the sum of its parts' Linears. The 16 tokens of a frame share their time and all
+    frames share their grid, so the first Linear is applied to F times and 4 + 4 places instead of F * 16 tokens.
+    """
+
+    def __init__(self, image_dim: int, memory_dim: int) -> None:
+        super().__init__()
+        self.position = nn.Linear(POSITION_DIM, POSITION_DIM)
+        self.project = nn.Linear(image_dim + POSITION_DIM, memory_dim)
+
+    def forward(self, tokens: Tensor, steps: Tensor, frame_mask: Tensor) -> tuple[Tensor, Tensor]:
+        """Encode tokens (B, F, P, D) seen at control steps (B, F).
+
+        Returns:
+            H (B, F*P, d_m) float32 and its mask (B, F*P) bool, from ``frame_mask`` (B, F).
+        """
+        of_image, of_position = self.project.weight.split([tokens.shape[-1], POSITION_DIM], dim=1)
+        image = F.linear(tokens.to(of_image.dtype), of_image, self.project.bias)
+        encoded = image + F.linear(F.silu(self._positions(steps)), of_position)
+        mask = repeat(frame_mask.bool(), "b f -> b (f p)", p=tokens.shape[2])
+        return rearrange(encoded, "b f p d -> b (f p) d"), mask
+
+    def _positions(self, steps: Tensor) -> Tensor:
+        """`position` of `position_features` (B, F, 16, 768), by its parts."""
+        weight = self.position.weight
+        of_time, of_row, of_column = weight.split(2 * _FREQUENCIES, dim=1)
+        grid = _grid_waves(steps.device).to(weight.dtype)
+        time = F.linear(_waves(steps, _TIME_BASE).to(weight.dtype), of_time, self.position.bias)
+        rows = rearrange(F.linear(grid, of_row), "y d -> y 1 d")
+        columns = rearrange(F.linear(grid, of_column), "x d -> 1 x d")
+        return rearrange(time, "b f d -> b f 1 d") + rearrange(rows + columns, "y x d -> (y x) d")

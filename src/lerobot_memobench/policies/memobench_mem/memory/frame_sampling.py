@@ -1,0 +1,40 @@
+"""Frame sampling: a plan sees frames spread evenly over the episode so far (RoboMME; the paper's memory module)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import EpisodeFrames, Frame, MemoryMechanism
+
+
+def sample_frames(step: int, max_frames: int) -> list[int]:
+    """Choose at most ``max_frames`` of the frames 0 ... ``step``, evenly, first and last included.
+
+    All of them while there are no more than ``max_frames``. Indices are rounded down and strictly increase.
+    """
+    if step < 0 or max_frames < 1:
+        raise ValueError(f"step must be >= 0 and max_frames >= 1, got {step} and {max_frames}")
+    if step < max_frames:
+        return list(range(step + 1))
+    if max_frames == 1:
+        return [step]
+    return [i * step // (max_frames - 1) for i in range(max_frames)]
+
+
+class FrameSampling(MemoryMechanism):
+    """Keeps every frame, because which are read changes with each new one."""
+
+    name = "frame_sampling"
+    capacity = None
+
+    def write(self, kept: list[Frame], frame: Frame) -> None:
+        """Keep the frame."""
+        kept.append(frame)
+
+    def read(self, kept: Sequence[Frame]) -> list[Frame]:
+        """Return the chosen frames."""
+        return [kept[slot] for slot in sample_frames(len(kept) - 1, self.frames)]
+
+    def recall(self, episode: EpisodeFrames, slot: int) -> list[Frame]:
+        """Load the chosen frames alone."""
+        return episode.load(sample_frames(slot, self.frames))

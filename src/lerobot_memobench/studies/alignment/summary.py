@@ -1,0 +1,66 @@
+"""A study's runs in one table: mean and spread over seeds, beside the baselines."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from lerobot_memobench.studies.alignment.readouts import mean_and_deviation
+
+MEASURES = {
+    "memory": ("memory", "all"),
+    "memory, own task": ("memory", "own_task"),
+    "last frame": ("last_frame", "all"),
+    "last frame, own task": ("last_frame", "own_task"),
+    "own head": ("head", "all"),
+    "own head, own task": ("head", "own_task"),
+    "action loss": ("action_loss",),
+}
+"""Columns of the table, and where a run holds their numbers."""
+
+BASELINES = {
+    "untrained weights": ("untrained_memory", "untrained_last_frame"),
+    "tower's tokens, no clock": ("tower_history", "tower_last_frame"),
+    "commonest subgoal": ("commonest",),
+    "chance": ("chance",),
+}
+"""Last rows of the table, and the baselines of their first columns."""
+
+
+def summarise(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return per measure the values of all seeds, their mean and their sample standard deviation."""
+    found: dict[str, Any] = {}
+    for name, path in MEASURES.items():
+        values = [value for run in runs if (value := _value(run, path)) is not None]
+        if values:
+            mean, deviation = mean_and_deviation(values)
+            found[name] = {"values": values, "mean": mean, "deviation": deviation}
+    return found
+
+
+def _value(run: dict[str, Any], path: Sequence[str]) -> float | None:
+    """The number at a path of keys; None where a run has no such measure."""
+    value: Any = run
+    for key in path:
+        value = value.get(key) if isinstance(value, dict) else None
+    return None if value is None else float(value)
+
+
+def markdown_table(summary: dict[str, Any]) -> str:
+    """Return the study's table: a row per alignment and per baseline."""
+    lines = [["", *MEASURES], ["---", *["---:"] * len(MEASURES)]]
+    for align, found in summary["alignments"].items():
+        lines.append([f"align={align}", *(_cell(name, found.get(name)) for name in MEASURES)])
+    base = summary["baselines"]
+    for label, names in BASELINES.items():
+        cells = [f"{100 * base[name][key]:.1f}" for name in names for key in ("all", "own_task")]
+        lines.append([label, *cells, *["–"] * (len(MEASURES) - len(cells))])
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
+
+
+def _cell(name: str, measure: dict[str, Any] | None) -> str:
+    if measure is None:
+        return "–"
+    if name == "action loss":
+        return f"{measure['mean']:.4f} ± {measure['deviation']:.4f}"
+    return f"{100 * measure['mean']:.1f} ± {100 * measure['deviation']:.1f}"
