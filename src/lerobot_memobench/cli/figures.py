@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lerobot_memobench.cli.console import console
-from lerobot_memobench.cli.report import Beside, With
+from lerobot_memobench.cli.documents import Beside, With
 from lerobot_memobench.errors import MemobenchError
 
 if TYPE_CHECKING:

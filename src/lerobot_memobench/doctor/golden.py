@@ -65,5 +65,5 @@ def write_golden() -> Path:
 
 if __name__ == "__main__":
     if sys.argv[1:] != ["--write"]:
-        sys.exit("usage: python -m lerobot_memobench.cli.golden --write")
+        sys.exit("usage: python -m lerobot_memobench.doctor.golden --write")
     print(write_golden())

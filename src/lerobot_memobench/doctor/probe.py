@@ -1,4 +1,4 @@
-"""Try one thing that may crash the process: ``python -m lerobot_memobench.cli.probe gl egl``. Prints JSON.
+"""Try one thing that may crash the process: ``python -m lerobot_memobench.doctor.probe gl egl``. Prints JSON.
 
 A driver that is broken ends the process with a signal, which only its parent can report.
 """
@@ -38,7 +38,7 @@ def gl(backend: str) -> dict[str, Any]:
 
 def golden() -> dict[str, Any]:
     """Render the golden scene; return how far it is from the one that ships."""
-    from lerobot_memobench.cli.golden import difference, read_golden, render_golden
+    from lerobot_memobench.doctor.golden import difference, read_golden, render_golden
 
     return {"difference": difference(render_golden(), read_golden())}
 

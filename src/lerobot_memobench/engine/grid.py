@@ -1,4 +1,4 @@
-"""Which episodes an evaluation still has to run, in the batches in which an undisturbed one would run them."""
+"""All episodes of an evaluation, in the batches in which they are run, and which of them a part or a run has left."""
 
 from __future__ import annotations
 
@@ -6,13 +6,43 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from lerobot_memobench.cli.orders import Shard
+from lerobot_memobench.errors import MemobenchError
 
 if TYPE_CHECKING:
     from lerobot_memobench.tasks.task import Task
 
 Range = tuple[int, int]
 """First run of a task and how many: run k is LeRobot's k-th, of the seed ``seed`` + k."""
+
+
+@dataclass(frozen=True)
+class Shard:
+    """Part ``number`` (from 1 on) of ``count``."""
+
+    number: int
+    count: int
+
+    def __str__(self) -> str:
+        return f"{self.number}/{self.count}"
+
+    @property
+    def folder(self) -> str:
+        """Name of its folder in that of the evaluation."""
+        return f"shard-{self.number}-of-{self.count}"
+
+    def of(self, length: int) -> slice:
+        """Return which of ``length`` things are its: contiguous, the parts' sizes at most one apart."""
+        return slice((self.number - 1) * length // self.count, self.number * length // self.count)
+
+
+def parse_shard(text: str) -> Shard:
+    """Read ``2/8``: parts are counted from 1."""
+    number, slash, count = text.partition("/")
+    if not (slash and number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
+        raise MemobenchError(
+            f"found shard={text}; expected i/n with i from 1 to n, such as shard=1/8 for the first of 8"
+        )
+    return Shard(int(number), int(count))
 
 
 @dataclass(frozen=True)
@@ -25,6 +55,7 @@ class Place:
 
     @property
     def key(self) -> tuple[str, int]:
+        """What LeRobot calls the task."""
         return self.suite, self.number
 
 

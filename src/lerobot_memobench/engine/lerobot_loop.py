@@ -1,5 +1,8 @@
 """What LeRobot's evaluation loop is made to do beside its own: run parts of a task, seed each batch by itself.
 
+The only module that changes anything of LeRobot's. It was written against the loop of one version: what it relies on
+is listed in tests/engine/test_lerobot_loop.py, whose failures say what to look at when LeRobot moves on.
+
 LeRobot seeds Python, NumPy and torch once per run, so what a sampling policy draws in an episode depends on all that
 ran before it. Here each batch is seeded from the run's seed, the task and the batch's first episode: an evaluation
 that is resumed or shared among machines draws what an undisturbed one draws.
@@ -13,12 +16,31 @@ import logging
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from importlib import metadata
 from typing import Any
 
-from lerobot_memobench.cli.plan import Range
+from lerobot_memobench.engine.grid import Range
+from lerobot_memobench.errors import MemobenchError
+
+LEROBOT = "0.6.1"
+"""The version whose loop is known here."""
 
 KEEPS_ITS_NOISE = ("memobench_mem",)
 """Policies that seed each episode's noise themselves, from torch's initial seed: it must stay the run's."""
+
+
+def check_version() -> None:
+    """Refuse another LeRobot than the one whose loop is known: another one may run other episodes, or unseeded ones.
+
+    Raises:
+        MemobenchError: it is installed.
+    """
+    found = metadata.version("lerobot")
+    if found != LEROBOT:
+        raise MemobenchError(
+            f"lerobot {found} is installed, and the benchmark steers the evaluation loop of lerobot {LEROBOT}; install "
+            f"lerobot=={LEROBOT} (make setup)"
+        )
 
 
 def calm_output() -> None:
@@ -33,7 +55,12 @@ def calm_output() -> None:
 
 @contextmanager
 def steered(seed: int | None, ranges: Mapping[tuple[str, int], list[Range]] | None = None) -> Iterator[None]:
-    """While this lasts, LeRobot's loop seeds each batch and runs only ``ranges`` (everything when None)."""
+    """While this lasts, LeRobot's loop seeds each batch and runs only ``ranges`` (everything when None).
+
+    Raises:
+        MemobenchError: the installed LeRobot is another than the one whose loop is known here.
+    """
+    check_version()
     from lerobot.scripts import lerobot_eval
 
     run_one, rollout = lerobot_eval.run_one, lerobot_eval.rollout
@@ -73,20 +100,24 @@ def _seeded(rollout: Callable[..., Any], seed: int) -> Callable[..., Any]:
 
     @functools.wraps(rollout)
     def run(env: Any, policy: Any, *args: Any, **settings: Any) -> Any:
-        from lerobot.utils.random_utils import set_seed
-        from torch import Generator
-
         seeds = settings.get("seeds")
         if seeds and getattr(policy, "name", None) not in KEEPS_ITS_NOISE:
-            task = env.call("task")[0]
-            set_seed(batch_seed(seed, task, seeds[0]))
-            for name, generator in vars(policy).items():
-                if isinstance(generator, Generator):
-                    own = first_seeds.setdefault(name, generator.initial_seed())
-                    generator.manual_seed(batch_seed(seed, task, seeds[0], own))
+            _seed_batch(policy, first_seeds, seed, env.call("task")[0], seeds[0])
         return rollout(env, policy, *args, **settings)
 
     return run
+
+
+def _seed_batch(policy: Any, first_seeds: dict[str, int], seed: int, task: str, first: int) -> None:
+    """Seed what LeRobot seeds, and the policy's own generators, whose first seeds are remembered and still count."""
+    from lerobot.utils.random_utils import set_seed
+    from torch import Generator
+
+    set_seed(batch_seed(seed, task, first))
+    for name, generator in vars(policy).items():
+        if isinstance(generator, Generator):
+            own = first_seeds.setdefault(name, generator.initial_seed())
+            generator.manual_seed(batch_seed(seed, task, first, own))
 
 
 def batch_seed(seed: int, task: str, first: int, *more: int) -> int:

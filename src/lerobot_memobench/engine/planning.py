@@ -1,126 +1,174 @@
-"""``lerobot eval env=memobench``: the benchmark's defaults, and the choice of how it is run."""
+"""From the words of ``lerobot eval env=memobench`` to the plan: defaults, and what cannot be asked for.
+
+Everything that a look at settings, folders and configurations can tell is told here, before anything is run: a mistake
+costs a sentence and not a run.
+"""
 
 from __future__ import annotations
 
 import datetime as dt
 import os
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
-from lerobot_memobench.cli import preflight
-from lerobot_memobench.cli.arguments import Translation
-from lerobot_memobench.cli.evaluation import Evaluation, make_grid
-from lerobot_memobench.cli.orders import Orders
-from lerobot_memobench.cli.running import run_evaluation
+from lerobot_memobench.engine.grid import Grid, Place
+from lerobot_memobench.engine.orders import Orders, take_orders
+from lerobot_memobench.engine.plan import LOG, OUTPUT, EvaluationPlan
+from lerobot_memobench.engine.resume import earlier_batch_size
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.records.protocol import CARD_FILE, read_card
+from lerobot_memobench.policies.checkpoint import check_checkpoint
+from lerobot_memobench.settings.configurations import env_config, policy_config
+from lerobot_memobench.settings.flags import whole_number
+from lerobot_memobench.settings.reading import read_settings
+from lerobot_memobench.settings.translation import LerobotSettings
+from lerobot_memobench.settings.words import split_words
+from lerobot_memobench.tasks.task import load_task
+
+if TYPE_CHECKING:
+    from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 
 ENVIRONMENT = "memobench"
 EXPERT = "memobench_expert"
 FIRST_SEED = 7
 """Episode i of the protocol uses seed 7 + i."""
+EPISODES = 50
+LARGEST_BATCH = 64
 
 
-def evaluate(
-    translation: Translation, run: Callable[[], int], say_where: bool = True, orders: Orders | None = None
-) -> int:
-    """Complete the flags of an evaluation, run it, write and print its report; return the exit status.
+def is_benchmark(settings: LerobotSettings, orders: Orders) -> bool:
+    """Return whether an evaluation is the benchmark's; another one gets no defaults, and is checked here.
 
-    An environment of LeRobot's own gets nothing but the checks.
+    Raises:
+        MemobenchError: no environment is named, or what only the benchmark has is asked of another one.
     """
-    orders = orders or Orders()
-    if not translation.has("env.type") and not translation.has("config_path"):
+    if not settings.has("env.type") and not settings.has("config_path"):
         raise MemobenchError("name an environment: env=memobench")
-    if translation.get("env.type") != ENVIRONMENT:
-        if orders.any:
-            raise MemobenchError("resume=, shard= and shards= belong to the benchmark: name it with env=memobench")
-        preflight.check_policy(translation)
-        return run()
-    evaluation = prepare(translation, orders)
-    if orders.shards:
-        from lerobot_memobench.cli.shards import run_shards
-
-        return run_shards(evaluation)
-    return run_evaluation(evaluation, run, say_where)
+    if settings.get("env.type") == ENVIRONMENT:
+        return True
+    if orders.any:
+        raise MemobenchError("resume=, shard= and shards= belong to the benchmark: name it with env=memobench")
+    path = settings.get("policy.path")
+    if path is not None:
+        check_checkpoint(path)
+    return False
 
 
-def prepare(translation: Translation, orders: Orders) -> Evaluation:
-    """Complete the flags and find out what they ask for; what is wrong with them is told here."""
-    if orders.resume and not translation.has("output_dir"):
+def plan_line(line: Sequence[str]) -> EvaluationPlan:
+    """Return the plan of the benchmark's evaluation that ``lerobot eval <line>`` asks for."""
+    orders, words = take_orders(split_words(line))
+    return make_plan(read_settings("eval", words), orders, ("lerobot", "eval", *line))
+
+
+def make_plan(settings: LerobotSettings, orders: Orders, command: Sequence[str]) -> EvaluationPlan:
+    """Complete the settings of the benchmark's evaluation and find out what they ask for.
+
+    Raises:
+        MemobenchError: it cannot be run as asked.
+    """
+    if orders.resume and not settings.has(OUTPUT):
         raise MemobenchError("resume=true needs the folder of the evaluation to go on with: output_dir=<folder>")
-    if orders.shard is not None and translation.has("output_dir"):
-        translation.set("output_dir", Path(translation.get("output_dir") or "") / orders.shard.folder)
-    add_policy(translation)
-    preflight.check_policy(translation)
-    policy = preflight.parse_choice(translation, "policy")
-    if orders.resume:
-        add_earlier_batch_size(translation)
-    if orders.shard is not None or orders.shards:
-        translation.add("eval.batch_size", 1)  # by cores, each machine would cut the evaluation differently
-    most = getattr(policy, "max_environments", None)
-    if most is not None:
-        add_batch_size(translation, most)  # its servers keep one memory each
-    add_protocol(translation, getattr(policy, "n_action_steps", None))
-    environment = preflight.parse_choice(translation, "env")
+    settings = with_policy(settings)
+    policy = policy_config(settings)
+    output = _output(settings, orders)
+    log = Path(settings.get(LOG) or output)
+    settings = settings.changed(OUTPUT, output).changed(LOG, log)
+    settings = with_batch_size(settings, orders, log, getattr(policy, "max_environments", None))
+    settings = with_protocol(settings, getattr(policy, "n_action_steps", None))
+    environment = cast("MemobenchEnvConfig | None", env_config(settings))
     if environment is None and orders.any:
         raise MemobenchError("resume=, shard= and shards= cannot go with config_path=; give its settings on the line")
-    grid = make_grid(translation, environment) if environment is not None else None
-    preflight.check_rendering()
-    return Evaluation(translation, orders, policy, environment, grid)
+    grid = None if environment is None else make_grid(settings, environment)
+    check_rendering()
+    return EvaluationPlan(
+        settings=settings.without(OUTPUT, LOG),
+        policy=policy,
+        environment=environment,
+        grid=grid,
+        output=output,
+        log=log,
+        seed=whole_number(settings.get("seed")),
+        batch=whole_number(settings.get("eval.batch_size")) or 1,
+        orders=orders,
+        command=tuple(command),
+    )
 
 
-def add_policy(translation: Translation) -> None:
-    """Use the scripted expert where no policy is named, and let the environment offer it its action."""
-    if not translation.has("policy.path"):
-        translation.add("policy.type", EXPERT)
-    if translation.get("policy.type") == EXPERT:
-        translation.add("env.expert_action", True)
-    if "policy" not in translation.chosen:
-        from lerobot.configs.policies import PreTrainedConfig
+def check_rendering() -> None:
+    """Refuse to start without a GL library: every episode would fail at its first frame."""
+    from lerobot_memobench.sim.rendering import gl_backend
 
-        name = translation.get("policy.type")
-        if name is not None:
-            translation.chosen["policy"] = PreTrainedConfig.get_choice_class(name)
+    gl_backend()
 
 
-def add_protocol(translation: Translation, n_action_steps: int | None) -> None:
-    """Set seed, episodes, batch size, device and folders where the user has not."""
-    import torch
-
-    translation.add("seed", FIRST_SEED)
-    translation.add("eval.n_episodes", 50)
-    add_batch_size(translation)
-    if not torch.cuda.is_available() and not torch.backends.mps.is_available():
-        translation.add("policy.device", "cpu")
-    if n_action_steps is not None:
-        translation.add("env.replan_steps", n_action_steps)
-    translation.add("output_dir", default_output(translation))
-    translation.add("env.log_dir", translation.get("output_dir"))
+def with_policy(settings: LerobotSettings) -> LerobotSettings:
+    """Return settings with the scripted expert where no policy is named; the environment offers it its action."""
+    if not settings.has("policy.path"):
+        settings = settings.default("policy.type", EXPERT)
+    name = settings.get("policy.type")
+    if name == EXPERT:
+        settings = settings.default("env.expert_action", True)
+    return settings if name is None else settings.choosing("policy", name)
 
 
-def add_batch_size(translation: Translation, most: int = 64) -> None:
-    """Choose the largest batch that LeRobot would choose and that divides the episodes; at most ``most``.
+def with_batch_size(settings: LerobotSettings, orders: Orders, log: Path, most: int | None) -> LerobotSettings:
+    """Return settings with as many environments at once as the way it is run, or the policy, allows.
+
+    Going on keeps the number of the earlier run: what a policy samples may depend on it. Parts run one at a time: by
+    cores, each machine would cut the evaluation differently.
+
+    Args:
+        most: environments that the policy can serve, such as one for each of its servers.
+    """
+    earlier = earlier_batch_size(log) if orders.resume else None
+    if earlier is not None and _batch_is_open(settings):
+        settings = settings.changed("eval.batch_size", earlier)
+    if orders.in_parts:
+        settings = settings.default("eval.batch_size", 1)
+    return settings if most is None else with_largest_batch(settings, most)
+
+
+def with_largest_batch(settings: LerobotSettings, most: int) -> LerobotSettings:
+    """Return settings with the largest batch that LeRobot would choose and that divides the episodes; at most ``most``.
 
     LeRobot runs whole batches and throws the surplus of the last one away, after simulating it.
     """
-    if (translation.get("eval.batch_size") or "0") != "0":
-        return
-    episodes = int(translation.get("eval.n_episodes") or 50)
+    if not _batch_is_open(settings):
+        return settings
+    episodes = int(settings.get("eval.n_episodes") or EPISODES)
     limit = max(1, min(int((os.cpu_count() or 4) * 0.7), episodes, most))
-    translation.set("eval.batch_size", max(size for size in range(1, limit + 1) if episodes % size == 0))
+    return settings.changed("eval.batch_size", max(size for size in range(1, limit + 1) if episodes % size == 0))
 
 
-def add_earlier_batch_size(translation: Translation) -> None:
-    """Use the batch size of the evaluation that is gone on with: what a policy samples may depend on it."""
-    path = Path(translation.get("env.log_dir") or translation.get("output_dir") or "") / CARD_FILE
-    if path.is_file() and (translation.get("eval.batch_size") or "0") == "0":
-        translation.set("eval.batch_size", read_card(path)["runs"][-1]["batch_size"])
+def _batch_is_open(settings: LerobotSettings) -> bool:
+    return (settings.get("eval.batch_size") or "0") == "0"
 
 
-def default_output(translation: Translation) -> Path:
+def with_protocol(settings: LerobotSettings, n_action_steps: int | None) -> LerobotSettings:
+    """Return settings with the protocol's seed and episodes, a batch, a device, and the policy's replan interval."""
+    import torch
+
+    settings = settings.default("seed", FIRST_SEED).default("eval.n_episodes", EPISODES)
+    settings = with_largest_batch(settings, LARGEST_BATCH)
+    if not torch.cuda.is_available() and not torch.backends.mps.is_available():
+        settings = settings.default("policy.device", "cpu")
+    if n_action_steps is not None:
+        settings = settings.default("env.replan_steps", n_action_steps)
+    return settings
+
+
+def _output(settings: LerobotSettings, orders: Orders) -> Path:
+    """Return the folder that was asked for, that of the part in it, or a new one."""
+    given = settings.get(OUTPUT)
+    if given is None:
+        return unused_folder(settings)
+    return Path(given) / orders.shard.folder if orders.shard is not None else Path(given)
+
+
+def unused_folder(settings: LerobotSettings) -> Path:
     """Return a folder that no evaluation has used: ``outputs/eval/<date>/<time>_memobench_<policy>``."""
-    chosen = translation.chosen.get("policy")
-    name = translation.get("policy.type") or (chosen.get_choice_name(chosen) if chosen else "policy")  # type: ignore[attr-defined]
+    chosen = settings.chosen.get("policy")
+    name = settings.get("policy.type") or (chosen.get_choice_name(chosen) if chosen else "policy")  # type: ignore[attr-defined]
     now = dt.datetime.now()
     base = Path("outputs/eval") / f"{now:%Y-%m-%d}" / f"{now:%H-%M-%S}_{ENVIRONMENT}_{name}"
     folder, k = base, 1
@@ -128,3 +176,20 @@ def default_output(translation: Translation) -> Path:
         k += 1
         folder = base.with_name(f"{base.name}_{k}")
     return folder
+
+
+def make_grid(settings: LerobotSettings, environment: MemobenchEnvConfig) -> Grid:
+    """Return the episodes that an evaluation consists of.
+
+    Raises:
+        MemobenchError: unknown tasks, or no episodes.
+    """
+    places = tuple(Place(suite, index, load_task(folder)) for suite, index, folder in environment.selected())
+    runs, seed = whole_number(settings.get("eval.n_episodes")), whole_number(settings.get("seed"))
+    if runs is None or seed is None or runs < 1:
+        raise MemobenchError(
+            f"found episodes={settings.get('eval.n_episodes')} and seed={settings.get('seed')}; expected whole "
+            "numbers, and at least one episode"
+        )
+    batch = min(whole_number(settings.get("eval.batch_size")) or 1, runs)
+    return Grid(places, runs, batch, seed - environment.seed_base)

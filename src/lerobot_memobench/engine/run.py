@@ -2,135 +2,80 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
-from lerobot_memobench.cli import preflight
-from lerobot_memobench.cli.arguments import Translation
-from lerobot_memobench.cli.evaluation import Evaluation, describe, logged, with_checkpoint
-from lerobot_memobench.cli.loop import calm_output, steered
-from lerobot_memobench.cli.plan import Range, task_names
-from lerobot_memobench.datasets.unfinished import locked
-from lerobot_memobench.engine.card import remove_card, with_episodes, write_card
+from lerobot_memobench.engine.card import with_episodes, write_card
+from lerobot_memobench.engine.folder import check_new, held
+from lerobot_memobench.engine.lerobot_command import call_lerobot
+from lerobot_memobench.engine.lerobot_loop import calm_output, steered
+from lerobot_memobench.engine.plan import EvaluationPlan
+from lerobot_memobench.engine.plan_card import card_of, with_checkpoint
+from lerobot_memobench.engine.reporting import EvaluationReport, report_on
+from lerobot_memobench.engine.resume import Ranges, Tell, missing, remainder, resumed_card
 from lerobot_memobench.envs.episode_log import has_log, read_episodes
-from lerobot_memobench.evaluation.documents.report import REPORT_MARKDOWN
 from lerobot_memobench.evaluation.records.protocol import POLICY, read_protocol
 
-CONTINUED = "continued-{}"
-"""Folder of LeRobot's own files of a run that goes on: it would write over those of the first."""
+
+@dataclass(frozen=True)
+class Ended:
+    """How an evaluation ended.
+
+    Attributes:
+        status: exit status of LeRobot's command.
+        report: None when it failed, or when a part holds no episode.
+    """
+
+    status: int
+    report: EvaluationReport | None = None
 
 
-def run_evaluation(evaluation: Evaluation, run: Callable[[], int], say_where: bool = True) -> int:
-    """Run what is missing, write report and card, print the report; return the exit status.
+def run_evaluation(plan: EvaluationPlan, tell: Tell) -> Ended:
+    """Run what is missing, write report and card.
 
     Args:
-        run: calls LeRobot with the evaluation's flags, as they are then.
-        say_where: whether to print where the report is.
+        tell: told what matters and stops nothing, and how to go on when a run breaks off.
+
+    Raises:
+        MemobenchError: the folder holds another evaluation. Whatever LeRobot raises.
     """
-    log, orders = evaluation.log, evaluation.orders
-    if not orders.resume:
-        preflight.check_output(evaluation.output)
-        preflight.check_output(log)
-    card = describe(evaluation)
-    if orders.resume:
-        card = preflight.check_resumed(log, card)
-    ranges = missing(evaluation)
-    if ranges == {}:
-        if not has_log(log):
-            print(f"part {orders.shard} holds no episode: there are fewer batches than parts")
-            return 0
-        return finish(evaluation, card, say_where)
+    if not plan.orders.resume:
+        check_new(plan.output)
+        check_new(plan.log)
+    card = card_of(plan)
+    if plan.orders.resume:
+        card = resumed_card(plan.log, card, tell)
+    ranges = missing(plan)
+    if ranges != {}:
+        return _run_lerobot(plan, card, ranges, tell)
+    return Ended(0, _finish(plan, card) if has_log(plan.log) else None)
+
+
+def _run_lerobot(plan: EvaluationPlan, card: dict[str, Any], ranges: Ranges | None, tell: Tell) -> Ended:
+    """Run LeRobot's evaluation on what is left, in the folder that is held meanwhile."""
     calm_output()
-    output, status = evaluation.output, 1
+    status = 1
     try:
-        with folder_of(evaluation), steered(evaluation.seed, ranges):
+        with held(plan), steered(plan.seed, ranges):
             if card["protocol"]:
-                write_card(log, card)
-            go_on(evaluation, ranges)
-            status = run()
-            return finish(evaluation, card, say_where) if status == 0 else status
+                write_card(plan.log, card)
+            status = call_lerobot("eval", remainder(plan, ranges).lerobot_flags)
+            return Ended(status, None if status else _finish(plan, card))
     finally:
-        if status and has_log(log):
-            print(
-                f"the episodes that ended are in {log}; `memobench report {log}` reports them, the same command with "
-                f"resume=true output_dir={output} goes on",
-                file=sys.stderr,
+        if status and has_log(plan.log):
+            tell(
+                f"the episodes that ended are in {plan.log}; `memobench report {plan.log}` reports them, the same "
+                f"command with resume=true output_dir={plan.output} goes on"
             )
 
 
-def missing(evaluation: Evaluation) -> dict[tuple[str, int], list[Range]] | None:
-    """Return the runs that are to be made, in whole batches; None for all of them."""
-    grid, orders = evaluation.grid, evaluation.orders
-    if grid is None or not (orders.resume or orders.shard is not None):
-        return None
-    return grid.ranges(grid.missing(logged(evaluation.log, evaluation.environment.referent), orders.shard))
-
-
-@contextmanager
-def folder_of(evaluation: Evaluation) -> Iterator[None]:
-    """Hold the evaluation's folder; a run that ends before its first episode leaves nothing in it."""
-    log = evaluation.log
-    new = [folder for folder in (evaluation.output, log) if not folder.exists()]
-    log.mkdir(parents=True, exist_ok=True)
-    try:
-        with locked(log, log):
-            preflight.remove_drafts(log)
-            yield
-    finally:
-        if not has_log(log):
-            remove_card(log)
-            for folder in new:
-                preflight.remove_empty(folder)
-
-
-def go_on(evaluation: Evaluation, ranges: dict[tuple[str, int], list[Range]] | None) -> None:
-    """Change LeRobot's flags to what is left of the evaluation."""
-    if ranges is None or evaluation.grid is None:
-        return
-    translation: Translation = evaluation.translation
-    names = task_names(evaluation.grid.places, ranges)
-    if len(names) < len(evaluation.grid.places) and not translation.has("env.task_dir"):
-        translation.set("env.task" if translation.has("env.task") else "env.tasks", ",".join(names))
-    if has_log(evaluation.log):
-        translation.set("env.resume", True)
-        translation.set("output_dir", new_folder(evaluation.output))
-
-
-def new_folder(output: Path) -> Path:
-    """Return the first folder ``continued-k`` that is not there."""
-    k = 1
-    while (output / CONTINUED.format(k)).exists():
-        k += 1
-    return output / CONTINUED.format(k)
-
-
-def finish(evaluation: Evaluation, card: dict[str, Any], say_where: bool) -> int:
-    """Write and print the report of the log, write what was found onto the card."""
-    log, grid = evaluation.log, evaluation.grid
-    protocol = card["protocol"] or {k: v for k, v in read_protocol(log).items() if k != POLICY}
+def _finish(plan: EvaluationPlan, card: dict[str, Any]) -> EvaluationReport:
+    """Write the report of the log, and what was found onto the card."""
+    protocol = card["protocol"] or {k: v for k, v in read_protocol(plan.log).items() if k != POLICY}
     # LeRobot runs whole batches: episodes beyond those asked for are no part of the report.
-    limit = None if grid is None else grid.first + max(grid.runs, protocol["episodes"])
-    print_report(log, limit)
-    records = [record for record in read_episodes(log) if limit is None or record["episode"] < limit]
-    card = with_checkpoint({**card, "protocol": protocol}, evaluation.translation.get("policy.path"))
-    write_card(log, with_episodes(card, records))
-    if say_where:
-        print(f"report: {log / REPORT_MARKDOWN}")
-    return 0
-
-
-def print_report(folder: Path, episodes: int | None) -> None:
-    """Write the report of the log in ``folder`` beside it and print its table."""
-    from lerobot_memobench.cli.console import console
-    from lerobot_memobench.evaluation.documents.report import failure_line, table, write_report
-
-    summary, notes = write_report(folder, episodes)
-    out = console()
-    out.print()
-    out.print(table(summary))
-    out.print(failure_line(summary))
-    for note in notes:
-        out.print(f"note: {note}")
+    limit = None if plan.grid is None else plan.grid.first + max(plan.grid.runs, protocol["episodes"])
+    report = report_on(plan.log, limit)
+    records = [record for record in read_episodes(plan.log) if limit is None or record["episode"] < limit]
+    card = with_checkpoint({**card, "protocol": protocol}, plan.policy_path)
+    write_card(plan.log, with_episodes(card, records))
+    return report

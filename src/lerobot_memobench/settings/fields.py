@@ -71,32 +71,28 @@ def annotation_of(config: type, key: str, chosen: Chosen) -> Any:
     """
     if key == CONFIG_KEY:
         return str
-    cls: type = config
-    done: list[str] = []
+    cls = config
     parts = key.split(".")
-    for k, part in enumerate(parts):
-        known = field_types(cls)
-        if part not in known:
-            raise KeyError(key)
-        annotation = known[part]
-        done.append(part)
-        rest = parts[k + 1 :]
-        if not rest:
-            return annotation
+    for k, part in enumerate(parts[:-1]):
+        annotation = _field(cls, part, key)
         if is_registry(annotation):
-            if rest[0] in (*CHOICE_KEYS, PATH_KEY) and len(rest) == 1:
+            if k == len(parts) - 2 and parts[-1] in (*CHOICE_KEYS, PATH_KEY):
                 return str
-            choice = chosen(".".join(done))
-            if choice is None:
-                if k == 0:
-                    raise MemobenchError(f"{key!r} needs {part}=: name one before setting something of it")
-                return Any
-            cls = choice
-        elif dataclasses.is_dataclass(annotation):
-            cls = typing.cast(type, annotation)
-        else:
-            return Any  # a dict or a union: LeRobot's parser decides
-    raise AssertionError("unreachable")
+            choice = chosen(".".join(parts[: k + 1]))
+            if choice is None and k == 0:
+                raise MemobenchError(f"{key!r} needs {part}=: name one before setting something of it")
+            annotation = choice
+        if not dataclasses.is_dataclass(annotation):
+            return Any  # a dict, a union, a choice made elsewhere: LeRobot's parser decides
+        cls = typing.cast(type, annotation)
+    return _field(cls, parts[-1], key)
+
+
+def _field(cls: type, name: str, key: str) -> Any:
+    known = field_types(cls)
+    if name not in known:
+        raise KeyError(key)
+    return known[name]
 
 
 def checked_value(key: str, annotation: Any, text: str) -> str:
@@ -107,25 +103,33 @@ def checked_value(key: str, annotation: Any, text: str) -> str:
     """
     if text in ("null", "~"):
         return text
-    if annotation in (bool, int, float) and text.lower() == "none":  # a word such as `align=none` is a value
-        return "null"
+    if annotation in (bool, int, float):
+        # For text, a word such as `align=none` is a value.
+        return "null" if text.lower() == "none" else _checked_plain(key, annotation, text)
+    if typing.get_origin(annotation) is Literal:
+        values = [str(value) for value in typing.get_args(annotation)]
+        _check_known(key, text, values, values)
+    elif isinstance(annotation, type) and issubclass(annotation, enum.Enum):
+        values = [str(member.value) for member in annotation]
+        _check_known(key, text, [*values, *annotation.__members__], list(annotation.__members__))
+    return text
+
+
+def _checked_plain(key: str, annotation: type, text: str) -> str:
+    """Return the text of a truth value or number."""
     if annotation is bool:
         if text.lower() not in ("true", "false"):
             raise MemobenchError(f"{key}={text}: expected true or false")
         return text.lower()
-    if annotation in (int, float):
-        try:
-            annotation(text.replace("_", "") if annotation is int else text)
-        except ValueError:
-            word = "a whole number" if annotation is int else "a number"
-            raise MemobenchError(f"{key}={text}: expected {word}") from None
-        return text.replace("_", "") if annotation is int else text
-    if typing.get_origin(annotation) is Literal:
-        known = [str(value) for value in typing.get_args(annotation)]
-        if text not in known:
-            raise MemobenchError(f"{key}={text}: {nearest(text, known)}")
-    elif isinstance(annotation, type) and issubclass(annotation, enum.Enum):
-        known = [*(str(member.value) for member in annotation), *annotation.__members__]
-        if text not in known:
-            raise MemobenchError(f"{key}={text}: {nearest(text, annotation.__members__)}")
-    return text
+    plain = text.replace("_", "") if annotation is int else text
+    try:
+        annotation(plain)
+    except ValueError:
+        word = "a whole number" if annotation is int else "a number"
+        raise MemobenchError(f"{key}={text}: expected {word}") from None
+    return plain
+
+
+def _check_known(key: str, text: str, known: list[str], named: list[str]) -> None:
+    if text not in known:
+        raise MemobenchError(f"{key}={text}: {nearest(text, named)}")

@@ -5,13 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
-from typing import Annotated
 
-import typer
-
-from lerobot_memobench.cli.arguments import Words, has_flag
-from lerobot_memobench.cli.console import console
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.settings.flags import has_flag
+from lerobot_memobench.settings.words import Words
 
 KEY = "config"
 
@@ -48,21 +45,3 @@ def resolve_recipe(words: Words) -> Words:
     if len(named) > 1 or any(key == "config_path" for key, _ in others) or has_flag(words.flags, "config_path"):
         raise MemobenchError(f"{KEY}={named[-1]}: give one recipe, either by {KEY}= or by config_path=")
     return replace(words, settings=[("config_path", str(recipe_file(named[0]))), *others])
-
-
-def recipe(
-    name: Annotated[str | None, typer.Argument(help="A recipe; all are listed without it.")] = None,
-) -> int:
-    """Print the file of a training recipe, for `lerobot-train --config_path=$(memobench recipe train_paper)`."""
-    if name is not None:
-        print(recipe_file(name))
-        return 0
-    from rich.table import Table
-
-    table = Table(header_style="bold", pad_edge=False)
-    table.add_column("recipe", no_wrap=True)
-    table.add_column("what it trains")
-    for key, path in recipes().items():
-        table.add_row(key, path.read_text().splitlines()[0].removeprefix("# "))
-    console().print(table)
-    return 0

@@ -13,7 +13,7 @@ import pytest
 import torch
 from lerobot.scripts import lerobot_eval
 
-from lerobot_memobench.cli.loop import batch_seed, steered
+from lerobot_memobench.engine.lerobot_loop import batch_seed, steered
 
 
 class Env:

@@ -5,14 +5,10 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any, cast
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lerobot_memobench.cli.arguments import Words
-from lerobot_memobench.cli.orders import Orders, Shard, parse_shard, take_orders
-from lerobot_memobench.cli.plan import Grid, Place, task_names
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.engine.grid import Grid, Place, Shard, parse_shard, task_names
 
 
 def place(name: str, number: int = 0) -> Place:
@@ -21,9 +17,6 @@ def place(name: str, number: int = 0) -> Place:
 
 def grid(tasks: str = "ab", runs: int = 10, batch: int = 4, first: int = 0) -> Grid:
     return Grid(tuple(place(name, k) for k, name in enumerate(tasks)), runs, batch, first)
-
-
-# --- the grid ---
 
 
 def test_a_whole_evaluation_is_one_range_per_task() -> None:
@@ -77,53 +70,6 @@ def test_parts_make_up_the_whole(tasks: int, runs: int, batch: int, count: int, 
     }
     assert run | done == set(episodes)
     assert all(start % whole.batch == 0 for ranges in whole.ranges(whole.missing(done)).values() for start, _ in ranges)
-
-
-# --- the words on the command line ---
-
-
-def orders(*settings: str) -> Orders:
-    words = Words([tuple(word.split("=", 1)) for word in settings])  # type: ignore[misc]
-    return take_orders(words, ["lerobot", "eval", *settings])
-
-
-def test_orders_are_taken_out_of_the_settings() -> None:
-    words = Words([("env", "memobench"), ("resume", "true"), ("episodes", "3"), ("shard", "2/3")])
-    taken = take_orders(words, ["lerobot", "eval"])
-    assert words.settings == [("env", "memobench"), ("episodes", "3")]
-    assert (taken.resume, taken.shard, taken.any) == (True, Shard(2, 3), True)
-    assert not orders().any
-
-
-def test_executors_and_their_options() -> None:
-    taken = orders("shards=8", "workers=2", "executor=slurm", "executor_option=partition=gpu", "executor_option=mem=4")
-    assert (taken.shards, taken.workers, taken.executor) == (8, 2, "slurm")
-    assert taken.executor_options == {"partition": "gpu", "mem": 4}
-
-
-@pytest.mark.parametrize(
-    ("word", "message"),
-    [
-        ("shard=0/4", "i from 1 to n"),
-        ("shard=5/4", "i from 1 to n"),
-        ("shard=2", "i from 1 to n"),
-        ("shard=a/b", "i from 1 to n"),
-        ("shard=-1/4", "i from 1 to n"),
-        ("shards=0", "from 1 on"),
-        ("shards=many", "from 1 on"),
-        ("resume=yes", "true or false"),
-        ("executor=slurm", "shards=8"),
-        ("workers=3", "shards=8"),
-    ],
-)
-def test_orders_that_cannot_be_obeyed(word: str, message: str) -> None:
-    with pytest.raises(MemobenchError, match=message):
-        orders(word)
-
-
-def test_one_part_or_all_of_them() -> None:
-    with pytest.raises(MemobenchError, match="one part"):
-        orders("shard=1/2", "shards=2")
 
 
 def test_parts_have_folders_that_sort() -> None:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lerobot_memobench.cli import demo
+from lerobot_memobench.engine import contact_sheet as sheets
+from lerobot_memobench.engine import demo
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import get_task
 
@@ -38,26 +39,24 @@ def test_one_task_of_each_memory_type() -> None:
     assert [get_task(name).memory_type for name in demo.TASKS] == ["temporal", "spatial", "object", "procedural"]
 
 
-def test_the_demo_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(demo, "run_expert", fake_evaluation)
+def test_the_demo_folder(tmp_path: Path) -> None:
     out = tmp_path / "outputs" / "demo"
     (out / "videos").mkdir(parents=True)
     (out / "videos" / "old.mp4").write_text("")
     (out / "notes.txt").write_text("the user's own")
-    assert demo.run_demo(out) == 0
+    assert demo.make_demo(out, fake_evaluation) == 0
     assert {path.name for path in out.iterdir()} == {*demo.PRODUCTS, "notes.txt"}
     assert {path.stem for path in (out / "videos").iterdir()} == set(demo.TASKS)
     with Image.open(out / "contact_sheet.png") as sheet:
         pixels = np.asarray(sheet.convert("L")).astype(int)
-    assert pixels.shape == (4 * 160, demo.FRAMES_PER_VIDEO * demo.COLUMN_WIDTH)
-    means = pixels[:160].reshape(160, demo.FRAMES_PER_VIDEO, -1).mean(axis=(0, 2))
+    assert pixels.shape == (4 * 160, sheets.FRAMES_PER_VIDEO * sheets.COLUMN_WIDTH)
+    means = pixels[:160].reshape(160, sheets.FRAMES_PER_VIDEO, -1).mean(axis=(0, 2))
     assert (np.diff(means) > 20).all()  # evenly spaced in time, left to right
 
 
-def test_a_failed_evaluation_leaves_the_earlier_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_evaluation_leaves_the_earlier_demo(tmp_path: Path) -> None:
     (tmp_path / "report.json").write_text("earlier")
-    monkeypatch.setattr(demo, "run_expert", lambda output: 3)
-    assert demo.run_demo(tmp_path) == 3
+    assert demo.make_demo(tmp_path, lambda output: 3) == 3
     assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
 
 
@@ -68,4 +67,4 @@ def test_a_missing_video_is_named(tmp_path: Path) -> None:
 
 def test_even_distances_hold_both_ends() -> None:
     frames = [np.full((1, 1, 3), k, dtype=np.uint8) for k in range(11)]
-    assert [int(frame[0, 0, 0]) for frame in demo.evenly(frames, 3)] == [0, 5, 10]
+    assert [int(frame[0, 0, 0]) for frame in sheets.evenly(frames, 3)] == [0, 5, 10]

@@ -12,9 +12,10 @@ from typing import Any
 import dill
 import pytest
 
-from lerobot_memobench.cli import shards
+from lerobot_memobench.cli.evaluate import SHARD_PROGRAM
 from lerobot_memobench.cli.lerobot import main as lerobot
 from lerobot_memobench.cli.memobench import main as memobench
+from lerobot_memobench.engine import shards
 from lerobot_memobench.envs.episode_log import read_episodes
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
@@ -140,8 +141,7 @@ def here(fake_lerobot: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
     """Parts run in the process that asks for them."""
 
     def run(job: shards.ShardJob) -> None:
-        words = ["eval", f"output_dir={job.out}", f"shard={job.shard}", "resume=true", *job.flags]
-        assert lerobot(words) == 0
+        assert lerobot(job.words) == 0
 
     monkeypatch.setattr(shards.ShardJob, "run", run)
     return fake_lerobot
@@ -217,7 +217,7 @@ def test_slurm_gets_a_job_per_part_and_one_that_merges(
 @pytest.mark.slow
 def test_a_parts_process_ends_with_the_one_that_wanted_it(tmp_path: Path) -> None:
     words = ["eval", "env=memobench", f"tasks={STOVE}", "episodes=50", "output_dir=out", "shard=1/1", "batch_size=1"]
-    part = subprocess.Popen([sys.executable, "-c", shards.CHILD, *words], cwd=tmp_path, stdin=subprocess.PIPE)
+    part = subprocess.Popen([sys.executable, *SHARD_PROGRAM, *words], cwd=tmp_path, stdin=subprocess.PIPE)
     while not (tmp_path / "out" / "shard-1-of-1" / "card.json").exists():
         assert part.poll() is None
     assert part.stdin is not None

@@ -10,38 +10,17 @@ from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.configs.train import TrainPipelineConfig
 
 import lerobot_memobench.registration  # noqa: F401
-from lerobot_memobench.cli.arguments import Translation, flag_value, has_flag, split_words, translate
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.settings.translation import LerobotSettings, translate
+from lerobot_memobench.settings.words import split_words
 
 
 def evaluated(*words: str) -> list[str]:
-    return translate("eval", split_words(words), EvalPipelineConfig, {}).flags
+    return list(translate("eval", split_words(words), EvalPipelineConfig, {}).flags)
 
 
 def trained(*words: str) -> list[str]:
-    return translate("train", split_words(words), TrainPipelineConfig, {}).flags
-
-
-def test_words_are_taken_apart() -> None:
-    words = split_words(["env=memobench", "--policy.type", "act", "-v", "--seed=3", "tasks=a=b", "--resume"])
-    assert words.settings == [("env", "memobench"), ("tasks", "a=b")]
-    assert words.flags == ["--policy.type", "act", "-v", "--seed=3", "--resume"]
-    assert not words.wants_help
-
-
-@pytest.mark.parametrize("word", ["memobench", "=x", "", "a b=c", "=="])
-def test_a_word_that_is_neither_is_refused(word: str) -> None:
-    with pytest.raises(MemobenchError, match="expected key=value"):
-        split_words(["env=memobench", word])
-
-
-def test_flags_are_found_in_both_spellings() -> None:
-    flags = ["--a.b=1", "--c", "2", "--d", "--a.b=3"]
-    assert flag_value(flags, "a.b") == "3"
-    assert flag_value(flags, "c") == "2"
-    assert flag_value(flags, "d") is None
-    assert has_flag(flags, "d")
-    assert not has_flag(flags, "a")
+    return list(translate("train", split_words(words), TrainPipelineConfig, {}).flags)
 
 
 def test_the_commands_of_the_readme() -> None:
@@ -181,16 +160,20 @@ def test_a_dataset_that_can_only_be_a_folder_must_be_there(name: str) -> None:
 
 def test_a_config_file_may_hold_the_choices() -> None:
     file = {"policy": {"type": "memobench_mem"}, "env": {"type": "memobench"}}
-    flags = translate("train", split_words(["align=semantic", "env.horizon=3"]), TrainPipelineConfig, file).flags
-    assert flags == ["--policy.align=semantic", "--env.horizon=3"]
+    settings = translate("train", split_words(["align=semantic", "env.horizon=3"]), TrainPipelineConfig, file)
+    assert list(settings.flags) == ["--policy.align=semantic", "--env.horizon=3"]
 
 
 def test_a_command_without_a_configuration_takes_any_key() -> None:
-    assert translate("dataset-viz", split_words(["repo-id=a/b"]), None, {}).flags == ["--repo-id=a/b"]
+    assert list(translate("dataset-viz", split_words(["repo-id=a/b"]), None, {}).flags) == ["--repo-id=a/b"]
 
 
 def test_what_is_added_never_overrides() -> None:
-    translation = Translation(["--seed", "3"])
-    translation.add("seed", 7)
-    translation.add("env.expert_action", True)
-    assert translation.flags == ["--seed", "3", "--env.expert_action=true"]
+    given = LerobotSettings(("--seed", "3"))
+    settings = given.default("seed", 7).default("env.expert_action", True)
+    assert list(settings.flags) == ["--seed", "3", "--env.expert_action=true"]
+    assert list(given.flags) == ["--seed", "3"]
+
+
+def test_what_is_changed_replaces_both_spellings() -> None:
+    assert list(LerobotSettings(("--seed", "3", "--x=1")).changed("seed", 5).flags) == ["--x=1", "--seed=5"]

@@ -1,0 +1,52 @@
+"""``memobench doctor``: what the examination of this machine found, as a table or JSON."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.table import Table
+
+from lerobot_memobench.cli.console import console
+
+if TYPE_CHECKING:
+    from lerobot_memobench.doctor.findings import Finding, Status
+
+MARKS: dict[Status, str] = {
+    "ok": "[green]ok[/green]",
+    "warning": "[yellow]warning[/yellow]",
+    "failed": "[red]failed[/red]",
+}
+
+
+def doctor(
+    as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
+) -> int:
+    """Check that this machine can run the benchmark, and say how to mend what it cannot."""
+    from lerobot_memobench.doctor.examination import examine
+    from lerobot_memobench.doctor.findings import exit_status
+
+    findings = examine()
+    if as_json:
+        print(json.dumps([finding.as_dict() for finding in findings], indent=1))
+    else:
+        console().print(finding_table(findings))
+    return exit_status(findings)
+
+
+def finding_table(findings: Sequence[Finding]) -> Table:
+    """Return one row per finding, the fix under what it mends."""
+    table = Table(header_style="bold", pad_edge=False, show_lines=False)
+    for name in ("checked", "", "found"):
+        table.add_column(name, overflow="fold")
+    for finding in findings:
+        fix = f"\n[bold]fix:[/bold] {_plain(finding.fix)}" if finding.fix else ""
+        table.add_row(finding.what, MARKS[finding.status], _plain(finding.detail) + fix)
+    return table
+
+
+def _plain(text: str) -> str:
+    """Keep rich from reading brackets in other programs' messages as markup."""
+    return text.replace("[", "\\[")

@@ -1,0 +1,109 @@
+"""``lerobot eval``: parse the words, make the plan, run it, print what it found."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lerobot_memobench.cli.console import console, counting
+from lerobot_memobench.engine.lerobot_command import call_lerobot
+from lerobot_memobench.engine.merging import merge_and_report
+from lerobot_memobench.engine.orders import take_orders
+from lerobot_memobench.engine.plan import EvaluationPlan
+from lerobot_memobench.engine.planning import is_benchmark, make_plan
+from lerobot_memobench.engine.reporting import EvaluationReport
+from lerobot_memobench.engine.run import run_evaluation
+from lerobot_memobench.engine.shards import plan_shards, run_shards
+from lerobot_memobench.evaluation.documents.report import failure_line, table
+from lerobot_memobench.settings.reading import read_settings
+from lerobot_memobench.settings.words import Words
+
+if TYPE_CHECKING:
+    from lerobot_memobench.datasets.running import Advance
+
+SHARD_PROGRAM = ("-m", "lerobot_memobench.cli.shard_process")
+"""Words after Python's name that start the process of one part."""
+
+
+def evaluate(words: Words, command: Sequence[str]) -> int:
+    """Run ``lerobot eval``; an environment of LeRobot's own gets nothing but the checks.
+
+    Args:
+        command: the whole command line, for the card.
+    """
+    orders, words = take_orders(words)
+    settings = read_settings("eval", words)
+    if words.wants_help or not is_benchmark(settings, orders):
+        return call_lerobot("eval", settings.flags)
+    plan = make_plan(settings, orders, command)
+    return evaluate_in_parts(plan) if orders.shards else evaluate_here(plan)
+
+
+def evaluate_here(plan: EvaluationPlan, say_where: bool = True) -> int:
+    """Run an evaluation, or the part of it that is asked for, and print its report.
+
+    Args:
+        say_where: whether the report's file is named.
+    """
+    ended = run_evaluation(plan, tell)
+    if ended.report is not None:
+        print_figures(ended.report)
+        if say_where:
+            print(f"report: {ended.report.page}")
+    elif not ended.status:
+        print(f"part {plan.orders.shard} holds no episode: there are fewer batches than parts")
+    return ended.status
+
+
+def evaluate_in_parts(plan: EvaluationPlan) -> int:
+    """Run all parts of an evaluation as jobs, merge them and print the report; 1 when episodes are missing."""
+    screen = console()
+    jobs = plan_shards(plan, SHARD_PROGRAM, tell)
+    with counting(screen, "parts", len(jobs)) as count:
+
+        def advance(news: Advance) -> None:
+            count(news.done, news.total, news.task_name, found=news.found)
+
+        report = run_shards(plan, jobs, advance, finish=merge_and_print)
+    if report is not None:
+        return print_merged(report)
+    screen.print(f"jobs are submitted; the last of them merges the parts in {plan.output.absolute()}", soft_wrap=True)
+    return 0
+
+
+def merge_and_print(out: Path, folders: Sequence[Path]) -> int:
+    """Merge parts into ``out`` and print the report; return 1 when episodes that were asked for are missing."""
+    return print_merged(merge_and_report(out, folders))
+
+
+def print_merged(report: EvaluationReport) -> int:
+    """Print the report of a merged evaluation; return 1 when episodes that were asked for are missing."""
+    print_figures(report)
+    screen = console()
+    screen.print(f"report: {report.page}", soft_wrap=True)
+    if not report.absent:
+        return 0
+    task, episode = report.absent[0]
+    screen.print(
+        f"note: {len(report.absent)} episodes that were asked for are missing, the first is {task}, episode {episode}; "
+        "run their parts with resume=true and merge again",
+        soft_wrap=True,
+    )
+    return 1
+
+
+def print_figures(report: EvaluationReport) -> None:
+    """Print a report's table, its failures and what a reader must know."""
+    screen = console()
+    screen.print()
+    screen.print(table(report.summary))
+    screen.print(failure_line(report.summary))
+    for note in report.notes:
+        screen.print(f"note: {note}")
+
+
+def tell(text: str) -> None:
+    """Tell the user what may matter and stops nothing."""
+    print(text, file=sys.stderr)

@@ -1,0 +1,24 @@
+"""The whole examination, in the order in which it is read."""
+
+from __future__ import annotations
+
+from lerobot_memobench.doctor.drawing import golden_frame, rendering
+from lerobot_memobench.doctor.findings import Finding
+from lerobot_memobench.doctor.hardware import device, ffmpeg, torchcodec
+from lerobot_memobench.doctor.plugin import plugin
+from lerobot_memobench.doctor.versions import opencv, package_versions, python_version
+
+
+def examine() -> list[Finding]:
+    """Look at everything; this takes some tens of seconds, most of it LeRobot's import."""
+    return [
+        python_version(),
+        *package_versions(),
+        opencv(),
+        plugin(),
+        *rendering(),
+        golden_frame(),
+        ffmpeg(),
+        torchcodec(),
+        device(),
+    ]
