@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import random
+from importlib import metadata
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,7 +14,9 @@ import pytest
 import torch
 from lerobot.scripts import lerobot_eval
 
+from lerobot_memobench.engine import lerobot_loop
 from lerobot_memobench.engine.lerobot_loop import batch_seed, steered
+from lerobot_memobench.errors import MemobenchError
 
 
 class Env:
@@ -22,14 +25,74 @@ class Env:
         return ["a_task", "a_task"]
 
 
-def test_lerobot_takes_what_is_passed_to_it() -> None:
-    assert {"n_episodes", "start_seed", "videos_dir", "recording_dir"} <= set(
-        inspect.signature(lerobot_eval.run_one).parameters
+# --- what is relied on: where one of these fails, LeRobot's loop is another one ---
+
+MODULE = "src/lerobot_memobench/engine/lerobot_loop.py, and lerobot/scripts/lerobot_eval.py beside it"
+
+PARAMETERS = {
+    "run_one": {
+        "n_episodes": "_only() asks for part of a task by it",
+        "start_seed": "_only() begins a part by it: run k of a task has the seed start_seed + k",
+        "videos_dir": "_only() gives each of several parts films of its own by it",
+        "recording_dir": "_only() gives each of several parts recordings of its own by it",
+    },
+    "rollout": {
+        "env": "_seeded() asks it for the task",
+        "policy": "_seeded() seeds its generators",
+        "seeds": "_seeded() knows the batch by its first one",
+    },
+}
+
+CALLS = {
+    ("eval_policy", "rollout("): "looks rollout up in its module for each batch, where _seeded() stands",
+    ("eval_policy", "env=env"): "passes rollout's arguments by name, as _seeded() reads them",
+    ("eval_policy", "policy=policy"): "passes rollout's arguments by name, as _seeded() reads them",
+    ("eval_policy", "seeds=list(seeds)"): "gives a batch the seeds of its episodes",
+    ("eval_policy_all", "run_one,"): "looks run_one up in its module when it begins, where _only() stands",
+    ("eval_policy_all", "start_seed=start_seed"): "gives every task the run's seed",
+    (
+        "rollout",
+        "disable=inside_slurm()",
+    ): "draws no bar in a batch job, which calm_output() makes it take itself to be in",
+}
+
+
+def test_this_is_the_lerobot_whose_loop_is_known() -> None:
+    found = metadata.version("lerobot")
+    assert found == lerobot_loop.LEROBOT, (
+        f"lerobot {found} is installed. Read {MODULE}: does it still do what the tests below say? Compare the film and "
+        "the log of one killed and resumed evaluation (tests/cli/test_killed_evaluation.py), then change LEROBOT"
     )
-    assert {"env", "policy", "seeds"} <= set(inspect.signature(lerobot_eval.rollout).parameters)
-    source = inspect.getsource(lerobot_eval.eval_policy) + inspect.getsource(lerobot_eval.eval_policy_all)
-    for call in ("rollout(\n", "env=env", "policy=policy", "seeds=list(seeds)", "run_one,", "start_seed=start_seed"):
-        assert call in source, call
+
+
+@pytest.mark.parametrize("function", PARAMETERS)
+def test_lerobot_takes_what_is_passed_to_it(function: str) -> None:
+    found = inspect.signature(getattr(lerobot_eval, function)).parameters
+    for name, why in PARAMETERS[function].items():
+        assert name in found, f"lerobot_eval.{function} has no {name} any more, and {why}. Look at {MODULE}"
+
+
+@pytest.mark.parametrize(("function", "call"), CALLS)
+def test_lerobot_calls_what_is_put_in_its_place(function: str, call: str) -> None:
+    source = inspect.getsource(getattr(lerobot_eval, function))
+    assert call in source, (
+        f"lerobot_eval.{function} holds no {call!r} any more; it was relied on that it {CALLS[function, call]}. Look at "
+        f"{MODULE}"
+    )
+
+
+def test_another_lerobot_is_refused_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metadata, "version", lambda name: "0.7.0")
+    before = lerobot_eval.run_one, lerobot_eval.rollout
+    with (
+        pytest.raises(MemobenchError, match=r"lerobot 0\.7\.0 is installed.* install lerobot==0\.6\.1"),
+        steered(7, {}),
+    ):
+        pass
+    assert (lerobot_eval.run_one, lerobot_eval.rollout) == before
+
+
+# --- what it is made to do ---
 
 
 def test_ranges_are_run_one_by_one_and_joined(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
