@@ -76,8 +76,8 @@ def test_lerobot_takes_what_is_passed_to_it(function: str) -> None:
 def test_lerobot_calls_what_is_put_in_its_place(function: str, call: str) -> None:
     source = inspect.getsource(getattr(lerobot_eval, function))
     assert call in source, (
-        f"lerobot_eval.{function} holds no {call!r} any more; it was relied on that it {CALLS[function, call]}. Look at "
-        f"{MODULE}"
+        f"lerobot_eval.{function} holds no {call!r} any more; it was relied on that it {CALLS[function, call]}. "
+        f"Look at {MODULE}"
     )
 
 

@@ -16,6 +16,7 @@ from lerobot_memobench.files import write_file
 
 if TYPE_CHECKING:
     from lerobot_memobench.evaluation.documents.tables import Report
+    from lerobot_memobench.evaluation.records.runs import Run
 
 
 class ReportFormat(StrEnum):
@@ -35,6 +36,14 @@ class Beside(StrEnum):
 
 
 With = Annotated[Beside | None, typer.Option("--with", help="paper: stand the published figures beside.")]
+Folders = Annotated[
+    list[str] | None,
+    typer.Argument(
+        help="Folders that evaluations have written, or NAME=FOLDER; the same name for one policy at several replan "
+        "intervals. None with --with paper: the paper's figure.",
+        metavar="[DIR...]",
+    ),
+]
 Formats = Annotated[
     list[ReportFormat] | None,
     typer.Option("--format", help="table (default), markdown, latex or json; repeatable."),
@@ -46,6 +55,16 @@ ENDINGS = {
     ReportFormat.LATEX: "tex",
     ReportFormat.JSON: "json",
 }
+
+
+def given_runs(folders: list[str] | None, with_: Beside | None) -> tuple[list[Run], bool]:
+    """Return the evaluations and whether the paper's figures are drawn; one of both is needed."""
+    from lerobot_memobench.evaluation.records.runs import read_runs
+
+    paper = with_ is Beside.PAPER
+    if not folders and not paper:
+        raise MemobenchError("there is nothing to draw; name folders of evaluations, or --with paper, or both")
+    return (read_runs(folders) if folders else []), paper
 
 
 def show_report(report: Report, name: str, formats: Sequence[ReportFormat] | None, out: Path | None) -> None:
