@@ -12,9 +12,7 @@ from collections.abc import Callable, Sequence
 import typer
 
 from lerobot_memobench.cli import controls, data, figures
-from lerobot_memobench.cli.agreement import agreement
 from lerobot_memobench.cli.cache import cache
-from lerobot_memobench.cli.compare import compare
 from lerobot_memobench.cli.demo import demo
 from lerobot_memobench.cli.doctor import doctor
 from lerobot_memobench.cli.generate import generate
@@ -22,7 +20,7 @@ from lerobot_memobench.cli.html import html
 from lerobot_memobench.cli.merge import merge, rerun
 from lerobot_memobench.cli.necessity import necessity
 from lerobot_memobench.cli.recipe import recipe
-from lerobot_memobench.cli.report import report
+from lerobot_memobench.cli.report import agreement, compare, report
 from lerobot_memobench.cli.simulator import bench, gallery
 from lerobot_memobench.cli.study import study
 from lerobot_memobench.cli.tasks import tasks

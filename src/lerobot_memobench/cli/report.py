@@ -1,4 +1,4 @@
-"""``memobench report``: what evaluations found, in figures."""
+"""``memobench report``, ``compare`` and ``agreement``: what evaluations and annotation studies found, in figures."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lerobot_memobench.cli.console import console
-from lerobot_memobench.cli.documents import Beside, ReportFormat, With
+from lerobot_memobench.cli.documents import Beside, Formats, ReportFormat, With, show_report
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files import write_file
 
 if TYPE_CHECKING:
     from lerobot_memobench.evaluation.records.runs import Run
@@ -76,3 +78,58 @@ def _print_report(runs: Sequence[Run], formats: Sequence[str], paper: bool) -> N
             console().print(terminal(found))
         else:
             print(render(found, runs, name, paper), end="")
+
+
+def compare(
+    a: Annotated[str, typer.Argument(help="Folder of an evaluation, or NAME=FOLDER.", metavar="A")],
+    b: Annotated[str, typer.Argument(help="The one that is compared with it.", metavar="B")],
+    allow: Annotated[
+        list[str] | None,
+        typer.Option(help="A setting that is meant to differ, such as replan_steps; repeatable.", metavar="NAME"),
+    ] = None,
+    format_: Formats = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for compare.md, compare.tex, compare.json and so on.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random signs.")] = 0,
+    permutations: Annotated[int, typer.Option(min=100, help="Random signs where not all can be tried.")] = 10_000,
+) -> None:
+    """Compare two evaluations of the same episodes, pair by pair: McNemar for success, sign-flip for the rates."""
+    from lerobot_memobench.evaluation.comparison import differences as comparison
+    from lerobot_memobench.evaluation.records.runs import read_runs
+
+    first, second = read_runs([a, b])
+    found = comparison.compare(first, second, allow=allow or (), seed=seed, permutations=permutations)
+    show_report(comparison.report(found), "compare", format_, out)
+
+
+def agreement(
+    labels: Annotated[
+        Path | None, typer.Argument(help="CSV: a row per template, a column per rater.", metavar="[LABELS.CSV]")
+    ] = None,
+    paper: Annotated[
+        bool, typer.Option("--paper", help="Recompute the paper's study from what it publishes of it instead.")
+    ] = False,
+    template: Annotated[
+        Path | None, typer.Option(help="Write a blank sheet of the 84 templates for a new study instead.")
+    ] = None,
+    raters: Annotated[int, typer.Option(min=2, help="Columns of the blank sheet.")] = 3,
+    format_: Formats = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for agreement.md, agreement.json and so on.")] = None,
+) -> None:
+    """Agreement of raters with one another and with the released operation labels."""
+    from lerobot_memobench.evaluation.agreement import kappa as statistics
+    from lerobot_memobench.evaluation.agreement.label_sheet import blank_sheet, read_labels
+    from lerobot_memobench.paper import annotator_agreement
+
+    if sum([labels is not None, paper, template is not None]) != 1:
+        raise MemobenchError("expected one of LABELS.CSV, --paper and --template FILE")
+    if template is not None:
+        if template.exists():
+            raise MemobenchError(f"--template {template} exists; name a new file, raters may have filled in that one")
+        template.parent.mkdir(parents=True, exist_ok=True)
+        console().print(str(write_file(template, blank_sheet(raters))), soft_wrap=True)
+    elif labels is not None:
+        show_report(statistics.report(statistics.study(read_labels(labels))), "agreement", format_, out)
+    else:
+        show_report(statistics.published_report(annotator_agreement()), "agreement_paper", format_, out)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from lerobot_memobench.doctor.drawing import golden_frame, rendering
 from lerobot_memobench.doctor.findings import Finding
-from lerobot_memobench.doctor.hardware import device, ffmpeg, torchcodec
-from lerobot_memobench.doctor.plugin import plugin
-from lerobot_memobench.doctor.versions import opencv, package_versions, python_version
+from lerobot_memobench.doctor.machine import device, ffmpeg, golden_frame, rendering, torchcodec
+from lerobot_memobench.doctor.software import opencv, package_versions, plugin, python_version
 
 
 def examine() -> list[Finding]:

@@ -1,20 +1,43 @@
-"""Try one thing that may crash the process: ``python -m lerobot_memobench.doctor.probe gl egl``. Prints JSON.
+"""Try one thing that may crash the process, in a process of its own.
 
-A driver that is broken ends the process with a signal, which only its parent can report.
+A driver that is broken ends the process with a signal, which only its parent can report. The child is
+``python -m lerobot_memobench.doctor.probe gl egl`` and prints JSON.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import signal
+import subprocess
 import sys
 from collections.abc import Callable
 from typing import Any
+
+PROBE = "lerobot_memobench.doctor.probe"
 
 SCENE = """
 <mujoco><worldbody><light pos='0 0 3'/><camera name='eye' pos='0 -1 0' xyaxes='1 0 0 0 0 1'/>
 <geom type='sphere' size='.2' rgba='.9 .2 .1 1'/></worldbody></mujoco>
 """
+
+
+def run_probe(*words: str, timeout_s: float = 180.0) -> dict[str, Any]:
+    """Run a probe in a process of its own; return its answer, or {"error": …} however it ended."""
+    command = [sys.executable, "-m", PROBE, *words]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
+    except subprocess.TimeoutExpired:
+        return {"error": f"no answer in {timeout_s:.0f} s"}
+    if done.returncode < 0:
+        return {"error": f"the process was killed by {signal.Signals(-done.returncode).name}"}
+    lines = done.stdout.strip().splitlines()
+    if done.returncode or not lines:
+        reason = (done.stderr.strip().splitlines() or ["without a message"])[-1]
+        return {"error": f"the process ended with status {done.returncode}: {reason}"}
+    answer = json.loads(lines[-1])
+    assert isinstance(answer, dict)
+    return answer
 
 
 def gl(backend: str) -> dict[str, Any]:

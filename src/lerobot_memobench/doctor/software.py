@@ -1,4 +1,4 @@
-"""What is installed, against what this project and LeRobot ask for."""
+"""What is installed: versions against what this project and LeRobot ask for, and whether LeRobot finds its plugin."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
 from lerobot_memobench.doctor.findings import Finding
-from lerobot_memobench.doctor.plugin import DISTRIBUTION
+
+DISTRIBUTION = "lerobot_policy_memobench"
+PLUGIN = "LeRobot plugin"
 
 #: What the versions of are shown and held against the requirements of this project and of LeRobot.
 SHOWN = ("lerobot", "torch", "transformers", "mujoco", "robosuite", "numpy", "gymnasium", "torchcodec", "av")
@@ -70,6 +72,37 @@ def opencv() -> Finding:
         return Finding("OpenCV", "ok", f"opencv-python-headless {installed['opencv-python-headless']} alone")
     fix = "run `make setup`, or uninstall all of them and install opencv-python-headless alone"
     return Finding("OpenCV", "warning", " and ".join(installed) or "not installed", fix)
+
+
+def plugin() -> Finding:
+    """Do what LeRobot does to find plugins; it logs an import error and goes on, this reports it."""
+    if DISTRIBUTION not in [distribution.metadata.get("Name") for distribution in metadata.distributions()]:
+        return Finding(
+            PLUGIN,
+            "failed",
+            f"no installed distribution is named {DISTRIBUTION}, so LeRobot does not look for it",
+            "install the project (`make setup`); a source folder on PYTHONPATH is not enough",
+        )
+    try:
+        missing = not_registered()
+    except Exception as error:
+        reason = f"importing it fails: {type(error).__name__}: {error}"
+        return Finding(PLUGIN, "failed", reason, "mend the import error; LeRobot only logs it")
+    if missing:
+        return Finding(PLUGIN, "failed", f"imported, but not registered: {', '.join(missing)}", "run `make setup`")
+    return Finding(PLUGIN, "ok", "discovered: env memobench, policies memobench_mem, memobench_expert")
+
+
+def not_registered() -> list[str]:
+    """Import the plugin as LeRobot does; return what LeRobot still does not know of it."""
+    __import__(DISTRIBUTION)
+    from lerobot.configs.policies import PreTrainedConfig
+    from lerobot.envs.configs import EnvConfig
+    from lerobot.policies import factory as _factory  # noqa: F401 - importing it registers policies
+
+    policies, environments = PreTrainedConfig.get_known_choices(), EnvConfig.get_known_choices()
+    missing = [f"policy {name}" for name in ("memobench_mem", "memobench_expert") if name not in policies]
+    return missing + [f"env {name}" for name in ("memobench",) if name not in environments]
 
 
 def _installed(name: str) -> str | None:
