@@ -1,156 +1,22 @@
-"""``memobench doctor``: each failure is found, with its fix."""
+"""``memobench doctor``: what is printed, and the exit status."""
 
 from __future__ import annotations
 
-import builtins
 import json
-import shutil
-from importlib import metadata
-from typing import Any
 
-import numpy as np
-import pytest
-from packaging.specifiers import SpecifierSet
 from rich.console import Console
 
-from lerobot_memobench.cli import doctor
-from lerobot_memobench.cli.doctor import Finding
-from lerobot_memobench.cli.golden import SIDE, TOLERANCE, difference, read_golden, render_golden, shrink
-
-
-def test_this_machine_renders_the_golden_frame() -> None:
-    assert difference(render_golden(), read_golden()) < TOLERANCE / 2
-
-
-def test_wrong_pictures_are_outside_the_tolerance() -> None:
-    golden = read_golden()
-    assert golden.shape == (SIDE, SIDE, 3)
-    grey = np.repeat(golden.mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8)
-    for wrong in (golden[::-1], golden[:, ::-1], golden[..., ::-1], grey, golden // 2, np.zeros_like(golden)):
-        assert difference(wrong, golden) > TOLERANCE
-
-
-def test_shrinking_averages_blocks() -> None:
-    image = np.zeros((2 * SIDE, 2 * SIDE, 3), dtype=np.uint8)
-    image[::2] = 100
-    assert (shrink(image) == 50).all()
-
-
-def test_supported_versions_come_from_the_requirements() -> None:
-    supported = doctor.supported_versions()
-    assert supported["lerobot"] == SpecifierSet("==0.6.1")
-    assert not supported["mujoco"].contains("3.17.0")
-    assert not supported["torch"].contains("2.12.0")
-
-
-def test_a_version_out_of_range_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    real = metadata.version
-    monkeypatch.setattr(metadata, "version", lambda name: "4.0.0" if name == "mujoco" else real(name))
-    findings = {finding.what: finding for finding in doctor.package_versions()}
-    assert findings["mujoco"].status == "failed"
-    assert findings["mujoco"].fix
-    assert findings["lerobot"].status == "ok"
-
-
-def test_a_missing_package_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    def version(name: str) -> str:
-        raise metadata.PackageNotFoundError(name)
-
-    monkeypatch.setattr(metadata, "version", version)
-    assert {finding.status for finding in doctor.package_versions()} == {"failed"}
-
-
-def test_the_plugin_is_discovered() -> None:
-    assert doctor.plugin().status == "ok"
-
-
-def test_an_uninstalled_plugin_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(metadata, "distributions", list)
-    finding = doctor.plugin()
-    assert finding.status == "failed"
-    assert "make setup" in finding.fix
-
-
-def test_the_plugins_import_error_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    real = builtins.__import__
-
-    def broken(name: str, *args: Any) -> Any:
-        if name == doctor.DISTRIBUTION:
-            raise ImportError("no module named 'nonsense'")
-        return real(name, *args)
-
-    monkeypatch.setattr(builtins, "__import__", broken)
-    finding = doctor.plugin()
-    assert finding.status == "failed"
-    assert "nonsense" in finding.detail
-
-
-def probes(monkeypatch: pytest.MonkeyPatch, answers: dict[str, dict[str, Any]]) -> None:
-    monkeypatch.setattr(doctor, "run_probe", lambda *words: answers[" ".join(words)])
-
-
-SOFTWARE = {"renderer": "llvmpipe (LLVM 15)", "version": "4.5", "vendor": "Mesa", "sphere": True}
-BROKEN = {"error": "the process was killed by SIGSEGV"}
-
-
-def test_the_backend_in_use_must_work_the_other_need_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("MUJOCO_GL", "egl")
-    probes(monkeypatch, {"gl egl": SOFTWARE, "gl osmesa": BROKEN})
-    assert [finding.status for finding in doctor.rendering()] == ["ok", "ok", "warning"]
-    probes(monkeypatch, {"gl egl": BROKEN, "gl osmesa": SOFTWARE})
-    findings = list(doctor.rendering())
-    assert [finding.status for finding in findings] == ["ok", "failed", "ok"]
-    assert "SIGSEGV" in findings[1].detail
-    assert "MUJOCO_GL=osmesa" in findings[1].fix
-
-
-def test_a_backend_that_draws_nonsense_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("MUJOCO_GL", "egl")
-    probes(monkeypatch, {"gl egl": {**SOFTWARE, "sphere": False}, "gl osmesa": SOFTWARE})
-    assert [finding.status for finding in doctor.rendering()] == ["ok", "failed", "ok"]
-
-
-def test_no_gl_library_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("MUJOCO_GL", raising=False)
-    monkeypatch.setattr("ctypes.util.find_library", lambda name: None)
-    probes(monkeypatch, {"gl egl": BROKEN, "gl osmesa": BROKEN})
-    findings = list(doctor.rendering())
-    assert findings[0].status == "failed"
-    assert "libegl1" in findings[0].fix
-
-
-@pytest.mark.parametrize(
-    ("answer", "status"),
-    [({"difference": 0.3}, "ok"), ({"difference": 40.0}, "failed"), (BROKEN, "failed")],
-)
-def test_golden_frame(monkeypatch: pytest.MonkeyPatch, answer: dict[str, Any], status: str) -> None:
-    probes(monkeypatch, {"golden": answer})
-    finding = doctor.golden_frame()
-    assert finding.status == status
-    assert bool(finding.fix) == (status == "failed")
-
-
-def test_video(monkeypatch: pytest.MonkeyPatch) -> None:
-    probes(monkeypatch, {"torchcodec": {"error": "no libavutil"}})
-    assert doctor.torchcodec().status == "warning"
-    assert "apt-get install ffmpeg" in doctor.torchcodec().fix
-    monkeypatch.setattr(shutil, "which", lambda name: None)
-    assert doctor.ffmpeg().status == "warning"
-
-
-def test_a_probe_that_dies_is_reported() -> None:
-    assert "error" in doctor.run_probe("gl", "nonsense")
-    assert "status" in doctor.run_probe("nonsense")["error"] or "KeyError" in doctor.run_probe("nonsense")["error"]
-    assert "no answer" in doctor.run_probe("gl", "egl", timeout_s=0.01)["error"]
+from lerobot_memobench.cli.doctor import finding_table
+from lerobot_memobench.doctor.findings import Finding, exit_status
 
 
 def test_the_exit_status_and_the_table() -> None:
     findings = [Finding("a", "ok", "x"), Finding("b", "warning", "[y]", "do z")]
-    assert doctor.exit_status(findings) == 0
-    assert doctor.exit_status([*findings, Finding("c", "failed", "w", "v")]) == 1
+    assert exit_status(findings) == 0
+    assert exit_status([*findings, Finding("c", "failed", "w", "v")]) == 1
     console = Console(width=80, record=True, quiet=False)
     with console.capture() as capture:
-        console.print(doctor.finding_table(findings))
+        console.print(finding_table(findings))
     assert "[y]" in capture.get()
     assert "do z" in capture.get()
     assert json.dumps([finding.as_dict() for finding in findings])

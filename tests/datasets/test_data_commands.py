@@ -16,7 +16,6 @@ from lerobot_memobench.datasets.convert import ConversionSummary
 from lerobot_memobench.datasets.hdf5 import Problem
 from lerobot_memobench.datasets.running import Advance
 from lerobot_memobench.datasets.validate import Verdict
-from lerobot_memobench.errors import MemobenchError
 
 
 @pytest.fixture
@@ -77,13 +76,3 @@ def test_push(call, monkeypatch):
     result = call("push", "ds", "--repo-id", "a/b", "--private")
     assert asked == {"words": (Path("ds"), "a/b"), "private": True, "hdf5": False}
     assert (result.return_value, result.output.strip()) == (0, "dataset: https://x/y")
-
-
-def test_executor_options():
-    assert data.executor_options(["partition=cpu", "mem_per_cpu_gb=4", "env_command=a=b"]) == {
-        "partition": "cpu",
-        "mem_per_cpu_gb": 4,
-        "env_command": "a=b",
-    }
-    with pytest.raises(MemobenchError, match="expected key=value"):
-        data.executor_options(["partition"])

@@ -10,21 +10,11 @@ from typing import Any
 
 import pytest
 
-from lerobot_memobench.engine import card as cards
-from lerobot_memobench.engine.card import (
-    checkpoint_files,
-    disagreement,
-    extended,
-    joined_runs,
-    new_card,
-    outcome,
-    policy_facts,
-    run_facts,
-    training_facts,
-    tree_hash,
-    with_episodes,
-    write_card,
-)
+from lerobot_memobench.engine.card import extended, joined_runs, new_card, with_episodes, write_card
+from lerobot_memobench.engine.card_markdown import markdown
+from lerobot_memobench.engine.machine import run_facts
+from lerobot_memobench.engine.outcomes import disagreement, outcome
+from lerobot_memobench.engine.policy_identity import checkpoint_files, policy_facts, training_facts, tree_hash
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records.protocol import read_card
 
@@ -77,7 +67,7 @@ def test_a_card_is_read_back_as_it_was(tmp_path: Path) -> None:
 
 
 def test_what_is_told_for_people() -> None:
-    text = cards.markdown(with_episodes(card(), [record("a")]))
+    text = markdown(with_episodes(card(), [record("a")]))
     for part in ("| tasks | 1: a |", "| horizon | 1200 |", "| type | act |", "lerobot eval", "| mujoco | 3"):
         assert part in text, part
 

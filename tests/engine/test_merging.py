@@ -9,8 +9,10 @@ from typing import Any
 
 import pytest
 
-from lerobot_memobench.engine.card import new_card, policy_facts, run_facts, write_card
+from lerobot_memobench.engine.card import new_card, write_card
+from lerobot_memobench.engine.machine import run_facts
 from lerobot_memobench.engine.merging import merge, part_folders
+from lerobot_memobench.engine.policy_identity import policy_facts
 from lerobot_memobench.envs.episode_log import EpisodeLog, read_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records.protocol import read_card, read_protocol

@@ -1,17 +1,13 @@
-"""``memobench convert``, ``validate``, ``describe`` and ``push``: functions for the typer application.
-
-Register them with ``app.command()(convert)`` and so on; each returns the exit status.
-"""
+"""``memobench convert``, ``validate``, ``describe`` and ``push``: datasets that are there."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lerobot_memobench.cli.console import console, counting
-from lerobot_memobench.errors import MemobenchError
 
 if TYPE_CHECKING:
     from lerobot_memobench.datasets.running import Advance
@@ -101,14 +97,3 @@ def describe(
     for file in run(folder, out or folder / "description"):
         console().print(str(file), soft_wrap=True)
     return 0
-
-
-def executor_options(given: list[str]) -> dict[str, Any]:
-    """Return ``key=value`` words (``memobench generate --executor-option``) as arguments; numbers as numbers."""
-    options: dict[str, Any] = {}
-    for word in given:
-        key, equals, value = word.partition("=")
-        if not key or not equals:
-            raise MemobenchError(f"found executor option {word!r}, expected key=value, such as partition=cpu")
-        options[key] = int(value) if value.isdigit() else value
-    return options

@@ -1,130 +1,109 @@
-"""``lerobot eval env=memobench``: the benchmark's defaults, and the choice of how it is run."""
+"""``lerobot eval``: parse the words, make the plan, run it, print what it found."""
 
 from __future__ import annotations
 
-import datetime as dt
-import os
-from collections.abc import Callable
+import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from lerobot_memobench.cli import preflight
-from lerobot_memobench.cli.arguments import Translation
-from lerobot_memobench.cli.evaluation import Evaluation, make_grid
-from lerobot_memobench.cli.orders import Orders
-from lerobot_memobench.cli.running import run_evaluation
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.records.protocol import CARD_FILE, read_card
+from lerobot_memobench.cli.console import console, counting
+from lerobot_memobench.engine.lerobot_command import call_lerobot
+from lerobot_memobench.engine.merging import merge_and_report
+from lerobot_memobench.engine.orders import take_orders
+from lerobot_memobench.engine.plan import EvaluationPlan
+from lerobot_memobench.engine.planning import is_benchmark, make_plan
+from lerobot_memobench.engine.reporting import EvaluationReport
+from lerobot_memobench.engine.run import run_evaluation
+from lerobot_memobench.engine.shards import plan_shards, run_shards
+from lerobot_memobench.evaluation.documents.report import failure_line, table
+from lerobot_memobench.settings.reading import read_settings
+from lerobot_memobench.settings.words import Words
 
-ENVIRONMENT = "memobench"
-EXPERT = "memobench_expert"
-FIRST_SEED = 7
-"""Episode i of the protocol uses seed 7 + i."""
+if TYPE_CHECKING:
+    from lerobot_memobench.datasets.running import Advance
+
+SHARD_PROGRAM = ("-m", "lerobot_memobench.cli.shard_process")
+"""Words after Python's name that start the process of one part."""
 
 
-def evaluate(
-    translation: Translation, run: Callable[[], int], say_where: bool = True, orders: Orders | None = None
-) -> int:
-    """Complete the flags of an evaluation, run it, write and print its report; return the exit status.
+def evaluate(words: Words, command: Sequence[str]) -> int:
+    """Run ``lerobot eval``; an environment of LeRobot's own gets nothing but the checks.
 
-    An environment of LeRobot's own gets nothing but the checks.
+    Args:
+        command: the whole command line, for the card.
     """
-    orders = orders or Orders()
-    if not translation.has("env.type") and not translation.has("config_path"):
-        raise MemobenchError("name an environment: env=memobench")
-    if translation.get("env.type") != ENVIRONMENT:
-        if orders.any:
-            raise MemobenchError("resume=, shard= and shards= belong to the benchmark: name it with env=memobench")
-        preflight.check_policy(translation)
-        return run()
-    evaluation = prepare(translation, orders)
-    if orders.shards:
-        from lerobot_memobench.cli.shards import run_shards
-
-        return run_shards(evaluation)
-    return run_evaluation(evaluation, run, say_where)
+    orders, words = take_orders(words)
+    settings = read_settings("eval", words)
+    if words.wants_help or not is_benchmark(settings, orders):
+        return call_lerobot("eval", settings.flags)
+    plan = make_plan(settings, orders, command)
+    return evaluate_in_parts(plan) if orders.shards else evaluate_here(plan)
 
 
-def prepare(translation: Translation, orders: Orders) -> Evaluation:
-    """Complete the flags and find out what they ask for; what is wrong with them is told here."""
-    if orders.resume and not translation.has("output_dir"):
-        raise MemobenchError("resume=true needs the folder of the evaluation to go on with: output_dir=<folder>")
-    if orders.shard is not None and translation.has("output_dir"):
-        translation.set("output_dir", Path(translation.get("output_dir") or "") / orders.shard.folder)
-    add_policy(translation)
-    preflight.check_policy(translation)
-    policy = preflight.parse_choice(translation, "policy")
-    if orders.resume:
-        add_earlier_batch_size(translation)
-    if orders.shard is not None or orders.shards:
-        translation.add("eval.batch_size", 1)  # by cores, each machine would cut the evaluation differently
-    most = getattr(policy, "max_environments", None)
-    if most is not None:
-        add_batch_size(translation, most)  # its servers keep one memory each
-    add_protocol(translation, getattr(policy, "n_action_steps", None))
-    environment = preflight.parse_choice(translation, "env")
-    if environment is None and orders.any:
-        raise MemobenchError("resume=, shard= and shards= cannot go with config_path=; give its settings on the line")
-    grid = make_grid(translation, environment) if environment is not None else None
-    preflight.check_rendering()
-    return Evaluation(translation, orders, policy, environment, grid)
+def evaluate_here(plan: EvaluationPlan, say_where: bool = True) -> int:
+    """Run an evaluation, or the part of it that is asked for, and print its report.
 
-
-def add_policy(translation: Translation) -> None:
-    """Use the scripted expert where no policy is named, and let the environment offer it its action."""
-    if not translation.has("policy.path"):
-        translation.add("policy.type", EXPERT)
-    if translation.get("policy.type") == EXPERT:
-        translation.add("env.expert_action", True)
-    if "policy" not in translation.chosen:
-        from lerobot.configs.policies import PreTrainedConfig
-
-        name = translation.get("policy.type")
-        if name is not None:
-            translation.chosen["policy"] = PreTrainedConfig.get_choice_class(name)
-
-
-def add_protocol(translation: Translation, n_action_steps: int | None) -> None:
-    """Set seed, episodes, batch size, device and folders where the user has not."""
-    import torch
-
-    translation.add("seed", FIRST_SEED)
-    translation.add("eval.n_episodes", 50)
-    add_batch_size(translation)
-    if not torch.cuda.is_available() and not torch.backends.mps.is_available():
-        translation.add("policy.device", "cpu")
-    if n_action_steps is not None:
-        translation.add("env.replan_steps", n_action_steps)
-    translation.add("output_dir", default_output(translation))
-    translation.add("env.log_dir", translation.get("output_dir"))
-
-
-def add_batch_size(translation: Translation, most: int = 64) -> None:
-    """Choose the largest batch that LeRobot would choose and that divides the episodes; at most ``most``.
-
-    LeRobot runs whole batches and throws the surplus of the last one away, after simulating it.
+    Args:
+        say_where: whether the report's file is named.
     """
-    if (translation.get("eval.batch_size") or "0") != "0":
-        return
-    episodes = int(translation.get("eval.n_episodes") or 50)
-    limit = max(1, min(int((os.cpu_count() or 4) * 0.7), episodes, most))
-    translation.set("eval.batch_size", max(size for size in range(1, limit + 1) if episodes % size == 0))
+    ended = run_evaluation(plan, tell)
+    if ended.report is not None:
+        print_figures(ended.report)
+        if say_where:
+            print(f"report: {ended.report.page}")
+    elif not ended.status:
+        print(f"part {plan.orders.shard} holds no episode: there are fewer batches than parts")
+    return ended.status
 
 
-def add_earlier_batch_size(translation: Translation) -> None:
-    """Use the batch size of the evaluation that is gone on with: what a policy samples may depend on it."""
-    path = Path(translation.get("env.log_dir") or translation.get("output_dir") or "") / CARD_FILE
-    if path.is_file() and (translation.get("eval.batch_size") or "0") == "0":
-        translation.set("eval.batch_size", read_card(path)["runs"][-1]["batch_size"])
+def evaluate_in_parts(plan: EvaluationPlan) -> int:
+    """Run all parts of an evaluation as jobs, merge them and print the report; 1 when episodes are missing."""
+    screen = console()
+    jobs = plan_shards(plan, SHARD_PROGRAM, tell)
+    with counting(screen, "parts", len(jobs)) as count:
+
+        def advance(news: Advance) -> None:
+            count(news.done, news.total, news.task_name, found=news.found)
+
+        report = run_shards(plan, jobs, advance, finish=merge_and_print)
+    if report is not None:
+        return print_merged(report)
+    screen.print(f"jobs are submitted; the last of them merges the parts in {plan.output.absolute()}", soft_wrap=True)
+    return 0
 
 
-def default_output(translation: Translation) -> Path:
-    """Return a folder that no evaluation has used: ``outputs/eval/<date>/<time>_memobench_<policy>``."""
-    chosen = translation.chosen.get("policy")
-    name = translation.get("policy.type") or (chosen.get_choice_name(chosen) if chosen else "policy")  # type: ignore[attr-defined]
-    now = dt.datetime.now()
-    base = Path("outputs/eval") / f"{now:%Y-%m-%d}" / f"{now:%H-%M-%S}_{ENVIRONMENT}_{name}"
-    folder, k = base, 1
-    while folder.exists():
-        k += 1
-        folder = base.with_name(f"{base.name}_{k}")
-    return folder
+def merge_and_print(out: Path, folders: Sequence[Path]) -> int:
+    """Merge parts into ``out`` and print the report; return 1 when episodes that were asked for are missing."""
+    return print_merged(merge_and_report(out, folders))
+
+
+def print_merged(report: EvaluationReport) -> int:
+    """Print the report of a merged evaluation; return 1 when episodes that were asked for are missing."""
+    print_figures(report)
+    screen = console()
+    screen.print(f"report: {report.page}", soft_wrap=True)
+    if not report.absent:
+        return 0
+    task, episode = report.absent[0]
+    screen.print(
+        f"note: {len(report.absent)} episodes that were asked for are missing, the first is {task}, episode {episode}; "
+        "run their parts with resume=true and merge again",
+        soft_wrap=True,
+    )
+    return 1
+
+
+def print_figures(report: EvaluationReport) -> None:
+    """Print a report's table, its failures and what a reader must know."""
+    screen = console()
+    screen.print()
+    screen.print(table(report.summary))
+    screen.print(failure_line(report.summary))
+    for note in report.notes:
+        screen.print(f"note: {note}")
+
+
+def tell(text: str) -> None:
+    """Tell the user what may matter and stops nothing."""
+    print(text, file=sys.stderr)

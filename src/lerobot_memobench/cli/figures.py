@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lerobot_memobench.cli.console import console
-from lerobot_memobench.cli.report import Beside, With
+from lerobot_memobench.cli.documents import Folders, With, given_runs
 from lerobot_memobench.errors import MemobenchError
 
 if TYPE_CHECKING:
@@ -22,14 +22,6 @@ app = typer.Typer(
     no_args_is_help=True,
 )
 
-Folders = Annotated[
-    list[str] | None,
-    typer.Argument(
-        help="Folders that evaluations have written, or NAME=FOLDER; the same name for one policy at several replan "
-        "intervals. None with --with paper: the paper's figure.",
-        metavar="[DIR...]",
-    ),
-]
 Out = Annotated[
     Path, typer.Option(help="A file ending in .pdf, .png or .svg, or a folder that gets the PDF and the PNG.")
 ]
@@ -62,7 +54,7 @@ def radar(
     """Per method the best value over replan intervals, each axis normalised by its highest."""
     from lerobot_memobench.evaluation.documents.figures import entries, radar
 
-    runs, paper = _given(folders, with_)
+    runs, paper = given_runs(folders, with_)
     ours = entries.entries_of(runs)
     chosen = entries.average_axes() if axes is Axes.AVERAGE else entries.type_axes()
     panels = [("", ours)]
@@ -87,7 +79,7 @@ def correlations(
     """MSR, MUR and MCR against SR with Pearson's r."""
     from lerobot_memobench.evaluation.documents.figures import correlations, entries
 
-    runs, paper = _given(folders, with_)
+    runs, paper = given_runs(folders, with_)
     if paper and by is Grouping.TASKS:
         raise MemobenchError("the paper publishes no figures per task; leave out --by tasks or --with paper")
     rows = [*(entries.published_entries("main") if paper else ()), *entries.entries_of(runs)]
@@ -105,7 +97,7 @@ def failures(
     """How rollouts ended: success and the classes of failure, as bars."""
     from lerobot_memobench.evaluation.documents.figures import failures
 
-    runs, paper = _given(folders, with_)
+    runs, paper = given_runs(folders, with_)
     bars = [*failures.bars(runs, by is Grouping.TASKS), *([failures.paper_bar()] if paper else [])]
     _save(failures.draw(bars), out, "failures")
 
@@ -122,7 +114,7 @@ def prefix(
     """Prefix completion per checkpoint, in any order and in order, one panel per task."""
     from lerobot_memobench.evaluation.documents.figures import prefix
 
-    runs, paper = _given(folders, with_)
+    runs, paper = given_runs(folders, with_)
     panels = prefix.panels(runs, None if tasks is None else _chosen(tasks, runs))
     _save(prefix.draw([*panels, *([prefix.paper_panel()] if paper else [])]), out, "prefix")
 
@@ -139,20 +131,10 @@ def replan(
     """SR, MSR, MUR and MCR by replan interval."""
     from lerobot_memobench.evaluation.documents.figures import replan
 
-    runs, paper = _given(folders, with_)
+    runs, paper = given_runs(folders, with_)
     if by is Grouping.TASKS:
         raise MemobenchError("found --by tasks; expected types: replan curves are drawn of averages and memory types")
     _save(replan.draw(runs, paper, by is Grouping.TYPES), out, "replan")
-
-
-def _given(folders: list[str] | None, with_: Beside | None) -> tuple[list[Run], bool]:
-    """Return the evaluations and whether the paper's figures are drawn; one of both is needed."""
-    from lerobot_memobench.evaluation.records.runs import read_runs
-
-    paper = with_ is Beside.PAPER
-    if not folders and not paper:
-        raise MemobenchError("there is nothing to draw; name folders of evaluations, or --with paper, or both")
-    return (read_runs(folders) if folders else []), paper
 
 
 def _chosen(spec: str, runs: list[Run]) -> list[str]:

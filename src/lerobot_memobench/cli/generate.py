@@ -1,21 +1,73 @@
-"""``memobench generate`` and ``memobench cache``: the data a policy is taught with."""
+"""``memobench generate``: demonstrations by the scripted experts."""
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
 from rich.table import Table
 
 from lerobot_memobench.cli.console import console, counting
+from lerobot_memobench.settings.words import executor_options
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 
 if TYPE_CHECKING:
     from lerobot_memobench.datasets.generation import Advance, GenerationSummary
 
 
-def generate(tasks: str, episodes: int, out: Path, **settings: Any) -> int:
-    """Make the demonstrations and print what became of them; return the exit status (1: a seed failed)."""
+class Referent(StrEnum):
+    """What the goal of object and procedural tasks is."""
+
+    FIXED = "fixed"
+    RANDOM = "random"
+
+
+class Format(StrEnum):
+    """What demonstrations are written as."""
+
+    LEROBOT = "lerobot"
+    HDF5 = "hdf5"
+
+
+class Executor(StrEnum):
+    """What runs the episodes."""
+
+    PROCESSES = "processes"
+    LOCAL = "local"
+    SLURM = "slurm"
+    RAY = "ray"
+
+
+def generate(
+    out: Annotated[Path, typer.Option(help="Folder of the dataset that is made.")],
+    tasks: Annotated[str, typer.Option(help="all, memory types or task names, separated by commas.")] = "all",
+    episodes: Annotated[int, typer.Option(min=1, help="Demonstrations per task.")] = 50,
+    seed_base: Annotated[int, typer.Option(help="Demonstration i uses the seed seed_base + i.")] = 10_000,
+    referent: Annotated[
+        Referent, typer.Option(help="fixed: the catalogue's goal; random: the seed decides.")
+    ] = Referent.FIXED,
+    images: Annotated[bool, typer.Option(help="Record both cameras.")] = True,
+    image_size: Annotated[int, typer.Option(min=16, help="Height and width of the images, pixels.")] = 256,
+    prompt_video: Annotated[bool, typer.Option(help="Begin with the prompt where a task has one.")] = True,
+    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    repo_id: Annotated[str | None, typer.Option(help="Name of the dataset, user/name.")] = None,
+    formats: Annotated[
+        list[Format] | None, typer.Option("--format", help="lerobot (default), hdf5, or both by naming both.")
+    ] = None,
+    executor: Annotated[
+        Executor, typer.Option(help="processes here, or datatrove's: local, slurm, ray.")
+    ] = Executor.PROCESSES,
+    executor_option: Annotated[
+        list[str] | None, typer.Option(help="key=value for datatrove's executor, e.g. partition=cpu; repeatable.")
+    ] = None,
+) -> int:
+    """Let the scripted experts make demonstrations into a LeRobotDataset. The same command continues a killed
+    run.
+    """
+    options = executor_options(executor_option or [])
+    named: dict[str, Any] = {} if repo_id is None else {"repo_id": repo_id}
     chosen = [get_task(name) for name in resolve_tasks(tasks)]
     from lerobot_memobench.datasets.generation import generate as run
 
@@ -26,7 +78,29 @@ def generate(tasks: str, episodes: int, out: Path, **settings: Any) -> int:
             what = f"{news.task_name}, seed {news.seed}"
             count(news.done, news.total, what, trouble=news.failure, found=news.found)
 
-        summary = run(chosen, episodes, out, progress=advance, **settings)
+        summary = run(
+            chosen,
+            episodes,
+            out,
+            seed_base=seed_base,
+            referent=referent.value,
+            images=images,
+            image_size=image_size,
+            prompt_video=prompt_video,
+            workers=workers,
+            formats=tuple(format_.value for format_ in formats or [Format.LEROBOT]),
+            executor=executor.value,
+            executor_options=options,
+            progress=advance,
+            **named,
+        )
+    _print_summary(summary, out)
+    return summary.exit_status
+
+
+def _print_summary(summary: GenerationSummary, out: Path) -> None:
+    """Print what became of every seed, and where the dataset is."""
+    screen = console()
     screen.print(_summary_table(summary))
     for failure in summary.failures:
         screen.print(f"no demonstration of {failure.task_name}, seed {failure.seed}: {failure.reason}")
@@ -36,7 +110,6 @@ def generate(tasks: str, episodes: int, out: Path, **settings: Any) -> int:
         screen.print("no dataset was written: no seed was solved")
     else:
         screen.print(f"dataset: {summary.folder}", soft_wrap=True)
-    return summary.exit_status
 
 
 def _summary_table(summary: GenerationSummary) -> Table:
@@ -48,26 +121,3 @@ def _summary_table(summary: GenerationSummary) -> Table:
         mean = f"{sum(task.frames) / len(task.frames):.0f}" if task.frames else "–"
         table.add_row(task.name, str(task.solved), str(task.episodes), str(sum(task.frames)), mean)
     return table
-
-
-def cache(
-    dataset: Path,
-    *,
-    size: str,
-    stride: int,
-    weights: str | None,
-    device: str | None,
-    batch_size: int,
-    workers: int | None = None,
-) -> None:
-    """Make the memory cache of a dataset and print where it is."""
-    from lerobot_memobench.cli.preflight import quiet
-    from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
-    from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-
-    with quiet():
-        config = MemobenchMemConfig(size=size, memory_stride=stride, device=device)
-    screen = console()
-    with counting(screen, "episodes") as count:
-        folder = cache_dataset(dataset, config, weights=weights, batch_size=batch_size, workers=workers, progress=count)
-    screen.print(f"memory cache: {folder}", soft_wrap=True)

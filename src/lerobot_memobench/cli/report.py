@@ -2,36 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import sys
-from enum import StrEnum
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lerobot_memobench.cli.console import console
+from lerobot_memobench.cli.documents import Beside, Formats, ReportFormat, With, show_report
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files import write_file
 
 if TYPE_CHECKING:
-    from lerobot_memobench.evaluation.documents.tables import Report
-
-
-class ReportFormat(StrEnum):
-    """What a report is written as."""
-
-    TABLE = "table"
-    MARKDOWN = "markdown"
-    CSV = "csv"
-    LATEX = "latex"
-    JSON = "json"
-
-
-class Beside(StrEnum):
-    """Whose figures stand beside."""
-
-    PAPER = "paper"
-
+    from lerobot_memobench.evaluation.records.runs import Run
 
 Runs = Annotated[
     list[str],
@@ -41,7 +25,6 @@ Runs = Annotated[
         metavar="DIR...",
     ),
 ]
-With = Annotated[Beside | None, typer.Option("--with", help="paper: stand the published figures beside.")]
 
 
 def report(
@@ -59,28 +42,40 @@ def report(
 
     report.json and report.md of each evaluation are written beside its log as well.
     """
-    from lerobot_memobench.evaluation.documents import formats
-    from lerobot_memobench.evaluation.documents.report import build, render, write_documents, write_report
+    from lerobot_memobench.evaluation.documents.report import write_documents
     from lerobot_memobench.evaluation.records.runs import read_runs
 
     runs = read_runs(folders)
     wanted = list(dict.fromkeys(each.value for each in format_ or [ReportFormat.TABLE]))
     paper = with_ is Beside.PAPER
-    screen = console()
+    _write_beside(runs)
+    if out is None:
+        _print_report(runs, wanted, paper)
+        return
+    for path in write_documents(runs, out, wanted, paper):
+        console().print(str(path), soft_wrap=True)
+
+
+def _write_beside(runs: Sequence[Run]) -> None:
+    """Write each evaluation's own report beside its log, where that can be written."""
+    from lerobot_memobench.evaluation.documents.report import write_report
+
     for run in runs:
         try:
             write_report(run.folder)
         except OSError as error:  # an archive that is only read
             reason = error.strerror or error
             print(f"memobench: {run.folder} cannot be written ({reason}); no report there", file=sys.stderr)
-    if out is not None:
-        for path in write_documents(runs, out, wanted, paper):
-            screen.print(str(path), soft_wrap=True)
-        return
+
+
+def _print_report(runs: Sequence[Run], formats: Sequence[str], paper: bool) -> None:
+    from lerobot_memobench.evaluation.documents.formats import terminal
+    from lerobot_memobench.evaluation.documents.report import build, render
+
     found = build(runs, paper)
-    for name in wanted:
+    for name in formats:
         if name == ReportFormat.TABLE:
-            screen.print(formats.terminal(found))
+            console().print(terminal(found))
         else:
             print(render(found, runs, name, paper), end="")
 
@@ -92,10 +87,7 @@ def compare(
         list[str] | None,
         typer.Option(help="A setting that is meant to differ, such as replan_steps; repeatable.", metavar="NAME"),
     ] = None,
-    format_: Annotated[
-        list[ReportFormat] | None,
-        typer.Option("--format", help="table (default), markdown, latex or json; repeatable."),
-    ] = None,
+    format_: Formats = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder for compare.md, compare.tex, compare.json and so on.")
     ] = None,
@@ -109,7 +101,7 @@ def compare(
 
     first, second = read_runs([a, b])
     found = compared(first, second, allow=allow or (), seed=seed, permutations=permutations)
-    _show(differences_report.report(found), "compare", format_, out)
+    show_report(differences_report.report(found), "compare", format_, out)
 
 
 def agreement(
@@ -123,10 +115,7 @@ def agreement(
         Path | None, typer.Option(help="Write a blank sheet of the 84 templates for a new study instead.")
     ] = None,
     raters: Annotated[int, typer.Option(min=2, help="Columns of the blank sheet.")] = 3,
-    format_: Annotated[
-        list[ReportFormat] | None,
-        typer.Option("--format", help="table (default), markdown, latex or json; repeatable."),
-    ] = None,
+    format_: Formats = None,
     out: Annotated[Path | None, typer.Option(help="Folder for agreement.md, agreement.json and so on.")] = None,
 ) -> None:
     """Agreement of raters with one another and with the released operation labels."""
@@ -134,7 +123,6 @@ def agreement(
     from lerobot_memobench.evaluation.agreement.published import published_report
     from lerobot_memobench.evaluation.agreement.report import report as study_report
     from lerobot_memobench.evaluation.agreement.study import study
-    from lerobot_memobench.files import write_file
     from lerobot_memobench.paper import annotator_agreement
 
     if sum([labels is not None, paper, template is not None]) != 1:
@@ -145,41 +133,6 @@ def agreement(
         template.parent.mkdir(parents=True, exist_ok=True)
         console().print(str(write_file(template, blank_sheet(raters))), soft_wrap=True)
     elif labels is not None:
-        _show(study_report(study(read_labels(labels))), "agreement", format_, out)
+        show_report(study_report(study(read_labels(labels))), "agreement", format_, out)
     else:
-        _show(published_report(annotator_agreement()), "agreement_paper", format_, out)
-
-
-ENDINGS = {
-    ReportFormat.TABLE: "txt",
-    ReportFormat.MARKDOWN: "md",
-    ReportFormat.LATEX: "tex",
-    ReportFormat.JSON: "json",
-}
-
-
-def _show(found: Report, name: str, formats_: list[ReportFormat] | None, out: Path | None) -> None:
-    """Print a report in the formats wanted, or write it to a folder."""
-    from lerobot_memobench.evaluation.documents import formats
-    from lerobot_memobench.files import write_file
-
-    wanted = list(dict.fromkeys(formats_ or [ReportFormat.TABLE]))
-    if ReportFormat.CSV in wanted:
-        raise MemobenchError(f"found --format csv; expected {', '.join(ENDINGS)}: what is told here is no one table")
-    screen = console()
-    for each in wanted:
-        if each is ReportFormat.TABLE and out is None:
-            screen.print(found.title, style="bold")
-            screen.print(formats.terminal(found))
-            continue
-        write = {
-            ReportFormat.TABLE: formats.text,
-            ReportFormat.MARKDOWN: formats.markdown,
-            ReportFormat.LATEX: formats.latex,
-            ReportFormat.JSON: lambda report: json.dumps(report.data, indent=2) + "\n",
-        }[each]
-        if out is None:
-            print(write(found), end="")
-        else:
-            out.mkdir(parents=True, exist_ok=True)
-            screen.print(str(write_file(out / f"{name}.{ENDINGS[each]}", write(found))), soft_wrap=True)
+        show_report(published_report(annotator_agreement()), "agreement_paper", format_, out)

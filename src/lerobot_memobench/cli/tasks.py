@@ -2,14 +2,37 @@
 
 from __future__ import annotations
 
+import json
+import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import typer
 from rich.table import Table
 
+from lerobot_memobench.cli.console import console
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import find_tasks, get_task, task_names, task_record
 from lerobot_memobench.tasks.task import Task, load_task
+
+
+def tasks(
+    as_json: Annotated[bool, typer.Option("--json", help="Print everything about each task as JSON.")] = False,
+    folder: Annotated[
+        Path | None,
+        typer.Option("--dir", help="A task folder, or a folder of them, instead of the catalogue."),
+    ] = None,
+) -> int:
+    """List the benchmark's tasks, or those of a folder."""
+    found, problems = load_tasks(folder)
+    if as_json:
+        print(json.dumps(records(found), indent=1))
+    else:
+        console().print(task_table(found))
+    for problem in problems:
+        print(f"memobench: {problem}", file=sys.stderr)
+    return 1 if problems else 0
 
 
 def load_tasks(folder: Path | None) -> tuple[list[Task], list[str]]:
@@ -31,14 +54,14 @@ def load_tasks(folder: Path | None) -> tuple[list[Task], list[str]]:
     return found, problems
 
 
-def records(found: list[Task]) -> list[dict[str, Any]]:
+def records(found: Sequence[Task]) -> list[dict[str, Any]]:
     """Return what ``memobench tasks --json`` prints; state sizes come from the compiled models."""
     from lerobot_memobench.sim.simulation import Simulation
 
     return [task_record(task, Simulation(task).state_dim) for task in found]
 
 
-def task_table(found: list[Task]) -> Table:
+def task_table(found: Sequence[Task]) -> Table:
     """Return one row per task."""
     table = Table(title=f"{len(found)} tasks", title_justify="left", header_style="bold", pad_edge=False)
     for name in ("memory type", "task", "checkpoints", "prompt video", "instruction"):

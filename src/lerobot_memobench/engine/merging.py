@@ -8,7 +8,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.engine.card import disagreement, extended, key_of, remove_card, with_episodes, write_card
+from lerobot_memobench.engine.card import extended, remove_card, with_episodes, write_card
+from lerobot_memobench.engine.folder import VIDEOS
+from lerobot_memobench.engine.outcomes import disagreement, key_of
+from lerobot_memobench.engine.reporting import EvaluationReport, report_on
 from lerobot_memobench.envs.episode_log import has_log, read_episodes, write_episodes
 from lerobot_memobench.envs.protocol import EXTENT, read_protocol_file, write_protocol
 from lerobot_memobench.errors import MemobenchError
@@ -19,11 +22,16 @@ from lerobot_memobench.evaluation.records.protocol import (
     read_card,
     read_protocol,
 )
+from lerobot_memobench.files import draft_of
 
 SHARDS = "shard-*-of-*"
 """Folders of the parts of an evaluation, in its own."""
 
-VIDEOS = "videos"
+
+def merge_and_report(out: Path, folders: Sequence[Path]) -> EvaluationReport:
+    """Merge parts into the folder ``out`` and report the whole; see `merge`."""
+    absent = merge(out, folders)
+    return report_on(out, absent=absent)
 
 
 def merge(out: Path, folders: Sequence[Path]) -> list[tuple[str, int]]:
@@ -47,28 +55,37 @@ def merge(out: Path, folders: Sequence[Path]) -> list[tuple[str, int]]:
     _check_protocols(protocols)
     joined = join(records)
     card = _joined_card(sources)
-    protocol: dict[str, Any] = {}
-    for found in protocols.values():
-        protocol = {**found, **protocol}
-    asked = card["protocol"] if card is not None else {}
-    first = (card["policy"].get("seed") or 0) - asked["seed_base"] if card is not None and card["policy"] else 0
-    episodes = range(first, first + asked.get("episodes", 0))
-    wanted = [(task, episode) for task in asked.get("tasks", []) for episode in episodes]
-    present = {(record["task"], record["episode"]) for record in joined}
+    wanted = [] if card is None else _wanted(card)
 
     out.mkdir(parents=True, exist_ok=True)
-    settings = {key: protocol[key] for key in protocol if key not in (*EXTENT, POLICY)}
     if all(read_protocol_file(source) for source in sources):
-        write_protocol(out, settings)
+        write_protocol(out, _joined_settings(list(protocols.values())))
     for source in folders:
         if source != out:
             _share_films(source / VIDEOS, out / VIDEOS)
     write_episodes(out, joined)
-    if card is not None:
-        write_card(out, with_episodes(card, joined))
-    else:
+    if card is None:
         remove_card(out)
+    else:
+        write_card(out, with_episodes(card, joined))
+    present = {(record["task"], record["episode"]) for record in joined}
     return [cell for cell in wanted if cell not in present]
+
+
+def _joined_settings(protocols: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the settings that the protocols tell, those of the first before all others."""
+    joined: dict[str, Any] = {}
+    for protocol in protocols:
+        joined = {**protocol, **joined}
+    return {key: value for key, value in joined.items() if key not in (*EXTENT, POLICY)}
+
+
+def _wanted(card: Mapping[str, Any]) -> list[tuple[str, int]]:
+    """Return (task, episode) of all that a card's evaluation was asked for."""
+    asked, policy = card["protocol"], card["policy"]
+    first = (policy.get("seed") or 0) - asked["seed_base"] if policy else 0
+    episodes = range(first, first + asked.get("episodes", 0))
+    return [(task, episode) for task in asked.get("tasks", []) for episode in episodes]
 
 
 def _check_protocols(protocols: Mapping[Path, Mapping[str, Any]]) -> None:
@@ -125,13 +142,11 @@ def _share_films(source: Path, target: Path) -> None:
         if place.exists():
             continue
         target.mkdir(parents=True, exist_ok=True)
-        draft = target / f".{film.name}.part"
-        draft.unlink(missing_ok=True)
-        try:
-            os.link(film, draft)
-        except OSError:  # another disk, or one without links
-            shutil.copyfile(film, draft)
-        os.replace(draft, place)
+        with draft_of(place) as draft:
+            try:
+                os.link(film, draft)
+            except OSError:  # another disk, or one without links
+                shutil.copyfile(film, draft)
 
 
 def part_folders(out: Path) -> list[Path]:

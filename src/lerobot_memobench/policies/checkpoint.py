@@ -32,6 +32,17 @@ def checkpoint_folder(text: str) -> Path | None:
     return None
 
 
+def local_folder(path: str) -> Path | None:
+    """Return the folder of a checkpoint: here, or where the hub's cache keeps a repository; None when not here."""
+    here = checkpoint_folder(path)
+    if here is not None or looks_local(path):
+        return here
+    from huggingface_hub import try_to_load_from_cache
+
+    cached = try_to_load_from_cache(path, CONFIG_FILE)
+    return Path(cached).parent if isinstance(cached, str) else None
+
+
 def checkpoint_type(path: str) -> str | None:
     """Return the policy type of a checkpoint folder; None for one that is not on this machine."""
     folder = Path(path).expanduser()

@@ -1,0 +1,36 @@
+"""``memobench cache``: a dataset's frames, encoded once for policies with a memory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lerobot_memobench.cli.console import console, counting
+
+
+def cache(
+    dataset: Annotated[Path, typer.Argument(help="Folder of a LeRobotDataset with the benchmark's columns.")],
+    size: Annotated[str, typer.Option(help="Size of the policy that reads it: tiny or pi05.")] = "tiny",
+    stride: Annotated[int, typer.Option(min=1, help="Keep every how many frames (policy.memory_stride).")] = 1,
+    weights: Annotated[
+        str | None, typer.Option(help="Folder or repository whose image tower is used (size pi05).")
+    ] = None,
+    device: Annotated[str | None, typer.Option(help="cuda or cpu; the best there is by default.")] = None,
+    batch_size: Annotated[int, typer.Option(min=1, help="Frames per pass of the image tower.")] = 64,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Threads that decode videos; as many as there are cores by default.")
+    ] = None,
+) -> None:
+    """Encode a dataset's frames and subgoals once, for policies with a memory."""
+    from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
+    from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+    from lerobot_memobench.settings.lerobot_commands import quiet
+
+    with quiet():
+        config = MemobenchMemConfig(size=size, memory_stride=stride, device=device)
+    screen = console()
+    with counting(screen, "episodes") as count:
+        folder = cache_dataset(dataset, config, weights=weights, batch_size=batch_size, workers=workers, progress=count)
+    screen.print(f"memory cache: {folder}", soft_wrap=True)

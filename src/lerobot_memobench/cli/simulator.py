@@ -1,0 +1,35 @@
+"""``memobench gallery`` and ``memobench bench``: how the simulated world looks, and how fast it is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lerobot_memobench.cli.console import console
+
+
+def gallery(
+    out: Annotated[Path, typer.Option(help="Folder of the pictures; those of the same name are replaced.")] = Path(
+        "outputs/gallery"
+    ),
+) -> None:
+    """Draw every task's initial scene, every object from all sides, every fixture open and closed."""
+    from lerobot_memobench.sim.gallery import write_gallery
+
+    for picture in write_gallery(out):
+        console().print(str(picture), soft_wrap=True)
+
+
+def bench(
+    names: Annotated[list[str] | None, typer.Argument(help="Which benchmarks; all when left out.")] = None,
+) -> None:
+    """Time steps, resets and workers against stock robosuite, in one run; the table belongs in a bug report."""
+    from lerobot_memobench.sim.bench import run, table
+
+    lines = []
+    for line in run(names):
+        print(line.json(), flush=True)
+        lines.append(line)
+    print(f"\n{table(lines)}")

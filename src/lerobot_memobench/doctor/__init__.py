@@ -1,0 +1,1 @@
+"""Can this machine run the benchmark, and if not, what mends it?"""

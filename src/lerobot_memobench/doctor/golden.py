@@ -1,0 +1,69 @@
+"""The golden frame: what the benchmark's scene looks like when it is rendered right.
+
+One small image ships with the package. A machine whose own frame differs by more than the tolerance draws
+something else: upside down, without textures or lights, in other colours.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from lerobot_memobench.errors import MemobenchError
+
+Frame = NDArray[np.uint8]
+
+GOLDEN_FILE = Path(__file__).with_name("golden.png")
+TASK = "turn_on_the_stove_and_turn_it_off"
+SEED = 7
+SIDE = 64
+"""Side of the golden frame, pixels: the 256 of the benchmark, averaged 4 × 4, so that edges do not count."""
+
+TOLERANCE = 6.0
+"""Largest mean absolute difference, of 255. Drivers differ in shading and shadow edges by far less."""
+
+
+def render_golden() -> Frame:
+    """Render the golden scene here and now; return it as (64, 64, 3) uint8."""
+    from lerobot_memobench.sim.simulation import Simulation
+    from lerobot_memobench.tasks.catalogue import get_task
+
+    simulation = Simulation(get_task(TASK))
+    simulation.reset(SEED)
+    return shrink(simulation.render("agentview"))
+
+
+def shrink(image: Frame) -> Frame:
+    """Average an image (64 k, 64 k, 3) to (64, 64, 3)."""
+    factor = image.shape[0] // SIDE
+    blocks = image.reshape(SIDE, factor, SIDE, factor, 3).astype(np.float64)
+    return np.round(blocks.mean(axis=(1, 3))).astype(np.uint8)
+
+
+def read_golden() -> Frame:
+    """Return the frame that ships with the package, (64, 64, 3) uint8."""
+    if not GOLDEN_FILE.is_file():
+        raise MemobenchError(f"{GOLDEN_FILE} is missing; install the package again")
+    with Image.open(GOLDEN_FILE) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def difference(a: Frame, b: Frame) -> float:
+    """Return the mean absolute difference of two frames, of 255."""
+    return float(np.abs(a.astype(np.float64) - b.astype(np.float64)).mean())
+
+
+def write_golden() -> Path:
+    """Make what this machine renders the golden frame. Look at it before it is committed."""
+    Image.fromarray(render_golden()).save(GOLDEN_FILE, optimize=True)
+    return GOLDEN_FILE
+
+
+if __name__ == "__main__":
+    if sys.argv[1:] != ["--write"]:
+        sys.exit("usage: python -m lerobot_memobench.doctor.golden --write")
+    print(write_golden())

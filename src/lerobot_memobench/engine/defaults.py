@@ -1,0 +1,87 @@
+"""The benchmark's defaults: what an evaluation is where its user leaves it open. What a user sets stays."""
+
+from __future__ import annotations
+
+import datetime as dt
+import os
+from pathlib import Path
+
+from lerobot_memobench.engine.orders import Orders
+from lerobot_memobench.engine.resume import earlier_batch_size
+from lerobot_memobench.settings.translation import LerobotSettings
+
+ENVIRONMENT = "memobench"
+EXPERT = "memobench_expert"
+FIRST_SEED = 7
+"""Episode i of the protocol uses seed 7 + i."""
+EPISODES = 50
+LARGEST_BATCH = 64
+
+
+def with_policy(settings: LerobotSettings) -> LerobotSettings:
+    """Return settings with the scripted expert where no policy is named; the environment offers it its action."""
+    if not settings.has("policy.path"):
+        settings = settings.default("policy.type", EXPERT)
+    name = settings.get("policy.type")
+    if name == EXPERT:
+        settings = settings.default("env.expert_action", True)
+    return settings if name is None else settings.choosing("policy", name)
+
+
+def with_batch_size(settings: LerobotSettings, orders: Orders, log: Path, most: int | None) -> LerobotSettings:
+    """Return settings with as many environments at once as the way it is run, or the policy, allows.
+
+    Going on keeps the number of the earlier run: what a policy samples may depend on it. Parts run one at a time: by
+    cores, each machine would cut the evaluation differently.
+
+    Args:
+        most: environments that the policy can serve, such as one for each of its servers.
+    """
+    earlier = earlier_batch_size(log) if orders.resume else None
+    if earlier is not None and _batch_is_open(settings):
+        settings = settings.changed("eval.batch_size", earlier)
+    if orders.in_parts:
+        settings = settings.default("eval.batch_size", 1)
+    return settings if most is None else with_largest_batch(settings, most)
+
+
+def with_largest_batch(settings: LerobotSettings, most: int) -> LerobotSettings:
+    """Return settings with the largest batch that LeRobot would choose and that divides the episodes; at most ``most``.
+
+    LeRobot runs whole batches and throws the surplus of the last one away, after simulating it.
+    """
+    if not _batch_is_open(settings):
+        return settings
+    episodes = int(settings.get("eval.n_episodes") or EPISODES)
+    limit = max(1, min(int((os.cpu_count() or 4) * 0.7), episodes, most))
+    return settings.changed("eval.batch_size", max(size for size in range(1, limit + 1) if episodes % size == 0))
+
+
+def _batch_is_open(settings: LerobotSettings) -> bool:
+    return (settings.get("eval.batch_size") or "0") == "0"
+
+
+def with_protocol(settings: LerobotSettings, n_action_steps: int | None) -> LerobotSettings:
+    """Return settings with the protocol's seed and episodes, a batch, a device, and the policy's replan interval."""
+    import torch
+
+    settings = settings.default("seed", FIRST_SEED).default("eval.n_episodes", EPISODES)
+    settings = with_largest_batch(settings, LARGEST_BATCH)
+    if not torch.cuda.is_available() and not torch.backends.mps.is_available():
+        settings = settings.default("policy.device", "cpu")
+    if n_action_steps is not None:
+        settings = settings.default("env.replan_steps", n_action_steps)
+    return settings
+
+
+def unused_folder(settings: LerobotSettings) -> Path:
+    """Return a folder that no evaluation has used: ``outputs/eval/<date>/<time>_memobench_<policy>``."""
+    chosen = settings.chosen.get("policy")
+    name = settings.get("policy.type") or (chosen.get_choice_name(chosen) if chosen else "policy")  # type: ignore[attr-defined]
+    now = dt.datetime.now()
+    base = Path("outputs/eval") / f"{now:%Y-%m-%d}" / f"{now:%H-%M-%S}_{ENVIRONMENT}_{name}"
+    folder, k = base, 1
+    while folder.exists():
+        k += 1
+        folder = base.with_name(f"{base.name}_{k}")
+    return folder

@@ -1,0 +1,86 @@
+"""The demo: the scripted expert on one task of each memory type, in videos, a contact sheet and a report."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+from lerobot_memobench.engine.card import CARD_MARKDOWN
+from lerobot_memobench.engine.contact_sheet import contact_sheet
+from lerobot_memobench.engine.folder import VIDEOS
+from lerobot_memobench.engine.plan import EvaluationPlan
+from lerobot_memobench.engine.planning import plan_line
+from lerobot_memobench.envs.episode_log import MERGED_FILE
+from lerobot_memobench.envs.protocol import PROTOCOL_FILE
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.documents.report import REPORT_JSON, REPORT_MARKDOWN
+from lerobot_memobench.evaluation.records.protocol import CARD_FILE
+
+#: One task of each memory type.
+TASKS = (
+    "turn_on_the_stove_and_turn_it_off",
+    "put_the_tomato_into_the_top_drawer_of_the_cabinet",
+    "put_the_butter_into_the_bowl_from_the_prompt_video",
+    "execute_the_assembly_procedure_demonstrated_in_the_prompt_video",
+)
+CONTACT_SHEET = "contact_sheet.png"
+
+#: What is taken over from the evaluation.
+RESULTS = (MERGED_FILE, REPORT_JSON, REPORT_MARKDOWN, PROTOCOL_FILE, CARD_FILE, CARD_MARKDOWN)
+
+#: All that a demo writes, and so all that a new one removes.
+PRODUCTS = (*RESULTS, VIDEOS, CONTACT_SHEET)
+
+
+def demo_plan(folder: Path) -> EvaluationPlan:
+    """Return the plan of the demo's evaluation: one filmed episode of each task."""
+    words = ["env=memobench", f"tasks={','.join(TASKS)}", "episodes=1", "env.videos=true"]
+    return plan_line([*words, f"output_dir={folder}"])
+
+
+def make_demo(out: Path, evaluate: Callable[[Path], int]) -> int:
+    """Evaluate, then put the results into ``out``; return the exit status.
+
+    The evaluation works in a folder of its own, so a demo that fails leaves an earlier one as it was.
+
+    Args:
+        evaluate: runs the demo's evaluation in a folder and returns its exit status.
+    """
+    if out.exists() and not out.is_dir():
+        raise MemobenchError(f"{out} is a file; name a folder")
+    out.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".demo-", dir=out) as scratch:
+        work = Path(scratch) / "eval"
+        status = evaluate(work)
+        if status:
+            return status
+        videos = collect_videos(work, Path(scratch) / VIDEOS)
+        contact_sheet(videos).save(Path(scratch) / CONTACT_SHEET, optimize=True)
+        for name in PRODUCTS:
+            _remove(out / name)
+        for name in RESULTS:
+            shutil.move(work / name, out / name)
+        for name in (VIDEOS, CONTACT_SHEET):
+            shutil.move(Path(scratch) / name, out / name)
+    return 0
+
+
+def collect_videos(evaluation: Path, folder: Path) -> list[Path]:
+    """Move the film of each task's episode into ``folder`` under the task's name; return them."""
+    folder.mkdir(parents=True)
+    found = []
+    for name in TASKS:
+        film = evaluation / VIDEOS / f"{name}.0.mp4"
+        if not film.is_file():
+            raise MemobenchError(f"the evaluation left no film of {name}; see its messages above")
+        found.append(Path(shutil.move(film, folder / f"{name}.mp4")))
+    return found
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

@@ -1,0 +1,126 @@
+"""What LeRobot's evaluation loop is made to do beside its own: run parts of a task, seed each batch by itself.
+
+The only module that changes anything of LeRobot's. It was written against the loop of one version: what it relies on
+is listed in tests/engine/test_lerobot_loop.py, whose failures say what to look at when LeRobot moves on.
+
+LeRobot seeds Python, NumPy and torch once per run, so what a sampling policy draws in an episode depends on all that
+ran before it. Here each batch is seeded from the run's seed, the task and the batch's first episode: an evaluation
+that is resumed or shared among machines draws what an undisturbed one draws.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import logging
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from importlib import metadata
+from typing import Any
+
+from lerobot_memobench.engine.grid import Range
+from lerobot_memobench.errors import MemobenchError
+
+LEROBOT = "0.6.1"
+"""The version whose loop is known here."""
+
+KEEPS_ITS_NOISE = ("memobench_mem",)
+"""Policies that seed each episode's noise themselves, from torch's initial seed: it must stay the run's."""
+
+
+def check_version() -> None:
+    """Refuse another LeRobot than the one whose loop is known: another one may run other episodes, or unseeded ones.
+
+    Raises:
+        MemobenchError: it is installed.
+    """
+    found = metadata.version("lerobot")
+    if found != LEROBOT:
+        raise MemobenchError(
+            f"lerobot {found} is installed, and the benchmark steers the evaluation loop of lerobot {LEROBOT}; install "
+            f"lerobot=={LEROBOT} (make setup)"
+        )
+
+
+def calm_output() -> None:
+    """Keep progress bars out of log files, and a library's farewell out of the end of a run."""
+    from lerobot.scripts import lerobot_eval
+
+    logging.getLogger("OpenGL").setLevel(logging.WARNING)
+    if not sys.stderr.isatty():
+        # The bar is redrawn at every step. LeRobot leaves it out where it takes itself to be in a batch job.
+        lerobot_eval.inside_slurm = lambda: True
+
+
+@contextmanager
+def steered(seed: int | None, ranges: Mapping[tuple[str, int], list[Range]] | None = None) -> Iterator[None]:
+    """While this lasts, LeRobot's loop seeds each batch and runs only ``ranges`` (everything when None).
+
+    Raises:
+        MemobenchError: the installed LeRobot is another than the one whose loop is known here.
+    """
+    check_version()
+    from lerobot.scripts import lerobot_eval
+
+    run_one, rollout = lerobot_eval.run_one, lerobot_eval.rollout
+    if ranges is not None:
+        lerobot_eval.run_one = _only(run_one, ranges)
+    if seed is not None:
+        lerobot_eval.rollout = _seeded(rollout, seed)
+    try:
+        yield
+    finally:
+        lerobot_eval.run_one, lerobot_eval.rollout = run_one, rollout
+
+
+def _only(run_one: Callable[..., Any], ranges: Mapping[tuple[str, int], list[Range]]) -> Callable[..., Any]:
+    """Wrap LeRobot's evaluation of one task: it is called once per range, the results are joined."""
+
+    @functools.wraps(run_one)
+    def run(task_group: str, task_id: int, env: Any, **settings: Any) -> tuple[str, int, dict[str, Any]]:
+        joined: dict[str, Any] = {}
+        mine = ranges.get((task_group, task_id), [])
+        for first, count in mine:
+            changed = {**settings, "start_seed": settings["start_seed"] + first, "n_episodes": count}
+            for folder in ("videos_dir", "recording_dir"):
+                if len(mine) > 1 and settings.get(folder) is not None:  # LeRobot numbers its films from 0
+                    changed[folder] = settings[folder] / f"from_{first}"
+            _, _, metrics = run_one(task_group, task_id, env, **changed)
+            for key, values in metrics.items():
+                joined[key] = [*joined.get(key, []), *values]
+        return task_group, task_id, joined
+
+    return run
+
+
+def _seeded(rollout: Callable[..., Any], seed: int) -> Callable[..., Any]:
+    """Wrap LeRobot's rollout of one batch: what the policy draws depends on the batch alone."""
+    first_seeds: dict[str, int] = {}  # of the policy's own generators: a setting of the policy's may have chosen them
+
+    @functools.wraps(rollout)
+    def run(env: Any, policy: Any, *args: Any, **settings: Any) -> Any:
+        seeds = settings.get("seeds")
+        if seeds and getattr(policy, "name", None) not in KEEPS_ITS_NOISE:
+            _seed_batch(policy, first_seeds, seed, env.call("task")[0], seeds[0])
+        return rollout(env, policy, *args, **settings)
+
+    return run
+
+
+def _seed_batch(policy: Any, first_seeds: dict[str, int], seed: int, task: str, first: int) -> None:
+    """Seed what LeRobot seeds, and the policy's own generators, whose first seeds are remembered and still count."""
+    from lerobot.utils.random_utils import set_seed
+    from torch import Generator
+
+    set_seed(batch_seed(seed, task, first))
+    for name, generator in vars(policy).items():
+        if isinstance(generator, Generator):
+            own = first_seeds.setdefault(name, generator.initial_seed())
+            generator.manual_seed(batch_seed(seed, task, first, own))
+
+
+def batch_seed(seed: int, task: str, first: int, *more: int) -> int:
+    """Return the seed (32 bits) of the batch that begins with the episode of the seed ``first``."""
+    text = " ".join(str(part) for part in (seed, task, first, *more))
+    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=4).digest(), "big")

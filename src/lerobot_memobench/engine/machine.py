@@ -1,0 +1,85 @@
+"""One start of an evaluation on this machine: versions, commit, processor, what draws the pictures."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+from collections.abc import Mapping, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+PACKAGES = ("lerobot_policy_memobench", "lerobot", "mujoco", "robosuite", "torch", "transformers", "numpy", "gymnasium")
+
+
+def run_facts(command: Sequence[str], batch: int, gl: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what is known of one start of an evaluation on this machine.
+
+    Args:
+        gl: what draws the pictures.
+    """
+    return {
+        "command": list(command),
+        "batch_size": batch,
+        "versions": versions(),
+        "git_commit": git_commit(),
+        "machine": {"cpu": cpu_model(), "cores": os.cpu_count(), "gpu": gpu_model(), "system": platform.platform()},
+        "gl": dict(gl),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Return the versions on which an evaluation's numbers may depend."""
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def git_commit() -> str | None:
+    """Return the commit that this package runs from, with ``+changes`` where files differ; None outside a checkout."""
+    package = Path(__file__).resolve().parents[1]
+    if not (package.parents[1] / ".git").exists():
+        return None
+    commit = _git(package, "rev-parse", "HEAD")
+    if not commit:
+        return None
+    return commit + ("+changes" if _git(package, "status", "--porcelain", "--", str(package)) else "")
+
+
+def _git(folder: Path, *words: str) -> str | None:
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(folder), *words], capture_output=True, text=True, timeout=20, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None
+
+
+def cpu_model() -> str:
+    """Return the processor's name."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def gpu_model() -> str | None:
+    """Return the GPU's name, None without one."""
+    import torch
+
+    return str(torch.cuda.get_device_name(0)) if torch.cuda.is_available() else None
+
+
+def gl_facts() -> dict[str, str]:
+    """Return what draws the pictures here; opens a GL context."""
+    from lerobot_memobench.sim.rendering import gl_backend, renderer_name
+
+    return {"GL backend": gl_backend(), "GL renderer": renderer_name()}

@@ -1,0 +1,68 @@
+"""The card of a plan: what is known of an evaluation before it has found anything."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from lerobot_memobench.engine.card import new_card
+from lerobot_memobench.engine.machine import gl_facts, run_facts
+from lerobot_memobench.engine.plan import EvaluationPlan
+from lerobot_memobench.engine.policy_identity import (
+    checkpoint_files,
+    encoded,
+    policy_facts,
+    training_facts,
+    tree_hash,
+)
+from lerobot_memobench.policies.checkpoint import ADAPTER_FILE, WEIGHTS_FILE, local_folder
+
+
+def card_of(plan: EvaluationPlan) -> dict[str, Any]:
+    """Return the card of an evaluation that is about to begin. Hashes the checkpoint, opens a GL context."""
+    shard = plan.orders.shard
+    card = new_card(
+        protocol=_protocol(plan),
+        policy={} if plan.policy is None else policy_facts(encoded(plan.policy), plan.seed),
+        checkpoint=None,
+        trained_on=None,
+        task_files=_task_files(plan),
+        flags=plan.portable_flags,
+        runs=[run_facts(plan.command, plan.batch, gl_facts())],
+        shard=None if shard is None else str(shard),
+    )
+    return with_checkpoint(card, plan.policy_path)
+
+
+def _protocol(plan: EvaluationPlan) -> dict[str, Any]:
+    if plan.grid is None or plan.environment is None:
+        return {}
+    names = sorted(place.task.name for place in plan.grid.places)
+    return {"tasks": names, "episodes": plan.grid.runs, **plan.environment.protocol}
+
+
+def _task_files(plan: EvaluationPlan) -> dict[str, str]:
+    from lerobot_memobench.datasets.generation import task_hash
+
+    return {} if plan.grid is None else {place.task.name: task_hash(place.task) for place in plan.grid.places}
+
+
+def with_checkpoint(card: dict[str, Any], path: str | None) -> dict[str, Any]:
+    """Return a card with what is known of the checkpoint; a repository's is known once LeRobot has fetched it."""
+    folder = None if path is None else local_folder(path)
+    if folder is None or "sha256" in card["policy"]:
+        return card
+    files = checkpoint_files(folder)
+    if not any(name in files for name in (WEIGHTS_FILE, ADAPTER_FILE)):
+        return card
+    return {
+        **card,
+        "policy": {**card["policy"], "sha256": tree_hash(files)},
+        "checkpoint": {"path": path, "revision": _revision(folder), "files": files},
+        "trained_on": training_facts(folder),
+    }
+
+
+def _revision(folder: Path) -> str | None:
+    """Return the commit of a repository's copy in the hub's cache, None for any other folder."""
+    return folder.name if folder.parent.name == "snapshots" else None

@@ -1,0 +1,74 @@
+"""What identifies a policy beyond its name: settings, seed, the hash of its checkpoint, what it was trained on."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from lerobot.configs.policies import PreTrainedConfig
+
+NOT_THE_CHECKPOINT = ("train_config.json", "README.md", "training_weights.safetensors", ".gitattributes")
+"""Files of a checkpoint folder on which what the policy does at evaluation does not depend."""
+
+ELSEWHERE = (
+    *("device", "pretrained_path", "repo_id", "private", "tags", "license", "push_to_hub", "use_peft"),
+    *("host", "port", "servers", "connect_timeout", "timeout", "retry"),
+)
+"""Settings of a policy that say where it runs or where it goes, not what it does."""
+
+
+def encoded(policy: PreTrainedConfig) -> dict[str, Any]:
+    """Return a policy's configuration as plain JSON values."""
+    import draccus
+
+    found = json.loads(json.dumps(draccus.encode(policy), default=str))
+    assert isinstance(found, dict)
+    return {**found, "type": policy.type}
+
+
+def policy_facts(settings: Mapping[str, Any], seed: int | None) -> dict[str, Any]:
+    """Return what identifies a policy beside its weights: its configuration as LeRobot encodes it, the run's seed."""
+    kept = {key: value for key, value in settings.items() if key not in ELSEWHERE and key != "type"}
+    return {"type": settings.get("type"), "seed": seed, "settings": kept}
+
+
+def checkpoint_files(folder: Path) -> dict[str, str]:
+    """Return name -> sha256 of the files that a checkpoint consists of."""
+    files = sorted(path for path in folder.iterdir() if path.is_file() and path.name not in NOT_THE_CHECKPOINT)
+    return {path.name: file_hash(path) for path in files}
+
+
+def training_facts(folder: Path) -> dict[str, Any] | None:
+    """Return what a checkpoint says about the dataset it was trained on, None where it says nothing.
+
+    Where the dataset is on this machine, ``sha256`` is that of its meta files and its manifest, which in turn hold a
+    digest of every episode that `memobench generate` made.
+    """
+    try:
+        told = json.loads((folder / "train_config.json").read_text())
+        dataset = told["dataset"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    found = {key: dataset.get(key) for key in ("repo_id", "revision", "root", "episodes")}
+    found["steps"] = told.get("steps")
+    root = Path(str(found["root"])) if found["root"] else None
+    if root is not None and (root / "meta").is_dir():
+        files = sorted(path for path in [*(root / "meta").rglob("*"), root / "manifest.json"] if path.is_file())
+        found["sha256"] = tree_hash({str(path.relative_to(root)): file_hash(path) for path in files})
+    return found
+
+
+def tree_hash(files: Mapping[str, str]) -> str:
+    """Return one sha256 for many: of the lines ``<sha256>  <name>`` in the order of names, as sha256sum prints them."""
+    lines = "".join(f"{files[name]}  {name}\n" for name in sorted(files))
+    return hashlib.sha256(lines.encode()).hexdigest()
+
+
+def file_hash(path: Path) -> str:
+    """Return the sha256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

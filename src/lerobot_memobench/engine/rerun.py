@@ -1,0 +1,73 @@
+"""Put a card to the test: run the evaluation that it describes once more and compare every episode."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from lerobot_memobench.engine.machine import gl_facts, versions
+from lerobot_memobench.engine.plan import EvaluationPlan
+from lerobot_memobench.engine.planning import plan_line
+from lerobot_memobench.engine.policy_identity import checkpoint_files, tree_hash
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.records.protocol import CARD_FILE, read_card
+from lerobot_memobench.policies.checkpoint import local_folder
+from lerobot_memobench.settings.flags import flag_value
+
+
+def repeatable_card(path: Path) -> dict[str, Any]:
+    """Return the card of an evaluation that has ended, from its file or its folder.
+
+    Raises:
+        MemobenchError: there is none, or it holds nothing to compare with.
+    """
+    path = path / CARD_FILE if path.is_dir() else path
+    card = read_card(path)
+    if not card["episodes"]:
+        raise MemobenchError(f"{path} holds no episodes to compare with; expected that of an evaluation that has ended")
+    return card
+
+
+def plan_of_card(card: Mapping[str, Any], out: Path | None = None) -> EvaluationPlan:
+    """Return the plan of a card's evaluation, to be run in ``out``, or in a folder of the present time."""
+    out = out or Path("outputs/eval") / f"{dt.datetime.now():%Y-%m-%d/%H-%M-%S}_rerun"
+    shard = [] if card["shard"] is None else [f"shard={card['shard']}"]
+    return plan_line([*card["flags"], f"output_dir={out}", *shard])
+
+
+def check_policy(card: Mapping[str, Any]) -> None:
+    """Refuse to repeat an evaluation with another policy.
+
+    Raises:
+        MemobenchError: the checkpoint is not here, or is another one.
+    """
+    if not card["checkpoint"]:
+        return
+    given = flag_value(card["flags"], "policy.path") or card["checkpoint"]["path"]
+    folder = local_folder(given)
+    if folder is None:
+        raise MemobenchError(f"the checkpoint {given} is not here; put it there to repeat the evaluation")
+    found, told = tree_hash(checkpoint_files(folder)), card["policy"].get("sha256")
+    if found != told:
+        raise MemobenchError(
+            f"the checkpoint {given} is not the one that was evaluated (sha256 {found[:12]}, on the card "
+            f"{str(told)[:12]}); its results would be another policy's"
+        )
+
+
+def differences_here(card: Mapping[str, Any]) -> list[str]:
+    """Return in what this machine differs from those that a card's runs were made on."""
+    here = {**versions(), **gl_facts()}
+    notes = []
+    for run in card["runs"]:
+        told = {**run["versions"], **run["gl"]}
+        changed = [
+            f"{name} {version} (here {here[name]})"
+            for name, version in told.items()
+            if here.get(name, version) != version
+        ]
+        if changed:
+            notes.append(f"the card's run used {', '.join(changed)}; results may depend on it")
+    return list(dict.fromkeys(notes))

@@ -1,0 +1,81 @@
+"""Run an evaluation in this process: all of it, a part, or what an earlier run has left."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from lerobot_memobench.engine.card import with_episodes, write_card
+from lerobot_memobench.engine.folder import check_new, held
+from lerobot_memobench.engine.lerobot_command import call_lerobot
+from lerobot_memobench.engine.lerobot_loop import calm_output, steered
+from lerobot_memobench.engine.plan import EvaluationPlan
+from lerobot_memobench.engine.plan_card import card_of, with_checkpoint
+from lerobot_memobench.engine.reporting import EvaluationReport, report_on
+from lerobot_memobench.engine.resume import Ranges, Tell, missing, remainder, resumed_card
+from lerobot_memobench.envs.episode_log import has_log, read_episodes
+from lerobot_memobench.evaluation.records.protocol import POLICY, read_protocol
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How an evaluation ended.
+
+    Attributes:
+        status: exit status of LeRobot's command.
+        report: None when it failed, or when a part holds no episode.
+    """
+
+    status: int
+    report: EvaluationReport | None = None
+
+
+def run_evaluation(plan: EvaluationPlan, tell: Tell) -> Ended:
+    """Run what is missing, write report and card.
+
+    Args:
+        tell: told what matters and stops nothing, and how to go on when a run breaks off.
+
+    Raises:
+        MemobenchError: the folder holds another evaluation. Whatever LeRobot raises.
+    """
+    if not plan.orders.resume:
+        check_new(plan.output)
+        check_new(plan.log)
+    card = card_of(plan)
+    if plan.orders.resume:
+        card = resumed_card(plan.log, card, tell)
+    ranges = missing(plan)
+    if ranges != {}:
+        return _run_lerobot(plan, card, ranges, tell)
+    return Ended(0, _finish(plan, card) if has_log(plan.log) else None)
+
+
+def _run_lerobot(plan: EvaluationPlan, card: dict[str, Any], ranges: Ranges | None, tell: Tell) -> Ended:
+    """Run LeRobot's evaluation on what is left, in the folder that is held meanwhile."""
+    calm_output()
+    status = 1
+    try:
+        with held(plan), steered(plan.seed, ranges):
+            if card["protocol"]:
+                write_card(plan.log, card)
+            status = call_lerobot("eval", remainder(plan, ranges).lerobot_flags)
+            return Ended(status, None if status else _finish(plan, card))
+    finally:
+        if status and has_log(plan.log):
+            tell(
+                f"the episodes that ended are in {plan.log}; `memobench report {plan.log}` reports them, the same "
+                f"command with resume=true output_dir={plan.output} goes on"
+            )
+
+
+def _finish(plan: EvaluationPlan, card: dict[str, Any]) -> EvaluationReport:
+    """Write the report of the log, and what was found onto the card."""
+    protocol = card["protocol"] or {k: v for k, v in read_protocol(plan.log).items() if k != POLICY}
+    # LeRobot runs whole batches: episodes beyond those asked for are no part of the report.
+    limit = None if plan.grid is None else plan.grid.first + max(plan.grid.runs, protocol["episodes"])
+    report = report_on(plan.log, limit)
+    records = [record for record in read_episodes(plan.log) if limit is None or record["episode"] < limit]
+    card = with_checkpoint({**card, "protocol": protocol}, plan.policy_path)
+    write_card(plan.log, with_episodes(card, records))
+    return report

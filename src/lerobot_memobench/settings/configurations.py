@@ -1,0 +1,57 @@
+"""The configurations of the policy and the environment that a command line chooses, as LeRobot will build them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, cast
+
+from lerobot_memobench.policies.checkpoint import check_checkpoint
+from lerobot_memobench.settings.lerobot_commands import quiet
+from lerobot_memobench.settings.translation import LerobotSettings
+
+if TYPE_CHECKING:
+    from lerobot.configs.policies import PreTrainedConfig
+    from lerobot.envs.configs import EnvConfig
+
+
+def policy_config(settings: LerobotSettings) -> PreTrainedConfig | None:
+    """Return the policy's configuration; None where none is chosen, or a configuration file has a say.
+
+    Its own checks run here: an unknown ``policy.align`` is told before anything starts.
+
+    Raises:
+        MemobenchError: the checkpoint is not whole. Others come from the configuration's own checks.
+    """
+    path = settings.get("policy.path")
+    if path is None:
+        return cast("PreTrainedConfig | None", _parsed(settings, "policy"))
+    check_checkpoint(path)
+    if not _is_known(settings, "policy"):
+        return None
+    from lerobot.configs.policies import PreTrainedConfig
+
+    with quiet():
+        return PreTrainedConfig.from_pretrained(path, cli_overrides=_overrides(settings, "policy"))
+
+
+def env_config(settings: LerobotSettings) -> EnvConfig | None:
+    """Return the environment's configuration; None where none is chosen, or a configuration file has a say."""
+    return cast("EnvConfig | None", _parsed(settings, "env"))
+
+
+def _is_known(settings: LerobotSettings, key: str) -> bool:
+    return key in settings.chosen and not settings.has("config_path")
+
+
+def _parsed(settings: LerobotSettings, key: str) -> Any:
+    import draccus
+
+    if not _is_known(settings, key):
+        return None
+    with quiet():
+        return draccus.parse(settings.chosen[key], args=_overrides(settings, key))
+
+
+def _overrides(settings: LerobotSettings, key: str) -> list[str]:
+    from lerobot.configs import parser
+
+    return parser.get_cli_overrides(key, list(settings.flags)) or []

@@ -1,0 +1,76 @@
+"""The commands of the installed LeRobot: which there are, where they begin, what configures them."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import sys
+import typing
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib import metadata
+from typing import Any
+
+from lerobot_memobench.errors import MemobenchError
+
+PREFIX = "lerobot-"
+
+
+def lerobot_commands() -> dict[str, metadata.EntryPoint]:
+    """Return name -> entry point of every command of the installed LeRobot (``eval``: ``lerobot-eval``)."""
+    return {
+        entry.name.removeprefix(PREFIX): entry
+        for entry in metadata.distribution("lerobot").entry_points
+        if entry.group == "console_scripts" and entry.name.startswith(PREFIX)
+    }
+
+
+def load_command(name: str) -> Callable[[], Any]:
+    """Return the main function of a LeRobot command, which reads ``sys.argv``. The import takes many seconds.
+
+    Raises:
+        MemobenchError: LeRobot was installed without what it needs.
+    """
+    try:
+        entry: Callable[[], Any] = lerobot_commands()[name].load()
+    except ImportError as error:
+        raise MemobenchError(f"{PREFIX}{name} needs what is not installed here: {error}") from error
+    return entry
+
+
+def register_plugins() -> None:
+    """Let LeRobot find its plugins as its own commands do, without the log lines about it."""
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    with quiet():
+        register_third_party_plugins()
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keep LeRobot's log lines about plugins and configurations to the run itself, which reads them again."""
+    level = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        yield
+    finally:
+        logging.disable(level)
+
+
+def config_class(entry: Callable[[], Any]) -> type | None:
+    """Return the configuration dataclass of a LeRobot command, None where it uses plain argparse.
+
+    LeRobot wraps the function that takes the configuration, in the module of the command's main function.
+    """
+    for function in vars(sys.modules[entry.__module__]).values():
+        inner = getattr(function, "__wrapped__", None)
+        if inner is None or getattr(function, "__module__", None) != entry.__module__:
+            continue
+        try:
+            hints = typing.get_type_hints(inner)
+        except NameError:  # a type that is imported for checkers only
+            hints = getattr(inner, "__annotations__", {})
+        first = next(iter(hints.values()), None)
+        if dataclasses.is_dataclass(first):
+            return typing.cast(type, first)
+    return None

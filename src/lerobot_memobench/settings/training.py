@@ -1,0 +1,72 @@
+"""``lerobot train policy=…``: the defaults and checks before LeRobot's training."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from lerobot_memobench.datasets.lerobot_format import DEFAULT_REPO_ID
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.settings.configurations import env_config, policy_config
+from lerobot_memobench.settings.translation import LerobotSettings
+
+INFO_FILE = Path("meta") / "info.json"
+TRAINED = ("policy.type", "policy.path", "reward_model.type", "reward_model.path")
+"""What may say what is trained."""
+
+
+def complete_training(settings: LerobotSettings) -> LerobotSettings:
+    """Return a training run's settings with the benchmark's defaults; what is wrong with them is told here.
+
+    Raises:
+        MemobenchError: no policy is named, or the dataset or the checkpoint is none.
+    """
+    from_file = settings.has("config_path")
+    if not from_file:
+        if not any(settings.has(key) for key in TRAINED):
+            raise MemobenchError("name a policy: policy=memobench_mem")
+        settings = with_places(settings)
+    check_dataset(settings)
+    policy_config(settings)
+    env_config(settings)
+    settings = with_logging(settings)
+    cores = os.cpu_count() or 4
+    if cores < 4 and not from_file:  # LeRobot's default of 4 loaders would only wait for one another
+        settings = settings.default("num_workers", cores)
+    return settings
+
+
+def with_places(settings: LerobotSettings) -> LerobotSettings:
+    """Return settings that name the dataset; without a repository to push to, which LeRobot would ask for."""
+    settings = settings.default("dataset.repo_id", DEFAULT_REPO_ID)
+    if not settings.has("policy.repo_id") and (settings.has("policy.type") or settings.has("policy.path")):
+        settings = settings.default("policy.push_to_hub", False)
+    return settings
+
+
+def check_dataset(settings: LerobotSettings) -> None:
+    """Refuse a dataset folder that is none."""
+    root = settings.get("dataset.root")
+    if root is None:
+        return
+    folder = Path(root).expanduser()
+    local_only = (settings.get("dataset.repo_id") or "").startswith("local/")
+    if not folder.exists() and not local_only:
+        return  # LeRobot downloads the repository into it
+    if not folder.is_dir():
+        raise MemobenchError(
+            f"the dataset folder {root} does not exist; make one with `memobench generate --out {root}`"
+        )
+    if not (folder / INFO_FILE).is_file():
+        raise MemobenchError(
+            f"the folder {root} is not a LeRobot dataset ({INFO_FILE} is missing); make one with "
+            "`memobench generate --out <folder>`"
+        )
+
+
+def with_logging(settings: LerobotSettings) -> LerobotSettings:
+    """Return settings that log a short run often enough to see its loss: LeRobot's default is every 200 steps."""
+    steps = settings.get("steps")
+    if steps is not None and steps.isdigit() and int(steps) < 2000:
+        return settings.default("log_freq", max(1, int(steps) // 10))
+    return settings

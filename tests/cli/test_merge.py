@@ -1,0 +1,235 @@
+"""``memobench merge`` and ``memobench rerun``, and evaluations shared among executors, without a simulator."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import dill
+import pytest
+
+from lerobot_memobench.cli.evaluate import SHARD_PROGRAM
+from lerobot_memobench.cli.lerobot import main as lerobot
+from lerobot_memobench.cli.memobench import main as memobench
+from lerobot_memobench.engine import shards
+from lerobot_memobench.envs.episode_log import read_episodes
+
+STOVE = "turn_on_the_stove_and_turn_it_off"
+DRAWER = "check_the_top_drawer_of_the_cabinet"
+COMMAND = ["eval", "env=memobench", f"tasks={STOVE},{DRAWER}", "episodes=4", "batch_size=2"]
+
+
+def comparable(folder: str) -> list[dict[str, Any]]:
+    return [{k: v for k, v in record.items() if k != "wall_s"} for record in read_episodes(Path(folder))]
+
+
+# --- merge ---
+
+
+def test_merged_parts_are_the_whole(fake_lerobot: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    assert lerobot([*COMMAND, "output_dir=whole"]) == 0
+    assert lerobot([*COMMAND, "output_dir=out", "shard=1/2"]) == 0
+    capsys.readouterr()
+    assert memobench(["merge", "out"]) == 1
+    assert f"4 episodes that were asked for are missing, the first is {DRAWER}, episode 0" in capsys.readouterr().out
+    assert lerobot([*COMMAND, "output_dir=out", "shard=2/2"]) == 0
+    assert memobench(["merge", "out"]) == 0
+    assert comparable("out") == comparable("whole")
+    assert json.loads(Path("out/report.json").read_text()) == json.loads(Path("whole/report.json").read_text())
+    assert (
+        json.loads(Path("out/card.json").read_text())["episodes"]
+        == json.loads(Path("whole/card.json").read_text())["episodes"]
+    )
+    # What was merged can be gone on with like any other evaluation.
+    fake_lerobot.ran.clear()
+    assert lerobot([*COMMAND[:3], "episodes=6", "output_dir=out", "resume=true"]) == 0
+    assert fake_lerobot.ran == [(STOVE, 4), (STOVE, 5), (DRAWER, 4), (DRAWER, 5)]
+    assert len(read_episodes("out")) == 12
+
+
+def test_folders_can_be_named(fake_lerobot: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    for number in (1, 2):
+        assert lerobot([*COMMAND, f"output_dir=machine{number}", f"shard={number}/2"]) == 0
+    folders = [f"machine{number}/shard-{number}-of-2" for number in (1, 2)]
+    assert memobench(["merge", "out", *folders]) == 0
+    assert len(read_episodes("out")) == 8
+    assert memobench(["merge", "empty"]) == 2
+    assert "name the folders" in capsys.readouterr().err
+    fake_lerobot.changed = {"scene_hash": "another"}
+    assert lerobot([*COMMAND, "output_dir=wrong", "shard=2/2"]) == 0
+    assert memobench(["merge", "out", folders[0], "wrong/shard-2-of-2"]) == 2
+    assert "scene_hash" in capsys.readouterr().err
+
+
+# --- rerun ---
+
+
+def test_a_card_is_repeated(fake_lerobot: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    assert lerobot([*COMMAND, "output_dir=out", "seed=9", "horizon=600"]) == 0
+    first = [flag for flag in fake_lerobot.calls[0] if "out" not in flag]
+    assert memobench(["rerun", "out/card.json", "--out", "again"]) == 0
+    assert "all 8 episodes agree" in capsys.readouterr().out
+    assert [flag for flag in fake_lerobot.calls[1] if "again" not in flag] == first
+    assert memobench(["rerun", "out", "--out", "folder"]) == 0
+    fake_lerobot.changed = {"steps": 5}
+    assert memobench(["rerun", "out", "--out", "changed"]) == 1
+    out = capsys.readouterr().out.replace("\n", " ")
+    assert f"not repeated: {DRAWER}, episode 2: steps is 109 on the card and 5 here" in out
+
+
+def test_a_part_alone_is_repeated_as_a_part(fake_lerobot: Any) -> None:
+    assert lerobot([*COMMAND, "output_dir=out", "shard=2/2"]) == 0
+    fake_lerobot.ran.clear()
+    assert memobench(["rerun", "out/shard-2-of-2/card.json", "--out", "again"]) == 0
+    assert fake_lerobot.ran == [(DRAWER, k) for k in range(4)]
+
+
+def test_missing_episodes_are_a_disagreement(fake_lerobot: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    assert lerobot([*COMMAND, "output_dir=out"]) == 0
+    card = json.loads(Path("out/card.json").read_text())
+    card["episodes"].append({**card["episodes"][-1], "episode": 9})
+    Path("card.json").write_text(json.dumps(card))
+    assert memobench(["rerun", "card.json", "--out", "again"]) == 1
+    assert "episode 9 is on the card and was not run here" in capsys.readouterr().out
+
+
+def test_other_versions_are_told(fake_lerobot: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    assert lerobot([*COMMAND, "output_dir=out"]) == 0
+    card = json.loads(Path("out/card.json").read_text())
+    card["runs"][0]["versions"]["mujoco"] = "0.1"
+    Path("card.json").write_text(json.dumps(card))
+    assert memobench(["rerun", "card.json", "--out", "again"]) == 0
+    assert "note: the card's run used mujoco 0.1 (here " in capsys.readouterr().out
+
+
+def test_another_or_no_checkpoint_is_refused(fake_lerobot: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = Path("checkpoint")
+    folder.mkdir()
+    (folder / "config.json").write_text(json.dumps({"type": "memobench_random", "device": "cpu"}))
+    (folder / "model.safetensors").write_bytes(b"weights")
+    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
+        (folder / name).write_text(json.dumps({"name": name, "steps": []}))
+    assert lerobot([*COMMAND, "output_dir=out", "policy=checkpoint"]) == 0
+    assert memobench(["rerun", "out", "--out", "again"]) == 0
+    (folder / "model.safetensors").write_bytes(b"others")
+    capsys.readouterr()
+    assert memobench(["rerun", "out", "--out", "other"]) == 2
+    assert "is not the one that was evaluated" in capsys.readouterr().err
+    (folder / "config.json").unlink()
+    assert memobench(["rerun", "out", "--out", "other"]) == 2
+    assert "is not here" in capsys.readouterr().err
+    assert not Path("other").exists()
+
+
+def test_a_card_of_an_unfinished_evaluation(fake_lerobot: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    fake_lerobot.kill_after = 1
+    with pytest.raises(fake_lerobot.killed):
+        lerobot([*COMMAND, "output_dir=out"])
+    assert memobench(["rerun", "out"]) == 2
+    assert "has ended" in capsys.readouterr().err
+
+
+# --- parts as jobs ---
+
+
+@pytest.fixture
+def here(fake_lerobot: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Parts run in the process that asks for them."""
+
+    def run(job: shards.ShardJob) -> None:
+        assert lerobot(job.words) == 0
+
+    monkeypatch.setattr(shards.ShardJob, "run", run)
+    return fake_lerobot
+
+
+def test_parts_as_jobs(here: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    assert lerobot([*COMMAND, "output_dir=whole"]) == 0
+    assert lerobot([*COMMAND, "output_dir=out", "shards=3", "workers=1"]) == 0
+    assert "3/3 part 3/3" in capsys.readouterr().out
+    assert comparable("out") == comparable("whole")
+    assert lerobot([*COMMAND, "output_dir=out", "shards=3", "workers=1"]) == 2
+    assert "already holds an evaluation" in capsys.readouterr().err
+    here.ran.clear()
+    assert lerobot([*COMMAND, "output_dir=out", "shards=3", "workers=1", "resume=true"]) == 0
+    assert here.ran == []
+    assert lerobot([*COMMAND, "output_dir=out", "shards=3", "workers=1", "resume=true", "horizon=5"]) == 2
+    assert "horizon: 1200 and 5" in capsys.readouterr().err
+
+
+def test_a_lost_part_is_run_again(here: Any) -> None:
+    assert lerobot([*COMMAND, "output_dir=out", "shards=4", "workers=1"]) == 0
+    here.ran.clear()
+    log = next(Path("out/shard-2-of-4/episodes").iterdir())
+    log.unlink()
+    Path("out/shard-2-of-4/episodes.jsonl").unlink()
+    assert lerobot([*COMMAND, "output_dir=out", "shards=4", "workers=1", "resume=true"]) == 0
+    assert here.ran == [(STOVE, 2), (STOVE, 3)]
+
+
+def test_datatroves_local_executor_runs_parts(here: Any) -> None:
+    assert lerobot([*COMMAND, "output_dir=out", "shards=2", "workers=1", "executor=local"]) == 0
+    assert here.ran == [(task, k) for task in (STOVE, DRAWER) for k in range(4)]
+    assert len(read_episodes("out")) == 8
+
+
+SBATCH = """#!/bin/sh
+echo "$@" >> "$SBATCH_LOG"
+for word in "$@"; do script="$word"; done
+cat "$script" >> "$SBATCH_LOG"
+echo "Submitted batch job 4711"
+"""
+
+
+def test_slurm_gets_a_job_per_part_and_one_that_merges(
+    here: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With a stand-in for sbatch: what it is given, and what the jobs then do when they run."""
+    log, tools = tmp_path / "sbatch.log", tmp_path / "bin"
+    tools.mkdir()
+    (tools / "sbatch").write_text(SBATCH)
+    (tools / "scontrol").write_text("#!/bin/sh\necho node1\n")
+    for tool in tools.iterdir():
+        tool.chmod(0o755)
+    monkeypatch.setenv("SLURM_NODELIST", "node1")
+    monkeypatch.setenv("PATH", f"{tools}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv("SBATCH_LOG", str(log))
+    options = ["executor=slurm", "executor_option=partition=gpu", "executor_option=time=08:00:00"]
+    assert lerobot([*COMMAND, "output_dir=out", "shards=4", "workers=2", *options]) == 0
+    assert "jobs are submitted" in capsys.readouterr().out
+    assert here.ran == []
+    script = log.read_text()
+    for line in ("#SBATCH --partition=gpu", "#SBATCH --array=0-3%2", "--dependency=afterok:4711"):
+        assert line in script, line
+    for part, ranks in (("make", range(4)), ("finish", range(1))):
+        for rank in ranks:
+            monkeypatch.setenv("SLURM_ARRAY_TASK_ID", str(rank))
+            with open(tmp_path / "out" / "logs" / part / "executor.pik", "rb") as file:
+                dill.load(file).run()  # noqa: S301 - datatrove wrote it, in this test
+    assert len(read_episodes("out")) == 8
+    assert Path("out/report.md").is_file()
+
+
+@pytest.mark.slow
+def test_a_parts_process_ends_with_the_one_that_wanted_it(tmp_path: Path) -> None:
+    words = ["eval", "env=memobench", f"tasks={STOVE}", "episodes=50", "output_dir=out", "shard=1/1", "batch_size=1"]
+    part = subprocess.Popen([sys.executable, *SHARD_PROGRAM, *words], cwd=tmp_path, stdin=subprocess.PIPE)
+    while not (tmp_path / "out" / "shard-1-of-1" / "card.json").exists():
+        assert part.poll() is None
+    assert part.stdin is not None
+    part.stdin.close()
+    assert part.wait(60) == 1
+
+
+@pytest.mark.slow
+def test_a_part_that_fails_says_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["eval", "env=memobench", f"tasks={STOVE}", "episodes=1", f"output_dir={tmp_path / 'out'}", "shards=1"]
+    assert lerobot([*words, "policy=remote", "host=127.0.0.1", "port=1", "policy.connect_timeout=0.1"]) == 2
+    error = capsys.readouterr().err
+    assert "part 1/1 ended with" in error
+    assert "127.0.0.1:1" in error
+    assert "resume=true goes on" in error

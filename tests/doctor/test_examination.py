@@ -1,0 +1,122 @@
+"""Each failure of a machine is found, with its fix."""
+
+from __future__ import annotations
+
+import builtins
+import shutil
+from importlib import metadata
+from typing import Any
+
+import pytest
+from packaging.specifiers import SpecifierSet
+
+from lerobot_memobench.doctor import machine, software
+from lerobot_memobench.doctor.probe import run_probe
+
+
+def test_supported_versions_come_from_the_requirements() -> None:
+    supported = software.supported_versions()
+    assert supported["lerobot"] == SpecifierSet("==0.6.1")
+    assert not supported["mujoco"].contains("3.17.0")
+    assert not supported["torch"].contains("2.12.0")
+
+
+def test_a_version_out_of_range_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    real = metadata.version
+    monkeypatch.setattr(metadata, "version", lambda name: "4.0.0" if name == "mujoco" else real(name))
+    findings = {finding.what: finding for finding in software.package_versions()}
+    assert findings["mujoco"].status == "failed"
+    assert findings["mujoco"].fix
+    assert findings["lerobot"].status == "ok"
+
+
+def test_a_missing_package_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    def version(name: str) -> str:
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(metadata, "version", version)
+    assert {finding.status for finding in software.package_versions()} == {"failed"}
+
+
+def test_the_plugin_is_discovered() -> None:
+    assert software.plugin().status == "ok"
+
+
+def test_an_uninstalled_plugin_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metadata, "distributions", list)
+    finding = software.plugin()
+    assert finding.status == "failed"
+    assert "make setup" in finding.fix
+
+
+def test_the_plugins_import_error_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    real = builtins.__import__
+
+    def broken(name: str, *args: Any) -> Any:
+        if name == software.DISTRIBUTION:
+            raise ImportError("no module named 'nonsense'")
+        return real(name, *args)
+
+    monkeypatch.setattr(builtins, "__import__", broken)
+    finding = software.plugin()
+    assert finding.status == "failed"
+    assert "nonsense" in finding.detail
+
+
+def probes(monkeypatch: pytest.MonkeyPatch, answers: dict[str, dict[str, Any]]) -> None:
+    monkeypatch.setattr(machine, "run_probe", lambda *words: answers[" ".join(words)])
+
+
+SOFTWARE = {"renderer": "llvmpipe (LLVM 15)", "version": "4.5", "vendor": "Mesa", "sphere": True}
+BROKEN = {"error": "the process was killed by SIGSEGV"}
+
+
+def test_the_backend_in_use_must_work_the_other_need_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    probes(monkeypatch, {"gl egl": SOFTWARE, "gl osmesa": BROKEN})
+    assert [finding.status for finding in machine.rendering()] == ["ok", "ok", "warning"]
+    probes(monkeypatch, {"gl egl": BROKEN, "gl osmesa": SOFTWARE})
+    findings = list(machine.rendering())
+    assert [finding.status for finding in findings] == ["ok", "failed", "ok"]
+    assert "SIGSEGV" in findings[1].detail
+    assert "MUJOCO_GL=osmesa" in findings[1].fix
+
+
+def test_a_backend_that_draws_nonsense_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    probes(monkeypatch, {"gl egl": {**SOFTWARE, "sphere": False}, "gl osmesa": SOFTWARE})
+    assert [finding.status for finding in machine.rendering()] == ["ok", "failed", "ok"]
+
+
+def test_no_gl_library_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setattr("ctypes.util.find_library", lambda name: None)
+    probes(monkeypatch, {"gl egl": BROKEN, "gl osmesa": BROKEN})
+    findings = list(machine.rendering())
+    assert findings[0].status == "failed"
+    assert "libegl1" in findings[0].fix
+
+
+@pytest.mark.parametrize(
+    ("answer", "status"),
+    [({"difference": 0.3}, "ok"), ({"difference": 40.0}, "failed"), (BROKEN, "failed")],
+)
+def test_golden_frame(monkeypatch: pytest.MonkeyPatch, answer: dict[str, Any], status: str) -> None:
+    probes(monkeypatch, {"golden": answer})
+    finding = machine.golden_frame()
+    assert finding.status == status
+    assert bool(finding.fix) == (status == "failed")
+
+
+def test_video(monkeypatch: pytest.MonkeyPatch) -> None:
+    probes(monkeypatch, {"torchcodec": {"error": "no libavutil"}})
+    assert machine.torchcodec().status == "warning"
+    assert "apt-get install ffmpeg" in machine.torchcodec().fix
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    assert machine.ffmpeg().status == "warning"
+
+
+def test_a_probe_that_dies_is_reported() -> None:
+    assert "error" in run_probe("gl", "nonsense")
+    assert "status" in run_probe("nonsense")["error"] or "KeyError" in run_probe("nonsense")["error"]
+    assert "no answer" in run_probe("gl", "egl", timeout_s=0.01)["error"]

@@ -1,0 +1,70 @@
+"""What the demo makes of an evaluation; the evaluation itself is LeRobot's and is replaced here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+from lerobot_memobench.engine import contact_sheet as sheets
+from lerobot_memobench.engine import demo
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.tasks.catalogue import get_task
+
+
+def write_video(path: Path, frames: int = 12) -> None:
+    """A video whose brightness rises from black to white."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=20)
+        stream.width, stream.height, stream.pix_fmt = 128, 64, "yuv420p"
+        for k in range(frames):
+            image = np.full((64, 128, 3), 255 * k // (frames - 1), dtype=np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode())
+
+
+def fake_evaluation(output: Path) -> int:
+    for name in demo.TASKS:
+        write_video(output / "videos" / f"{name}.0.mp4")
+    for name in ("episodes.jsonl", "report.json", "report.md", "protocol.json", "card.json", "card.md"):
+        (output / name).write_text(name)
+    return 0
+
+
+def test_one_task_of_each_memory_type() -> None:
+    assert [get_task(name).memory_type for name in demo.TASKS] == ["temporal", "spatial", "object", "procedural"]
+
+
+def test_the_demo_folder(tmp_path: Path) -> None:
+    out = tmp_path / "outputs" / "demo"
+    (out / "videos").mkdir(parents=True)
+    (out / "videos" / "old.mp4").write_text("")
+    (out / "notes.txt").write_text("the user's own")
+    assert demo.make_demo(out, fake_evaluation) == 0
+    assert {path.name for path in out.iterdir()} == {*demo.PRODUCTS, "notes.txt"}
+    assert {path.stem for path in (out / "videos").iterdir()} == set(demo.TASKS)
+    with Image.open(out / "contact_sheet.png") as sheet:
+        pixels = np.asarray(sheet.convert("L")).astype(int)
+    assert pixels.shape == (4 * 160, sheets.FRAMES_PER_VIDEO * sheets.COLUMN_WIDTH)
+    means = pixels[:160].reshape(160, sheets.FRAMES_PER_VIDEO, -1).mean(axis=(0, 2))
+    assert (np.diff(means) > 20).all()  # evenly spaced in time, left to right
+
+
+def test_a_failed_evaluation_leaves_the_earlier_demo(tmp_path: Path) -> None:
+    (tmp_path / "report.json").write_text("earlier")
+    assert demo.make_demo(tmp_path, lambda output: 3) == 3
+    assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
+
+
+def test_a_missing_video_is_named(tmp_path: Path) -> None:
+    with pytest.raises(MemobenchError, match=demo.TASKS[0]):
+        demo.collect_videos(tmp_path, tmp_path / "videos")
+
+
+def test_even_distances_hold_both_ends() -> None:
+    frames = [np.full((1, 1, 3), k, dtype=np.uint8) for k in range(11)]
+    assert [int(frame[0, 0, 0]) for frame in sheets.evenly(frames, 3)] == [0, 5, 10]

@@ -1,0 +1,172 @@
+"""What LeRobot's loop is made to do: parts of a task, and draws that depend on a batch alone."""
+
+from __future__ import annotations
+
+import inspect
+import random
+from importlib import metadata
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lerobot.scripts import lerobot_eval
+
+from lerobot_memobench.engine import lerobot_loop
+from lerobot_memobench.engine.lerobot_loop import batch_seed, steered
+from lerobot_memobench.errors import MemobenchError
+
+
+class Env:
+    def call(self, name: str) -> list[str]:
+        assert name == "task"
+        return ["a_task", "a_task"]
+
+
+# --- what is relied on: where one of these fails, LeRobot's loop is another one ---
+
+MODULE = "src/lerobot_memobench/engine/lerobot_loop.py, and lerobot/scripts/lerobot_eval.py beside it"
+
+PARAMETERS = {
+    "run_one": {
+        "n_episodes": "_only() asks for part of a task by it",
+        "start_seed": "_only() begins a part by it: run k of a task has the seed start_seed + k",
+        "videos_dir": "_only() gives each of several parts films of its own by it",
+        "recording_dir": "_only() gives each of several parts recordings of its own by it",
+    },
+    "rollout": {
+        "env": "_seeded() asks it for the task",
+        "policy": "_seeded() seeds its generators",
+        "seeds": "_seeded() knows the batch by its first one",
+    },
+}
+
+CALLS = {
+    ("eval_policy", "rollout("): "looks rollout up in its module for each batch, where _seeded() stands",
+    ("eval_policy", "env=env"): "passes rollout's arguments by name, as _seeded() reads them",
+    ("eval_policy", "policy=policy"): "passes rollout's arguments by name, as _seeded() reads them",
+    ("eval_policy", "seeds=list(seeds)"): "gives a batch the seeds of its episodes",
+    ("eval_policy_all", "run_one,"): "looks run_one up in its module when it begins, where _only() stands",
+    ("eval_policy_all", "start_seed=start_seed"): "gives every task the run's seed",
+    (
+        "rollout",
+        "disable=inside_slurm()",
+    ): "draws no bar in a batch job, which calm_output() makes it take itself to be in",
+}
+
+
+def test_this_is_the_lerobot_whose_loop_is_known() -> None:
+    found = metadata.version("lerobot")
+    assert found == lerobot_loop.LEROBOT, (
+        f"lerobot {found} is installed. Read {MODULE}: does it still do what the tests below say? Compare the film and "
+        "the log of one killed and resumed evaluation (tests/cli/test_killed_evaluation.py), then change LEROBOT"
+    )
+
+
+@pytest.mark.parametrize("function", PARAMETERS)
+def test_lerobot_takes_what_is_passed_to_it(function: str) -> None:
+    found = inspect.signature(getattr(lerobot_eval, function)).parameters
+    for name, why in PARAMETERS[function].items():
+        assert name in found, f"lerobot_eval.{function} has no {name} any more, and {why}. Look at {MODULE}"
+
+
+@pytest.mark.parametrize(("function", "call"), CALLS)
+def test_lerobot_calls_what_is_put_in_its_place(function: str, call: str) -> None:
+    source = inspect.getsource(getattr(lerobot_eval, function))
+    assert call in source, (
+        f"lerobot_eval.{function} holds no {call!r} any more; it was relied on that it {CALLS[function, call]}. "
+        f"Look at {MODULE}"
+    )
+
+
+def test_another_lerobot_is_refused_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metadata, "version", lambda name: "0.7.0")
+    before = lerobot_eval.run_one, lerobot_eval.rollout
+    with (
+        pytest.raises(MemobenchError, match=r"lerobot 0\.7\.0 is installed.* install lerobot==0\.6\.1"),
+        steered(7, {}),
+    ):
+        pass
+    assert (lerobot_eval.run_one, lerobot_eval.rollout) == before
+
+
+# --- what it is made to do ---
+
+
+def test_ranges_are_run_one_by_one_and_joined(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    calls: list[dict[str, Any]] = []
+
+    def run_one(group: str, number: int, env: Any, **settings: Any) -> Any:
+        calls.append({"task": (group, number), **settings})
+        return group, number, {"successes": [True] * settings["n_episodes"], "video_paths": []}
+
+    monkeypatch.setattr(lerobot_eval, "run_one", run_one)
+    settings = {"n_episodes": 50, "start_seed": 7, "videos_dir": tmp_path, "recording_dir": None}
+    with steered(7, {("temporal", 1): [(0, 4), (20, 2)], ("temporal", 2): [(10, 5)]}):
+        assert lerobot_eval.run_one("temporal", 0, None, **settings) == ("temporal", 0, {})
+        assert lerobot_eval.run_one("temporal", 1, None, **settings)[2] == {"successes": [True] * 6, "video_paths": []}
+        lerobot_eval.run_one("temporal", 2, None, **settings)
+    assert [(c["task"][1], c["start_seed"], c["n_episodes"], c["videos_dir"]) for c in calls] == [
+        (1, 7, 4, tmp_path / "from_0"),
+        (1, 27, 2, tmp_path / "from_20"),
+        (2, 17, 5, tmp_path),
+    ]
+    assert lerobot_eval.run_one is run_one
+
+
+def test_without_ranges_lerobot_runs_everything() -> None:
+    before = lerobot_eval.run_one
+    with steered(7):
+        assert lerobot_eval.run_one is before
+
+
+def draws(first: int, history: int = 0, seed: int | None = 7, name: str = "diffusion", own: int = 0) -> list[float]:
+    """What a policy draws in the batch that starts at ``first``, after a history of other draws."""
+    policy = SimpleNamespace(name=name, _generator=torch.Generator().manual_seed(own))
+    found: list[float] = []
+
+    def rollout(env: Any, policy: Any, seeds: list[int]) -> None:
+        found[:] = [
+            torch.rand(1).item(),
+            random.random(),
+            np.random.rand(),  # noqa: NPY002 - what LeRobot seeds
+            torch.rand(1, generator=policy._generator).item(),
+        ]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lerobot_eval, "rollout", rollout)
+        torch.manual_seed(7)
+        torch.rand(history)
+        with steered(seed):
+            for k in range(3 if history else 0):
+                lerobot_eval.rollout(env=Env(), policy=policy, seeds=[100 + k])
+            lerobot_eval.rollout(env=Env(), policy=policy, seeds=[first, first + 1])
+    return found
+
+
+def test_draws_do_not_depend_on_what_ran_before() -> None:
+    assert draws(27) == draws(27, history=5)
+    assert all(a != b for a, b in zip(draws(27), draws(28), strict=True))
+    assert all(a != b for a, b in zip(draws(27), draws(27, seed=8), strict=True))
+
+
+def test_a_policys_own_seed_still_counts() -> None:
+    assert draws(27, own=1)[3] == draws(27, own=1, history=5)[3] != draws(27, own=2)[3]
+
+
+def test_a_policy_that_seeds_its_noise_itself_keeps_the_runs_seed() -> None:
+    kept: list[int] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lerobot_eval, "rollout", lambda env, policy, seeds: kept.append(torch.initial_seed()))
+        torch.manual_seed(7)
+        with steered(7):
+            lerobot_eval.rollout(env=Env(), policy=SimpleNamespace(name="memobench_mem"), seeds=[9])
+    assert kept == [7]
+
+
+def test_batch_seeds_are_told_apart_and_fit_numpy() -> None:
+    seeds = {batch_seed(7, task, first) for task in ("a", "b") for first in range(500)}
+    assert len(seeds) == 1000
+    assert all(0 <= seed < 2**32 for seed in seeds)

@@ -1,0 +1,73 @@
+"""From the words of a command line to a plan: complete, and unchanged by what is left of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+import lerobot_memobench.registration  # noqa: F401
+from lerobot_memobench.engine.grid import Shard
+from lerobot_memobench.engine.planning import plan_line
+from lerobot_memobench.engine.resume import remainder
+from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.envs.episode_log import EpisodeLog
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.settings.flags import flag_value
+
+STOVE, DRAWER = "turn_on_the_stove_and_turn_it_off", "check_the_top_drawer_of_the_cabinet"
+LINE = ["env=memobench", f"tasks={STOVE},{DRAWER}", "episodes=4", "policy=memobench_random"]
+
+
+@pytest.fixture(autouse=True)
+def in_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("lerobot_memobench.settings.reading.register_plugins", lambda: None)
+
+
+def test_a_plan_says_everything() -> None:
+    plan = plan_line([*LINE, "output_dir=out", "batch_size=2", "shard=2/3"])
+    assert plan.output == plan.log == Path("out/shard-2-of-3")
+    assert (plan.seed, plan.batch, plan.orders.shard) == (7, 2, Shard(2, 3))
+    assert plan.command == ("lerobot", "eval", *LINE, "output_dir=out", "batch_size=2", "shard=2/3")
+    assert isinstance(plan.environment, MemobenchEnvConfig)
+    assert plan.policy is not None
+    assert plan.policy.type == "memobench_random"
+    assert plan.grid is not None
+    assert [place.task.name for place in plan.grid.places] == [STOVE, DRAWER]
+    assert (plan.grid.runs, plan.grid.batch, plan.grid.first) == (4, 2, 0)
+    assert flag_value(plan.lerobot_flags, "output_dir") == "out/shard-2-of-3"
+    assert not any("out" in flag for flag in plan.portable_flags)
+    assert not any(Path().iterdir())  # planning writes nothing
+
+
+def test_going_on_keeps_the_earlier_batch_size() -> None:
+    Path("out").mkdir()
+    card = {"protocol": {}, "runs": [{"batch_size": 4}]}
+    Path("out/card.json").write_text(json.dumps(card))
+    assert plan_line([*LINE, "output_dir=out", "resume=true"]).batch == 4
+    assert plan_line([*LINE, "output_dir=out", "resume=true", "batch_size=2"]).batch == 2
+    assert plan_line([*LINE, "output_dir=new", "shards=2"]).batch == 1
+
+
+def test_what_is_left_is_a_plan_of_its_own() -> None:
+    plan = plan_line([*LINE, "output_dir=out", "resume=true"])
+    before = dataclasses.replace(plan)
+    record = {"task": STOVE, "memory_type": "temporal", "episode": 0, "success": True, "checkpoints": []}
+    EpisodeLog("out").append(record)
+    assert plan.grid is not None
+    drawer = plan.grid.places[1]
+    left = remainder(plan, {drawer.key: [(0, 4)]})
+    assert left.output == Path("out/continued-1")
+    assert left.log == Path("out")
+    assert flag_value(left.lerobot_flags, "env.tasks") == DRAWER
+    assert flag_value(left.lerobot_flags, "env.resume") == "true"
+    assert plan == before
+    assert remainder(plan, None) is plan
+
+
+def test_going_on_needs_a_folder() -> None:
+    with pytest.raises(MemobenchError, match="output_dir=<folder>"):
+        plan_line([*LINE, "resume=true"])
