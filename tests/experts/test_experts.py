@@ -14,7 +14,8 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.formula import Atom, parse_formula
+from lerobot_memobench.tasks.formula import Atom
+from lerobot_memobench.tasks.formula_parsing import parse_formula
 from lerobot_memobench.tasks.task import Task
 
 STOVE = "turn_on_the_stove_and_turn_it_off"

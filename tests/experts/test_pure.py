@@ -7,7 +7,8 @@ import pytest
 
 from lerobot_memobench.experts.expert import steps_of
 from lerobot_memobench.experts.hand import DOWN, EASY_CLOSING, cross, downward, frame, length, unit
-from lerobot_memobench.tasks.formula import Atom, atoms, parse_formula
+from lerobot_memobench.tasks.formula import Atom, atoms
+from lerobot_memobench.tasks.formula_parsing import parse_formula
 
 
 @pytest.fixture

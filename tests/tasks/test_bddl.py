@@ -7,7 +7,9 @@ import re
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.tasks.bddl import Region, format_bddl, parse_bddl
+from lerobot_memobench.tasks.bddl.problem import Region
+from lerobot_memobench.tasks.bddl.reading import parse_bddl
+from lerobot_memobench.tasks.bddl.writing import format_bddl
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import And, Atom, Not
 

@@ -12,22 +12,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.tasks.evaluator import HOLD_STEPS, Evaluator
 from lerobot_memobench.tasks.formula import (
-    HOLD_STEPS,
     MAX_DEPTH,
     And,
     Atom,
-    Evaluator,
     Formula,
     Not,
     Or,
     Then,
     atoms,
     format_formula,
-    parse_formula,
     rename,
     to_lists,
 )
+from lerobot_memobench.tasks.formula_parsing import parse_formula
 
 A, B, C = Atom("on", ("a", "p")), Atom("on", ("b", "p")), Atom("open", ("d",))
 

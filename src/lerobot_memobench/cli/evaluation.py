@@ -98,7 +98,7 @@ def joined_flags(flags: Sequence[str]) -> list[str]:
 
 def make_grid(translation: Translation, environment: Any) -> Grid:
     """Return the episodes that an evaluation consists of; unknown tasks are told here."""
-    from lerobot_memobench.tasks.task import load_task
+    from lerobot_memobench.tasks.loading import load_task
 
     places = tuple(Place(suite, index, load_task(folder)) for suite, index, folder in environment.selected())
     runs, seed = number(translation.get("eval.n_episodes")), number(translation.get("seed"))

@@ -12,7 +12,8 @@ from lerobot_memobench.experts import motions
 from lerobot_memobench.experts.hand import OPEN, UP, Hand
 from lerobot_memobench.sim.scene import TABLE, TABLE_TOP
 from lerobot_memobench.sim.simulation import Simulation
-from lerobot_memobench.tasks.formula import And, Atom, Evaluator, Formula, Not, Or, Then
+from lerobot_memobench.tasks.evaluator import Evaluator
+from lerobot_memobench.tasks.formula import And, Atom, Formula, Not, Or, Then
 from lerobot_memobench.tasks.task import Task
 
 Doing = Generator[NDArray[np.float32], None, None]

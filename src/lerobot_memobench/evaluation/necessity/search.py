@@ -16,7 +16,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.tasks.formula import Atom, Evaluator, Formula
+from lerobot_memobench.tasks.evaluator import Evaluator
+from lerobot_memobench.tasks.formula import Atom, Formula
 
 STRIDE = 25
 """Steps are counted in multiples of this when probabilities are optimised, rounded up: a move never gets cheaper."""
