@@ -16,8 +16,9 @@ import pytest
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim import rendering
-from lerobot_memobench.sim.drawlist import build_draw_list, disc
-from lerobot_memobench.sim.rasterizer import HIGHLIGHTS
+from lerobot_memobench.sim.drawing.drawlist import build_draw_list
+from lerobot_memobench.sim.drawing.rasterizer import HIGHLIGHTS
+from lerobot_memobench.sim.drawing.shapes import disc
 from lerobot_memobench.sim.rendering import Highlight, RenderSettings, close_renderers, gl_backend
 from lerobot_memobench.sim.simulation import CAMERAS, NO_OP, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
