@@ -8,7 +8,8 @@ import pytest
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.assets import registry
-from lerobot_memobench.sim.assets.base import Asset, Builder
+from lerobot_memobench.sim.assets.asset import Asset
+from lerobot_memobench.sim.assets.builder import Builder
 from lerobot_memobench.sim.assets.kitchen import TABLE_SIZE, TABLE_TOP, build_kitchen
 from lerobot_memobench.sim.assets.registry import build_asset, known_classes, register
 

@@ -26,7 +26,7 @@ from lerobot_memobench.experts.hand import (
 )
 from lerobot_memobench.experts.leaning import far, leaning, reach_lean
 from lerobot_memobench.experts.travel import LOST, Doing, let_go, rise
-from lerobot_memobench.sim.assets.base import Articulation
+from lerobot_memobench.sim.assets.asset import Articulation
 
 REACH = 0.72
 """Distance from the arm's foot up to which a hand that points down moves freely, m."""

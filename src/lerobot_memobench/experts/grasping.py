@@ -13,7 +13,7 @@ from lerobot_memobench.experts.hand import CLOSED, COMFORTABLE, OPEN, STRETCHED,
 from lerobot_memobench.experts.leaning import clear_of_objects, lean_from_fixtures, reach_lean
 from lerobot_memobench.experts.surroundings import FINGER_REACH, FULLY_OPEN, crowding, in_the_way
 from lerobot_memobench.experts.travel import Held, rise, travel
-from lerobot_memobench.sim.assets.base import Grasp
+from lerobot_memobench.sim.assets.asset import Grasp
 from lerobot_memobench.sim.scene import TABLE_TOP
 
 ATTEMPTS = 4

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from lerobot_memobench.experts.grasping import ATTEMPTS, HOVER
 from lerobot_memobench.experts.hand import CLOSED, OPEN, UP, Array, Hand, cross, downward, frame, length
 from lerobot_memobench.experts.travel import LOST, Doing, let_go, rise
-from lerobot_memobench.sim.assets.base import Articulation
+from lerobot_memobench.sim.assets.asset import Articulation
 
 TILT = np.radians(35)
 """How far the hand points down when it takes a handle: enough for the flange to clear the table."""

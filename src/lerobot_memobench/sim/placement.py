@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.assets.base import Asset
+from lerobot_memobench.sim.assets.asset import Asset
 from lerobot_memobench.sim.scene import TABLE, TABLE_TOP
 from lerobot_memobench.tasks.bddl.problem import Region
 from lerobot_memobench.tasks.formula import Atom
