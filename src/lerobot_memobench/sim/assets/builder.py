@@ -29,7 +29,6 @@ FRICTION = (1.0, 0.02, 0.0005)
 ROLLING_FRICTION = 0.004
 GRIP_FRICTION = (1.8, 0.03, 0.0005)
 
-
 Primitive = Literal["box", "cylinder", "capsule", "ellipsoid", "sphere"]
 _TYPES: dict[Primitive, mujoco.mjtGeom] = {
     "box": mujoco.mjtGeom.mjGEOM_BOX,
