@@ -2,8 +2,9 @@
 
 import sys
 
+from lerobot_memobench.bench.claims import run
+from lerobot_memobench.bench.line import Line, table
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.bench import Line, run, table
 
 
 def main(names: list[str]) -> int:

@@ -26,3 +26,20 @@ def log_handlers_end_with_the_test() -> Iterator[None]:
     for handler in list(root.handlers):
         if type(handler) is logging.StreamHandler:
             root.removeHandler(handler)
+
+
+@pytest.fixture
+def gl() -> Iterator[str]:
+    """Skip without a GL library; free what was opened afterwards."""
+    from lerobot_memobench.errors import MemobenchError
+    from lerobot_memobench.sim.rendering import close_renderers, gl_backend
+
+    try:
+        backend = gl_backend()
+    except MemobenchError as error:
+        pytest.skip(str(error))
+    before = os.environ.get("MUJOCO_GL")
+    yield backend
+    close_renderers()
+    if before is None:
+        os.environ.pop("MUJOCO_GL", None)

@@ -1,17 +1,14 @@
-"""What simulator tests share: a scene of the arm alone, tasks by name, and a check for a GL library."""
+"""What simulator tests share: a scene of the arm alone, and tasks by name."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import mujoco
 import pytest
 
-from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.assets.kitchen import build_kitchen
-from lerobot_memobench.sim.rendering import close_renderers, gl_backend
 from lerobot_memobench.sim.scene import PHYSICS_STEP
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
@@ -41,17 +38,3 @@ def simulate() -> Callable[..., Simulation]:
         return sim
 
     return make
-
-
-@pytest.fixture
-def gl() -> Iterator[str]:
-    """Skip without a GL library; free what was opened afterwards."""
-    try:
-        backend = gl_backend()
-    except MemobenchError as error:
-        pytest.skip(str(error))
-    before = os.environ.get("MUJOCO_GL")
-    yield backend
-    close_renderers()
-    if before is None:
-        os.environ.pop("MUJOCO_GL", None)

@@ -11,9 +11,9 @@ import pytest
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.scene import TABLE
 from lerobot_memobench.sim.simulation import Simulation
+from lerobot_memobench.tasks.bddl.problem import Region
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import Atom
-from lerobot_memobench.tasks.task import Region
 
 DEEPEST = 0.002
 """How far things that rest on each other may sink in, m."""

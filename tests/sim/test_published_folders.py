@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.sim.simulation import NO_OP, Simulation
+from lerobot_memobench.tasks.loading import load_task
 from lerobot_memobench.tasks.progress import Progress
-from lerobot_memobench.tasks.task import load_task
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
 FOLDERS = sorted(path.parent for path in (SHARED / "upstream_tasks").glob("*/*/task_config.bddl"))

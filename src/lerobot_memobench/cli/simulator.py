@@ -26,7 +26,8 @@ def bench(
     names: Annotated[list[str] | None, typer.Argument(help="Which benchmarks; all when left out.")] = None,
 ) -> None:
     """Time steps, resets and workers against stock robosuite, in one run; the table belongs in a bug report."""
-    from lerobot_memobench.sim.bench import run, table
+    from lerobot_memobench.bench.claims import run
+    from lerobot_memobench.bench.line import table
 
     lines = []
     for line in run(names):

@@ -14,7 +14,8 @@ from rich.table import Table
 from lerobot_memobench.cli.console import console
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import find_tasks, get_task, task_names, task_record
-from lerobot_memobench.tasks.task import Task, load_task
+from lerobot_memobench.tasks.loading import load_task
+from lerobot_memobench.tasks.task import Task
 
 
 def tasks(

@@ -25,8 +25,9 @@ from lerobot_memobench.sim.placement import GAP
 from lerobot_memobench.sim.scene import TABLE_TOP
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
+from lerobot_memobench.tasks.loading import load_task
 from lerobot_memobench.tasks.progress import Progress
-from lerobot_memobench.tasks.task import BDDL_FILE, MEMORY_TYPES, METADATA_FILE, Task, load_task
+from lerobot_memobench.tasks.task import BDDL_FILE, MEMORY_TYPES, METADATA_FILE, Task
 
 NO_SEED = -1
 """Seed of a demonstration that does not say it."""

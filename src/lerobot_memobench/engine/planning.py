@@ -21,7 +21,7 @@ from lerobot_memobench.settings.flags import whole_number
 from lerobot_memobench.settings.reading import read_settings
 from lerobot_memobench.settings.translation import LerobotSettings
 from lerobot_memobench.settings.words import split_words
-from lerobot_memobench.tasks.task import load_task
+from lerobot_memobench.tasks.loading import load_task
 
 if TYPE_CHECKING:
     from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig

@@ -18,8 +18,8 @@ from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.envs.film import Film
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.tasks.failures import classify_failure
+from lerobot_memobench.tasks.loading import load_task
 from lerobot_memobench.tasks.memory_text import memory_text, with_memory
-from lerobot_memobench.tasks.task import load_task
 
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from lerobot_memobench.experts.grasping import ATTEMPTS, HOVER
@@ -25,8 +24,8 @@ from lerobot_memobench.experts.hand import (
     unit,
 )
 from lerobot_memobench.experts.leaning import far, leaning, reach_lean
-from lerobot_memobench.experts.travel import LOST, Doing, let_go, rise
-from lerobot_memobench.sim.assets.base import Articulation
+from lerobot_memobench.experts.travel import LOST, Doing, Steps, let_go, rise
+from lerobot_memobench.sim.assets.asset import Articulation
 
 REACH = 0.72
 """Distance from the arm's foot up to which a hand that points down moves freely, m."""
@@ -69,9 +68,7 @@ def _door(hand: Hand, name: str, ahead: float = 0.0) -> _Door:
     outward = outward if outward @ opening > 0 else -outward
     along = cross(UP, outward)
     along = along if along @ lever > 0 else -along
-    depth = articulation.handle.clearance + articulation.handle.thickness[0] / 2 + DOOR_THICKNESS / 2
-    edge = handle - depth * outward - EDGE_INSET * along
-    edge[2] = hand.sim.body_pose(_owner(hand, name))[0][2] + hand.sim.assets[_owner(hand, name)].top
+    edge = _edge(hand, name, handle, outward, along)
     turn = Rotation.from_rotvec(joint.xaxis * ahead)
     return _Door(
         q + ahead,
@@ -81,6 +78,16 @@ def _door(hand: Hand, name: str, ahead: float = 0.0) -> _Door:
         turn.apply(along),
         hinge + turn.apply(edge - hinge),
     )
+
+
+def _edge(hand: Hand, name: str, handle: Array, outward: Array, along: Array) -> Array:
+    """Return where a door's upper edge is taken, (3,), m."""
+    articulation, _ = hand.sim.world.articulation(name)
+    owner = _owner(hand, name)
+    depth = articulation.handle.clearance + articulation.handle.thickness[0] / 2 + DOOR_THICKNESS / 2
+    edge = handle - depth * outward - EDGE_INSET * along
+    edge[2] = hand.sim.body_pose(owner)[0][2] + hand.sim.assets[owner].top
+    return edge
 
 
 def _owner(hand: Hand, name: str) -> str:
@@ -123,7 +130,7 @@ def close_door(hand: Hand, name: str) -> Doing:
     return False
 
 
-def _pull_door(hand: Hand, name: str) -> Generator[NDArray[np.float32], None, None]:
+def _pull_door(hand: Hand, name: str) -> Steps:
     """Take the upper end of an upright handle between the fingers and follow the door's arc."""
     articulation, _ = hand.sim.world.articulation(name)
     up = (articulation.handle.length / 2 - 0.018) * UP
@@ -150,7 +157,7 @@ def _pull_door(hand: Hand, name: str) -> Generator[NDArray[np.float32], None, No
     yield from let_go(hand)
 
 
-def _swing_door(hand: Hand, name: str, opening: bool) -> Generator[NDArray[np.float32], None, None]:
+def _swing_door(hand: Hand, name: str, opening: bool) -> Steps:
     """Take a door that stands ajar by its upper edge and follow its arc."""
     articulation, start = hand.sim.world.articulation(name)
     goal = articulation.open_below if opening else articulation.closed_q
@@ -172,18 +179,23 @@ def _swing_door(hand: Hand, name: str, opening: bool) -> Generator[NDArray[np.fl
     yield from hand.close()
     for _ in range(160):
         door = _door(hand, name)
-        if _wanted(door.q, articulation, opening):
-            break
-        if not opening and far(door.handle + PUSH_GAP * door.outward) < REACH - 0.04:
-            break
-        if length(hand.position - door.edge) > LOST + EDGE_DEPTH:
+        if _swung(hand, door, articulation, opening):
             break
         lead = way * min(SWING_LEAD, abs(goal - door.q) + EASE)
         yield hand.toward(at(-EDGE_DEPTH, lead)(), turned(lead / 2), CLOSED, speed=0.8)
     yield from let_go(hand)
 
 
-def _push_door(hand: Hand, name: str) -> Generator[NDArray[np.float32], None, None]:
+def _swung(hand: Hand, door: _Door, articulation: Articulation, opening: bool) -> bool:
+    """Return whether swinging ends: the door is where it should be, can be pushed shut, or has slipped away."""
+    if _wanted(door.q, articulation, opening):
+        return True
+    if not opening and far(door.handle + PUSH_GAP * door.outward) < REACH - 0.04:
+        return True
+    return length(hand.position - door.edge) > LOST + EDGE_DEPTH
+
+
+def _push_door(hand: Hand, name: str) -> Steps:
     """Push a door shut with closed fingers on the outside of its handle."""
     articulation, _ = hand.sim.world.articulation(name)
     way = float(np.sign(articulation.closed_q - articulation.open_q))

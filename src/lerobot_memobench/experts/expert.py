@@ -12,7 +12,8 @@ from lerobot_memobench.experts import motions
 from lerobot_memobench.experts.hand import OPEN, UP, Hand
 from lerobot_memobench.sim.scene import TABLE, TABLE_TOP
 from lerobot_memobench.sim.simulation import Simulation
-from lerobot_memobench.tasks.formula import And, Atom, Evaluator, Formula, Not, Or, Then
+from lerobot_memobench.tasks.evaluator import Evaluator
+from lerobot_memobench.tasks.formula import LATCHES, And, Atom, Formula, Not, Or, Then
 from lerobot_memobench.tasks.task import Task
 
 Doing = Generator[NDArray[np.float32], None, None]
@@ -90,7 +91,7 @@ class Expert:
                 yield from self.achieve(atom)
 
     def _holds(self, atom: Atom) -> bool:
-        if atom.predicate in ("wasopen", "wasturnedon"):
+        if atom.predicate in LATCHES:
             return atom in self._watch.latched
         return self.sim.holds(atom)
 

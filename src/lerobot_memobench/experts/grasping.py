@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from lerobot_memobench.experts.hand import CLOSED, COMFORTABLE, OPEN, STRETCHED,
 from lerobot_memobench.experts.leaning import clear_of_objects, lean_from_fixtures, reach_lean
 from lerobot_memobench.experts.surroundings import FINGER_REACH, FULLY_OPEN, crowding, in_the_way
 from lerobot_memobench.experts.travel import Held, rise, travel
-from lerobot_memobench.sim.assets.base import Grasp
+from lerobot_memobench.sim.assets.asset import Grasp
 from lerobot_memobench.sim.scene import TABLE_TOP
 
 ATTEMPTS = 4
@@ -72,18 +73,25 @@ def grasp_pose(
         closing = _closing_of_fallen(hand, name)
     target[2] = max(target[2], TABLE_TOP + FINGER_REACH)
     turn = downward(closing)
+    away = _lean(hand, name, target, turn[:, 0], place, outward if rim else None)
+    return target, clear_of_objects(hand, name, target, turn[:, 0], away)
+
+
+def _lean(hand: Hand, name: str, target: Array, closing: Array, place: Array | None, outward: Array | None) -> Array:
+    """Return by how much and whither the hand leans at a grasp, (3,), rad; ``outward`` is where a rim's wall slopes."""
     lean = lean_from_fixtures(hand, name, target)
     # Only about the closing axis: the fingers stay level and the thin side of the hand turns away.
-    away = lean - (lean @ turn[:, 0]) * turn[:, 0]
+    away = lean - (lean @ closing) * closing
     reach = reach_lean(hand, target)
     if place is not None:
+        position, _ = hand.sim.body_pose(name)
         there = reach_lean(hand, place + target - position, STRETCHED)
         reach = max(reach, there, key=length)
-    away = away + reach - (reach @ turn[:, 0]) * turn[:, 0]
-    if rim:
+    away = away + reach - (reach @ closing) * closing
+    if outward is not None:
         # The wall of a bowl slopes: on the arm's side the fingers may lean with it.
         away = away + outward * float(np.clip(reach @ outward, 0.0, RIM_LEAN))
-    return target, clear_of_objects(hand, name, target, turn[:, 0], away)
+    return away
 
 
 def _closing_of_fallen(hand: Hand, name: str) -> float:
@@ -104,22 +112,9 @@ def _choose_grasp(hand: Hand, name: str, attempt: int, avoid: Array | None, plac
             f"the expert does not know how to hold {name!r}: class {asset.class_name} declares no grasp"
         )
     options: list[tuple[float, Grasp, float]] = []
-    here, start = hand.sim.eef_pose()
     for grasp in asset.grasps:
         spins = np.arange(0.0, 2 * np.pi, np.pi / 12) if grasp.symmetric else [0.0]
-        for spin in spins:
-            target, turn = grasp_pose(hand, name, grasp, float(spin), FULLY_OPEN, place)
-            wrist = length(Rotation.from_matrix(turn @ start.T).as_rotvec())
-            cost = 0.3 * wrist + length(target - here) + crowding(hand, name, target, turn)
-            if avoid is not None:
-                cost += 2.0 * abs(float(turn[:, 0] @ avoid))
-            cost += 3.0 * abs(float(turn[:, 0] @ lean_from_fixtures(hand, name, target)))
-            blocked = in_the_way(hand, name, target, turn)
-            cost += 2.0 + 20.0 * blocked if blocked > 0.0 else 0.0
-            cost += 0.3 if grasp.width > WIDE else 0.0
-            ends = [target] if place is None else [target, place + target - hand.sim.body_pose(name)[0]]
-            cost += 20.0 * max(0.0, max(hand.stretch(end, turn) for end in ends) - COMFORTABLE)
-            options.append((cost, grasp, float(spin)))
+        options += [(_cost(hand, name, grasp, float(spin), avoid, place), grasp, float(spin)) for spin in spins]
     options.sort(key=lambda option: option[0])
     options = [option for option in options if option[0] < options[0][0] + MUCH_WORSE]
     # A later attempt tries the next different way; each varies a little between episodes.
@@ -128,6 +123,56 @@ def _choose_grasp(hand: Hand, name: str, attempt: int, avoid: Array | None, plac
     if grasp.symmetric:
         spin += float(hand.rng.uniform(-0.1, 0.1))
     return grasp, spin
+
+
+def _cost(hand: Hand, name: str, grasp: Grasp, spin: float, avoid: Array | None, place: Array | None) -> float:
+    """Return how bad it is to hold an object so: far for wrist and arm, among neighbours, at a reach."""
+    here, start = hand.sim.eef_pose()
+    target, turn = grasp_pose(hand, name, grasp, spin, FULLY_OPEN, place)
+    wrist = length(Rotation.from_matrix(turn @ start.T).as_rotvec())
+    cost = 0.3 * wrist + length(target - here) + crowding(hand, name, target, turn)
+    if avoid is not None:
+        cost += 2.0 * abs(float(turn[:, 0] @ avoid))
+    cost += 3.0 * abs(float(turn[:, 0] @ lean_from_fixtures(hand, name, target)))
+    blocked = in_the_way(hand, name, target, turn)
+    cost += 2.0 + 20.0 * blocked if blocked > 0.0 else 0.0
+    cost += 0.3 if grasp.width > WIDE else 0.0
+    ends = [target] if place is None else [target, place + target - hand.sim.body_pose(name)[0]]
+    cost += 20.0 * max(0.0, max(hand.stretch(end, turn) for end in ends) - COMFORTABLE)
+    return cost
+
+
+@dataclass(frozen=True)
+class _Approach:
+    """The way to one grasp of an object, asked anew at every step: the object may move."""
+
+    hand: Hand
+    name: str
+    grasp: Grasp
+    spin: float
+    place: Array | None
+
+    def pose(self, opening: float | None = None) -> tuple[Array, Array]:
+        return grasp_pose(self.hand, self.name, self.grasp, self.spin, opening, self.place)
+
+    def above(self) -> Array:
+        """Over the grasp along the fingers, so that a leaning hand comes in as it will leave."""
+        target, turn = self.pose()
+        return target - HOVER * turn[:, 2]
+
+    def at(self) -> Array:
+        """At the grasp, reached as through a funnel: lower only where it is over the middle."""
+        target, turn = self.pose()
+        off = self.hand.position - target
+        beside = length(off - (off @ turn[:, 2]) * turn[:, 2])
+        return target - min(HOVER, FUNNEL * max(0.0, beside - FUNNEL_MOUTH)) * turn[:, 2]
+
+    def turned(self) -> Array:
+        return self.pose()[1]
+
+    def closing(self) -> Array:
+        """Where the hand goes while the fingers close."""
+        return self.pose(max(self.hand.sim.gripper_opening() - CLOSING_LEAD, self.grasp.width))[0]
 
 
 def pick(
@@ -146,41 +191,27 @@ def pick(
     """
     for attempt in range(ATTEMPTS):
         grasp, spin = _choose_grasp(hand, name, attempt, avoid, place)
-
-        def pose(opening: float | None = None, grasp: Grasp = grasp, spin: float = spin) -> tuple[Array, Array]:
-            return grasp_pose(hand, name, grasp, spin, opening, place)
-
-        def above() -> Array:
-            # Along the fingers, so that a leaning hand comes in as it will leave.
-            target, turn = pose()
-            return target - HOVER * turn[:, 2]
-
-        def at() -> Array:
-            # As through a funnel: lower only where it is over the middle.
-            target, turn = pose()
-            off = hand.position - target
-            beside = length(off - (off @ turn[:, 2]) * turn[:, 2])
-            return target - min(HOVER, FUNNEL * max(0.0, beside - FUNNEL_MOUTH)) * turn[:, 2]
-
-        def turned() -> Array:
-            return pose()[1]
-
+        way = _Approach(hand, name, grasp, spin, place)
         yield from rise(hand, OPEN)
-        yield from travel(hand, above, turned, OPEN, target=name)
-        yield from hand.move(above, turned, OPEN, tolerance=0.012, turn_tolerance=0.08)
-        yield from hand.move(at, turned, OPEN, tolerance=0.005, speed=0.6, timeout=60)
-
-        def closing(width: float = grasp.width) -> Array:
-            return pose(max(hand.sim.gripper_opening() - CLOSING_LEAD, width))[0]
-
-        yield from hand.close(closing, hand.rotation)
-        start, _ = hand.sim.body_pose(name)
-        # Back along the fingers: straight up where the hand hangs down, away from what it leans away from.
-        lifted = hand.position - LIFT * hand.rotation[:, 2]
-        yield from hand.move(lifted, hand.rotation, CLOSED, tolerance=0.02, speed=0.7, timeout=60)
-        now, turn = hand.sim.body_pose(name)
-        if hand.sim.gripper_opening() > EMPTY and now[2] - start[2] > LIFT * 0.5:
-            position, rotation = hand.sim.eef_pose()
-            return Held(name, rotation.T @ (now - position), rotation.T @ turn)
+        yield from travel(hand, way.above, way.turned, OPEN, target=name)
+        yield from hand.move(way.above, way.turned, OPEN, tolerance=0.012, turn_tolerance=0.08)
+        yield from hand.move(way.at, way.turned, OPEN, tolerance=0.005, speed=0.6, timeout=60)
+        yield from hand.close(way.closing, hand.rotation)
+        held = yield from _lift(hand, name)
+        if held is not None:
+            return held
         yield from hand.wait(4, OPEN)
     return None
+
+
+def _lift(hand: Hand, name: str) -> Generator[NDArray[np.float32], None, Held | None]:
+    """Lift what the fingers have closed on; return how it is held, None where it stayed behind."""
+    start, _ = hand.sim.body_pose(name)
+    # Back along the fingers: straight up where the hand hangs down, away from what it leans away from.
+    lifted = hand.position - LIFT * hand.rotation[:, 2]
+    yield from hand.move(lifted, hand.rotation, CLOSED, tolerance=0.02, speed=0.7, timeout=60)
+    now, turn = hand.sim.body_pose(name)
+    if hand.sim.gripper_opening() <= EMPTY or now[2] - start[2] <= LIFT * 0.5:
+        return None
+    position, rotation = hand.sim.eef_pose()
+    return Held(name, rotation.T @ (now - position), rotation.T @ turn)

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from lerobot_memobench.experts.grasping import ATTEMPTS, HOVER
 from lerobot_memobench.experts.hand import CLOSED, OPEN, UP, Array, Hand, cross, downward, frame, length
-from lerobot_memobench.experts.travel import LOST, Doing, let_go, rise
-from lerobot_memobench.sim.assets.base import Articulation
+from lerobot_memobench.experts.travel import LOST, Doing, Steps, let_go, rise
+from lerobot_memobench.sim.assets.asset import Articulation
 
 TILT = np.radians(35)
 """How far the hand points down when it takes a handle: enough for the flange to clear the table."""
@@ -35,6 +35,16 @@ def _at_handle(hand: Hand, articulation: Articulation, tilt: float) -> tuple[Arr
     return position, back, frame(-back, cross(UP, out))
 
 
+def _off_handle(hand: Hand, articulation: Articulation, tilt: float, back: float) -> Callable[[], Array]:
+    """Return where the hand is when it stands ``back`` from a handle along its fingers, m, asked anew each time."""
+
+    def target() -> Array:
+        position, direction, _ = _at_handle(hand, articulation, tilt)
+        return position + back * direction
+
+    return target
+
+
 def open_drawer(hand: Hand, region: str) -> Doing:
     """Take a drawer's handle and pull until the drawer counts as open."""
     articulation, _ = hand.sim.world.articulation(region)
@@ -42,37 +52,43 @@ def open_drawer(hand: Hand, region: str) -> Doing:
     tilt = TILT + float(hand.rng.uniform(-0.06, 0.06))
     for _ in range(ATTEMPTS):
         out = outward_of(hand, articulation)
-
-        def at(back: float, tilt: float = tilt) -> Callable[[], Array]:
-            def target() -> Array:
-                position, direction, _ = _at_handle(hand, articulation, tilt)
-                return position + back * direction
-
-            return target
-
-        def turned(tilt: float = tilt) -> Array:
-            return _at_handle(hand, articulation, tilt)[2]
-
-        yield from rise(hand, OPEN, 0.16)
-        yield from hand.move(at(0.14), turned, OPEN, tolerance=0.03, turn_tolerance=0.15)
-        yield from hand.move(at(0.07), turned, OPEN, tolerance=0.012, turn_tolerance=0.06)
-        yield from hand.move(at(0.0), turned, OPEN, tolerance=0.005, speed=0.6, timeout=60)
-        yield from hand.close()
-        rotation = turned()
-        for _ in range(90):
-            _, q = hand.sim.world.articulation(region)
-            if q < articulation.open_below - 0.006:
-                break
-            handle, _ = hand.sim.site_pose(articulation.handle_site)
-            if length(hand.position - handle) > LOST:
-                break
-            yield hand.toward(handle + 0.035 * out, rotation, CLOSED, speed=0.8)
+        yield from _take_handle(hand, articulation, tilt)
+        rotation = _at_handle(hand, articulation, tilt)[2]
+        yield from _pull(hand, region, rotation, out)
         yield from hand.wait(6, OPEN)
-        yield from hand.move(at(0.09), rotation, OPEN, tolerance=0.02, turn_tolerance=1.0, timeout=50)
+        back = _off_handle(hand, articulation, tilt, 0.09)
+        yield from hand.move(back, rotation, OPEN, tolerance=0.02, turn_tolerance=1.0, timeout=50)
         _, q = hand.sim.world.articulation(region)
         if q < articulation.open_below:
             return True
     return False
+
+
+def _take_handle(hand: Hand, articulation: Articulation, tilt: float) -> Steps:
+    def turned() -> Array:
+        return _at_handle(hand, articulation, tilt)[2]
+
+    def at(back: float) -> Callable[[], Array]:
+        return _off_handle(hand, articulation, tilt, back)
+
+    yield from rise(hand, OPEN, 0.16)
+    yield from hand.move(at(0.14), turned, OPEN, tolerance=0.03, turn_tolerance=0.15)
+    yield from hand.move(at(0.07), turned, OPEN, tolerance=0.012, turn_tolerance=0.06)
+    yield from hand.move(at(0.0), turned, OPEN, tolerance=0.005, speed=0.6, timeout=60)
+    yield from hand.close()
+
+
+def _pull(hand: Hand, region: str, rotation: Array, out: Array) -> Steps:
+    """Pull a drawer by its handle until it is open, or the handle is lost."""
+    for _ in range(90):
+        articulation, q = hand.sim.world.articulation(region)
+        assert articulation.open_below is not None
+        if q < articulation.open_below - 0.006:
+            break
+        handle, _ = hand.sim.site_pose(articulation.handle_site)
+        if length(hand.position - handle) > LOST:
+            break
+        yield hand.toward(handle + 0.035 * out, rotation, CLOSED, speed=0.8)
 
 
 def close_drawer(hand: Hand, region: str) -> Doing:
@@ -83,29 +99,40 @@ def close_drawer(hand: Hand, region: str) -> Doing:
     for _ in range(ATTEMPTS):
         out = outward_of(hand, articulation)
         rotation = _at_handle(hand, articulation, tilt)[2]
-
-        def before(gap: float, out: Array = out) -> Callable[[], Array]:
-            return lambda: hand.sim.site_pose(articulation.handle_site)[0] + gap * out
-
-        yield from rise(hand, CLOSED, 0.2)
-        high = before(0.10)() + 0.06 * UP
-        yield from hand.move(high, rotation, CLOSED, tolerance=0.03, turn_tolerance=0.15)
-        yield from hand.move(before(0.06), rotation, CLOSED, tolerance=0.015, turn_tolerance=0.08)
-        for _ in range(110):
-            _, q = hand.sim.world.articulation(region)
-            if q > articulation.closed_above + 0.003:
-                break
-            handle, _ = hand.sim.site_pose(articulation.handle_site)
-            gap = hand.position - handle
-            if length(gap - (gap @ out) * out) > 0.04:
-                break
-            yield hand.toward(handle - 0.03 * out, rotation, CLOSED, speed=0.7)
+        yield from _come_before(hand, articulation, rotation, out)
+        yield from _push(hand, region, rotation, out)
         back = hand.position + 0.08 * out
         yield from hand.move(back, rotation, CLOSED, tolerance=0.02, turn_tolerance=1.0, timeout=50)
         _, q = hand.sim.world.articulation(region)
         if q > articulation.closed_above:
             return True
     return False
+
+
+def _come_before(hand: Hand, articulation: Articulation, rotation: Array, out: Array) -> Steps:
+    """Bring the closed fingers in front of a handle, from above."""
+
+    def before(gap: float) -> Array:
+        return hand.sim.site_pose(articulation.handle_site)[0] + gap * out
+
+    yield from rise(hand, CLOSED, 0.2)
+    high = before(0.10) + 0.06 * UP
+    yield from hand.move(high, rotation, CLOSED, tolerance=0.03, turn_tolerance=0.15)
+    yield from hand.move(lambda: before(0.06), rotation, CLOSED, tolerance=0.015, turn_tolerance=0.08)
+
+
+def _push(hand: Hand, region: str, rotation: Array, out: Array) -> Steps:
+    """Push a drawer by its handle until it is shut, or the fingers slip off sideways."""
+    for _ in range(110):
+        articulation, q = hand.sim.world.articulation(region)
+        assert articulation.closed_above is not None
+        if q > articulation.closed_above + 0.003:
+            break
+        handle, _ = hand.sim.site_pose(articulation.handle_site)
+        gap = hand.position - handle
+        if length(gap - (gap @ out) * out) > 0.04:
+            break
+        yield hand.toward(handle - 0.03 * out, rotation, CLOSED, speed=0.7)
 
 
 def turn_knob(hand: Hand, name: str, on: bool) -> Doing:
@@ -116,41 +143,47 @@ def turn_knob(hand: Hand, name: str, on: bool) -> Doing:
     assert off_to is not None
     aim = on_from + float(hand.rng.uniform(0.12, 0.25)) if on else off_to - 0.06
 
-    def reached(q: float, spare: float) -> bool:
+    def reached(spare: float) -> bool:
+        _, q = hand.sim.world.articulation(name)
         return q >= on_from + spare if on else q < off_to - min(spare, 1e-4)
 
     for _ in range(ATTEMPTS):
-
-        def ridge() -> tuple[Array, Array]:
-            position, rotation = hand.sim.site_pose(articulation.handle_site)
-            across = rotation[:, 1] * np.array([1.0, 1.0, 0.0])
-            return position, downward(float(np.arctan2(across[1], across[0])))
-
-        def at() -> Array:
-            return ridge()[0]
-
-        def above() -> Array:
-            return ridge()[0] + HOVER * UP
-
-        def turned() -> Array:
-            return ridge()[1]
-
-        yield from rise(hand, OPEN)
-        yield from hand.move(above, turned, OPEN, tolerance=0.01, turn_tolerance=0.06)
-        yield from hand.move(at, turned, OPEN, tolerance=0.005, speed=0.6, timeout=60)
-        yield from hand.close()
-        grip = hand.rotation
-        _, start = hand.sim.world.articulation(name)
-        for _ in range(100):
-            _, q = hand.sim.world.articulation(name)
-            if reached(q, 0.08):
-                break
-            angle = float(Rotation.from_matrix(hand.rotation @ grip.T).as_rotvec()[2])
-            lead = float(np.clip(aim - start - angle, -0.25, 0.25)) + angle
-            goal = Rotation.from_rotvec([0.0, 0.0, lead]).as_matrix() @ grip
-            yield hand.toward(ridge()[0], goal, CLOSED)
+        yield from _take_ridge(hand, articulation)
+        yield from _twist(hand, name, aim, lambda: reached(0.08))
         yield from let_go(hand, 0.10)
-        _, q = hand.sim.world.articulation(name)
-        if reached(q, 0.0):
+        if reached(0.0):
             return True
     return False
+
+
+def _ridge(hand: Hand, articulation: Articulation) -> tuple[Array, Array]:
+    """Return the position of a knob's ridge, (3,), and the rotation (3, 3) of a hand that takes it from above."""
+    position, rotation = hand.sim.site_pose(articulation.handle_site)
+    across = rotation[:, 1] * np.array([1.0, 1.0, 0.0])
+    return position, downward(float(np.arctan2(across[1], across[0])))
+
+
+def _take_ridge(hand: Hand, articulation: Articulation) -> Steps:
+    def at(height: float) -> Callable[[], Array]:
+        return lambda: _ridge(hand, articulation)[0] + height * UP
+
+    def turned() -> Array:
+        return _ridge(hand, articulation)[1]
+
+    yield from rise(hand, OPEN)
+    yield from hand.move(at(HOVER), turned, OPEN, tolerance=0.01, turn_tolerance=0.06)
+    yield from hand.move(at(0.0), turned, OPEN, tolerance=0.005, speed=0.6, timeout=60)
+    yield from hand.close()
+
+
+def _twist(hand: Hand, name: str, aim: float, reached: Callable[[], bool]) -> Steps:
+    """Turn the hand with a knob in it, to the knob's position ``aim``, rad."""
+    grip = hand.rotation
+    articulation, start = hand.sim.world.articulation(name)
+    for _ in range(100):
+        if reached():
+            break
+        angle = float(Rotation.from_matrix(hand.rotation @ grip.T).as_rotvec()[2])
+        lead = float(np.clip(aim - start - angle, -0.25, 0.25)) + angle
+        goal = Rotation.from_rotvec([0.0, 0.0, lead]).as_matrix() @ grip
+        yield hand.toward(_ridge(hand, articulation)[0], goal, CLOSED)

@@ -19,6 +19,7 @@ MORE_LEAN = (0.0, 0.12, -0.12, 0.24, -0.24, 0.36, -0.36, 0.48, -0.48)
 
 
 def leaning(closing: Array, away: Array) -> Array:
+    """Return the rotation (3, 3) of a hand that points down, its wrist leaning along ``away`` by its length, rad."""
     size = length(away)
     return frame(DOWN - np.tan(min(size, UNDER_LEAN)) * unit(away), closing)
 
@@ -60,23 +61,27 @@ def lean_from_fixtures(hand: Hand, name: str, target: Array) -> Array:
     lean = np.zeros(3)
     for centre, rotation, half in tall_boxes(hand, name):
         local = rotation.T @ (target - centre)
-        if local[2] + 0.03 > half[2]:
-            continue
-        outside = local - np.clip(local, -half, half)
-        outside[2] = 0.0
-        gap = length(outside)
-        if gap > 1e-6:
-            if gap < BESIDE:
-                lean += rotation @ outside / gap * MOST_LEAN * min(1.0, 1.6 * (1.0 - gap / BESIDE))
-            continue
-        # Under it, as under an open drawer: in from the nearest side.
-        room = half[:2] - np.abs(local[:2])
-        side = int(np.argmin(room))
-        way = np.zeros(3)
-        way[side] = np.sign(local[side]) or 1.0
-        lean += rotation @ way * UNDER_LEAN
+        if local[2] + 0.03 <= half[2]:
+            lean += _lean_from_box(local, rotation, half)
     size = length(lean)
     return lean * min(1.0, UNDER_LEAN / size) if size > 0 else lean
+
+
+def _lean_from_box(local: Array, rotation: Array, half: Array) -> Array:
+    """Return the lean of a hand from one box, whose frame ``local`` (3,) is in."""
+    outside = local - np.clip(local, -half, half)
+    outside[2] = 0.0
+    gap = length(outside)
+    if gap >= BESIDE:
+        return np.zeros(3)
+    if gap > 1e-6:
+        return rotation @ outside / gap * MOST_LEAN * min(1.0, 1.6 * (1.0 - gap / BESIDE))
+    # Under it, as under an open drawer: in from the nearest side.
+    room = half[:2] - np.abs(local[:2])
+    side = int(np.argmin(room))
+    way = np.zeros(3)
+    way[side] = np.sign(local[side]) or 1.0
+    return rotation @ way * UNDER_LEAN
 
 
 def far(place: Array) -> float:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lerobot_memobench.experts.hand import CLOSED, DOWN, UP, Array, Hand, cross, frame, unit
+from lerobot_memobench.experts.hand import CLOSED, DOWN, UP, Array, Hand, Target, cross, frame, unit
 from lerobot_memobench.experts.travel import Doing, Held, holding, release, travel
 
 MOST_RIGHTING = np.radians(35)
@@ -17,7 +17,7 @@ MOST_RIGHTING = np.radians(35)
 def carry(
     hand: Hand,
     held: Held,
-    destination: Callable[[], Array],
+    destination: Target,
     turn: Array,
     clearance: float,
     tolerance: float = 0.006,
@@ -35,7 +35,34 @@ def carry(
         support: what it is put on, which is not in the way.
     """
 
-    def hand_at(height: float) -> Callable[[], Array]:
+    at = _hand_over(hand, held, destination, turn)
+
+    def lost() -> bool:
+        return not holding(hand, held)
+
+    position, rotation = hand.sim.eef_pose()
+    high = max(float(position[2]), float(at(clearance)()[2]))
+    up = np.array([position[0], position[1], high])
+    yield from hand.move(up, rotation, CLOSED, tolerance=0.02, turn_tolerance=1.0, timeout=60, give_up=lost)
+
+    yield from travel(hand, at(clearance), lambda: turn, CLOSED, target=support, held=held, give_up=lost)
+
+    def over() -> Array:
+        target = at(clearance)()
+        return np.array([target[0], target[1], max(target[2], high - 0.02)])
+
+    yield from hand.move(over, turn, CLOSED, tolerance=0.012, turn_tolerance=0.08, give_up=lost)
+    yield from hand.move(at(clearance), turn, CLOSED, tolerance=0.012, timeout=60, give_up=lost)
+    if lost():
+        return False
+    yield from hand.lower(at(0.0), turn, CLOSED, tolerance=tolerance)
+    return holding(hand, held)
+
+
+def _hand_over(hand: Hand, held: Held, destination: Target, turn: Array) -> Callable[[float], Target]:
+    """Return, for a height over the destination, m, where the hand is when the held thing is there."""
+
+    def at(height: float) -> Target:
         def target() -> Array:
             # Where the thing really is in the hand, not where it was when grasped: it may have turned or slipped.
             position, rotation = hand.sim.eef_pose()
@@ -45,26 +72,7 @@ def carry(
 
         return target
 
-    def lost() -> bool:
-        return not holding(hand, held)
-
-    position, rotation = hand.sim.eef_pose()
-    high = max(float(position[2]), float(hand_at(clearance)()[2]))
-    up = np.array([position[0], position[1], high])
-    yield from hand.move(up, rotation, CLOSED, tolerance=0.02, turn_tolerance=1.0, timeout=60, give_up=lost)
-
-    yield from travel(hand, hand_at(clearance), lambda: turn, CLOSED, target=support, held=held, give_up=lost)
-
-    def over() -> Array:
-        target = hand_at(clearance)()
-        return np.array([target[0], target[1], max(target[2], high - 0.02)])
-
-    yield from hand.move(over, turn, CLOSED, tolerance=0.012, turn_tolerance=0.08, give_up=lost)
-    yield from hand.move(hand_at(clearance), turn, CLOSED, tolerance=0.012, timeout=60, give_up=lost)
-    if lost():
-        return False
-    yield from hand.lower(hand_at(0.0), turn, CLOSED, tolerance=tolerance)
-    return holding(hand, held)
+    return at
 
 
 def _upright(hand: Hand, held: Held) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lerobot_memobench.experts.hand import Array, Hand
+from lerobot_memobench.sim.assets.asset import Asset
 
 FINGER_REACH = 0.0095
 """How far the finger tips stand out under the grip site, m."""
@@ -23,6 +24,11 @@ CLEAR = 0.025
 """Height left over what stands on the way, m."""
 
 
+def corners(asset: Asset) -> Array:
+    """Return the corners (3, 8) of an asset's bounding box in its frame, m."""
+    return np.array(np.meshgrid(*zip(asset.low, asset.high, strict=True))).reshape(3, -1)
+
+
 def tall_boxes(hand: Hand, name: str) -> list[tuple[Array, Array, Array]]:
     """Return centre, rotation and half size of fixtures and of drawers with their handles, (3,), (3, 3), (3,)."""
     boxes = []
@@ -34,12 +40,15 @@ def tall_boxes(hand: Hand, name: str) -> list[tuple[Array, Array, Array]]:
         boxes.append((position + rotation @ (low + high) / 2, rotation, (high - low) / 2))
         for region, articulation in asset.articulations.items():
             if articulation.kind == "drawer":
-                centre, turned = hand.sim.site_pose(asset.regions[region])
-                handle, _ = hand.sim.site_pose(articulation.handle_site)
-                half = hand.sim.site_half_size(asset.regions[region]) + 0.012
-                reach = np.abs(turned.T @ (handle - centre)) + 0.008
-                boxes.append((centre, turned, np.maximum(half, reach)))
+                boxes.append(_drawer_box(hand, asset.regions[region], articulation.handle_site))
     return boxes
+
+
+def _drawer_box(hand: Hand, region: str, handle_site: str) -> tuple[Array, Array, Array]:
+    centre, turned = hand.sim.site_pose(region)
+    handle, _ = hand.sim.site_pose(handle_site)
+    reach = np.abs(turned.T @ (handle - centre)) + 0.008
+    return centre, turned, np.maximum(hand.sim.site_half_size(region) + 0.012, reach)
 
 
 def in_the_way(hand: Hand, name: str, target: Array, turn: Array) -> float:
@@ -68,14 +77,17 @@ def crowding(hand: Hand, name: str, target: Array, turn: Array) -> float:
         if position[2] + asset.top < target[2] - FINGER_REACH:
             continue
         for side in (-1.0, 1.0):
-            local = rotation.T @ (target + side * apart * turn[:, 0] - position)
-            if asset.round:
-                gap = float(np.hypot(local[0], local[1])) - asset.radius
-            else:
-                outside = np.maximum(np.abs(local[:2]) - np.asarray(asset.half_extents), 0.0)
-                gap = float(np.hypot(*outside))
+            gap = _gap(asset, rotation.T @ (target + side * apart * turn[:, 0] - position))
             penalty += 40.0 * max(0.0, FINGER_THICKNESS - gap)
     return penalty
+
+
+def _gap(asset: Asset, local: Array) -> float:
+    """Return the level distance of a place in an asset's frame from its outline, m; not above 0 inside."""
+    if asset.round:
+        return float(np.hypot(local[0], local[1])) - asset.radius
+    outside = np.maximum(np.abs(local[:2]) - np.asarray(asset.half_extents), 0.0)
+    return float(np.hypot(*outside))
 
 
 def clear_height(hand: Hand, start: Array, end: Array, *, lowest: float, wide: float, but: tuple[str, ...]) -> float:
@@ -96,8 +108,7 @@ def clear_height(hand: Hand, start: Array, end: Array, *, lowest: float, wide: f
         position, rotation = hand.sim.body_pose(other)
         gap = float(np.linalg.norm((way - position)[:, :2], axis=1).min()) - asset.radius - wide
         if gap < 0.0:
-            corners = np.array(np.meshgrid(*zip(asset.low, asset.high, strict=True))).reshape(3, -1)
-            height = max(height, float(position[2] + (rotation @ corners)[2].max()))
+            height = max(height, float(position[2] + (rotation @ corners(asset))[2].max()))
     for centre, rotation, half in tall_boxes(hand, ""):
         local = (way - centre) @ rotation
         outside = np.abs(local[:, :2]) - half[:2]

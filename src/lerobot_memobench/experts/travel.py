@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.experts.hand import OPEN, UP, Array, Hand, length
-from lerobot_memobench.experts.surroundings import FINGER_REACH, clear_height
+from lerobot_memobench.experts.surroundings import FINGER_REACH, clear_height, corners
 from lerobot_memobench.sim.scene import TABLE_TOP
 
+Steps = Generator[NDArray[np.float32], None, None]
+"""A part of a motion: yields actions (7,)."""
 Doing = Generator[NDArray[np.float32], None, bool]
 """A motion: yields actions (7,), returns whether it did what it is for."""
 LOST = 0.05
@@ -32,12 +34,13 @@ class Held:
 
 
 def holding(hand: Hand, held: Held) -> bool:
+    """Return whether the thing is still where it was in the hand when it was taken."""
     position, rotation = hand.sim.eef_pose()
     now, _ = hand.sim.body_pose(held.name)
     return length(rotation.T @ (now - position) - held.offset) < LOST
 
 
-def rise(hand: Hand, gripper: float, least: float = 0.12) -> Generator[NDArray[np.float32], None, None]:
+def rise(hand: Hand, gripper: float, least: float = 0.12) -> Steps:
     """Go straight up to a height over the table at which nothing is in the way."""
     position, rotation = hand.sim.eef_pose()
     height = TABLE_TOP + least
@@ -55,18 +58,11 @@ def travel(
     target: str,
     held: Held | None = None,
     give_up: Callable[[], bool] | None = None,
-) -> Generator[NDArray[np.float32], None, None]:
+) -> Steps:
     """Go over to above a place, as high as what stands on the way asks for; nothing when the way is free."""
     start, end = hand.position, place()
-    lowest, wide = FINGER_REACH, HAND_BESIDE
-    but: tuple[str, ...] = (target,)
-    if held is not None:
-        asset = hand.sim.assets[held.name]
-        position, rotation = hand.sim.body_pose(held.name)
-        corners = np.array(np.meshgrid(*zip(asset.low, asset.high, strict=True))).reshape(3, -1)
-        lowest = max(lowest, float(start[2] - position[2] - (rotation @ corners)[2].min()))
-        wide, but = max(wide, asset.radius), (target, held.name)
-    height = clear_height(hand, start, end, lowest=lowest, wide=wide, but=but)
+    lowest, wide, but = _load(hand, held)
+    height = clear_height(hand, start, end, lowest=lowest, wide=wide, but=(target, *but))
     if height <= min(start[2], end[2]) + 0.01:
         return
     if start[2] < height - 0.01:
@@ -82,14 +78,24 @@ def travel(
     yield from hand.move(over, turned, gripper, tolerance=0.02, turn_tolerance=0.15, give_up=give_up)
 
 
-def let_go(hand: Hand, height: float = 0.12) -> Generator[NDArray[np.float32], None, None]:
+def _load(hand: Hand, held: Held | None) -> tuple[float, float, tuple[str, ...]]:
+    """Return how far the hand with its load reaches down and sideways, m, and the load's name, if any."""
+    if held is None:
+        return FINGER_REACH, HAND_BESIDE, ()
+    asset = hand.sim.assets[held.name]
+    position, rotation = hand.sim.body_pose(held.name)
+    below = float(hand.position[2] - position[2] - (rotation @ corners(asset))[2].min())
+    return max(FINGER_REACH, below), max(HAND_BESIDE, asset.radius), (held.name,)
+
+
+def let_go(hand: Hand, height: float = 0.12) -> Steps:
     """Open the fingers and go straight up, clear of what was held."""
     yield from hand.wait(6, OPEN)
     up = hand.position + height * UP
     yield from hand.move(up, hand.rotation, OPEN, tolerance=0.02, turn_tolerance=1.0, timeout=50)
 
 
-def release(hand: Hand, up: float = 0.12) -> Generator[NDArray[np.float32], None, None]:
+def release(hand: Hand, up: float = 0.12) -> Steps:
     """Open the fingers and go up.
 
     The hand rises while the fingers still open: fully open inside a bowl they would press against its wall and take
@@ -100,7 +106,7 @@ def release(hand: Hand, up: float = 0.12) -> Generator[NDArray[np.float32], None
     yield from hand.move(target, hand.rotation, OPEN, tolerance=0.02, turn_tolerance=1.0, speed=0.7, timeout=60)
 
 
-def go_home(hand: Hand, position: Array, rotation: Array) -> Generator[NDArray[np.float32], None, None]:
+def go_home(hand: Hand, position: Array, rotation: Array) -> Steps:
     """Rise and go back to a pose with the fingers open."""
     yield from rise(hand, OPEN, 0.2)
     yield from hand.move(position, rotation, OPEN, tolerance=0.012, turn_tolerance=0.08)

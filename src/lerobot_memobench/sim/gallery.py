@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.assets.base import COLLISION_GROUP, VISUAL_GROUP, Asset
+from lerobot_memobench.files import write_file
+from lerobot_memobench.sim.assets.asset import Asset
+from lerobot_memobench.sim.assets.builder import COLLISION_GROUP, VISUAL_GROUP
 from lerobot_memobench.sim.assets.kitchen import TABLE_TOP, build_kitchen
 from lerobot_memobench.sim.assets.registry import build_asset
 from lerobot_memobench.sim.rendering import Renderer, RenderSettings
@@ -95,26 +97,28 @@ def save(sheet: Image.Image, path: str | Path) -> Path:
     Raises:
         MemobenchError: when the file cannot be written.
     """
-    path = Path(path)
-    while True:
-        for colours in (256, 160, 96):
-            buffer = io.BytesIO()
-            reduced = sheet.quantize(colours, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
-            reduced.save(buffer, "PNG", optimize=True)
-            if buffer.tell() <= LARGEST_FILE:
-                break
-        else:
-            sheet = sheet.resize((sheet.width * 9 // 10, sheet.height * 9 // 10), Image.Resampling.LANCZOS)
-            continue
-        break
+    path, content = Path(path), _png(sheet)
+    while len(content) > LARGEST_FILE:
+        sheet = sheet.resize((sheet.width * 9 // 10, sheet.height * 9 // 10), Image.Resampling.LANCZOS)
+        content = _png(sheet)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(buffer.getvalue())
+        return write_file(path, content)
     except OSError as error:
         raise MemobenchError(
             f"the figure {path} cannot be written ({error.strerror or error}); choose another folder"
         ) from error
-    return path
+
+
+def _png(sheet: Image.Image) -> bytes:
+    """Return a picture as PNG, with as many colours as fit into `LARGEST_FILE`, or the fewest."""
+    for colours in (256, 160, 96):
+        buffer = io.BytesIO()
+        reduced = sheet.quantize(colours, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+        reduced.save(buffer, "PNG", optimize=True)
+        if buffer.tell() <= LARGEST_FILE:
+            break
+    return buffer.getvalue()
 
 
 # --- tasks ------------------------------------------------------------------------------------------------------
@@ -138,25 +142,18 @@ class Stand:
     """One instance of a class on plain ground in the kitchen's light, and cameras around it."""
 
     def __init__(self, class_name: str, views: Sequence[View], size: int) -> None:
-        spec = mujoco.MjSpec()
-        build_kitchen(spec)
-        for geom in [*spec.body("room").geoms, *spec.body("kitchen_table").geoms]:
-            geom.group = COLLISION_GROUP
-        ground = spec.body("kitchen_table").add_geom(
-            type=mujoco.mjtGeom.mjGEOM_BOX, size=[9, 9, 0.01], pos=[0, 0, -0.0101], rgba=list(_GROUND)
-        )
-        ground.group, ground.contype, ground.conaffinity = VISUAL_GROUP, 0, 0
+        spec = _plain_ground()
         self.asset: Asset = build_asset(spec, spec.worldbody, "thing", class_name)
         spec.body("thing").pos = [0.0, 0.0, TABLE_TOP - self.asset.bottom]
         low, high = np.array(self.asset.low), np.array(self.asset.high)
         middle = (low + high) / 2 + [0.0, 0.0, TABLE_TOP - self.asset.bottom]
         reach = float(np.linalg.norm(high - low)) / 2
-        for index, view in enumerate(views):
-            _add_camera(spec, f"view_{index}", middle, view, view.distance * reach)
+        self._cameras = [f"view_{index}" for index in range(len(views))]
+        for name, view in zip(self._cameras, views, strict=True):
+            _add_camera(spec, name, middle, view, view.distance * reach)
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
         self.opened(False)
-        self._cameras = [f"view_{index}" for index in range(len(views))]
         self._renderer = Renderer(self.model, RenderSettings(size, size, "high"))
 
     def opened(self, opened: bool) -> None:
@@ -175,6 +172,19 @@ class Stand:
     def close(self) -> None:
         """Free the renderer."""
         self._renderer.close()
+
+
+def _plain_ground() -> mujoco.MjSpec:
+    """Return the kitchen with its room and table out of sight and plain ground at the table's height."""
+    spec = mujoco.MjSpec()
+    build_kitchen(spec)
+    for geom in [*spec.body("room").geoms, *spec.body("kitchen_table").geoms]:
+        geom.group = COLLISION_GROUP
+    ground = spec.body("kitchen_table").add_geom(
+        type=mujoco.mjtGeom.mjGEOM_BOX, size=[9, 9, 0.01], pos=[0, 0, -0.0101], rgba=list(_GROUND)
+    )
+    ground.group, ground.contype, ground.conaffinity = VISUAL_GROUP, 0, 0
+    return spec
 
 
 def _add_camera(spec: mujoco.MjSpec, name: str, target: NDArray[np.float64], view: View, distance: float) -> None:

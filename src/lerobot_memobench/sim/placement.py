@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.assets.base import Asset
+from lerobot_memobench.sim.assets.asset import Asset
 from lerobot_memobench.sim.scene import TABLE, TABLE_TOP
+from lerobot_memobench.tasks.bddl.problem import Region
 from lerobot_memobench.tasks.formula import Atom
-from lerobot_memobench.tasks.task import Region, Task
+from lerobot_memobench.tasks.task import Task
 
 ATTEMPTS = 500
 """Draws before a task's regions count as too crowded."""

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.sim.drawlist import build_draw_list
-from lerobot_memobench.sim.rasterizer import Rasterizer
+from lerobot_memobench.sim.drawing.drawlist import build_draw_list
+from lerobot_memobench.sim.drawing.rasterizer import Rasterizer
 
 Image = NDArray[np.uint8]
 

@@ -7,12 +7,12 @@ with all of them costs three times one without).
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib.metadata
 import logging
 import os
 import re
-import tempfile
 import warnings
 from functools import cache
 from pathlib import Path
@@ -20,7 +20,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from lerobot_memobench.sim.meshes import area, read_mesh, simplify
+from lerobot_memobench.files import draft_of
+from lerobot_memobench.sim import thinning
 
 BASE_POSITION = (-0.66, 0.0, 0.0)
 """Foot of the mount, m: x = −0.16 − table length / 2 (robosuite's offset for a table of 1 m)."""
@@ -75,18 +76,19 @@ def _build() -> dict[str, np.ndarray]:
         # A mesh that is also collided with (a link drawn and felt by one file) keeps its own shape.
         if name not in drawn or not ("vis" in name or "pedestal" in name):
             continue
-        vertices, faces = read_mesh(Path(file))
+        vertices, faces = thinning.read_mesh(Path(file))
         density = FACES_PER_SQUARE_METRE * (HAND_FACES if name.startswith("gripper0") else 1)
-        target = max(LEAST_FACES, min(MOST_FACES, int(density * area(vertices, faces))))
-        vertices, faces = simplify(vertices, faces, target)
+        target = max(LEAST_FACES, min(MOST_FACES, int(density * thinning.area(vertices, faces))))
+        vertices, faces = thinning.simplify(vertices, faces, target)
         arrays[f"v:{name}"], arrays[f"f:{name}"] = vertices, faces
     return arrays
 
 
 def _cache_file() -> Path:
     """Where the thinned arm is kept between processes, named by all that it depends on."""
-    source = Path(__file__).read_bytes() + (Path(__file__).parent / "meshes.py").read_bytes()
-    key = hashlib.sha256(source + importlib.metadata.version("robosuite").encode()).hexdigest()[:16]
+    source = Path(__file__).read_bytes() + Path(thinning.__file__).read_bytes()
+    versions = importlib.metadata.version("robosuite") + importlib.metadata.version("fast-simplification")
+    key = hashlib.sha256(source + versions.encode()).hexdigest()[:16]
     root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return root / "lerobot_memobench" / f"panda-{key}.npz"
 
@@ -95,21 +97,16 @@ def _cache_file() -> Path:
 def _arrays() -> dict[str, np.ndarray]:
     """Load the thinned arm from the cache, or build it; a cache that cannot be written costs time, nothing else."""
     path = _cache_file()
-    try:
+    with contextlib.suppress(OSError, ValueError, KeyError, EOFError):
         with np.load(path, allow_pickle=False) as stored:
             arrays = dict(stored)
         if all(Path(f).exists() for f in re.findall(r'file="([^"]+)"', str(arrays["xml"]))):
             return arrays
-    except (OSError, ValueError, KeyError, EOFError):
-        pass
     arrays = _build()
-    try:
+    with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
-            np.savez(file, **arrays)  # type: ignore[arg-type]  # numpy's stub wants one type for all
-        os.replace(file.name, path)
-    except OSError:
-        pass
+        with draft_of(path) as draft:
+            np.savez(draft, **arrays)  # type: ignore[arg-type]  # numpy's stub wants one type for all
     return arrays
 
 

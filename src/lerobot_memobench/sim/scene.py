@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import mujoco
 
 from lerobot_memobench.sim import robot
-from lerobot_memobench.sim.assets.base import Asset
+from lerobot_memobench.sim.assets.asset import Asset
 from lerobot_memobench.sim.assets.kitchen import build_kitchen
 from lerobot_memobench.sim.assets.registry import build_asset
 from lerobot_memobench.tasks.task import Task

@@ -78,20 +78,22 @@ class Simulation:
         Equal seeds of equal tasks give bit-equal states, whatever was simulated before.
         """
         rng = np.random.default_rng([seed, zlib.crc32(self.task.name.encode())])
-        mujoco.mj_resetData(self.model, self.data)
-        self.data.qpos[self._arm_qpos] = robot.ARM_START
-        self.data.qpos[self._finger_qpos] = robot.GRIPPER_START
+        self._rewind()
         self._placement = self._placer.draw(rng)
         self._settle()
 
     def reset_to(self, placement: Placement) -> None:
         """Like `reset`, from a placement that was recorded."""
-        mujoco.mj_resetData(self.model, self.data)
-        self.data.qpos[self._arm_qpos] = robot.ARM_START
-        self.data.qpos[self._finger_qpos] = robot.GRIPPER_START
+        self._rewind()
         self._placement = placement
         self._placer.write(placement)
         self._settle()
+
+    def _rewind(self) -> None:
+        """Put the arm at its start; things are placed next."""
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[self._arm_qpos] = robot.ARM_START
+        self.data.qpos[self._finger_qpos] = robot.GRIPPER_START
 
     def _settle(self) -> None:
         self.highlights = ()

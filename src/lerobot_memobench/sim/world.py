@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.sim.assets.base import Articulation, Asset
+from lerobot_memobench.sim.assets.asset import Articulation, Asset
 from lerobot_memobench.sim.scene import TABLE_TOP
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task

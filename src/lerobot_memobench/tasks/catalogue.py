@@ -9,7 +9,8 @@ from typing import Any
 
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.tasks.formula import to_lists
-from lerobot_memobench.tasks.task import BDDL_FILE, MEMORY_TYPES, Task, load_task
+from lerobot_memobench.tasks.loading import load_task
+from lerobot_memobench.tasks.task import BDDL_FILE, MEMORY_TYPES, Task
 
 #: <memory type>/<task name>/{task_config.bddl, task_config.meta.json}
 CATALOGUE_DIR = Path(__file__).parent / "catalogue"

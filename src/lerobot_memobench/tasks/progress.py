@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from lerobot_memobench.tasks.formula import Atom, Evaluator
+from lerobot_memobench.tasks.evaluator import Evaluator
+from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task
 
 

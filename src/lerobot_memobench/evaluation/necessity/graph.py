@@ -5,7 +5,8 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass, field
 
-from lerobot_memobench.tasks.formula import Atom, Evaluator, Formula
+from lerobot_memobench.tasks.evaluator import Evaluator
+from lerobot_memobench.tasks.formula import Atom, Formula
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_memobench.sim.assets.base import GRIP_FRICTION, Asset, Builder
-from lerobot_memobench.sim.assets.meshes import lathe
+from lerobot_memobench.sim.assets.asset import ALONG_X, ALONG_Y, Asset
+from lerobot_memobench.sim.assets.builder import GRIP_FRICTION, Builder
+from lerobot_memobench.sim.assets.meshes import MeshData, lathe
 from lerobot_memobench.sim.assets.paint import BLACK, WHITE, Canvas, Colour, Drawing, Pixels, drawn
-
-HALF_PI = float(np.pi / 2)
 
 
 @dataclass(frozen=True)
@@ -36,19 +35,27 @@ class Bottle:
     def build(self, b: Builder) -> Asset:
         """Add the bottle to the scene."""
         high = self.profile[-1][1]
-        middle = high / 2
-        mesh = b.mesh(
-            self.key,
-            lambda: lathe(((0.0, self.profile[0][1]), *self.profile, (0.0, high)), 20, scale=self.scale).moved(
-                (0, 0, -middle)
-            ),
-        )
+        mesh = b.mesh(self.key, self._mesh)
         b.visual_mesh(mesh, b.material(self.key, self.texture, specular=self.gloss, shininess=0.6))
         radius = max(r for r, _ in self.profile)
         x, y = radius * self.scale[0], radius * self.scale[1]
+        self._contacts(b, x, y, high)
+        self._grasps(b, x, y, high)
+        return b.object((-x, -y, -high / 2), (x, y, high / 2), round=self._is_round)
+
+    @property
+    def _is_round(self) -> bool:
+        return self.scale[0] == self.scale[1]
+
+    def _mesh(self) -> MeshData:
+        high = self.profile[-1][1]
+        closed = ((0.0, self.profile[0][1]), *self.profile, (0.0, high))
+        return lathe(closed, 20, scale=self.scale).moved((0, 0, -high / 2))
+
+    def _contacts(self, b: Builder, x: float, y: float, high: float) -> None:
+        middle = high / 2
         body = (0, 0, self.shoulder / 2 - middle)
-        round_ = self.scale[0] == self.scale[1]
-        if round_:
+        if self._is_round:
             b.collision("cylinder", (x, self.shoulder / 2), 0.9 * self.mass, body, friction=GRIP_FRICTION)
         else:
             # The corners of a box around an ellipse stand out: two crossed boxes are nearer to it.
@@ -56,28 +63,21 @@ class Bottle:
             b.collision("box", (0.72 * x, y, self.shoulder / 2), 0.4 * self.mass, body, friction=GRIP_FRICTION)
         rest = (high - self.shoulder) / 2
         if rest > 0:
-            b.collision(
-                "cylinder",
-                (self.neck, rest),
-                0.1 * self.mass,
-                (0, 0, high - rest - middle),
-                friction=GRIP_FRICTION,
-            )
-        self._grasps(b, x, y, high, round_)
-        return b.object((-x, -y, -middle), (x, y, middle), round=round_)
+            cap = (0, 0, high - rest - middle)
+            b.collision("cylinder", (self.neck, rest), 0.1 * self.mass, cap, friction=GRIP_FRICTION)
 
-    def _grasps(self, b: Builder, x: float, y: float, high: float, round_: bool) -> None:
+    def _grasps(self, b: Builder, x: float, y: float, high: float) -> None:
         """Hold the body where the fingers reach it from above, else the neck or cap."""
         middle = high / 2
         reach = high - 0.036
         at = min(reach, self.shoulder - 0.010)
         if high - at > 0.042:
             # The body begins below the fingers' reach.
-            b.grasp((0, 0, high - 0.022 - middle), 0.0, 2 * self.neck, symmetric=True, depth=0.01)
-        elif round_ and 2 * x <= 0.068:
-            b.grasp((0, 0, at - middle), 0.0, 2 * x, symmetric=True, depth=0.02)
+            b.grasp((0, 0, high - 0.022 - middle), ALONG_X, 2 * self.neck, symmetric=True, depth=0.01)
+        elif self._is_round and 2 * x <= 0.068:
+            b.grasp((0, 0, at - middle), ALONG_X, 2 * x, symmetric=True, depth=0.02)
         else:
-            for yaw, width in ((0.0, 2 * x), (HALF_PI, 2 * y)):
+            for yaw, width in ((ALONG_X, 2 * x), (ALONG_Y, 2 * y)):
                 if width <= 0.068:
                     b.grasp((0, 0, at - middle), yaw, width, depth=0.02)
 

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
-from lerobot_memobench.sim.assets.base import GRIP_FRICTION, Articulation, Asset, Builder, Handle
+import mujoco
+
+from lerobot_memobench.sim.assets.asset import Articulation, Asset, Handle
+from lerobot_memobench.sim.assets.builder import GRIP_FRICTION, Builder
 from lerobot_memobench.sim.assets.meshes import Block, MeshData, blocks
-from lerobot_memobench.sim.assets.paint import wood
+from lerobot_memobench.sim.assets.paint import Colour, wood
 
 DRAWER_RANGE = (-0.16, 0.01)
 CLOSED = 0.005
@@ -55,8 +59,8 @@ def _carcass() -> list[Block]:
     return parts
 
 
-def _drawer() -> list[Block]:
-    """Return floor, sides, back and front of a drawer; its underside is z = 0."""
+def _box() -> list[Block]:
+    """Return floor, sides and back of a drawer; its underside is z = 0."""
     middle, depth = (_INNER_FRONT + _INNER_BACK) / 2, (_INNER_BACK - _INNER_FRONT) / 2
     x = _HALF_DRAWER_X
     high = _WALL_HIGH / 2
@@ -65,8 +69,12 @@ def _drawer() -> list[Block]:
         Block((-x + _WALL / 2, middle, high), (_WALL / 2, depth, high), 1),
         Block((x - _WALL / 2, middle, high), (_WALL / 2, depth, high), 1),
         Block((0, _INNER_BACK + _WALL / 2, high), (x, _WALL / 2, high), 0),
-        Block((0, _FACE + _PANEL / 2, _DRAWER_HIGH / 2), (x, _PANEL / 2, _DRAWER_HIGH / 2), 0),
     ]
+
+
+def _panel() -> list[Block]:
+    """Return the front of a drawer."""
+    return [Block((0, _FACE + _PANEL / 2, _DRAWER_HIGH / 2), (_HALF_DRAWER_X, _PANEL / 2, _DRAWER_HIGH / 2), 0)]
 
 
 def _handle() -> list[Block]:
@@ -84,30 +92,32 @@ def _mesh(parts: Callable[[], list[Block]]) -> Callable[[], MeshData]:
     return lambda: blocks(parts(), tile=0.25)
 
 
+class _Materials(NamedTuple):
+    dark: str
+    front: str
+    inside: str
+    metal: str
+
+
+def _materials(b: Builder) -> _Materials:
+    def boards(key: str, dark: Colour, light: Colour, seed: int, waves: float, shine: tuple[float, float]) -> str:
+        return b.material(
+            f"cabinet_{key}", lambda: wood(dark, light, seed=seed, waves=waves), specular=shine[0], shininess=shine[1]
+        )
+
+    return _Materials(
+        dark=boards("wood", (46, 34, 28), (92, 70, 58), 5, 7, (0.15, 0.2)),
+        front=boards("front", (66, 48, 38), (118, 90, 72), 6, 7, (0.15, 0.2)),
+        inside=boards("inside", (150, 118, 84), (196, 164, 124), 7, 4, (0.1, 0.1)),
+        metal=b.material("cabinet_metal", rgba=(0.62, 0.62, 0.63, 1), specular=0.8, shininess=0.6),
+    )
+
+
 def _cabinet(b: Builder) -> Asset:
-    dark = b.material(
-        "cabinet_wood",
-        lambda: wood((46, 34, 28), (92, 70, 58), seed=5, waves=7),
-        specular=0.15,
-        shininess=0.2,
-    )
-    front = b.material(
-        "cabinet_front",
-        lambda: wood((66, 48, 38), (118, 90, 72), seed=6, waves=7),
-        specular=0.15,
-        shininess=0.2,
-    )
-    inside = b.material(
-        "cabinet_inside",
-        lambda: wood((150, 118, 84), (196, 164, 124), seed=7, waves=4),
-        specular=0.1,
-        shininess=0.1,
-    )
-    metal = b.material("cabinet_metal", rgba=(0.62, 0.62, 0.63, 1), specular=0.8, shininess=0.6)
-    b.visual_mesh(b.mesh("cabinet_carcass", _mesh(_carcass)), dark)
+    materials = _materials(b)
+    b.visual_mesh(b.mesh("cabinet_carcass", _mesh(_carcass)), materials.dark)
     for part in _carcass():
         b.collision("box", part.half, 0.8, part.centre)
-
     middle, depth = (_FRONT + _BACK) / 2, (_BACK - _FRONT) / 2
     regions = {"top_side": b.site("top_side", (0, middle, _HIGH - 0.001), (_HALF_X, depth, 0.001), box=True)}
     articulations = {}
@@ -118,39 +128,52 @@ def _cabinet(b: Builder) -> Asset:
             b.exclude(other, drawer)
         bodies.append(drawer)
         joint = b.joint(drawer, f"{level}_level", "slide", (0, 1, 0), DRAWER_RANGE, damping=50, frictionloss=2.0)
-        box, panel = _drawer()[:-1], _drawer()[-1]
-        b.visual_mesh(b.mesh("cabinet_drawer", _mesh(lambda: _drawer()[:-1])), inside, body=drawer)
-        b.visual_mesh(b.mesh("cabinet_panel", _mesh(lambda: _drawer()[-1:])), front, body=drawer)
-        b.visual_mesh(b.mesh("cabinet_handle", _mesh(_handle)), metal, body=drawer)
-        for part in (*box, panel):
-            b.collision("box", part.half, 0.12, part.centre, body=drawer)
-        for part in _handle():
-            b.collision("box", part.half, 0.03, part.centre, body=drawer, friction=GRIP_FRICTION)
-        low, high = _FLOOR, _OPENING - 0.0015
-        regions[f"{level}_region"] = b.site(
-            f"{level}_region",
-            (0, (_INNER_FRONT + _INNER_BACK) / 2, (low + high) / 2),
-            (_HALF_DRAWER_X - _WALL, (_INNER_BACK - _INNER_FRONT) / 2, (high - low) / 2),
-            body=drawer,
-            box=True,
-        )
-        handle = b.site(f"{level}_handle", (0, _FACE - _HANDLE_OUT + _HANDLE_THICK / 2, _DRAWER_HIGH / 2), body=drawer)
-        articulations[f"{level}_region"] = Articulation(
-            joint=joint,
-            kind="drawer",
-            closed_q=CLOSED,
-            open_q=OPEN,
-            handle_site=handle,
-            handle=Handle(_HANDLE_LENGTH, (_HANDLE_THICK, _HANDLE_THICK), _HANDLE_OUT - _HANDLE_THICK),
-            open_below=-0.14,
-            closed_above=0.0,
-        )
+        _fill_drawer(b, drawer, materials)
+        regions[f"{level}_region"] = _inside(b, drawer, level)
+        articulations[f"{level}_region"] = _articulation(b, drawer, level, joint)
     return b.fixture(
         low=(-_HALF_X, _FRONT - _HANDLE_OUT, 0),
         high=(_HALF_X, _BACK, _HIGH),
         regions=regions,
         articulations=articulations,
         clear=depth,
+    )
+
+
+def _fill_drawer(b: Builder, drawer: mujoco.MjsBody, materials: _Materials) -> None:
+    """Add what is seen and felt of a drawer to its body."""
+    b.visual_mesh(b.mesh("cabinet_drawer", _mesh(_box)), materials.inside, body=drawer)
+    b.visual_mesh(b.mesh("cabinet_panel", _mesh(_panel)), materials.front, body=drawer)
+    b.visual_mesh(b.mesh("cabinet_handle", _mesh(_handle)), materials.metal, body=drawer)
+    for part in (*_box(), *_panel()):
+        b.collision("box", part.half, 0.12, part.centre, body=drawer)
+    for part in _handle():
+        b.collision("box", part.half, 0.03, part.centre, body=drawer, friction=GRIP_FRICTION)
+
+
+def _inside(b: Builder, drawer: mujoco.MjsBody, level: str) -> str:
+    """Add the region in a drawer and return its full name."""
+    low, high = _FLOOR, _OPENING - 0.0015
+    return b.site(
+        f"{level}_region",
+        (0, (_INNER_FRONT + _INNER_BACK) / 2, (low + high) / 2),
+        (_HALF_DRAWER_X - _WALL, (_INNER_BACK - _INNER_FRONT) / 2, (high - low) / 2),
+        body=drawer,
+        box=True,
+    )
+
+
+def _articulation(b: Builder, drawer: mujoco.MjsBody, level: str, joint: str) -> Articulation:
+    handle = (0, _FACE - _HANDLE_OUT + _HANDLE_THICK / 2, _DRAWER_HIGH / 2)
+    return Articulation(
+        joint=joint,
+        kind="drawer",
+        closed_q=CLOSED,
+        open_q=OPEN,
+        handle_site=b.site(f"{level}_handle", handle, body=drawer),
+        handle=Handle(_HANDLE_LENGTH, (_HANDLE_THICK, _HANDLE_THICK), _HANDLE_OUT - _HANDLE_THICK),
+        open_below=-0.14,
+        closed_above=0.0,
     )
 
 

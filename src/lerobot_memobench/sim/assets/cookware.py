@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from lerobot_memobench.sim.assets.base import GRIP_FRICTION, Asset, Builder, turned
+from lerobot_memobench.sim.assets.asset import ALONG_X, Asset
+from lerobot_memobench.sim.assets.builder import GRIP_FRICTION, Builder, turned
 from lerobot_memobench.sim.assets.meshes import MeshData, ball, lathe, merged, tube
 from lerobot_memobench.sim.assets.paint import Canvas, Pixels, drawn
 
@@ -90,7 +91,7 @@ def _frypan(b: Builder) -> Asset:
             friction=GRIP_FRICTION,
         )
     for y in (0.135, 0.165, 0.195):
-        b.grasp((0.0, y, 0.0445 + 0.1 * (y - 0.15)), 0.0, 0.021, depth=0.03)
+        b.grasp((0.0, y, 0.0445 + 0.1 * (y - 0.15)), ALONG_X, 0.021, depth=0.03)
     high = (_PAN, _PAN_END, _PAN_HIGH)
     return b.object((-_PAN, -_PAN, 0), high, floor=0.005, clear=_PAN_BASE - 0.006)
 
@@ -166,8 +167,8 @@ def _moka_pot(b: Builder) -> Asset:
     b.collision("box", (0.009, 0.006, 0.030), 0.01, (0, -0.080, z + 0.091), friction=GRIP_FRICTION)
     b.collision("box", (0.009, 0.022, 0.006), 0.005, (0, -0.055, z + 0.123), friction=GRIP_FRICTION)
     b.collision("cylinder", (0.009, 0.008), 0.005, (0, 0, z + 0.144), friction=GRIP_FRICTION)
-    b.grasp((0.0, -0.080, z + 0.110), 0.0, 0.018, depth=0.03)
-    b.grasp((0.0, 0.0, z + 0.144), 0.0, 0.018, depth=0.004)
+    b.grasp((0.0, -0.080, z + 0.110), ALONG_X, 0.018, depth=0.03)
+    b.grasp((0.0, 0.0, z + 0.144), ALONG_X, 0.018, depth=0.004)
     return b.object((-0.0405, -0.087, z), (0.0405, 0.061, z + 0.152))
 
 

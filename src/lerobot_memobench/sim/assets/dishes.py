@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from lerobot_memobench.sim.assets.base import GRIP_FRICTION, Asset, Builder
+from lerobot_memobench.sim.assets.asset import ALONG_X, Asset
+from lerobot_memobench.sim.assets.builder import GRIP_FRICTION, Builder
 from lerobot_memobench.sim.assets.meshes import MeshData, lathe
 from lerobot_memobench.sim.assets.paint import Canvas, Colour, Pixels, drawn
 
@@ -74,7 +75,7 @@ class Bowl:
         low = (self._wall(self.base) - middle, 0.5 * self.base)
         b.ring(16, low, (self.rim - middle, top), self.wall, 0.5 * self.mass, GRIP_FRICTION)
         held = self.height - 0.008
-        b.grasp((self._wall(held) - middle, 0.0, held), 0.0, self.wall + 0.003, symmetric=True, depth=0.015)
+        b.grasp((self._wall(held) - middle, 0.0, held), ALONG_X, self.wall + 0.003, symmetric=True, depth=0.015)
         r, h = self.rim, self.height
         return b.object((-r, -r, 0), (r, r, h), round=True, floor=self.base, clear=self.foot - self.wall)
 
@@ -155,7 +156,7 @@ def _plate(b: Builder) -> Asset:
         0.4 * mass,
         GRIP_FRICTION,
     )
-    b.grasp((_PLATE - 0.006, 0.0, _PLATE_HIGH - 0.004), 0.0, 0.012, symmetric=True, depth=0.004)
+    b.grasp((_PLATE - 0.006, 0.0, _PLATE_HIGH - 0.004), ALONG_X, 0.012, symmetric=True, depth=0.004)
     r = _PLATE
     return b.object((-r, -r, 0), (r, r, _PLATE_HIGH), round=True, floor=0.005, clear=_PLATE_FLOOR)
 

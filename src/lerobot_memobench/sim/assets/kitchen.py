@@ -7,7 +7,8 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from lerobot_memobench.sim.assets.base import Asset, Builder
+from lerobot_memobench.sim.assets.asset import Asset
+from lerobot_memobench.sim.assets.builder import Builder
 from lerobot_memobench.sim.assets.meshes import Block, blocks
 from lerobot_memobench.sim.assets.paint import Pixels, speckle, wood
 
@@ -17,10 +18,23 @@ WALL_X = -1.25
 
 
 def build_kitchen(spec: mujoco.MjSpec, table: str = "kitchen_table") -> Asset:
-    """Add table, floor, walls and lights to the world body of ``spec`` and return the table.
+    """Add table, floor, walls and lights to the world body of ``spec`` and return the table."""
+    _light(spec)
+    _room(Builder(spec, spec.worldbody, "room", "room"))
+    spec.worldbody.add_geom(
+        name="room_ground",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[3, 3, 0.1],
+        group=0,
+        rgba=[0.5, 0.5, 0.5, 0],
+    )
+    asset = _table(Builder(spec, spec.worldbody, table, "kitchen_table"))
+    spec.body(table).pos = [0, 0, TABLE_TOP]
+    return asset
 
-    One light casts shadows; a second one and the headlight's ambience fill in.
-    """
+
+def _light(spec: mujoco.MjSpec) -> None:
+    """Add the lights: one casts shadows; a second one and the headlight's ambience fill in."""
     spec.visual.headlight.ambient = [0.34, 0.34, 0.34]
     spec.visual.headlight.diffuse = [0.16, 0.16, 0.16]
     spec.visual.headlight.specular = [0.0, 0.0, 0.0]
@@ -31,9 +45,8 @@ def build_kitchen(spec: mujoco.MjSpec, table: str = "kitchen_table") -> Asset:
     spec.visual.map.znear = 0.01
     spec.visual.map.zfar = 8.0
     spec.visual.quality.shadowsize = 1024
-    world = spec.worldbody
     direction = np.array([-0.33, 0.24, -0.91])
-    world.add_light(
+    spec.worldbody.add_light(
         name="key_light",
         type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
         pos=np.array([0.0, 0.0, TABLE_TOP]) - 2.0 * direction,
@@ -42,7 +55,7 @@ def build_kitchen(spec: mujoco.MjSpec, table: str = "kitchen_table") -> Asset:
         specular=[0.25, 0.25, 0.25],
         castshadow=True,
     )
-    world.add_light(
+    spec.worldbody.add_light(
         name="fill_light",
         type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
         pos=[1.5, 1.0, 2.0],
@@ -51,7 +64,10 @@ def build_kitchen(spec: mujoco.MjSpec, table: str = "kitchen_table") -> Asset:
         specular=[0.0, 0.0, 0.0],
         castshadow=False,
     )
-    room = Builder(spec, world, "room", "room")
+
+
+def _room(room: Builder) -> None:
+    """Add floor and walls, which are only seen."""
     floor = room.material("floor", lambda: speckle((128, 122, 112), 5, seed=11), specular=0.0)
     wall = room.material("wall", lambda: speckle((146, 146, 124), 5, seed=12, along=0.03), specular=0.0)
     room.visual_mesh(room.mesh("room_floor", lambda: blocks([Block((0, 0, -0.05), (2.5, 2.5, 0.05))], 0.8)), floor)
@@ -61,16 +77,6 @@ def build_kitchen(spec: mujoco.MjSpec, table: str = "kitchen_table") -> Asset:
         Block((0, 2.45, 1.5), (2.5, 0.05, 1.5), 2),
     ]
     room.visual_mesh(room.mesh("room_walls", lambda: blocks(walls, 0.6)), wall)
-    world.add_geom(
-        name="room_ground",
-        type=mujoco.mjtGeom.mjGEOM_PLANE,
-        size=[3, 3, 0.1],
-        group=0,
-        rgba=[0.5, 0.5, 0.5, 0],
-    )
-    asset = _table(Builder(spec, world, table, "kitchen_table"))
-    spec.body(table).pos = [0, 0, TABLE_TOP]
-    return asset
 
 
 def _table_texture() -> Pixels:

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Half = tuple[float, float, float]
+"""Half sizes along x, y and z [m]."""
 
 # Order of the faces of a box in an atlas of 3 x 2 cells (see `paint.atlas`).
 BOX_FACES = ("+x", "+y", "+z", "-x", "-y", "-z")
@@ -86,33 +88,48 @@ def lathe(
         v = 1 - way / way[-1]
     else:
         v = (heights.max() - heights) / np.ptp(heights)
-    angles = np.linspace(-np.pi, np.pi, segments + 1)
-    vertices: list[tuple[float, float, float]] = []
-    rings: list[list[int]] = []
-    for radius, z in zip(radii, heights, strict=True):
-        if radius <= 0:
-            rings.append([len(vertices)] * (segments + 1))
-            vertices.append((0.0, 0.0, z))
-            continue
-        first = len(vertices)
-        rings.append([first + j for j in range(segments)] + [first])
-        vertices += [(radius * np.cos(a) * scale[0], radius * np.sin(a) * scale[1], z) for a in angles[:segments]]
-    faces, uv_faces = [], []
-    for i in range(len(rings) - 1):
-        for j in range(segments):
-            quad = (rings[i][j], rings[i][j + 1], rings[i + 1][j + 1], rings[i + 1][j])
-            base = i * (segments + 1) + j
-            uv_quad = (base, base + 1, base + segments + 2, base + segments + 1)
-            for corners in ((0, 1, 2), (0, 2, 3)):
-                triangle = [quad[c] for c in corners]
-                if len(set(triangle)) == 3:
-                    faces.append(triangle)
-                    uv_faces.append([uv_quad[c] for c in corners])
+    vertices, rings = _rings(radii, heights, segments, scale)
+    faces, uv_faces = _between_rings(rings)
     # Textures repeat: keep clear of the first and last row, which blend into each other.
     v = 0.008 + 0.984 * v
     u = np.linspace(0.0, 1.0, segments + 1)
     uv = np.stack([np.tile(u, len(v)), np.repeat(v, segments + 1)], axis=1)
     return MeshData(np.array(vertices), np.array(faces), uv, np.array(uv_faces))
+
+
+def _rings(
+    radii: Floats, heights: Floats, segments: int, scale: tuple[float, float]
+) -> tuple[list[tuple[float, float, float]], list[list[int]]]:
+    """Return the vertices of a lathe's rings, one for a ring without radius, and the indices around each, closed."""
+    angles = np.linspace(-np.pi, np.pi, segments + 1)[:segments]
+    vertices: list[tuple[float, float, float]] = []
+    rings: list[list[int]] = []
+    for radius, z in zip(radii, heights, strict=True):
+        first = len(vertices)
+        if radius <= 0:
+            rings.append([first] * (segments + 1))
+            vertices.append((0.0, 0.0, z))
+        else:
+            rings.append([*range(first, first + segments), first])
+            vertices += [(radius * np.cos(a) * scale[0], radius * np.sin(a) * scale[1], z) for a in angles]
+    return vertices, rings
+
+
+def _between_rings(rings: list[list[int]]) -> tuple[list[list[int]], list[list[int]]]:
+    """Return the triangles between neighbouring rings, as indices of vertices and of texture coordinates."""
+    faces, uv_faces = [], []
+    width = len(rings[0])
+    for i in range(len(rings) - 1):
+        for j in range(width - 1):
+            quad = (rings[i][j], rings[i][j + 1], rings[i + 1][j + 1], rings[i + 1][j])
+            base = i * width + j
+            uv_quad = (base, base + 1, base + width + 1, base + width)
+            for corners in ((0, 1, 2), (0, 2, 3)):
+                triangle = [quad[c] for c in corners]
+                if len(set(triangle)) == 3:
+                    faces.append(triangle)
+                    uv_faces.append([uv_quad[c] for c in corners])
+    return faces, uv_faces
 
 
 def ball(radii: Sequence[float], segments: int = 16, rings: int = 9) -> MeshData:
@@ -152,11 +169,26 @@ def cell_uv(column: int, row: int, columns: int = 3, rows: int = 2) -> Floats:
     return np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
 
 
-def quads_mesh(quads: Sequence[Sequence[Floats]], uvs: Sequence[Floats]) -> MeshData:
-    """Return a mesh of flat quads: four corners each, counter-clockwise from outside, and their uv (4, 2)."""
+Quad = Sequence[Sequence[float] | Floats]
+"""Four corners (3,), counter-clockwise from outside."""
+
+
+def quads_mesh(quads: Sequence[Quad], uvs: Sequence[Floats]) -> MeshData:
+    """Return a mesh of flat quads with their uv (4, 2)."""
     vertices = np.array([corner for quad in quads for corner in quad], dtype=np.float64)
     faces = [[4 * k + a, 4 * k + b, 4 * k + c] for k in range(len(quads)) for a, b, c in ((0, 1, 2), (0, 2, 3))]
     return MeshData(vertices, np.array(faces), np.concatenate(uvs))
+
+
+def grid_faces(columns: int, rows: int, first: int = 0) -> list[tuple[int, int, int]]:
+    """Return the triangles of a grid whose (rows + 1) × (columns + 1) vertices stand row by row from ``first`` on."""
+    faces = []
+    for i in range(rows):
+        for j in range(columns):
+            p = first + i * (columns + 1) + j
+            q = p + columns + 1
+            faces += [(p, p + 1, q + 1), (p, q + 1, q)]
+    return faces
 
 
 @dataclass(frozen=True)
@@ -172,25 +204,27 @@ def blocks(parts: Sequence[Block], tile: float = 0.3) -> MeshData:
     """Return many boxes as one mesh; the image repeats every ``tile`` metres, its u along the grain."""
     quads, uvs = [], []
     for number, part in enumerate(parts):
-        half = np.array(part.half)
+        # Boards are cut from different places of the plank.
+        shift = np.array([0.37 * number, 0.61 * number])
         for axis in range(3):
-            a, b = (axis + 1) % 3, (axis + 2) % 3
+            along = part.grain if part.grain != axis else (axis + 1) % 3
+            across = 3 - axis - along
             for sign in (-1.0, 1.0):
-                corners = []
-                for p, q in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
-                    corner = np.zeros(3)
-                    corner[axis] = sign * half[axis]
-                    corner[a], corner[b] = p * half[a], q * half[b]
-                    corners.append(corner)
-                if sign < 0:
-                    corners.reverse()
-                along = part.grain if part.grain != axis else a
-                across = 3 - axis - along
-                # Boards are cut from different places of the plank.
-                shift = np.array([0.37 * number, 0.61 * number])
+                corners = _block_side(np.array(part.half), axis, sign)
                 uvs.append(np.array([[c[along], c[across]] for c in corners]) / tile + shift)
                 quads.append([corner + np.array(part.centre) for corner in corners])
     return quads_mesh(quads, uvs)
+
+
+def _block_side(half: Floats, axis: int, sign: float) -> list[Floats]:
+    """Return the corners of the side of a box that looks along an axis or against it."""
+    corners: list[Floats] = []
+    for p, q in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
+        corner = np.zeros(3)
+        corner[axis] = sign * half[axis]
+        corner[(axis + 1) % 3], corner[(axis + 2) % 3] = p * half[(axis + 1) % 3], q * half[(axis + 2) % 3]
+        corners.append(corner)
+    return corners[::-1] if sign < 0 else corners
 
 
 def tube(
@@ -211,24 +245,20 @@ def tube(
         over = np.cross(side, tangent)
         a, b = radius if isinstance(radius, tuple) else (radius, radius)
         vertices += [point + a * np.cos(t) * side + b * np.sin(t) * over for t in angles]
+    vertices += [points[0], points[-1]]
+    return MeshData(np.array(vertices), np.array(_tube_faces(len(points), sides)))
+
+
+def _tube_faces(rings: int, sides: int) -> list[list[int]]:
+    """Return the triangles of a tube's wall and of its ends, whose middles stand after the rings."""
     faces = []
-    rings = len(points)
     for i in range(rings - 1):
         for j in range(sides):
             k = (j + 1) % sides
             p, q, r, s = i * sides + j, i * sides + k, (i + 1) * sides + k, (i + 1) * sides + j
             faces += [[p, r, q], [p, s, r]]
-    start, end = len(vertices), len(vertices) + 1
-    vertices += [points[0], points[-1]]
+    start, end = rings * sides, rings * sides + 1
     for j in range(sides):
         k = (j + 1) % sides
         faces += [[start, j, k], [end, (rings - 1) * sides + k, (rings - 1) * sides + j]]
-    return MeshData(np.array(vertices), np.array(faces))
-
-
-def arc(centre: tuple[float, float], radius: float, start: float, stop: float, count: int) -> list[tuple[float, float]]:
-    """Return points (r, z) of an arc from angle ``start`` to ``stop`` [degrees], for profiles."""
-    return [
-        (centre[0] + radius * np.cos(np.radians(a)), centre[1] + radius * np.sin(np.radians(a)))
-        for a in np.linspace(start, stop, count)
-    ]
+    return faces

@@ -10,8 +10,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from lerobot_memobench.sim.assets.base import GRIP_FRICTION, Articulation, Asset, Builder, Handle
-from lerobot_memobench.sim.assets.meshes import Block, Floats, MeshData, blocks, cell_uv, quads_mesh
+from lerobot_memobench.sim.assets.asset import Articulation, Asset, Handle
+from lerobot_memobench.sim.assets.builder import GRIP_FRICTION, Builder
+from lerobot_memobench.sim.assets.meshes import Block, MeshData, Quad, blocks, cell_uv, quads_mesh
 from lerobot_memobench.sim.assets.paint import Canvas, Pixels, drawn
 
 DOOR_RANGE = (-2.094, 0.0)
@@ -21,6 +22,9 @@ _FRONT, _BACK = 0.000, 0.196  # y of the box without door
 _HIGH = 0.189
 _PLINTH = 0.028  # the door sweeps over a plate on the table
 _BOARD = 0.010
+_FLOOR = _PLINTH + _BOARD  # z of the inside's
+_MIDDLE = (_FRONT + _BACK) / 2
+_INNER_DEPTH = (_BACK - _BOARD - _FRONT) / 2
 _DOOR_THICK = 0.020
 _DOOR_GAP = 0.001
 _HANDLE_OUT = 0.045
@@ -69,16 +73,13 @@ def _door_mesh() -> MeshData:
     wide, thick, high = 2 * _HALF_X, _DOOR_THICK, _DOOR_HIGH
     lo, hi = -high, high
 
-    def quad(*corners: tuple[float, float, float]) -> list[Floats]:
-        return [np.array(corner) for corner in corners]
-
-    quads = [
-        quad((0, -thick, lo), (wide, -thick, lo), (wide, -thick, hi), (0, -thick, hi)),
-        quad((wide, 0, lo), (0, 0, lo), (0, 0, hi), (wide, 0, hi)),
-        quad((wide, -thick, lo), (wide, 0, lo), (wide, 0, hi), (wide, -thick, hi)),
-        quad((0, 0, lo), (0, -thick, lo), (0, -thick, hi), (0, 0, hi)),
-        quad((0, -thick, hi), (wide, -thick, hi), (wide, 0, hi), (0, 0, hi)),
-        quad((0, 0, lo), (wide, 0, lo), (wide, -thick, lo), (0, -thick, lo)),
+    quads: list[Quad] = [
+        [(0, -thick, lo), (wide, -thick, lo), (wide, -thick, hi), (0, -thick, hi)],
+        [(wide, 0, lo), (0, 0, lo), (0, 0, hi), (wide, 0, hi)],
+        [(wide, -thick, lo), (wide, 0, lo), (wide, 0, hi), (wide, -thick, hi)],
+        [(0, 0, lo), (0, -thick, lo), (0, -thick, hi), (0, 0, hi)],
+        [(0, -thick, hi), (wide, -thick, hi), (wide, 0, hi), (0, 0, hi)],
+        [(0, 0, lo), (wide, 0, lo), (wide, -thick, lo), (0, -thick, lo)],
     ]
     # The image: left half front, right half everything else.
     front, back = cell_uv(0, 0, 2, 1), cell_uv(1, 0, 2, 1)
@@ -130,12 +131,21 @@ def _microwave(b: Builder) -> Asset:
     glass = b.material("microwave_tray", rgba=(0.86, 0.90, 0.90, 1), specular=0.5)
     b.visual_mesh(b.mesh("microwave_case", lambda: blocks(_shell())), case)
     b.visual_mesh(b.mesh("microwave_lining", lambda: blocks(_lining())), lining)
-    middle = (_FRONT + _BACK) / 2
-    floor = _PLINTH + _BOARD
-    b.visual("cylinder", (0.070, 0.001), glass, (0.03, middle - 0.005, floor + 0.0022))
+    b.visual("cylinder", (0.070, 0.001), glass, (0.03, _MIDDLE - 0.005, _FLOOR + 0.0022))
     for part in _shell():
         b.collision("box", part.half, 0.5, part.centre)
+    articulation = _door(b, front, metal)
+    return b.fixture(
+        low=(-_HALF_X, _FRONT - _DOOR_GAP - _DOOR_THICK - _HANDLE_OUT, 0),
+        high=(_HALF_X, _BACK, _HIGH),
+        regions=_regions(b),
+        articulations={"": articulation},
+        clear=_INNER_DEPTH,
+    )
 
+
+def _door(b: Builder, front: str, metal: str) -> Articulation:
+    """Add the door with its joint and handle."""
     door = b.child("door", (-_HALF_X, _FRONT - _DOOR_GAP, _DOOR_Z))
     b.exclude(b.body, door)
     joint = b.joint(door, "microjoint", "hinge", (0, 0, 1), DOOR_RANGE, damping=0.5, frictionloss=0.15)
@@ -145,37 +155,28 @@ def _microwave(b: Builder) -> Asset:
     for part in _handle():
         b.collision("box", part.half, 0.03, part.centre, body=door, friction=GRIP_FRICTION)
     bar = _handle()[0].centre
-    # The handle's frame has x along the bar (up) and y out of the door: turn z up to x about y.
-    handle = b.site("door_handle", bar, quat=(np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0), body=door)
-    inner = (_HIGH - _BOARD - floor) / 2
-    depth = (_BACK - _BOARD - _FRONT) / 2
-    regions = {
-        "heating_region": b.site(
-            "heating_region",
-            (0, _FRONT + depth, floor + inner),
-            (_HALF_X - _BOARD, depth, inner),
-            box=True,
-        ),
-        "top_side": b.site("top_side", (0, middle, _HIGH - 0.001), (_HALF_X, (_BACK - _FRONT) / 2, 0.001), box=True),
-    }
-    return b.fixture(
-        low=(-_HALF_X, _FRONT - _DOOR_GAP - _DOOR_THICK - _HANDLE_OUT, 0),
-        high=(_HALF_X, _BACK, _HIGH),
-        regions=regions,
-        articulations={
-            "": Articulation(
-                joint=joint,
-                kind="door",
-                closed_q=0.0,
-                open_q=-1.9,
-                handle_site=handle,
-                handle=Handle(2 * _HANDLE_HALF, (_HANDLE_THICK, _HANDLE_THICK), _HANDLE_OUT - _HANDLE_THICK),
-                open_below=-1.3,
-                closed_above=-0.005,
-            )
-        },
-        clear=depth,
+    return Articulation(
+        joint=joint,
+        kind="door",
+        closed_q=0.0,
+        open_q=-1.9,
+        # The handle's frame has x along the bar (up) and y out of the door: turn z up to x about y.
+        handle_site=b.site("door_handle", bar, quat=(np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0), body=door),
+        handle=Handle(2 * _HANDLE_HALF, (_HANDLE_THICK, _HANDLE_THICK), _HANDLE_OUT - _HANDLE_THICK),
+        open_below=-1.3,
+        closed_above=-0.005,
     )
+
+
+def _regions(b: Builder) -> dict[str, str]:
+    """Add the inside and the top, and return their full names."""
+    high = (_HIGH - _BOARD - _FLOOR) / 2
+    inside = ((0, _FRONT + _INNER_DEPTH, _FLOOR + high), (_HALF_X - _BOARD, _INNER_DEPTH, high))
+    top = ((0, _MIDDLE, _HIGH - 0.001), (_HALF_X, (_BACK - _FRONT) / 2, 0.001))
+    return {
+        "heating_region": b.site("heating_region", *inside, box=True),
+        "top_side": b.site("top_side", *top, box=True),
+    }
 
 
 BUILDERS: dict[str, Callable[[Builder], Asset]] = {"microwave": _microwave}

@@ -95,6 +95,12 @@ def atlas(faces: Mapping[str, Pixels], colour: Colour, cell: int = 128) -> Pixel
     return np.asarray(sheet, dtype=np.uint8)
 
 
+def wrapped(front: Pixels, side: Pixels, top: Pixels, colour: Colour) -> Pixels:
+    """Return the atlas of a package with equal front and back, equal sides, and a top."""
+    faces = {"+x": front, "-x": front, "+y": side, "-y": side, "+z": top}
+    return atlas(faces, colour)
+
+
 def wood(dark: Colour, light: Colour, seed: int, size: int = 256, waves: float = 5.0) -> Pixels:
     """Return a wood texture that repeats without a seam; the grain runs along u."""
     rng = np.random.default_rng(seed)

@@ -10,22 +10,42 @@ import mujoco
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.sim.assets import (
     bottles,
+    boxes,
     cabinet,
+    cartons,
     cookware,
     dishes,
     kitchen,
     microwave,
-    packages,
-    produce,
     shelf,
+    snacks,
     stove,
     trinkets,
+    vegetables,
 )
-from lerobot_memobench.sim.assets.base import Asset, Builder
+from lerobot_memobench.sim.assets.asset import Asset
+from lerobot_memobench.sim.assets.builder import Builder
 
 Build = Callable[[Builder], Asset]
 
-_builders: dict[str, Build] = {}
+_MODULES = (
+    bottles,
+    boxes,
+    cabinet,
+    cartons,
+    cookware,
+    dishes,
+    kitchen,
+    microwave,
+    shelf,
+    snacks,
+    stove,
+    trinkets,
+    vegetables,
+)
+"""Where the project's own classes are: each has ``BUILDERS``, class name -> builder."""
+
+_builders: dict[str, Build] = {name: build for module in _MODULES for name, build in module.BUILDERS.items()}
 
 
 def register(class_name: str, builder: Build) -> None:
@@ -62,19 +82,3 @@ def split_class(class_name: str) -> tuple[str, int]:
     """Return family and variant: ``cork__3`` is variant 3 of ``cork``, and ``cork`` is variant 0."""
     match = re.fullmatch(r"(.+?)__(\d+)", class_name)
     return (match.group(1), int(match.group(2))) if match else (class_name, 0)
-
-
-for _module in (
-    bottles,
-    cabinet,
-    cookware,
-    dishes,
-    kitchen,
-    microwave,
-    packages,
-    produce,
-    shelf,
-    stove,
-    trinkets,
-):
-    _builders.update(_module.BUILDERS)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from lerobot_memobench.sim.assets.base import Asset, Builder
+from lerobot_memobench.sim.assets.asset import Asset
+from lerobot_memobench.sim.assets.builder import Builder
 from lerobot_memobench.sim.assets.meshes import Block, blocks
 from lerobot_memobench.sim.assets.paint import wood
 

@@ -7,12 +7,12 @@ the knob's ridge runs along the fixture's x axis; turning it on turns the ridge 
 from __future__ import annotations
 
 from collections.abc import Callable
-from types import MappingProxyType
 
 import numpy as np
 
-from lerobot_memobench.sim.assets.base import GRIP_FRICTION, Articulation, Asset, Builder, Handle
-from lerobot_memobench.sim.assets.meshes import Floats, MeshData, box, cell_uv, lathe, quads_mesh
+from lerobot_memobench.sim.assets.asset import Articulation, Asset, Handle
+from lerobot_memobench.sim.assets.builder import GRIP_FRICTION, Builder
+from lerobot_memobench.sim.assets.meshes import Floats, MeshData, Quad, box, cell_uv, lathe, quads_mesh
 from lerobot_memobench.sim.assets.paint import Canvas, Pixels, drawn, speckle
 
 _PLATE = (0.062, 0.250)  # from x to x
@@ -34,18 +34,15 @@ def _plate_mesh() -> MeshData:
     y, z, bevel = _HALF_WIDTH, _TOP, 0.028
     front_z = 0.014
 
-    def quad(*corners: tuple[float, float, float]) -> list[Floats]:
-        return [np.array(corner) for corner in corners]
-
-    quads = [
-        quad((x0, -y, z), (x1 - bevel, -y, z), (x1 - bevel, y, z), (x0, y, z)),
-        quad((x1 - bevel, -y, z), (x1, -y, front_z), (x1, y, front_z), (x1 - bevel, y, z)),
-        quad((x1, -y, 0), (x1, y, 0), (x1, y, front_z), (x1, -y, front_z)),
-        quad((x0, y, 0), (x0, -y, 0), (x0, -y, z), (x0, y, z)),
-        quad((x0, -y, 0), (x1, -y, 0), (x1, -y, front_z), (x0, -y, z)),
-        quad((x1, y, 0), (x0, y, 0), (x0, y, z), (x1, y, front_z)),
-        quad((x1 - bevel, -y, z), (x0, -y, z), (x1, -y, front_z), (x1, -y, front_z)),
-        quad((x0, y, z), (x1 - bevel, y, z), (x1, y, front_z), (x1, y, front_z)),
+    quads: list[Quad] = [
+        [(x0, -y, z), (x1 - bevel, -y, z), (x1 - bevel, y, z), (x0, y, z)],
+        [(x1 - bevel, -y, z), (x1, -y, front_z), (x1, y, front_z), (x1 - bevel, y, z)],
+        [(x1, -y, 0), (x1, y, 0), (x1, y, front_z), (x1, -y, front_z)],
+        [(x0, y, 0), (x0, -y, 0), (x0, -y, z), (x0, y, z)],
+        [(x0, -y, 0), (x1, -y, 0), (x1, -y, front_z), (x0, -y, z)],
+        [(x1, y, 0), (x0, y, 0), (x0, y, z), (x1, y, front_z)],
+        [(x1 - bevel, -y, z), (x0, -y, z), (x1, -y, front_z), (x1, -y, front_z)],
+        [(x0, y, z), (x1 - bevel, y, z), (x1, y, front_z), (x1, y, front_z)],
     ]
     return quads_mesh(quads, [cell_uv(0, 0, 1, 1)] * len(quads))
 
@@ -106,7 +103,23 @@ def _stove(b: Builder) -> Asset:
     b.collision("box", ((x1 - x0) / 2, _HALF_WIDTH, _TOP / 2), 3.5, ((x0 + x1) / 2, 0, _TOP / 2))
     half = 0.5 * (_BURNER_TOP - _TOP)
     b.collision("cylinder", (_BURNER_RADIUS, half), 0.3, (_BURNER, 0, _TOP + half))
+    articulation = _knob(b, black, ridge)
+    cook = b.site("cook_region", (_BURNER, 0, _BURNER_TOP - 0.001), (0.085, 0.085, 0.001), box=True)
+    asset = b.fixture(
+        low=(-_KNOB_RADIUS, -_HALF_WIDTH, 0),
+        high=(x1, _HALF_WIDTH, _RIDGE_TOP),
+        regions={"cook_region": cook},
+        articulations={"": articulation},
+        supports=_BURNER_TOP,
+        clear=_BURNER_RADIUS,
+        glow=(glowing.name,),
+    )
+    glowing.rgba = list(asset.glow_off)
+    return asset
 
+
+def _knob(b: Builder, black: str, ridge: str) -> Articulation:
+    """Add the knob with its joint."""
     knob = b.child("knob")
     joint = b.joint(knob, "button", "hinge", (0, 0, 1), BUTTON_RANGE, damping=0.2, frictionloss=0.05)
     b.visual_mesh(b.mesh("stove_knob", _knob_mesh), black, body=knob)
@@ -114,32 +127,16 @@ def _stove(b: Builder) -> Asset:
     b.collision("cylinder", (_KNOB_RADIUS, _KNOB_BASE / 2 - 0.0005), 0.1, (0, 0, _KNOB_BASE / 2 + 0.0005), body=knob)
     rise = 0.5 * (_RIDGE_TOP - _KNOB_BASE)
     b.collision("box", (*_RIDGE, rise), 0.05, (0, 0, _KNOB_BASE + rise), body=knob, friction=GRIP_FRICTION)
-    handle = b.site("button_handle", (0, 0, _RIDGE_TOP - 0.02), body=knob)
-    cook = b.site("cook_region", (_BURNER, 0, _BURNER_TOP - 0.001), (0.085, 0.085, 0.001), box=True)
-    asset = b.fixture(
-        low=(-_KNOB_RADIUS, -_HALF_WIDTH, 0),
-        high=(x1, _HALF_WIDTH, _RIDGE_TOP),
-        regions={"cook_region": cook},
-        articulations=MappingProxyType(
-            {
-                "": Articulation(
-                    joint=joint,
-                    kind="knob",
-                    closed_q=BUTTON_RANGE[0],
-                    open_q=1.0,
-                    handle_site=handle,
-                    handle=Handle(2 * _RIDGE[0], (2 * _RIDGE[1], _RIDGE_TOP - _KNOB_BASE), 0.03),
-                    on_at_least=0.5,
-                    off_below=0.0,
-                )
-            }
-        ),
-        supports=_BURNER_TOP,
-        clear=_BURNER_RADIUS,
-        glow=(glowing.name,),
+    return Articulation(
+        joint=joint,
+        kind="knob",
+        closed_q=BUTTON_RANGE[0],
+        open_q=1.0,
+        handle_site=b.site("button_handle", (0, 0, _RIDGE_TOP - 0.02), body=knob),
+        handle=Handle(2 * _RIDGE[0], (2 * _RIDGE[1], _RIDGE_TOP - _KNOB_BASE), 0.03),
+        on_at_least=0.5,
+        off_below=0.0,
     )
-    glowing.rgba = list(asset.glow_off)
-    return asset
 
 
 BUILDERS: dict[str, Callable[[Builder], Asset]] = {"flat_stove": _stove}

@@ -6,11 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from lerobot_memobench.sim.assets.base import GRIP_FRICTION, Asset, Builder
+from lerobot_memobench.sim.assets.asset import ALONG_X, ALONG_Y, Asset
+from lerobot_memobench.sim.assets.builder import GRIP_FRICTION, Builder
 from lerobot_memobench.sim.assets.meshes import Block, Floats, MeshData, blocks, box, lathe, tube
 from lerobot_memobench.sim.assets.paint import Canvas, Colour, Pixels, atlas, drawn
-
-HALF_PI = float(np.pi / 2)
 
 # Charger: a plug lying on its back, prongs to -x, the port to +x, with a coiled cable on top.
 _CHARGER = (0.024, 0.021, 0.019)  # half sizes of the plug
@@ -62,9 +61,9 @@ def _charger(b: Builder) -> Asset:
     b.visual_mesh(b.mesh("charger_cable", _cable, smooth=True), dark)
     b.collision("box", _CHARGER, 0.06, friction=GRIP_FRICTION)
     b.collision("box", (0.0085, 0.0087, 0.0035), 0.004, (-x - 0.0085, 0, 0))
-    b.grasp((0, 0, 0), HALF_PI, 2 * y, depth=0.012)
+    b.grasp((0, 0, 0), ALONG_Y, 2 * y, depth=0.012)
     # Lengthwise, by the prongs' ends and the port's side: for a hand that must not close towards a drawer.
-    b.grasp((-0.0085, 0, 0), 0.0, 2 * x + 0.017, depth=0.012)
+    b.grasp((-0.0085, 0, 0), ALONG_X, 2 * x + 0.017, depth=0.012)
     return b.object((-x - 0.017, -y, -z), (x + 0.0235, y + 0.0125, z))
 
 
@@ -103,7 +102,7 @@ def _cap(b: Builder) -> Asset:
     radius, half = _CAP
     b.visual_mesh(b.mesh("cap", _cap_mesh), b.material("cap", _cap_texture, specular=0.5, shininess=0.5))
     b.collision("cylinder", (radius, half), 0.03, friction=GRIP_FRICTION)
-    b.grasp((0, 0, 0), 0.0, 2 * radius, symmetric=True, depth=0.008)
+    b.grasp((0, 0, 0), ALONG_X, 2 * radius, symmetric=True, depth=0.008)
     return b.object((-radius, -radius, -half), (radius, radius, half), round=True)
 
 
@@ -140,7 +139,7 @@ def _cork(b: Builder) -> Asset:
     top, bottom, half = _CORK
     b.visual_mesh(b.mesh("cork", _cork_mesh), b.material("cork", _cork_texture, specular=0.05, shininess=0.1))
     b.collision("cylinder", (bottom, half), 0.015, friction=GRIP_FRICTION)
-    b.grasp((0, 0, 0.004), 0.0, 2 * bottom, symmetric=True, depth=0.015)
+    b.grasp((0, 0, 0.004), ALONG_X, 2 * bottom, symmetric=True, depth=0.015)
     return b.object((-top, -top, -half), (top, top, half), round=True)
 
 

@@ -26,7 +26,8 @@ from lerobot_memobench.evaluation.records.runs import folder_names, read_rollout
 from lerobot_memobench.tasks.catalogue import find_tasks, get_task, task_names
 from lerobot_memobench.tasks.failures import FAILURES
 from lerobot_memobench.tasks.formula import format_formula
-from lerobot_memobench.tasks.task import LEVELS, MEMORY_TYPES, Task, load_task
+from lerobot_memobench.tasks.loading import load_task
+from lerobot_memobench.tasks.task import LEVELS, MEMORY_TYPES, Task
 
 FPS = 20
 """Control steps per second (paper, section 5.1), and frames per second of the films."""

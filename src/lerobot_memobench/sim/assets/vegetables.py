@@ -1,4 +1,4 @@
-"""Vegetables, a nut and a biscuit. Each fits the gripper across and the drawer in height.
+"""Vegetables: tomato, artichoke, broccoli, Brussels sprout. Each fits the gripper across and the drawer in height.
 
 Contacts have flat bottoms, so that nothing rolls.
 """
@@ -10,11 +10,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from lerobot_memobench.sim.assets.base import GRIP_FRICTION, Asset, Builder
-from lerobot_memobench.sim.assets.meshes import Floats, MeshData, ball, lathe, merged, tube
+from lerobot_memobench.sim.assets.asset import ALONG_X, Asset
+from lerobot_memobench.sim.assets.builder import GRIP_FRICTION, Builder
+from lerobot_memobench.sim.assets.meshes import Floats, MeshData, ball, grid_faces, lathe, merged, tube
 from lerobot_memobench.sim.assets.paint import Canvas, Pixels, drawn
-
-HALF_PI = float(np.pi / 2)
 
 
 def _plain(mesh: MeshData) -> MeshData:
@@ -67,7 +66,7 @@ def _tomato(b: Builder) -> Asset:
     b.visual_mesh(b.mesh("tomato_calyx", _calyx_mesh), green)
     radius, half = _TOMATO
     _round_contacts(b, radius, half, 0.10)
-    b.grasp((0, 0, 0), 0.0, 2 * radius, symmetric=True, depth=0.008)
+    b.grasp((0, 0, 0), ALONG_X, 2 * radius, symmetric=True, depth=0.008)
     return b.object((-radius, -radius, -half), (radius, radius, half + 0.002), round=True)
 
 
@@ -131,7 +130,7 @@ def _artichoke(b: Builder) -> Asset:
         b.material("artichoke", _artichoke_texture, specular=0.15, shininess=0.3),
     )
     _round_contacts(b, 0.94 * radius, half, 0.10)
-    b.grasp((0, 0, 0), 0.0, 1.88 * radius, symmetric=True, depth=0.010)
+    b.grasp((0, 0, 0), ALONG_X, 1.88 * radius, symmetric=True, depth=0.010)
     return b.object((-radius, -radius, -half), (radius, radius, half), round=True)
 
 
@@ -181,7 +180,7 @@ def _broccoli(b: Builder) -> Asset:
     b.collision("cylinder", (0.0140, 0.5 * half), 0.06, (0, 0, -0.5 * half))
     b.collision("cylinder", (0.94 * radius, 0.010), 0.03, (0, 0, 0.1 * half), friction=GRIP_FRICTION)
     b.collision("cylinder", (0.6 * radius, 0.4 * half), 0.01, (0, 0, 0.6 * half))
-    b.grasp((0, 0, 0.1 * half), 0.0, 1.88 * radius, symmetric=True, depth=0.012)
+    b.grasp((0, 0, 0.1 * half), ALONG_X, 1.88 * radius, symmetric=True, depth=0.012)
     return b.object((-radius, -radius, -half), (radius, radius, half), round=True)
 
 
@@ -193,7 +192,7 @@ def _sprout_leaf(angle: float, tilt: float, wide: float, out: float) -> MeshData
     """Return a leaf that wraps the ball from below and stands off at its edge."""
     radius, half = _SPROUT
     columns, rows = 5, 4
-    vertices, uv, faces = [], [], []
+    vertices, uv = [], []
     for i in range(rows + 1):
         elevation = -1.15 + (tilt + 1.15) * i / rows
         share = np.sqrt(max(0.02, 1 - (i / rows) ** 2.2)) if i == rows else 1.0
@@ -210,12 +209,7 @@ def _sprout_leaf(angle: float, tilt: float, wide: float, out: float) -> MeshData
                 )
             )
             uv.append((0.5 + 0.48 * across, 0.98 - 0.96 * i / rows))
-    for i in range(rows):
-        for j in range(columns):
-            p = i * (columns + 1) + j
-            q = p + columns + 1
-            faces += [(p, p + 1, q + 1), (p, q + 1, q)]
-    return MeshData(np.array(vertices), np.array(faces), np.array(uv))
+    return MeshData(np.array(vertices), np.array(grid_faces(columns, rows)), np.array(uv))
 
 
 def _sprout_mesh() -> MeshData:
@@ -252,95 +246,7 @@ def _sprout(b: Builder) -> Asset:
         b.material("brussels_sprout", _sprout_texture, specular=0.25, shininess=0.4),
     )
     _round_contacts(b, radius, half, 0.05, foot=0.55)
-    b.grasp((0, 0, 0), 0.0, 2 * radius, symmetric=True, depth=0.008)
-    return b.object((-radius, -radius, -half), (radius, radius, half), round=True)
-
-
-# Chestnut --------------------------------------------------------------------------------------
-_CHESTNUT = (0.0195, 0.0235, 0.0180)
-
-
-def _chestnut_mesh() -> MeshData:
-    x, y, half = _CHESTNUT
-    profile = [(0.0, -half), (0.62, -half), (0.90, -0.72 * half), (1.0, -0.25 * half), (0.93, 0.20 * half)]
-    profile += [(0.70, 0.60 * half), (0.38, 0.80 * half), (0.13, 0.90 * half), (0.06, half), (0.0, half)]
-    return lathe(profile, 16, scale=(x, y))
-
-
-def _chestnut_texture() -> Pixels:
-    def paint(canvas: Canvas) -> None:
-        for k in range(40):
-            canvas.line((112, 50, 24), 0.006, k / 40, 0.08, k / 40 + 0.012, 0.68)
-        canvas.rect(0, 0, 1, 0.09, (226, 204, 160))
-        points: list[float] = []
-        for k in range(49):
-            points += [k / 48, 0.70 + 0.03 * float(np.sin(2 * np.pi * 3 * k / 48))]
-        canvas.shape((206, 172, 124), *points, 1, 1, 0, 1)
-
-    return drawn(192, 96, (92, 38, 18), paint)
-
-
-def _chestnut(b: Builder) -> Asset:
-    x, y, half = _CHESTNUT
-    b.visual_mesh(
-        b.mesh("chestnut", _chestnut_mesh, smooth=True),
-        b.material("chestnut", _chestnut_texture, specular=0.9, shininess=0.8),
-    )
-    b.collision("box", (x, 0.70 * y, 0.45 * half), 0.02, (0, 0, -0.15 * half), friction=GRIP_FRICTION)
-    b.collision("box", (0.70 * x, y, 0.45 * half), 0.01, (0, 0, -0.15 * half), friction=GRIP_FRICTION)
-    b.collision("cylinder", (0.60 * x, 0.90 * half), 0.01, (0, 0, -0.10 * half))
-    b.grasp((0, 0, -0.002), 0.0, 2 * x, depth=0.008)
-    b.grasp((0, 0, -0.002), HALF_PI, 2 * y, depth=0.008)
-    return b.object((-x, -y, -half), (x, y, half))
-
-
-# Biscuit ---------------------------------------------------------------------------------------
-_BISCUIT = (0.0290, 0.0115)
-
-
-def _biscuit_mesh() -> MeshData:
-    """Return two scalloped biscuits with cream between them."""
-    radius, half = _BISCUIT
-    profile = [
-        (0.0, -half),
-        (radius - 0.002, -half),
-        (radius, -half + 0.002),
-        (radius, -0.0030),
-        (radius - 0.003, -0.0025),
-    ]
-    profile += [(radius - 0.003, 0.0025), (radius, 0.0030), (radius, half - 0.002), (radius - 0.002, half)]
-    profile += [(0.55 * radius, half - 0.0008), (0.0, half - 0.0005)]
-
-    def scallop(points: Floats) -> Floats:
-        angle = np.arctan2(points[:, 1], points[:, 0])
-        points[:, :2] *= (0.975 + 0.025 * np.cos(np.round(angle * 16 / np.pi) * np.pi))[:, None]
-        return points
-
-    return lathe(profile, 32, by_length=True).warped(scallop)
-
-
-def _biscuit_texture() -> Pixels:
-    brown, gold = (150, 90, 36), (222, 166, 86)
-
-    def paint(canvas: Canvas) -> None:
-        # Rows: middle of the top, its holes and edge, the side with cream, the underside.
-        canvas.rect(0, 0.30, 1, 0.40, (206, 146, 70))
-        for k in range(10):
-            canvas.oval(k / 10 + 0.035, 0.245, k / 10 + 0.065, 0.285, brown)
-        for k in range(5):
-            canvas.oval(k / 5 + 0.06, 0.120, k / 5 + 0.14, 0.160, brown)
-        canvas.rect(0, 0.475, 1, 0.60, (250, 236, 206))
-
-    return drawn(256, 256, gold, paint)
-
-
-def _biscuit(b: Builder) -> Asset:
-    radius, half = _BISCUIT
-    b.visual_mesh(
-        b.mesh("biscuit", _biscuit_mesh), b.material("biscuit", _biscuit_texture, specular=0.1, shininess=0.2)
-    )
-    b.collision("cylinder", (radius, half), 0.04, friction=GRIP_FRICTION)
-    b.grasp((0, 0, 0), 0.0, 2 * radius, symmetric=True, depth=0.006)
+    b.grasp((0, 0, 0), ALONG_X, 2 * radius, symmetric=True, depth=0.008)
     return b.object((-radius, -radius, -half), (radius, radius, half), round=True)
 
 
@@ -349,6 +255,4 @@ BUILDERS: dict[str, Callable[[Builder], Asset]] = {
     "artichoke": _artichoke,
     "broccoli": _broccoli,
     "brussels_sprouts": _sprout,
-    "chestnut": _chestnut,
-    "biscuit": _biscuit,
 }

@@ -1,18 +1,13 @@
-"""What every asset is made of: a builder over ``mujoco.MjSpec`` and the facts about a finished asset.
+"""Builds objects and fixtures into a ``mujoco.MjSpec``.
 
 An asset is a function of a `Builder`: it adds visual geoms (group 1, without contacts or mass), collision
-geoms (group 0, which cameras never draw) and sites below one root body, and returns an `Asset`, the numbers
-that a scene, a predicate or an expert wants to know without asking MuJoCo.
-
-Frames: x of an asset points to the agentview camera when it is placed with yaw 0, z points up. The origin of
-an object is its geometric centre; that of a container (bowl, plate, pan) is the centre of its bottom, and
-that of a fixture is on the table top. Units are metres, kilograms and radians.
+geoms (group 0, which cameras never draw) and sites below one root body, and returns an `Asset`. For frames and
+units see `sim.assets.asset`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Literal
 
@@ -20,10 +15,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.sim.assets.meshes import MeshData
-
-Vector = Sequence[float] | NDArray[np.float64]
-Image = NDArray[np.uint8]
+from lerobot_memobench.sim.assets.asset import Articulation, Asset, Grasp
+from lerobot_memobench.sim.assets.shared_parts import SharedParts, Vector
 
 VISUAL_GROUP = 1
 COLLISION_GROUP = 0
@@ -36,122 +29,27 @@ FRICTION = (1.0, 0.02, 0.0005)
 ROLLING_FRICTION = 0.004
 GRIP_FRICTION = (1.8, 0.03, 0.0005)
 
-
-@dataclass(frozen=True)
-class Grasp:
-    """A top-down grasp: gripper pointing down, its closing axis level.
-
-    ``position``: where the middle between the finger tips goes, in the body's frame [m].
-    ``yaw``: angle of the closing axis about the body's z [rad]; 0 closes along the body's x.
-    ``width``: what is between the fingers [m].
-    ``symmetric``: the grasp may be turned about the body's z axis by any angle, position and axis together.
-    ``depth``: how far below ``position`` there is still something to hold [m]; fingers may reach that deep.
-    """
-
-    position: tuple[float, float, float]
-    yaw: float
-    width: float
-    symmetric: bool = False
-    depth: float = 0.01
+Primitive = Literal["box", "cylinder", "capsule", "ellipsoid", "sphere"]
+_TYPES: dict[Primitive, mujoco.mjtGeom] = {
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+    "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+}
 
 
-@dataclass(frozen=True)
-class Handle:
-    """A bar to pull or a ridge to turn, in the frame of its site: x along it, y into the fixture.
-
-    ``length``: along x [m]. ``thickness``: the bar's cross-section, y and z [m]. ``clearance``: free space
-    behind the bar [m].
-    """
-
-    length: float
-    thickness: tuple[float, float]
-    clearance: float
-
-
-@dataclass(frozen=True)
-class Articulation:
-    """A joint that predicates read and experts move.
-
-    Drawers and doors are open when q < ``open_below`` and closed when q > ``closed_above``; knobs are on when
-    q >= ``on_at_least`` and off when q < ``off_below``. ``closed_q`` and ``open_q`` are good targets for q
-    (off and on for a knob). ``handle_site``: full name of the site at the handle's middle, which moves along.
-    """
-
-    joint: str
-    kind: Literal["drawer", "door", "knob"]
-    closed_q: float
-    open_q: float
-    handle_site: str
-    handle: Handle
-    open_below: float | None = None
-    closed_above: float | None = None
-    on_at_least: float | None = None
-    off_below: float | None = None
-
-
-@dataclass(frozen=True)
-class Asset:
-    """What is known of one built instance.
-
-    ``low`` and ``high``: corners of the bounding box in the body's frame [m], joints at their closed pose.
-    ``regions``: region name (``top_region``, ``cook_region``, ...) -> full name of its box site.
-    ``articulations``: region name, or ``""`` for the fixture as a whole -> its joint.
-    ``supports``: height in the body's frame of the surface on which things are put: a bowl's floor, the top
-    of anything else [m]; ``clear_radius``: radius of that surface [m].
-    ``glow``: full names of visual geoms whose rgba is ``glow_on`` while the fixture is on, else ``glow_off``.
-    ``round``: the outline from above is a circle about the origin.
-    """
-
-    name: str
-    class_name: str
-    kind: Literal["object", "fixture"]
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
-    grasps: tuple[Grasp, ...] = ()
-    articulations: Mapping[str, Articulation] = field(default_factory=lambda: MappingProxyType({}))
-    regions: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
-    supports: float = 0.0
-    clear_radius: float = 0.0
-    glow: tuple[str, ...] = ()
-    glow_on: tuple[float, float, float, float] = (1.0, 0.12, 0.04, 1.0)
-    glow_off: tuple[float, float, float, float] = (0.34, 0.34, 0.35, 1.0)
-    round: bool = False
-
-    @property
-    def bottom(self) -> float:
-        """z of the lowest point in the body's frame [m], 0 or below."""
-        return self.low[2]
-
-    @property
-    def top(self) -> float:
-        """z of the highest point in the body's frame [m]."""
-        return self.high[2]
-
-    @property
-    def half_extents(self) -> tuple[float, float]:
-        """Half the size of the smallest origin-centred rectangle around the asset, x and y [m]."""
-        return (max(-self.low[0], self.high[0]), max(-self.low[1], self.high[1]))
-
-    @property
-    def radius(self) -> float:
-        """Radius about the origin, seen from above, that holds everything [m]."""
-        if self.round:
-            return max(self.half_extents)
-        return float(np.hypot(*self.half_extents))
-
-
-class Builder:
+class Builder(SharedParts):
     """Builds one instance of an asset into a shared ``MjSpec``.
 
-    Textures, materials and meshes are memoised by key in the spec: nine cartons share one of each. Bodies,
-    geoms, joints and sites are named ``f"{name}_{suffix}"``.
+    Bodies, geoms, joints and sites are named ``f"{name}_{suffix}"``.
     """
 
     def __init__(
         self, spec: mujoco.MjSpec, parent: mujoco.MjsBody, name: str, class_name: str, variant: int = 0
     ) -> None:
         """Add the root body ``name`` below ``parent``; the scene places it and frees objects with a joint."""
-        self.spec = spec
+        super().__init__(spec)
         self.name = name
         self.class_name = class_name
         self.variant = variant
@@ -167,56 +65,6 @@ class Builder:
     def _fresh(self, kind: str) -> str:
         self._counts[kind] = self._counts.get(kind, -1) + 1
         return self.full(f"{kind}{self._counts[kind]}")
-
-    # shared parts ------------------------------------------------------------------------------
-    def material(
-        self,
-        key: str,
-        image: Callable[[], Image] | None = None,
-        rgba: Vector = (1.0, 1.0, 1.0, 1.0),
-        specular: float = 0.2,
-        shininess: float = 0.3,
-        reflectance: float = 0.0,
-        emission: float = 0.0,
-    ) -> str:
-        """Return the name of the material ``key``, made on first use; ``image`` draws its texture."""
-        name = f"memobench_{key}"
-        if self.spec.material(name) is not None:
-            return name
-        made = self.spec.add_material(name=name, rgba=list(rgba), specular=specular, shininess=shininess)
-        made.reflectance = reflectance
-        made.emission = emission
-        if image is not None:
-            pixels = np.ascontiguousarray(image(), dtype=np.uint8)
-            texture = self.spec.add_texture(
-                name=name,
-                type=mujoco.mjtTexture.mjTEXTURE_2D,
-                height=pixels.shape[0],
-                width=pixels.shape[1],
-                nchannel=3,
-            )
-            texture.data = pixels.tobytes()
-            made.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
-        return name
-
-    def mesh(self, key: str, make: Callable[[], MeshData], smooth: bool = False) -> str:
-        """Return the name of the mesh ``key``, made on first use; ``smooth`` shades sharp edges as round."""
-        name = f"memobench_{key}"
-        if self.spec.mesh(name) is not None:
-            return name
-        data = make()
-        made = self.spec.add_mesh(
-            name=name,
-            uservert=data.vertices.astype(np.float32).ravel(),
-            userface=data.faces.astype(np.int32).ravel(),
-            smoothnormal=smooth,
-        )
-        made.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-        if data.uv is not None:
-            made.usertexcoord = data.uv.astype(np.float32).ravel()
-            indices = data.faces if data.uv_faces is None else data.uv_faces
-            made.userfacetexcoord = indices.astype(np.int32).ravel()
-        return name
 
     # bodies and joints -------------------------------------------------------------------------
     def child(self, suffix: str, pos: Vector = (0.0, 0.0, 0.0), quat: Vector | None = None) -> mujoco.MjsBody:
@@ -282,7 +130,7 @@ class Builder:
 
     def visual(
         self,
-        kind: Literal["box", "cylinder", "capsule", "ellipsoid", "sphere"],
+        kind: Primitive,
         size: Vector,
         material: str,
         pos: Vector = (0.0, 0.0, 0.0),
@@ -306,7 +154,7 @@ class Builder:
 
     def collision(
         self,
-        kind: Literal["box", "cylinder", "capsule", "ellipsoid", "sphere"],
+        kind: Primitive,
         size: Vector,
         mass: float,
         pos: Vector = (0.0, 0.0, 0.0),
@@ -434,15 +282,6 @@ class Builder:
             clear_radius=clear,
             glow=glow,
         )
-
-
-_TYPES = {
-    "box": mujoco.mjtGeom.mjGEOM_BOX,
-    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
-    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
-    "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
-    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
-}
 
 
 def _size(size: Vector) -> list[float]:

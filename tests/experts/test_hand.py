@@ -1,13 +1,11 @@
-"""What experts compute without a simulator: rotations of the hand, steps of a plan."""
+"""Vectors and rotations of the hand."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from lerobot_memobench.experts.expert import steps_of
 from lerobot_memobench.experts.hand import DOWN, EASY_CLOSING, cross, downward, frame, length, unit
-from lerobot_memobench.tasks.formula import Atom, atoms, parse_formula
 
 
 @pytest.fixture
@@ -41,20 +39,3 @@ def test_downward_closes_along_the_angle_the_easy_way_round(yaw: float) -> None:
     np.testing.assert_allclose(turn[:, 2], DOWN, atol=1e-12)
     assert abs(turn[:, 0] @ [np.cos(yaw), np.sin(yaw), 0.0]) == pytest.approx(1.0)
     assert turn[:, 0] @ EASY_CLOSING > -1e-9
-
-
-def test_steps_are_the_atoms_in_order_without_what_must_not_be() -> None:
-    formula = parse_formula(
-        ["then", ["on", "a", "b"], ["and", ["not", ["on", "c", "b"]], ["close", "d"], ["then", ["wasopen", "e"]]]]
-    )
-    assert steps_of(formula) == [Atom("on", ("a", "b")), Atom("close", ("d",)), Atom("wasopen", ("e",))]
-
-
-def test_of_alternatives_the_first_is_done() -> None:
-    formula = parse_formula(["or", ["on", "a", "b"], ["on", "a", "c"]])
-    assert steps_of(formula) == [Atom("on", ("a", "b"))]
-
-
-def test_a_formula_without_negation_or_choice_is_done_whole() -> None:
-    formula = parse_formula(["and", ["wasturnedon", "s"], ["turnoff", "s"], ["in", "x", "y"]])
-    assert steps_of(formula) == list(atoms(formula))

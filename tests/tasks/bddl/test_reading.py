@@ -1,4 +1,4 @@
-"""The reader and writer of BDDL problems."""
+"""The reader of BDDL problems."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import re
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.tasks.bddl import Region, format_bddl, parse_bddl
-from lerobot_memobench.tasks.catalogue import get_task, task_names
+from lerobot_memobench.tasks.bddl.problem import Region
+from lerobot_memobench.tasks.bddl.reading import parse_bddl
 from lerobot_memobench.tasks.formula import And, Atom, Not
 
 
@@ -57,15 +57,6 @@ def test_optional_sections(bddl: str) -> None:
     problem = parse_bddl(bddl.replace("(:domain robosuite)", "").replace("(:obj_of_interest cup_1 box_1)", ""))
     assert problem.domain == ""
     assert problem.objects_of_interest == ()
-
-
-def test_print_and_parse_give_the_same_problem(bddl: str) -> None:
-    problem = parse_bddl(bddl)
-    assert parse_bddl(format_bddl(problem, "a comment (with parentheses)")) == problem
-    for name in task_names():
-        task = get_task(name)
-        problem = parse_bddl(task.bddl_text, name)
-        assert parse_bddl(format_bddl(problem)) == problem
 
 
 MALFORMED = [

@@ -6,11 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.assets import registry
-from lerobot_memobench.sim.assets.base import Asset, Builder
+from lerobot_memobench.sim.assets.asset import Asset
 from lerobot_memobench.sim.assets.kitchen import TABLE_SIZE, TABLE_TOP, build_kitchen
-from lerobot_memobench.sim.assets.registry import build_asset, known_classes, register
+from lerobot_memobench.sim.assets.registry import build_asset, known_classes
 
 OBJECTS = {
     "akita_black_bowl",
@@ -394,22 +393,3 @@ def test_kitchen() -> None:
     assert len(tops) == 1
     np.testing.assert_allclose(2 * model.geom_size[tops[0]], TABLE_SIZE)
     assert data.geom_xpos[tops[0]][2] + model.geom_size[tops[0]][2] == pytest.approx(TABLE_TOP)
-
-
-def test_unknown_class_names_the_nearest() -> None:
-    spec = mujoco.MjSpec()
-    with pytest.raises(MemobenchError, match="microwave"):
-        build_asset(spec, spec.worldbody, "oven_1", "microwav")
-
-
-def test_registered_builder_goes_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "_builders", dict(registry._builders))
-
-    def cube(b: Builder) -> Asset:
-        b.collision("box", (0.01, 0.01, 0.01), 0.01)
-        return b.object((-0.01, -0.01, -0.01), (0.01 * b.variant, 0.01, 0.01))
-
-    register("cork__3", cube)
-    spec = mujoco.MjSpec()
-    assert build_asset(spec, spec.worldbody, "a", "cork__3").high[0] == pytest.approx(0.03)
-    assert build_asset(spec, spec.worldbody, "b", "cork__1").high[0] != pytest.approx(0.01)

@@ -11,10 +11,11 @@ import pytest
 
 from lerobot_memobench.envs.episode import EXECUTION, Episode
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.experts.expert import Expert
+from lerobot_memobench.experts.expert import Expert, steps_of
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.formula import Atom, parse_formula
+from lerobot_memobench.tasks.formula import Atom, atoms
+from lerobot_memobench.tasks.formula_parsing import parse_formula
 from lerobot_memobench.tasks.task import Task
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
@@ -83,6 +84,23 @@ def sweep(tasks: list[Task], seeds: range, **settings: object) -> dict[str, list
 def with_goal(name: str, goal: list[object]) -> Task:
     """Return a task of one's own: the scene of another, a goal, no checkpoints."""
     return dataclasses.replace(get_task(name), goal=parse_formula(goal), checkpoints=())
+
+
+def test_steps_are_the_atoms_in_order_without_what_must_not_be() -> None:
+    formula = parse_formula(
+        ["then", ["on", "a", "b"], ["and", ["not", ["on", "c", "b"]], ["close", "d"], ["then", ["wasopen", "e"]]]]
+    )
+    assert steps_of(formula) == [Atom("on", ("a", "b")), Atom("close", ("d",)), Atom("wasopen", ("e",))]
+
+
+def test_of_alternatives_the_first_is_done() -> None:
+    formula = parse_formula(["or", ["on", "a", "b"], ["on", "a", "c"]])
+    assert steps_of(formula) == [Atom("on", ("a", "b"))]
+
+
+def test_a_formula_without_negation_or_choice_is_done_whole() -> None:
+    formula = parse_formula(["and", ["wasturnedon", "s"], ["turnoff", "s"], ["in", "x", "y"]])
+    assert steps_of(formula) == list(atoms(formula))
 
 
 @pytest.mark.parametrize(

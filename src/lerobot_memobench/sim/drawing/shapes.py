@@ -1,13 +1,6 @@
-"""What a camera can see of a model, as one list of triangles.
-
-MuJoCo draws geom by geom, each with its own state changes, and a shadow makes it draw everything three times. Here
-all visual geoms of a scene become one vertex array; where each stands and what it is made of is a small table that
-is sent anew for every frame. A frame is then three draw calls, whatever the number of geoms.
-"""
+"""The triangles of what MuJoCo knows as shapes: meshes, boxes, cylinders, spheres, ellipsoids, capsules."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -15,136 +8,19 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
 
-VISUAL_GROUP = 1
-"""Geoms of this group are seen; the others are for contacts."""
-LAYER_SIZE = 512
-"""Side to which textures are brought, pixels: the largest of the project's own."""
 ROUND = 32
 """Sides of cylinders and spheres."""
-ROWS = 5
-"""Texels per geom in the table: three rows of the pose, colour, material."""
 
-_DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], dtype=np.float32)
-"""A geom of this colour shows its material's, as in MuJoCo."""
-
-VERTEX = np.dtype([("position", "<f4", 3), ("normal", "<f4", 3), ("uv", "<f4", 2), ("geom", "<f4")])
-
-Floats = NDArray[np.float32]
 Triangles = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating], NDArray[np.integer]]
 """Positions (N, 3), normals (N, 3), texture coordinates (N, 2), triangles (M, 3)."""
 
 
-@dataclass(frozen=True)
-class DrawList:
-    """The triangles of a scene.
-
-    ``vertices``: structured array of `VERTEX`, in the frames of their geoms. ``indices``: three per triangle.
-    ``geoms``: model ids of the rows of the table. ``casting``: how many of the indices, from the first on, belong to
-    geoms that cast shadows. ``layers``: (L, LAYER_SIZE, LAYER_SIZE, 3) textures, the first one white.
-    """
-
-    vertices: NDArray[np.void]
-    indices: NDArray[np.uint32]
-    geoms: NDArray[np.int64]
-    casting: int
-    layers: NDArray[np.uint8]
-    materials: Floats
-
-    def table(self, model: mujoco.MjModel, data: mujoco.MjData) -> Floats:
-        """Return poses, colours and materials of the present state, (geoms, ROWS, 4)."""
-        table = np.empty((len(self.geoms), ROWS, 4), dtype=np.float32)
-        table[:, :3, :3] = data.geom_xmat[self.geoms].reshape(-1, 3, 3)
-        table[:, :3, 3] = data.geom_xpos[self.geoms]
-        table[:, 3] = colours(model, self.geoms)
-        table[:, 4] = self.materials
-        return table
-
-
-def build_draw_list(model: mujoco.MjModel, shadowless: tuple[str, ...] = ()) -> DrawList:
-    """Collect the visual geoms of a model.
-
-    Args:
-        model: a compiled scene.
-        shadowless: bodies that cast no shadow: drawn last, since they fill what the others leave free.
+def triangles_of(model: mujoco.MjModel, geom: int) -> Triangles:
+    """Return a geom's triangles in its own frame.
 
     Raises:
-        MemobenchError: for a visual geom of a shape that is not drawn here.
+        MemobenchError: for a shape that is not drawn here.
     """
-    bodies = {model.body(name).id for name in shadowless if _has_body(model, name)}
-    visual = [geom for geom in range(model.ngeom) if model.geom_group[geom] == VISUAL_GROUP]
-    background = [geom for geom in visual if int(model.geom_bodyid[geom]) in bodies]
-    casters = [geom for geom in visual if int(model.geom_bodyid[geom]) not in bodies]
-    # The table hides much of floor and walls, which were added before it.
-    order = casters + background[::-1]
-    parts, indices, start, casting = [], [], 0, 0
-    for row, geom in enumerate(order):
-        positions, normals, uv, triangles = _triangles(model, geom)
-        part = np.zeros(len(positions), dtype=VERTEX)
-        part["position"], part["normal"], part["uv"], part["geom"] = positions, normals, uv, row
-        parts.append(part)
-        indices.append((triangles + start).astype(np.uint32).ravel())
-        start += len(part)
-        casting += indices[-1].size if row < len(casters) else 0
-    layers, layer_of = _layers(model)
-    geoms = np.array(order, dtype=np.int64)
-    return DrawList(
-        np.concatenate(parts) if parts else np.zeros(0, VERTEX),
-        np.concatenate(indices) if indices else np.zeros(0, np.uint32),
-        geoms,
-        casting,
-        layers,
-        _materials(model, geoms, layer_of),
-    )
-
-
-def _has_body(model: mujoco.MjModel, name: str) -> bool:
-    return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) >= 0
-
-
-def colours(model: mujoco.MjModel, geoms: NDArray[np.int64]) -> Floats:
-    """Return the colours (N, 4) of geoms: their own where set, else their material's."""
-    rgba = model.geom_rgba[geoms]
-    material = model.geom_matid[geoms]
-    plain = (material >= 0) & np.all(rgba == _DEFAULT_RGBA, axis=1)
-    return np.where(plain[:, None], model.mat_rgba[np.maximum(material, 0)], rgba) if model.nmat else rgba
-
-
-def _materials(model: mujoco.MjModel, geoms: NDArray[np.int64], layer_of: dict[int, int]) -> Floats:
-    """Return specular, shininess exponent, emission and texture layer (N, 4); MuJoCo's defaults without material."""
-    rows = np.tile(np.array([0.5, 64.0, 0.0, 0.0], dtype=np.float32), (len(geoms), 1))
-    for row, geom in zip(rows, geoms, strict=True):
-        material = int(model.geom_matid[geom])
-        if material >= 0:
-            texture = int(model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB.value])
-            row[:] = (
-                model.mat_specular[material],
-                128.0 * model.mat_shininess[material],
-                model.mat_emission[material],
-                layer_of.get(texture, 0),
-            )
-    return rows
-
-
-def _layers(model: mujoco.MjModel) -> tuple[NDArray[np.uint8], dict[int, int]]:
-    """Return the two-dimensional textures at one size, and texture id → layer; layer 0 is white."""
-    from PIL import Image
-
-    layers: list[NDArray[np.uint8]] = [np.full((LAYER_SIZE, LAYER_SIZE, 3), 255, dtype=np.uint8)]
-    layer_of: dict[int, int] = {}
-    for texture in range(model.ntex):
-        if model.tex_type[texture] != mujoco.mjtTexture.mjTEXTURE_2D or model.tex_nchannel[texture] != 3:
-            continue
-        height, width = int(model.tex_height[texture]), int(model.tex_width[texture])
-        start = int(model.tex_adr[texture])
-        pixels = np.asarray(model.tex_data[start : start + 3 * height * width]).reshape(height, width, 3)
-        layer_of[texture] = len(layers)
-        # At its own size this leaves every pixel as it is.
-        resized = Image.fromarray(pixels).resize((LAYER_SIZE, LAYER_SIZE), Image.Resampling.BICUBIC)
-        layers.append(np.asarray(resized))
-    return np.stack(layers), layer_of
-
-
-def _triangles(model: mujoco.MjModel, geom: int) -> Triangles:
     kind = mujoco.mjtGeom(int(model.geom_type[geom]))
     size = np.asarray(model.geom_size[geom])
     match kind:

@@ -1,0 +1,1 @@
+"""How fast is it? Claims measured beside stock robosuite, both sides in one run."""

@@ -1,0 +1,138 @@
+"""The two sides of a comparison: this simulator, and stock robosuite 1.4.1 with the same arm, cameras and sizes."""
+
+from __future__ import annotations
+
+import gc
+import logging
+import os
+import statistics
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.bench.machine import TASK, machine
+from lerobot_memobench.sim.rendering import RenderSettings, close_renderers, gl_backend
+from lerobot_memobench.sim.scene import CONTROL_HZ
+from lerobot_memobench.sim.simulation import CAMERAS, Simulation
+from lerobot_memobench.tasks.catalogue import get_task
+from lerobot_memobench.tasks.progress import Progress
+
+STOCK_CAMERAS = ["agentview", "robot0_eye_in_hand"]
+IMAGE_SIZE = 256
+
+Turn = Callable[[], float]
+"""Do the thing once and return how long it took, s."""
+
+
+class Ours:
+    """A step as the gym environment takes it: physics, checkpoints, proprioception and, if wanted, both images."""
+
+    def __init__(self, task: str = TASK, images: bool = True, quality: str = "default") -> None:
+        self.task = get_task(task)
+        self.sim = Simulation(self.task, RenderSettings(IMAGE_SIZE, IMAGE_SIZE, quality))
+        self.images = images
+        self.reset(0)
+
+    def look(self) -> list[NDArray[np.uint8]]:
+        """Return both images, if wanted."""
+        return [self.sim.render(camera) for camera in CAMERAS] if self.images else []
+
+    def reset(self, seed: int) -> None:
+        """Start the scene of a seed, stabilisation steps included."""
+        self.sim.reset(seed)
+        self.progress = Progress(self.task)
+        self.look()
+
+    def step(self, action: NDArray[np.float64]) -> None:
+        """Take one control step."""
+        self.sim.step(action)
+        self.progress.step(self.sim.holds)
+        self.sim.proprio()
+        self.look()
+
+
+# --- stock robosuite ---
+
+
+def stock_robosuite(images: bool = True) -> Any:
+    """Return robosuite's PickPlace as its documentation makes it, without its warnings."""
+    os.environ["MUJOCO_GL"] = gl_backend()
+    logging.getLogger("robosuite_logs").setLevel(logging.ERROR)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import robosuite
+        from robosuite.controllers import load_controller_config
+
+        return robosuite.make(
+            "PickPlace",
+            robots="Panda",
+            controller_configs=load_controller_config(default_controller="OSC_POSE"),
+            has_renderer=False,
+            has_offscreen_renderer=images,
+            use_camera_obs=images,
+            camera_names=STOCK_CAMERAS,
+            camera_heights=IMAGE_SIZE,
+            camera_widths=IMAGE_SIZE,
+            control_freq=CONTROL_HZ,
+            horizon=10**9,
+        )
+
+
+def make_current(env: Any) -> None:
+    """Make robosuite's GL context current; it takes for granted that nobody else draws."""
+    context = getattr(env.sim, "_render_context_offscreen", None)
+    if context is not None:
+        context.gl_ctx.make_current()
+
+
+@contextmanager
+def stock_open(images: bool) -> Iterator[Any]:
+    """Yield stock robosuite, and close both sides' GL contexts afterwards."""
+    machine()  # asks GL now, not while both sides have contexts open
+    env = stock_robosuite(images)
+    try:
+        env.reset()
+        yield env
+    finally:
+        # robosuite ends EGL for the whole process at exit; what is still open then could not be freed.
+        close_renderers()
+        close_stock(env)
+
+
+def close_stock(env: Any) -> None:
+    """Free robosuite's GL context while EGL still runs; left to the interpreter's exit it prints tracebacks."""
+    make_current(env)
+    env.close()
+    env.sim = None
+    gc.collect()
+
+
+# --- taking turns ---
+
+
+def actions() -> Iterator[NDArray[np.float64]]:
+    """Small movements around the start: both sides get the same ones."""
+    rng = np.random.default_rng(0)
+    while True:
+        yield rng.uniform(-0.3, 0.3, 7)
+
+
+def timed(do: Callable[[], Any]) -> float:
+    """Return the seconds that a call takes."""
+    start = time.perf_counter()
+    do()
+    return time.perf_counter() - start
+
+
+def alternate(ours: Turn, theirs: Turn, rounds: int, ours_per_round: int, theirs_per_round: int) -> tuple[float, float]:
+    """Return the median seconds of both sides, taken in turns."""
+    mine, other = [], []
+    for _ in range(rounds):
+        mine += [ours() for _ in range(ours_per_round)]
+        other += [theirs() for _ in range(theirs_per_round)]
+    return statistics.median(mine), statistics.median(other)

@@ -1,0 +1,197 @@
+"""Things in boxes and blocks, with labels that can be read: butter, oatmeal, cereal, flour, bean curd."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from lerobot_memobench.sim.assets.asset import ALONG_X, ALONG_Y, Asset
+from lerobot_memobench.sim.assets.builder import GRIP_FRICTION, Builder
+from lerobot_memobench.sim.assets.meshes import Half, MeshData, box
+from lerobot_memobench.sim.assets.paint import WHITE, Canvas, Colour, Pixels, atlas, drawn, wrapped
+
+
+def _package(
+    b: Builder,
+    key: str,
+    half: Half,
+    texture: Callable[[], Pixels],
+    mass: float,
+    shape: Callable[[Half], MeshData] = box,
+    gloss: float = 0.25,
+    widest: float = 0.066,
+) -> Asset:
+    """Build a box with a texture; it is held across every horizontal side of up to ``widest``, m."""
+    b.visual_mesh(b.mesh(key, lambda: shape(half)), b.material(key, texture, specular=gloss, shininess=0.4))
+    b.collision("box", half, mass, friction=GRIP_FRICTION)
+    x, y, z = half
+    # A finger reaches about 4 cm below the palm, and should not touch the table.
+    at = max(0.0, z - 0.032)
+    for yaw, width in sorted(((ALONG_X, 2 * x), (ALONG_Y, 2 * y)), key=lambda pair: pair[1]):
+        if width <= widest:
+            b.grasp((0, 0, at), yaw, width, depth=min(0.03, at + z - 0.004))
+    return b.object((-x, -y, -z), half)
+
+
+# Butter ----------------------------------------------------------------------------------------
+def _butter_texture() -> Pixels:
+    yellow: Colour = (250, 204, 62)
+    blue: Colour = (30, 70, 160)
+
+    def top(canvas: Canvas) -> None:
+        canvas.rect(0, 0, 1, 0.10, blue)
+        canvas.rect(0, 0.90, 1, 1, blue)
+        canvas.oval(0.10, 0.16, 0.90, 0.84, (255, 240, 180))
+        canvas.text("BUTTER", 0.24, 0.16, 0.76, 0.84, blue, turn=1)
+
+    def side(canvas: Canvas) -> None:
+        canvas.rect(0, 0, 0.1, 1, blue)
+        canvas.rect(0.9, 0, 1, 1, blue)
+        canvas.text("BUTTER", 0.15, 0.15, 0.85, 0.85, blue)
+
+    end = drawn(64, 32, yellow, lambda c: c.text("BUTTER", 0.08, 0.12, 0.92, 0.88, blue))
+    long = drawn(128, 32, yellow, side)
+    return atlas({"+z": drawn(96, 180, yellow, top), "+x": end, "-x": end, "+y": long, "-y": long}, yellow)
+
+
+def _butter(b: Builder) -> Asset:
+    # A little shorter than the published one, so that it can be taken by its ends where others lie close beside it.
+    return _package(b, "butter", (0.0358, 0.0195, 0.0090), _butter_texture, 0.06, widest=0.073)
+
+
+# Boxes -----------------------------------------------------------------------------------------
+def _oatmeal_bowl(canvas: Canvas) -> None:
+    canvas.oval(0.16, 0.54, 0.84, 0.74, (244, 226, 184))
+    canvas.oval(0.24, 0.57, 0.76, 0.70, (226, 192, 128))
+    canvas.shape((52, 98, 168), 0.16, 0.64, 0.84, 0.64, 0.68, 0.90, 0.32, 0.90)
+    for x, y in ((0.40, 0.60), (0.55, 0.63), (0.62, 0.595)):
+        canvas.oval(x, y, x + 0.07, y + 0.045, (60, 70, 150))
+
+
+def _oatmeal_texture() -> Pixels:
+    tan: Colour = (222, 186, 132)
+    brown: Colour = (110, 62, 26)
+    red: Colour = (188, 40, 36)
+
+    def front(canvas: Canvas) -> None:
+        canvas.rect(0, 0, 1, 0.36, red)
+        canvas.text("OATMEAL", 0.04, 0.06, 0.96, 0.32, WHITE)
+        canvas.rect(0, 0.36, 1, 0.39, WHITE)
+        _oatmeal_bowl(canvas)
+
+    def side(canvas: Canvas) -> None:
+        canvas.rect(0, 0, 1, 0.36, red)
+        canvas.rect(0, 0.36, 1, 0.39, WHITE)
+        canvas.text("OATMEAL", 0.30, 0.42, 0.70, 0.96, brown, turn=1)
+
+    top = drawn(96, 64, red, lambda c: c.text("OATMEAL", 0.06, 0.1, 0.94, 0.9, WHITE))
+    return wrapped(drawn(160, 224, tan, front), drawn(96, 224, tan, side), top, red)
+
+
+def _oatmeal(b: Builder) -> Asset:
+    return _package(b, "box_of_oatmeal", (0.0240, 0.0480, 0.0690), _oatmeal_texture, 0.18)
+
+
+def _cereal_loops(canvas: Canvas) -> None:
+    canvas.oval(0.08, 0.60, 0.92, 0.96, (240, 246, 250))
+    colours = ((220, 52, 48), (62, 160, 72), (240, 130, 30), (70, 110, 200))
+    spots = (
+        (0.18, 0.68),
+        (0.38, 0.63),
+        (0.58, 0.66),
+        (0.72, 0.74),
+        (0.28, 0.80),
+        (0.48, 0.76),
+        (0.56, 0.85),
+    )
+    for k, (x, y) in enumerate(spots):
+        canvas.oval(x, y, x + 0.13, y + 0.095, colours[k % 4])
+        canvas.oval(x + 0.045, y + 0.032, x + 0.085, y + 0.063, (240, 246, 250))
+
+
+def _cereal_texture() -> Pixels:
+    yellow: Colour = (252, 196, 38)
+    purple: Colour = (92, 42, 140)
+
+    def front(canvas: Canvas) -> None:
+        canvas.rect(0, 0.12, 1, 0.52, purple)
+        canvas.text("CEREAL", 0.04, 0.16, 0.96, 0.48, WHITE)
+        _cereal_loops(canvas)
+
+    def side(canvas: Canvas) -> None:
+        canvas.rect(0, 0.12, 1, 0.52, purple)
+        canvas.text("CEREAL", 0.25, 0.55, 0.75, 0.97, purple, turn=1)
+
+    top = drawn(96, 64, yellow, lambda c: c.text("CEREAL", 0.06, 0.1, 0.94, 0.9, purple))
+    return wrapped(drawn(160, 240, yellow, front), drawn(80, 240, yellow, side), top, yellow)
+
+
+def _cereal(b: Builder) -> Asset:
+    return _package(b, "box_of_cereal", (0.0210, 0.0500, 0.0720), _cereal_texture, 0.16)
+
+
+def _ear_of_wheat(canvas: Canvas) -> None:
+    gold: Colour = (204, 154, 52)
+    canvas.line(gold, 0.035, 0.5, 0.97, 0.5, 0.60)
+    for k in range(5):
+        y = 0.60 + 0.06 * k
+        canvas.shape(gold, 0.5, y + 0.07, 0.30, y + 0.02, 0.34, y - 0.03, 0.5, y + 0.03)
+        canvas.shape(gold, 0.5, y + 0.07, 0.70, y + 0.02, 0.66, y - 0.03, 0.5, y + 0.03)
+    canvas.oval(0.44, 0.53, 0.56, 0.62, gold)
+
+
+def _flour_texture() -> Pixels:
+    paper: Colour = (244, 236, 216)
+    blue: Colour = (38, 78, 148)
+
+    def front(canvas: Canvas) -> None:
+        canvas.rect(0, 0.10, 1, 0.46, blue)
+        canvas.text("FLOUR", 0.05, 0.14, 0.95, 0.42, WHITE)
+        _ear_of_wheat(canvas)
+
+    def side(canvas: Canvas) -> None:
+        canvas.rect(0, 0.10, 1, 0.46, blue)
+        canvas.text("FLOUR", 0.28, 0.50, 0.72, 0.96, blue, turn=1)
+
+    top = drawn(96, 64, paper, lambda c: c.text("FLOUR", 0.06, 0.1, 0.94, 0.9, blue))
+    return wrapped(drawn(160, 224, paper, front), drawn(112, 224, paper, side), top, paper)
+
+
+def _flour(b: Builder) -> Asset:
+    return _package(b, "box_of_flour", (0.0280, 0.0430, 0.0660), _flour_texture, 0.22)
+
+
+# Bean curd -------------------------------------------------------------------------------------
+def _bean_curd_texture() -> Pixels:
+    cream: Colour = (246, 240, 218)
+    green: Colour = (40, 130, 70)
+    rim: Colour = (224, 230, 226)
+
+    def top(canvas: Canvas) -> None:
+        canvas.rect(0.05, 0.05, 0.95, 0.95, cream)
+        canvas.rect(0.05, 0.30, 0.95, 0.72, green)
+        canvas.text("TOFU", 0.12, 0.34, 0.88, 0.68, WHITE)
+        for x in (0.28, 0.5, 0.72):
+            canvas.oval(x - 0.07, 0.77, x + 0.07, 0.89, (214, 196, 130))
+
+    def side(canvas: Canvas) -> None:
+        canvas.rect(0, 0, 1, 0.10, rim)
+        canvas.rect(0.34, 0.10, 0.66, 1, green)
+        for x in (0.17, 0.83):
+            canvas.line((226, 218, 192), 0.012, x, 0.12, x, 1)
+
+    edge = drawn(96, 64, cream, side)
+    faces = {"+z": drawn(128, 128, rim, top), "+x": edge, "-x": edge, "+y": edge, "-y": edge}
+    return atlas(faces, cream)
+
+
+def _bean_curd(b: Builder) -> Asset:
+    return _package(b, "bean_curd", (0.0250, 0.0300, 0.0175), _bean_curd_texture, 0.12)
+
+
+BUILDERS: dict[str, Callable[[Builder], Asset]] = {
+    "butter": _butter,
+    "box_of_oatmeal": _oatmeal,
+    "box_of_cereal": _cereal,
+    "box_of_flour": _flour,
+    "bean_curd": _bean_curd,
+}
