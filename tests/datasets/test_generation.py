@@ -19,10 +19,11 @@ from types import SimpleNamespace
 import dill
 import pytest
 
-from lerobot_memobench.datasets import generation, running
+from lerobot_memobench.datasets import generation
 from lerobot_memobench.datasets.generation import generate
 from lerobot_memobench.datasets.lerobot_format import is_dataset
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.jobs import processes
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
 
@@ -198,7 +199,7 @@ def test_a_worker_that_is_killed(tasks, recorded, tmp_path, monkeypatch):
         future.set_exception(BrokenProcessPool("gone"))
         return future
 
-    monkeypatch.setattr(running.ProcessPoolExecutor, "submit", submit)
+    monkeypatch.setattr(processes.ProcessPoolExecutor, "submit", submit)
     with pytest.raises(MemobenchError, match="one of 2 worker processes was killed"):
         run(tasks, tmp_path / "ds", workers=2)
     monkeypatch.undo()

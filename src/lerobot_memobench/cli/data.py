@@ -14,8 +14,8 @@ from lerobot_memobench.cli.console import console, counting
 from lerobot_memobench.errors import MemobenchError
 
 if TYPE_CHECKING:
-    from lerobot_memobench.datasets.running import Advance
     from lerobot_memobench.datasets.validate import Verdict
+    from lerobot_memobench.jobs.job import Advance
 
 
 def convert(

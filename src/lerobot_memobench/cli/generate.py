@@ -11,7 +11,8 @@ from lerobot_memobench.cli.console import console, counting
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 
 if TYPE_CHECKING:
-    from lerobot_memobench.datasets.generation import Advance, GenerationSummary
+    from lerobot_memobench.datasets.generation import GenerationSummary
+    from lerobot_memobench.jobs.job import Advance
 
 
 def generate(tasks: str, episodes: int, out: Path, **settings: Any) -> int:

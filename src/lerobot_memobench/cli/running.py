@@ -13,11 +13,11 @@ from lerobot_memobench.cli.arguments import Translation
 from lerobot_memobench.cli.evaluation import Evaluation, describe, logged, with_checkpoint
 from lerobot_memobench.cli.loop import calm_output, steered
 from lerobot_memobench.cli.plan import Range, task_names
-from lerobot_memobench.datasets.unfinished import locked
 from lerobot_memobench.engine.card import remove_card, with_episodes, write_card
 from lerobot_memobench.envs.episode_log import has_log, read_episodes
 from lerobot_memobench.evaluation.documents.report import REPORT_MARKDOWN
 from lerobot_memobench.evaluation.records.protocol import POLICY, read_protocol
+from lerobot_memobench.jobs.locking import locked
 
 CONTINUED = "continued-{}"
 """Folder of LeRobot's own files of a run that goes on: it would write over those of the first."""

@@ -19,9 +19,11 @@ from lerobot_memobench.cli.console import console, counting
 from lerobot_memobench.cli.evaluation import Evaluation, describe, logged
 from lerobot_memobench.cli.merging import merge_and_report
 from lerobot_memobench.cli.orders import Shard
-from lerobot_memobench.datasets.running import Advance, check_executor, run_jobs
 from lerobot_memobench.envs.episode_log import has_log
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.jobs.executors import check_executor
+from lerobot_memobench.jobs.job import Advance
+from lerobot_memobench.jobs.running import run_jobs
 
 LOGS = "logs"
 CHILD = "from lerobot_memobench.cli.shards import child; child()"

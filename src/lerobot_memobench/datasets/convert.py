@@ -24,10 +24,12 @@ from lerobot_memobench.datasets.lerobot_format import (
     is_dataset,
 )
 from lerobot_memobench.datasets.restore import NO_SEED, restore, task_of
-from lerobot_memobench.datasets.running import ProgressCallback, StagedJob, run_jobs, staged
-from lerobot_memobench.datasets.staging import EpisodeStage, clean_temporaries, stage_failure
-from lerobot_memobench.datasets.unfinished import check_request, compare_requests, locked
+from lerobot_memobench.datasets.staging import EpisodeStage, StagedJob, clean_temporaries, stage_failure, staged
+from lerobot_memobench.datasets.unfinished import check_request, compare_requests
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.jobs.job import ProgressCallback
+from lerobot_memobench.jobs.locking import locked
+from lerobot_memobench.jobs.running import run_jobs
 
 
 @dataclass(frozen=True)

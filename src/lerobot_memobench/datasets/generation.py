@@ -32,36 +32,27 @@ from lerobot_memobench.datasets.lerobot_format import (
     is_dataset,
 )
 from lerobot_memobench.datasets.mjcf import model_file
-from lerobot_memobench.datasets.running import Advance, ProgressCallback, StagedJob, check_executor, run_jobs, staged
 from lerobot_memobench.datasets.staging import (
     FORMATS,
     HDF5,
     LEROBOT,
     EpisodeStage,
     StagedEpisode,
+    StagedJob,
     clean_temporaries,
     stage_failure,
+    staged,
 )
-from lerobot_memobench.datasets.unfinished import REQUEST_FILE, check_request, compare_requests, locked
+from lerobot_memobench.datasets.unfinished import REQUEST_FILE, check_request, compare_requests
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.jobs.executors import check_executor
+from lerobot_memobench.jobs.job import ProgressCallback
+from lerobot_memobench.jobs.locking import locked
+from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import NO_OP
 from lerobot_memobench.tasks.task import Task
-
-__all__ = [
-    "FIRST_SEED",
-    "HOLD_FRAMES",
-    "Advance",
-    "Failure",
-    "GenerationSummary",
-    "ProgressCallback",
-    "RecordingSettings",
-    "TaskSummary",
-    "generate",
-    "record_demonstration",
-    "task_hash",
-]
 
 FIRST_SEED = 10_000
 """Demonstrations use the seeds 10,000 + i; evaluation uses 7 + i (paper, section 5.1)."""
@@ -306,7 +297,7 @@ def generate(
     ``out`` is continued (``resume=False`` starts anew), a finished one is only reported. Failed episodes are in no
     dataset, but in the summary, the manifest and the card.
 
-    ``executor`` says where ``workers`` episodes at a time are made (``running.EXECUTORS``); it changes nothing of
+    ``executor`` says where ``workers`` episodes at a time are made (``jobs.executors.EXECUTORS``); it changes nothing of
     the result. On Slurm the call returns when the jobs are submitted, the last of which writes the dataset.
 
     Raises:

@@ -232,6 +232,28 @@ def read_staged(folder: Path) -> StagedEpisode | None:
         ) from None
 
 
+class StagedJob:
+    """What jobs have in common that make one episode, complete or absent: two workers at the same one do no harm."""
+
+    folder: Path
+
+    def finished(self) -> bool:
+        """Whether the episode, or why there is none, is in ``folder``."""
+        return read_staged(self.folder) is not None
+
+    def failure(self) -> str | None:
+        """Why a finished job has no episode, or None."""
+        return staged(self).failure
+
+
+def staged(job: StagedJob) -> StagedEpisode:
+    """Return the finished episode of a job that has been run."""
+    found = read_staged(job.folder)
+    if found is None:
+        raise MemobenchError(f"{job.folder} has vanished while the run was going on; run the command again")
+    return found
+
+
 def clean_temporaries(folder: Path) -> None:
     """Remove what this machine's killed workers left in the folder of episodes; others may still be working."""
     for path in folder.glob(f"{TEMPORARY}{_host()}-*"):

@@ -14,8 +14,8 @@ from lerobot_memobench.datasets.hdf5 import PublishedFile, Unusable, find_files
 from lerobot_memobench.datasets.lerobot_format import is_dataset
 from lerobot_memobench.datasets.replay import read_episode, replay
 from lerobot_memobench.datasets.restore import restore, task_of
-from lerobot_memobench.datasets.running import process_pool
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.jobs.processes import process_pool
 from lerobot_memobench.tasks.task import Task
 
 
