@@ -337,7 +337,7 @@ def test_decoded_frames_are_what_the_simulator_shows(tmp_path):
     """Decode an episode's video and render its recorded states anew: the same pictures, frame by frame."""
     from lerobot.datasets import LeRobotDataset
 
-    from lerobot_memobench.envs.episode import IMAGE_KEYS
+    from lerobot_memobench.envs.observations import IMAGE_KEYS
     from lerobot_memobench.sim.simulation import Simulation
 
     task = get_task(STOVE)

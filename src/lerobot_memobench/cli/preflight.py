@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from lerobot_memobench import files
 from lerobot_memobench.cli.arguments import Translation
 from lerobot_memobench.engine.card import extended
 from lerobot_memobench.envs.episode_log import has_log
@@ -138,7 +139,9 @@ def warn(text: str) -> None:
 
 def remove_drafts(folder: Path) -> None:
     """Remove what a killed run was writing: whole files have names of their own. The caller holds the folder."""
-    for pattern in (".*.part", "*.part", f".{PROTOCOL_FILE}.*", "videos/.*.part"):
+    for part in (folder, folder / "videos"):
+        files.remove_drafts(part)
+    for pattern in (".*.part", "*.part", f".{PROTOCOL_FILE}.*", "videos/.*.part"):  # of earlier versions
         for draft in folder.glob(pattern):
             draft.unlink(missing_ok=True)
 
