@@ -101,7 +101,7 @@ class Frames:
         }
 
     def _decode(self, key: str, folder: Path, say: Say) -> np.ndarray:
-        from lerobot_memobench.datasets.memory_cache import _reader
+        from lerobot_memobench.datasets.memory_cache.decoding import frame_reader
 
         path = folder / f"{key}-{dataset_fingerprint(self.root, key)}.npy"
         if not path.is_file():
@@ -110,7 +110,7 @@ class Frames:
             part = path.with_suffix(".part")
             shape = (len(self.states), channels, height, width)
             store = np.lib.format.open_memmap(part, mode="w+", dtype=np.uint8, shape=shape)
-            read = _reader(self.root, key)
+            read = frame_reader(self.root, key)
             for episode, (first, last) in enumerate(zip(self.episodes[:-1], self.episodes[1:], strict=True)):
                 store[first:last] = (read(episode, list(range(last - first))) * 255).round().to(torch.uint8).numpy()
                 say(f"decoded {key}, episode {episode + 1} of {len(self.episodes) - 1}")
