@@ -19,9 +19,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels
-from lerobot_memobench.datasets.generation import HOLD_FRAMES, PATIENCE, generate, record_demonstration
+from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.digest import digest
+from lerobot_memobench.datasets.generation import generate
+from lerobot_memobench.datasets.labels import labels
 from lerobot_memobench.datasets.lerobot_format import is_dataset, write_dataset
+from lerobot_memobench.datasets.recording import HOLD_FRAMES, PATIENCE, record_demonstration
 from lerobot_memobench.datasets.replay import read_episode, replay
 from lerobot_memobench.datasets.validate import Verdict, exit_status, validate
 from lerobot_memobench.errors import MemobenchError

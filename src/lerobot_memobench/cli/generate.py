@@ -11,7 +11,7 @@ from lerobot_memobench.cli.console import console, counting
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 
 if TYPE_CHECKING:
-    from lerobot_memobench.datasets.generation import GenerationSummary
+    from lerobot_memobench.datasets.generation_summary import GenerationSummary
     from lerobot_memobench.jobs.job import Advance
 
 

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_memobench.datasets.card import ordered_types
-from lerobot_memobench.datasets.lerobot_format import MANIFEST_FILE, image_key, is_dataset
+from lerobot_memobench.datasets.lerobot_format.card_tables import ordered_types
+from lerobot_memobench.datasets.lerobot_format.layout import MANIFEST_FILE, image_key, is_dataset
 from lerobot_memobench.datasets.paper_figures import FAMILIES, LENGTH_BUCKETS
 from lerobot_memobench.errors import MemobenchError
 

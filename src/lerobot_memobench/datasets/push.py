@@ -11,7 +11,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lerobot_memobench.datasets.lerobot_format import HDF5_FOLDER, is_dataset
+from lerobot_memobench.datasets.lerobot_format.layout import HDF5_FOLDER, is_dataset
 from lerobot_memobench.errors import MemobenchError
 
 if TYPE_CHECKING:

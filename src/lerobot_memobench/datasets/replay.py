@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.datasets.demonstration import Demonstration, labels
+from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.labels import labels
 from lerobot_memobench.datasets.language import persistent_rows
-from lerobot_memobench.datasets.lerobot_format import is_dataset
+from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task

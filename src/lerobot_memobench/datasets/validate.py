@@ -10,10 +10,12 @@ from concurrent.futures import as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_memobench.datasets.hdf5 import PublishedFile, Unusable, find_files
-from lerobot_memobench.datasets.lerobot_format import is_dataset
+from lerobot_memobench.datasets.hdf5.layout import Unusable
+from lerobot_memobench.datasets.hdf5.published_task import task_of
+from lerobot_memobench.datasets.hdf5.reading import PublishedFile, find_files
+from lerobot_memobench.datasets.hdf5.restore import restore
+from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
 from lerobot_memobench.datasets.replay import read_episode, replay
-from lerobot_memobench.datasets.restore import restore, task_of
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.processes import process_pool
 from lerobot_memobench.tasks.task import Task
