@@ -26,8 +26,9 @@ from lerobot_memobench.datasets.hdf5.restore import restore
 from lerobot_memobench.datasets.hdf5.writing import write_task_file
 from lerobot_memobench.datasets.labels import labels
 from lerobot_memobench.datasets.lerobot_format import is_dataset, write_dataset
+from lerobot_memobench.datasets.lerobot_format.reading import read_episode
 from lerobot_memobench.datasets.recording import record_demonstration
-from lerobot_memobench.datasets.replay import read_episode, replay
+from lerobot_memobench.datasets.replay import replay
 from lerobot_memobench.datasets.staging.stage import stage_demonstration
 from lerobot_memobench.datasets.validate import validate
 from lerobot_memobench.errors import MemobenchError

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -194,14 +195,18 @@ class RecordingJob(StagedJob):
         except Exception as error:
             error.add_note(f"while recording {where}")
             raise
-        info = {
-            "task_name": self.task.name,
-            "memory_type": self.task.memory_type,
-            "seed": self.seed,
-            "referent": self.settings.referent,
-            "variant": demo.variant,
-            "success": False,
-            "frames": len(demo),
-            "scene_hash": demo.scene_hash,
-        }
-        stage_failure(info, reason, self.folder)
+        stage_failure(_failed_info(demo), reason, self.folder)
+
+
+def _failed_info(demo: Demonstration) -> dict[str, Any]:
+    """What is kept of a seed without a demonstration."""
+    return {
+        "task_name": demo.task.name,
+        "memory_type": demo.task.memory_type,
+        "seed": demo.seed,
+        "referent": demo.referent,
+        "variant": demo.variant,
+        "success": False,
+        "frames": len(demo),
+        "scene_hash": demo.scene_hash,
+    }
