@@ -34,11 +34,14 @@ import av
 import numpy as np
 
 from lerobot_memobench.datasets.convert import convert
-from lerobot_memobench.datasets.demonstration import CAMERAS, FPS, Demonstration, labels
-from lerobot_memobench.datasets.generation import FIRST_SEED, generate, record_demonstration
-from lerobot_memobench.datasets.hdf5 import PublishedFile, write_task_file
+from lerobot_memobench.datasets.demonstration import CAMERAS, FPS, Demonstration
+from lerobot_memobench.datasets.generation import FIRST_SEED, generate
+from lerobot_memobench.datasets.hdf5.reading import PublishedFile
+from lerobot_memobench.datasets.hdf5.writing import write_task_file
+from lerobot_memobench.datasets.labels import labels
 from lerobot_memobench.datasets.lerobot_format import dataset_features, image_key, write_dataset
-from lerobot_memobench.datasets.staging import stage_demonstration
+from lerobot_memobench.datasets.recording import record_demonstration
+from lerobot_memobench.datasets.staging.stage import stage_demonstration
 from lerobot_memobench.tasks import get_task
 
 TASK = "turn_on_the_stove_and_turn_it_off"

@@ -73,8 +73,9 @@ def main() -> None:
 
 def record(root: Path) -> Path:
     """Record two episodes and write them as a dataset."""
-    from lerobot_memobench.datasets.generation import FIRST_SEED, record_demonstration
+    from lerobot_memobench.datasets.generation import FIRST_SEED
     from lerobot_memobench.datasets.lerobot_format import write_dataset
+    from lerobot_memobench.datasets.recording import record_demonstration
     from lerobot_memobench.tasks import get_task
 
     task = get_task(TASK)

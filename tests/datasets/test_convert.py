@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,14 +17,19 @@ import pytest
 
 from lerobot_memobench.datasets import convert as convert_module
 from lerobot_memobench.datasets.convert import convert
-from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels
-from lerobot_memobench.datasets.generation import record_demonstration
-from lerobot_memobench.datasets.hdf5 import PublishedFile, write_task_file
+from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.digest import digest
+from lerobot_memobench.datasets.hdf5.mjcf import model_file, read_fixture_poses
+from lerobot_memobench.datasets.hdf5.published_task import task_of
+from lerobot_memobench.datasets.hdf5.reading import PublishedFile
+from lerobot_memobench.datasets.hdf5.restore import restore
+from lerobot_memobench.datasets.hdf5.writing import write_task_file
+from lerobot_memobench.datasets.labels import labels
 from lerobot_memobench.datasets.lerobot_format import is_dataset, write_dataset
-from lerobot_memobench.datasets.mjcf import model_file, read_fixture_poses
-from lerobot_memobench.datasets.replay import read_episode, replay
-from lerobot_memobench.datasets.restore import restore, task_of
-from lerobot_memobench.datasets.staging import stage_demonstration
+from lerobot_memobench.datasets.lerobot_format.reading import read_episode
+from lerobot_memobench.datasets.recording import record_demonstration
+from lerobot_memobench.datasets.replay import replay
+from lerobot_memobench.datasets.staging.stage import stage_demonstration
 from lerobot_memobench.datasets.validate import validate
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks import get_task
@@ -243,6 +249,32 @@ def test_the_rest_converts(source, stove, tmp_path):
     again = convert(source, tmp_path / "ds")
     assert (again.episodes, again.problems) == (summary.episodes, summary.problems)
     np.testing.assert_array_equal(read_episode(tmp_path / "ds", 0).columns["action"], stove.actions)
+
+
+@pytest.mark.parametrize(
+    ("attribute", "value"),
+    [
+        ("memory_type", "{outside}"),
+        ("memory_type", "../../outside"),
+        ("memory_type", "two\nlines"),
+        ("bddl_file_name", "tasks/.hidden/task_config.bddl"),
+    ],
+)
+def test_no_name_in_a_file_leads_out_of_the_folder(source, tmp_path, monkeypatch, attribute, value):
+    """The bad file is named, the others are converted, and nothing is written where the name leads."""
+    outside, temporary = tmp_path / "outside", tmp_path / "temporary"
+    outside.mkdir()
+    temporary.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    with h5py.File(source / f"{BUTTER}_demo.hdf5", "a") as file:
+        file["data"].attrs[attribute] = value.format(outside=outside)
+    summary = convert(source, tmp_path / "ds")
+    assert summary.episodes == 2
+    assert [(problem.file, problem.group) for problem in summary.problems] == [
+        (f"{BUTTER}_demo.hdf5", f"data/demo_{k}") for k in range(2)
+    ]
+    assert all("names no file" in problem.reason for problem in summary.problems)
+    assert list(outside.iterdir()) == []
 
 
 def test_images_that_cannot_be_read_are_a_problem_of_their_group(source, tmp_path):

@@ -19,10 +19,11 @@ from types import SimpleNamespace
 import dill
 import pytest
 
-from lerobot_memobench.datasets import generation, running
+from lerobot_memobench.datasets import generation, recording
 from lerobot_memobench.datasets.generation import generate
 from lerobot_memobench.datasets.lerobot_format import is_dataset
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.jobs import processes
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
 
@@ -54,9 +55,9 @@ def recorded(make_demo, monkeypatch):
         progress = SimpleNamespace(index=1, steps=1200)
         return SimpleNamespace(task=task, prompt_shown=None, horizon=1200, progress=progress, referent="fixed")
 
-    monkeypatch.setattr(generation, "_episode", episode)
-    monkeypatch.setattr(generation, "_record", record)
-    monkeypatch.setattr(generation, "model_file", lambda task, poses: "<mujoco/>")
+    monkeypatch.setattr(recording, "compiled_episode", episode)
+    monkeypatch.setattr(recording, "record", record)
+    monkeypatch.setattr(recording, "model_file", lambda task, poses: "<mujoco/>")
     return calls
 
 
@@ -140,19 +141,19 @@ def test_finished_run_is_only_reported(tasks, recorded, tmp_path):
 
 def test_resume_makes_only_what_is_missing(tasks, recorded, tmp_path, monkeypatch):
     reference = tree_hash_of_run(tasks, tmp_path / "undisturbed")
-    inner = generation._record
+    inner = recording.record
 
     def broken(episode, seed, settings, show):
         if (episode.task.name, seed) == ("task_b", 10_000):
             raise RuntimeError("power cut")
         return inner(episode, seed, settings, show)
 
-    monkeypatch.setattr(generation, "_record", broken)
+    monkeypatch.setattr(recording, "record", broken)
     with pytest.raises(RuntimeError, match="power cut") as caught:
         run(tasks, tmp_path / "ds")
     assert "while recording task_b, seed 10000" in caught.value.__notes__
     assert not is_dataset(tmp_path / "ds")
-    monkeypatch.setattr(generation, "_record", inner)
+    monkeypatch.setattr(recording, "record", inner)
     recorded.clear()
     run(tasks, tmp_path / "ds")
     assert recorded == [("task_b", 10_000), ("task_b", 10_001)]
@@ -198,7 +199,7 @@ def test_a_worker_that_is_killed(tasks, recorded, tmp_path, monkeypatch):
         future.set_exception(BrokenProcessPool("gone"))
         return future
 
-    monkeypatch.setattr(running.ProcessPoolExecutor, "submit", submit)
+    monkeypatch.setattr(processes.ProcessPoolExecutor, "submit", submit)
     with pytest.raises(MemobenchError, match="one of 2 worker processes was killed"):
         run(tasks, tmp_path / "ds", workers=2)
     monkeypatch.undo()

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lerobot_memobench.datasets.demonstration import labels
+from lerobot_memobench.datasets.labels import labels
 from lerobot_memobench.datasets.language import persistent_rows
 
 

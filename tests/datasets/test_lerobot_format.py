@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_memobench.datasets.demonstration import digest, labels
+from lerobot_memobench.datasets.digest import digest
+from lerobot_memobench.datasets.labels import labels
 from lerobot_memobench.datasets.lerobot_format import dataset_features, is_dataset, write_dataset
-from lerobot_memobench.datasets.replay import read_episode
-from lerobot_memobench.datasets.staging import stage_demonstration
-from lerobot_memobench.datasets.video import encode_video, image_stats, numeric_stats
+from lerobot_memobench.datasets.lerobot_format.reading import read_episode
+from lerobot_memobench.datasets.staging.stage import stage_demonstration
+from lerobot_memobench.datasets.statistics import image_stats, numeric_stats
+from lerobot_memobench.datasets.video import encode_video
 from lerobot_memobench.errors import MemobenchError
 
 SIZE = 64

@@ -19,10 +19,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels
-from lerobot_memobench.datasets.generation import HOLD_FRAMES, PATIENCE, generate, record_demonstration
+from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.digest import digest
+from lerobot_memobench.datasets.generation import generate
+from lerobot_memobench.datasets.labels import labels
 from lerobot_memobench.datasets.lerobot_format import is_dataset, write_dataset
-from lerobot_memobench.datasets.replay import read_episode, replay
+from lerobot_memobench.datasets.lerobot_format.reading import read_episode
+from lerobot_memobench.datasets.recording import HOLD_FRAMES, PATIENCE, record_demonstration
+from lerobot_memobench.datasets.replay import replay
 from lerobot_memobench.datasets.validate import Verdict, exit_status, validate
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks import get_task
@@ -337,7 +341,7 @@ def test_decoded_frames_are_what_the_simulator_shows(tmp_path):
     """Decode an episode's video and render its recorded states anew: the same pictures, frame by frame."""
     from lerobot.datasets import LeRobotDataset
 
-    from lerobot_memobench.envs.episode import IMAGE_KEYS
+    from lerobot_memobench.envs.observations import IMAGE_KEYS
     from lerobot_memobench.sim.simulation import Simulation
 
     task = get_task(STOVE)

@@ -45,6 +45,13 @@ def test_written_records_are_read_back_as_they_were(tmp_path: Path) -> None:
     assert not problems
 
 
+@pytest.mark.parametrize("task", ["../outside", ".hidden", "", 7])
+def test_a_task_names_one_file_of_the_log_and_none_elsewhere(tmp_path: Path, task: object) -> None:
+    with pytest.raises(MemobenchError, match=r"the task of a record of an episode is .*, which names no file"):
+        EpisodeLog(tmp_path / "log").append(record() | {"task": task})
+    assert not list(tmp_path.iterdir())
+
+
 def test_one_file_per_task_and_process(tmp_path: Path) -> None:
     path = EpisodeLog(tmp_path).append(record("a"))
     assert path == tmp_path / "episodes" / f"a.{os.getpid()}.jsonl"

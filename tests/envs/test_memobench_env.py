@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
-from lerobot_memobench.envs.episode import EXECUTION, PROMPT, PROMPT_LIMIT
+from lerobot_memobench.envs.episode import PROMPT_LIMIT
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
+from lerobot_memobench.envs.observations import EXECUTION, PROMPT
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.rendering import close_renderers, gl_backend
 from lerobot_memobench.tasks.catalogue import get_task, task_names

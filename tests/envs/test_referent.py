@@ -10,8 +10,8 @@ import pytest
 from scipy import stats
 
 from lerobot_memobench.datasets.generation import FIRST_SEED as DEMONSTRATION_SEEDS
-from lerobot_memobench.envs.configuration_memobench import SEED_BASE as EVALUATION_SEEDS
 from lerobot_memobench.envs.episode import referent_of
+from lerobot_memobench.envs.protocol import SEED_BASE as EVALUATION_SEEDS
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 
 SEEDS = 400

@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from lerobot_memobench.envs.episode import EXECUTION, Episode
+from lerobot_memobench.envs.episode import Episode
+from lerobot_memobench.envs.observations import EXECUTION
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.expert import Expert, steps_of
 from lerobot_memobench.sim.simulation import Simulation

@@ -10,8 +10,8 @@ import typer
 from lerobot_memobench.cli.console import console, counting
 
 if TYPE_CHECKING:
-    from lerobot_memobench.datasets.running import Advance
     from lerobot_memobench.datasets.validate import Verdict
+    from lerobot_memobench.jobs.job import Advance
 
 
 def convert(

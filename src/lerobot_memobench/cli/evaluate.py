@@ -21,7 +21,7 @@ from lerobot_memobench.settings.reading import read_settings
 from lerobot_memobench.settings.words import Words
 
 if TYPE_CHECKING:
-    from lerobot_memobench.datasets.running import Advance
+    from lerobot_memobench.jobs.job import Advance
 
 SHARD_PROGRAM = ("-m", "lerobot_memobench.cli.shard_process")
 """Words after Python's name that start the process of one part."""

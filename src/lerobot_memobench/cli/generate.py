@@ -14,7 +14,8 @@ from lerobot_memobench.settings.words import executor_options
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 
 if TYPE_CHECKING:
-    from lerobot_memobench.datasets.generation import Advance, GenerationSummary
+    from lerobot_memobench.datasets.generation_summary import GenerationSummary
+    from lerobot_memobench.jobs.job import Advance
 
 
 class Referent(StrEnum):

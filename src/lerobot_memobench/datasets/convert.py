@@ -14,20 +14,24 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.datasets.hdf5 import Problem, PublishedFile, Unusable, find_files
-from lerobot_memobench.datasets.lerobot_format import (
+from lerobot_memobench.datasets.hdf5.layout import Problem, Unusable
+from lerobot_memobench.datasets.hdf5.published_task import task_of
+from lerobot_memobench.datasets.hdf5.reading import PublishedFile, find_files
+from lerobot_memobench.datasets.hdf5.restore import NO_SEED, restore
+from lerobot_memobench.datasets.lerobot_format.assembling import assemble
+from lerobot_memobench.datasets.lerobot_format.layout import (
     DEFAULT_REPO_ID,
     MANIFEST_FILE,
-    STAGING,
-    assemble,
     check_destination,
     is_dataset,
 )
-from lerobot_memobench.datasets.restore import NO_SEED, restore, task_of
-from lerobot_memobench.datasets.running import ProgressCallback, StagedJob, run_jobs, staged
-from lerobot_memobench.datasets.staging import EpisodeStage, clean_temporaries, stage_failure
-from lerobot_memobench.datasets.unfinished import check_request, compare_requests, locked
+from lerobot_memobench.datasets.staging.episode import StagedEpisode, StagedJob, staged
+from lerobot_memobench.datasets.staging.folders import STAGING
+from lerobot_memobench.datasets.staging.request import compare_requests, episodes_folder
+from lerobot_memobench.datasets.staging.stage import EpisodeStage, stage_failure
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.jobs.job import ProgressCallback
+from lerobot_memobench.jobs.running import run_jobs
 
 
 @dataclass(frozen=True)
@@ -62,10 +66,12 @@ class ConversionJob(StagedJob):
 
     @property
     def task_name(self) -> str:
+        """The file's name."""
         return self.file.name
 
     @property
     def seed(self) -> int:
+        """The group's number."""
         return int(self.group.removeprefix("demo_"))
 
     def run(self) -> None:
@@ -125,71 +131,74 @@ def convert(
         return _finished(out, request)
     check_destination(out)
     staging = out / STAGING
-    staging.mkdir(parents=True, exist_ok=True)
-    finished = False
-    try:
-        with locked(staging, out):
-            check_request(staging, request, out, f"delete {staging} to start anew or name another folder")
-            folder = staging / "episodes"
-            folder.mkdir(exist_ok=True)
-            clean_temporaries(folder)
-            jobs, problems = _plan(files, folder.absolute(), upside_down)
-            run_jobs(jobs, workers=workers, progress=progress, logs=staging / "logs")
-            episodes = [staged(job) for job in jobs]
-            for job, episode in zip(jobs, episodes, strict=True):
-                if episode.failure is not None:
-                    problems.append(Problem(str(job.file), f"data/{job.group}", episode.failure))
-            order = {str(path): number for number, path in enumerate(files)}
-            problems.sort(key=lambda problem: order[problem.file])
-            problems = [replace(problem, file=_name(Path(problem.file), source)) for problem in problems]
-            good = [episode for episode in episodes if episode.failure is None]
-            if good:
-                assemble(
-                    good,
-                    out,
-                    repo_id=repo_id,
-                    made_by=f"Converted by `memobench convert` from {len(files)} HDF5 files in the published layout; "
-                    "what they do not hold was read off their states in the simulator.",
-                    manifest={"request": request, "left_out": [asdict(problem) for problem in problems]},
-                    left_out=[str(problem) for problem in problems],
-                )
-        finished = True
-    finally:
-        if finished:
-            shutil.rmtree(staging, ignore_errors=True)
-            if not any(out.iterdir()):
-                out.rmdir()
+    with episodes_folder(out, request, f"delete {staging} to start anew or name another folder") as folder:
+        jobs, problems = _plan(files, folder, upside_down)
+        run_jobs(jobs, workers=workers, progress=progress, logs=staging / "logs")
+        episodes = [staged(job) for job in jobs]
+        good = [episode for episode in episodes if episode.failure is None]
+        problems += _failures(jobs, episodes)
+        problems = _told(problems, files, source)
+        if good:
+            assemble(
+                good,
+                out,
+                repo_id=repo_id,
+                made_by=f"Converted by `memobench convert` from {len(files)} HDF5 files in the published layout; "
+                "what they do not hold was read off their states in the simulator.",
+                manifest={"request": request, "left_out": [asdict(problem) for problem in problems]},
+                left_out=[str(problem) for problem in problems],
+            )
+    shutil.rmtree(staging, ignore_errors=True)
+    if not any(out.iterdir()):
+        out.rmdir()
     return ConversionSummary(out if good else None, len(good), tuple(problems))
 
 
 def _plan(files: Sequence[Path], folder: Path, upside_down: bool) -> tuple[list[ConversionJob], list[Problem]]:
     """Return a job per group that looks as it should, and what does not."""
-    jobs: list[ConversionJob] = []
+    usable: list[tuple[Path, str, tuple[int, int]]] = []
     problems: list[Problem] = []
-    size: tuple[int, int] | None = None
-    number = 0
     for path in files:
         try:
             with PublishedFile(path) as file:
-                groups = file.groups()
-                announced = file.announced()
-                if announced is not None and announced != len(groups):
-                    reason = f"it says that it has {announced} demonstrations, but there are {len(groups)}"
-                    problems.append(Problem(str(path), "data", reason))
-                if not groups:
-                    problems.append(Problem(str(path), "data", "it has no demonstrations"))
-                for group in groups:
+                problems += _miscounted(file)
+                for group in file.groups():
                     try:
-                        found = file.read(group)
+                        usable.append((path, group, file.read(group).image_size))
                     except Unusable as error:
                         problems.append(Problem(str(path), f"data/{group}", str(error)))
-                        continue
-                    size = size or found.image_size
-                    jobs.append(ConversionJob(path, group, folder / f"{number:06d}", size, upside_down))
-                    number += 1
         except Unusable as error:
             problems.append(Problem(str(path), "", str(error)))
+    jobs = [
+        ConversionJob(path, group, folder / f"{number:06d}", usable[0][2], upside_down)
+        for number, (path, group, _) in enumerate(usable)
+    ]
     return jobs, problems
+
+
+def _miscounted(file: PublishedFile) -> list[Problem]:
+    announced, count = file.announced(), len(file.groups())
+    reasons = []
+    if announced is not None and announced != count:
+        reasons.append(f"it says that it has {announced} demonstrations, but there are {count}")
+    if not count:
+        reasons.append("it has no demonstrations")
+    return [Problem(str(file.path), "data", reason) for reason in reasons]
+
+
+def _failures(jobs: Sequence[ConversionJob], episodes: Sequence[StagedEpisode]) -> list[Problem]:
+    return [
+        Problem(str(job.file), f"data/{job.group}", episode.failure)
+        for job, episode in zip(jobs, episodes, strict=True)
+        if episode.failure is not None
+    ]
+
+
+def _told(problems: Sequence[Problem], files: Sequence[Path], source: Path) -> list[Problem]:
+    """Return problems in the order of their files, which are named within the source."""
+    order = {str(path): number for number, path in enumerate(files)}
+    ordered = sorted(problems, key=lambda problem: order[problem.file])
+    return [replace(problem, file=_name(Path(problem.file), source)) for problem in ordered]
 
 
 def _name(path: Path, source: Path) -> str:

@@ -9,14 +9,18 @@ import json
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lerobot_memobench.datasets.card import ordered_types
-from lerobot_memobench.datasets.lerobot_format import MANIFEST_FILE, image_key, is_dataset
+from lerobot_memobench.datasets.lerobot_format.card_tables import ordered_types
+from lerobot_memobench.datasets.lerobot_format.layout import MANIFEST_FILE, image_key
+from lerobot_memobench.datasets.lerobot_format.reading import episode_rows
 from lerobot_memobench.datasets.paper_figures import FAMILIES, LENGTH_BUCKETS
 from lerobot_memobench.errors import MemobenchError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 LENGTHS_FIGURE, STORYBOARD_FIGURE, TABLES_FILE = "lengths.png", "storyboard.jpg", "tables.md"
 OURS, THEIRS = "#0072B2", "#E69F00"
@@ -24,23 +28,6 @@ OURS, THEIRS = "#0072B2", "#E69F00"
 FRAME = 160
 """Height and width of a storyboard's pictures, pixels."""
 MOST_FRAMES = 6
-
-
-def episode_rows(folder: Path) -> list[dict[str, Any]]:
-    """Return the rows of ``meta/episodes``, one per episode.
-
-    Raises:
-        MemobenchError: the folder is no dataset, or one without the benchmark's columns.
-    """
-    import pyarrow.parquet as pq
-
-    if not is_dataset(folder):
-        raise MemobenchError(f"{folder} is no dataset (there is no meta/info.json); name one that was generated")
-    rows: list[dict[str, Any]] = pq.read_table(folder / "meta" / "episodes").to_pylist()
-    missing = [key for key in ("task_name", "memory_type", "exec_start_index", "key_frames") if key not in rows[0]]
-    if missing:
-        raise MemobenchError(f"{folder} lacks {', '.join(missing)} in meta/episodes: this package did not make it")
-    return rows
 
 
 def describe(folder: Path, out: Path) -> list[Path]:
@@ -86,38 +73,46 @@ def draw_lengths(rows: Sequence[Mapping[str, Any]], path: Path) -> Path:
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    lengths = np.array([row["length"] for row in rows])
-    published = sum(LENGTH_BUCKETS.values())
     with mpl.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
         figure = Figure(figsize=(9, 3.2), layout="constrained")
         left, right = figure.subplots(1, 2, width_ratios=(3, 2))
-        places = np.arange(len(LENGTH_BUCKETS))
-        ours = [100 * ((lengths >= low) & (lengths < (high or np.inf))).mean() for low, high in LENGTH_BUCKETS]
-        theirs = [100 * count / published for count in LENGTH_BUCKETS.values()]
-        left.bar(places - 0.2, ours, 0.38, color=OURS, label=f"here, {len(rows):,} episodes")
-        left.bar(places + 0.2, theirs, 0.38, color=THEIRS, hatch="//", edgecolor="white", label=f"paper, {published:,}")
-        names = [f"{low}+" if high is None else f"{low}–{high - 1}" for low, high in LENGTH_BUCKETS]
-        left.set_xticks(places, names, rotation=30, ha="right")
-        left.set_ylabel("episodes, %")
-        left.set_xlabel("length, control steps of 50 ms, prompt included")
-        left.legend(frameon=False)
-
-        types = [name for name in FAMILIES if any(row["memory_type"] == name for row in rows)]
-        for shift, colour, marker, source in ((-0.12, OURS, "o", "here"), (0.12, THEIRS, "s", "paper")):
-            for place, name in enumerate(types):
-                if source == "here":
-                    chosen = np.array([row["length"] for row in rows if row["memory_type"] == name])
-                    mean, high = chosen.mean(), np.percentile(chosen, 95)
-                else:
-                    mean, high = FAMILIES[name].mean, FAMILIES[name].p95
-                right.plot([place + shift] * 2, [mean, high], color=colour, lw=2, solid_capstyle="butt")
-                right.plot(place + shift, mean, marker, color=colour, ms=6, label=source if place == 0 else None)
-        right.set_xticks(range(len(types)), types)
-        right.set_ylim(bottom=0)
-        right.set_ylabel("steps: mean, line to P95")
-        right.legend(frameon=False)
+        _draw_buckets(left, rows)
+        _draw_types(right, rows)
         figure.savefig(path, dpi=130)
     return path
+
+
+def _draw_buckets(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
+    lengths = np.array([row["length"] for row in rows])
+    published = sum(LENGTH_BUCKETS.values())
+    places = np.arange(len(LENGTH_BUCKETS))
+    ours = [100 * ((lengths >= low) & (lengths < (high or np.inf))).mean() for low, high in LENGTH_BUCKETS]
+    theirs = [100 * count / published for count in LENGTH_BUCKETS.values()]
+    axes.bar(places - 0.2, ours, 0.38, color=OURS, label=f"here, {len(rows):,} episodes")
+    axes.bar(places + 0.2, theirs, 0.38, color=THEIRS, hatch="//", edgecolor="white", label=f"paper, {published:,}")
+    names = [f"{low}+" if high is None else f"{low}–{high - 1}" for low, high in LENGTH_BUCKETS]
+    axes.set_xticks(places, names, rotation=30, ha="right")
+    axes.set_ylabel("episodes, %")
+    axes.set_xlabel("length, control steps of 50 ms, prompt included")
+    axes.legend(frameon=False)
+
+
+def _draw_types(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
+    types = [name for name in FAMILIES if any(row["memory_type"] == name for row in rows)]
+    lengths = {name: np.array([row["length"] for row in rows if row["memory_type"] == name]) for name in types}
+    ours = [(lengths[name].mean(), np.percentile(lengths[name], 95)) for name in types]
+    theirs = [(FAMILIES[name].mean, FAMILIES[name].p95) for name in types]
+    for shift, colour, marker, source, spans in (
+        (-0.12, OURS, "o", "here", ours),
+        (0.12, THEIRS, "s", "paper", theirs),
+    ):
+        for place, (mean, high) in enumerate(spans):
+            axes.plot([place + shift] * 2, [mean, high], color=colour, lw=2, solid_capstyle="butt")
+            axes.plot(place + shift, mean, marker, color=colour, ms=6, label=source if place == 0 else None)
+    axes.set_xticks(range(len(types)), types)
+    axes.set_ylim(bottom=0)
+    axes.set_ylabel("steps: mean, line to P95")
+    axes.legend(frameon=False)
 
 
 def draw_storyboard(folder: Path, rows: Sequence[Mapping[str, Any]], path: Path) -> Path:

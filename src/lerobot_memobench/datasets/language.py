@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_memobench.datasets.demonstration import FPS, Labels
+from lerobot_memobench.datasets.demonstration import FPS
+from lerobot_memobench.datasets.labels import Labels
 
 MIN_FRAMES_BETWEEN_ROWS = 5
 """LeRobot's ``emitted_at`` looks 0.1 s to either side and raises when it finds two rows of a style, so rows

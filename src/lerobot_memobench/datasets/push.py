@@ -7,11 +7,13 @@ already is known by its hash. When it is over the hub is asked what it holds.
 
 from __future__ import annotations
 
+import contextlib
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lerobot_memobench.datasets.lerobot_format import HDF5_FOLDER, is_dataset
+from lerobot_memobench.datasets.lerobot_format.layout import HDF5_FOLDER, is_dataset
 from lerobot_memobench.errors import MemobenchError
 
 if TYPE_CHECKING:
@@ -41,9 +43,7 @@ def push(
     Raises:
         MemobenchError: no dataset, no token, a token that may not write there, or a hub that cannot be reached.
     """
-    import httpx
     from huggingface_hub import HfApi, get_token
-    from huggingface_hub.errors import HfHubHTTPError, HFValidationError
 
     folder = Path(folder)
     if not is_dataset(folder):
@@ -56,14 +56,13 @@ def push(
             f"there is no token to write to {repo_id}: run `hf auth login`, set HF_TOKEN, or pass one that may write"
         )
     api = HfApi(token=token)
-    try:
+    with _told(repo_id):
         repo_id = api.create_repo(repo_id, repo_type="dataset", private=private, exist_ok=True).repo_id
-        parts = [*PARTS, *([f"{HDF5_FOLDER}/**"] if hdf5 else [])]
         api.upload_folder(
             repo_id=repo_id,
             folder_path=folder,
             repo_type="dataset",
-            allow_patterns=parts,
+            allow_patterns=[*PARTS, *([f"{HDF5_FOLDER}/**"] if hdf5 else [])],
             commit_message="Upload MEMOBench demonstrations",
         )
         missing = _missing(api, folder, repo_id, hdf5)
@@ -72,6 +71,17 @@ def push(
                 f"{len(missing)} files, such as {missing[0]}, did not arrive at {repo_id}; run the same command again"
             )
         _tag(api, folder, repo_id)
+    return f"{api.endpoint}/datasets/{repo_id}"
+
+
+@contextlib.contextmanager
+def _told(repo_id: str) -> Iterator[None]:
+    """Turn what the hub or the way to it objects into a sentence with a way out."""
+    import httpx
+    from huggingface_hub.errors import HfHubHTTPError, HFValidationError
+
+    try:
+        yield
     except HFValidationError as error:
         raise MemobenchError(f"found repository {repo_id!r}, which the hub does not allow: {_line(error)}") from None
     except HfHubHTTPError as error:
@@ -87,7 +97,6 @@ def push(
             f"the hub could not be reached ({type(error).__name__}: {_line(error)[:200]}); run the same command "
             "again to go on"
         ) from None
-    return f"{api.endpoint}/datasets/{repo_id}"
 
 
 def _missing(api: HfApi, folder: Path, repo_id: str, hdf5: bool) -> list[str]:

@@ -6,24 +6,20 @@ video too; no expert and no gym environment is asked. Everything is compared exa
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.datasets.demonstration import Demonstration, labels
+from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.labels import labels
 from lerobot_memobench.datasets.language import persistent_rows
-from lerobot_memobench.datasets.lerobot_format import is_dataset
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.datasets.lerobot_format.reading import Columns, RecordedEpisode
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.progress import Progress
 from lerobot_memobench.tasks.task import Task
-
-Columns = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -38,18 +34,6 @@ class Disagreement:
     def __str__(self) -> str:
         where = "" if self.frame is None else f" at frame {self.frame}"
         return f"{self.column}{where}: recorded {_short(self.recorded)}, replayed {_short(self.replayed)}"
-
-
-@dataclass(frozen=True, eq=False)
-class RecordedEpisode:
-    """An episode of a dataset on disk: ``columns`` per frame and what meta/episodes says."""
-
-    task_name: str
-    variant: int
-    seed: int
-    exec_start: int
-    columns: Columns
-    whole: dict[str, Any]
 
 
 def replay(recorded: Demonstration | RecordedEpisode, *, task: Task | None = None) -> Disagreement | None:
@@ -113,40 +97,6 @@ def resimulate(task: Task, seed: int, actions: NDArray[np.float32], exec_start: 
 def demonstration_columns(demo: Demonstration) -> Columns:
     """Return states, proprioception and labels under the dataset's column names."""
     return {"states": demo.states, "observation.state": demo.proprio, **labels(demo).columns()}
-
-
-def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
-    """Read an episode of a dataset that this package made; without states/, states are not compared."""
-    import pyarrow.parquet as pq
-
-    root = Path(root)
-    if not is_dataset(root):
-        raise MemobenchError(f"{root} is no dataset (there is no meta/info.json); name the folder of a generated one")
-    chosen = [("episode_index", "==", episode_index)]
-    rows = pq.read_table(root / "meta" / "episodes", filters=chosen).to_pylist()
-    if len(rows) != 1:
-        raise MemobenchError(f"{root} has no episode {episode_index}; see total_episodes in its meta/info.json")
-    meta = rows[0]
-    missing = [key for key in ("task_name", "variant", "seed", "exec_start_index") if key not in meta]
-    if missing:
-        raise MemobenchError(f"{root} lacks {', '.join(missing)} in meta/episodes: this package did not make it")
-    table = pq.read_table(root / "data", filters=chosen).sort_by("frame_index")
-    columns: Columns = {}
-    for name in table.column_names:
-        values = table.column(name).to_pylist()
-        is_text = name == "language_persistent" or isinstance(values[0], str)
-        columns[name] = values if is_text else np.array(values)
-    columns["action"] = columns["action"].astype(np.float32)
-    columns["observation.state"] = columns["observation.state"].astype(np.float32)
-    if (root / "states").is_dir():
-        states = pq.read_table(root / "states", filters=chosen).sort_by("frame_index")
-        columns["states"] = np.array(states.column("state").to_pylist(), dtype=np.float64)
-    whole = {key: meta[key] for key in ("success", "key_frames", "scene_hash") if key in meta}
-    if "fixture_poses" in meta:
-        whole["fixture_poses"] = json.loads(meta["fixture_poses"])
-    if "language_persistent" in columns:
-        whole["language_persistent"] = columns["language_persistent"][0]
-    return RecordedEpisode(meta["task_name"], meta["variant"], meta["seed"], meta["exec_start_index"], columns, whole)
 
 
 def _whole(demo: Demonstration) -> dict[str, Any]:

@@ -5,17 +5,21 @@ The folder may hold a LeRobotDataset, HDF5 files of this package in the publishe
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_memobench.datasets.hdf5 import PublishedFile, Unusable, find_files
-from lerobot_memobench.datasets.lerobot_format import is_dataset
-from lerobot_memobench.datasets.replay import read_episode, replay
-from lerobot_memobench.datasets.restore import restore, task_of
-from lerobot_memobench.datasets.running import process_pool
+from lerobot_memobench.datasets.hdf5.layout import Unusable
+from lerobot_memobench.datasets.hdf5.published_task import task_of
+from lerobot_memobench.datasets.hdf5.reading import PublishedFile, find_files
+from lerobot_memobench.datasets.hdf5.restore import restore
+from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
+from lerobot_memobench.datasets.lerobot_format.reading import read_episode
+from lerobot_memobench.datasets.replay import replay
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.jobs.processes import process_pool
 from lerobot_memobench.tasks.task import Task
 
 
@@ -43,6 +47,7 @@ class _Check:
     tasks: Mapping[str, Task] | None = None
 
     def run(self) -> Verdict:
+        """Replay it."""
         try:
             return Verdict(self.name, self._replay())
         except MemobenchError as error:
@@ -120,8 +125,6 @@ def exit_status(verdicts: Sequence[Verdict]) -> int:
 def _checks(folder: Path, tasks: Mapping[str, Task] | None) -> list[_Check]:
     checks: list[_Check] = []
     if is_dataset(folder):
-        import json
-
         total = json.loads((folder / "meta" / "info.json").read_text())["total_episodes"]
         checks += [_Check(folder, f"episode {index}", index=index, tasks=tasks) for index in range(total)]
     has_files = folder.is_file() or any(path.suffix in (".hdf5", ".h5") for path in folder.rglob("*"))

@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from lerobot_memobench.datasets.unfinished import locked
 from lerobot_memobench.engine.card import remove_card
 from lerobot_memobench.engine.plan import EvaluationPlan
 from lerobot_memobench.envs.episode_log import has_log, read_episodes
 from lerobot_memobench.envs.protocol import PROTOCOL_FILE
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.files import remove_drafts
+from lerobot_memobench.jobs.locking import locked
 
 VIDEOS = "videos"
 EARLIER_DRAFTS = (".*.part", "*.part", f".{PROTOCOL_FILE}.*", f"{VIDEOS}/.*.part")

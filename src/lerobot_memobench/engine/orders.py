@@ -23,7 +23,7 @@ class Orders:
         shard: run this part alone.
         shards: run so many parts as jobs of their own, ``workers`` at a time, and merge them; 0: no parts.
         workers: 0: as many as shards.
-        executor, executor_options: see `datasets.running.run_jobs`.
+        executor, executor_options: see `jobs.running.run_jobs`.
     """
 
     resume: bool = False

@@ -14,7 +14,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.datasets.running import ProgressCallback, check_executor, run_jobs
 from lerobot_memobench.engine.folder import check_folder, check_new, logged
 from lerobot_memobench.engine.grid import Shard
 from lerobot_memobench.engine.merging import SHARDS, merge_and_report
@@ -24,6 +23,9 @@ from lerobot_memobench.engine.reporting import EvaluationReport
 from lerobot_memobench.engine.resume import Tell, resumed_card
 from lerobot_memobench.envs.episode_log import has_log
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.jobs.executors import check_executor
+from lerobot_memobench.jobs.job import ProgressCallback
+from lerobot_memobench.jobs.running import run_jobs
 
 LOGS = "logs"
 

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from lerobot_memobench.envs.episode import PROMPT, Episode
+from lerobot_memobench.envs.episode import Episode
+from lerobot_memobench.envs.observations import PROMPT
 
 BAND = 64
 """Height of the text over the pictures, pixels."""
@@ -42,29 +43,32 @@ def annotate(images: dict[str, NDArray[np.uint8]], episode: Episode) -> NDArray[
     band = Image.new("RGB", (width, BAND), _BACKGROUND)
     draw = ImageDraw.Draw(band)
     prompt = episode.phase == PROMPT
-    task = episode.task
-    text, font = _fit(draw, task.language, 14, width - 96)
+    text, font = _fit(draw, episode.task.language, 14, width - 96)
     draw.text((8, 5), text, fill=_TEXT, font=font)
     clock = f"prompt {episode.step_index}" if prompt else f"step {episode.exec_steps}"
     draw.text((width - 8, 5), clock, fill=_PROMPT_COLOUR if prompt else _FAINT, font=_font(13), anchor="ra")
-
     x = 8
-    for index, checkpoint in enumerate(task.checkpoints):
-        colour = OPERATION_COLOURS[checkpoint.operation]
-        done = index < episode.progress.index and not prompt
-        box = (x, 34, x + 20, 54)
-        draw.rounded_rectangle(box, 4, fill=colour if done else None, outline=colour, width=2)
-        if done:
-            draw.line([(x + 5, 44), (x + 9, 49), (x + 16, 39)], fill=_BACKGROUND, width=3)
-        else:
-            draw.text((x + 10, 44), checkpoint.operation, fill=colour, font=_font(12), anchor="mm")
+    for index, checkpoint in enumerate(episode.task.checkpoints):
+        _draw_checkpoint(draw, x, checkpoint.operation, done=index < episode.progress.index and not prompt)
         x += 26
-    if prompt:
-        subgoal = "watch the prompt"
-    elif episode.success:
-        subgoal = "done"
-    else:
-        subgoal = episode.subgoal()
-    text, font = _fit(draw, subgoal, 14, width - x - 14)
+    text, font = _fit(draw, _now(episode), 14, width - x - 14)
     draw.text((x + 6, 44), text, fill=_PROMPT_COLOUR if prompt else _TEXT, font=font, anchor="lm")
     return np.vstack([np.asarray(band), pictures])
+
+
+def _draw_checkpoint(draw: ImageDraw.ImageDraw, x: int, operation: str, *, done: bool) -> None:
+    """A box at ``x`` pixels: ticked, or with the letter of what memory has to do."""
+    colour = OPERATION_COLOURS[operation]
+    box = (x, 34, x + 20, 54)
+    draw.rounded_rectangle(box, 4, fill=colour if done else None, outline=colour, width=2)
+    if done:
+        draw.line([(x + 5, 44), (x + 9, 49), (x + 16, 39)], fill=_BACKGROUND, width=3)
+    else:
+        draw.text((x + 10, 44), operation, fill=colour, font=_font(12), anchor="mm")
+
+
+def _now(episode: Episode) -> str:
+    """What is going on, in words."""
+    if episode.phase == PROMPT:
+        return "watch the prompt"
+    return "done" if episode.success else episode.subgoal()

@@ -14,34 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.configs import PolicyFeature
 from lerobot.envs.configs import EnvConfig
-from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
+from lerobot_memobench.envs.observations import METADATA, action_space, observation_space, policy_features, policy_names
+from lerobot_memobench.envs.protocol import SEED_BASE, SETTINGS, check_protocol
 from lerobot_memobench.errors import MemobenchError, nearest
-
-IMAGE_SIZE = 256
-SEED_BASE = 7
-"""Seed of evaluation episode 0 (paper, section 5.1)."""
-
-
-def _features() -> dict[str, PolicyFeature]:
-    image = PolicyFeature(type=FeatureType.VISUAL, shape=(IMAGE_SIZE, IMAGE_SIZE, 3))
-    return {
-        ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(7,)),
-        "pixels/image": image,
-        "pixels/wrist_image": image,
-        "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(8,)),
-    }
-
-
-def _features_map() -> dict[str, str]:
-    return {
-        ACTION: ACTION,
-        "pixels/image": f"{OBS_IMAGES}.image",
-        "pixels/wrist_image": f"{OBS_IMAGES}.wrist_image",
-        "agent_pos": OBS_STATE,
-    }
 
 
 @EnvConfig.register_subclass("memobench")
@@ -85,8 +63,8 @@ class MemobenchEnvConfig(EnvConfig):
     videos: bool = False
     seed_base: int = SEED_BASE
     resume: bool = False
-    features: dict[str, PolicyFeature] = field(default_factory=_features)
-    features_map: dict[str, str] = field(default_factory=_features_map)
+    features: dict[str, PolicyFeature] = field(default_factory=policy_features)
+    features_map: dict[str, str] = field(default_factory=policy_names)
 
     def __post_init__(self) -> None:
         if self.fps != 20:
@@ -120,8 +98,6 @@ class MemobenchEnvConfig(EnvConfig):
     @property
     def protocol(self) -> dict[str, Any]:
         """What must agree for two evaluations to be one, or to be compared."""
-        from lerobot_memobench.envs.protocol import SETTINGS
-
         return {name: getattr(self, name) for name in SETTINGS}
 
     def selected(self) -> list[tuple[str, int, Path]]:
@@ -139,34 +115,35 @@ class MemobenchEnvConfig(EnvConfig):
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """Return `{memory type: {task id: vector env}}`; nothing is simulated before an env's first reset."""
-        from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
-
-        from lerobot_memobench.envs.memobench_env import MemobenchEnv, spaces_and_metadata
-        from lerobot_memobench.envs.protocol import check_protocol
+        from lerobot_memobench.envs.memobench_env import MemobenchEnv
         from lerobot_memobench.envs.resuming import skip_logged
 
         chosen = self.selected()  # before anything is written: a wrong name leaves nothing behind
-        if use_async_envs and n_envs > 1:
+        use_async_envs = use_async_envs and n_envs > 1
+        if use_async_envs:
             # LeRobot's workers are forked from a server: it imports torch and the simulator once for all of them.
             get_context("forkserver").set_forkserver_preload([MemobenchEnv.__module__])
         log_dir = self.resolved_log_dir()
         check_protocol(log_dir, self.protocol)  # now, not when the first episode has been simulated
-        spaces = spaces_and_metadata(self.expert_action)
         suites: dict[str, dict[int, gym.vector.VectorEnv]] = {}
         for memory_type, task_id, folder in chosen:
             make: Callable[[], gym.Env[Any, Any]]
             make = partial(MemobenchEnv, str(folder), log_dir=str(log_dir), **self.gym_kwargs)
             if self.resume:
                 make = skip_logged(make, log_dir, self.referent, self.seed_base)
-            if use_async_envs and n_envs > 1:
-                vector = _LazyAsyncVectorEnv([make] * n_envs, *spaces)
-            else:
-                # LeRobot freezes finished rows of its own async envs only; a sync row would be reset and go on.
-                vector = gym.vector.SyncVectorEnv(
-                    [freeze_after_episode_end(make)] * n_envs, autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP
-                )
-            suites.setdefault(memory_type, {})[task_id] = vector
+            suites.setdefault(memory_type, {})[task_id] = self._vector([make] * n_envs, use_async_envs)
         return suites
+
+    def _vector(self, make: list[Callable[[], gym.Env[Any, Any]]], use_async_envs: bool) -> gym.vector.VectorEnv:
+        from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
+
+        if use_async_envs:
+            # What a vector environment must know before its workers exist.
+            return _LazyAsyncVectorEnv(make, observation_space(self.expert_action), action_space(), METADATA)
+        # LeRobot freezes finished rows of its own async envs only; a sync row would be reset and go on.
+        return gym.vector.SyncVectorEnv(
+            [freeze_after_episode_end(one) for one in make], autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP
+        )
 
     def resolved_log_dir(self) -> Path:
         """Return the folder of the episode log: given, else the run's output folder, else a dated one."""

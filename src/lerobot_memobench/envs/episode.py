@@ -12,6 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_memobench.envs.observations import ACTION_DIM, EXECUTION, IMAGE_KEYS, PROMPT
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.experts.prompts import PromptDemonstrator
@@ -21,15 +22,11 @@ from lerobot_memobench.tasks.formula import Atom, atoms
 from lerobot_memobench.tasks.progress import Progress
 from lerobot_memobench.tasks.task import Task
 
-PROMPT, EXECUTION = 0, 1
 HORIZON = 1200
 """Execution steps before an episode is cut off (paper, section 5.1)."""
 PROMPT_LIMIT = 1000
 """Control steps after which a prompt video ends, whatever it still had to show."""
 REFERENTS = ("fixed", "random")
-
-IMAGE_KEYS = {"image": "agentview", "wrist_image": "wrist"}
-"""Observation name → camera; `observation.images.<name>` in datasets and at the policy."""
 
 
 class Episode:
@@ -44,7 +41,6 @@ class Episode:
 
     Attributes:
         task: the task of this episode: a variant of the given one when the referent is random.
-        phase: `PROMPT` or `EXECUTION`, of the present frame.
         step_index: control steps since the episode began, prompt included.
         exec_start: the frame at which execution began; None during the prompt.
         progress: checkpoints and goal, counted in execution steps.
@@ -82,7 +78,7 @@ class Episode:
         self.progress = Progress(task)
         self.step_index = 0
         self.exec_start: int | None = None
-        self.applied_action: NDArray[np.float32] = np.zeros(7, dtype=np.float32)
+        self.applied_action: NDArray[np.float32] = np.zeros(ACTION_DIM, dtype=np.float32)
         self.prompt_shown: bool | None = None
         self.drifted = False
         self._siblings = list(_wrong_atoms(task))
@@ -109,6 +105,7 @@ class Episode:
 
     @property
     def phase(self) -> int:
+        """`PROMPT` or `EXECUTION`."""
         return PROMPT if self.exec_start is None else EXECUTION
 
     @property
@@ -147,7 +144,7 @@ class Episode:
     def expert_action(self) -> NDArray[np.float32]:
         """Return what the scripted expert does now, (7,); zeros during the prompt. Ask once per step."""
         if self.phase == PROMPT:
-            return np.zeros(7, dtype=np.float32)
+            return np.zeros(ACTION_DIM, dtype=np.float32)
         if self._expert is None:
             self._expert = Expert(self.task, self.sim, self._rng(3))
         return self._expert.act()

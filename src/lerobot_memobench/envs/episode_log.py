@@ -16,6 +16,7 @@ from typing import Any
 
 from lerobot_memobench.envs.protocol import write_protocol
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files import file_name, write_file
 
 logger = logging.getLogger(__name__)
 
@@ -47,10 +48,11 @@ class EpisodeLog:
         The process is looked up here, not at construction: a log made before a fork is used after it.
 
         Raises:
-            MemobenchError: the folder cannot be written or holds episodes of another protocol, or the record is no
-                JSON.
+            MemobenchError: the folder cannot be written or holds episodes of another protocol, the record is no JSON,
+                or its task's name names no file.
         """
-        path = self.directory / EPISODES_FOLDER / f"{record['task']}.{os.getpid()}.jsonl"
+        task = file_name(record["task"], "the task of a record of an episode")
+        path = self.directory / EPISODES_FOLDER / f"{task}.{os.getpid()}.jsonl"
         try:
             line = json.dumps({**record, WRITTEN_AT: time.time()}, allow_nan=False).encode() + b"\n"
         except (TypeError, ValueError) as error:
@@ -133,10 +135,7 @@ def write_episodes(directory: str | Path, records: list[dict[str, Any]]) -> Path
     """Write ``records`` as ``<directory>/episodes.jsonl``, whole or not at all, and return its path."""
     path = Path(directory) / MERGED_FILE
     path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_suffix(".jsonl.part")
-    draft.write_text("".join(json.dumps(record) + "\n" for record in records))
-    os.replace(draft, path)
-    return path
+    return write_file(path, "".join(json.dumps(record) + "\n" for record in records))
 
 
 def _read_lines(file: Path, problems: list[str]) -> Iterator[dict[str, Any]]:

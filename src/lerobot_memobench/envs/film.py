@@ -6,15 +6,21 @@ true. A film is written as the episode goes and shows its end.
 
 from __future__ import annotations
 
-import os
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_memobench.files import draft_of
+
 LAST_FRAMES = 20
 """How often the final frame is repeated: a second to see how it ended."""
+
+
+class _DiscardedError(Exception):
+    """The film is not wanted."""
 
 
 class Film:
@@ -27,7 +33,7 @@ class Film:
 
     def __init__(self, path: Path, fps: int = 20) -> None:
         self._path, self._fps = path, fps
-        self._draft = path.with_name(f".{path.name}.{os.getpid()}.part")
+        self._writing = ExitStack()
         self._container: Any = None
 
     def add(self, frame: NDArray[np.uint8]) -> None:
@@ -36,7 +42,7 @@ class Film:
 
         if self._container is None:
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            self._container = av.open(str(self._draft), "w", format="mp4")
+            self._container = av.open(str(self._writing.enter_context(draft_of(self._path))), "w", format="mp4")
             # Ultrafast costs a tenth of a rendered frame; crf 20 keeps small text readable.
             options = {"preset": "ultrafast", "crf": "20"}
             self._stream = self._container.add_stream("libx264", rate=self._fps, options=options)
@@ -54,7 +60,7 @@ class Film:
         self._container.mux(self._stream.encode())
         self._container.close()
         self._container = None
-        os.replace(self._draft, self._path)
+        self._writing.close()
         return self._path
 
     def discard(self) -> None:
@@ -62,4 +68,5 @@ class Film:
         if self._container is not None:
             self._container.close()
             self._container = None
-            self._draft.unlink(missing_ok=True)
+            with suppress(_DiscardedError), self._writing:  # an error is what makes a draft go
+                raise _DiscardedError

@@ -8,44 +8,19 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
 from lerobot_memobench.envs.annotate import annotate
-from lerobot_memobench.envs.configuration_memobench import IMAGE_SIZE, SEED_BASE
-from lerobot_memobench.envs.episode import EXECUTION, HORIZON, IMAGE_KEYS, PROMPT, PROMPT_LIMIT, Episode
+from lerobot_memobench.envs.episode import HORIZON, PROMPT_LIMIT, Episode
 from lerobot_memobench.envs.episode_log import EpisodeLog
+from lerobot_memobench.envs.episode_record import episode_record
 from lerobot_memobench.envs.film import Film
+from lerobot_memobench.envs.observations import IMAGE_SIZE, METADATA, PROMPT, action_space, observation_space
+from lerobot_memobench.envs.protocol import SEED_BASE
+from lerobot_memobench.files import file_name
 from lerobot_memobench.sim.rendering import RenderSettings
-from lerobot_memobench.tasks.failures import classify_failure
 from lerobot_memobench.tasks.loading import load_task
 from lerobot_memobench.tasks.memory_text import memory_text, with_memory
-
-METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}
-
-
-def _observation_space(expert_action: bool) -> spaces.Dict:
-    image = spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
-    parts: dict[str, spaces.Space[Any]] = {
-        "pixels": spaces.Dict(dict.fromkeys(IMAGE_KEYS, image)),
-        "agent_pos": spaces.Box(-np.inf, np.inf, (8,), np.float32),
-        # LeRobot passes numeric keys that it does not know on as `observation.<key>`, so a policy with a memory can
-        # tell by itself when each row of a batch starts and stands still.
-        "phase": spaces.Box(PROMPT, EXECUTION, (1,), np.float32),
-        "step": spaces.Box(0, np.inf, (1,), np.float32),
-    }
-    if expert_action:
-        parts["expert_action"] = spaces.Box(-1.0, 1.0, (7,), np.float32)
-    return spaces.Dict(parts)
-
-
-def _action_space() -> spaces.Box:
-    return spaces.Box(-1.0, 1.0, (7,), np.float32)
-
-
-def spaces_and_metadata(expert_action: bool) -> tuple[spaces.Dict, spaces.Box, dict[str, Any]]:
-    """Return what a vector environment must know before its workers exist."""
-    return _observation_space(expert_action), _action_space(), METADATA
 
 
 class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
@@ -88,8 +63,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._episode: Episode | None = None
         self._oracle_memory = oracle_memory
         self._describe(0)
-        self.observation_space = _observation_space(expert_action)
-        self.action_space = _action_space()
+        self.observation_space = observation_space(expert_action)
+        self.action_space = action_space()
         protocol = {
             "seed_base": seed_base,
             "referent": referent,
@@ -134,14 +109,14 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         seed = self._next_seed if seed is None else int(seed)
         self._next_seed = seed + 1
         self._started = time.monotonic()
-        self._logged = False
+        self._over = False
         self.episode.reset(seed)
         self._describe(0)
         self._images = self.episode.images()
-        if self._film is not None:
-            self._film.discard()
+        self._discard_film()
         if self._videos is not None:
-            self._film = Film(self._videos / f"{self.task}.{seed - self._seed_base}.mp4", METADATA["render_fps"])
+            name = f"{file_name(self.task, 'the name of a task')}.{seed - self._seed_base}.mp4"
+            self._film = Film(self._videos / name, METADATA["render_fps"])
             self._film.add(self.render())
         return self._observation(), self._info()
 
@@ -154,18 +129,21 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._describe(completed)
         if episode.phase == PROMPT or episode.exec_steps % self._render_every == 0 or episode.done:
             self._images = episode.images()
-        success = episode.success
-        truncated = episode.done and not success
         if self._film is not None:
             self._film.add(self.render())
-            if episode.done:
-                self._film.finish()
-                self._film = None
-        if episode.done and not self._logged:
-            self._logged = True
-            if self._log is not None:
-                self._log.append(self.record())
-        return self._observation(), float(success), success, truncated, self._info()
+        if episode.done and not self._over:
+            self._end()
+        success = episode.success
+        return self._observation(), float(success), success, episode.done and not success, self._info()
+
+    def _end(self) -> None:
+        """Close the books of an episode that has just ended."""
+        self._over = True
+        if self._film is not None:
+            self._film.finish()
+            self._film = None
+        if self._log is not None:
+            self._log.append(self.record())
 
     def _describe(self, completed: int) -> None:
         """Set the instruction, which LeRobot asks for at every step; the oracle's has the memory text behind it."""
@@ -179,31 +157,13 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         return self.episode.sim.scene_hash()
 
     def record(self) -> dict[str, Any]:
-        """Return the episode's line for the log; see `spec/benchmark.md`, files that other tools read."""
-        episode = self.episode
-        progress, task = episode.progress, episode.task
-        return {
-            "task": task.name,
-            "memory_type": task.memory_type,
-            "episode": episode.seed - self._seed_base,
-            "seed": episode.seed,
-            "referent": episode.referent,
-            "variant": task.variant_index,
-            "replan_steps": self._replan_steps,
-            "prompt_steps": episode.exec_start if episode.exec_start is not None else episode.step_index,
-            "prompt_shown": episode.prompt_shown,
-            "steps": episode.exec_steps,
-            "success": episode.success,
-            "checkpoints": [
-                {"operation": checkpoint.operation, "first_step": first, "ordered_step": ordered}
-                for checkpoint, first, ordered in zip(
-                    task.checkpoints, progress.first_step, progress.ordered_step, strict=True
-                )
-            ],
-            "failure": classify_failure(task, progress.first_step, episode.success, episode.drifted),
-            "scene_hash": episode.scene_hash,
-            "wall_s": round(time.monotonic() - self._started, 3),
-        }
+        """Return the episode's line for the log."""
+        return episode_record(
+            self.episode,
+            seed_base=self._seed_base,
+            replan_steps=self._replan_steps,
+            wall_s=time.monotonic() - self._started,
+        )
 
     def _observation(self) -> dict[str, Any]:
         episode = self.episode
@@ -231,7 +191,10 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     def close(self) -> None:
         """Let the scene go; the next reset compiles or fetches it anew."""
+        self._discard_film()
+        self._episode = None
+
+    def _discard_film(self) -> None:
         if self._film is not None:
             self._film.discard()
             self._film = None
-        self._episode = None

@@ -7,14 +7,17 @@ horizon, the rendering) is told here once, also by plain ``lerobot-eval`` and fr
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files import write_file
 
 PROTOCOL_FILE = "protocol.json"
+
+SEED_BASE = 7
+"""Seed of evaluation episode 0 (paper, section 5.1)."""
 
 SETTINGS = (
     "seed_base",
@@ -111,9 +114,4 @@ def write_protocol(directory: Path, settings: Mapping[str, Any]) -> None:
     """Write the settings beside a log, whole or not at all; leave equal ones as they are, refuse others."""
     if check_protocol(directory, settings):
         return
-    draft = directory / f".{PROTOCOL_FILE}.{os.getpid()}"
-    with draft.open("w") as file:
-        file.write(json.dumps(dict(settings), indent=1) + "\n")
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(draft, directory / PROTOCOL_FILE)
+    write_file(directory / PROTOCOL_FILE, json.dumps(dict(settings), indent=1) + "\n", durable=True)

@@ -9,13 +9,10 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
-from numpy.typing import NDArray
 
 from lerobot_memobench.envs.annotate import BAND
-from lerobot_memobench.envs.configuration_memobench import IMAGE_SIZE
-from lerobot_memobench.envs.episode import EXECUTION
 from lerobot_memobench.envs.episode_log import has_log, read_episodes
+from lerobot_memobench.envs.observations import EXECUTION, IMAGE_SIZE, blank
 
 
 class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
@@ -37,18 +34,21 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
         self._skipped: dict[str, Any] | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start the episode of a seed, or let it rest where the log holds it."""
         self._skipped = None if seed is None else self._records().get(seed - self._seed_base)
         if self._skipped is None:
             return self.env.reset(seed=seed, options=options)
         return blank(self.observation_space), self._info(False)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Advance, or end as the log says."""
         if self._skipped is None:
             return self.env.step(action)
         success = self._skipped["success"]
         return blank(self.observation_space), float(success), success, not success, self._info(success)
 
     def render(self) -> Any:
+        """Return what the environment shows; black while it rests."""
         if self._skipped is None:
             return self.env.render()
         return np.zeros((BAND + IMAGE_SIZE, 2 * IMAGE_SIZE, 3), np.uint8)
@@ -78,11 +78,3 @@ def skip_logged(
 
 def _make(make: Callable[[], gym.Env[Any, Any]], log_dir: Path, referent: str, seed_base: int) -> SkipLogged:
     return SkipLogged(make(), log_dir, referent, seed_base)
-
-
-def blank(space: spaces.Space[Any]) -> Any:
-    """Return an observation of nothing: zeros of the space's shapes."""
-    if isinstance(space, spaces.Dict):
-        return {key: blank(part) for key, part in space.items()}
-    zeros: NDArray[Any] = np.zeros(space.shape or (), space.dtype)
-    return zeros

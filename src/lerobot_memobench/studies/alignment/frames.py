@@ -11,12 +11,10 @@ import numpy as np
 import pyarrow.parquet as pq
 import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.datasets.video_utils import decode_video_frames
 from lerobot.utils.feature_utils import dataset_to_policy_features
-from torch import Tensor
 
 from lerobot_memobench.datasets.memory_cache import dataset_fingerprint
+from lerobot_memobench.datasets.memory_cache.decoding import frame_reader
 from lerobot_memobench.files import draft_of
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 
@@ -57,20 +55,11 @@ class Frames:
         height, width, channels = self.meta.features[key]["shape"]
         shape = (len(self.states), channels, height, width)
         store = np.lib.format.open_memmap(path, mode="w+", dtype=np.uint8, shape=shape)
+        read = frame_reader(self.root, key)
         for episode, (first, last) in enumerate(itertools.pairwise(self.episodes)):
-            store[first:last] = (self._pictures(key, episode) * 255).round().to(torch.uint8).numpy()
+            store[first:last] = (read(episode, list(range(last - first))) * 255).round().to(torch.uint8).numpy()
             say(f"decoded {key}, episode {episode + 1} of {len(self.episodes) - 1}")
         store.flush()
-
-    def _pictures(self, key: str, episode: int) -> Tensor:
-        """Pictures (n, 3, H, W) in [0, 1] of one episode, as LeRobot decodes them."""
-        first, last = self.episodes[episode : episode + 2].tolist()
-        if key not in self.meta.video_keys:
-            dataset = LeRobotDataset(self.root.name, root=self.root)
-            return torch.stack([dataset[index][key] for index in range(first, last)])
-        start = self.meta.episodes[episode][f"videos/{key}/from_timestamp"]
-        times = [start + number / self.meta.fps for number in range(last - first)]
-        return decode_video_frames(self.root / self.meta.get_video_file_path(episode, key), times, tolerance_s=1e-4)
 
     def batch(self, indices: np.ndarray, chunk: int) -> dict[str, Any]:
         """What LeRobot's loader gives for frames (B,) of the dataset, with chunks of ``chunk`` actions."""

@@ -1,4 +1,4 @@
-"""A demonstration from a group of the published layout: its task, where execution starts, what was satisfied when.
+"""A demonstration from a group of the published layout: where execution starts, what was satisfied when.
 
 The layout holds states, not what the arm felt or which predicates held. Proprioception is read off the states in
 the simulator. Checkpoint columns come from the key frames where all are there; where one is missing (-1) the
@@ -8,87 +8,26 @@ predicates are evaluated on the states, with the latches and orders that a rollo
 from __future__ import annotations
 
 import json
-import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.datasets.demonstration import Demonstration, digest
-from lerobot_memobench.datasets.hdf5 import SUFFIX, PublishedDemo, PublishedFile, Unusable, truth_from_intervals
-from lerobot_memobench.datasets.mjcf import Pose, read_fixture_poses
+from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.digest import digest
+from lerobot_memobench.datasets.hdf5.layout import Unusable, truth_from_intervals
+from lerobot_memobench.datasets.hdf5.mjcf import Pose, read_fixture_poses
+from lerobot_memobench.datasets.hdf5.reading import PublishedDemo
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.placement import GAP
 from lerobot_memobench.sim.scene import TABLE_TOP
 from lerobot_memobench.sim.simulation import Simulation
-from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.loading import load_task
 from lerobot_memobench.tasks.progress import Progress
-from lerobot_memobench.tasks.task import BDDL_FILE, MEMORY_TYPES, METADATA_FILE, Task
+from lerobot_memobench.tasks.task import Task
 
 NO_SEED = -1
 """Seed of a demonstration that does not say it."""
-
-Metadata = dict[str, Any]
-
-
-def task_of(file: PublishedFile, demo: PublishedDemo) -> Task:
-    """Return the task that a demonstration shows, from the file's own BDDL and metadata.
-
-    Raises:
-        Unusable: they do not make a task.
-    """
-    name = task_name(file)
-    ours = file.task_metadata
-    metadata = dict(demo.metadata if ours is None else ours)
-    if ours is None:
-        # The frames differ between demonstrations, the task must not: its scene is compiled once.
-        goals = metadata.get("subtask_goals")
-        metadata["key_frame"] = [-1] * len(goals) if isinstance(goals, list) else []
-        metadata["timestep_exec_start_idx"] = -1
-    memory_type = file.attribute("memory_type") or _memory_type(name, file)
-    task = _load(name, memory_type, file.bddl_text, json.dumps(metadata, sort_keys=True))
-    if name in task_names():
-        known = get_task(name)
-        if "family" not in metadata:
-            task = replace(task, family=known.family)
-        if (task.bddl_text, task.metadata) == (known.bddl_text, known.metadata):
-            task = known
-    return task.variant(int(demo.extras.get("variant", 0))) if ours is not None else task
-
-
-def task_name(file: PublishedFile) -> str:
-    """Return the task's name: the folder of ``bddl_file_name``, or its stem, or the HDF5 file's."""
-    path = PurePosixPath(file.bddl_name.replace("\\", "/"))
-    if path.name == BDDL_FILE and path.parent.name not in ("", "..", "."):
-        return path.parent.name
-    if path.stem not in ("", "..", "task_config"):
-        return path.stem
-    return file.path.name.removesuffix(SUFFIX).removesuffix(file.path.suffix)
-
-
-def _memory_type(name: str, file: PublishedFile) -> str:
-    if name in task_names():
-        return get_task(name).memory_type
-    folders = [*PurePosixPath(file.bddl_name.replace("\\", "/")).parts, *file.path.resolve().parts]
-    return next((folder for folder in reversed(folders) if folder in MEMORY_TYPES), "")
-
-
-@lru_cache(maxsize=64)
-def _load(name: str, memory_type: str, bddl_text: str, metadata: str) -> Task:
-    with tempfile.TemporaryDirectory() as parent:
-        folder = Path(parent).resolve() / (memory_type or "tasks") / name
-        folder.mkdir(parents=True)
-        (folder / BDDL_FILE).write_text(bddl_text, encoding="utf-8")
-        (folder / METADATA_FILE).write_text(metadata, encoding="utf-8")
-        try:
-            return load_task(folder)
-        except MemobenchError as error:
-            told = str(error).replace(str(folder / METADATA_FILE), "meta_data")
-            raise Unusable(told.replace(str(folder / BDDL_FILE), "bddl_file_content")) from None
 
 
 def restore(task: Task, demo: PublishedDemo) -> Demonstration:
@@ -102,16 +41,9 @@ def restore(task: Task, demo: PublishedDemo) -> Demonstration:
         raise Unusable(f"states have width {demo.states.shape[1]}, expected {sim.state_dim} of task {task.name}")
     exec_start = execution_start(task, demo)
     _check_clock(demo.states, exec_start)
-    frames = key_frames(task, demo, exec_start)
+    told = _told_truth(task, demo, exec_start)
     poses = fixture_poses(sim, task, demo)
-    intervals = demo.extras.get("satisfied_intervals")
-    known: NDArray[np.bool_] | None = None
-    if intervals is not None:
-        known = truth_from_intervals(json.loads(intervals), len(demo.states))
-    elif frames and min(frames) >= 0:
-        known = np.arange(len(demo.states))[:, None] >= np.array(frames)
     found = _read_off(sim, task, demo.states, exec_start, poses, evaluate="success" not in demo.extras)
-    success = bool(demo.extras.get("success", found.success or (known is not None and len(frames) > 0)))
     try:
         restored = Demonstration(
             task=task,
@@ -123,19 +55,30 @@ def restore(task: Task, demo: PublishedDemo) -> Demonstration:
             proprio=found.proprio,
             images=None,
             exec_start=exec_start,
-            satisfied=found.satisfied if known is None else known,
-            success=success,
+            satisfied=found.satisfied if told is None else told,
+            success=bool(demo.extras.get("success", found.success or (told is not None and told.shape[1] > 0))),
             fixture_poses=poses,
             model_xml=demo.model_file,
             scene_hash=str(demo.extras.get("scene_hash", "")),
         )
-    except Unusable:
-        raise
+        written = demo.extras.get("digest", digest(restored))
     except MemobenchError as error:
         raise Unusable(str(error)) from None
-    if demo.extras.get("digest", digest(restored)) != digest(restored):
+    if written != digest(restored):
         raise Unusable("its states, actions or labels are not those that were written (the digest differs)")
     return restored
+
+
+def _told_truth(task: Task, demo: PublishedDemo, exec_start: int) -> NDArray[np.bool_] | None:
+    """Return the (T, K) truth that the group tells; None where the states have to."""
+    frames = key_frames(task, demo, exec_start)
+    intervals = demo.extras.get("satisfied_intervals")
+    if intervals is not None:
+        return truth_from_intervals(json.loads(intervals), len(demo.states))
+    if frames and min(frames) >= 0:
+        known: NDArray[np.bool_] = np.arange(len(demo.states))[:, None] >= np.array(frames)
+        return known
+    return None
 
 
 def execution_start(task: Task, demo: PublishedDemo) -> int:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from datatrove.pipeline.base import PipelineStep
 
-if TYPE_CHECKING:
-    from lerobot_memobench.datasets.running import Job
+from lerobot_memobench.jobs.job import Job
 
 
 class JobsStep(PipelineStep):
-    """Run the jobs of one rank: neighbours in the list, which are mostly of one task and share its scene."""
+    """Run the jobs of one rank: neighbours in the list, which may share what is costly to set up."""
 
     name = "jobs"
     type = "MEMOBench"

@@ -1,0 +1,200 @@
+"""Read files in the published layout, this package's or others', and say what is wrong with them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.datasets.demonstration import ACTION_DIM
+from lerobot_memobench.datasets.hdf5.checks import array, demo_number, finite, first_line, json_object, text_attribute
+from lerobot_memobench.datasets.hdf5.layout import EXTRAS, IMAGE_NAMES, Image, Unusable
+from lerobot_memobench.errors import MemobenchError
+
+if TYPE_CHECKING:
+    import h5py
+
+SLICE = 32
+"""Frames read at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class PublishedDemo:
+    """A group that was checked, without its images.
+
+    Attributes:
+        states: (T, D) float64.
+        actions: (T, 7) float32.
+        metadata: ``meta_data``.
+        model_file: MJCF, or "" where there is none.
+        extras: the attributes that only this package writes; empty for files of others.
+        image_size: (height, width).
+    """
+
+    group: str
+    states: NDArray[np.float64]
+    actions: NDArray[np.float32]
+    metadata: dict[str, Any]
+    model_file: str
+    extras: dict[str, Any]
+    image_size: tuple[int, int]
+
+
+class PublishedFile:
+    """A file in the published layout, being read; a context.
+
+    Every check names what was found. ``Unusable`` raised on opening concerns the file, by ``read`` a group.
+    """
+
+    def __init__(self, path: Path) -> None:
+        import h5py
+
+        self.path = path
+        try:
+            self._file: h5py.File = h5py.File(path, "r")
+        except FileNotFoundError:
+            raise Unusable("there is no such file") from None
+        except OSError as error:
+            raise Unusable(f"it is no HDF5 file, or was cut off ({first_line(error)})") from None
+        try:
+            data = self._file.get("data")
+            if not isinstance(data, h5py.Group):
+                raise Unusable(f"it has no group 'data' (found {', '.join(self._file) or 'nothing'})")
+            self._data: h5py.Group = data
+            self.bddl_name = text_attribute(data, "bddl_file_name", required=True)
+            self.bddl_text = text_attribute(data, "bddl_file_content", required=True)
+        except Unusable:
+            self._file.close()
+            raise
+        except Exception as error:
+            self._file.close()
+            raise Unusable(f"it is damaged ({first_line(error)})") from None
+
+    def __enter__(self) -> PublishedFile:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+    @cached_property
+    def task_metadata(self) -> dict[str, Any] | None:
+        """The task's metadata as this package stores it; None in files of others."""
+        stored = text_attribute(self._data, "task_metadata")
+        return None if stored is None else json_object(stored, "task_metadata")
+
+    def attribute(self, name: str) -> str | None:
+        """Return a text attribute of ``data``, or None."""
+        return text_attribute(self._data, name)
+
+    def groups(self) -> list[str]:
+        """Return the names of the demonstrations, demo_2 before demo_10."""
+        return sorted(self._data, key=lambda name: (demo_number(name) is None, demo_number(name) or 0, name))
+
+    def announced(self) -> int | None:
+        """Return how many demonstrations the file says it has, where it does."""
+        value = self._data.attrs.get("num_demos")
+        return int(value) if isinstance(value, int | np.integer) else None
+
+    def read(self, group: str) -> PublishedDemo:
+        """Read and check one demonstration, all but its pixels.
+
+        Raises:
+            Unusable: with the first thing that is not as the layout says.
+        """
+        try:
+            return self._read(group)
+        except Unusable:
+            raise
+        except Exception as error:  # h5py raises OSError, KeyError, RuntimeError, ValueError on damaged files
+            raise Unusable(f"it cannot be read ({first_line(error)})") from None
+
+    def _read(self, name: str) -> PublishedDemo:
+        import h5py
+
+        group = self._data[name]
+        if demo_number(name) is None or not isinstance(group, h5py.Group):
+            raise Unusable("it is no group demo_<number>")
+        states = array(group, "states", (None, None), np.float64)
+        actions = array(group, "actions", (None, ACTION_DIM), np.float32, np.float64)
+        if not isinstance(group.get("obs"), h5py.Group):
+            raise Unusable("the group 'obs' is missing")
+        images = {
+            image: array(group, f"obs/{image}", (None, None, None, 3), np.uint8) for image in IMAGE_NAMES.values()
+        }
+        _check_length(group, {"states": states, "actions": actions, **images})
+        image_size = _image_size(images.values())
+        return PublishedDemo(
+            group=name,
+            states=finite("states", states[:]),
+            actions=finite("actions", actions[:]).astype(np.float32),
+            metadata=json_object(text_attribute(group, "meta_data", required=True), "meta_data"),
+            model_file=text_attribute(group, "model_file") or "",
+            extras={key: group.attrs[key] for key in EXTRAS if key in group.attrs},
+            image_size=image_size,
+        )
+
+    def images(self, group: str, *, upside_down: bool = False) -> Iterator[dict[str, Image]]:
+        """Yield both cameras' frames, (H, W, 3) uint8, one after the other; ``SLICE`` of them are in memory.
+
+        Args:
+            group: a name of ``groups()``.
+            upside_down: the file's images are stored as robosuite's renderer gives them: turn them up.
+        """
+        obs = self._data[group]["obs"]
+        length = len(obs[IMAGE_NAMES["image"]])
+        for start in range(0, length, SLICE):
+            try:
+                block = {camera: obs[name][start : start + SLICE] for camera, name in IMAGE_NAMES.items()}
+            except Exception as error:
+                raise Unusable(f"its images cannot be read from frame {start} on ({first_line(error)})") from None
+            for offset in range(len(block["image"])):
+                frame = {camera: frames[offset] for camera, frames in block.items()}
+                if upside_down:
+                    frame = {camera: np.ascontiguousarray(picture[::-1]) for camera, picture in frame.items()}
+                yield frame
+
+
+def _check_length(group: h5py.Group, arrays: Mapping[str, h5py.Dataset]) -> None:
+    """Raise unless all arrays have as many frames as ``num_samples`` says, and have some."""
+    lengths = {key: len(found) for key, found in arrays.items()}
+    if len(set(lengths.values())) > 1:
+        told = ", ".join(f"{key} {length}" for key, length in lengths.items())
+        raise Unusable(f"its arrays have different lengths: {told}")
+    length = lengths["states"]
+    if not length:
+        raise Unusable("it has no frames")
+    count = group.attrs.get("num_samples")
+    if count is None:
+        raise Unusable("the attribute 'num_samples' is missing")
+    if not isinstance(count, int | np.integer) or int(count) != length:
+        raise Unusable(f"num_samples is {count}, but its arrays have {length} frames")
+
+
+def _image_size(images: Iterable[h5py.Dataset]) -> tuple[int, int]:
+    """Return (height, width) of all cameras."""
+    sizes = {image.shape[1:3] for image in images}
+    if len(sizes) > 1:
+        raise Unusable(f"its cameras have different sizes: {', '.join(map(str, sorted(sizes)))}")
+    return sizes.pop()
+
+
+def find_files(source: Path) -> list[Path]:
+    """Return the HDF5 files of a path: itself, or all below it, sorted.
+
+    Raises:
+        MemobenchError: there is none.
+    """
+    if source.is_file():
+        return [source]
+    found = sorted(path for path in source.rglob("*") if path.suffix in (".hdf5", ".h5") and path.is_file())
+    if not found:
+        raise MemobenchError(f"found no HDF5 file (.hdf5, .h5) at {source}; name a file or a folder of them")
+    return found

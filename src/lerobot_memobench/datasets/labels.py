@@ -1,0 +1,127 @@
+"""The one place where a demonstration's labels are computed.
+
+Every checkpoint column of the dataset is a function of the demonstration, :func:`labels`, so that writers, validators
+and policies cannot disagree about what a column means.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.datasets.demonstration import EXECUTION, PROMPT, Demonstration
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.tasks.memory_text import memory_text
+from lerobot_memobench.tasks.task import LEVELS, OPERATIONS, Task
+
+MAX_CHECKPOINTS = 6
+"""Width of ``checkpoint.completed``: no task of the benchmark has more checkpoints."""
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """Per-frame columns of one episode of T frames (attribute to column name: :meth:`columns`).
+
+    Attributes:
+        phase: (T,) int64, 0 prompt, 1 execution.
+        index: (T,) int64, checkpoints completed in order at frames before t: the number of the one worked on.
+        operation: (T,) int64, 0 S, 1 U, 2 C of that checkpoint, -1 when none is left.
+        completed: (T, 6) bool, checkpoint k has been satisfied at some frame up to and including t.
+        event: (T,) bool, some checkpoint is satisfied for the first time at frame t.
+        simple_subgoal: T strings, intermediate-level text of the checkpoint worked on. Once all are done the
+            last one's text stays (``operation`` is -1 there), so the column is never empty.
+        grounded_subgoal, coarse_subgoal: the same at the fine and at the coarse level.
+        memory: T strings, intermediate-level texts of the checkpoints completed in order before t, joined by
+            "; "; empty at the start. The oracle memory of the paper (:mod:`lerobot_memobench.tasks.memory_text`).
+        key_frames: (K,) int64, the frame at which checkpoint k was completed in order, -1 if it never was.
+    """
+
+    phase: NDArray[np.int64]
+    index: NDArray[np.int64]
+    operation: NDArray[np.int64]
+    completed: NDArray[np.bool_]
+    event: NDArray[np.bool_]
+    simple_subgoal: list[str]
+    grounded_subgoal: list[str]
+    coarse_subgoal: list[str]
+    memory: list[str]
+    key_frames: NDArray[np.int64]
+
+    def columns(self) -> dict[str, NDArray | list[str]]:
+        """Return the dataset's column names and their T values each."""
+        return {
+            "phase": self.phase,
+            "checkpoint.index": self.index,
+            "checkpoint.operation": self.operation,
+            "checkpoint.completed": self.completed,
+            "checkpoint.event": self.event,
+            "simple_subgoal": self.simple_subgoal,
+            "grounded_subgoal": self.grounded_subgoal,
+            "coarse_subgoal": self.coarse_subgoal,
+            "memory": self.memory,
+        }
+
+
+def labels(demo: Demonstration) -> Labels:
+    """Compute every checkpoint column of a demonstration.
+
+    A checkpoint is completed in order at the first frame at which its predicate holds while all earlier ones
+    have been completed (at that frame or before it). Several may be completed at one frame. A predicate that
+    held too early and no longer holds when its turn comes is not completed, though ``completed`` and
+    ``event``, which ignore the order, show it.
+    """
+    task, length = demo.task, len(demo)
+    _check_width(task)
+    key_frames = _ordered_completion(demo.satisfied)
+    index = _completed_before(key_frames, length)
+    ever = np.logical_or.accumulate(demo.satisfied, axis=0)
+    # One entry per value of index, 0 ... K; the last stands for "none left". A code is a position in "SUC".
+    codes = [OPERATIONS.index(checkpoint.operation) for checkpoint in task.checkpoints] + [-1]
+    texts = {level: _subgoals(task, number) for number, level in enumerate(LEVELS)}
+    memories = [memory_text(task, k) for k in range(len(task.checkpoints) + 1)]
+    return Labels(
+        phase=np.where(np.arange(length) < demo.exec_start, PROMPT, EXECUTION).astype(np.int64),
+        index=index,
+        operation=np.array(codes, dtype=np.int64)[index],
+        completed=np.pad(ever, [(0, 0), (0, MAX_CHECKPOINTS - ever.shape[1])]),
+        event=np.asarray(np.diff(ever, axis=0, prepend=False).any(axis=1)),
+        simple_subgoal=[texts["intermediate"][k] for k in index],
+        grounded_subgoal=[texts["fine"][k] for k in index],
+        coarse_subgoal=[texts["coarse"][k] for k in index],
+        memory=[memories[k] for k in index],
+        key_frames=key_frames,
+    )
+
+
+def _check_width(task: Task) -> None:
+    if len(task.checkpoints) > MAX_CHECKPOINTS:
+        raise MemobenchError(
+            f"task {task.name} has {len(task.checkpoints)} checkpoints; the column checkpoint.completed has room for "
+            f"{MAX_CHECKPOINTS}, so merge some of them"
+        )
+
+
+def _ordered_completion(satisfied: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """(T, K) truth table to (K,) frames of ordered completion, -1 for never."""
+    key_frames = np.full(satisfied.shape[1], -1, dtype=np.int64)
+    frame = 0
+    for k in range(satisfied.shape[1]):
+        holds = np.flatnonzero(satisfied[frame:, k])
+        if holds.size == 0:
+            break
+        frame += int(holds[0])  # the next checkpoint may hold at this same frame
+        key_frames[k] = frame
+    return key_frames
+
+
+def _completed_before(key_frames: NDArray[np.int64], length: int) -> NDArray[np.int64]:
+    """(K,) frames of ordered completion to (length,) how many lie before each frame."""
+    return np.searchsorted(key_frames[key_frames >= 0], np.arange(length), side="left").astype(np.int64)
+
+
+def _subgoals(task: Task, level: int) -> list[str]:
+    """K + 1 texts; once all checkpoints are done the last one's stays. A task without any has its instruction."""
+    texts = [checkpoint.language[level] for checkpoint in task.checkpoints] or [task.language]
+    return [*texts, texts[-1]]

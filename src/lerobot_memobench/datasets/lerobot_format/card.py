@@ -1,0 +1,187 @@
+"""The dataset card: README.md beside the data, as the Hugging Face hub shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lerobot_memobench.datasets.lerobot_format.card_tables import (
+    buckets_table,
+    lengths_table,
+    markdown,
+    ordered_types,
+    storage_of,
+    tasks_table,
+)
+from lerobot_memobench.datasets.staging.episode import StagedEpisode
+
+LICENSE = "apache-2.0"
+
+SCRIPTED = (
+    "Scripted experts act in a MuJoCo simulation; nothing was collected from people or robots. Actions were recorded "
+    "as applied, so that replaying them from the seed gives the same states."
+)
+
+COLUMNS = {
+    "observation.images.image": "third-person camera",
+    "observation.images.wrist_image": "wrist camera",
+    "observation.state": "end-effector position 3, axis-angle 3, gripper joints 2",
+    "action": "OSC pose delta 6 (±1 is ±0.05 m, ±0.5 rad), gripper (−1 opens, +1 closes)",
+    "phase": "0 prompt video (the policy does not act), 1 execution",
+    "checkpoint.index": "number of checkpoints completed in order before this frame",
+    "checkpoint.operation": "of the next one: 0 Storage, 1 Update, 2 Compression; −1 when none is left",
+    "checkpoint.completed": "checkpoint k has been satisfied by now; false beyond the task's count",
+    "checkpoint.event": "a checkpoint is satisfied for the first time at this frame",
+    "simple_subgoal": "text of the checkpoint being worked on, intermediate level",
+    "grounded_subgoal": "the same at the fine level; once all are done, the last one's text stays",
+    "coarse_subgoal": "the same at the coarse level",
+    "memory": "the checkpoints completed in order before this frame, as text (oracle memory); empty at the start",
+    "language_persistent": "LeRobot's language rows, styles `subtask` and `memory`, for its training recipes",
+}
+
+EPISODE_COLUMNS = {
+    "task_name": "task of the catalogue",
+    "memory_type": "temporal, spatial, object or procedural",
+    "family": "group of similar tasks",
+    "operations": "labels of the checkpoints in order, e.g. SUC",
+    "seed": "seed of the scene",
+    "referent": "fixed, or random: the prompt video decides what the goal is",
+    "variant": "which admissible referent or order; 0 is the published one",
+    "success": "the goal was reached",
+    "exec_start_index": "frame at which execution starts",
+    "key_frames": "frame at which each checkpoint was completed in order, −1 if never",
+    "scene_hash": "hash of the initial scene",
+    "fixture_poses": "JSON, fixture to position and quaternion wxyz",
+    "digest": "sha256 of states, actions and labels",
+}
+
+
+def write_card(
+    folder: Path,
+    episodes: Sequence[StagedEpisode],
+    features: dict[str, dict[str, Any]],
+    *,
+    repo_id: str,
+    made_by: str,
+    left_out: Sequence[str] = (),
+) -> None:
+    """Write ``folder``/README.md: what the dataset is, its columns, how it was made, statistics, licence."""
+    solved = [episode for episode in episodes if episode.failure is None]
+    failed = [episode for episode in episodes if episode.failure is not None]
+    written = [episode.info for episode in solved]
+    parts = [
+        _front_matter(len(written)),
+        "# MEMOBench demonstrations",
+        *_introduction(written, repo_id),
+        "## How it was made",
+        (made_by or f"Written by `lerobot_memobench`. {SCRIPTED}") + " `manifest.json` holds a hash of every episode's "
+        "states, actions and labels; `states/` holds the simulator's states (1 + nq + nv numbers per frame).",
+        _failures(failed, len(episodes)),
+        _left_out(left_out),
+        "## Statistics",
+        *_statistics(written, failed, storage_of(folder, solved)),
+        "## Columns",
+        *_columns(features),
+        "## Licence",
+        "Apache-2.0.",
+    ]
+    (folder / "README.md").write_text("\n\n".join(part for part in parts if part) + "\n", encoding="utf-8")
+
+
+def _front_matter(count: int) -> str:
+    bucket = "n<1K" if count < 1000 else "1K<n<10K"
+    return "\n".join(
+        [
+            "---",
+            f"license: {LICENSE}",
+            "task_categories:",
+            "- robotics",
+            "tags:",
+            *(f"- {tag}" for tag in ("LeRobot", "memobench", "memory", "manipulation", "simulation", "mujoco")),
+            "language:",
+            "- en",
+            "size_categories:",
+            f"- {bucket}",
+            "configs:",
+            "- config_name: default",
+            "  data_files: data/*/*.parquet",
+            "---",
+        ]
+    )
+
+
+def _introduction(written: Sequence[dict[str, Any]], repo_id: str) -> list[str]:
+    tasks = {info["task_name"] for info in written}
+    return [
+        f"{len(written)} demonstrations of {len(tasks)} robot manipulation tasks that need memory "
+        f"({', '.join(ordered_types(written))}), as a LeRobotDataset v3.0 at 20 frames per second. Each task names the "
+        "checkpoints a memory has to keep (Storage), revise (Update) or summarise (Compression); every frame says "
+        "which of them are done, because the simulator wrote the labels. Benchmark and metrics: MEMOBench; generator, "
+        "environment and policies: `lerobot_memobench`.",
+        f'```python\nfrom lerobot.datasets import LeRobotDataset\n\ndataset = LeRobotDataset("{repo_id}", '
+        'root="<this folder>")\n'
+        'one_type = LeRobotDataset(..., episode_filter=lambda episode: episode["memory_type"] == "spatial")\n'
+        "```",
+        "Pass `collate_fn=lerobot.utils.collate.lerobot_collate_fn` to a DataLoader of your own: language rows differ "
+        "in number between episodes. `lerobot-train` does so by itself.",
+    ]
+
+
+def _statistics(
+    written: Sequence[dict[str, Any]], failed: Sequence[StagedEpisode], storage: dict[str, float]
+) -> list[str]:
+    return [
+        "Steps are frames: control steps of 50 ms, prompt video included. The paper's rows are those of its "
+        "demonstrations (appendix, family level statistics), stored as HDF5; storage here is that of the "
+        "LeRobotDataset: videos as they are, everything else in proportion to the frames.",
+        lengths_table(written, storage),
+        _prompts(written),
+        "How many episodes have which length, in steps (paper: appendix, distribution of lengths):",
+        buckets_table(written),
+        tasks_table(written, failed),
+    ]
+
+
+def _prompts(infos: Sequence[dict[str, Any]]) -> str:
+    parts = []
+    for name in ordered_types(infos):
+        lengths = [info["exec_start_index"] for info in infos if info["memory_type"] == name]
+        if any(lengths):
+            parts.append(f"{np.mean(lengths):.1f} in {name} tasks")
+    return f"Of these steps the prompt video takes, on average, {' and '.join(parts)}." if parts else ""
+
+
+def _columns(features: dict[str, dict[str, Any]]) -> list[str]:
+    return [
+        markdown(
+            ["column", "type", "meaning"],
+            [[f"`{key}`", _type(ft), COLUMNS[key]] for key, ft in features.items() if key in COLUMNS],
+        ),
+        "LeRobot's own columns are there too: `task`, `timestamp`, `frame_index`, `episode_index`, `index`, "
+        "`task_index`.",
+        "Per episode, in `meta/episodes`:",
+        markdown(["column", "meaning"], [[f"`{key}`", meaning] for key, meaning in EPISODE_COLUMNS.items()]),
+        "`meta/stats.json` holds mean, standard deviation, range and the quantiles q01, q10, q50, q90, q99; those of "
+        "numbers are exact over all frames, those of images over sampled frames.",
+    ]
+
+
+def _failures(failed: Sequence[StagedEpisode], asked: int) -> str:
+    if not failed:
+        return f"All {asked} seeds asked for were solved; none was left out."
+    lines = [f"- {e.info['task_name']}, seed {e.info['seed']}: {e.failure}" for e in failed]
+    return f"**{len(failed)} of {asked} seeds asked for have no demonstration here:**\n\n" + "\n".join(lines)
+
+
+def _left_out(problems: Sequence[str]) -> str:
+    if not problems:
+        return ""
+    return f"**Left out ({len(problems)}):**\n\n" + "\n".join(f"- {problem}" for problem in problems)
+
+
+def _type(feature: dict[str, Any]) -> str:
+    shape = tuple(feature["shape"])
+    return feature["dtype"] if shape == (1,) else f"{feature['dtype']} {'×'.join(map(str, shape))}"

@@ -1,0 +1,30 @@
+"""Memory cache: what a memory policy would otherwise recompute for every sample, made once beside the dataset.
+
+It holds the pooled tokens of the frozen vision tower for every ``stride``-th frame of one camera, the embedding of
+every subgoal text, and per frame its phase and subgoal. Everything large is memory-mapped, so training gathers 32
+frames of history without decoding a video (delta timestamps are fixed offsets and cannot say "spread over the episode
+so far").
+"""
+
+from lerobot_memobench.datasets.memory_cache.building import (
+    FrameEncoder,
+    Progress,
+    TextEncoder,
+    build_memory_cache,
+)
+from lerobot_memobench.datasets.memory_cache.frame_table import resolve_subgoals
+from lerobot_memobench.datasets.memory_cache.layout import FOLDER, CacheMeta, dataset_fingerprint, read_meta
+from lerobot_memobench.datasets.memory_cache.reading import MemoryCache
+
+__all__ = [
+    "FOLDER",
+    "CacheMeta",
+    "FrameEncoder",
+    "MemoryCache",
+    "Progress",
+    "TextEncoder",
+    "build_memory_cache",
+    "dataset_fingerprint",
+    "read_meta",
+    "resolve_subgoals",
+]

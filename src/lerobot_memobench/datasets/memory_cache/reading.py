@@ -1,0 +1,126 @@
+"""Read a complete memory cache, through memory maps."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lerobot_memobench.datasets.memory_cache.frame_table import LEVEL_COLUMNS, MEMORY_COLUMN, resolve_subgoals
+from lerobot_memobench.datasets.memory_cache.layout import (
+    FOLDER,
+    FORMAT,
+    TOKENS_FILE,
+    CacheMeta,
+    dataset_fingerprint,
+    fix_hint,
+    read_meta,
+    slot_starts,
+)
+from lerobot_memobench.errors import MemobenchError
+
+
+class MemoryCache:
+    """A complete cache, read through memory maps. Open one with :meth:`open`."""
+
+    def __init__(self, folder: Path, meta: CacheMeta) -> None:
+        self.folder, self.meta = folder, meta
+        self.episodes: np.ndarray = np.load(folder / "episodes.npy")
+        self.phase: np.ndarray = np.load(folder / "phase.npy")
+        self.slots = slot_starts(self.episodes, meta.stride)
+        self._tokens = np.memmap(folder / TOKENS_FILE, dtype=np.uint16, mode="r", shape=meta.shape)
+        self._subgoals = {
+            level: resolve_subgoals(np.load(folder / f"subgoal-{level}.npy"), self.episodes) for level in meta.levels
+        }
+        self.texts: list[str] = json.loads((folder / "texts.json").read_text())
+        self.text_embeddings = torch.from_numpy(np.load(folder / "texts.npy"))
+        self._memory: np.ndarray | None = np.load(folder / "memory.npy") if meta.oracle else None
+        self.memories: list[str] = json.loads((folder / "memory.json").read_text()) if meta.oracle else []
+
+    @classmethod
+    def open(
+        cls, root: Path, name: str, *, frames_key: str, camera: str, stride: int, texts_key: str | None = None
+    ) -> MemoryCache:
+        """Open ``<root>/memory_cache/<name>`` after checking that it fits.
+
+        Args:
+            root: folder of the LeRobotDataset.
+            frames_key: identity of the vision tower that will read the cache.
+            texts_key: identity of the text encoder; None when no text is needed.
+
+        Raises:
+            MemobenchError: no cache, an unfinished one, one of another dataset (stale), or one made by another tower,
+                camera, stride or text encoder (foreign). The message names the reason and the fix.
+        """
+        root = Path(root)
+        meta = read_meta(root, name)
+        if meta is None:
+            raise MemobenchError(f"{root} has no memory cache '{name}'. {fix_hint(root)}")
+        wanted = {
+            "format": FORMAT,
+            "dataset": dataset_fingerprint(root, camera),
+            "frames_key": frames_key,
+            "camera": camera,
+            "stride": stride,
+        }
+        if texts_key is not None:
+            wanted["texts_key"] = texts_key
+        reason = meta.mismatch(wanted)
+        if reason:
+            raise MemobenchError(f"The memory cache {root / FOLDER / name} {reason}. {fix_hint(root)}")
+        if not meta.complete:
+            raise MemobenchError(
+                f"The memory cache {root / FOLDER / name} is not finished. Go on with `memobench cache {root}`."
+            )
+        return cls(root / FOLDER / name, meta)
+
+    @property
+    def num_frames(self) -> int:
+        """Frames of the dataset."""
+        return int(self.episodes[-1])
+
+    def locate(self, index: int) -> tuple[int, int]:
+        """Episode and frame in it, of a frame of the dataset's global index."""
+        if not 0 <= index < self.num_frames:
+            raise MemobenchError(
+                f"Frame {index} lies outside the memory cache {self.folder}, which has {self.num_frames} frames. "
+                f"{fix_hint(self.folder.parent.parent)}"
+            )
+        episode = int(np.searchsorted(self.episodes, index, "right")) - 1
+        return episode, index - int(self.episodes[episode])
+
+    def tokens(self, episode: int, slots: Sequence[int]) -> Tensor:
+        """Tokens (n, P, D) bfloat16 of stored frames of an episode; slot k is its frame k * stride."""
+        rows = np.asarray(slots, dtype=np.int64) + self.slots[episode]
+        return torch.from_numpy(self._tokens[rows]).view(torch.bfloat16)
+
+    def memory_texts(self, indices: Sequence[int]) -> list[str]:
+        """Oracle memory texts of frames of the dataset, by their global indices.
+
+        Raises:
+            MemobenchError: the dataset has no such column.
+        """
+        if self._memory is None:
+            raise MemobenchError(
+                f"The dataset of {self.folder} has no column '{MEMORY_COLUMN}', which --policy.oracle_memory=true "
+                "reads; generate it again with this version."
+            )
+        return [self.memories[row] for row in self._memory[np.asarray(indices, dtype=np.int64)].tolist()]
+
+    def text_rows(self, level: str) -> np.ndarray:
+        """(N,) int32: row of :attr:`text_embeddings` for each frame of the dataset; -1 where there is none.
+
+        Raises:
+            MemobenchError: the dataset has no texts at this level.
+        """
+        if level not in self._subgoals:
+            known = ", ".join(self._subgoals) or "none"
+            raise MemobenchError(
+                f"The dataset of {self.folder} has no subgoals at level '{level}' (column {LEVEL_COLUMNS[level]}); "
+                f"levels it has: {known}. Choose one with --policy.subgoal_level."
+            )
+        return self._subgoals[level]

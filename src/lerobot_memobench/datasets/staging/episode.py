@@ -1,0 +1,126 @@
+"""A finished episode's folder, read back."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.datasets.language import LanguageRow
+from lerobot_memobench.datasets.staging.folders import file_hash
+from lerobot_memobench.datasets.statistics import Stats
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files import file_name
+
+RECORD_FILE = "episode.json"
+ARRAYS_FILE = "arrays.npz"
+HDF5_FILE = "demonstration.hdf5"
+
+LEROBOT, HDF5 = "lerobot", "hdf5"
+FORMATS = (LEROBOT, HDF5)
+"""What a run can make of its episodes."""
+
+
+@dataclass(frozen=True)
+class StagedEpisode:
+    """A finished episode's folder; ``record`` is its episode.json, the rest is read when asked for."""
+
+    folder: Path
+    record: dict[str, Any]
+
+    @property
+    def failure(self) -> str | None:
+        """Why there is no demonstration of this seed, or None."""
+        return self.record["failure"]
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """Identity and per-episode metadata (see ``episode_info``)."""
+        return self.record["info"]
+
+    @property
+    def language_rows(self) -> list[LanguageRow]:
+        """LeRobot's persistent language rows (see ``persistent_rows``)."""
+        return self.record["language_persistent"]
+
+    @property
+    def has_images(self) -> bool:
+        """Whether its cameras were recorded."""
+        return bool(self.record["image_stats"])
+
+    @property
+    def hdf5(self) -> Path:
+        """The demonstration in the published layout, alone at the root of a file of its own."""
+        return self.folder / HDF5_FILE
+
+    @property
+    def hdf5_attributes(self) -> dict[str, Any] | None:
+        """Attributes of its task's HDF5 file; None where HDF5 was not asked for."""
+        return self.record.get("hdf5")
+
+    @property
+    def video_bytes(self) -> int:
+        """Size of its videos."""
+        return sum(self.video(camera).stat().st_size for camera in self.record["image_stats"])
+
+    def video(self, camera: str) -> Path:
+        """Return the file of a camera's video."""
+        return self.folder / f"{camera}.mp4"
+
+    def image_stats(self, camera: str) -> Stats:
+        """Return the statistics of a camera's pixels (see ``ImageHistograms``)."""
+        return {name: np.array(value) for name, value in self.record["image_stats"][camera].items()}
+
+    def arrays(self) -> dict[str, NDArray]:
+        """Read states, actions, proprio and label columns; text columns are arrays of str."""
+        with np.load(self.folder / ARRAYS_FILE, allow_pickle=False) as data:
+            return dict(data)
+
+    def check(self) -> None:
+        """Raise a MemobenchError that names the first file whose bytes are not those that were written."""
+        for name, expected in self.record["files"].items():
+            path = self.folder / file_name(name, f"a file that {self.folder / RECORD_FILE} names")
+            found = file_hash(path) if path.is_file() else "missing"
+            if found != expected:
+                raise MemobenchError(
+                    f"{path} is damaged (sha256 {found[:12]}, written as {expected[:12]}); "
+                    f"delete the folder {self.folder} and generate again to make this episode anew"
+                )
+
+
+def read_staged(folder: Path) -> StagedEpisode | None:
+    """Return the finished episode in ``folder``, or None when there is none."""
+    try:
+        return StagedEpisode(folder, json.loads((folder / RECORD_FILE).read_text()))
+    except FileNotFoundError:
+        return None
+    except json.JSONDecodeError as error:
+        raise MemobenchError(
+            f"{folder / RECORD_FILE} is damaged ({error}); delete the folder and generate again"
+        ) from None
+
+
+class StagedJob:
+    """What jobs have in common that make one episode, complete or absent: two workers at the same one do no harm."""
+
+    folder: Path
+
+    def finished(self) -> bool:
+        """Whether the episode, or why there is none, is in ``folder``."""
+        return read_staged(self.folder) is not None
+
+    def failure(self) -> str | None:
+        """Why a finished job has no episode, or None."""
+        return staged(self).failure
+
+
+def staged(job: StagedJob) -> StagedEpisode:
+    """Return the finished episode of a job that has been run."""
+    found = read_staged(job.folder)
+    if found is None:
+        raise MemobenchError(f"{job.folder} has vanished while the run was going on; run the command again")
+    return found

@@ -1,0 +1,41 @@
+"""What the log keeps of a finished episode."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from lerobot_memobench.envs.episode import Episode
+from lerobot_memobench.tasks.failures import classify_failure
+
+
+def episode_record(episode: Episode, *, seed_base: int, replan_steps: int | None, wall_s: float) -> dict[str, Any]:
+    """Return an episode's line for the log (`docs/evaluate.md` tells its fields).
+
+    Args:
+        seed_base: the seed that counts as episode 0.
+        replan_steps: actions that the policy executes per prediction, where it is known.
+        wall_s: seconds that the episode took.
+    """
+    progress, task = episode.progress, episode.task
+    return {
+        "task": task.name,
+        "memory_type": task.memory_type,
+        "episode": episode.seed - seed_base,
+        "seed": episode.seed,
+        "referent": episode.referent,
+        "variant": task.variant_index,
+        "replan_steps": replan_steps,
+        "prompt_steps": episode.exec_start if episode.exec_start is not None else episode.step_index,
+        "prompt_shown": episode.prompt_shown,
+        "steps": episode.exec_steps,
+        "success": episode.success,
+        "checkpoints": [
+            {"operation": checkpoint.operation, "first_step": first, "ordered_step": ordered}
+            for checkpoint, first, ordered in zip(
+                task.checkpoints, progress.first_step, progress.ordered_step, strict=True
+            )
+        ],
+        "failure": classify_failure(task, progress.first_step, episode.success, episode.drifted),
+        "scene_hash": episode.scene_hash,
+        "wall_s": round(wall_s, 3),
+    }

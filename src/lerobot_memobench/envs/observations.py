@@ -1,0 +1,73 @@
+"""What a policy is shown and what it answers: names, shapes and units, for LeRobot's configuration and for gym.
+
+Cheap to import: no simulator, no GL.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+
+IMAGE_SIZE = 256
+"""Height and width of a picture, pixels."""
+IMAGE_KEYS = {"image": "agentview", "wrist_image": "wrist"}
+"""Observation name → camera; `observation.images.<name>` in datasets and at the policy."""
+PROPRIO_DIM = 8
+"""End-effector position (3, m), axis-angle (3, rad), fingers (2, m)."""
+ACTION_DIM = 7
+"""End-effector displacement (6; ±5 cm, ±0.5 rad per unit), gripper (−1 opens, 1 closes)."""
+PROMPT, EXECUTION = 0, 1
+"""Values of `phase`: a prompt video plays and actions have no effect; the policy acts."""
+
+METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}
+
+
+def policy_features() -> dict[str, PolicyFeature]:
+    """Return LeRobot's description of actions and observations, by the environment's names."""
+    image = PolicyFeature(type=FeatureType.VISUAL, shape=(IMAGE_SIZE, IMAGE_SIZE, 3))
+    return {
+        ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(ACTION_DIM,)),
+        **{f"pixels/{name}": image for name in IMAGE_KEYS},
+        "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(PROPRIO_DIM,)),
+    }
+
+
+def policy_names() -> dict[str, str]:
+    """Return what each of `policy_features` is called at the policy."""
+    return {
+        ACTION: ACTION,
+        **{f"pixels/{name}": f"{OBS_IMAGES}.{name}" for name in IMAGE_KEYS},
+        "agent_pos": OBS_STATE,
+    }
+
+
+def observation_space(expert_action: bool) -> spaces.Dict:
+    """Return the space of observations, with the scripted expert's action on request."""
+    image = spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
+    parts: dict[str, spaces.Space[Any]] = {
+        "pixels": spaces.Dict(dict.fromkeys(IMAGE_KEYS, image)),
+        "agent_pos": spaces.Box(-np.inf, np.inf, (PROPRIO_DIM,), np.float32),
+        # LeRobot passes numeric keys that it does not know on as `observation.<key>`, so a policy with a memory can
+        # tell by itself when each row of a batch starts and stands still.
+        "phase": spaces.Box(PROMPT, EXECUTION, (1,), np.float32),
+        "step": spaces.Box(0, np.inf, (1,), np.float32),
+    }
+    if expert_action:
+        parts["expert_action"] = action_space()
+    return spaces.Dict(parts)
+
+
+def action_space() -> spaces.Box:
+    """Return the space of actions."""
+    return spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
+
+
+def blank(space: spaces.Space[Any]) -> Any:
+    """Return an observation of nothing: zeros of the space's shapes."""
+    if isinstance(space, spaces.Dict):
+        return {key: blank(part) for key, part in space.items()}
+    return np.zeros(space.shape or (), space.dtype)

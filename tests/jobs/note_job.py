@@ -1,0 +1,33 @@
+"""A job that leaves a file; odd ones have a reason to give."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Note:
+    """Writes one character into ``folder``/runs each time it is run."""
+
+    folder: Path
+    seed: int
+    task_name: str = "note"
+
+    def run(self) -> None:
+        """Write."""
+        with (self.folder / "runs").open("a") as file:
+            file.write("x")
+
+    def finished(self) -> bool:
+        """Whether it has been run."""
+        return (self.folder / "runs").is_file()
+
+    def failure(self) -> str | None:
+        """Return a reason where the number is odd."""
+        return "odd" if self.seed % 2 else None
+
+    @property
+    def runs(self) -> int:
+        """How often it has been run."""
+        return len((self.folder / "runs").read_text())
