@@ -60,6 +60,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self.render_mode = "rgb_array"
         self._task = load_task(folder)
         self.task = self._task.name
+        if log_dir is not None:  # now, not when the first episode has been simulated
+            file_name(self.task, "the name of a task")
         self._episode: Episode | None = None
         self._oracle_memory = oracle_memory
         self._describe(0)
@@ -115,8 +117,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._images = self.episode.images()
         self._discard_film()
         if self._videos is not None:
-            name = f"{file_name(self.task, 'the name of a task')}.{seed - self._seed_base}.mp4"
-            self._film = Film(self._videos / name, METADATA["render_fps"])
+            self._film = Film(self._videos / f"{self.task}.{seed - self._seed_base}.mp4", METADATA["render_fps"])
             self._film.add(self.render())
         return self._observation(), self._info()
 
