@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import re
 import statistics
 import sys
 from collections.abc import Collection, Iterator
@@ -90,6 +91,16 @@ def test_a_private_name_is_found() -> None:
 def test_the_picture_shows_the_imports_of_today() -> None:
     wanted = {here: targets for here, targets in house.direct(house.arrows(IMPORTS)).items() if targets}
     assert house.drawn() == wanted, "draw it anew: python scripts/house.py"
+
+
+def test_the_pages_for_newcomers_name_what_is_there() -> None:
+    source, pages = house.SOURCE / PACKAGE, sorted((house.ROOT / "docs" / "develop").glob("*.md"))
+    assert len(pages) == 5
+    for page in pages:
+        assert page.name == "way_of_a_frame.md" or len(page.read_text().splitlines()) <= 40
+        names = re.findall(r"`([\w/]+\.py)", page.read_text())
+        here = [house.ROOT, source, page.parent, *(path for path in source.rglob("*") if path.is_dir())]
+        assert [name for name in names if not any((base / name).is_file() for base in here)] == []
 
 
 def test_files_and_functions_are_short() -> None:
