@@ -1,0 +1,217 @@
+"""What could be seen now, as objects instead of pixels: class, pose, joint and highlight of each visible thing.
+
+The observation is a fixed number of slots, flat, float32. A slot is an object, a fixture, or a moving part of a fixture
+(a drawer, a door, a knob). Slots hold only what a camera of the benchmark sees at this moment:
+rays run from both cameras to points of each thing, and what none of them reaches is absent. They carry no identity:
+they are sorted by class and place, so exchanging two equal objects changes nothing; and no goal, progress or history.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, get_args, get_type_hints
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.sim.assets.asset import Articulation, Asset
+from lerobot_memobench.sim.assets.builder import VISUAL_GROUP
+from lerobot_memobench.sim.assets.registry import known_classes, split_class
+from lerobot_memobench.sim.simulation import CAMERAS, Simulation
+
+SLOTS = 16
+"""Things that an observation has room for. The catalogue's fullest scene has ten."""
+
+FIELDS = {"present": 1, "class": 1, "position": 3, "rotation": 6, "joint": 1, "highlighted": 1}
+"""Numbers of a slot, in order.
+
+``present``: 1, or 0 for an empty slot, which is all zeros. ``class``: index into `classes`. ``position``: of the
+thing's origin in the world, m. ``rotation``: the first two columns of its rotation matrix. ``joint``: position of a
+drawer (m), door or knob (rad), else 0. ``highlighted``: 1 while it stands in a highlight of the prompt.
+"""
+
+WIDTH = sum(FIELDS.values())
+SIZE = SLOTS * WIDTH
+"""Length of the observation."""
+
+STARTS = dict(zip(FIELDS, np.cumsum([0, *FIELDS.values()])[:-1].tolist(), strict=True))
+"""Field -> where it begins in its slot."""
+
+POINTS = 24
+"""Points of a thing to which rays run."""
+SEEN_POINTS = 2
+"""Rays that must arrive: one may slip through a gap between drawer and frame."""
+
+Array = NDArray[np.float64]
+
+
+@cache
+def classes() -> tuple[str, ...]:
+    """Return the names of the classes, in order of their indices: kinds of moving parts, then objects and fixtures."""
+    return (*get_args(get_type_hints(Articulation)["kind"]), *known_classes())
+
+
+def layout() -> dict[str, Any]:
+    """Return how to read the observation: ``slots``, ``fields`` (name, start, size) and ``classes``."""
+    fields = [{"name": name, "start": STARTS[name], "size": size} for name, size in FIELDS.items()]
+    return {"slots": SLOTS, "fields": fields, "classes": list(classes())}
+
+
+@dataclass(frozen=True)
+class Thing:
+    """What one slot may show.
+
+    Attributes:
+        kind: index of its class. body: whose pose it has. joint: address of its joint in qpos, None without one.
+        points: (POINTS, 3) on its surface, in the body's frame, m.
+    """
+
+    kind: int
+    body: int
+    joint: int | None
+    points: Array
+
+
+class ObjectSlots:
+    """Look at one simulation as slots.
+
+    Raises:
+        MemobenchError: the scene holds more things than there are slots, or one of a class that is not registered.
+    """
+
+    def __init__(self, sim: Simulation) -> None:
+        self._sim = sim
+        self._things: list[Thing] = []
+        self._owner = np.full(sim.model.nbody, -1)
+        for name, asset in sim.assets.items():
+            self._add(name, asset)
+        if len(self._things) > SLOTS:
+            raise MemobenchError(
+                f"task {sim.task.name} has {len(self._things)} objects and moving parts, more than the {SLOTS} that "
+                "an object observation holds; use env.obs_type=pixels_agent_pos"
+            )
+        for body in range(1, sim.model.nbody):  # parents go first: what hangs on a thing belongs to it
+            if self._owner[body] < 0:
+                self._owner[body] = self._owner[sim.model.body_parentid[body]]
+        self._things = [
+            Thing(thing.kind, thing.body, thing.joint, self._surface(index, thing.body))
+            for index, thing in enumerate(self._things)
+        ]
+        self._points = np.concatenate([thing.points for thing in self._things])
+        self._bodies = np.repeat([thing.body for thing in self._things], POINTS)
+        self._of_point = np.repeat(np.arange(len(self._things)), POINTS)
+        self._cameras = [sim.model.camera(name).id for name in CAMERAS.values()]
+        self._group = np.zeros(6, np.uint8)
+        self._group[VISUAL_GROUP] = 1
+
+    def observe(self) -> NDArray[np.float32]:
+        """Return the slots (SIZE,) of what is visible in the present state."""
+        seen = self._visible()
+        rows = [self._row(thing) for thing, visible in zip(self._things, seen, strict=True) if visible]
+        found = np.zeros((SLOTS, WIDTH), np.float32)
+        if rows:
+            stacked = np.array(rows)
+            place = stacked[:, STARTS["position"] : STARTS["position"] + 3]
+            order = np.lexsort((place[:, 2], place[:, 1], place[:, 0], stacked[:, STARTS["class"]]))
+            found[: len(rows)] = stacked[order]
+        return found.reshape(-1)
+
+    def _add(self, name: str, asset: Asset) -> None:
+        """Note an instance, and each of its moving parts."""
+        model = self._sim.model
+        self._note(split_class(asset.class_name)[0], model.body(name).id, None)
+        for articulation in asset.articulations.values():
+            joint = model.joint(articulation.joint)
+            self._note(articulation.kind, int(model.jnt_bodyid[joint.id]), int(joint.qposadr[0]))
+
+    def _note(self, kind: str, body: int, joint: int | None) -> None:
+        if kind not in classes():
+            raise MemobenchError(f"object observations know no class {kind!r}; use env.obs_type=pixels_agent_pos")
+        self._owner[body] = len(self._things)
+        self._things.append(Thing(classes().index(kind), body, joint, np.empty((0, 3))))
+
+    def _surface(self, index: int, body: int) -> Array:
+        """Return POINTS points of a thing's visual geoms, far apart, a little inside, in its body's frame."""
+        model = self._sim.model
+        found = []
+        for geom in np.flatnonzero((self._owner[model.geom_bodyid] == index) & (model.geom_group == VISUAL_GROUP)):
+            points = corners(model, geom)
+            points = points @ rotation(model.geom_quat[geom]).T + model.geom_pos[geom]
+            inner = model.geom_bodyid[geom]
+            while inner != body:
+                points = points @ rotation(model.body_quat[inner]).T + model.body_pos[inner]
+                inner = model.body_parentid[inner]
+            found.append(points)
+        points = spread(np.concatenate(found), POINTS)
+        middle = (points.min(axis=0) + points.max(axis=0)) / 2
+        return middle + 0.94 * (points - middle)
+
+    def _visible(self) -> NDArray[np.bool_]:
+        """Return for each thing whether a camera sees it."""
+        model, data = self._sim.model, self._sim.data
+        frames = data.xmat[self._bodies].reshape(-1, 3, 3)
+        targets = np.einsum("nij,nj->ni", frames, self._points) + data.xpos[self._bodies]
+        hits = np.zeros(len(self._things), dtype=int)
+        for camera in self._cameras:
+            origin = data.cam_xpos[camera].copy()
+            rays = targets - origin
+            inside = in_picture(rays @ data.cam_xmat[camera].reshape(3, 3), float(model.cam_fovy[camera]))
+            count = int(inside.sum())
+            if not count:
+                continue
+            geoms, distances = np.full(count, -1, np.int32), np.zeros(count)
+            mujoco.mj_multiRay(
+                model, data, origin, rays[inside].ravel(), self._group, True, -1, geoms, distances, None, count,
+                mujoco.mjMAXVAL,
+            )  # fmt: skip
+            owners = np.where(geoms >= 0, self._owner[model.geom_bodyid[geoms]], -1)
+            mine = self._of_point[inside]
+            hits += np.bincount(mine[owners == mine], minlength=len(hits))
+        return hits >= SEEN_POINTS
+
+    def _row(self, thing: Thing) -> Array:
+        data = self._sim.data
+        position = data.xpos[thing.body]
+        turned = data.xmat[thing.body].reshape(3, 3)
+        joint = 0.0 if thing.joint is None else data.qpos[thing.joint]
+        lit = any(
+            np.hypot(*(position[:2] - np.array(mark.position[:2]))) < mark.radius for mark in self._sim.highlights
+        )
+        return np.array([1.0, thing.kind, *position, *turned[:, 0], *turned[:, 1], joint, float(lit)])
+
+
+def rotation(quaternion: Array) -> Array:
+    """Return the rotation matrix (3, 3) of a quaternion wxyz."""
+    matrix = np.empty(9)
+    mujoco.mju_quat2Mat(matrix, quaternion)
+    return matrix.reshape(3, 3)
+
+
+def corners(model: mujoco.MjModel, geom: int) -> Array:
+    """Return points (n, 3) on a geom's surface in its frame: a mesh's vertices, else the corners of its box."""
+    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
+        mesh = model.geom_dataid[geom]
+        first = model.mesh_vertadr[mesh]
+        return np.asarray(model.mesh_vert[first : first + model.mesh_vertnum[mesh]], dtype=np.float64)
+    middle, half = model.geom_aabb[geom][:3], model.geom_aabb[geom][3:]
+    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+    return np.asarray(middle + signs * half)
+
+
+def spread(points: Array, count: int) -> Array:
+    """Return ``count`` of the points (n, 3), each the farthest from those before; repeated where there are fewer."""
+    chosen = [int(np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
+    distance = np.linalg.norm(points - points[chosen[0]], axis=1)
+    while len(chosen) < count:
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return points[chosen]
+
+
+def in_picture(rays: Array, fovy: float) -> NDArray[np.bool_]:
+    """Return which rays (n, 3), in a camera's frame (it looks along -z), fall into its square picture."""
+    edge = -rays[:, 2] * np.tan(np.radians(fovy) / 2)
+    return (np.abs(rays[:, 0]) < edge) & (np.abs(rays[:, 1]) < edge)

@@ -1,0 +1,191 @@
+"""Object observations hold what a camera sees now, without identity, and nothing is drawn for them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lerobot_memobench.envs.episode import Episode
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.sim import object_slots, simulation
+from lerobot_memobench.sim.object_slots import FIELDS, SIZE, SLOTS, STARTS, WIDTH, ObjectSlots, classes, layout
+from lerobot_memobench.sim.rendering import Highlight, RenderSettings
+from lerobot_memobench.sim.simulation import CAMERAS, Simulation
+from lerobot_memobench.tasks.catalogue import get_task, task_names
+
+NINE = "put_the_butter_picked_up_in_the_prompt_video_on_the_plate"
+DRAWERS = "put_the_tomato_into_the_top_drawer_of_the_cabinet"
+TOMATO, TOP = "beefsteak_tomato__1_1", "wooden_cabinet_1_top_region"
+
+
+def started(name: str, seed: int = 20_000) -> Simulation:
+    sim = Simulation(get_task(name))
+    sim.reset(seed)
+    return sim
+
+
+def table(sim: Simulation, slots: ObjectSlots | None = None) -> NDArray[np.float32]:
+    """The filled slots (n, WIDTH)."""
+    found = (slots or ObjectSlots(sim)).observe().reshape(SLOTS, WIDTH)
+    count = int(found[:, 0].sum())
+    assert not found[count:].any()
+    return found[:count]
+
+
+def column(rows: NDArray[np.float32], name: str) -> NDArray[np.float32]:
+    return rows[:, STARTS[name] : STARTS[name] + FIELDS[name]]
+
+
+def names(rows: NDArray[np.float32]) -> list[str]:
+    return [classes()[int(kind)] for kind in rows[:, STARTS["class"]]]
+
+
+def put(sim: Simulation, name: str, position: NDArray[np.float64]) -> None:
+    """Set a free body down somewhere, as it stood."""
+    address = int(sim.model.joint(f"{name}_joint0").qposadr[0])
+    sim.data.qpos[address : address + 3] = position
+    mujoco.mj_forward(sim.model, sim.data)
+
+
+def pull(sim: Simulation, region: str, q: float) -> None:
+    articulation, _ = sim.world.articulation(region)
+    sim.data.qpos[int(sim.model.joint(articulation.joint).qposadr[0])] = q
+    mujoco.mj_forward(sim.model, sim.data)
+
+
+def test_the_layout_tells_how_to_read_it() -> None:
+    told = layout()
+    assert told["slots"] == SLOTS
+    starts = [(field["name"], field["start"], field["size"]) for field in told["fields"]]
+    assert [name for name, _, _ in starts] == list(FIELDS)
+    assert sum(size for _, _, size in starts) * SLOTS == SIZE
+    assert all(start == sum(size for _, _, size in starts[:k]) for k, (_, start, _) in enumerate(starts))
+    assert len(set(told["classes"])) == len(told["classes"])
+    assert {"drawer", "door", "knob", "butter", "wooden_cabinet"} <= set(told["classes"])
+
+
+@pytest.mark.parametrize("name", task_names())
+def test_every_scene_fits_and_says_where_things_are(name: str) -> None:
+    sim = started(name)
+    rows = table(sim)
+    kinds = names(rows)
+    assert sorted(kinds, key=classes().index) == kinds
+    places = column(rows, "position")
+    for place, kind in zip(places, kinds, strict=True):
+        bodies = [asset for asset in sim.assets.values() if asset.class_name.startswith(kind)]
+        if bodies:
+            nearest = min(np.abs(sim.body_pose(asset.name)[0] - place).max() for asset in bodies)
+            assert nearest < 1e-6
+    np.testing.assert_allclose(np.linalg.norm(column(rows, "rotation").reshape(-1, 2, 3), axis=2), 1.0, atol=1e-6)
+    assert not column(rows, "highlighted").any()
+
+
+def seen_pixels(sim: Simulation, name: str) -> int:
+    """Pixels of both cameras that change when an object is taken away; nothing throws shadows."""
+    pictures, state = [], sim.state()
+    for _ in range(2):
+        pictures.append(np.stack([sim.render(camera) for camera in CAMERAS]))
+        put(sim, name, np.array([0.0, 0.0, -5.0]))
+    sim.set_state(state)
+    return int((pictures[0] != pictures[1]).any(axis=-1).sum())
+
+
+@pytest.mark.usefixtures("gl")
+@pytest.mark.parametrize("name", [NINE, DRAWERS])
+def test_what_shows_many_pixels_is_there_and_what_shows_none_is_not(name: str) -> None:
+    episode = Episode(get_task(name), prompt_video=False, render=RenderSettings(256, 256, "fast"))
+    episode.reset(20_001)
+    sim, other = episode.sim, Simulation(get_task(name), RenderSettings(256, 256, "fast"))
+    slots = ObjectSlots(sim)
+    for step in range(320):
+        episode.step(episode.expert_action())
+        if step % 40:
+            continue
+        places = column(table(sim, slots), "position")
+        other.set_state(sim.state(), sim.fixture_poses())
+        for asset in (asset.name for asset in sim.assets.values() if asset.kind == "object"):
+            there = np.abs(places - sim.body_pose(asset)[0]).max(axis=1).min() < 1e-5
+            count = seen_pixels(other, asset)
+            assert there or count < 120, (step, asset, count)
+            assert not there or count > 0, (step, asset)
+
+
+def test_what_is_in_a_shut_drawer_is_absent_and_shows_when_it_is_open() -> None:
+    sim = started(DRAWERS)
+    slots = ObjectSlots(sim)
+    kind = sim.assets[TOMATO].class_name.partition("__")[0]
+    assert kind in names(table(sim, slots))
+    articulation, _ = sim.world.articulation(TOP)
+    put(sim, TOMATO, sim.site_pose(TOP)[0])
+    assert kind not in names(table(sim, slots))
+    pull(sim, TOP, articulation.open_q)
+    put(sim, TOMATO, sim.site_pose(TOP)[0])
+    rows = table(sim, slots)
+    assert kind in names(rows)
+    drawn = column(rows[[k for k, name in enumerate(names(rows)) if name == "drawer"]], "joint")
+    assert np.abs(drawn - articulation.open_q).min() < 1e-6
+
+
+def test_what_stands_behind_something_is_absent() -> None:
+    sim = started(DRAWERS)
+    slots = ObjectSlots(sim)
+    kind = sim.assets[TOMATO].class_name.partition("__")[0]
+    put(sim, TOMATO, np.array([-0.6, 0.0, 0.3]))  # below the table, where no camera looks
+    assert kind not in names(table(sim, slots))
+
+
+def test_equal_things_may_change_places() -> None:
+    sim = started(NINE)
+    slots = ObjectSlots(sim)
+    before = slots.observe()
+    one, other = [name for name, asset in sim.assets.items() if asset.class_name == "butter"][:2]
+    addresses = [int(sim.model.joint(f"{name}_joint0").qposadr[0]) for name in (one, other)]
+    poses = [sim.data.qpos[address : address + 7].copy() for address in addresses]
+    for address, pose in zip(addresses, reversed(poses), strict=True):
+        sim.data.qpos[address : address + 7] = pose
+    mujoco.mj_forward(sim.model, sim.data)
+    np.testing.assert_array_equal(slots.observe(), before)
+    assert sim.body_pose(one)[0] @ sim.body_pose(one)[0] != pytest.approx(poses[0][:3] @ poses[0][:3])
+
+
+def test_nothing_but_the_present_counts() -> None:
+    """Neither how the state came about nor the goal: a variant of the task sees the same."""
+    task = get_task(NINE)
+    sim, other = Simulation(task), Simulation(task.variant(3))
+    sim.reset(20_000)
+    state, poses = sim.state(), sim.fixture_poses()
+    seen = ObjectSlots(sim).observe()
+    other.reset(20_007)
+    slots = ObjectSlots(other)
+    slots.observe()
+    other.set_state(state, poses)
+    np.testing.assert_array_equal(slots.observe(), seen)
+
+
+def test_a_highlight_is_seen_on_what_stands_in_it() -> None:
+    sim = started(NINE)
+    chosen = next(name for name, asset in sim.assets.items() if asset.class_name == "butter")
+    place = sim.body_pose(chosen)[0]
+    sim.highlights = (Highlight((float(place[0]), float(place[1]), float(place[2])), 0.02),)
+    rows = table(sim)
+    lit = rows[column(rows, "highlighted")[:, 0] == 1]
+    assert len(lit) == 1
+    np.testing.assert_allclose(column(lit, "position")[0], place, atol=1e-6)
+
+
+def test_nothing_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise AssertionError("a picture was asked for")
+
+    monkeypatch.setattr(simulation, "get_renderer", refuse)
+    assert table(started(NINE)).any()
+
+
+def test_a_scene_with_more_things_than_slots_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(object_slots, "SLOTS", 5)
+    with pytest.raises(MemobenchError, match=r"10 objects and moving parts, more than the 5"):
+        ObjectSlots(started(NINE))
