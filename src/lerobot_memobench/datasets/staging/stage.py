@@ -105,6 +105,7 @@ class EpisodeStage:
                 "were recorded; give one per frame and camera, or none"
             )
         found = labels(demo)
+        _check_storable(demo, found.columns())
         record = {
             "failure": None,
             "info": episode_info(demo),
@@ -130,6 +131,19 @@ class EpisodeStage:
             camera: {name: value.tolist() for name, value in histograms.stats().items()}
             for camera, histograms in self._histograms.items()
         }
+
+
+def _check_storable(demo: Demonstration, columns: Mapping[str, Any]) -> None:
+    """Raise unless a dataset's tables can hold the episode: one that they cannot would end the others with it."""
+    texts = [values for values in columns.values() if isinstance(values, list)]
+    try:
+        json.dumps([episode_info(demo), texts], ensure_ascii=False).encode()
+        np.array([demo.seed, demo.variant], dtype=np.int64)
+    except (UnicodeEncodeError, OverflowError) as error:
+        raise MemobenchError(
+            f"{demo.task.name}: a text that is no Unicode, or a number of more than 64 bits, cannot be stored "
+            f"({error}); correct the task's texts or the seed"
+        ) from None
 
 
 def stage_demonstration(demo: Demonstration, folder: Path, formats: Collection[str] = (LEROBOT,)) -> StagedEpisode:
