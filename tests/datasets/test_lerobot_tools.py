@@ -210,6 +210,8 @@ def test_datasets_without_the_column_are_read_as_before(ours, tmp_path):
     with pytest.raises(MemobenchError, match="edited a dataset that was written before its frames had the column"):
         describe(edited, tmp_path / "out")
     assert {verdict.disagreement for verdict in validate(edited)} == {STRANGER}
+    mixed = merge(tmp_path / "mixed", edited, old)  # numbers beside gaps are floats in its tables
+    assert [place.record for place in list_episodes(mixed)] == [None, None, *(p.record for p in list_episodes(ours))]
 
 
 def test_a_damaged_record_is_told(ours, tmp_path):

@@ -32,7 +32,6 @@ FRAME = 160
 """Height and width of a storyboard's pictures, pixels."""
 MOST_FRAMES = 6
 
-
 MADE_BY = "## How it was made"
 """Heading of a card of ours; LeRobot's has none."""
 
@@ -98,10 +97,9 @@ def _card_tables(folder: Path) -> str | None:
 def _tables_of(folder: Path, rows: Sequence[Mapping[str, Any]]) -> str:
     """Return what the card would say, from the rows alone."""
     infos = [{**row, "frames": row["length"]} for row in rows]
-    parts = statistics_section(infos, [], storage_by_frames(folder, infos))
-    return (
-        "\n\n".join([MADE_BY, f"{EDITED} Storage is shared out by frames.", *(part for part in parts if part)]) + "\n"
-    )
+    parts = [MADE_BY, f"{EDITED} Storage is shared out by frames."]
+    parts += statistics_section(infos, [], storage_by_frames(folder, infos))
+    return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def _manifest_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
