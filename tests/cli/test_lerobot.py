@@ -298,6 +298,7 @@ def test_no_gl_library(evaluation: Called, capsys: pytest.CaptureFixture[str], m
         (lambda folder: (folder / "policy_preprocessor.json").write_text("{"), "is not JSON"),
         (lambda folder: (folder / "model.safetensors").unlink(), "holds no weights"),
         (lambda folder: (folder / "config.json").write_text("{}"), "names no policy type"),
+        (lambda folder: _name_statistics(folder, "../elsewhere.safetensors"), "which names no file"),
     ],
 )
 def test_a_checkpoint_that_is_not_whole(
@@ -305,6 +306,11 @@ def test_a_checkpoint_that_is_not_whole(
 ) -> None:
     spoil(checkpoint(Path("run")))
     assert message in refused(["eval", "env=memobench", "policy=run"], evaluation, capsys)
+
+
+def _name_statistics(folder: Path, name: str) -> None:
+    path = folder / "policy_preprocessor.json"
+    path.write_text(path.read_text().replace("stats.safetensors", name))
 
 
 def test_a_checkpoint_without_statistics(evaluation: Called, capsys: pytest.CaptureFixture[str]) -> None:

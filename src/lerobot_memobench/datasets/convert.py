@@ -14,7 +14,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.datasets.hdf5.layout import Problem, Unusable
+from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.hdf5.layout import Problem, Unusable, usable_or_named
 from lerobot_memobench.datasets.hdf5.published_task import task_of
 from lerobot_memobench.datasets.hdf5.reading import PublishedFile, find_files
 from lerobot_memobench.datasets.hdf5.restore import NO_SEED, restore
@@ -25,10 +26,11 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     check_destination,
     is_dataset,
 )
+from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
 from lerobot_memobench.datasets.staging.episode import StagedEpisode, StagedJob, staged
 from lerobot_memobench.datasets.staging.folders import STAGING
 from lerobot_memobench.datasets.staging.request import compare_requests, episodes_folder
-from lerobot_memobench.datasets.staging.stage import EpisodeStage, stage_failure
+from lerobot_memobench.datasets.staging.stage import EpisodeStage, episode_info, stage_failure
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.job import ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
@@ -78,13 +80,7 @@ class ConversionJob(StagedJob):
         """Stage the episode, or why it cannot be used."""
         try:
             with PublishedFile(self.file) as file:
-                found = file.read(self.group)
-                if found.image_size != self.image_size:
-                    raise Unusable(
-                        f"its images are {found.image_size[0]}×{found.image_size[1]} pixels, those of the first "
-                        f"demonstration {self.image_size[0]}×{self.image_size[1]}"
-                    )
-                demo = restore(task_of(file, found), found)
+                demo = self._restored(file)
                 with EpisodeStage(self.folder) as stage:
                     for images in file.images(self.group, upside_down=self.upside_down):
                         stage.add_images(images)
@@ -95,6 +91,18 @@ class ConversionJob(StagedJob):
         except Exception as error:
             error.add_note(f"while converting {self.file}, {self.group}")
             raise
+
+    def _restored(self, file: PublishedFile) -> Demonstration:
+        with usable_or_named():
+            found = file.read(self.group)
+            if found.image_size != self.image_size:
+                raise Unusable(
+                    f"its images are {found.image_size[0]}×{found.image_size[1]} pixels, those of the first "
+                    f"demonstration {self.image_size[0]}×{self.image_size[1]}"
+                )
+            demo = restore(task_of(file, found), found)
+            EpisodeRecord.model_validate(episode_info(demo))  # here it ends one episode, when the tables are made all
+            return demo
 
 
 def convert(
@@ -160,7 +168,7 @@ def _plan(files: Sequence[Path], folder: Path, upside_down: bool) -> tuple[list[
     problems: list[Problem] = []
     for path in files:
         try:
-            with PublishedFile(path) as file:
+            with PublishedFile(path) as file, usable_or_named():
                 problems += _miscounted(file)
                 for group in file.groups():
                     try:

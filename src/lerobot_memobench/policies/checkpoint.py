@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files import file_name
 
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
@@ -104,7 +105,7 @@ def _check_statistics(folder: Path, file: str, step: Mapping[str, Any]) -> None:
     state_file = step.get("state_file")
     present: set[str] = set()
     if isinstance(state_file, str):
-        present = _tensor_names(folder / state_file)
+        present = _tensor_names(folder / file_name(state_file, f"state_file in {folder / file}"))
     missing = [key for key in needed if not any(name.startswith(f"{key}.") for name in present)]
     if missing:
         raise MemobenchError(

@@ -18,7 +18,7 @@ from lerobot_memobench.evaluation.necessity.demonstrations import follow
 from lerobot_memobench.evaluation.necessity.laboratory import Laboratory
 from lerobot_memobench.evaluation.necessity.question import Settings, fingerprint, variants_of
 from lerobot_memobench.evaluation.necessity.scene import EXAMPLES, Scene
-from lerobot_memobench.files import draft_of, write_file
+from lerobot_memobench.files import draft_of, file_name, write_file
 from lerobot_memobench.tasks.task import Task
 
 if TYPE_CHECKING:
@@ -112,8 +112,12 @@ def _mean_of(tables: Sequence[dict[str, float]]) -> dict[str, float] | None:
 
 
 def pictures_path(out: Path, task: str, referent: str, seed: int) -> Path:
-    """Return where a scene's first aliased pair lies: a strip of both moments, two cameras each."""
-    return out / "pictures" / f"{task}.{referent}.{seed}.png"
+    """Return where a scene's first aliased pair lies: a strip of both moments, two cameras each.
+
+    Raises:
+        MemobenchError: the names, which may come from a file of results, lead elsewhere.
+    """
+    return out / "pictures" / file_name(f"{task}.{referent}.{seed}.png", f"the name of a picture of results in {out}")
 
 
 def _write_pair(scene: Scene, path: Path) -> None:

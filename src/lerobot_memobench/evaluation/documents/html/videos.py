@@ -40,7 +40,7 @@ def find_videos(folder: Path, records: Sequence[Record]) -> tuple[dict[int, Path
     found: dict[int, Path] = {}
     misfits: list[str] = []
     for k, record in enumerate(records):
-        if not _names_a_file(record):
+        if not _names_a_file(episode_id(record)):
             continue
         film = folder / VIDEOS / f"{record['task']}.{record['episode']}.mp4"
         if film.is_file():
@@ -61,10 +61,10 @@ def find_videos(folder: Path, records: Sequence[Record]) -> tuple[dict[int, Path
     return found, [f"Videos that do not clearly belong to a logged rollout were left out: {named}."]
 
 
-def _names_a_file(record: Record) -> bool:
+def _names_a_file(name: str) -> bool:
     """Whether a rollout's name may be a file's: a log is only text, which must not lead out of these folders."""
     try:
-        return bool(file_name(episode_id(record), "a rollout's name"))
+        return bool(file_name(name, "a rollout's name"))
     except MemobenchError:
         return False
 
@@ -103,6 +103,8 @@ def _lerobot_videos(folder: Path, records: Sequence[Record]) -> dict[int, Path]:
     by_task = _positions(records)
     found: dict[int, Path] = {}
     for group, task_id, successes in entries:
+        if not _names_a_file(f"{group}_{task_id}"):
+            continue
         for positions in by_task.values():
             rollouts = [records[k] for k in positions]
             if rollouts[0]["memory_type"] != group or [r["success"] for r in rollouts] != successes:
