@@ -44,6 +44,7 @@ class MemobenchMemConfig(PI05Config):
     # -- alignment
     align: str = "none"
     align_weight: float | None = None
+    """Weight of the alignment loss; none or 0: the paper's for this objective (``align=none`` trains without one)."""
     subgoal_level: str = "intermediate"
     shuffle_subgoals: bool = False
     """Control of the paper: the subgoal texts of an episode change places among themselves."""
@@ -96,15 +97,16 @@ class MemobenchMemConfig(PI05Config):
         dims = self.dimensions
         if self.image_resolution is None:
             self.image_resolution = (dims.vision.image, dims.vision.image)
-        if self.tokenizer_max_length is None:
-            self.tokenizer_max_length = dims.tokenizer_max_length
-            if self.oracle_memory and dims.tokenizer == "words":
-                self.tokenizer_max_length += ORACLE_TOKENS
+        # A checkpoint without oracle memory holds the length of prompts without it, which would cut the text off.
+        if self.tokenizer_max_length in (None, dims.tokenizer_max_length):
+            room = ORACLE_TOKENS if self.oracle_memory and dims.tokenizer == "words" else 0
+            self.tokenizer_max_length = dims.tokenizer_max_length + room
         if self.optimizer_lr is None:
             self.optimizer_lr = dims.learning_rate
         self.tokenizer_name = self.tokenizer_name or dims.tokenizer
         self.text_encoder = self.text_encoder or dims.text_encoder
-        if self.align_weight is None:
+        # A checkpoint with align=none holds a weight of 0, with which another objective would change nothing.
+        if not self.align_weight:
             self.align_weight = ALIGN_WEIGHTS[self.align]
         super().__post_init__()
         self._check_numbers()
@@ -149,6 +151,9 @@ class MemobenchMemConfig(PI05Config):
                 "--policy.shuffle_subgoals=true changes nothing with --policy.align=none, which reads no subgoals; "
                 "name an alignment too."
             )
+
+    # No field: LeRobot asks it of a configuration when it makes its sampler (see `execution_frames`).
+    drop_n_last_frames = 0
 
     @property
     def dimensions(self) -> Dimensions:
