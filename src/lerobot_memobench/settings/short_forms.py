@@ -19,6 +19,7 @@ SHORT_FORMS: dict[str, dict[str, tuple[str, ...]]] = {
         "port": ("policy.port",),
         "dialect": ("policy.dialect",),
         "prompt_video": ("env.prompt_video",),
+        "prompt_in": ("env.prompt_in",),
         "horizon": ("env.horizon",),
         "episodes": ("eval.n_episodes",),
         "batch_size": ("eval.batch_size",),
