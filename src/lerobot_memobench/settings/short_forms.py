@@ -32,3 +32,6 @@ CHOOSING = ("policy", "env", "dataset")
 
 #: Words of `lerobot eval env=memobench` that say how it is run, not what (see `engine.orders`).
 EVALUATION_WORDS = ("resume", "shard", "shards", "workers", "executor", "executor_option")
+
+#: Words of `lerobot train` that are none of LeRobot's (see `settings.training`).
+TRAINING_WORDS = ("prompt_frames",)
