@@ -43,6 +43,23 @@ def test_a_plan_says_everything() -> None:
     assert not any(Path().iterdir())  # planning writes nothing
 
 
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        (["policy=act"], "reset"),
+        (["policy=memobench_random"], "reset"),
+        (["policy=memobench_mem"], "steps"),
+        ([], "steps"),
+        (["policy=act", "prompt_in=steps"], "steps"),
+    ],
+)
+def test_the_prompt_plays_where_the_policy_can_take_it(words: list[str], found: str) -> None:
+    plan = plan_line([*LINE[:-1], *words])
+    assert "--env.prompt_in=" + found in plan.portable_flags
+    assert plan.environment is not None
+    assert plan.environment.protocol["prompt_in"] == found
+
+
 def test_going_on_keeps_the_earlier_batch_size() -> None:
     Path("out").mkdir()
     card = {"protocol": {}, "runs": [{"batch_size": 4}]}

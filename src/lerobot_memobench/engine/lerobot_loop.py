@@ -1,7 +1,8 @@
 """What LeRobot's evaluation loop is made to do beside its own: run parts of a task, seed each batch by itself.
 
-The only module that changes anything of LeRobot's. It was written against the loop of one version: what it relies on
-is listed in tests/engine/test_lerobot_loop.py, whose failures say what to look at when LeRobot moves on.
+With `lerobot_training` the only module that changes anything of LeRobot's. It was written against the loop of one
+version: what it relies on is listed in tests/engine/test_lerobot_loop.py, whose failures say what to look at when
+LeRobot moves on.
 
 LeRobot seeds Python, NumPy and torch once per run, so what a sampling policy draws in an episode depends on all that
 ran before it. Here each batch is seeded from the run's seed, the task and the batch's first episode: an evaluation
@@ -29,8 +30,11 @@ KEEPS_ITS_NOISE = ("memobench_mem",)
 """Policies that seed each episode's noise themselves, from torch's initial seed: it must stay the run's."""
 
 
-def check_version() -> None:
-    """Refuse another LeRobot than the one whose loop is known: another one may run other episodes, or unseeded ones.
+def check_version(part: str = "evaluation loop") -> None:
+    """Refuse another LeRobot than the one whose loops are known: another one may run other episodes, or unseeded ones.
+
+    Args:
+        part: what is steered, for the message.
 
     Raises:
         MemobenchError: it is installed.
@@ -38,7 +42,7 @@ def check_version() -> None:
     found = metadata.version("lerobot")
     if found != LEROBOT:
         raise MemobenchError(
-            f"lerobot {found} is installed, and the benchmark steers the evaluation loop of lerobot {LEROBOT}; install "
+            f"lerobot {found} is installed, and the benchmark steers the {part} of lerobot {LEROBOT}; install "
             f"lerobot=={LEROBOT} (make setup)"
         )
 

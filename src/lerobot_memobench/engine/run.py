@@ -14,6 +14,7 @@ from lerobot_memobench.engine.plan_card import card_of, with_checkpoint
 from lerobot_memobench.engine.reporting import EvaluationReport, report_on
 from lerobot_memobench.engine.resume import Ranges, Tell, missing, remainder, resumed_card
 from lerobot_memobench.envs.episode_log import has_log, read_episodes
+from lerobot_memobench.envs.protocol import read_protocol_file
 from lerobot_memobench.evaluation.records.protocol import POLICY, read_protocol
 
 
@@ -72,6 +73,7 @@ def _run_lerobot(plan: EvaluationPlan, card: dict[str, Any], ranges: Ranges | No
 def _finish(plan: EvaluationPlan, card: dict[str, Any]) -> EvaluationReport:
     """Write the report of the log, and what was found onto the card."""
     protocol = card["protocol"] or {k: v for k, v in read_protocol(plan.log).items() if k != POLICY}
+    protocol = {**protocol, **read_protocol_file(plan.log)}  # what `auto` came to in LeRobot's process
     # LeRobot runs whole batches: episodes beyond those asked for are no part of the report.
     limit = None if plan.grid is None else plan.grid.first + max(plan.grid.runs, protocol["episodes"])
     report = report_on(plan.log, limit)

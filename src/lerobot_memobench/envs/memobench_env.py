@@ -15,7 +15,15 @@ from lerobot_memobench.envs.episode import HORIZON, PROMPT_LIMIT, Episode
 from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.envs.episode_record import episode_record
 from lerobot_memobench.envs.film import Film
-from lerobot_memobench.envs.observations import IMAGE_SIZE, METADATA, PROMPT, action_space, observation_space
+from lerobot_memobench.envs.observations import (
+    ACTION_DIM,
+    IMAGE_SIZE,
+    METADATA,
+    PROMPT,
+    action_space,
+    observation_space,
+)
+from lerobot_memobench.envs.prompting import RESET, STEPS
 from lerobot_memobench.envs.protocol import SEED_BASE
 from lerobot_memobench.files import file_name
 from lerobot_memobench.sim.rendering import RenderSettings
@@ -48,6 +56,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         log_dir: str | None = None,
         referent: str = "fixed",
         prompt_video: bool = True,
+        prompt_in: str = STEPS,
         horizon: int = HORIZON,
         render: str = "default",
         render_every: int = 1,
@@ -71,6 +80,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             "seed_base": seed_base,
             "referent": referent,
             "prompt_video": prompt_video,
+            "prompt_in": prompt_in,
             "horizon": horizon,
             "replan_steps": replan_steps,
             "render": render,
@@ -86,6 +96,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             "horizon": horizon,
             "render": RenderSettings(IMAGE_SIZE, IMAGE_SIZE, render),
         }
+        self._prompt_in = prompt_in
         self._render_every, self._replan_steps = render_every, replan_steps
         self._expert_action, self._seed_base = expert_action, seed_base
         self._next_seed = seed_base
@@ -99,14 +110,17 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     @property
     def _max_episode_steps(self) -> int:
-        """Upper bound for LeRobot's loop: prompt and execution. The horizon itself counts execution steps."""
-        prompt = self._settings["prompt_video"] and self._task.prompt is not None
+        """Upper bound for LeRobot's loop: what it steps through. The horizon itself counts execution steps."""
+        prompt = self._settings["prompt_video"] and self._task.prompt is not None and self._prompt_in == STEPS
         return int(self._settings["horizon"]) + (PROMPT_LIMIT if prompt else 0)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start the episode of a seed; without one, of the seed after the last."""
+        """Start the episode of a seed; without one, of the seed after the last.
+
+        With the prompt played in here (`prompt_in`), the first observation is that of the first execution frame.
+        """
         super().reset(seed=seed)
         seed = self._next_seed if seed is None else int(seed)
         self._next_seed = seed + 1
@@ -119,7 +133,18 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         if self._videos is not None:
             self._film = Film(self._videos / f"{self.task}.{seed - self._seed_base}.mp4", METADATA["render_fps"])
             self._film.add(self.render())
+        if self._prompt_in == RESET and self.episode.phase == PROMPT:
+            self._play_prompt()
         return self._observation(), self._info()
+
+    def _play_prompt(self) -> None:
+        """Let the prompt run to its end, where the scene is restored; only a film watches it."""
+        while self.episode.phase == PROMPT:
+            self.episode.step(np.zeros(ACTION_DIM, np.float32))
+            if self._film is not None or self.episode.phase != PROMPT:
+                self._images = self.episode.images()
+            if self._film is not None:
+                self._film.add(self.render())
 
     def step(self, action: NDArray[np.float32]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Advance by one control step of 50 ms. The reward is 1 at success, else 0."""

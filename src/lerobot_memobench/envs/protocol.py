@@ -23,6 +23,7 @@ SETTINGS = (
     "seed_base",
     "referent",
     "prompt_video",
+    "prompt_in",
     "horizon",
     "replan_steps",
     "render",
@@ -30,6 +31,10 @@ SETTINGS = (
     "oracle_memory",
 )
 """What must agree for two evaluations to be one, or to be compared."""
+
+OF_THE_POLICY = ("prompt_in",)
+"""Those of them that follow from what a policy can take in: evaluations of two policies may differ in them, which is
+told, the parts of one may not."""
 
 EXTENT = ("tasks", "episodes")
 """How much was run: it may differ, the episodes in common still compare."""

@@ -8,10 +8,20 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.envs.episode_log import read_episodes
-from lerobot_memobench.envs.protocol import EXTENT, POLICY, SETTINGS, differences, read_protocol_file
+from lerobot_memobench.envs.protocol import EXTENT, OF_THE_POLICY, POLICY, SETTINGS, differences, read_protocol_file
 from lerobot_memobench.errors import MemobenchError
 
-__all__ = ["CARD_FILE", "EXTENT", "POLICY", "SETTINGS", "differences", "protocol_of_log", "read_card", "read_protocol"]
+__all__ = [
+    "CARD_FILE",
+    "EXTENT",
+    "OF_THE_POLICY",
+    "POLICY",
+    "SETTINGS",
+    "differences",
+    "protocol_of_log",
+    "read_card",
+    "read_protocol",
+]
 
 CARD_FILE = "card.json"
 
@@ -21,8 +31,8 @@ def read_protocol(folder: str | Path) -> dict[str, Any]:
 
     Keys: ``tasks`` (names, sorted) and ``episodes`` (per task; the largest number where they differ) as asked for, or
     as found in the log where nobody wrote down what was asked for; ``seed_base``, ``referent``, ``prompt_video``,
-    ``horizon``, ``replan_steps``, ``render``, ``render_every`` as far as they are known; ``policy``, what is known of
-    the policy ({} for plain ``lerobot-eval``).
+    ``prompt_in``, ``horizon``, ``replan_steps``, ``render``, ``render_every`` as far as they are known; ``policy``,
+    what is known of the policy ({} for plain ``lerobot-eval``).
 
     Raises:
         MemobenchError: there is no evaluation in the folder.

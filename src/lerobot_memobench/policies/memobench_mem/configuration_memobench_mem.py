@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from typing import ClassVar
 
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
@@ -34,6 +35,8 @@ def _choose(field: str, given: str, known: tuple[str, ...]) -> None:
 @dataclass
 class MemobenchMemConfig(PI05Config):
     """pi0.5's fields plus the memory's. Fields that are ``None`` here take the size's value after construction."""
+
+    knows_phases: ClassVar[bool] = True
 
     size: str = "tiny"
     """``tiny`` (from scratch, trains on a CPU) or ``pi05`` (3.2 B)."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from lerobot.configs import PreTrainedConfig
 
@@ -36,6 +37,8 @@ class RemoteConfig(UntrainedConfig):
         retry: how long a server that went away is waited for, s.
         label: what is served, in your words; it goes onto the result card, since a server does not tell it.
     """
+
+    knows_phases: ClassVar[bool] = True
 
     host: str = "127.0.0.1"
     port: int | None = None
