@@ -63,6 +63,14 @@ def test_a_circle_is_found() -> None:
     assert set(house.circle({"a": {"b"}, "b": {"c"}, "c": {"b"}})) == {"b", "c"}
 
 
+def test_no_module_of_one_system_is_imported() -> None:
+    """Each can be imported on Windows and macOS, whose users read reports and train without the simulator."""
+    of_unix = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "syslog", "termios", "tty"}
+    of_windows = {"_winapi", "msvcrt", "winreg"}
+    found = [(name, source) for name, tree in TREES.items() for source, _ in house.imported(tree)]
+    assert [(name, source) for name, source in found if source in of_unix | of_windows] == []
+
+
 def is_private(name: str) -> bool:
     return name.startswith("_") and not name.endswith("__")
 
