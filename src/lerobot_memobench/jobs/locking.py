@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from filelock import lock_descriptor
@@ -37,8 +37,13 @@ def locked(staging: Path, out: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def taking_turns(path: Path) -> Iterator[None]:
-    """Hold a lock file, which is made and stays; whoever comes next, on this machine, waits. A kill releases it."""
+def taking_turns(path: Path, wait: Callable[[], None] = lambda: None) -> Iterator[None]:
+    """Hold a lock file, which stays; whoever comes next, on this machine, calls ``wait``, then waits.
+
+    A kill releases it.
+    """
     with path.open("w") as file:
-        lock_descriptor(file.fileno())
+        if not lock_descriptor(file.fileno(), blocking=False):
+            wait()
+            lock_descriptor(file.fileno())
         yield
