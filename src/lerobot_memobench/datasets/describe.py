@@ -20,7 +20,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import MANIFEST_FILE, imag
 from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, list_episodes
 from lerobot_memobench.datasets.paper_figures import FAMILIES, LENGTH_BUCKETS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files import write_file
+from lerobot_memobench.files import draft_of, write_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -139,7 +139,8 @@ def draw_lengths(rows: Sequence[Mapping[str, Any]], path: Path) -> Path:
         left, right = figure.subplots(1, 2, width_ratios=(3, 2))
         _draw_buckets(left, rows)
         _draw_types(right, rows)
-        figure.savefig(path, dpi=130)
+        with draft_of(path) as draft:
+            figure.savefig(draft, dpi=130)
     return path
 
 
@@ -201,7 +202,8 @@ def draw_storyboard(folder: Path, rows: Sequence[Mapping[str, Any]], path: Path)
             sheet.paste(picture, (left, top + title))
             words = textwrap.fill(f"{frame}: {text}", 30, max_lines=3, placeholder=" …")
             draw.multiline_text((left + 2, top + title + FRAME + 1), words, fill="black", font=font, spacing=1)
-    sheet.save(path, quality=88, optimize=True)
+    with draft_of(path) as draft:
+        sheet.save(draft, quality=88, optimize=True)
     return path
 
 

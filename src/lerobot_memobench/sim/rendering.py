@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.errors import MemobenchError, nearest, unsupported_system
 from lerobot_memobench.sim.drawing.drawlist import build_draw_list
 from lerobot_memobench.sim.drawing.rasterizer import Rasterizer
 
@@ -63,8 +63,10 @@ def gl_backend() -> str:
     """Return the backend to render with: ``MUJOCO_GL`` where set, else the first whose library is installed.
 
     Raises:
-        MemobenchError: when no usable library is there.
+        MemobenchError: when no usable library is there, as on any system but Linux.
     """
+    if problem := unsupported_system():
+        raise MemobenchError(problem)
     wanted = os.environ.get("MUJOCO_GL", "").lower()
     if wanted == "glfw":
         if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
