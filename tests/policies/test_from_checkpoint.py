@@ -78,7 +78,6 @@ def go_on(dataset_root: Path, start: Path, tmp_path: Path, monkeypatch: pytest.M
         ["align=semantic", "subgoal_level=coarse"],
         ["align=semantic", "shuffle_subgoals=true", "shuffle_seed=3"],
         ["oracle_memory=true"],
-        ["integration=none"],
     ],
     ids=" ".join,
 )
@@ -148,6 +147,8 @@ def test_what_saved_steps_cannot_follow_is_refused(go_on: Any, start: Path, tmp_
         go_on(source=relative)
     with pytest.raises(MemobenchError, match=r"tokenizer_name=google/some would have no effect.*words"):
         go_on("tokenizer_name=google/some", source=start)
+    with pytest.raises(MemobenchError, match="do not fit this policy"):
+        go_on("integration=none")
     config = PreTrainedConfig.from_pretrained(start)
     config.oracle_memory = True  # type: ignore[attr-defined]
     with pytest.raises(MemobenchError, match=r"oracle_memory=True would have no effect"):

@@ -149,7 +149,10 @@ class MemobenchMemPolicy(PI05Policy):
         path = weights_file(source, revision, named=f"The checkpoint '{source}'", fix="give a pretrained_model folder")
         if dataset_meta is None:
             require_statistics(source, revision)
-        require_agreement(source, revision, config, training=dataset_meta is not None)
+        # The steps lie with an adapter, and not with what it adapts, of which these are the weights.
+        steps = (config.pretrained_path, config.pretrained_revision) if config.use_peft else (source, revision)
+        if steps[0] is not None:
+            require_agreement(*steps, config, training=dataset_meta is not None)
         policy = cls(config, dataset_meta=dataset_meta, load_base=False)
         load_weights(policy, path, source, remembers=config.memory != "none")
         policy.to(config.device)
