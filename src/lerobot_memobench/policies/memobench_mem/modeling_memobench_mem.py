@@ -65,7 +65,7 @@ class MemobenchMemPolicy(PI05Policy):
         """Build the policy from scratch, or from ``config.base_weights``.
 
         Args:
-            dataset_meta: metadata of the dataset to train on; its memory cache is checked, and made when missing.
+            dataset_meta: metadata of the dataset to train on; its memory cache is checked, and made or finished.
             load_base: whether to read ``config.base_weights`` (not when a checkpoint follows).
         """
         # As PI05Policy.__init__, which names its model class.
