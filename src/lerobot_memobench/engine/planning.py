@@ -16,7 +16,7 @@ from lerobot_memobench.engine.orders import Orders, take_orders
 from lerobot_memobench.engine.plan import LOG, OUTPUT, EvaluationPlan
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import check_checkpoint
-from lerobot_memobench.settings.configurations import env_config, policy_config
+from lerobot_memobench.settings.configurations import check_pictures, env_config, policy_config
 from lerobot_memobench.settings.flags import whole_number
 from lerobot_memobench.settings.reading import read_settings
 from lerobot_memobench.settings.translation import LerobotSettings
@@ -67,6 +67,7 @@ def make_plan(settings: LerobotSettings, orders: Orders, command: Sequence[str])
     settings = with_batch_size(settings, orders, log, getattr(policy, "max_environments", None))
     settings = with_protocol(settings, getattr(policy, "n_action_steps", None))
     environment = cast("MemobenchEnvConfig | None", env_config(settings))
+    check_pictures(policy, environment)
     if environment is None and orders.any:
         raise MemobenchError("resume=, shard= and shards= cannot go with config_path=; give its settings on the line")
     grid = None if environment is None else make_grid(settings, environment)
