@@ -18,7 +18,7 @@ from lerobot.policies import make_pre_post_processors
 from safetensors.torch import load_file, save_file
 from small_policy import CHUNK, batch_of, made_for_training, small_config
 
-from lerobot_memobench.datasets.memory_cache import MemoryCache
+from lerobot_memobench.datasets.memory_cache import MemoryCache, find_cache
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.language.text_encoders import WordTextEncoder
 from lerobot_memobench.policies.memobench_mem.language.tokenizer import make_vocabulary, make_word_tokenizer
@@ -496,13 +496,9 @@ def test_word_text_encoder_tells_texts_apart() -> None:
 
 
 def test_cache_of_one_dataset_is_not_used_for_another(trained: Any) -> None:
-    cache = MemoryCache.open(
-        Path(trained[3].root),
-        "tiny-stride1",
-        frames_key=trained[0].perception.key,
-        camera="observation.images.image",
-        stride=1,
-    )
+    contents = {"frames_key": trained[0].perception.key, "camera": "observation.images.image", "stride": 1}
+    root = Path(trained[3].root)
+    cache = MemoryCache.open(root, find_cache(root, "tiny-stride1", **contents).name, **contents)
     step = GatherMemoryProcessorStep(frames=4, cache=cache)
     with pytest.raises(MemobenchError, match="outside the memory cache"):
         step.gather(cache, [10_000])

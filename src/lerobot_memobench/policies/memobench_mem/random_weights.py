@@ -60,4 +60,4 @@ def _buffer(module: nn.Module, name: str) -> Tensor:
     if name == "embed_scale":
         return torch.tensor(module.scalar_embed_scale)
     assert name == "position_ids", f"the buffer {name} of {type(module).__name__} is unknown"
-    return torch.arange(int(module.num_positions)).expand(1, -1)  # type: ignore[arg-type]
+    return torch.arange(int(module.num_positions)).expand(1, -1)
