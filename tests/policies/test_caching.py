@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +10,15 @@ import pytest
 import torch
 from small_policy import made_for_training, small_config
 
-from lerobot_memobench.datasets.memory_cache import FOLDER
-from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
+from lerobot_memobench.datasets.memory_cache import FOLDER, MemoryCache
+from lerobot_memobench.policies.memobench_mem.caching import cache_dataset, load_perception, open_cache
 from lerobot_memobench.policies.memobench_mem.perception.pixels import PixelPerception
-from lerobot_memobench.policies.memobench_mem.processing.training_cache import set_training_cache, training_cache
 
 
-@pytest.fixture(autouse=True)
-def _training_cache_of_others() -> Iterator[None]:
-    before = training_cache()
-    yield
-    set_training_cache(before)
+def _opened(root: Path, **fields: Any) -> MemoryCache:
+    """The cache that a policy opens when it is made to train."""
+    config = small_config(**fields)
+    return open_cache(root, config, load_perception(config))
 
 
 def _copy(dataset_root: Path, root: Path) -> Path:
@@ -60,15 +57,13 @@ def test_training_finishes_a_cache_that_was_killed(
         patched.setattr(PixelPerception, "__call__", killed_in_its_second_pass)
         with pytest.raises(KeyboardInterrupt):
             cache_dataset(root, small_config(), batch_size=40)
-    made_for_training(root)
-    cache = training_cache()
-    assert cache is not None
+    cache = _opened(root)
     assert cache.meta.complete
     assert not cache.tokens(0, [0]).any()  # the first episode, done before the kill, is not done again
     assert cache.tokens(1, [0]).any()
 
 
-def test_caches_of_other_cameras_resolutions_and_weights_lie_side_by_side(dataset_root: Path, tmp_path: Path) -> None:
+def test_caches_of_other_cameras_and_resolutions_lie_side_by_side(dataset_root: Path, tmp_path: Path) -> None:
     root = _copy(dataset_root, tmp_path / "data")
     wrist, small = {"memory_camera": "observation.images.wrist_image"}, {"image_resolution": (48, 48)}
     first = cache_dataset(root, small_config())
@@ -76,18 +71,13 @@ def test_caches_of_other_cameras_resolutions_and_weights_lie_side_by_side(datase
     others = [cache_dataset(root, small_config(**fields)) for fields in (wrist, small)]
     assert len({first, *others}) == 3
     assert (first / "tokens.bin").read_bytes() == tokens
-    made_for_training(root, **wrist)
-    cache = training_cache()
-    assert cache is not None
-    assert cache.meta.camera == wrist["memory_camera"]
+    assert _opened(root, **wrist).meta.camera == wrist["memory_camera"]
 
 
 def test_a_cache_can_be_put_elsewhere(dataset_root: Path, tmp_path: Path) -> None:
     root = _copy(dataset_root, tmp_path / "data")
-    made_for_training(root, memory_cache_dir=str(tmp_path / "caches"))
+    cache = _opened(root, memory_cache_dir=str(tmp_path / "caches"))
     assert not (root / FOLDER).exists()
     (folder,) = (path for path in (tmp_path / "caches").iterdir() if path.is_dir())
     assert folder.name.startswith("data-tiny-stride1-")
-    cache = training_cache()
-    assert cache is not None
     assert cache.folder == folder
