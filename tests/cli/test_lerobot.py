@@ -347,6 +347,19 @@ def test_an_error_from_inside_is_one_sentence_and_leaves_no_empty_folder(
     assert not Path("out").exists()
 
 
+def test_a_dataset_that_cannot_be_fetched_is_to_be_made_here(
+    training: Called, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    training.action = lambda flags: LeRobotDatasetMetadata(flag_value(flags, "dataset.repo_id") or "", root="none")
+    assert main(["train", "policy=memobench_mem"]) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert "memobench generate --tasks object --episodes 5 --out outputs/demonstrations`, then dataset=" in told
+
+
 def test_finished_episodes_of_a_failed_run_stay(evaluation: Called, capsys: pytest.CaptureFixture[str]) -> None:
     def fail(flags: list[str]) -> None:
         log_episodes(flags, count=1)

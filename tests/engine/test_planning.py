@@ -60,6 +60,13 @@ def test_the_prompt_plays_where_the_policy_can_take_it(words: list[str], found: 
     assert plan.environment.protocol["prompt_in"] == found
 
 
+@pytest.mark.parametrize("policy", [["policy=memobench_mem"], ["policy=remote", "policy.dialect=robomme"]])
+def test_repeated_pictures_are_refused_for_policies_that_remember(policy: list[str]) -> None:
+    with pytest.raises(MemobenchError, match=r"env.render_every is 5; leave env.render_every at 1"):
+        plan_line(["env=memobench", f"tasks={STOVE}", *policy, "env.render_every=5"])
+    assert plan_line([*LINE, "env.render_every=5"]).grid is not None
+
+
 def test_going_on_keeps_the_earlier_batch_size() -> None:
     Path("out").mkdir()
     card = {"protocol": {}, "runs": [{"batch_size": 4}]}

@@ -17,7 +17,7 @@ from lerobot_memobench.engine.plan import LOG, OUTPUT, EvaluationPlan
 from lerobot_memobench.envs.prompting import prompt_in
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import check_checkpoint
-from lerobot_memobench.settings.configurations import env_config, policy_config
+from lerobot_memobench.settings.configurations import check_pictures, env_config, policy_config
 from lerobot_memobench.settings.flags import whole_number
 from lerobot_memobench.settings.reading import read_settings
 from lerobot_memobench.settings.translation import LerobotSettings
@@ -70,6 +70,7 @@ def make_plan(settings: LerobotSettings, orders: Orders, command: Sequence[str])
     if policy is not None:  # else LeRobot's process finds out
         settings = settings.default("env.prompt_in", prompt_in(policy))
     environment = cast("MemobenchEnvConfig | None", env_config(settings))
+    check_pictures(policy, environment)
     if environment is None and orders.any:
         raise MemobenchError("resume=, shard= and shards= cannot go with config_path=; give its settings on the line")
     grid = None if environment is None else make_grid(settings, environment)

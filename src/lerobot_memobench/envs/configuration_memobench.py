@@ -39,7 +39,8 @@ class MemobenchEnvConfig(EnvConfig):
         horizon: execution steps per episode.
         render: `fast` (no shadows), `default`, or `high` (four samples per pixel, finer shadows).
         render_every: draw images every so many execution steps and repeat the last in between. Set it to the number
-            of actions a policy executes per prediction: it looks at nothing else.
+            of actions a policy executes per prediction: it looks at nothing else. A policy that remembers the frames
+            in between refuses it; `observation.picture_step` tells such a one which step it is shown.
         replan_steps: that number, noted in the episode log.
         expert_action: offer the scripted expert's action as `observation.expert_action`.
         oracle_memory: write what has been completed so far behind the instruction (the paper's oracle memory control),
@@ -147,7 +148,9 @@ class MemobenchEnvConfig(EnvConfig):
 
         if use_async_envs:
             # What a vector environment must know before its workers exist.
-            return _LazyAsyncVectorEnv(make, observation_space(self.expert_action), action_space(), METADATA)
+            return _LazyAsyncVectorEnv(
+                make, observation_space(self.expert_action, self.render_every), action_space(), METADATA
+            )
         # LeRobot freezes finished rows of its own async envs only; a sync row would be reset and go on.
         return gym.vector.SyncVectorEnv(
             [freeze_after_episode_end(one) for one in make], autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP

@@ -74,7 +74,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._episode: Episode | None = None
         self._oracle_memory = oracle_memory
         self._describe(0)
-        self.observation_space = observation_space(expert_action)
+        self.observation_space = observation_space(expert_action, render_every)
         self.action_space = action_space()
         protocol = {
             "seed_base": seed_base,
@@ -128,7 +128,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._over = False
         self.episode.reset(seed)
         self._describe(0)
-        self._images = self.episode.images()
+        self._draw()
         self._discard_film()
         if self._videos is not None:
             self._film = Film(self._videos / f"{self.task}.{seed - self._seed_base}.mp4", METADATA["render_fps"])
@@ -154,13 +154,16 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         episode.step(np.asarray(action, dtype=np.float32))
         self._describe(completed)
         if episode.phase == PROMPT or episode.exec_steps % self._render_every == 0 or episode.done:
-            self._images = episode.images()
+            self._draw()
         if self._film is not None:
             self._film.add(self.render())
         if episode.done and not self._over:
             self._end()
         success = episode.success
         return self._observation(), float(success), success, episode.done and not success, self._info()
+
+    def _draw(self) -> None:
+        self._images, self._picture_step = self.episode.images(), self.episode.step_index
 
     def _end(self) -> None:
         """Close the books of an episode that has just ended."""
@@ -199,6 +202,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             "phase": np.array([episode.phase], dtype=np.float32),
             "step": np.array([episode.step_index], dtype=np.float32),
         }
+        if self._render_every > 1:
+            observation["picture_step"] = np.array([self._picture_step], dtype=np.float32)
         if self._expert_action:
             observation["expert_action"] = episode.expert_action()
         return observation

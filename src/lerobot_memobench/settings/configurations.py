@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, cast
 
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import check_checkpoint
+from lerobot_memobench.policies.freshness import REFUSAL
 from lerobot_memobench.settings.lerobot_commands import quiet
 from lerobot_memobench.settings.translation import LerobotSettings
 
@@ -36,6 +38,16 @@ def policy_config(settings: LerobotSettings) -> PreTrainedConfig | None:
 def env_config(settings: LerobotSettings) -> EnvConfig | None:
     """Return the environment's configuration; None where none is chosen, or a configuration file has a say."""
     return cast("EnvConfig | None", _parsed(settings, "env"))
+
+
+def check_pictures(policy: PreTrainedConfig | None, environment: EnvConfig | None) -> None:
+    """Refuse an environment that repeats pictures to a policy that remembers the frames between its plans.
+
+    Raises:
+        MemobenchError: it would remember one step's picture as another's.
+    """
+    if getattr(policy, "watches", False) and getattr(environment, "render_every", 1) > 1:
+        raise MemobenchError(f"env.render_every is {getattr(environment, 'render_every', 1)}; {REFUSAL}")
 
 
 def _is_known(settings: LerobotSettings, key: str) -> bool:

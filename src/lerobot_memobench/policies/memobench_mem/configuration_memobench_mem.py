@@ -67,6 +67,8 @@ class MemobenchMemConfig(PI05Config):
     tokens_per_frame: int = TOKENS_PER_FRAME
     memory_stride: int = 1
     """Every how many control steps a frame enters the history (and the cache)."""
+    memory_cache_dir: str | None = None
+    """Folder for memory caches, of several datasets perhaps; none: ``memory_cache`` in the dataset's folder."""
 
     # -- training
     prompt_loss: bool = False
@@ -175,8 +177,13 @@ class MemobenchMemConfig(PI05Config):
         return "none" if self.integration == "none" else "frame_sampling"
 
     @property
+    def watches(self) -> bool:
+        """Whether frames count that are seen between two plans."""
+        return self.memory != "none"
+
+    @property
     def cache_name(self) -> str:
-        """Name of the memory cache this policy reads, below ``<dataset>/memory_cache``."""
+        """What the name of the memory cache begins with that this policy reads."""
         return f"{self.size}-stride{self.memory_stride}"
 
     def get_scheduler_preset(self) -> WarmupFractionSchedulerConfig:

@@ -17,6 +17,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.freshness import PICTURE_STEP, require_fresh
 from lerobot_memobench.policies.memobench_mem.action_loss import counted_actions, mean_losses
 from lerobot_memobench.policies.memobench_mem.adapters import trained_whole
 from lerobot_memobench.policies.memobench_mem.alignment.loss import alignment_loss
@@ -49,7 +50,7 @@ from lerobot_memobench.policies.memobench_mem import processor_memobench_mem  # 
 
 logger = logging.getLogger(__name__)
 
-OBS_STEP, OBS_PHASE = "observation.step", "observation.phase"
+OBS_STEP, OBS_PHASE, OBS_PICTURE = "observation.step", "observation.phase", f"observation.{PICTURE_STEP}"
 
 
 class MemobenchMemPolicy(PI05Policy):
@@ -71,7 +72,7 @@ class MemobenchMemPolicy(PI05Policy):
         """Build the policy from scratch, or from ``config.base_weights``.
 
         Args:
-            dataset_meta: metadata of the dataset to train on; its memory cache is checked, and made when missing.
+            dataset_meta: metadata of the dataset to train on; its memory cache is checked, and made or finished.
             load_base: whether this is all; not when a checkpoint follows, with which training begins.
         """
         # As PI05Policy.__init__, which names its model class.
@@ -307,13 +308,20 @@ class MemobenchMemPolicy(PI05Policy):
         else:
             steps = [self._calls] * count  # an environment without a clock: one call is one step
         self._calls += 1
-        started, frozen = self.history.observe(steps, lambda rows: self.perception(batch[seen][rows]))
+        started, frozen = self.history.observe(steps, lambda rows: self._encode(batch, steps, rows))
         self.noise.resize(count)
         for row in range(count):
             if started[row]:
                 told = (key for key in (seen, OBS_STATE, OBS_LANGUAGE_TOKENS) if key in batch)
                 self.noise.begin(row, (batch[key][row] for key in told))
         return steps, started, frozen
+
+    def _encode(self, batch: dict[str, Tensor], steps: list[int], rows: list[int]) -> Tensor:
+        """Tokens (n, P, D) of the present frames of some rows; a frame of an earlier step is refused."""
+        if OBS_PICTURE in batch:
+            for row in rows:
+                require_fresh(steps[row], round(float(batch[OBS_PICTURE][row])))
+        return self.perception(batch[self.perception.remembers][rows])
 
     def plan(self, batch: dict[str, Tensor], rows: list[int], noise: Tensor, **kwargs: Any) -> Tensor:
         """Actions (n, chunk, A) for some rows of the batch, with their histories and sampling noise."""

@@ -86,6 +86,11 @@ class RemoteConfig(UntrainedConfig):
         return self.spoken.memory if self.memory is None else self.memory
 
     @property
+    def watches(self) -> bool:
+        """Whether frames count that are seen between two plans: a server that buffers frames gets all of them."""
+        return self.spoken.buffers
+
+    @property
     def max_environments(self) -> int | None:
         """How many environments can be stepped at once; None for any number."""
         return len(self.addresses()) if self.spoken.shared else None
