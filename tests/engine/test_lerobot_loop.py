@@ -14,8 +14,8 @@ import pytest
 import torch
 from lerobot.scripts import lerobot_eval
 
-from lerobot_memobench.engine import lerobot_loop
-from lerobot_memobench.engine.lerobot_loop import batch_seed, steered
+from lerobot_memobench.engine.loop import steering
+from lerobot_memobench.engine.loop.steering import batch_seed, steered
 from lerobot_memobench.errors import MemobenchError
 
 
@@ -27,7 +27,7 @@ class Env:
 
 # --- what is relied on: where one of these fails, LeRobot's loop is another one ---
 
-MODULE = "src/lerobot_memobench/engine/lerobot_loop.py, and lerobot/scripts/lerobot_eval.py beside it"
+MODULE = "src/lerobot_memobench/engine/loop, and lerobot/scripts/lerobot_eval.py beside it"
 
 PARAMETERS = {
     "run_one": {
@@ -59,7 +59,7 @@ CALLS = {
 
 def test_this_is_the_lerobot_whose_loop_is_known() -> None:
     found = metadata.version("lerobot")
-    assert found == lerobot_loop.LEROBOT, (
+    assert found == steering.LEROBOT, (
         f"lerobot {found} is installed. Read {MODULE}: does it still do what the tests below say? Compare the film and "
         "the log of one killed and resumed evaluation (tests/cli/test_killed_evaluation.py), then change LEROBOT"
     )

@@ -54,6 +54,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         replan_steps: int | None = None,
         expert_action: bool = False,
         oracle_memory: bool = False,
+        films: int | None = None,
         videos: bool = False,
         seed_base: int = SEED_BASE,
     ) -> None:
@@ -76,8 +77,10 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             "oracle_memory": oracle_memory,
         }
         self._log = EpisodeLog(log_dir, protocol) if log_dir is not None else None
-        self._videos = Path(log_dir) / "videos" if log_dir is not None and videos else None
+        self._videos = Path(log_dir) / "videos" if log_dir is not None else None
+        self._films = float("inf") if videos else films or 0
         self._film: Film | None = None
+        self._watched = True
         self._settings: dict[str, Any] = {
             "referent": referent,
             "prompt_video": prompt_video,
@@ -109,12 +112,12 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         seed = self._next_seed if seed is None else int(seed)
         self._next_seed = seed + 1
         self._started = time.monotonic()
-        self._over = False
+        self._over, self._watched = False, True
         self.episode.reset(seed)
         self._describe(0)
         self._images = self.episode.images()
         self._discard_film()
-        if self._videos is not None:
+        if self._videos is not None and seed - self._seed_base < self._films:
             name = f"{file_name(self.task, 'the name of a task')}.{seed - self._seed_base}.mp4"
             self._film = Film(self._videos / name, METADATA["render_fps"])
             self._film.add(self.render())
@@ -127,7 +130,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         completed = episode.progress.index
         episode.step(np.asarray(action, dtype=np.float32))
         self._describe(completed)
-        if episode.phase == PROMPT or episode.exec_steps % self._render_every == 0 or episode.done:
+        if self._is_seen():
             self._images = episode.images()
         if self._film is not None:
             self._film.add(self.render())
@@ -135,6 +138,23 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             self._end()
         success = episode.success
         return self._observation(), float(success), success, episode.done and not success, self._info()
+
+    def watch(self, watched: bool) -> None:
+        """Say whether somebody looks at the frames that follow, until the next reset or another word.
+
+        A frame that nobody looks at is not drawn: its observation holds the pictures drawn last. The first and the last
+        frame of the execution always are.
+        """
+        self._watched = watched
+
+    def _is_seen(self) -> bool:
+        """Whether the present frame is drawn."""
+        episode = self.episode
+        if episode.done or episode.step_index == episode.exec_start:
+            return True
+        if not self._watched and self._film is None:
+            return False
+        return episode.phase == PROMPT or episode.exec_steps % self._render_every == 0
 
     def _end(self) -> None:
         """Close the books of an episode that has just ended."""

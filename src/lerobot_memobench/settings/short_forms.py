@@ -20,6 +20,7 @@ SHORT_FORMS: dict[str, dict[str, tuple[str, ...]]] = {
         "dialect": ("policy.dialect",),
         "prompt_video": ("env.prompt_video",),
         "horizon": ("env.horizon",),
+        "films": ("env.films",),
         "episodes": ("eval.n_episodes",),
         "batch_size": ("eval.batch_size",),
     },

@@ -248,6 +248,15 @@ class MemobenchMemPolicy(PI05Policy):
         for part in (self.history, self.plans, self.noise):
             part.reset()
         self._calls = 0
+        self._acting: list[int] = []
+
+    def looks_next(self) -> bool:
+        """Whether the pictures of the next observation are read: it is remembered, or a plan is made from it.
+
+        Asked after an action. Whether the next frame is the first of an execution, where plans begin, only the
+        environment knows: that one is to be shown in any case, as the first of an episode.
+        """
+        return self.history.writes_next() or bool(self.plans.wanting(self._acting))
 
     def observe(self, batch: dict[str, Tensor]) -> tuple[list[int], list[bool], list[bool]]:
         """Take the current frames of all rows into their histories; return steps, new episodes and frozen rows."""
@@ -320,7 +329,7 @@ class MemobenchMemPolicy(PI05Policy):
         for row in range(count):
             if started[row] or prompt[row]:
                 self.plans.drop(row)
-        acting = [row for row in range(count) if not prompt[row] and not frozen[row]]
+        acting = self._acting = [row for row in range(count) if not prompt[row] and not frozen[row]]
         wanting = self.plans.wanting(acting)
         if wanting:
             plans = self.plan(batch, wanting, self._noise(wanting, steps))
