@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
+from lerobot_memobench.bench.evaluation import eval_loop
 from lerobot_memobench.bench.line import Line, line_of
 from lerobot_memobench.bench.machine import TASK
 from lerobot_memobench.bench.sides import Ours, actions, alternate, make_current, stock_open, timed
@@ -63,6 +64,7 @@ BENCHMARKS: dict[str, Callable[[], Line | list[Line]]] = {
     "step_without_images": step_without_images,
     "reset": reset,
     "workers": workers,
+    "eval_loop": eval_loop,
 }
 
 

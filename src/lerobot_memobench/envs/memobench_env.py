@@ -78,7 +78,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         }
         self._log = EpisodeLog(log_dir, protocol) if log_dir is not None else None
         self._videos = Path(log_dir) / "videos" if log_dir is not None else None
-        self._films = float("inf") if videos else films or 0
+        self._filmed = range(films or 0)
+        self._films_all = videos
         self._film: Film | None = None
         self._watched = True
         self._settings: dict[str, Any] = {
@@ -117,8 +118,9 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._describe(0)
         self._images = self.episode.images()
         self._discard_film()
-        if self._videos is not None and seed - self._seed_base < self._films:
-            name = f"{file_name(self.task, 'the name of a task')}.{seed - self._seed_base}.mp4"
+        number = seed - self._seed_base
+        if self._videos is not None and (self._films_all or number in self._filmed):
+            name = f"{file_name(self.task, 'the name of a task')}.{number}.mp4"
             self._film = Film(self._videos / name, METADATA["render_fps"])
             self._film.add(self.render())
         return self._observation(), self._info()
