@@ -7,16 +7,17 @@ from typing import Any
 
 import pytest
 
-from lerobot_memobench.bench import evaluation, total
-from lerobot_memobench.bench.evaluation import Stopwatch, evaluate_once, looking_every, step_bare
+from lerobot_memobench.bench import stopwatch, total
+from lerobot_memobench.bench.evaluation import evaluate_once, looking_every, step_bare
+from lerobot_memobench.bench.stopwatch import Stopwatch
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.policies.memobench_random.configuration_memobench_random import MemobenchRandomConfig
 from lerobot_memobench.policies.memobench_random.modeling_memobench_random import MemobenchRandomPolicy
 
 
 def test_a_step_costs_what_passes_from_the_first_to_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(evaluation.time, "perf_counter", iter([10.0, 18.0]).__next__)
-    monkeypatch.setattr(evaluation.time, "process_time", iter([1.0, 5.0]).__next__)
+    monkeypatch.setattr(stopwatch.time, "perf_counter", iter([10.0, 18.0]).__next__)
+    monkeypatch.setattr(stopwatch.time, "process_time", iter([1.0, 5.0]).__next__)
     watch = Stopwatch()
     for _ in range(4):
         watch.step()

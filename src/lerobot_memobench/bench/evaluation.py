@@ -10,11 +10,10 @@ import itertools
 import logging
 import statistics
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from unittest.mock import patch
 
 import gymnasium as gym
@@ -23,12 +22,13 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.bench.line import Line
 from lerobot_memobench.bench.machine import TASK, machine
-from lerobot_memobench.bench.sides import STOCK_CAMERAS, make_current, stock_open
+from lerobot_memobench.bench.sides import stock_open
+from lerobot_memobench.bench.stock_env import StockEnv
+from lerobot_memobench.bench.stopwatch import Cost, stopwatch
 from lerobot_memobench.engine.defaults import FIRST_SEED
 from lerobot_memobench.engine.planning import plan_line
 from lerobot_memobench.engine.run import run_evaluation
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
-from lerobot_memobench.envs.observations import IMAGE_KEYS, METADATA, action_space, observation_space
 from lerobot_memobench.policies.memobench_random.modeling_memobench_random import MemobenchRandomPolicy
 
 NEVER, EACH, FIFTH = 0, 1, 5
@@ -40,59 +40,6 @@ LINES = {
     "eval_loop_filmed": (EACH, 1),
 }
 """Line -> steps between looks, and how many episodes are filmed."""
-
-
-class Cost(NamedTuple):
-    """Of one control step, s: by the clock on the wall, and of all processors together."""
-
-    wall: float
-    cpu: float
-
-
-class Stopwatch:
-    """Counts the steps of vector environments, and tells what each has cost since the first."""
-
-    def __init__(self) -> None:
-        self.steps, self._start, self._end = 0, Cost(0, 0), Cost(0, 0)
-
-    def step(self) -> None:
-        """Note that a step begins."""
-        if not self.steps:
-            self._start = Cost(time.perf_counter(), time.process_time())
-        self.steps += 1
-
-    def end(self) -> None:
-        """Note that all is done."""
-        self._end = Cost(time.perf_counter(), time.process_time())
-
-    @property
-    def cost(self) -> Cost:
-        """Of one step."""
-        spent = (end - start for start, end in zip(self._start, self._end, strict=True))
-        return Cost(*(seconds / self.steps for seconds in spent))
-
-
-@contextmanager
-def stopwatch() -> Iterator[Stopwatch]:
-    """Yield a watch that notes the steps of vector environments in this process and the end of LeRobot's evaluation."""
-    from lerobot.scripts import lerobot_eval
-
-    watch, step, evaluate = Stopwatch(), gym.vector.SyncVectorEnv.step, lerobot_eval.eval_policy
-
-    def noted_step(self: gym.vector.SyncVectorEnv, actions: Any) -> Any:
-        watch.step()
-        return step(self, actions)
-
-    def noted_evaluation(*args: Any, **settings: Any) -> Any:
-        found = evaluate(*args, **settings)
-        watch.end()
-        return found
-
-    with (
-        patch.object(gym.vector.SyncVectorEnv, "step", noted_step),
-        patch.object(lerobot_eval, "eval_policy", noted_evaluation),
-    ):
-        yield watch
 
 
 @contextmanager
@@ -135,48 +82,6 @@ def _moves(steps: int) -> NDArray[np.float32]:
     return np.random.default_rng(0).uniform(-1, 1, (steps, 1, 7)).astype(np.float32)
 
 
-# --- stock robosuite ---
-
-
-class StockEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
-    """Stock robosuite as LeRobot's loop wants it, with our observation's names."""
-
-    metadata = METADATA
-    task = task_description = "pick_place"
-
-    def __init__(self, stock: Any, steps: int) -> None:
-        self.render_mode, self._stock, self._max_episode_steps = "rgb_array", stock, steps
-        self.observation_space, self.action_space = observation_space(False), action_space()
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start anew."""
-        super().reset(seed=seed)
-        make_current(self._stock)
-        self._step = 0
-        return self._observed(self._stock.reset()), {"is_success": False}
-
-    def step(self, action: NDArray[np.float32]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Take one control step."""
-        make_current(self._stock)
-        self._step += 1
-        found, reward, _, _ = self._stock.step(action)
-        return self._observed(found), float(reward), False, self._step >= self._max_episode_steps, {"is_success": False}
-
-    def _observed(self, found: dict[str, Any]) -> dict[str, Any]:
-        self._pictures = {key: found[f"{camera}_image"] for key, camera in zip(IMAGE_KEYS, STOCK_CAMERAS, strict=True)}
-        hand = (found["robot0_eef_pos"], found["robot0_eef_quat"][:3], found["robot0_gripper_qpos"])
-        still = np.ones(1, np.float32)
-        return {"pixels": self._pictures, "agent_pos": np.concatenate(hand, dtype=np.float32), "phase": still} | {
-            "step": still * self._step
-        }
-
-    def render(self) -> NDArray[np.uint8]:
-        """Return both cameras side by side."""
-        return np.hstack(list(self._pictures.values()))
-
-
 def evaluate_stock(stock: Any, films: int, steps: int) -> Cost:
     """Return what a step of stock robosuite costs in LeRobot's own loop, with its films."""
     from lerobot.envs.utils import freeze_after_episode_end
@@ -205,9 +110,6 @@ def evaluate_stock(stock: Any, films: int, steps: int) -> Cost:
 
 def _same(given: Any) -> Any:
     return given
-
-
-# --- taking turns ---
 
 
 def eval_loop(task: str = TASK, rounds: int = 5, steps: int = 100, their_steps: int = 20) -> list[Line]:
