@@ -76,6 +76,13 @@ def test_going_on_keeps_the_earlier_batch_size() -> None:
     assert plan_line([*LINE, "output_dir=new", "shards=2"]).batch == 1
 
 
+def test_ten_episodes_are_filmed_unless_another_number_is_given() -> None:
+    for words, films in (([], 10), (["films=0"], 0), (["env.films=3"], 3)):
+        environment = plan_line([*LINE, *words]).environment
+        assert environment is not None
+        assert environment.films == films
+
+
 def test_what_is_left_is_a_plan_of_its_own() -> None:
     plan = plan_line([*LINE, "output_dir=out", "resume=true"])
     before = dataclasses.replace(plan)

@@ -238,6 +238,17 @@ def test_rows_freeze_when_their_episode_ends(tmp_path: Path, use_async: bool) ->
     assert len(read_episodes(tmp_path)) == 2
 
 
+def test_the_first_episodes_are_filmed_or_all(tmp_path: Path) -> None:
+    for settings, filmed in (({}, []), ({"films": 2}, [0, 1]), ({"videos": True}, [-1, 0, 1, 2])):
+        folder = tmp_path / str(len(filmed))
+        env = make(STOVE, log_dir=str(folder), horizon=1, render="fast", **settings)
+        for seed in (6, 7, 8, 9):
+            env.reset(seed=seed)
+            env.step(np.zeros(7, np.float32))
+        env.close()
+        assert {film.name for film in folder.rglob("*.mp4")} == {f"{STOVE}.{number}.mp4" for number in filmed}
+
+
 def test_log_holds_the_finished_episodes(tmp_path: Path) -> None:
     env = make(DRAWER, log_dir=str(tmp_path), horizon=4, replan_steps=20)
     hashes = []
@@ -292,6 +303,7 @@ def test_render_is_annotated() -> None:
         ({"prompt_in": "rest"}, "env.prompt_in is 'rest'; did you mean 'reset'"),
         ({"horizon": 0}, "env.horizon is 0"),
         ({"render_every": 0}, "env.render_every is 0"),
+        ({"films": -1}, "env.films is -1"),
         ({"fps": 30}, "control rate is 20"),
     ],
 )

@@ -58,11 +58,19 @@ def reset(task: str = TASK, rounds: int = 3) -> Line:
     return line_of("reset", mine, other, {"task": task})
 
 
+def eval_loop() -> list[Line]:
+    """A control step of ``lerobot eval``; LeRobot is imported for it, which takes longer than the other claims."""
+    from lerobot_memobench.bench import evaluation
+
+    return evaluation.eval_loop()
+
+
 BENCHMARKS: dict[str, Callable[[], Line | list[Line]]] = {
     "step_with_images": step_with_images,
     "step_without_images": step_without_images,
     "reset": reset,
     "workers": workers,
+    "eval_loop": eval_loop,
 }
 
 

@@ -39,7 +39,7 @@ def table(lines: list[Line]) -> str:
     for line in lines:
         notes = ", ".join(
             f"{key.replace('_', ' ')} {line.detail[key]}"
-            for key in ("quality", "memory_mb", "their_memory_mb")
+            for key in ("quality", "memory_mb", "their_memory_mb", "over_bare")
             if key in line.detail
         )
         name = line.name.replace("_", " ")

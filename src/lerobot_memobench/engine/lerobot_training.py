@@ -1,6 +1,6 @@
 """What LeRobot's training is made to do beside its own: leave the frames of prompts out.
 
-With `lerobot_loop` the only module that changes anything of LeRobot's; what it relies on is listed in
+With `loop.steering` and the drawing of execution frames (`policies.memobench_mem.execution_frames`) all that changes anything of LeRobot's; what it relies on is listed in
 tests/engine/test_lerobot_training.py. Whether prompt frames are wanted is decided where the policy is known for sure:
 when LeRobot, its configuration complete, has opened the datasets.
 """
@@ -16,7 +16,7 @@ from types import ModuleType
 from typing import Any
 
 from lerobot_memobench.datasets.execution_frames import ExecutionFrames, leave_out_prompts
-from lerobot_memobench.engine.lerobot_loop import check_version
+from lerobot_memobench.engine.loop.steering import check_version
 from lerobot_memobench.envs.prompting import knows_phases
 
 logger = logging.getLogger(__name__)

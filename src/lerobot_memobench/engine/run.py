@@ -8,7 +8,7 @@ from typing import Any
 from lerobot_memobench.engine.card import with_episodes, write_card
 from lerobot_memobench.engine.folder import check_new, held
 from lerobot_memobench.engine.lerobot_command import call_lerobot
-from lerobot_memobench.engine.lerobot_loop import calm_output, steered
+from lerobot_memobench.engine.loop.steering import calm_output, steered
 from lerobot_memobench.engine.plan import EvaluationPlan
 from lerobot_memobench.engine.plan_card import card_of, with_checkpoint
 from lerobot_memobench.engine.reporting import EvaluationReport, report_on

@@ -46,7 +46,9 @@ class MemobenchEnvConfig(EnvConfig):
         oracle_memory: write what has been completed so far behind the instruction (the paper's oracle memory control),
             word for word as the column `memory` of a dataset says it for the same frame.
         log_dir: where the episode log goes; LeRobot's output folder when left out.
-        videos: film every episode into `<log_dir>/videos/<task>.<episode>.mp4`, annotated as `render()` is.
+        films: film so many episodes of each task, from episode 0 on, into `<log_dir>/videos/<task>.<episode>.mp4`,
+            annotated as `render()` is; none when left out.
+        videos: film every episode, whatever `films` says.
         seed_base: the seed that counts as episode 0.
         resume: leave out the episodes that the log in `log_dir` holds already.
     """
@@ -65,6 +67,7 @@ class MemobenchEnvConfig(EnvConfig):
     expert_action: bool = False
     oracle_memory: bool = False
     log_dir: str | None = None
+    films: int | None = None
     videos: bool = False
     seed_base: int = SEED_BASE
     resume: bool = False
@@ -84,6 +87,8 @@ class MemobenchEnvConfig(EnvConfig):
         for name, number in (("horizon", self.horizon), ("render_every", self.render_every)):
             if number < 1:
                 raise MemobenchError(f"env.{name} is {number}; expected a whole number from 1 on")
+        if self.films is not None and self.films < 0:
+            raise MemobenchError(f"env.films is {self.films}; expected a whole number of episodes from 0 on")
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
@@ -98,6 +103,7 @@ class MemobenchEnvConfig(EnvConfig):
             "replan_steps": self.replan_steps,
             "expert_action": self.expert_action,
             "oracle_memory": self.oracle_memory,
+            "films": self.films,
             "videos": self.videos,
             "seed_base": self.seed_base,
         }

@@ -63,6 +63,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         replan_steps: int | None = None,
         expert_action: bool = False,
         oracle_memory: bool = False,
+        films: int | None = None,
         videos: bool = False,
         seed_base: int = SEED_BASE,
     ) -> None:
@@ -88,8 +89,11 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             "oracle_memory": oracle_memory,
         }
         self._log = EpisodeLog(log_dir, protocol) if log_dir is not None else None
-        self._videos = Path(log_dir) / "videos" if log_dir is not None and videos else None
+        self._videos = Path(log_dir) / "videos" if log_dir is not None else None
+        self._filmed = range(films or 0)
+        self._films_all = videos
         self._film: Film | None = None
+        self._watched = True
         self._settings: dict[str, Any] = {
             "referent": referent,
             "prompt_video": prompt_video,
@@ -125,13 +129,14 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         seed = self._next_seed if seed is None else int(seed)
         self._next_seed = seed + 1
         self._started = time.monotonic()
-        self._over = False
+        self._over, self._watched = False, True
         self.episode.reset(seed)
         self._describe(0)
         self._draw()
         self._discard_film()
-        if self._videos is not None:
-            self._film = Film(self._videos / f"{self.task}.{seed - self._seed_base}.mp4", METADATA["render_fps"])
+        number = seed - self._seed_base
+        if self._videos is not None and (self._films_all or number in self._filmed):
+            self._film = Film(self._videos / f"{self.task}.{number}.mp4", METADATA["render_fps"])
             self._film.add(self.render())
         if self._prompt_in == RESET and self.episode.phase == PROMPT:
             self._play_prompt()
@@ -142,7 +147,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         while self.episode.phase == PROMPT:
             self.episode.step(np.zeros(ACTION_DIM, np.float32))
             if self._film is not None or self.episode.phase != PROMPT:
-                self._images = self.episode.images()
+                self._draw()
             if self._film is not None:
                 self._film.add(self.render())
 
@@ -153,7 +158,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         completed = episode.progress.index
         episode.step(np.asarray(action, dtype=np.float32))
         self._describe(completed)
-        if episode.phase == PROMPT or episode.exec_steps % self._render_every == 0 or episode.done:
+        if self._is_seen():
             self._draw()
         if self._film is not None:
             self._film.add(self.render())
@@ -164,6 +169,23 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     def _draw(self) -> None:
         self._images, self._picture_step = self.episode.images(), self.episode.step_index
+
+    def watch(self, watched: bool) -> None:
+        """Say whether somebody looks at the frames that follow, until the next reset or another word.
+
+        A frame that nobody looks at is not drawn: its observation holds the pictures drawn last. The first and the last
+        frame of the execution always are.
+        """
+        self._watched = watched
+
+    def _is_seen(self) -> bool:
+        """Whether the present frame is drawn."""
+        episode = self.episode
+        if episode.done or episode.step_index == episode.exec_start:
+            return True
+        if not self._watched and self._film is None:
+            return False
+        return episode.phase == PROMPT or episode.exec_steps % self._render_every == 0
 
     def _end(self) -> None:
         """Close the books of an episode that has just ended."""

@@ -21,6 +21,7 @@ SHORT_FORMS: dict[str, dict[str, tuple[str, ...]]] = {
         "prompt_video": ("env.prompt_video",),
         "prompt_in": ("env.prompt_in",),
         "horizon": ("env.horizon",),
+        "films": ("env.films",),
         "episodes": ("eval.n_episodes",),
         "batch_size": ("eval.batch_size",),
     },

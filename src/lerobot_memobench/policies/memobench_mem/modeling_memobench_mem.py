@@ -151,9 +151,9 @@ class MemobenchMemPolicy(PI05Policy):
         if dataset_meta is None:
             require_statistics(source, revision)
         # The steps lie with an adapter, and not with what it adapts, of which these are the weights.
-        steps = (config.pretrained_path, config.pretrained_revision) if config.use_peft else (source, revision)
-        if steps[0] is not None:
-            require_agreement(*steps, config, training=dataset_meta is not None)
+        saved, of = (config.pretrained_path, config.pretrained_revision) if config.use_peft else (source, revision)
+        if saved is not None:
+            require_agreement(saved, of, config, training=dataset_meta is not None)
         policy = cls(config, dataset_meta=dataset_meta, load_base=False)
         load_weights(policy, path, source, remembers=config.memory != "none")
         policy.to(config.device)
@@ -292,6 +292,15 @@ class MemobenchMemPolicy(PI05Policy):
             part.reset()
         self._calls = 0
         self.thread.begin()
+        self._acting_rows: list[int] = []
+
+    def looks_next(self) -> bool:
+        """Whether the pictures of the next observation are read: it is remembered, or a plan is made from it.
+
+        Asked after an action. Whether the next frame is the first of an execution, where plans begin, only the
+        environment knows: that one is to be shown in any case, as the first of an episode.
+        """
+        return self.history.writes_next() or bool(self.plans.wanting(self._acting_rows))
 
     def observe(self, batch: dict[str, Tensor]) -> tuple[list[int], list[bool], list[bool]]:
         """Take the current frames of all rows into their histories; return steps, new episodes and frozen rows."""
@@ -379,7 +388,7 @@ class MemobenchMemPolicy(PI05Policy):
         for row in range(count):
             if started[row] or prompt[row]:
                 self.plans.drop(row)
-        acting = [row for row in range(count) if not prompt[row] and not frozen[row]]
+        acting = self._acting_rows = [row for row in range(count) if not prompt[row] and not frozen[row]]
         wanting = self.plans.wanting(acting)
         if wanting:
             plans = self.plan(batch, wanting, self._noise(wanting, steps))
