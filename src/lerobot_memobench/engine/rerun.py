@@ -24,7 +24,7 @@ def repeatable_card(path: Path) -> dict[str, Any]:
         MemobenchError: there is none, or it holds nothing to compare with.
     """
     path = path / CARD_FILE if path.is_dir() else path
-    card = read_card(path)
+    card = read_card(path, whole=True)
     if not card["episodes"]:
         raise MemobenchError(f"{path} holds no episodes to compare with; expected that of an evaluation that has ended")
     return card
