@@ -1,4 +1,4 @@
-"""Logs, protocols and cards that were damaged in any way: every command that reads them ends in a result or a sentence."""
+"""Logs, protocols and cards, damaged in any way: every command that reads them ends in a result or a sentence."""
 
 from __future__ import annotations
 

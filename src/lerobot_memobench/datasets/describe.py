@@ -16,6 +16,7 @@ import numpy as np
 from lerobot_memobench.datasets.lerobot_format.card_tables import ordered_types
 from lerobot_memobench.datasets.lerobot_format.layout import MANIFEST_FILE, image_key
 from lerobot_memobench.datasets.lerobot_format.reading import episode_rows
+from lerobot_memobench.datasets.manifest import read_manifest
 from lerobot_memobench.datasets.paper_figures import FAMILIES, LENGTH_BUCKETS
 from lerobot_memobench.errors import MemobenchError
 
@@ -46,7 +47,7 @@ def describe(folder: Path, out: Path) -> list[Path]:
         found[-1].write_text(card_tables(card.read_text(encoding="utf-8")), encoding="utf-8")
     if hashes.is_file():
         found.append(out / MANIFEST_FILE)
-        found[-1].write_text(short_manifest(json.loads(hashes.read_text(encoding="utf-8"))), encoding="utf-8")
+        found[-1].write_text(short_manifest(read_manifest(folder)), encoding="utf-8")
     return found
 
 
@@ -62,7 +63,9 @@ def short_manifest(manifest: Mapping[str, Any]) -> str:
     """Return a manifest as JSON of one line per task: seed to the hash of its episode, or to why there is none."""
     tasks: dict[str, dict[str, str]] = {}
     for row in manifest["episodes"]:
-        tasks.setdefault(row["task_name"], {})[str(row["seed"])] = row["failure"] or row["digest"]
+        tasks.setdefault(row["task_name"], {})[str(row["seed"])] = (
+            row["failure"] or row.get("digest") or "no hash was kept"
+        )
     head = {key: value for key, value in manifest.items() if key != "episodes"}
     lines = [f"{json.dumps(name)}: {json.dumps(seeds)}" for name, seeds in sorted(tasks.items())]
     return json.dumps(head | {"tasks": None})[: -len("null}")] + "{\n" + ",\n".join(lines) + "\n}}\n"

@@ -17,7 +17,7 @@ from typing import Any, Literal, NotRequired, TypedDict
 from lerobot_memobench.envs.protocol import write_protocol
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.files import file_name, write_file
-from lerobot_memobench.files.reading import Count, Malformed, Number, Whole, checked, parsed
+from lerobot_memobench.files.reading import Count, Malformed, Name, Number, Whole, checked, parsed
 
 logger = logging.getLogger(__name__)
 
@@ -41,20 +41,20 @@ class Outcome(TypedDict, total=False):
     """What a log and a card may both say of an episode; logs of other tools leave parts of it out."""
 
     seed: Whole | None
-    referent: str
+    referent: Name
     variant: Count | None
     replan_steps: Count | None
     prompt_steps: Count | None
     steps: Count | None
-    failure: str | None
-    scene_hash: str | None
+    failure: Name | None
+    scene_hash: Name | None
 
 
 class EpisodeRecord(Outcome):
     """What a line must hold to count as a rollout (see `episode_record`)."""
 
-    task: str
-    memory_type: str
+    task: Name
+    memory_type: Name
     episode: Whole
     success: bool
     checkpoints: list[CheckpointRecord]

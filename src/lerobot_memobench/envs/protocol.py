@@ -15,7 +15,7 @@ from annotated_types import Ge, Le
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.files import write_file
-from lerobot_memobench.files.reading import Count, Whole, read_json
+from lerobot_memobench.files.reading import Count, Name, Whole, read_json
 
 PROTOCOL_FILE = "protocol.json"
 
@@ -46,14 +46,14 @@ MOST_EPISODES = 100_000
 class Protocol(TypedDict, total=False):
     """What ``protocol.json`` and a card may say; a setting in which joined episodes differ is a list of its values."""
 
-    tasks: list[str]
+    tasks: list[Name]
     episodes: Annotated[int, Ge(0), Le(MOST_EPISODES)]
     seed_base: Whole | list[Whole]
-    referent: str | list[str]
+    referent: Name | list[Name]
     prompt_video: bool | None
     horizon: Count | None
     replan_steps: Count | list[Count | None] | None
-    render: str | None
+    render: Name | None
     render_every: Count | None
     oracle_memory: bool | None
 

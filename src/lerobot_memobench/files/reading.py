@@ -13,7 +13,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from annotated_types import Ge, Le
+from annotated_types import Ge, Le, MaxLen, MinLen
 
 from lerobot_memobench.errors import MemobenchError
 
@@ -26,6 +26,7 @@ LARGEST = 2**53
 
 Whole = Annotated[int, Ge(-LARGEST), Le(LARGEST)]
 Count = Annotated[int, Ge(0), Le(LARGEST)]
+Name = Annotated[str, MinLen(1), MaxLen(255)]
 Number = Annotated[float, Ge(-LARGEST), Le(LARGEST)]
 
 LONGEST = 80

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from lerobot_memobench.datasets.memory_cache.layout import (
     slot_starts,
 )
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files.reading import read_json
 
 
 class MemoryCache:
@@ -36,10 +36,27 @@ class MemoryCache:
         self._subgoals = {
             level: resolve_subgoals(np.load(folder / f"subgoal-{level}.npy"), self.episodes) for level in meta.levels
         }
-        self.texts: list[str] = json.loads((folder / "texts.json").read_text())
+        self.texts: list[str] = read_json(folder / "texts.json", list[str], "it is damaged")
         self.text_embeddings = torch.from_numpy(np.load(folder / "texts.npy"))
         self._memory: np.ndarray | None = np.load(folder / "memory.npy") if meta.oracle else None
-        self.memories: list[str] = json.loads((folder / "memory.json").read_text()) if meta.oracle else []
+        self.memories: list[str] = read_json(folder / "memory.json", list[str], "it is damaged") if meta.oracle else []
+        self._check()
+
+    def _check(self) -> None:
+        """Raise a ValueError unless the tables are those of one dataset."""
+        frames, episodes = self.num_frames, len(self.episodes)
+        tables = [(rows, len(self.texts)) for rows in self._subgoals.values()]
+        tables += [] if self._memory is None else [(self._memory, len(self.memories))]
+        fitting = (
+            episodes > 0
+            and (np.diff(self.episodes) > 0).all()
+            and (self.episodes[0], self.slots[-1]) == (0, self.meta.slots)
+            and self.phase.shape == (frames,)
+            and self.text_embeddings.shape[:1] == (len(self.texts),)
+            and all(rows.shape == (frames,) and rows.max(initial=-1) < count for rows, count in tables)
+        )
+        if not fitting:
+            raise ValueError("its tables are not of one dataset")
 
     @classmethod
     def open(
@@ -76,7 +93,13 @@ class MemoryCache:
             raise MemobenchError(
                 f"The memory cache {root / FOLDER / name} is not finished. Go on with `memobench cache {root}`."
             )
-        return cls(root / FOLDER / name, meta)
+        try:
+            return cls(root / FOLDER / name, meta)
+        except (OSError, ValueError, EOFError, TypeError, IndexError) as error:  # as NumPy answers damaged arrays
+            told = " ".join(str(error).split())[:200]
+            raise MemobenchError(
+                f"The memory cache {root / FOLDER / name} is damaged ({told}). Delete that folder. {fix_hint(root)}"
+            ) from None
 
     @property
     def num_frames(self) -> int:

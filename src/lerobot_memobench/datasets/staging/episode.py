@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,7 @@ from lerobot_memobench.datasets.staging.folders import file_hash
 from lerobot_memobench.datasets.statistics import Stats
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.files import file_name
+from lerobot_memobench.files.reading import Count, Malformed, Number, Whole, checked, read_json
 
 RECORD_FILE = "episode.json"
 ARRAYS_FILE = "arrays.npz"
@@ -23,6 +23,55 @@ HDF5_FILE = "demonstration.hdf5"
 LEROBOT, HDF5 = "lerobot", "hdf5"
 FORMATS = (LEROBOT, HDF5)
 """What a run can make of its episodes."""
+
+ADVICE = "it is damaged; delete the folder that it is in and run the command again"
+
+
+class Info(TypedDict):
+    """What meta/episodes, manifest and card say of an episode (see ``episode_info``)."""
+
+    task_name: str
+    memory_type: str
+    family: str
+    language: str
+    operations: str
+    seed: Whole
+    referent: str
+    variant: Count
+    success: bool
+    frames: Count
+    exec_start_index: Count
+    key_frames: list[Whole]
+    scene_hash: str
+    fixture_poses: dict[str, list[Number]]
+    digest: str
+
+
+class Identity(TypedDict):
+    """What is known of an episode that could not be made."""
+
+    task_name: str
+    seed: Whole
+
+
+class Row(TypedDict, total=False):
+    """One of LeRobot's persistent language rows; `datasets.language` writes them."""
+
+    role: str
+    content: str | None
+    style: str | None
+    timestamp: Number
+
+
+class Record(TypedDict):
+    """``episode.json``."""
+
+    failure: str | None
+    info: Identity
+    language_persistent: list[Row]
+    image_stats: dict[str, dict[str, list[Number] | list[list[list[Number]]]]]
+    files: dict[str, str]
+    hdf5: NotRequired[dict[str, Any] | None]
 
 
 @dataclass(frozen=True)
@@ -95,13 +144,20 @@ class StagedEpisode:
 def read_staged(folder: Path) -> StagedEpisode | None:
     """Return the finished episode in ``folder``, or None when there is none."""
     try:
-        return StagedEpisode(folder, json.loads((folder / RECORD_FILE).read_text()))
+        record = read_json(folder / RECORD_FILE, Record, ADVICE)
     except FileNotFoundError:
         return None
-    except json.JSONDecodeError as error:
-        raise MemobenchError(
-            f"{folder / RECORD_FILE} is damaged ({error}); delete the folder and generate again"
-        ) from None
+    if record["failure"] is None:
+        _check_info(folder, record["info"])
+    return StagedEpisode(folder, record)
+
+
+def _check_info(folder: Path, info: dict[str, Any]) -> None:
+    """Refuse an episode of which not all is told that a dataset says of it."""
+    try:
+        checked(info, Info)
+    except Malformed as error:
+        raise MemobenchError(f"{folder / RECORD_FILE}: {error} in info; {ADVICE}") from None
 
 
 class StagedJob:

@@ -8,7 +8,7 @@ from annotated_types import Ge, Le, MinLen
 
 from lerobot_memobench.envs.episode_log import CheckpointRecord, Outcome
 from lerobot_memobench.envs.protocol import Protocol
-from lerobot_memobench.files.reading import LARGEST, Count, Whole
+from lerobot_memobench.files.reading import LARGEST, Count, Name, Whole
 
 
 class PolicySettings(TypedDict, total=False):
@@ -20,7 +20,7 @@ class PolicySettings(TypedDict, total=False):
 class Policy(TypedDict, total=False):
     """What identifies a policy; {} where nothing is known of it."""
 
-    type: str | None
+    type: Name | None
     seed: Whole | None
     settings: PolicySettings
     sha256: str | None
@@ -52,7 +52,7 @@ class Start(TypedDict):
 class Found(Outcome):
     """What an episode came to."""
 
-    task: str
+    task: Name
     episode: Whole
     memory_type: NotRequired[str]
     success: NotRequired[bool]
