@@ -54,18 +54,19 @@ class Malformed(MemobenchError):
     """What was read is not of the expected shape; the message is the reason alone."""
 
 
-def read_json(path: Path, schema: Any, advice: str) -> Any:
+def read_json(path: Path, schema: Any, advice: str, *, nan: bool = False) -> Any:
     """Return what a JSON file of ours holds.
 
     Args:
         schema: the type that it must have. advice: ends the sentence: what to do.
+        nan: whether NaN and Infinity are numbers, as of a training that diverged.
 
     Raises:
         FileNotFoundError: there is none, which is the caller's to judge.
         MemobenchError: it cannot be read or is not of the schema, named with the place in it.
     """
     try:
-        return checked(parsed(path.read_bytes()), schema)
+        return checked(parsed(path.read_bytes(), nan=nan), schema)
     except FileNotFoundError:
         raise
     except OSError as error:
@@ -74,8 +75,8 @@ def read_json(path: Path, schema: Any, advice: str) -> Any:
         raise MemobenchError(f"{path}: {error}; {advice}") from None
 
 
-def parsed(content: bytes | str) -> Any:
-    """Return the value that JSON text says; numbers that are none (NaN), lone surrogates and bad UTF-8 are no JSON.
+def parsed(content: bytes | str, *, nan: bool = False) -> Any:
+    """Return the value that JSON text says; NaN (unless ``nan``), lone surrogates and bad UTF-8 are no JSON.
 
     Raises:
         Malformed: it is no JSON, or nested deeper than any file of ours.
@@ -84,7 +85,7 @@ def parsed(content: bytes | str) -> Any:
 
     data = content.encode(errors="replace") if isinstance(content, str) else content
     try:
-        return from_json(data.removeprefix(codecs.BOM_UTF8), allow_inf_nan=False)
+        return from_json(data.removeprefix(codecs.BOM_UTF8), allow_inf_nan=nan)
     except ValueError as error:
         raise Malformed(f"it is not JSON ({error})") from None
 

@@ -70,6 +70,8 @@ class CacheMeta:
 META_SCHEMA: Any = TypedDict("META_SCHEMA", get_type_hints(CacheMeta))  # type: ignore[misc]
 """What the file must hold before it is a `CacheMeta`."""
 
+SIZES = ("stride", "tokens_per_frame", "dim", "slots")
+
 
 def fix_hint(root: Path) -> str:
     """What a user types when a cache does not fit."""
@@ -83,7 +85,7 @@ def read_meta(root: Path, name: str) -> CacheMeta | None:
         return None
     advice = f"it is not a memory cache this version can read. {fix_hint(Path(root))}"
     found = read_json(path, META_SCHEMA, advice)
-    if set(found) != set(META_SCHEMA.__annotations__) or found["stride"] < 1:
+    if set(found) != set(META_SCHEMA.__annotations__) or min(map(found.__getitem__, SIZES)) < 1:
         raise MemobenchError(f"{path}: {advice}")
     return CacheMeta(**found)
 

@@ -21,6 +21,7 @@ from lerobot_memobench.datasets.memory_cache.layout import (
     slot_starts,
 )
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files import file_name
 from lerobot_memobench.files.reading import read_json
 
 
@@ -34,7 +35,10 @@ class MemoryCache:
         self.slots = slot_starts(self.episodes, meta.stride)
         self._tokens = np.memmap(folder / TOKENS_FILE, dtype=np.uint16, mode="r", shape=meta.shape)
         self._subgoals = {
-            level: resolve_subgoals(np.load(folder / f"subgoal-{level}.npy"), self.episodes) for level in meta.levels
+            level: resolve_subgoals(
+                np.load(folder / file_name(f"subgoal-{level}.npy", "the table of a level")), self.episodes
+            )
+            for level in meta.levels
         }
         self.texts: list[str] = read_json(folder / "texts.json", list[str], "it is damaged")
         self.text_embeddings = torch.from_numpy(np.load(folder / "texts.npy"))
@@ -95,7 +99,7 @@ class MemoryCache:
             )
         try:
             return cls(root / FOLDER / name, meta)
-        except (OSError, ValueError, EOFError, TypeError, IndexError) as error:  # as NumPy answers damaged arrays
+        except Exception as error:  # NumPy answers damaged arrays with errors of every type
             told = " ".join(str(error).split())[:200]
             raise MemobenchError(
                 f"The memory cache {root / FOLDER / name} is damaged ({told}). Delete that folder. {fix_hint(root)}"

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NotRequired, TypedDict
+from typing import Annotated, Any, NotRequired, TypedDict
 
 import numpy as np
+from annotated_types import Len
 from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.language import LanguageRow
@@ -63,13 +64,19 @@ class Row(TypedDict, total=False):
     timestamp: Number
 
 
+Frames = Annotated[list[Count], Len(1, 1)]
+"""Over how many frames a statistic is, (1,)."""
+Pixels = Annotated[list[Annotated[list[Annotated[list[Number], Len(1, 1)]], Len(1, 1)]], Len(3, 3)]
+"""A statistic of a camera's channels, (3, 1, 1)."""
+
+
 class Record(TypedDict):
     """``episode.json``."""
 
     failure: str | None
     info: Identity
     language_persistent: list[Row]
-    image_stats: dict[str, dict[str, list[Number] | list[list[list[Number]]]]]
+    image_stats: dict[str, dict[str, Pixels | Frames]]
     files: dict[str, str]
     hdf5: NotRequired[dict[str, Any] | None]
 

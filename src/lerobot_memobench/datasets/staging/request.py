@@ -13,7 +13,7 @@ from lerobot_memobench.datasets.staging.episode import LEROBOT
 from lerobot_memobench.datasets.staging.folders import STAGING, clean_temporaries
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.files import remove_drafts, write_file
-from lerobot_memobench.files.reading import read_json
+from lerobot_memobench.files.reading import read_json, short
 from lerobot_memobench.jobs.locking import locked
 
 REQUEST_FILE = "request.json"
@@ -59,4 +59,5 @@ def compare_requests(earlier: dict[str, Any], request: dict[str, Any], what: str
     earlier = {"formats": [LEROBOT], **earlier}  # written before there were two
     for key, value in request.items():
         if earlier.get(key) != value:
-            raise MemobenchError(f"{what} with {key}={earlier.get(key)!r}, now {value!r} was asked for; {advice}")
+            there = short(earlier.get(key))
+            raise MemobenchError(f"{what} with {key}={there}, now {short(value)} was asked for; {advice}")

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NotRequired, TypedDict
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NotRequired, TypedDict
 
-from lerobot_memobench.files.reading import Count, Number
+from lerobot_memobench.files import write_file
+from lerobot_memobench.files.reading import Count, Number, read_json
 
 
 class Scores(TypedDict):
@@ -22,7 +26,7 @@ class KeptRun(TypedDict):
     memory: Scores
     last_frame: Scores
     head: NotRequired[Scores]
-    action_loss: Number
+    action_loss: float
 
 
 class KeptBaselines(TypedDict):
@@ -34,3 +38,18 @@ class KeptBaselines(TypedDict):
     tower_last_frame: Scores
     untrained_memory: Scores
     untrained_last_frame: Scores
+
+
+def kept_or_made(path: Path, schema: Any, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Return what ``path`` holds; where there is no such file, what ``make`` returns, written there.
+
+    Raises:
+        MemobenchError: the file is not of the schema. It may have taken hours, so it is not replaced.
+    """
+    try:
+        kept: dict[str, Any] = read_json(path, schema, "remove it, and the run is made again", nan=True)
+    except FileNotFoundError:
+        kept = make()
+        path.parent.mkdir(exist_ok=True)
+        write_file(path, json.dumps(kept, indent=1))
+    return kept

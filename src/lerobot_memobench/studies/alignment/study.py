@@ -24,7 +24,7 @@ from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
 from lerobot_memobench.studies.alignment.baselines import measure_baselines
 from lerobot_memobench.studies.alignment.figure import draw
 from lerobot_memobench.studies.alignment.frames import Frames, Say
-from lerobot_memobench.studies.alignment.kept import KeptBaselines, KeptRun
+from lerobot_memobench.studies.alignment.kept import KeptBaselines, KeptRun, kept_or_made
 from lerobot_memobench.studies.alignment.measures import Measures
 from lerobot_memobench.studies.alignment.questions import make_questions
 from lerobot_memobench.studies.alignment.settings import ALIGNMENTS, StudySettings, claim_folder
@@ -70,14 +70,7 @@ class Study:
 
     def _once(self, name: str, schema: Any, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         """Return a finished result of that name, or do the work and write it."""
-        path = self.out / "runs" / f"{name}.json"
-        if path.is_file():
-            kept: dict[str, Any] = read_json(path, schema, "remove the file, and the run is made again")
-            return kept
-        found = work()
-        path.parent.mkdir(exist_ok=True)
-        write_file(path, json.dumps(found, indent=1))
-        return found
+        return kept_or_made(self.out / "runs" / f"{name}.json", schema, work)
 
     def _run(self, align: str, seed: int) -> dict[str, Any]:
         started = time.process_time()
