@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TypedDict
+from typing import Annotated, Any, Literal, TypedDict
+
+from annotated_types import Len, MaxLen
 
 from lerobot_memobench.files.reading import Count, Number, Whole
 
@@ -23,20 +25,14 @@ class Example(TypedDict):
     b: Said
 
 
-class Aliased(TypedDict, total=False):
-    """Pictures at which more than one answer is right; empty where no demonstration succeeded."""
-
-    at_home: Number
-    pixel_exact: Number
-    as_it_happens: Number
-
-
-class InOrder(Aliased, total=False):
-    """How far policies without memory come in the demonstrated order."""
-
-    chance: Number
-    deterministic: Number
-    stochastic: Number
+Nothing = Annotated[dict[str, Any], MaxLen(0)]
+"""Where no demonstration succeeded."""
+Aliased = Annotated[dict[Literal["at_home", "pixel_exact", "as_it_happens"], Number], Len(3, 3)]
+"""Pictures at which more than one answer is right."""
+InOrder = Annotated[
+    dict[Literal["chance", "deterministic", "stochastic", "pixel_exact", "as_it_happens"], Number], Len(5, 5)
+]
+"""How far policies without memory come in the demonstrated order."""
 
 
 class KeptScene(TypedDict):
@@ -46,8 +42,8 @@ class KeptScene(TypedDict):
     seed: Whole
     solved: Count
     decisions: Count
-    aliased: Aliased
-    in_order: InOrder
+    aliased: Nothing | Aliased
+    in_order: Nothing | InOrder
     examples: list[Example]
     largest_same: Number
     smallest_different: Number
