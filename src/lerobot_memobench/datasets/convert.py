@@ -7,7 +7,6 @@ dataset to anybody.
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -22,11 +21,11 @@ from lerobot_memobench.datasets.hdf5.restore import NO_SEED, restore
 from lerobot_memobench.datasets.lerobot_format.assembling import assemble
 from lerobot_memobench.datasets.lerobot_format.layout import (
     DEFAULT_REPO_ID,
-    MANIFEST_FILE,
     check_destination,
     is_dataset,
 )
 from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
+from lerobot_memobench.datasets.manifest import read_manifest
 from lerobot_memobench.datasets.staging.episode import StagedEpisode, StagedJob, staged
 from lerobot_memobench.datasets.staging.folders import STAGING
 from lerobot_memobench.datasets.staging.request import compare_requests, episodes_folder
@@ -217,13 +216,15 @@ def _name(path: Path, source: Path) -> str:
 def _finished(out: Path, request: dict[str, Any]) -> ConversionSummary:
     """Report a conversion that is finished already."""
     try:
-        manifest = json.loads((out / MANIFEST_FILE).read_text())
+        manifest = read_manifest(out)
         earlier, left_out = manifest["request"], manifest["left_out"]
         count = len(manifest["episodes"])
-    except (OSError, KeyError, ValueError):
+    except (FileNotFoundError, KeyError):
         raise MemobenchError(
             f"{out} already holds a dataset that this command did not make; name another folder"
         ) from None
     compare_requests(earlier, request, f"{out} already holds a finished conversion", "name another folder")
     shutil.rmtree(out / STAGING, ignore_errors=True)
-    return ConversionSummary(out, count, tuple(Problem(**problem) for problem in left_out))
+    return ConversionSummary(
+        out, count, tuple(Problem(problem["file"], problem["group"], problem["reason"]) for problem in left_out)
+    )

@@ -18,6 +18,7 @@ from lerobot_memobench.datasets.lerobot_format.card import statistics_section
 from lerobot_memobench.datasets.lerobot_format.card_tables import ordered_types, storage_by_frames
 from lerobot_memobench.datasets.lerobot_format.layout import MANIFEST_FILE, image_key
 from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, list_episodes
+from lerobot_memobench.datasets.manifest import read_manifest
 from lerobot_memobench.datasets.paper_figures import FAMILIES, LENGTH_BUCKETS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.files import draft_of, write_file
@@ -63,7 +64,7 @@ def describe(folder: Path, out: Path, say: Say = lambda _: None) -> list[Path]:
     if tables is None:
         say(EDITED)
     found.append(write_file(out / TABLES_FILE, tables or _tables_of(folder, rows)))
-    manifest = json.loads(hashes.read_text(encoding="utf-8")) if hashes.is_file() else _manifest_of(rows)
+    manifest = read_manifest(folder) if hashes.is_file() else _manifest_of(rows)
     found.append(write_file(out / MANIFEST_FILE, short_manifest(manifest)))
     return found
 
@@ -123,7 +124,9 @@ def short_manifest(manifest: Mapping[str, Any]) -> str:
     """Return a manifest as JSON of one line per task: seed to the hash of its episode, or to why there is none."""
     tasks: dict[str, dict[str, str]] = {}
     for row in manifest["episodes"]:
-        tasks.setdefault(row["task_name"], {})[str(row["seed"])] = row["failure"] or row["digest"] or "no hash was kept"
+        tasks.setdefault(row["task_name"], {})[str(row["seed"])] = (
+            row["failure"] or row.get("digest") or "no hash was kept"
+        )
     head = {key: value for key, value in manifest.items() if key != "episodes"}
     lines = [f"{json.dumps(name)}: {json.dumps(seeds)}" for name, seeds in sorted(tasks.items())]
     return json.dumps(head | {"tasks": None})[: -len("null}")] + "{\n" + ",\n".join(lines) + "\n}}\n"

@@ -5,7 +5,6 @@ The folder may hold a LeRobotDataset, HDF5 files of this package in the publishe
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from lerobot_memobench.datasets.hdf5.layout import Unusable, usable_or_named
 from lerobot_memobench.datasets.hdf5.published_task import task_of
 from lerobot_memobench.datasets.hdf5.reading import PublishedFile, find_files
 from lerobot_memobench.datasets.hdf5.restore import restore
+from lerobot_memobench.datasets.lerobot_format.info import episode_count
 from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
 from lerobot_memobench.datasets.lerobot_format.reading import read_episode
 from lerobot_memobench.datasets.replay import replay
@@ -127,8 +127,8 @@ def exit_status(verdicts: Sequence[Verdict]) -> int:
 def _checks(folder: Path, tasks: Mapping[str, Task] | None) -> list[_Check]:
     checks: list[_Check] = []
     if is_dataset(folder):
-        total = json.loads((folder / "meta" / "info.json").read_text())["total_episodes"]
-        checks += [_Check(folder, f"episode {index}", index=index, tasks=tasks) for index in range(total)]
+        total = range(episode_count(folder))
+        checks += [_Check(folder, f"episode {index}", index=index, tasks=tasks) for index in total]
     has_files = folder.is_file() or any(path.suffix in (".hdf5", ".h5") for path in folder.rglob("*"))
     if not checks and not has_files:
         raise MemobenchError(

@@ -1,8 +1,8 @@
 """What LeRobot's training is made to do beside its own: leave the frames of prompts out.
 
-With `loop.steering` and the drawing of execution frames (`policies.memobench_mem.execution_frames`) all that changes anything of LeRobot's; what it relies on is listed in
-tests/engine/test_lerobot_training.py. Whether prompt frames are wanted is decided where the policy is known for sure:
-when LeRobot, its configuration complete, has opened the datasets.
+With `loop` and `policies.memobench_mem.execution_frames`, which draws that policy's batches, all that changes anything
+of LeRobot's; what it relies on is listed in tests/engine/test_lerobot_training.py. Whether prompt frames are wanted is
+decided where the policy is known for sure: when LeRobot, its configuration complete, has opened the datasets.
 """
 
 from __future__ import annotations

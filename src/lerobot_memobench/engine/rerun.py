@@ -28,7 +28,7 @@ def repeatable_card(path: Path, server: str | None = None) -> dict[str, Any]:
         MemobenchError: there is none, it holds nothing to compare with, or what no card may ask for (`card_flags`).
     """
     path = path / CARD_FILE if path.is_dir() else path
-    card = read_card(path)
+    card = read_card(path, whole=True)
     if not card["episodes"]:
         raise MemobenchError(f"{path} holds no episodes to compare with; expected that of an evaluation that has ended")
     return {**card, "flags": allowed_flags(card.get("flags"), server)}

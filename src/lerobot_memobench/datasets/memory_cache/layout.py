@@ -18,14 +18,14 @@ Layout of ``<dataset>/memory_cache/<name>/``, or of ``<name>/`` in a folder that
 from __future__ import annotations
 
 import hashlib
-import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, get_type_hints
 
 import numpy as np
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files.reading import read_json
 
 FOLDER = "memory_cache"
 FORMAT = 2
@@ -79,6 +79,12 @@ class CacheMeta:
         return next((reasons[key] for key, value in wanted.items() if getattr(self, key) != value), None)
 
 
+META_SCHEMA: Any = TypedDict("META_SCHEMA", get_type_hints(CacheMeta))  # type: ignore[misc]
+"""What the file must hold before it is a `CacheMeta`."""
+
+SIZES = ("stride", "tokens_per_frame", "dim", "slots")
+
+
 def fix_hint(root: Path) -> str:
     """What a user types when a cache does not fit."""
     return f"Make it again with `memobench cache {root}`."
@@ -93,10 +99,11 @@ def read_meta(root: Path, name: str, place: Path | None = None) -> CacheMeta | N
     path = (place or Path(root) / FOLDER) / name / META_FILE
     if not path.is_file():
         return None
-    try:
-        return CacheMeta(**json.loads(path.read_text()))
-    except (TypeError, json.JSONDecodeError):
-        raise MemobenchError(f"{path} is not a memory cache this version can read. {fix_hint(Path(root))}") from None
+    advice = f"it is not a memory cache this version can read. {fix_hint(Path(root))}"
+    found = read_json(path, META_SCHEMA, advice)
+    if set(found) != set(META_SCHEMA.__annotations__) or min(map(found.__getitem__, SIZES)) < 1:
+        raise MemobenchError(f"{path}: {advice}")
+    return CacheMeta(**found)
 
 
 def readable_meta(root: Path, name: str, place: Path | None = None) -> CacheMeta | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -24,6 +23,8 @@ from lerobot_memobench.datasets.memory_cache.layout import (
     texts_file,
 )
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files import file_name
+from lerobot_memobench.files.reading import read_json
 
 
 class MemoryCache:
@@ -36,13 +37,33 @@ class MemoryCache:
         self.slots = slot_starts(self.episodes, meta.stride)
         self._tokens = np.memmap(folder / TOKENS_FILE, dtype=np.uint16, mode="r", shape=meta.shape)
         self._subgoals = {
-            level: resolve_subgoals(np.load(folder / f"subgoal-{level}.npy"), self.episodes) for level in meta.levels
+            level: resolve_subgoals(
+                np.load(folder / file_name(f"subgoal-{level}.npy", "the table of a level")), self.episodes
+            )
+            for level in meta.levels
         }
-        self.texts: list[str] = json.loads((folder / TEXTS_FILE).read_text())
+        self.texts: list[str] = read_json(folder / TEXTS_FILE, list[str], "it is damaged")
         embeddings = folder / texts_file(meta.texts_key, texts_key or meta.texts_key)
         self.text_embeddings = torch.from_numpy(np.load(embeddings))
         self._memory: np.ndarray | None = np.load(folder / "memory.npy") if meta.oracle else None
-        self.memories: list[str] = json.loads((folder / "memory.json").read_text()) if meta.oracle else []
+        self.memories: list[str] = read_json(folder / "memory.json", list[str], "it is damaged") if meta.oracle else []
+        self._check()
+
+    def _check(self) -> None:
+        """Raise a ValueError unless the tables are those of one dataset."""
+        frames, episodes = self.num_frames, len(self.episodes)
+        tables = [(rows, len(self.texts)) for rows in self._subgoals.values()]
+        tables += [] if self._memory is None else [(self._memory, len(self.memories))]
+        fitting = (
+            episodes > 0
+            and (np.diff(self.episodes) > 0).all()
+            and (self.episodes[0], self.slots[-1]) == (0, self.meta.slots)
+            and self.phase.shape == (frames,)
+            and self.text_embeddings.shape[:1] == (len(self.texts),)
+            and all(rows.shape == (frames,) and rows.max(initial=-1) < count for rows, count in tables)
+        )
+        if not fitting:
+            raise ValueError("its tables are not of one dataset")
 
     @classmethod
     def open(
@@ -86,7 +107,13 @@ class MemoryCache:
             raise MemobenchError(f"The memory cache {folder} {reason}. {fix_hint(root)}")
         if not meta.complete:
             raise MemobenchError(f"The memory cache {folder} is not finished. Go on with `memobench cache {root}`.")
-        return cls(folder, meta, texts_key)
+        try:
+            return cls(folder, meta, texts_key)
+        except Exception as error:  # NumPy answers damaged arrays with errors of every type
+            told = " ".join(str(error).split())[:200]
+            raise MemobenchError(
+                f"The memory cache {folder} is damaged ({told}). Delete that folder. {fix_hint(root)}"
+            ) from None
 
     @property
     def num_frames(self) -> int:

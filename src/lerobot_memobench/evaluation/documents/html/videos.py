@@ -8,7 +8,6 @@ frame k shows the world after k control steps.
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections import Counter
@@ -20,6 +19,7 @@ from lerobot_memobench.envs.film import LAST_FRAMES
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics.rollouts import Record
 from lerobot_memobench.files import draft_of, file_name
+from lerobot_memobench.files.reading import parsed
 
 VIDEOS = "videos"
 LEROBOT_INFO = "eval_info.json"
@@ -96,7 +96,7 @@ def _lerobot_videos(folder: Path, records: Sequence[Record]) -> dict[int, Path]:
     its list of successes is that of the task's logged rollouts, which it is not after a resumed or a sharded run.
     """
     try:
-        info: Any = json.loads((folder / LEROBOT_INFO).read_text())
+        info: Any = parsed((folder / LEROBOT_INFO).read_bytes())
         entries = [(e["task_group"], e["task_id"], e["metrics"]["successes"]) for e in info["per_task"]]
     except (OSError, ValueError, KeyError, TypeError):
         return {}
