@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.drawing.drawlist import LAYER_SIZE, ROWS, VERTEX, DrawList, Floats
 from lerobot_memobench.sim.drawing.resources import Resources
-from lerobot_memobench.sim.drawing.shaders import ATTRIBUTES, TEXTURE_UNITS, scene_program, shadow_program
+from lerobot_memobench.sim.drawing.shaders import ATTRIBUTES, TEXTURE_UNITS, scene_program
+from lerobot_memobench.sim.drawing.shadows import ShadowMap
 from lerobot_memobench.sim.drawing.shapes import disc
 from lerobot_memobench.sim.drawing.views import camera_matrix, light_matrix
 
@@ -54,21 +55,26 @@ class Rasterizer:
             if model.light_active[i] and model.light_type[i] == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL.value
         ]
         casting = [i for i in self._lights if model.light_castshadow[i]]
-        self._caster = casting[0] if casting and shadow_size and draw_list.casting else None
+        casters = draw_list.still.size + draw_list.moving.size
+        self._caster = casting[0] if casting and shadow_size and casters else None
         self._resources = Resources(GL, width, height)
         self._sent: bytes | None = None
         self._make_vertices()
         self._make_table()
         self._make_textures()
         self._make_targets(samples)
+        self._shadows: ShadowMap | None = None
         if self._caster is not None:
-            self._make_shadow_map(shadow_size)
-        self._make_programs()
+            self._shadows = ShadowMap(GL, self._resources, draw_list, shadow_size, draw_list.indices.size)
+        self._make_program()
 
     # --- set up ---------------------------------------------------------------------------------------------
 
     def _make_vertices(self) -> None:
-        """Upload the scene's triangles and, behind them, one disc per highlight, each with its row of the table."""
+        """Upload the scene's triangles and, behind them, one disc per highlight, each with its row of the table.
+
+        The buffer of indices holds what a camera sees, the shadows' casters again, and the discs.
+        """
         GL = self._gl
         positions, normals, uv, triangles = disc()
         discs = np.zeros((HIGHLIGHTS, len(positions)), dtype=VERTEX)
@@ -78,7 +84,9 @@ class Rasterizer:
         disc_indices = (triangles.reshape(1, -1) + steps).astype(np.uint32)
         self._disc_size = int(triangles.size)
         vertices = np.concatenate([self._list.vertices, discs.ravel()])
-        indices = np.concatenate([self._list.indices, disc_indices.ravel()])
+        scene = (self._list.indices, self._list.still, self._list.moving)
+        self._first_disc = sum(part.size for part in scene)
+        indices = np.concatenate([*scene, disc_indices.ravel()])
 
         self._array = self._resources.vertex_array()
         self._resources.buffer(GL.GL_ARRAY_BUFFER, vertices.view(np.uint8), GL.GL_STATIC_DRAW)
@@ -116,42 +124,22 @@ class Rasterizer:
         GL, make = self._gl, self._resources
         samples = min(samples, int(GL.glGetIntegerv(GL.GL_MAX_SAMPLES)))
         self._target = make.framebuffer()
-        make.renderbuffer(GL.GL_RGBA8, GL.GL_COLOR_ATTACHMENT0, samples)
-        make.renderbuffer(GL.GL_DEPTH_COMPONENT24, GL.GL_DEPTH_ATTACHMENT, samples)
+        size = (self._width, self._height)
+        make.renderbuffer(GL.GL_RGBA8, GL.GL_COLOR_ATTACHMENT0, samples, size)
+        make.renderbuffer(GL.GL_DEPTH_COMPONENT24, GL.GL_DEPTH_ATTACHMENT, samples, size)
         make.check_framebuffer()
         self._result = self._target
         if samples:
             self._result = make.framebuffer()
-            make.renderbuffer(GL.GL_RGBA8, GL.GL_COLOR_ATTACHMENT0, 0)
+            make.renderbuffer(GL.GL_RGBA8, GL.GL_COLOR_ATTACHMENT0, 0, size)
             make.check_framebuffer()
 
-    def _make_shadow_map(self, size: int) -> None:
-        GL = self._gl
-        self._shadow_size = size
-        self._shadow_frame = self._resources.framebuffer()
-        texture = self._resources.texture(TEXTURE_UNITS["shadows"], GL.GL_TEXTURE_2D)
-        GL.glTexImage2D(
-            GL.GL_TEXTURE_2D, 0, GL.GL_DEPTH_COMPONENT16, size, size, 0, GL.GL_DEPTH_COMPONENT,
-            GL.GL_UNSIGNED_SHORT, None,
-        )  # fmt: skip
-        self._resources.sample(GL.GL_TEXTURE_2D, GL.GL_LINEAR, GL.GL_CLAMP_TO_BORDER)
-        GL.glTexParameterfv(GL.GL_TEXTURE_2D, GL.GL_TEXTURE_BORDER_COLOR, np.ones(4, dtype=np.float32))
-        GL.glTexParameteri(GL.GL_TEXTURE_2D, GL.GL_TEXTURE_COMPARE_MODE, GL.GL_COMPARE_REF_TO_TEXTURE)
-        GL.glTexParameteri(GL.GL_TEXTURE_2D, GL.GL_TEXTURE_COMPARE_FUNC, GL.GL_LEQUAL)
-        GL.glFramebufferTexture2D(GL.GL_FRAMEBUFFER, GL.GL_DEPTH_ATTACHMENT, GL.GL_TEXTURE_2D, texture, 0)
-        GL.glDrawBuffer(GL.GL_NONE)
-        GL.glReadBuffer(GL.GL_NONE)
-        self._resources.check_framebuffer()
-
-    def _make_programs(self) -> None:
+    def _make_program(self) -> None:
         GL = self._gl
         # The headlight goes first.
         caster = None if self._caster is None else 1 + self._lights.index(self._caster)
         self._program = self._resources.program(scene_program(GL, 1 + len(self._lights), caster))
         self._at = {name: GL.glGetUniformLocation(self._program, name) for name in _UNIFORMS}
-        if self._caster is not None:
-            self._shadow_program = self._resources.program(shadow_program(GL))
-            self._shadow_light = GL.glGetUniformLocation(self._shadow_program, "light")
 
     # --- draw -----------------------------------------------------------------------------------------------
 
@@ -168,8 +156,8 @@ class Rasterizer:
             raise MemobenchError(f"there are {len(discs)} highlights in a frame; at most {HIGHLIGHTS} can be drawn")
         self._enter()
         light = np.eye(4, dtype=np.float32) if self._caster is None else light_matrix(model, data, self._caster)
-        if self._send(model, data, discs) and self._caster is not None:
-            self._draw_shadows(light)
+        if self._send(model, data, discs) and self._shadows is not None:
+            self._shadows.draw(self._table, light)
         self._draw_scene(model, data, camera, light)
         if discs:
             self._draw_discs(len(discs))
@@ -203,20 +191,6 @@ class Rasterizer:
         GL.glBufferData(GL.GL_TEXTURE_BUFFER, self._table.nbytes, self._table, GL.GL_STREAM_DRAW)
         return True
 
-    def _draw_shadows(self, light: Floats) -> None:
-        GL = self._gl
-        GL.glBindFramebuffer(GL.GL_FRAMEBUFFER, self._shadow_frame)
-        GL.glViewport(0, 0, self._shadow_size, self._shadow_size)
-        GL.glClear(GL.GL_DEPTH_BUFFER_BIT)
-        GL.glUseProgram(self._shadow_program)
-        GL.glUniformMatrix4fv(self._shadow_light, 1, GL.GL_TRUE, light)
-        GL.glFrontFace(GL.GL_CCW)
-        # Pushed away from the light by more than a texel's slope, or surfaces would speckle themselves.
-        GL.glEnable(GL.GL_POLYGON_OFFSET_FILL)
-        GL.glPolygonOffset(2.0, 4.0)
-        GL.glDrawElements(GL.GL_TRIANGLES, self._list.casting, GL.GL_UNSIGNED_INT, None)
-        GL.glDisable(GL.GL_POLYGON_OFFSET_FILL)
-
     def _draw_scene(self, model: mujoco.MjModel, data: mujoco.MjData, camera: int, light: Floats) -> None:
         GL = self._gl
         GL.glBindFramebuffer(GL.GL_FRAMEBUFFER, self._target)
@@ -246,7 +220,7 @@ class Rasterizer:
 
     def _draw_discs(self, count: int) -> None:
         GL = self._gl
-        start = ctypes.c_void_p(4 * self._list.indices.size)
+        start = ctypes.c_void_p(4 * self._first_disc)
         GL.glEnable(GL.GL_BLEND)
         GL.glBlendFunc(GL.GL_SRC_ALPHA, GL.GL_ONE_MINUS_SRC_ALPHA)
         GL.glDepthMask(GL.GL_FALSE)

@@ -79,13 +79,13 @@ class Resources:
         self._gl.glBindFramebuffer(self._gl.GL_FRAMEBUFFER, name)
         return name
 
-    def renderbuffer(self, kind: Any, attachment: Any, samples: int) -> None:
-        """Give the framebuffer that is bound a place for pixels or depths."""
+    def renderbuffer(self, kind: Any, attachment: Any, samples: int, size: tuple[int, int]) -> None:
+        """Give the framebuffer that is bound a place for pixels or depths of a width and height."""
         GL = self._gl
         name = int(GL.glGenRenderbuffers(1))
         self._renderbuffers.append(name)
         GL.glBindRenderbuffer(GL.GL_RENDERBUFFER, name)
-        GL.glRenderbufferStorageMultisample(GL.GL_RENDERBUFFER, samples, kind, self.width, self.height)
+        GL.glRenderbufferStorageMultisample(GL.GL_RENDERBUFFER, samples, kind, *size)
         GL.glFramebufferRenderbuffer(GL.GL_FRAMEBUFFER, attachment, GL.GL_RENDERBUFFER, name)
 
     def check_framebuffer(self) -> None:
