@@ -49,14 +49,12 @@ class DrawList:
     layers: NDArray[np.uint8]
     materials: Floats
 
-    def table(self, model: mujoco.MjModel, data: mujoco.MjData) -> Floats:
-        """Return poses, colours and materials of the present state, (geoms, ROWS, 4)."""
-        table = np.empty((len(self.geoms), ROWS, 4), dtype=np.float32)
+    def fill(self, table: Floats, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        """Write poses, colours and materials of the present state into a table, (geoms, ROWS, 4)."""
         table[:, :3, :3] = data.geom_xmat[self.geoms].reshape(-1, 3, 3)
         table[:, :3, 3] = data.geom_xpos[self.geoms]
         table[:, 3] = colours(model, self.geoms)
         table[:, 4] = self.materials
-        return table
 
 
 def build_draw_list(

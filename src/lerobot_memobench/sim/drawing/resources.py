@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,11 +16,12 @@ class Resources:
 
     Args:
         GL: PyOpenGL's module: it fixes its platform on import, so only who has a context imports it.
+        call: the functions of a frame.
         width, height: size of the frames, pixels.
     """
 
-    def __init__(self, GL: Any, width: int, height: int) -> None:
-        self._gl, self.width, self.height = GL, width, height
+    def __init__(self, GL: Any, call: SimpleNamespace, width: int, height: int) -> None:
+        self._gl, self._call, self.width, self.height = GL, call, width, height
         self._arrays: list[int] = []
         self._buffers: list[int] = []
         self._textures: list[tuple[int, Any, int]] = []
@@ -69,8 +71,8 @@ class Resources:
             self._bind(unit, target, name)
 
     def _bind(self, unit: int, target: Any, name: int) -> None:
-        self._gl.glActiveTexture(self._gl.GL_TEXTURE0 + unit)
-        self._gl.glBindTexture(target, name)
+        self._call.glActiveTexture(self._gl.GL_TEXTURE0 + unit)
+        self._call.glBindTexture(target, name)
 
     def framebuffer(self) -> int:
         """Make a framebuffer and bind it."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
+from types import SimpleNamespace
 from typing import Any
 
 from lerobot_memobench.sim.drawing.drawlist import DrawList, Floats
@@ -15,14 +15,17 @@ class ShadowMap:
 
     Args:
         GL: PyOpenGL's module; a context is current.
+        call: the functions of a frame.
         resources: where GL objects are made, and freed with the rest.
         draw_list: what there is to draw.
         size: side of the map, pixels.
         first: where the still casters' indices begin in the buffer of indices; the moving ones' follow them.
     """
 
-    def __init__(self, GL: Any, resources: Resources, draw_list: DrawList, size: int, first: int) -> None:
-        self._gl, self._list, self._size, self._first = GL, draw_list, size, first
+    def __init__(
+        self, GL: Any, call: SimpleNamespace, resources: Resources, draw_list: DrawList, size: int, first: int
+    ) -> None:
+        self._gl, self._call, self._list, self._size, self._first = GL, call, draw_list, size, first
         self._still = resources.framebuffer()
         resources.renderbuffer(GL.GL_DEPTH_COMPONENT16, GL.GL_DEPTH_ATTACHMENT, 0, (size, size))
         self._finish_framebuffer(resources)
@@ -30,7 +33,6 @@ class ShadowMap:
         self._make_texture(resources)
         self._finish_framebuffer(resources)
         self._program = resources.program(shadow_program(GL))
-        self._light = GL.glGetUniformLocation(self._program, "light")
         self._kept: bytes | None = None
 
     def _make_texture(self, resources: Resources) -> None:
@@ -56,30 +58,29 @@ class ShadowMap:
 
         Args:
             table: poses of the geoms, (rows, ROWS, 4), as the shader was told them.
-            light: from the world to the light's clip space, (4, 4).
+            light: from the world to the light's clip space, (4, 4), as the shader was told it.
         """
-        GL, size = self._gl, self._size
-        GL.glViewport(0, 0, size, size)
-        GL.glUseProgram(self._program)
-        GL.glUniformMatrix4fv(self._light, 1, GL.GL_TRUE, light)
-        GL.glFrontFace(GL.GL_CCW)
+        GL, call, size = self._gl, self._call, self._size
+        call.glViewport(0, 0, size, size)
+        call.glUseProgram(self._program)
+        call.glFrontFace(GL.GL_CCW)
         # Pushed away from the light by more than a texel's slope, or surfaces would speckle themselves.
-        GL.glEnable(GL.GL_POLYGON_OFFSET_FILL)
-        GL.glPolygonOffset(2.0, 4.0)
+        call.glEnable(GL.GL_POLYGON_OFFSET_FILL)
+        call.glPolygonOffset(2.0, 4.0)
         # What cannot move in an episode still stands elsewhere after a reset, and in another simulation of the scene.
         kept = table[self._list.still_rows, :3].tobytes() + light.tobytes()
         if kept != self._kept:
             self._kept = kept
-            GL.glBindFramebuffer(GL.GL_FRAMEBUFFER, self._still)
-            GL.glClear(GL.GL_DEPTH_BUFFER_BIT)
+            call.glBindFramebuffer(GL.GL_FRAMEBUFFER, self._still)
+            call.glClear(GL.GL_DEPTH_BUFFER_BIT)
             self._draw(self._first, self._list.still.size)
-        GL.glBindFramebuffer(GL.GL_READ_FRAMEBUFFER, self._still)
-        GL.glBindFramebuffer(GL.GL_DRAW_FRAMEBUFFER, self._all)
-        GL.glBlitFramebuffer(0, 0, size, size, 0, 0, size, size, GL.GL_DEPTH_BUFFER_BIT, GL.GL_NEAREST)
+        call.glBindFramebuffer(GL.GL_READ_FRAMEBUFFER, self._still)
+        call.glBindFramebuffer(GL.GL_DRAW_FRAMEBUFFER, self._all)
+        call.glBlitFramebuffer(0, 0, size, size, 0, 0, size, size, GL.GL_DEPTH_BUFFER_BIT, GL.GL_NEAREST)
         # The nearest depth of a texel is the same whoever is drawn first.
         self._draw(self._first + self._list.still.size, self._list.moving.size)
-        GL.glDisable(GL.GL_POLYGON_OFFSET_FILL)
+        call.glDisable(GL.GL_POLYGON_OFFSET_FILL)
 
     def _draw(self, first: int, count: int) -> None:
         GL = self._gl
-        GL.glDrawElements(GL.GL_TRIANGLES, count, GL.GL_UNSIGNED_INT, ctypes.c_void_p(4 * first))
+        self._call.glDrawElements(GL.GL_TRIANGLES, count, GL.GL_UNSIGNED_INT, 4 * first)
