@@ -57,6 +57,8 @@ class Simulation:
         self.render_settings = render or RenderSettings()
         self._scene = scene
         self.model: mujoco.MjModel = copy.copy(scene.model)
+        # robosuite's force and torque sensors cost time in every physics step, and nobody reads them.
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR.value
         self.data = mujoco.MjData(self.model)
         self.assets = scene.assets
         self.world = World(task, self.model, self.data, scene.assets)
