@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import resource
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -55,8 +54,8 @@ def seconds(tasks: str, steps: int, processes: int, every: int) -> tuple[dict[st
 
 def _cpu_of_children() -> float:
     """Return the CPU seconds of this process's children that have ended."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
+    used = os.times()
+    return used.children_user + used.children_system
 
 
 def rollouts_total(tasks: str = "all", processes: int | None = None, every: int = FIFTH) -> dict[str, Any]:
