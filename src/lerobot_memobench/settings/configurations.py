@@ -56,11 +56,16 @@ def _is_known(settings: LerobotSettings, key: str) -> bool:
 
 def _parsed(settings: LerobotSettings, key: str) -> Any:
     import draccus
+    import yaml
 
     if not _is_known(settings, key):
         return None
-    with quiet():
-        return draccus.parse(settings.chosen[key], args=_overrides(settings, key))
+    try:
+        with quiet():
+            return draccus.parse(settings.chosen[key], args=_overrides(settings, key))
+    except yaml.YAMLError as error:  # LeRobot reads every value as YAML
+        problem = " ".join(str(error).split())
+        raise MemobenchError(f"a value of {key}. cannot be read ({problem}); put it in quotes within quotes") from None
 
 
 def _overrides(settings: LerobotSettings, key: str) -> list[str]:
