@@ -64,6 +64,37 @@ def test_a_circle_is_found() -> None:
     assert set(house.circle({"a": {"b"}, "b": {"c"}, "c": {"b"}})) == {"b", "c"}
 
 
+def test_no_module_of_one_system_is_imported() -> None:
+    """Each can be imported on Windows and macOS, whose users read reports and train without the simulator."""
+    of_unix = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "syslog", "termios", "tty"}
+    of_windows = {"_winapi", "msvcrt", "winreg"}
+    found = [(name, source) for name, tree in TREES.items() for source, _ in house.imported(tree)]
+    assert [(name, source) for name, source in found if source in of_unix | of_windows] == []
+
+
+def renamed(tree: ast.AST) -> Iterator[str]:
+    """Yield calls that give a file its name once it is written, or make a file under a name of their own."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            call = ast.unparse(node.func)
+            made = node.func.attr in ("rename", "mkstemp", "mktemp", "NamedTemporaryFile")
+            path_replaces = node.func.attr == "replace" and len(node.args) == 1 and not node.keywords
+            if made or path_replaces or call in ("os.replace", "shutil.move"):
+                yield call
+
+
+def test_files_are_written_whole_in_one_place() -> None:
+    """Elsewhere finished folders are moved, by the one process that holds their destination."""
+    movers = ("files", "datasets.staging.stage", "datasets.lerobot_format.assembling", "engine.demo")
+    allowed = {f"{PACKAGE}.{name}" for name in movers}
+    assert [(name, call) for name, tree in TREES.items() for call in renamed(tree) if name not in allowed] == []
+
+
+def test_a_renaming_is_found() -> None:
+    source = "os.replace(a, b); a.replace(b); draft.rename(b); tempfile.mkstemp(); 'text'.replace('t', 'x')"
+    assert len(list(renamed(ast.parse(source)))) == 4
+
+
 def is_private(name: str) -> bool:
     return name.startswith("_") and not name.endswith("__")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import sys
 from collections.abc import Iterable
 
 
@@ -11,6 +12,21 @@ class MemobenchError(ValueError):
 
     The command line prints the message without a traceback and exits with status 2.
     """
+
+
+SYSTEMS = {"darwin": "macOS", "win32": "Windows", "cygwin": "Windows"}
+
+
+def unsupported_system() -> str:
+    """Return one sentence where the simulator cannot run, "" on Linux."""
+    if sys.platform == "linux":
+        return ""
+    name = SYSTEMS.get(sys.platform, sys.platform)
+    place = "WSL2" if name == "Windows" else "a Linux machine, virtual machine or container"
+    return (
+        f"{name} cannot run the simulator, which draws with EGL or OSMesa on Linux: use {place}; docs/install.md says "
+        "what works without"
+    )
 
 
 def nearest(given: str, known: Iterable[str], count: int = 3) -> str:

@@ -2,25 +2,44 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 
-from lerobot_memobench.bench.sides import Ours, alternate
+from lerobot_memobench.bench.sides import Ours, Times, Vectored, alternate, timed
 
 
 def test_sides_take_turns_and_medians_count() -> None:
     order: list[str] = []
-    times = iter([1.0, 2.0, 50.0, 1.0, 2.0, 3.0])
+    times = iter([1.0, 2.0, 50.0, 1.0, 4.0, 5.0])
 
-    def ours() -> float:
+    def ours() -> Times:
         order.append("o")
-        return next(times)
+        return Times(next(times), 3.0)
 
-    def theirs() -> float:
+    def theirs() -> Times:
         order.append("t")
-        return 7.0
+        return Times(7.0, 8.0)
 
-    assert alternate(ours, theirs, rounds=2, ours_per_round=3, theirs_per_round=1) == (2.0, 7.0)
+    pairs = alternate(ours, theirs, rounds=2, ours_per_round=3, theirs_per_round=1)
+    assert pairs == [((2.0, 3.0), (7.0, 8.0)), ((4.0, 3.0), (7.0, 8.0))]
     assert "".join(order) == "ooot" * 2
+
+
+def test_waiting_is_no_work() -> None:
+    taken = timed(lambda: time.sleep(0.2))
+    assert taken.wall >= 0.2
+    assert taken.cpu < taken.wall
+
+
+def test_the_vector_environment_is_lerobots(gl: str) -> None:
+    side = Vectored()
+    [inner] = side.env.envs
+    side.step(np.zeros(7))
+    assert inner.unwrapped.episode.progress.steps == 1
+    side.reset(1)
+    assert inner.unwrapped.episode.progress.steps == 0
+    side.close()
 
 
 def test_our_side_steps_as_the_environment_does(gl: str) -> None:

@@ -298,6 +298,7 @@ def test_no_gl_library(evaluation: Called, capsys: pytest.CaptureFixture[str], m
         (lambda folder: (folder / "policy_preprocessor.json").write_text("{"), "is not JSON"),
         (lambda folder: (folder / "model.safetensors").unlink(), "holds no weights"),
         (lambda folder: (folder / "config.json").write_text("{}"), "names no policy type"),
+        (lambda folder: _name_statistics(folder, "../elsewhere.safetensors"), "which names no file"),
     ],
 )
 def test_a_checkpoint_that_is_not_whole(
@@ -305,6 +306,11 @@ def test_a_checkpoint_that_is_not_whole(
 ) -> None:
     spoil(checkpoint(Path("run")))
     assert message in refused(["eval", "env=memobench", "policy=run"], evaluation, capsys)
+
+
+def _name_statistics(folder: Path, name: str) -> None:
+    path = folder / "policy_preprocessor.json"
+    path.write_text(path.read_text().replace("stats.safetensors", name))
 
 
 def test_a_checkpoint_without_statistics(evaluation: Called, capsys: pytest.CaptureFixture[str]) -> None:
@@ -339,6 +345,19 @@ def test_an_error_from_inside_is_one_sentence_and_leaves_no_empty_folder(
     assert main(["eval", "env=memobench", "output_dir=out"]) == 2
     assert capsys.readouterr().err == "lerobot: the scene is wrong\n"
     assert not Path("out").exists()
+
+
+def test_a_dataset_that_cannot_be_fetched_is_to_be_made_here(
+    training: Called, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    training.action = lambda flags: LeRobotDatasetMetadata(flag_value(flags, "dataset.repo_id") or "", root="none")
+    assert main(["train", "policy=memobench_mem"]) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert "memobench generate --tasks object --episodes 5 --out outputs/demonstrations`, then dataset=" in told
 
 
 def test_finished_episodes_of_a_failed_run_stay(evaluation: Called, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import importlib.util
+import os
 import re
+import shutil
 import subprocess
+import sys
 import tomllib
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from packaging.markers import default_environment
@@ -65,6 +70,56 @@ def test_scripts_are_sound_and_executable(script: str) -> None:
     path = ROOT / script
     assert path.stat().st_mode & 0o111
     subprocess.run(["bash", "-n", path], check=True)
+
+
+def load_compile_imports() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("compile_imports", ROOT / "scripts" / "compile_imports.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_late_imports_are_compiled_although_bytecode_is_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source, library = tmp_path / "src", tmp_path / "library"
+    for folder in (source / "deep", library):
+        folder.mkdir(parents=True)
+    (source / "deep" / "a.py").write_text("def f():\n    import not_installed_here\n    from found_late import x\n")
+    (library / "found_late.py").write_text("x = 1\n")
+    script = load_compile_imports()
+    assert script.imported(source) == {"not_installed_here", "found_late"}
+    monkeypatch.setattr(script, "COMMANDS", ())
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    monkeypatch.syspath_prepend(library)
+    script.compile_imports([source])
+    assert Path(importlib.util.cache_from_source(str(library / "found_late.py"))).is_file()
+
+
+def executable(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"#!/usr/bin/env bash\n{text}\n")
+    path.chmod(0o755)
+
+
+def test_setup_compiles_once_and_goes_on_where_that_fails(tmp_path: Path) -> None:
+    """The installers are stand-ins here, and so are the system's libraries: nothing is fetched."""
+    for name in ("requirements.lock", "pyproject.toml", ".python-version", "scripts/setup", *LOCKS[1:]):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        shutil.copy(ROOT / name, tmp_path / name)
+    executable(tmp_path / ".uv/bin/uv", "exit 0")
+    executable(tmp_path / ".venv/bin/memobench", "exit 0")
+    executable(tmp_path / ".venv/bin/python", '[ "$1" = -c ] && exit 0; echo "$*" >>calls; exit 1')
+    executable(tmp_path / "bin/ldconfig", "echo libEGL.so.1 libGLESv2.so.2 libOpenGL.so.0 libOSMesa.so")
+    executable(tmp_path / "bin/ffmpeg", "exit 0")
+    environment = {**os.environ, "PATH": f"{tmp_path / 'bin'}:{os.environ['PATH']}"}
+    said = []
+    for _ in range(2):
+        done = subprocess.run([tmp_path / "scripts/setup"], env=environment, capture_output=True, text=True, check=True)
+        said.append(done.stderr)
+    assert "could not be compiled; going on" in said[0]
+    assert said[1] == ""
+    assert (tmp_path / "calls").read_text() == "scripts/compile_imports.py src\n"
 
 
 def test_no_file_names_a_package_registry() -> None:

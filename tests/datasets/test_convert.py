@@ -251,6 +251,96 @@ def test_the_rest_converts(source, stove, tmp_path):
     np.testing.assert_array_equal(read_episode(tmp_path / "ds", 0).columns["action"], stove.actions)
 
 
+NO_TEXT = b"\xff\xfe broken"
+"""Bytes that are no UTF-8, stored as if they were; h5py gives them back with lone surrogates."""
+
+SURROGATE = "half a character"
+"""Stands for the task's own metadata with one in its texts; JSON can say it, UTF-8 cannot."""
+
+BAD_IN_A_DEMONSTRATION = [
+    ("seed", np.arange(3)),
+    ("seed", "many"),
+    ("seed", np.float64("nan")),
+    ("seed", np.uint64(2**63 + 1)),
+    ("variant", np.arange(2)),
+    ("success", np.array([True, False])),
+    ("fixture_poses", "{"),
+    ("fixture_poses", "[1]"),
+    ("fixture_poses", '{"flat_stove_1": [1, 2]}'),
+    ("fixture_poses", '{"flat_stove_1": "here"}'),
+    ("fixture_poses", '{"no_fixture": 1}'),
+    ("fixture_poses", 5),
+    ("satisfied_intervals", "7"),
+    ("satisfied_intervals", "[1, 2]"),
+    ("satisfied_intervals", "[[[0]], []]"),
+    ("satisfied_intervals", NO_TEXT),
+    ("scene_hash", NO_TEXT),
+    ("meta_data", NO_TEXT),
+    ("meta_data", '"text"'),
+    ("meta_data", 3),
+    ("meta_data", None),
+    ("model_file", 5),
+    ("num_samples", np.arange(2)),
+    ("num_samples", None),
+    ("digest", np.arange(4)),
+]
+
+BAD_IN_A_FILE = [
+    ("task_metadata", "[1]"),
+    ("task_metadata", "{}"),
+    ("task_metadata", np.arange(3)),
+    ("task_metadata", NO_TEXT),
+    ("task_metadata", SURROGATE),
+    ("bddl_file_content", NO_TEXT),
+    ("bddl_file_content", 1.5),
+    ("bddl_file_content", None),
+    ("bddl_file_name", None),
+    ("memory_type", np.arange(3)),
+    ("memory_type", NO_TEXT),
+]
+
+
+def _spoil(attributes: h5py.AttributeManager, name: str, value: object) -> None:
+    del attributes[name]
+    if value is NO_TEXT:
+        attributes.create(name, NO_TEXT, dtype=h5py.string_dtype())
+    elif value is not None:
+        attributes[name] = value
+
+
+def test_a_bad_attribute_ends_its_episode_or_file_alone(written, tmp_path):
+    """Of another type or shape, no Unicode, JSON of something else, missing: each is named, the sound one converted."""
+    source = tmp_path / "source"
+    source.mkdir()
+    many = source / "many.hdf5"
+    shutil.copy(written / f"{STOVE}_demo.hdf5", many)
+    with h5py.File(many, "a") as file:
+        del file["data/demo_1"], file["data"].attrs["num_demos"]
+        for number, (name, value) in enumerate(BAD_IN_A_DEMONSTRATION, 1):
+            file.copy("data/demo_0", f"data/demo_{number}")
+            if name != "digest":
+                del file[f"data/demo_{number}"].attrs["digest"]  # or all would be found by it
+            _spoil(file[f"data/demo_{number}"].attrs, name, value)
+    for number, (name, value) in enumerate(BAD_IN_A_FILE):
+        path = source / f"one_{number:02}.hdf5"
+        shutil.copy(written / f"{STOVE}_demo.hdf5", path)
+        with h5py.File(path, "a") as file:
+            del file["data/demo_1"], file["data"].attrs["num_demos"], file["data/demo_0"].attrs["digest"]
+            if value is SURROGATE:
+                value = file["data"].attrs["task_metadata"].replace("stove", "st\\ud800ve")
+            _spoil(file["data"].attrs, name, value)
+    summary = convert(source, tmp_path / "ds")
+    named = [(problem.file, problem.group.removeprefix("data/")) for problem in summary.problems]
+    expected = {("many.hdf5", f"demo_{n}") for n in range(1, len(BAD_IN_A_DEMONSTRATION) + 1)}
+    assert {each for each in named if each[0] == "many.hdf5"} == expected
+    assert {file for file, _ in named} - {"many.hdf5"} == {f"one_{n:02}.hdf5" for n in range(len(BAD_IN_A_FILE))}
+    assert all("\n" not in problem.reason for problem in summary.problems)
+    assert summary.episodes == 1
+    assert validate(tmp_path / "ds")[0].disagreement is None
+    verdicts = validate(source)
+    assert [verdict.episode for verdict in verdicts if verdict.disagreement is None] == ["many.hdf5, demo_0"]
+
+
 @pytest.mark.parametrize(
     ("attribute", "value"),
     [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -54,6 +55,26 @@ def test_the_storyboard_shows_the_frames_of_the_checkpoints(dataset, tmp_path):
     scale = FRAME / 64
     for line, column, frame in [(0, 0, 0), (0, 1, 6), (0, 2, 9), (1, 0, 2), (1, 1, 4)]:
         assert bar(line, column) == pytest.approx((frame * 4 + 2) * scale, abs=6), (line, column)
+
+
+def test_an_interrupted_drawing_leaves_the_earlier_one_whole(dataset, tmp_path, monkeypatch):
+    files = describe(dataset, tmp_path / "out")
+    earlier = [file.read_bytes() for file in files]
+
+    def torn(self, path, *args, **kwargs):
+        Path(path).write_bytes(b"half")
+        raise OSError("disk full")
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", torn)
+    with pytest.raises(OSError, match="disk full"):
+        describe(dataset, tmp_path / "out")
+    monkeypatch.undo()
+    monkeypatch.setattr("lerobot_memobench.datasets.describe.draw_lengths", lambda rows, path: path)
+    monkeypatch.setattr("PIL.Image.Image.save", torn)
+    with pytest.raises(OSError, match="disk full"):
+        describe(dataset, tmp_path / "out")
+    assert [file.read_bytes() for file in files] == earlier
+    assert sorted((tmp_path / "out").iterdir()) == sorted(files)
 
 
 def test_without_images_there_is_no_storyboard(make_demo, tmp_path):

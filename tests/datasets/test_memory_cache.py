@@ -1,11 +1,14 @@
-"""The memory cache: contents, going on after a kill, and refusing what does not fit."""
+"""The memory cache: contents, going on after a kill, waiting for others, full disks, refusing what does not fit."""
 
 from __future__ import annotations
 
 import importlib.util
 import json
+import logging
 import shutil
-from collections.abc import Sequence
+import subprocess
+import threading
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +20,7 @@ from lerobot_memobench.datasets.memory_cache import (
     MemoryCache,
     build_memory_cache,
     dataset_fingerprint,
+    find_cache,
     read_meta,
     resolve_subgoals,
 )
@@ -52,8 +56,33 @@ class _Frames:
         return images.mean(dim=(1, 2, 3))[:, None, None].expand(-1, 4, 3).to(torch.bfloat16)
 
 
+class _WideFrames(_Frames):
+    """16 KiB per frame: 1.5 MB in all."""
+
+    dim = 2048
+
+    def __call__(self, images: torch.Tensor) -> torch.Tensor:
+        return super().__call__(images)[..., :1].expand(-1, -1, self.dim)
+
+
+class _HeldFrames(_Frames):
+    """Waits in its first pass until it is let go."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.begun, self.go = threading.Event(), threading.Event()
+
+    def __call__(self, images: torch.Tensor) -> torch.Tensor:
+        self.begun.set()
+        assert self.go.wait(60)
+        return super().__call__(images)
+
+
 class _Texts:
-    key, dim = "texts", 5
+    dim = 5
+
+    def __init__(self, key: str = "texts") -> None:
+        self.key = key
 
     def __call__(self, texts: Sequence[str]) -> torch.Tensor:
         return torch.tensor([[float(len(text))] * 5 for text in texts])
@@ -220,3 +249,159 @@ def test_frames_without_text_take_the_next_then_the_last() -> None:
     rows = np.array([-1, 4, -1, 5, -1, -1, -1, 6, -1], np.int32)
     episodes = np.array([0, 5, 7, 9])
     assert resolve_subgoals(rows, episodes).tolist() == [4, 4, 5, 5, 5, -1, -1, 6, 6]
+
+
+# -- several at once -----------------------------------------------------------------------------------------------
+
+
+def test_whoever_comes_second_says_so_and_waits(root: Path) -> None:
+    told = threading.Event()
+
+    class Listener(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            if "waiting" in record.getMessage():
+                told.set()
+
+    logger, listener = logging.getLogger("lerobot_memobench"), Listener()
+    first, second = _HeldFrames(), _Frames()
+    builders = [
+        threading.Thread(target=build_memory_cache, args=(root, "test", frames, _Texts()), daemon=True)
+        for frames in (first, second)
+    ]
+    logger.addHandler(listener)
+    try:
+        builders[0].start()
+        assert first.begun.wait(60)
+        builders[1].start()
+        assert told.wait(60)
+        first.go.set()
+        for builder in builders:
+            builder.join(60)
+    finally:
+        logger.removeHandler(listener)
+    assert (first.seen, second.seen) == (94, 0)
+    assert _open(root).num_frames == 94
+
+
+def test_what_decides_the_content_decides_the_name(root: Path, tmp_path: Path) -> None:
+    contents = {"frames_key": "tower-96x96", "camera": CAMERA, "stride": 1}
+    others = [{"frames_key": "tower-48x48"}, {"frames_key": "other-96x96"}, {"camera": "other"}, {"stride": 2}]
+    for place in (None, tmp_path / "caches"):
+        folders = [find_cache(root, "tiny", place=place, **contents | other) for other in ({}, *others)]
+        assert len(set(folders)) == len(folders)
+        assert {folder.parent for folder in folders} == {place or root / FOLDER}
+        assert folders[0] == find_cache(root, "tiny", place=place, **contents)
+    with_place = find_cache(root, "tiny", place=tmp_path / "caches", **contents)
+    parquet = next((root / "data").rglob("*.parquet"))
+    parquet.write_bytes(parquet.read_bytes() + b" ")  # another dataset of the same name
+    assert find_cache(root, "tiny", place=tmp_path / "caches", **contents) != with_place
+
+
+def test_a_cache_named_before_the_hash_is_found_when_it_fits(root: Path) -> None:
+    earlier = build_memory_cache(root, "tiny-stride1", _Frames(), _Texts())
+    contents = {"camera": CAMERA, "stride": 1}
+    assert find_cache(root, "tiny-stride1", frames_key="tower", **contents) == earlier
+    other = find_cache(root, "tiny-stride1", frames_key="other", **contents)
+    build_memory_cache(root, other.name, _Frames("other"), _Texts())
+    meta = read_meta(root, earlier.name)
+    assert meta is not None
+    assert (meta.complete, meta.frames_key) == (True, "tower")
+    assert {path.name for path in (root / FOLDER).iterdir() if path.is_dir()} == {earlier.name, other.name}
+
+
+def test_another_text_encoder_adds_its_texts_and_nothing_else(root: Path) -> None:
+    build_memory_cache(root, "test", _Frames(), _Texts())
+    again = _Frames()
+    build_memory_cache(root, "test", again, _Texts("second"))
+    assert again.seen == 0
+    first, second = _open(root, texts_key="texts"), _open(root, texts_key="second")
+    assert torch.equal(first.text_embeddings, second.text_embeddings)
+    assert len(list((root / FOLDER / "test").glob("texts*.npy"))) == 2
+
+
+# -- the disk ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def small_disk(root: Path) -> Iterator[Path]:
+    """A disk of one MiB where the dataset's caches lie."""
+    folder = root / FOLDER
+    folder.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", folder], capture_output=True)
+    if mounted.returncode:
+        pytest.skip("nothing may be mounted here")
+    yield folder
+    subprocess.run(["umount", folder], check=True)
+
+
+def test_its_size_is_told_before_anything_is_encoded(root: Path, tmp_path: Path) -> None:
+    frames, told = _WideFrames(), []
+    build_memory_cache(
+        root, "test", frames, _Texts(), place=tmp_path / "b" / "c", tell=lambda said: told.append((frames.seen, said))
+    )
+    assert (tmp_path / "b" / "c" / "test" / "tokens.bin").stat().st_size == 94 * 16 * 1024
+    assert [seen for seen, _ in told] == [0]
+    assert "takes 1.5 MiB: 94 frames of 16.0 KiB" in told[0][1]
+    assert not (root / FOLDER).exists()
+    assert _open(root, place=tmp_path / "b" / "c").num_frames == 94
+
+
+def test_a_disk_without_room_is_one_sentence_and_nothing_is_left(
+    root: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1_000_000))
+    frames = _WideFrames()
+    with pytest.raises(
+        MemobenchError, match=r"1\.5 MiB are needed there and 976\.6 KiB are free.*memory_cache_dir"
+    ) as told:
+        build_memory_cache(root, "test", frames, _Texts())
+    assert "\n" not in str(told.value)
+    assert frames.seen == 0
+    assert not (root / FOLDER / "test").exists()
+
+
+def test_a_disk_that_is_full_kills_nobody(root: Path, small_disk: Path) -> None:
+    frames = _WideFrames()
+    with pytest.raises(MemobenchError, match="does not fit on its disk"):
+        build_memory_cache(root, "test", frames, _Texts())
+    assert frames.seen == 0
+    assert [path for path in small_disk.iterdir() if path.is_dir()] == []
+    subprocess.run(["mount", "-o", "remount,size=4m", small_disk], check=True)
+    build_memory_cache(root, "test", frames, _Texts())
+    assert frames.seen == 94
+
+
+def test_a_disk_that_fills_up_meanwhile_loses_nothing_that_was_done(
+    root: Path, small_disk: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A disk that promises room which it then has not, as file systems do that copy on write.
+    building = "lerobot_memobench.datasets.memory_cache.building"
+    with monkeypatch.context() as patched:
+        patched.setattr(f"{building}.reserve", lambda path, size: path.open("wb").truncate(size))
+        with pytest.raises(MemobenchError, match=r"is full.*make room") as told:
+            build_memory_cache(root, "test", _WideFrames(), _Texts(), batch_size=5)
+    assert "\n" not in str(told.value)
+    meta = read_meta(root, "test")
+    assert meta is not None
+    assert not meta.complete
+    done = np.load(small_disk / "test" / "done.npy")
+    assert done.tolist() == [1, 0, 0]
+    subprocess.run(["mount", "-o", "remount,size=4m", small_disk], check=True)
+    rest = _WideFrames()
+    build_memory_cache(root, "test", rest, _Texts())
+    assert rest.seen == 94 - 40
+
+
+def test_where_nothing_may_be_written_it_says_so(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(path: Path, *_: object) -> None:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    with monkeypatch.context() as patched:
+        patched.setattr("lerobot_memobench.datasets.memory_cache.building.taking_turns", refuse)
+        with pytest.raises(MemobenchError, match=r"cannot be written \(Permission denied\).*memobench cache --out"):
+            build_memory_cache(root, "test", _Frames(), _Texts())
+    build_memory_cache(root, "test", _Frames(), _Texts())
+    with monkeypatch.context() as patched:  # a finished one is read all the same
+        patched.setattr("lerobot_memobench.datasets.memory_cache.building.taking_turns", refuse)
+        build_memory_cache(root, "test", _Frames(), _Texts())

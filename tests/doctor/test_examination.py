@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import builtins
+import ctypes.util
+import platform
 import shutil
+import sys
 from importlib import metadata
 from typing import Any
 
@@ -12,6 +15,7 @@ from packaging.specifiers import SpecifierSet
 
 from lerobot_memobench.doctor import machine, software
 from lerobot_memobench.doctor.probe import run_probe
+from lerobot_memobench.sim.rendering import BACKENDS
 
 
 def test_supported_versions_come_from_the_requirements() -> None:
@@ -86,6 +90,52 @@ def test_a_backend_that_draws_nonsense_fails(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setenv("MUJOCO_GL", "egl")
     probes(monkeypatch, {"gl egl": {**SOFTWARE, "sphere": False}, "gl osmesa": SOFTWARE})
     assert [finding.status for finding in machine.rendering()] == ["ok", "failed", "ok"]
+
+
+@pytest.mark.parametrize("used", ["egl", "osmesa"])
+def test_the_backend_not_in_use_is_really_tried(monkeypatch: pytest.MonkeyPatch, used: str) -> None:
+    if not all(map(ctypes.util.find_library, BACKENDS.values())):
+        pytest.skip("needs both EGL and OSMesa")
+    monkeypatch.setenv("MUJOCO_GL", used)
+    monkeypatch.setenv("PYOPENGL_PLATFORM", used)  # as MuJoCo leaves it behind
+    assert [finding.detail for finding in machine.rendering() if finding.status != "ok"] == []
+
+
+@pytest.mark.parametrize("wanted", ["glfw", "nonsense"])
+def test_a_setting_is_not_mended_by_packages(monkeypatch: pytest.MonkeyPatch, wanted: str) -> None:
+    monkeypatch.setenv("MUJOCO_GL", wanted)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    probes(monkeypatch, {"gl egl": SOFTWARE, "gl osmesa": SOFTWARE})
+    findings = list(machine.rendering())
+    assert [finding.status for finding in findings] == ["failed", "ok", "ok"]
+    assert "apt-get" not in findings[0].fix
+    assert "MUJOCO_GL" in findings[0].fix
+
+
+def test_a_platform_that_fits_no_backend_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    probes(monkeypatch, {"golden": {"error": "the PYOPENGL_PLATFORM environment variable is set to 'glx'"}})
+    assert machine.golden_frame().fix == "unset PYOPENGL_PLATFORM"
+
+
+@pytest.mark.parametrize(
+    ("name", "called", "instead"), [("darwin", "macOS", "container"), ("win32", "Windows", "WSL2")]
+)
+def test_a_system_without_the_simulator_is_told(
+    monkeypatch: pytest.MonkeyPatch, name: str, called: str, instead: str
+) -> None:
+    assert software.system().status in ("ok", "warning")  # the tests' own
+    monkeypatch.setattr(sys, "platform", name)
+    finding = software.system()
+    assert finding.status == "failed"
+    assert called in finding.fix
+    assert instead in finding.fix
+    assert list(machine.rendering()) == []  # no advice to install Debian's packages
+
+
+def test_an_untested_processor_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(platform, "machine", lambda: "aarch64")
+    assert software.system().status == "warning"
 
 
 def test_no_gl_library_at_all(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,8 +11,12 @@ from PIL import Image
 
 from lerobot_memobench.engine import contact_sheet as sheets
 from lerobot_memobench.engine import demo
+from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.documents.html import write_html
 from lerobot_memobench.tasks.catalogue import get_task
+
+from ..evaluation.logs import rollout
 
 
 def write_video(path: Path, frames: int = 12) -> None:
@@ -46,12 +50,25 @@ def test_the_demo_folder(tmp_path: Path) -> None:
     (out / "notes.txt").write_text("the user's own")
     assert demo.make_demo(out, fake_evaluation) == 0
     assert {path.name for path in out.iterdir()} == {*demo.PRODUCTS, "notes.txt"}
-    assert {path.stem for path in (out / "videos").iterdir()} == set(demo.TASKS)
+    assert {path.name for path in (out / "videos").iterdir()} == {f"{name}.0.mp4" for name in demo.TASKS}
     with Image.open(out / "contact_sheet.png") as sheet:
         pixels = np.asarray(sheet.convert("L")).astype(int)
     assert pixels.shape == (4 * 160, sheets.FRAMES_PER_VIDEO * sheets.COLUMN_WIDTH)
     means = pixels[:160].reshape(160, sheets.FRAMES_PER_VIDEO, -1).mean(axis=(0, 2))
     assert (np.diff(means) > 20).all()  # evenly spaced in time, left to right
+
+
+def test_the_html_report_finds_the_demos_films(tmp_path: Path) -> None:
+    def evaluate(output: Path) -> int:
+        fake_evaluation(output)
+        write_episodes(output, [rollout(name, "temporal", "", [], True, 0) for name in demo.TASKS])
+        return 0
+
+    demo.make_demo(tmp_path / "demo", evaluate)
+    (tmp_path / "demo" / "card.json").unlink()  # of a fake evaluation, no card
+    written = write_html([tmp_path / "demo"], tmp_path / "html")
+    assert written.videos == len(demo.TASKS)
+    assert not written.notes
 
 
 def test_a_failed_evaluation_leaves_the_earlier_demo(tmp_path: Path) -> None:

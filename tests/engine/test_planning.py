@@ -43,6 +43,30 @@ def test_a_plan_says_everything() -> None:
     assert not any(Path().iterdir())  # planning writes nothing
 
 
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        (["policy=act"], "reset"),
+        (["policy=memobench_random"], "reset"),
+        (["policy=memobench_mem"], "steps"),
+        ([], "steps"),
+        (["policy=act", "prompt_in=steps"], "steps"),
+    ],
+)
+def test_the_prompt_plays_where_the_policy_can_take_it(words: list[str], found: str) -> None:
+    plan = plan_line([*LINE[:-1], *words])
+    assert "--env.prompt_in=" + found in plan.portable_flags
+    assert plan.environment is not None
+    assert plan.environment.protocol["prompt_in"] == found
+
+
+@pytest.mark.parametrize("policy", [["policy=memobench_mem"], ["policy=remote", "policy.dialect=robomme"]])
+def test_repeated_pictures_are_refused_for_policies_that_remember(policy: list[str]) -> None:
+    with pytest.raises(MemobenchError, match=r"env.render_every is 5; leave env.render_every at 1"):
+        plan_line(["env=memobench", f"tasks={STOVE}", *policy, "env.render_every=5"])
+    assert plan_line([*LINE, "env.render_every=5"]).grid is not None
+
+
 def test_going_on_keeps_the_earlier_batch_size() -> None:
     Path("out").mkdir()
     card = {"protocol": {}, "runs": [{"batch_size": 4}]}
@@ -50,6 +74,13 @@ def test_going_on_keeps_the_earlier_batch_size() -> None:
     assert plan_line([*LINE, "output_dir=out", "resume=true"]).batch == 4
     assert plan_line([*LINE, "output_dir=out", "resume=true", "batch_size=2"]).batch == 2
     assert plan_line([*LINE, "output_dir=new", "shards=2"]).batch == 1
+
+
+def test_ten_episodes_are_filmed_unless_another_number_is_given() -> None:
+    for words, films in (([], 10), (["films=0"], 0), (["env.films=3"], 3)):
+        environment = plan_line([*LINE, *words]).environment
+        assert environment is not None
+        assert environment.films == films
 
 
 def test_what_is_left_is_a_plan_of_its_own() -> None:

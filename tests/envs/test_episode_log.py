@@ -122,7 +122,7 @@ def test_cutting_the_file_anywhere_loses_at_most_the_last_record(tmp_path: Path,
         (json.dumps(record(success="yes")), "expected true or false"),
         (json.dumps({**record(), "episode": "0"}), "expected an integer"),
         (json.dumps(record(checkpoints=[{"operation": "X", "first_step": 1}])), "checkpoints"),
-        (json.dumps(record(task=3)), "must be text"),
+        (json.dumps(record(task=3)), "found task = 3, expected text"),
     ],
 )
 def test_lines_that_are_no_rollout_are_named(tmp_path: Path, line: str, reason: str) -> None:

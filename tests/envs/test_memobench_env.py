@@ -136,6 +136,35 @@ def test_prompt_plays_whatever_the_policy_does() -> None:
     assert len(set(ends[0])) > 20, "the prompt shows nothing"
 
 
+def test_a_prompt_within_reset_changes_nothing_but_who_sees_it(tmp_path: Path) -> None:
+    """Log, film and the first execution frame are those of a prompt that was stepped through."""
+    shown, records, films = [], [], []
+    for where in ("steps", "reset"):
+        log = tmp_path / where
+        env = make(HIGHLIGHT, prompt_in=where, horizon=3, log_dir=str(log), videos=True)
+        observation, info = env.reset(seed=7)
+        if where == "reset":
+            assert env._max_episode_steps == 3
+            assert info["phase"] == EXECUTION
+        while observation["phase"] == [PROMPT]:
+            observation, *_ = env.step(np.ones(7, np.float32))
+        shown.append(observation | {"scene": env.scene_hash()})
+        for action in actions(7, 3):
+            env.step(action)
+        env.close()
+        (record,) = read_episodes(log)
+        records.append({key: value for key, value in record.items() if key != "wall_s"})
+        films.append((log / "videos" / f"{HIGHLIGHT}.0.mp4").read_bytes())
+    for key in ("agent_pos", "phase", "step"):
+        np.testing.assert_array_equal(shown[0][key], shown[1][key])
+    for camera, picture in shown[0]["pixels"].items():
+        np.testing.assert_array_equal(picture, shown[1]["pixels"][camera])
+    assert shown[0]["scene"] == shown[1]["scene"]
+    assert records[0] == records[1]
+    assert records[0]["prompt_steps"] == 66
+    assert films[0] == films[1]
+
+
 def test_highlight_is_seen_in_the_prompt_only() -> None:
     env = make(HIGHLIGHT)
     observation, _ = env.reset(seed=7)
@@ -209,6 +238,17 @@ def test_rows_freeze_when_their_episode_ends(tmp_path: Path, use_async: bool) ->
     assert len(read_episodes(tmp_path)) == 2
 
 
+def test_the_first_episodes_are_filmed_or_all(tmp_path: Path) -> None:
+    for settings, filmed in (({}, []), ({"films": 2}, [0, 1]), ({"videos": True}, [-1, 0, 1, 2])):
+        folder = tmp_path / str(len(filmed))
+        env = make(STOVE, log_dir=str(folder), horizon=1, render="fast", **settings)
+        for seed in (6, 7, 8, 9):
+            env.reset(seed=seed)
+            env.step(np.zeros(7, np.float32))
+        env.close()
+        assert {film.name for film in folder.rglob("*.mp4")} == {f"{STOVE}.{number}.mp4" for number in filmed}
+
+
 def test_log_holds_the_finished_episodes(tmp_path: Path) -> None:
     env = make(DRAWER, log_dir=str(tmp_path), horizon=4, replan_steps=20)
     hashes = []
@@ -260,8 +300,10 @@ def test_render_is_annotated() -> None:
         ({"tasks": "turn_on_the_stofe_and_turn_it_off"}, "turn_on_the_stove_and_turn_it_off"),
         ({"referent": "randon"}, "did you mean 'random'"),
         ({"render": "ultra"}, "env.render is 'ultra'"),
+        ({"prompt_in": "rest"}, "env.prompt_in is 'rest'; did you mean 'reset'"),
         ({"horizon": 0}, "env.horizon is 0"),
         ({"render_every": 0}, "env.render_every is 0"),
+        ({"films": -1}, "env.films is -1"),
         ({"fps": 30}, "control rate is 20"),
     ],
 )

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from importlib.util import find_spec
 from pathlib import Path
 
 import dill
 import pytest
+from filelock import lock_descriptor
 from note_job import Note
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.job import Advance
-from lerobot_memobench.jobs.locking import locked
+from lerobot_memobench.jobs.locking import locked, taking_turns
 from lerobot_memobench.jobs.running import run_jobs
 
 needs_datatrove = pytest.mark.skipif(find_spec("datatrove") is None, reason="datatrove is not installed")
@@ -65,3 +68,37 @@ def test_one_run_at_a_time_in_a_folder(tmp_path: Path) -> None:
         pass
     with locked(tmp_path, tmp_path):  # free again, and nothing is left behind
         assert list(tmp_path.iterdir()) == []
+
+
+def test_no_folder_is_held_on_windows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "platform", "win32")
+    with pytest.raises(MemobenchError, match="WSL2"), locked(tmp_path, tmp_path):
+        pass
+
+
+def test_one_after_another_at_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "cache.lock"
+    with taking_turns(path), path.open() as other:
+        assert not lock_descriptor(other.fileno(), blocking=False)
+    with path.open() as other:
+        assert lock_descriptor(other.fileno(), blocking=False)
+
+
+@pytest.mark.parametrize("hold", ["taking_turns(path)", "locked(path.parent, path.parent)"])
+def test_a_killed_process_lets_go(tmp_path: Path, hold: str) -> None:
+    path = tmp_path / "cache.lock"
+    code = f"""
+import pathlib, time
+from lerobot_memobench.jobs.locking import locked, taking_turns
+path = pathlib.Path({str(path)!r})
+with {hold}:
+    print("held", flush=True)
+    time.sleep(600)
+"""
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "held\n"
+        holder.kill()
+        holder.wait()
+    with taking_turns(path), locked(tmp_path, tmp_path):
+        pass

@@ -305,6 +305,15 @@ def test_backends_that_cannot_be(monkeypatch: pytest.MonkeyPatch, value: str, wo
         gl_backend()
 
 
+@pytest.mark.parametrize(("name", "words"), [("win32", "Windows .* WSL2"), ("darwin", "macOS .* Linux machine")])
+def test_the_first_picture_on_a_system_without_the_backends(
+    monkeypatch: pytest.MonkeyPatch, name: str, words: str
+) -> None:
+    monkeypatch.setattr(sys, "platform", name)
+    with pytest.raises(MemobenchError, match=words):
+        gl_backend()
+
+
 _FRAME = """
 import hashlib, sys
 from lerobot_memobench.sim.simulation import Simulation

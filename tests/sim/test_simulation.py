@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -62,6 +63,22 @@ def check_against_fresh_process(names: list[str], steps: int) -> None:
             walk(sim, 5)
         sim.reset(7)
         assert walk(sim, steps) == fresh[name], name
+
+
+@pytest.mark.parametrize("task", ["check_all_three_drawers_of_the_cabinet", "open_and_close_the_microwave"])
+def test_sensors_are_off_and_nothing_else_follows(task: str) -> None:
+    """Nobody reads robosuite's sensors; with them the scene goes the same way, to the last bit."""
+    without, with_sensors = Simulation(get_task(task)), Simulation(get_task(task))
+    off = mujoco.mjtDisableBit.mjDSBL_SENSOR.value
+    assert without.model.opt.disableflags & off
+    with_sensors.model.opt.disableflags &= ~off
+    for sim in (without, with_sensors):
+        sim.reset(7)
+        walk(sim)
+    assert not without.data.sensordata.any()
+    assert with_sensors.data.sensordata.any()
+    for name in ("physics", "goal_position", "goal_rotation", "gripper"):
+        np.testing.assert_array_equal(getattr(without.snapshot(), name), getattr(with_sensors.snapshot(), name))
 
 
 def test_reset_after_other_seeds_equals_a_fresh_process() -> None:

@@ -1,16 +1,19 @@
 """What is claimed of the simulator's speed, measured beside stock robosuite 1.4.1 in one run.
 
-A machine that does other things at the same time slows both sides: they take turns, the median of each counts, and
-what is claimed is the ratio. Stock robosuite is its own PickPlace with the same arm, controller, cameras and sizes.
+Both sides take turns, and each turn of ours makes a pair with the turn of theirs that follows. What is claimed is the
+median of the pairs' ratios on the wall's clock, on a machine that does nothing else; the processors' clock stands
+beside it, and moves less where others compute too. Stock robosuite is its own PickPlace with the same arm, controller,
+cameras and sizes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 from lerobot_memobench.bench.line import Line, line_of
 from lerobot_memobench.bench.machine import TASK
-from lerobot_memobench.bench.sides import Ours, actions, alternate, make_current, stock_open, timed
+from lerobot_memobench.bench.sides import Ours, Times, Vectored, actions, alternate, make_current, stock_open, timed
 from lerobot_memobench.bench.workers import workers
 from lerobot_memobench.errors import MemobenchError, nearest
 
@@ -26,43 +29,69 @@ def step_without_images(task: str = TASK, rounds: int = 12) -> Line:
 
 
 def _step(name: str, task: str, quality: str, rounds: int, images: bool) -> Line:
-    moves = actions()
     ours = Ours(task, images, quality)
     with stock_open(images) as env:
-
-        def their_turn() -> float:
-            make_current(env)
-            return timed(lambda: env.step(next(moves)))
-
-        def our_turn() -> float:
-            return timed(lambda: ours.step(next(moves)))
-
-        for _ in range(3):  # the first frames compile shaders
-            our_turn(), their_turn()
-        mine, other = alternate(our_turn, their_turn, rounds, 20, 5)
+        pairs = _step_pairs(ours, env, rounds)
     detail = {"task": task, "quality": quality} if images else {"task": task}
-    return line_of(name, mine, other, detail)
+    return line_of(name, pairs, detail)
+
+
+def _step_pairs(ours: Ours | Vectored, env: Any, rounds: int) -> list[tuple[Times, Times]]:
+    moves = actions()
+
+    def their_turn() -> Times:
+        make_current(env)
+        return timed(lambda: env.step(next(moves)))
+
+    def our_turn() -> Times:
+        return timed(lambda: ours.step(next(moves)))
+
+    for _ in range(3):  # the first frames compile shaders
+        our_turn(), their_turn()
+    return alternate(our_turn, their_turn, rounds, 20, 5)
 
 
 def reset(task: str = TASK, rounds: int = 3) -> Line:
     """Reset to a new seed with both images; ours includes the ten stabilisation steps."""
-    seeds = iter(range(10**9))
     ours = Ours(task)
     with stock_open(True) as env:
+        pairs = _reset_pairs(ours, env, rounds)
+    return line_of("reset", pairs, {"task": task})
 
-        def their_turn() -> float:
-            make_current(env)
-            return timed(env.reset)
 
-        mine, other = alternate(lambda: timed(lambda: ours.reset(next(seeds))), their_turn, rounds, 8, 1)
-    return line_of("reset", mine, other, {"task": task})
+def _reset_pairs(ours: Ours | Vectored, env: Any, rounds: int) -> list[tuple[Times, Times]]:
+    seeds = iter(range(1, 10**9))
+
+    def their_turn() -> Times:
+        make_current(env)
+        return timed(env.reset)
+
+    return alternate(lambda: timed(lambda: ours.reset(next(seeds))), their_turn, rounds, 8, 1)
+
+
+def vector_env(task: str = TASK, rounds: int = 8) -> list[Line]:
+    """Steps and resets through the vector environment that LeRobot uses, both images, beside bare stock robosuite."""
+    ours = Vectored(task)
+    with stock_open(True) as env:
+        steps, resets = _step_pairs(ours, env, rounds), _reset_pairs(ours, env, max(1, rounds // 2))
+        ours.close()
+    return [line_of("vector_env_step", steps, {"task": task}), line_of("vector_env_reset", resets, {"task": task})]
+
+
+def eval_loop() -> list[Line]:
+    """A control step of ``lerobot eval``; LeRobot is imported for it, which takes longer than the other claims."""
+    from lerobot_memobench.bench import evaluation
+
+    return evaluation.eval_loop()
 
 
 BENCHMARKS: dict[str, Callable[[], Line | list[Line]]] = {
     "step_with_images": step_with_images,
     "step_without_images": step_without_images,
     "reset": reset,
+    "vector_env": vector_env,
     "workers": workers,
+    "eval_loop": eval_loop,
 }
 
 

@@ -10,7 +10,8 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +26,16 @@ from lerobot_memobench.tasks.progress import Progress
 STOCK_CAMERAS = ["agentview", "robot0_eye_in_hand"]
 IMAGE_SIZE = 256
 
-Turn = Callable[[], float]
-"""Do the thing once and return how long it took, s."""
+
+class Times(NamedTuple):
+    """What a thing took, s: on the clock on the wall, and of processors, all threads of the process together."""
+
+    wall: float
+    cpu: float
+
+
+Turn = Callable[[], Times]
+"""Do the thing once and return how long it took."""
 
 
 class Ours:
@@ -54,6 +63,32 @@ class Ours:
         self.progress.step(self.sim.holds)
         self.sim.proprio()
         self.look()
+
+
+class Vectored:
+    """The same through the vector environment that LeRobot steps: one environment, both images."""
+
+    def __init__(self, task: str = TASK) -> None:
+        from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+
+        self._logs = TemporaryDirectory()
+        config = MemobenchEnvConfig(task=task, prompt_video=False, log_dir=self._logs.name)
+        [suite] = config.create_envs(1).values()
+        [self.env] = suite.values()
+        self.reset(0)
+
+    def reset(self, seed: int) -> None:
+        """Start the episode of a seed."""
+        self.env.reset(seed=[seed])
+
+    def step(self, action: NDArray[np.float64]) -> None:
+        """Take one control step."""
+        self.env.step(action[None].astype(np.float32))
+
+    def close(self) -> None:
+        """End the environment and its log."""
+        self.env.close()
+        self._logs.cleanup()
 
 
 # --- stock robosuite ---
@@ -122,17 +157,20 @@ def actions() -> Iterator[NDArray[np.float64]]:
         yield rng.uniform(-0.3, 0.3, 7)
 
 
-def timed(do: Callable[[], Any]) -> float:
-    """Return the seconds that a call takes."""
-    start = time.perf_counter()
+def timed(do: Callable[[], Any]) -> Times:
+    """Return what a call takes."""
+    wall, cpu = time.perf_counter(), time.process_time()
     do()
-    return time.perf_counter() - start
+    return Times(time.perf_counter() - wall, time.process_time() - cpu)
 
 
-def alternate(ours: Turn, theirs: Turn, rounds: int, ours_per_round: int, theirs_per_round: int) -> tuple[float, float]:
-    """Return the median seconds of both sides, taken in turns."""
-    mine, other = [], []
-    for _ in range(rounds):
-        mine += [ours() for _ in range(ours_per_round)]
-        other += [theirs() for _ in range(theirs_per_round)]
-    return statistics.median(mine), statistics.median(other)
+def alternate(
+    ours: Turn, theirs: Turn, rounds: int, ours_per_round: int, theirs_per_round: int
+) -> list[tuple[Times, Times]]:
+    """Return a pair per round: the medians of both sides, which take turns."""
+
+    def median_of(turn: Turn, times: int) -> Times:
+        taken = [turn() for _ in range(times)]
+        return Times(statistics.median(t.wall for t in taken), statistics.median(t.cpu for t in taken))
+
+    return [(median_of(ours, ours_per_round), median_of(theirs, theirs_per_round)) for _ in range(rounds)]

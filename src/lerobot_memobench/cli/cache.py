@@ -19,6 +19,12 @@ def cache(
     ] = None,
     device: Annotated[str | None, typer.Option(help="cuda or cpu; the best there is by default.")] = None,
     batch_size: Annotated[int, typer.Option(min=1, help="Frames per pass of the image tower.")] = 64,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for memory caches (policy.memory_cache_dir); memory_cache in the dataset's by default."
+        ),
+    ] = None,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Threads that decode videos; as many as there are cores by default.")
     ] = None,
@@ -29,8 +35,17 @@ def cache(
     from lerobot_memobench.settings.lerobot_commands import quiet
 
     with quiet():
-        config = MemobenchMemConfig(size=size, memory_stride=stride, device=device)
+        place = None if out is None else str(out)
+        config = MemobenchMemConfig(size=size, memory_stride=stride, memory_cache_dir=place, device=device)
     screen = console()
     with counting(screen, "episodes") as count:
-        folder = cache_dataset(dataset, config, weights=weights, batch_size=batch_size, workers=workers, progress=count)
+        folder = cache_dataset(
+            dataset,
+            config,
+            weights=weights,
+            batch_size=batch_size,
+            workers=workers,
+            progress=count,
+            tell=lambda said: screen.print(said, soft_wrap=True, markup=False),
+        )
     screen.print(f"memory cache: {folder}", soft_wrap=True)

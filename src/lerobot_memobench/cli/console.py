@@ -18,8 +18,11 @@ SPEED_PERIOD = 600.0
 
 
 def console() -> Console:
-    """Return a console as wide as the terminal, or wide enough for the tables where there is none."""
-    return Console(width=None if sys.stdout.isatty() else WIDTH_OF_A_FILE, highlight=False)
+    """Return a console as wide as the terminal, or wide enough for the tables where there is none.
+
+    What stands in brackets is printed as it is: most of it comes out of files.
+    """
+    return Console(width=None if sys.stdout.isatty() else WIDTH_OF_A_FILE, highlight=False, markup=False)
 
 
 class Count:

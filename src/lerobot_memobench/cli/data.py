@@ -94,6 +94,7 @@ def describe(
     """Keep of a dataset what fits into a repository: figures, the card's tables, the hash of every episode."""
     from lerobot_memobench.datasets.describe import describe as run
 
-    for file in run(folder, out or folder / "description"):
-        console().print(str(file), soft_wrap=True)
+    screen = console()
+    for file in run(folder, out or folder / "description", say=lambda text: screen.print(text, markup=False)):
+        screen.print(str(file), soft_wrap=True)
     return 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Iterator
 
 from lerobot_memobench.errors import MemobenchError
@@ -33,12 +34,24 @@ def one_sentence(error: BaseException) -> str | None:
     if isinstance(errors[0], FileExistsError):
         return _line(errors[0])
     hub = next((found for found in errors if _is_hub_error(found)), None)
+    if hub is not None and any(_came_through(found, "lerobot.datasets.") for found in errors):
+        return (
+            f"the dataset is not on this machine and could not be fetched from the hub ({_line(hub)[:200]}); name a "
+            "folder that is here, dataset=<folder>, or make one: `memobench generate --tasks object --episodes 5 --out "
+            "outputs/demonstrations`, then dataset=outputs/demonstrations"
+        )
     if hub is not None:
         return (
             f"what was asked for is not on this machine and could not be fetched from the hub ({_line(hub)[:200]}); "
             "name a folder that is here: dataset=<folder> or policy=<folder>"
         )
     return None
+
+
+def _came_through(error: BaseException, package: str) -> bool:
+    """Whether a module of a package was at work when an error arose."""
+    frames = (frame for frame, _ in traceback.walk_tb(error.__traceback__))
+    return any(str(frame.f_globals.get("__name__")).startswith(package) for frame in frames)
 
 
 def _is_hub_error(error: BaseException) -> bool:

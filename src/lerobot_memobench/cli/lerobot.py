@@ -59,14 +59,18 @@ def run(words: Sequence[str]) -> int:
 
 def train(words: Words) -> int:
     """Run ``lerobot train`` with the benchmark's defaults, checked."""
-    words = resolve_recipe(words)
+    from lerobot_memobench.settings.training import complete_training, take_prompt_frames
+
+    prompt_frames, words = take_prompt_frames(resolve_recipe(words))
     check_task_names(words)
     settings = read_settings("train", words)
-    if not words.wants_help:
-        from lerobot_memobench.settings.training import complete_training
+    if words.wants_help:
+        return call_lerobot("train", settings.flags)
+    from lerobot_memobench.engine.lerobot_training import trained_on
 
-        settings = complete_training(settings)
-    return call_lerobot("train", settings.flags)
+    settings = complete_training(settings)
+    with trained_on(prompt_frames):
+        return call_lerobot("train", settings.flags)
 
 
 def overview(commands: Iterable[str]) -> str:

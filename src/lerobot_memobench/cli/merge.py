@@ -26,6 +26,9 @@ def merge(
 def rerun(
     card: Annotated[Path, typer.Argument(help="A card.json, or the folder of an evaluation that holds one.")],
     out: Annotated[Path | None, typer.Option(help="Folder of the repetition; a dated one when left out.")] = None,
+    server: Annotated[
+        str | None, typer.Option(help="Where the card's policy server is here, host:port; 127.0.0.1 needs no saying.")
+    ] = None,
 ) -> int:
     """Repeat the evaluation that a card describes and compare every episode. Status 1: one ended differently."""
     from lerobot_memobench.cli.evaluate import evaluate_here
@@ -33,7 +36,7 @@ def rerun(
     from lerobot_memobench.engine.outcomes import first_disagreement
     from lerobot_memobench.envs.episode_log import read_episodes
 
-    told = again.repeatable_card(card)
+    told = again.repeatable_card(card, server)
     again.check_policy(told)
     screen = console()
     for note in again.differences_here(told):

@@ -7,28 +7,29 @@ dataset to anybody.
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.datasets.hdf5.layout import Problem, Unusable
+from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.hdf5.layout import Problem, Unusable, usable_or_named
 from lerobot_memobench.datasets.hdf5.published_task import task_of
 from lerobot_memobench.datasets.hdf5.reading import PublishedFile, find_files
 from lerobot_memobench.datasets.hdf5.restore import NO_SEED, restore
 from lerobot_memobench.datasets.lerobot_format.assembling import assemble
 from lerobot_memobench.datasets.lerobot_format.layout import (
     DEFAULT_REPO_ID,
-    MANIFEST_FILE,
     check_destination,
     is_dataset,
 )
+from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
+from lerobot_memobench.datasets.manifest import read_manifest
 from lerobot_memobench.datasets.staging.episode import StagedEpisode, StagedJob, staged
 from lerobot_memobench.datasets.staging.folders import STAGING
 from lerobot_memobench.datasets.staging.request import compare_requests, episodes_folder
-from lerobot_memobench.datasets.staging.stage import EpisodeStage, stage_failure
+from lerobot_memobench.datasets.staging.stage import EpisodeStage, episode_info, stage_failure
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.job import ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
@@ -78,13 +79,7 @@ class ConversionJob(StagedJob):
         """Stage the episode, or why it cannot be used."""
         try:
             with PublishedFile(self.file) as file:
-                found = file.read(self.group)
-                if found.image_size != self.image_size:
-                    raise Unusable(
-                        f"its images are {found.image_size[0]}×{found.image_size[1]} pixels, those of the first "
-                        f"demonstration {self.image_size[0]}×{self.image_size[1]}"
-                    )
-                demo = restore(task_of(file, found), found)
+                demo = self._restored(file)
                 with EpisodeStage(self.folder) as stage:
                     for images in file.images(self.group, upside_down=self.upside_down):
                         stage.add_images(images)
@@ -95,6 +90,18 @@ class ConversionJob(StagedJob):
         except Exception as error:
             error.add_note(f"while converting {self.file}, {self.group}")
             raise
+
+    def _restored(self, file: PublishedFile) -> Demonstration:
+        with usable_or_named():
+            found = file.read(self.group)
+            if found.image_size != self.image_size:
+                raise Unusable(
+                    f"its images are {found.image_size[0]}×{found.image_size[1]} pixels, those of the first "
+                    f"demonstration {self.image_size[0]}×{self.image_size[1]}"
+                )
+            demo = restore(task_of(file, found), found)
+            EpisodeRecord.model_validate(episode_info(demo))  # here it ends one episode, when the tables are made all
+            return demo
 
 
 def convert(
@@ -160,7 +167,7 @@ def _plan(files: Sequence[Path], folder: Path, upside_down: bool) -> tuple[list[
     problems: list[Problem] = []
     for path in files:
         try:
-            with PublishedFile(path) as file:
+            with PublishedFile(path) as file, usable_or_named():
                 problems += _miscounted(file)
                 for group in file.groups():
                     try:
@@ -209,13 +216,15 @@ def _name(path: Path, source: Path) -> str:
 def _finished(out: Path, request: dict[str, Any]) -> ConversionSummary:
     """Report a conversion that is finished already."""
     try:
-        manifest = json.loads((out / MANIFEST_FILE).read_text())
+        manifest = read_manifest(out)
         earlier, left_out = manifest["request"], manifest["left_out"]
         count = len(manifest["episodes"])
-    except (OSError, KeyError, ValueError):
+    except (FileNotFoundError, KeyError):
         raise MemobenchError(
             f"{out} already holds a dataset that this command did not make; name another folder"
         ) from None
     compare_requests(earlier, request, f"{out} already holds a finished conversion", "name another folder")
     shutil.rmtree(out / STAGING, ignore_errors=True)
-    return ConversionSummary(out, count, tuple(Problem(**problem) for problem in left_out))
+    return ConversionSummary(
+        out, count, tuple(Problem(problem["file"], problem["group"], problem["reason"]) for problem in left_out)
+    )

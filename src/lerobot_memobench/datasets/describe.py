@@ -7,17 +7,21 @@ from __future__ import annotations
 
 import json
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lerobot_memobench.datasets.lerobot_format.card_tables import ordered_types
+from lerobot_memobench.datasets.demonstration import CAMERAS
+from lerobot_memobench.datasets.lerobot_format.card import statistics_section
+from lerobot_memobench.datasets.lerobot_format.card_tables import ordered_types, storage_by_frames
 from lerobot_memobench.datasets.lerobot_format.layout import MANIFEST_FILE, image_key
-from lerobot_memobench.datasets.lerobot_format.reading import episode_rows
+from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, list_episodes
+from lerobot_memobench.datasets.manifest import read_manifest
 from lerobot_memobench.datasets.paper_figures import FAMILIES, LENGTH_BUCKETS
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files import draft_of, write_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,30 +33,88 @@ FRAME = 160
 """Height and width of a storyboard's pictures, pixels."""
 MOST_FRAMES = 6
 
+MADE_BY = "## How it was made"
+"""Heading of a card of ours; LeRobot's has none."""
 
-def describe(folder: Path, out: Path) -> list[Path]:
+EDITED = (
+    "A tool that knows nothing of this benchmark, such as `lerobot-edit-dataset`, has edited this dataset: its tables "
+    "and hashes are read from its frames. Lost are the card, which seeds had failed, and the simulator's states: "
+    "`memobench validate` makes those again from seed and actions and compares their hash, but cannot where an episode "
+    "has no seed."
+)
+
+Say = Callable[[str], None]
+
+
+def describe(folder: Path, out: Path, say: Say = lambda _: None) -> list[Path]:
     """Write pictures, tables and hashes of the dataset in ``folder`` to ``out``; return the files.
 
-    The storyboard needs images; a dataset of states and actions has none.
+    The storyboard needs images; a dataset of states and actions has none. ``say`` is told, in a sentence each, what
+    other tools have taken from the dataset, and which of its episodes another program made; those are left out.
+
+    Raises:
+        MemobenchError: the folder is no dataset, or none of its episodes is one of this benchmark.
     """
-    rows = episode_rows(folder)
+    rows = _known(folder, say)
     out.mkdir(parents=True, exist_ok=True)
     found = [draw_lengths(rows, out / LENGTHS_FIGURE)]
     if (folder / "videos").is_dir():
         found.append(draw_storyboard(folder, rows, out / STORYBOARD_FIGURE))
-    card, hashes = folder / "README.md", folder / MANIFEST_FILE
-    if card.is_file():
-        found.append(out / TABLES_FILE)
-        found[-1].write_text(card_tables(card.read_text(encoding="utf-8")), encoding="utf-8")
-    if hashes.is_file():
-        found.append(out / MANIFEST_FILE)
-        found[-1].write_text(short_manifest(json.loads(hashes.read_text(encoding="utf-8"))), encoding="utf-8")
+    tables, hashes = _card_tables(folder), folder / MANIFEST_FILE
+    if tables is None:
+        say(EDITED)
+    found.append(write_file(out / TABLES_FILE, tables or _tables_of(folder, rows)))
+    manifest = read_manifest(folder) if hashes.is_file() else _manifest_of(rows)
+    found.append(write_file(out / MANIFEST_FILE, short_manifest(manifest)))
     return found
+
+
+def _known(folder: Path, say: Say) -> list[dict[str, Any]]:
+    """Return what the dataset says of its episodes, without those that another program made."""
+    places = list_episodes(folder)
+    rows = [
+        place.record.model_dump() | {"episode_index": place.index, "length": place.length, "start": place.start}
+        for place in places
+        if place.record is not None
+    ]
+    strangers = [str(place.index) for place in places if place.record is None]
+    if not rows:
+        raise MemobenchError(f"{folder} has no episode of this benchmark: of each, {STRANGER}")
+    if strangers:
+        listed = ", ".join(strangers[:5]) + (", …" if len(strangers) > 5 else "")
+        say(f"{len(strangers)} of {len(places)} episodes ({listed}) are left out: of each, {STRANGER}")
+    return rows
+
+
+def _card_tables(folder: Path) -> str | None:
+    """Return the tables of the dataset's card, None where it has none of ours."""
+    try:
+        card = (folder / "README.md").read_text(encoding="utf-8")
+    except FileNotFoundError:
+        return None
+    return card_tables(card) if MADE_BY in card else None
+
+
+def _tables_of(folder: Path, rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return what the card would say, from the rows alone."""
+    infos = [{**row, "frames": row["length"]} for row in rows]
+    parts = [MADE_BY, f"{EDITED} Storage is shared out by frames."]
+    parts += statistics_section(infos, [], storage_by_frames(folder, infos))
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _manifest_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return a manifest of the episodes that are there."""
+    versions = sorted({json.dumps(row["versions"], sort_keys=True) for row in rows if row["versions"]})
+    return {
+        "versions": [json.loads(each) for each in versions],
+        "episodes": [{**row, "failure": None} for row in rows],
+    }
 
 
 def card_tables(card: str) -> str:
     """Return the part of a dataset card that says how it was made, what failed, and its statistics."""
-    begin, end = card.find("## How it was made"), card.find("## Columns")
+    begin, end = card.find(MADE_BY), card.find("## Columns")
     if begin < 0:
         raise MemobenchError("the dataset's README.md has no section 'How it was made': this package did not write it")
     return card[begin : end if end > begin else None].rstrip() + "\n"
@@ -62,7 +124,9 @@ def short_manifest(manifest: Mapping[str, Any]) -> str:
     """Return a manifest as JSON of one line per task: seed to the hash of its episode, or to why there is none."""
     tasks: dict[str, dict[str, str]] = {}
     for row in manifest["episodes"]:
-        tasks.setdefault(row["task_name"], {})[str(row["seed"])] = row["failure"] or row["digest"]
+        tasks.setdefault(row["task_name"], {})[str(row["seed"])] = (
+            row["failure"] or row.get("digest") or "no hash was kept"
+        )
     head = {key: value for key, value in manifest.items() if key != "episodes"}
     lines = [f"{json.dumps(name)}: {json.dumps(seeds)}" for name, seeds in sorted(tasks.items())]
     return json.dumps(head | {"tasks": None})[: -len("null}")] + "{\n" + ",\n".join(lines) + "\n}}\n"
@@ -78,7 +142,8 @@ def draw_lengths(rows: Sequence[Mapping[str, Any]], path: Path) -> Path:
         left, right = figure.subplots(1, 2, width_ratios=(3, 2))
         _draw_buckets(left, rows)
         _draw_types(right, rows)
-        figure.savefig(path, dpi=130)
+        with draft_of(path) as draft:
+            figure.savefig(draft, dpi=130)
     return path
 
 
@@ -121,6 +186,7 @@ def draw_storyboard(folder: Path, rows: Sequence[Mapping[str, Any]], path: Path)
     from PIL import Image, ImageDraw, ImageFont
 
     dataset = LeRobotDataset("local/storyboard", root=folder)
+    camera = next(key for key in map(image_key, CAMERAS) if key in dataset.meta.features)
     chosen = [next(row for row in rows if row["memory_type"] == name) for name in ordered_types(rows)]
     caption, title = 40, 20
     height = FRAME + caption + title
@@ -132,14 +198,15 @@ def draw_storyboard(folder: Path, rows: Sequence[Mapping[str, Any]], path: Path)
         name = row["task_name"].replace("_", " ")
         draw.text((2, top + 3), f"{row['memory_type']}: {name}", fill="black", font=bold)
         for column, (frame, text) in enumerate(_moments(dataset, row)):
-            image = dataset[row["dataset_from_index"] + frame][image_key("image")].numpy()
+            image = dataset[row["start"] + frame][camera].numpy()
             pixels = (image.transpose(1, 2, 0) * 255).round().astype(np.uint8)
             picture = Image.fromarray(pixels).resize((FRAME, FRAME), Image.Resampling.LANCZOS)
             left = column * (FRAME + 6)
             sheet.paste(picture, (left, top + title))
             words = textwrap.fill(f"{frame}: {text}", 30, max_lines=3, placeholder=" …")
             draw.multiline_text((left + 2, top + title + FRAME + 1), words, fill="black", font=font, spacing=1)
-    sheet.save(path, quality=88, optimize=True)
+    with draft_of(path) as draft:
+        sheet.save(draft, quality=88, optimize=True)
     return path
 
 
@@ -151,7 +218,7 @@ def _moments(dataset: Any, row: Mapping[str, Any]) -> list[tuple[int, str]]:
     found.append((begin, "execution begins"))
     last = begin
     for frame in sorted(int(frame) for frame in row["key_frames"] if frame >= 0):
-        before = dataset.hf_dataset[row["dataset_from_index"] + max(frame - 1, last)]
-        found.append((frame, before["simple_subgoal"]))
+        before = dataset.hf_dataset[row["start"] + max(frame - 1, last)]
+        found.append((frame, before.get("simple_subgoal", "")))
         last = frame
     return found[: MOST_FRAMES - 1] + found[MOST_FRAMES - 1 :][-1:]

@@ -23,10 +23,10 @@ from lerobot_memobench.datasets.lerobot_format.card import SCRIPTED
 from lerobot_memobench.datasets.lerobot_format.layout import (
     DEFAULT_REPO_ID,
     HDF5_FOLDER,
-    MANIFEST_FILE,
     check_destination,
     is_dataset,
 )
+from lerobot_memobench.datasets.manifest import read_manifest
 from lerobot_memobench.datasets.recording import HOLD_FRAMES, RecordingJob, RecordingSettings
 from lerobot_memobench.datasets.staging.episode import FORMATS, HDF5, LEROBOT, staged
 from lerobot_memobench.datasets.staging.folders import STAGING
@@ -182,10 +182,10 @@ def is_finished(out: Path) -> bool:
     if is_dataset(out):
         return True
     try:
-        manifest = json.loads((out / MANIFEST_FILE).read_text())
-        return LEROBOT not in manifest["request"]["formats"] and (out / HDF5_FOLDER).is_dir()
-    except (OSError, ValueError, KeyError, TypeError):
+        formats = read_manifest(out).get("request", {}).get("formats")
+    except (FileNotFoundError, MemobenchError):
         return False
+    return isinstance(formats, list) and LEROBOT not in formats and (out / HDF5_FOLDER).is_dir()
 
 
 def _checked_formats(formats: Collection[str], images: bool) -> tuple[str, ...]:
@@ -204,9 +204,9 @@ def _checked_formats(formats: Collection[str], images: bool) -> tuple[str, ...]:
 def _finished(out: Path, plan: _Plan) -> GenerationSummary:
     """Report a dataset that is finished already; remove what a kill in the last moment left beside it."""
     try:
-        manifest = json.loads((out / MANIFEST_FILE).read_text())
+        manifest = read_manifest(out)
         earlier = manifest["request"]
-    except (FileNotFoundError, KeyError, json.JSONDecodeError):
+    except (FileNotFoundError, KeyError):
         raise MemobenchError(
             f"{out} already holds a dataset that this command did not make; name another folder"
         ) from None

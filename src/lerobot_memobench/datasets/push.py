@@ -8,11 +8,11 @@ already is known by its hash. When it is over the hub is asked what it holds.
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lerobot_memobench.datasets.lerobot_format.info import read_info
 from lerobot_memobench.datasets.lerobot_format.layout import HDF5_FOLDER, is_dataset
 from lerobot_memobench.errors import MemobenchError
 
@@ -114,7 +114,7 @@ def _missing(api: HfApi, folder: Path, repo_id: str, hdf5: bool) -> list[str]:
 
 def _tag(api: HfApi, folder: Path, repo_id: str) -> None:
     """Mark the commit with the version of LeRobot's format: LeRobot loads no dataset without it."""
-    version = json.loads((folder / "meta" / "info.json").read_text())["codebase_version"]
+    version = read_info(folder)["codebase_version"]
     if version in [tag.name for tag in api.list_repo_refs(repo_id, repo_type="dataset").tags]:
         api.delete_tag(repo_id, tag=version, repo_type="dataset")
     api.create_tag(repo_id, tag=version, repo_type="dataset")

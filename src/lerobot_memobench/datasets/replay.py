@@ -13,9 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.digest import digest
 from lerobot_memobench.datasets.labels import labels
 from lerobot_memobench.datasets.language import persistent_rows
 from lerobot_memobench.datasets.lerobot_format.reading import Columns, RecordedEpisode
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.progress import Progress
@@ -39,9 +41,12 @@ class Disagreement:
 def replay(recorded: Demonstration | RecordedEpisode, *, task: Task | None = None) -> Disagreement | None:
     """Play an episode again and return the first disagreement, or None.
 
-    Compared are states (where recorded), proprioception, every label column, language rows, success, key
-    frames and the scene's hash. ``task`` replaces the catalogue's task of that name, for datasets of tasks of
-    one's own.
+    Compared are states (where recorded), proprioception, every label column, language rows, success, key frames, the
+    scene's hash and the episode's: it is of the states too, and so stands for them where LeRobot's dataset tools have
+    left them behind. ``task`` replaces the catalogue's task of that name, for datasets of tasks of one's own.
+
+    Raises:
+        MemobenchError: no such task, or the actions are gone.
     """
     if isinstance(recorded, Demonstration):
         again = resimulate(recorded.task, recorded.seed, recorded.actions, recorded.exec_start)
@@ -50,7 +55,10 @@ def replay(recorded: Demonstration | RecordedEpisode, *, task: Task | None = Non
             _whole(recorded), _whole(again)
         )
     task = (task or get_task(recorded.task_name)).variant(recorded.variant)
+    if "action" not in recorded.columns:
+        raise MemobenchError("its frames have no column 'action' (a tool removed it), so nothing can be played again")
     again = resimulate(task, recorded.seed, recorded.columns["action"], recorded.exec_start)
+    again = replace(again, referent=recorded.referent)
     return _first_difference(recorded.columns, demonstration_columns(again)) or _whole_difference(
         recorded.whole, _whole(again)
     )
@@ -107,6 +115,7 @@ def _whole(demo: Demonstration) -> dict[str, Any]:
         "scene_hash": demo.scene_hash,
         "fixture_poses": {name: np.asarray(pose).tolist() for name, pose in demo.fixture_poses.items()},
         "language_persistent": persistent_rows(found),
+        "digest": digest(demo),
     }
 
 

@@ -5,16 +5,16 @@ The folder may hold a LeRobotDataset, HDF5 files of this package in the publishe
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_memobench.datasets.hdf5.layout import Unusable
+from lerobot_memobench.datasets.hdf5.layout import Unusable, usable_or_named
 from lerobot_memobench.datasets.hdf5.published_task import task_of
 from lerobot_memobench.datasets.hdf5.reading import PublishedFile, find_files
 from lerobot_memobench.datasets.hdf5.restore import restore
+from lerobot_memobench.datasets.lerobot_format.info import episode_count
 from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
 from lerobot_memobench.datasets.lerobot_format.reading import read_episode
 from lerobot_memobench.datasets.replay import replay
@@ -38,7 +38,9 @@ class Verdict:
 
 @dataclass(frozen=True)
 class _Check:
-    """An episode to be replayed, in any process: of a dataset (``index``), or of an HDF5 file (``group``)."""
+    """An episode to be replayed, in any process: of a dataset (``index``), or of an HDF5 file (``group``; "" stands
+    for a file without any that can be read, and replaying it says why).
+    """
 
     path: Path
     name: str
@@ -52,7 +54,7 @@ class _Check:
             return Verdict(self.name, self._replay())
         except MemobenchError as error:
             return Verdict(self.name, str(error))
-        except (OSError, KeyError, ValueError, IndexError) as error:
+        except Exception as error:  # whatever one episode says, the others are replayed
             return Verdict(self.name, f"it cannot be read ({type(error).__name__}: {error})")
 
     def _replay(self) -> str | None:
@@ -125,8 +127,8 @@ def exit_status(verdicts: Sequence[Verdict]) -> int:
 def _checks(folder: Path, tasks: Mapping[str, Task] | None) -> list[_Check]:
     checks: list[_Check] = []
     if is_dataset(folder):
-        total = json.loads((folder / "meta" / "info.json").read_text())["total_episodes"]
-        checks += [_Check(folder, f"episode {index}", index=index, tasks=tasks) for index in range(total)]
+        total = range(episode_count(folder))
+        checks += [_Check(folder, f"episode {index}", index=index, tasks=tasks) for index in total]
     has_files = folder.is_file() or any(path.suffix in (".hdf5", ".h5") for path in folder.rglob("*"))
     if not checks and not has_files:
         raise MemobenchError(
@@ -135,8 +137,8 @@ def _checks(folder: Path, tasks: Mapping[str, Task] | None) -> list[_Check]:
     for path in find_files(folder) if has_files else ():
         name = path.name if path == folder else path.relative_to(folder).as_posix()
         try:
-            with PublishedFile(path) as file:
+            with PublishedFile(path) as file, usable_or_named():
                 checks += [_Check(path, f"{name}, {group}", group=group) for group in file.groups()]
-        except Unusable as error:
-            raise MemobenchError(f"{path}: {error}") from None
+        except Unusable:
+            checks.append(_Check(path, name))
     return checks

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files import draft_of
 
 Frame = NDArray[np.uint8]
 
@@ -59,7 +60,8 @@ def difference(a: Frame, b: Frame) -> float:
 
 def write_golden() -> Path:
     """Make what this machine renders the golden frame. Look at it before it is committed."""
-    Image.fromarray(render_golden()).save(GOLDEN_FILE, optimize=True)
+    with draft_of(GOLDEN_FILE) as draft:
+        Image.fromarray(render_golden()).save(draft, optimize=True)
     return GOLDEN_FILE
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from lerobot_memobench.doctor.findings import Finding
 from lerobot_memobench.doctor.golden import TOLERANCE
 from lerobot_memobench.doctor.probe import run_probe
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.errors import MemobenchError, unsupported_system
 from lerobot_memobench.sim.rendering import BACKENDS, gl_backend
 
 SYSTEM_PACKAGES = "apt-get install libegl1 libgl1-mesa-dri libgles2 libopengl0 libosmesa6"
@@ -21,14 +21,18 @@ SOFTWARE = ("llvmpipe", "softpipe", "swrast", "swiftshader")
 
 
 def rendering() -> Iterator[Finding]:
-    """Yield what each GL backend really does here."""
+    """Yield what each GL backend really does here; nothing where there can be none."""
+    if unsupported_system():
+        return
+    wanted = os.environ.get("MUJOCO_GL", "").lower()
     try:
         chosen = gl_backend()
     except MemobenchError as error:
         chosen = ""
-        yield Finding("GL backend", "failed", str(error), SYSTEM_PACKAGES)
+        fix = SYSTEM_PACKAGES if wanted in ("", *BACKENDS) else "unset MUJOCO_GL, or set it to egl or osmesa"
+        yield Finding("GL backend", "failed", str(error), fix)
     else:
-        origin = "MUJOCO_GL" if os.environ.get("MUJOCO_GL") else "the first whose library is installed"
+        origin = "MUJOCO_GL" if wanted else "the first whose library is installed"
         yield Finding("GL backend", "ok", f"{chosen} ({origin})")
     for backend in BACKENDS:
         yield _backend(backend, used=backend == chosen)
@@ -66,7 +70,8 @@ def golden_frame() -> Finding:
     """Compare a frame of the benchmark with the one that ships."""
     answer = run_probe("golden")
     if "error" in answer:
-        return Finding("golden frame", "failed", answer["error"], "mend the GL backend above first")
+        fix = "unset PYOPENGL_PLATFORM" if "PYOPENGL_PLATFORM" in answer["error"] else "mend what failed above first"
+        return Finding("golden frame", "failed", answer["error"], fix)
     off = answer["difference"]
     detail = f"mean difference {off:.2f} of 255 (tolerance {TOLERANCE:g})"
     if off > TOLERANCE:

@@ -42,7 +42,8 @@ def run_probe(*words: str, timeout_s: float = 180.0) -> dict[str, Any]:
 
 def gl(backend: str) -> dict[str, Any]:
     """Render a sphere with a backend; return the GL strings and whether the sphere is there."""
-    os.environ["MUJOCO_GL"] = backend
+    # MuJoCo has set PyOpenGL's platform to the backend in use where the parent imported it, and refuses any other.
+    os.environ["MUJOCO_GL"] = os.environ["PYOPENGL_PLATFORM"] = backend
     import mujoco
 
     model = mujoco.MjModel.from_xml_string(SCENE)

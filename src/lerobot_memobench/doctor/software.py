@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import platform
 import sys
 from collections.abc import Iterator
 from importlib import metadata
@@ -10,6 +11,7 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
 from lerobot_memobench.doctor.findings import Finding
+from lerobot_memobench.errors import unsupported_system
 
 DISTRIBUTION = "lerobot_policy_memobench"
 PLUGIN = "LeRobot plugin"
@@ -19,6 +21,16 @@ SHOWN = ("lerobot", "torch", "transformers", "mujoco", "robosuite", "numpy", "gy
 
 EXTRAS = ("", "dataset", "training", "evaluation", "pi", "transformers-dep", "av-dep")
 """Parts of LeRobot that are installed with this project."""
+
+
+def system() -> Finding:
+    """Compare the operating system with the one that is supported."""
+    found = f"{platform.system()} {platform.machine()}"
+    if problem := unsupported_system():
+        return Finding("system", "failed", found, problem)
+    if platform.machine() != "x86_64":
+        return Finding("system", "warning", f"{found}; tested is Linux x86_64", "expect slower or missing packages")
+    return Finding("system", "ok", found)
 
 
 def python_version() -> Finding:

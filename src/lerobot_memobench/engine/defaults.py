@@ -16,6 +16,8 @@ FIRST_SEED = 7
 """Episode i of the protocol uses seed 7 + i."""
 EPISODES = 50
 LARGEST_BATCH = 64
+FILMS = 10
+"""Episodes of each task that are filmed, as many as LeRobot renders of an environment without films of its own."""
 
 
 def with_policy(settings: LerobotSettings) -> LerobotSettings:
@@ -62,7 +64,7 @@ def _batch_is_open(settings: LerobotSettings) -> bool:
 
 
 def with_protocol(settings: LerobotSettings, n_action_steps: int | None) -> LerobotSettings:
-    """Return settings with the protocol's seed and episodes, a batch, a device, and the policy's replan interval."""
+    """Return settings with the protocol's seed and episodes, a batch, a device, the policy's replan interval, films."""
     import torch
 
     settings = settings.default("seed", FIRST_SEED).default("eval.n_episodes", EPISODES)
@@ -71,7 +73,7 @@ def with_protocol(settings: LerobotSettings, n_action_steps: int | None) -> Lero
         settings = settings.default("policy.device", "cpu")
     if n_action_steps is not None:
         settings = settings.default("env.replan_steps", n_action_steps)
-    return settings
+    return settings.default("env.films", FILMS)
 
 
 def unused_folder(settings: LerobotSettings) -> Path:

@@ -68,14 +68,14 @@ def make_demo(out: Path, evaluate: Callable[[Path], int]) -> int:
 
 
 def collect_videos(evaluation: Path, folder: Path) -> list[Path]:
-    """Move the film of each task's episode into ``folder`` under the task's name; return them."""
+    """Move the film of each task's episode into ``folder``, under its name, by which the HTML report finds it."""
     folder.mkdir(parents=True)
     found = []
     for name in TASKS:
         film = evaluation / VIDEOS / f"{name}.0.mp4"
         if not film.is_file():
             raise MemobenchError(f"the evaluation left no film of {name}; see its messages above")
-        found.append(Path(shutil.move(film, folder / f"{name}.mp4")))
+        found.append(Path(shutil.move(film, folder / film.name)))
     return found
 
 

@@ -59,7 +59,7 @@ def held(plan: EvaluationPlan) -> Iterator[None]:
         if not has_log(plan.log):
             remove_card(plan.log)
             for folder in new:
-                _remove_empty(folder)
+                remove_empty(folder)
 
 
 def _clean(folder: Path) -> None:
@@ -71,7 +71,7 @@ def _clean(folder: Path) -> None:
             draft.unlink(missing_ok=True)
 
 
-def _remove_empty(folder: Path) -> None:
+def remove_empty(folder: Path) -> None:
     """Remove a folder and those below it, as far as they hold nothing."""
     if not folder.is_dir():
         return

@@ -81,9 +81,10 @@ def _joined_settings(protocols: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _wanted(card: Mapping[str, Any]) -> list[tuple[str, int]]:
-    """Return (task, episode) of all that a card's evaluation was asked for."""
+    """Return (task, episode) of all that a card's evaluation was asked for, as far as it tells."""
     asked, policy = card["protocol"], card["policy"]
-    first = (policy.get("seed") or 0) - asked["seed_base"] if policy else 0
+    base = asked.get("seed_base")
+    first = (policy.get("seed") or 0) - base if policy and isinstance(base, int) else 0
     episodes = range(first, first + asked.get("episodes", 0))
     return [(task, episode) for task in asked.get("tasks", []) for episode in episodes]
 
@@ -121,7 +122,7 @@ def _joined_card(folders: Sequence[Path]) -> dict[str, Any] | None:
     for folder in folders:
         if not (folder / CARD_FILE).is_file():
             return None
-        mine = read_card(folder / CARD_FILE)
+        mine = read_card(folder / CARD_FILE, whole=True)
         card = mine if card is None else extended(card, mine, again=False)
     if card is not None:
         for folder in folders:
@@ -130,7 +131,7 @@ def _joined_card(folders: Sequence[Path]) -> dict[str, Any] | None:
 
 
 def _check_task_files(card: Mapping[str, Any], folder: Path) -> None:
-    for name, value in read_card(folder / CARD_FILE)["task_files"].items():
+    for name, value in read_card(folder / CARD_FILE, whole=True)["task_files"].items():
         if card["task_files"][name] != value:
             raise MemobenchError(f"the episodes of {name} in {folder} were run with other task files than the others")
 

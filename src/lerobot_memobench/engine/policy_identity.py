@@ -6,7 +6,10 @@ import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NotRequired, TypedDict
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files.reading import Count, read_json
 
 if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig
@@ -19,6 +22,22 @@ ELSEWHERE = (
     *("host", "port", "servers", "connect_timeout", "timeout", "retry"),
 )
 """Settings of a policy that say where it runs or where it goes, not what it does."""
+
+
+class TrainedOn(TypedDict, total=False):
+    """LeRobot's settings of the dataset of a training run."""
+
+    repo_id: str | None
+    revision: str | None
+    root: str | None
+    episodes: list[int] | None
+
+
+class TrainConfig(TypedDict):
+    """What is used of a checkpoint's ``train_config.json``."""
+
+    dataset: TrainedOn
+    steps: NotRequired[Count | None]
 
 
 def encoded(policy: PreTrainedConfig) -> dict[str, Any]:
@@ -49,10 +68,10 @@ def training_facts(folder: Path) -> dict[str, Any] | None:
     digest of every episode that `memobench generate` made.
     """
     try:
-        told = json.loads((folder / "train_config.json").read_text())
-        dataset = told["dataset"]
-    except (OSError, ValueError, KeyError, TypeError):
+        told = read_json(folder / "train_config.json", TrainConfig, "it is ignored")
+    except (FileNotFoundError, MemobenchError):
         return None
+    dataset = told["dataset"]
     found = {key: dataset.get(key) for key in ("repo_id", "revision", "root", "episodes")}
     found["steps"] = told.get("steps")
     root = Path(str(found["root"])) if found["root"] else None

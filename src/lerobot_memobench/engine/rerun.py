@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from lerobot_memobench.engine.card_flags import allowed_flags
 from lerobot_memobench.engine.machine import gl_facts, versions
 from lerobot_memobench.engine.plan import EvaluationPlan
 from lerobot_memobench.engine.planning import plan_line
@@ -17,17 +18,20 @@ from lerobot_memobench.policies.checkpoint import local_folder
 from lerobot_memobench.settings.flags import flag_value
 
 
-def repeatable_card(path: Path) -> dict[str, Any]:
-    """Return the card of an evaluation that has ended, from its file or its folder.
+def repeatable_card(path: Path, server: str | None = None) -> dict[str, Any]:
+    """Return the card of an evaluation that has ended, from its file or its folder, with flags that may be repeated.
+
+    Args:
+        server: where the policy's server is here (``host:port``, or several with commas); as on the card when None.
 
     Raises:
-        MemobenchError: there is none, or it holds nothing to compare with.
+        MemobenchError: there is none, it holds nothing to compare with, or what no card may ask for (`card_flags`).
     """
     path = path / CARD_FILE if path.is_dir() else path
-    card = read_card(path)
+    card = read_card(path, whole=True)
     if not card["episodes"]:
         raise MemobenchError(f"{path} holds no episodes to compare with; expected that of an evaluation that has ended")
-    return card
+    return {**card, "flags": allowed_flags(card.get("flags"), server)}
 
 
 def plan_of_card(card: Mapping[str, Any], out: Path | None = None) -> EvaluationPlan:
@@ -41,14 +45,13 @@ def check_policy(card: Mapping[str, Any]) -> None:
     """Refuse to repeat an evaluation with another policy.
 
     Raises:
-        MemobenchError: the checkpoint is not here, or is another one.
+        MemobenchError: the checkpoint is another one, or nobody knows which it was.
     """
-    if not card["checkpoint"]:
+    given = flag_value(card["flags"], "policy.path")
+    if given is None:
         return
-    given = flag_value(card["flags"], "policy.path") or card["checkpoint"]["path"]
     folder = local_folder(given)
-    if folder is None:
-        raise MemobenchError(f"the checkpoint {given} is not here; put it there to repeat the evaluation")
+    assert folder is not None  # `repeatable_card` has found it
     found, told = tree_hash(checkpoint_files(folder)), card["policy"].get("sha256")
     if found != told:
         raise MemobenchError(

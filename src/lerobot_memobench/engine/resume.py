@@ -25,7 +25,11 @@ Ranges = Mapping[tuple[str, int], list[Range]]
 def earlier_batch_size(log: Path) -> int | None:
     """Return the batch size of the evaluation in a folder, None where there is none or nobody knows."""
     path = log / CARD_FILE
-    return int(read_card(path)["runs"][-1]["batch_size"]) if path.is_file() else None
+    if not path.is_file():
+        return None
+    starts = read_card(path).get("runs") or [{}]
+    size = starts[-1].get("batch_size")
+    return None if size is None else int(size)
 
 
 def resumed_card(folder: Path, card: dict[str, Any], tell: Tell) -> dict[str, Any]:
@@ -49,7 +53,7 @@ def resumed_card(folder: Path, card: dict[str, Any], tell: Tell) -> dict[str, An
     if not path.is_file():
         tell(f"note: {folder} has no {CARD_FILE}: whether its episodes are this policy's cannot be checked")
         return card
-    earlier = read_card(path)
+    earlier = read_card(path, whole=True)
     edited = [name for name, value in card["task_files"].items() if earlier["task_files"].get(name, value) != value]
     if edited:
         raise MemobenchError(f"the files of {edited[0]} are not those that the episodes in {folder} were run with")

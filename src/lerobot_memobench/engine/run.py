@@ -6,14 +6,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from lerobot_memobench.engine.card import with_episodes, write_card
-from lerobot_memobench.engine.folder import check_new, held
+from lerobot_memobench.engine.folder import check_new, held, remove_empty
 from lerobot_memobench.engine.lerobot_command import call_lerobot
-from lerobot_memobench.engine.lerobot_loop import calm_output, steered
+from lerobot_memobench.engine.loop.steering import calm_output, steered
 from lerobot_memobench.engine.plan import EvaluationPlan
 from lerobot_memobench.engine.plan_card import card_of, with_checkpoint
 from lerobot_memobench.engine.reporting import EvaluationReport, report_on
 from lerobot_memobench.engine.resume import Ranges, Tell, missing, remainder, resumed_card
 from lerobot_memobench.envs.episode_log import has_log, read_episodes
+from lerobot_memobench.envs.protocol import read_protocol_file
 from lerobot_memobench.evaluation.records.protocol import POLICY, read_protocol
 
 
@@ -54,14 +55,18 @@ def run_evaluation(plan: EvaluationPlan, tell: Tell) -> Ended:
 def _run_lerobot(plan: EvaluationPlan, card: dict[str, Any], ranges: Ranges | None, tell: Tell) -> Ended:
     """Run LeRobot's evaluation on what is left, in the folder that is held meanwhile."""
     calm_output()
-    status = 1
+    status, left = 1, None
     try:
         with held(plan), steered(plan.seed, ranges):
             if card["protocol"]:
                 write_card(plan.log, card)
-            status = call_lerobot("eval", remainder(plan, ranges).lerobot_flags)
+            left = remainder(plan, ranges)
+            left.output.mkdir(parents=True, exist_ok=True)  # LeRobot makes it for films of its own only
+            status = call_lerobot("eval", left.lerobot_flags)
             return Ended(status, None if status else _finish(plan, card))
     finally:
+        if left is not None:
+            remove_empty(left.output)
         if status and has_log(plan.log):
             tell(
                 f"the episodes that ended are in {plan.log}; `memobench report {plan.log}` reports them, the same "
@@ -72,6 +77,7 @@ def _run_lerobot(plan: EvaluationPlan, card: dict[str, Any], ranges: Ranges | No
 def _finish(plan: EvaluationPlan, card: dict[str, Any]) -> EvaluationReport:
     """Write the report of the log, and what was found onto the card."""
     protocol = card["protocol"] or {k: v for k, v in read_protocol(plan.log).items() if k != POLICY}
+    protocol = {**protocol, **read_protocol_file(plan.log)}  # what `auto` came to in LeRobot's process
     # LeRobot runs whole batches: episodes beyond those asked for are no part of the report.
     limit = None if plan.grid is None else plan.grid.first + max(plan.grid.runs, protocol["episodes"])
     report = report_on(plan.log, limit)

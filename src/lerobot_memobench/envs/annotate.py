@@ -13,6 +13,8 @@ from lerobot_memobench.envs.observations import PROMPT
 
 BAND = 64
 """Height of the text over the pictures, pixels."""
+CLOCK = 96
+"""Width that is left to the clock, pixels."""
 _BACKGROUND, _TEXT, _FAINT = (24, 26, 30), (240, 240, 240), (150, 155, 165)
 OPERATION_COLOURS = {"S": (86, 180, 233), "U": (230, 159, 0), "C": (0, 158, 115)}
 """Storage, Update, Compression: Okabe and Ito's palette, apart for the colour-blind too."""
@@ -37,23 +39,49 @@ def _fit(draw: ImageDraw.ImageDraw, text: str, size: int, width: int) -> tuple[s
 
 
 def annotate(images: dict[str, NDArray[np.uint8]], episode: Episode) -> NDArray[np.uint8]:
-    """Return a frame (BAND + height, 2 · width, 3) uint8 of the present step."""
-    pictures = np.hstack(list(images.values()))
-    width = pictures.shape[1]
+    """Return a frame (BAND + height, 2 · width, 3) uint8 of the present step.
+
+    What does not change is not drawn again: the band is until a checkpoint is done, a clock once per number.
+    """
+    pictures = list(images.values())
+    height, width = pictures[0].shape[0], sum(picture.shape[1] for picture in pictures)
+    frame = np.empty((BAND + height, width, 3), np.uint8)
+    prompt = episode.phase == PROMPT
+    operations = tuple(checkpoint.operation for checkpoint in episode.task.checkpoints)
+    done = 0 if prompt else episode.progress.index
+    frame[:BAND] = _band(width, episode.task.language, operations, done, _now(episode), prompt)
+    clock = _clock(f"prompt {episode.step_index}" if prompt else f"step {episode.exec_steps}", prompt)
+    frame[: len(clock), width - clock.shape[1] :] = clock
+    np.concatenate(pictures, axis=1, out=frame[BAND:])
+    return frame
+
+
+@lru_cache(maxsize=64)
+def _band(
+    width: int, language: str, operations: tuple[str, ...], done: int, now: str, prompt: bool
+) -> NDArray[np.uint8]:
+    """All of the text but the clock, (BAND, width, 3)."""
     band = Image.new("RGB", (width, BAND), _BACKGROUND)
     draw = ImageDraw.Draw(band)
-    prompt = episode.phase == PROMPT
-    text, font = _fit(draw, episode.task.language, 14, width - 96)
+    text, font = _fit(draw, language, 14, width - CLOCK)
     draw.text((8, 5), text, fill=_TEXT, font=font)
-    clock = f"prompt {episode.step_index}" if prompt else f"step {episode.exec_steps}"
-    draw.text((width - 8, 5), clock, fill=_PROMPT_COLOUR if prompt else _FAINT, font=_font(13), anchor="ra")
     x = 8
-    for index, checkpoint in enumerate(episode.task.checkpoints):
-        _draw_checkpoint(draw, x, checkpoint.operation, done=index < episode.progress.index and not prompt)
+    for index, operation in enumerate(operations):
+        _draw_checkpoint(draw, x, operation, done=index < done)
         x += 26
-    text, font = _fit(draw, _now(episode), 14, width - x - 14)
+    text, font = _fit(draw, now, 14, width - x - 14)
     draw.text((x + 6, 44), text, fill=_PROMPT_COLOUR if prompt else _TEXT, font=font, anchor="lm")
-    return np.vstack([np.asarray(band), pictures])
+    return np.asarray(band)
+
+
+@lru_cache(maxsize=4096)
+def _clock(clock: str, prompt: bool) -> NDArray[np.uint8]:
+    """The upper right corner, (height, width, 3): only as wide as the clock is, so that it covers nothing."""
+    corner = Image.new("RGB", (CLOCK, BAND // 2), _BACKGROUND)
+    draw = ImageDraw.Draw(corner)
+    draw.text((CLOCK - 8, 5), clock, fill=_PROMPT_COLOUR if prompt else _FAINT, font=_font(13), anchor="ra")
+    left, _, _, bottom = draw.textbbox((CLOCK - 8, 5), clock, font=_font(13), anchor="ra")
+    return np.asarray(corner)[: int(bottom), int(left) :].copy()
 
 
 def _draw_checkpoint(draw: ImageDraw.ImageDraw, x: int, operation: str, *, done: bool) -> None:

@@ -18,6 +18,7 @@ from lerobot.configs import PolicyFeature
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_memobench.envs.observations import METADATA, action_space, observation_space, policy_features, policy_names
+from lerobot_memobench.envs.prompting import AUTO, PLACES, policy_being_run, prompt_in
 from lerobot_memobench.envs.protocol import SEED_BASE, SETTINGS, check_protocol
 from lerobot_memobench.errors import MemobenchError, nearest
 
@@ -33,16 +34,21 @@ class MemobenchEnvConfig(EnvConfig):
         task_dir: a folder in the published format to run instead of the catalogue (one task, or a tree of them).
         referent: `fixed`, the published goals, or `random`: by seed another admissible referent or order.
         prompt_video: whether object and procedural tasks begin with their prompt video.
+        prompt_in: `steps`, the policy sees the prompt step by step, with `phase` 0; `reset`, it plays before the first
+            observation; `auto`: in steps for a policy that knows phases, in reset for any other (`envs.prompting`).
         horizon: execution steps per episode.
         render: `fast` (no shadows), `default`, or `high` (four samples per pixel, finer shadows).
         render_every: draw images every so many execution steps and repeat the last in between. Set it to the number
-            of actions a policy executes per prediction: it looks at nothing else.
+            of actions a policy executes per prediction: it looks at nothing else. A policy that remembers the frames
+            in between refuses it; `observation.picture_step` tells such a one which step it is shown.
         replan_steps: that number, noted in the episode log.
         expert_action: offer the scripted expert's action as `observation.expert_action`.
         oracle_memory: write what has been completed so far behind the instruction (the paper's oracle memory control),
             word for word as the column `memory` of a dataset says it for the same frame.
         log_dir: where the episode log goes; LeRobot's output folder when left out.
-        videos: film every episode into `<log_dir>/videos/<task>.<episode>.mp4`, annotated as `render()` is.
+        films: film so many episodes of each task, from episode 0 on, into `<log_dir>/videos/<task>.<episode>.mp4`,
+            annotated as `render()` is; none when left out.
+        videos: film every episode, whatever `films` says.
         seed_base: the seed that counts as episode 0.
         resume: leave out the episodes that the log in `log_dir` holds already.
     """
@@ -53,6 +59,7 @@ class MemobenchEnvConfig(EnvConfig):
     fps: int = 20
     referent: str = "fixed"
     prompt_video: bool = True
+    prompt_in: str = AUTO
     horizon: int = 1200
     render: str = "default"
     render_every: int = 1
@@ -60,6 +67,7 @@ class MemobenchEnvConfig(EnvConfig):
     expert_action: bool = False
     oracle_memory: bool = False
     log_dir: str | None = None
+    films: int | None = None
     videos: bool = False
     seed_base: int = SEED_BASE
     resume: bool = False
@@ -71,6 +79,7 @@ class MemobenchEnvConfig(EnvConfig):
             raise MemobenchError(f"fps is {self.fps}; the benchmark's control rate is 20, leave it out")
         for name, value, known in (
             ("referent", self.referent, ("fixed", "random")),
+            ("prompt_in", self.prompt_in, PLACES),
             ("render", self.render, ("fast", "default", "high")),
         ):
             if value not in known:
@@ -78,6 +87,8 @@ class MemobenchEnvConfig(EnvConfig):
         for name, number in (("horizon", self.horizon), ("render_every", self.render_every)):
             if number < 1:
                 raise MemobenchError(f"env.{name} is {number}; expected a whole number from 1 on")
+        if self.films is not None and self.films < 0:
+            raise MemobenchError(f"env.films is {self.films}; expected a whole number of episodes from 0 on")
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
@@ -85,20 +96,22 @@ class MemobenchEnvConfig(EnvConfig):
         return {
             "referent": self.referent,
             "prompt_video": self.prompt_video,
+            "prompt_in": self.resolved_prompt_in(),
             "horizon": self.horizon,
             "render": self.render,
             "render_every": self.render_every,
             "replan_steps": self.replan_steps,
             "expert_action": self.expert_action,
             "oracle_memory": self.oracle_memory,
+            "films": self.films,
             "videos": self.videos,
             "seed_base": self.seed_base,
         }
 
     @property
     def protocol(self) -> dict[str, Any]:
-        """What must agree for two evaluations to be one, or to be compared."""
-        return {name: getattr(self, name) for name in SETTINGS}
+        """What must agree for two evaluations to be one, or to be compared; without what is still `auto`."""
+        return {name: getattr(self, name) for name in SETTINGS if getattr(self, name) != AUTO}
 
     def selected(self) -> list[tuple[str, int, Path]]:
         """Return memory type, task id and folder of each chosen task; unknown names raise `MemobenchError`."""
@@ -124,11 +137,13 @@ class MemobenchEnvConfig(EnvConfig):
             # LeRobot's workers are forked from a server: it imports torch and the simulator once for all of them.
             get_context("forkserver").set_forkserver_preload([MemobenchEnv.__module__])
         log_dir = self.resolved_log_dir()
-        check_protocol(log_dir, self.protocol)  # now, not when the first episode has been simulated
+        settings = self.gym_kwargs
+        protocol = {**self.protocol, "prompt_in": settings["prompt_in"]}
+        check_protocol(log_dir, protocol)  # now, not when the first episode has been simulated
         suites: dict[str, dict[int, gym.vector.VectorEnv]] = {}
         for memory_type, task_id, folder in chosen:
             make: Callable[[], gym.Env[Any, Any]]
-            make = partial(MemobenchEnv, str(folder), log_dir=str(log_dir), **self.gym_kwargs)
+            make = partial(MemobenchEnv, str(folder), log_dir=str(log_dir), **settings)
             if self.resume:
                 make = skip_logged(make, log_dir, self.referent, self.seed_base)
             suites.setdefault(memory_type, {})[task_id] = self._vector([make] * n_envs, use_async_envs)
@@ -139,11 +154,17 @@ class MemobenchEnvConfig(EnvConfig):
 
         if use_async_envs:
             # What a vector environment must know before its workers exist.
-            return _LazyAsyncVectorEnv(make, observation_space(self.expert_action), action_space(), METADATA)
+            return _LazyAsyncVectorEnv(
+                make, observation_space(self.expert_action, self.render_every), action_space(), METADATA
+            )
         # LeRobot freezes finished rows of its own async envs only; a sync row would be reset and go on.
         return gym.vector.SyncVectorEnv(
             [freeze_after_episode_end(one) for one in make], autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP
         )
+
+    def resolved_prompt_in(self) -> str:
+        """Return where the prompt plays: as given, else as suits the policy on LeRobot's command line."""
+        return prompt_in(policy_being_run()) if self.prompt_in == AUTO else self.prompt_in
 
     def resolved_log_dir(self) -> Path:
         """Return the folder of the episode log: given, else the run's output folder, else a dated one."""

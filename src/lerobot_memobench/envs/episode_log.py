@@ -12,11 +12,12 @@ import os
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NotRequired, TypedDict
 
 from lerobot_memobench.envs.protocol import write_protocol
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.files import file_name, write_file
+from lerobot_memobench.files.reading import Count, Malformed, Name, Number, Whole, checked, parsed
 
 logger = logging.getLogger(__name__)
 
@@ -27,8 +28,39 @@ MERGED_FILE = "episodes.jsonl"
 #: is newer.
 WRITTEN_AT = "written_at"
 
-#: What a line must hold to count as a rollout.
-REQUIRED = ("task", "memory_type", "episode", "success", "checkpoints")
+
+class CheckpointRecord(TypedDict):
+    """A checkpoint of a rollout: the execution steps, counted from 1, at which it held first, and first in order."""
+
+    operation: Literal["S", "U", "C"]
+    first_step: Count | None
+    ordered_step: NotRequired[Count | None]
+
+
+class Outcome(TypedDict, total=False):
+    """What a log and a card may both say of an episode; logs of other tools leave parts of it out."""
+
+    seed: Whole | None
+    referent: Name
+    variant: Count | None
+    replan_steps: Count | None
+    prompt_steps: Count | None
+    steps: Count | None
+    failure: Name | None
+    scene_hash: Name | None
+
+
+class EpisodeRecord(Outcome):
+    """What a line must hold to count as a rollout (see `episode_record`)."""
+
+    task: Name
+    memory_type: Name
+    episode: Whole
+    success: bool
+    checkpoints: list[CheckpointRecord]
+    prompt_shown: NotRequired[bool | None]
+    wall_s: NotRequired[Number | None]
+    written_at: NotRequired[Number]
 
 
 class EpisodeLog:
@@ -139,38 +171,20 @@ def write_episodes(directory: str | Path, records: list[dict[str, Any]]) -> Path
 
 
 def _read_lines(file: Path, problems: list[str]) -> Iterator[dict[str, Any]]:
-    for number, line in enumerate(file.read_bytes().split(b"\n"), start=1):
+    try:
+        content = file.read_bytes()
+    except OSError as error:
+        problems.append(f"{file} cannot be read ({error.strerror or error}); left out")
+        return
+    for number, line in enumerate(content.split(b"\n"), start=1):
         if not line.strip():
             continue
         try:
-            record = json.loads(line)
-        except ValueError:  # also for bytes that are no UTF-8
+            record = parsed(line)
+        except Malformed:
             problems.append(f"{file}, line {number}: not a whole JSON line (was the run killed?); left out")
             continue
-        problem = _problem(record)
-        if problem:
-            problems.append(f"{file}, line {number}: {problem}; left out")
-        else:
-            yield record
-
-
-def _problem(record: Any) -> str | None:
-    """Return what keeps a parsed line from being a rollout."""
-    if not isinstance(record, dict):
-        return f"found {type(record).__name__}, expected an object"
-    missing = [key for key in REQUIRED if key not in record]
-    if missing:
-        return f"found no {', '.join(missing)}"
-    if not isinstance(record["task"], str) or not isinstance(record["memory_type"], str):
-        return "task and memory_type must be text"
-    if not isinstance(record["episode"], int):
-        return f"found the episode {record['episode']!r}, expected an integer"
-    if not isinstance(record["success"], bool):
-        return f"found success {record['success']!r}, expected true or false"
-    checkpoints = record["checkpoints"]
-    if not isinstance(checkpoints, list) or not all(
-        isinstance(item, dict) and item.get("operation") in ("S", "U", "C") and "first_step" in item
-        for item in checkpoints
-    ):
-        return "expected checkpoints to be a list of {operation, first_step, ordered_step}"
-    return None
+        try:
+            yield checked(record, EpisodeRecord)
+        except Malformed as error:
+            problems.append(f"{file}, line {number}: {error}; left out")

@@ -43,20 +43,29 @@ class Film:
         if self._container is None:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._container = av.open(str(self._writing.enter_context(draft_of(self._path))), "w", format="mp4")
-            # Ultrafast costs a tenth of a rendered frame; crf 20 keeps small text readable.
-            options = {"preset": "ultrafast", "crf": "20"}
+            # Ultrafast costs a tenth of a rendered frame, and more threads only add to it; crf 20 keeps small text
+            # readable.
+            options = {"preset": "ultrafast", "crf": "20", "threads": "1"}
             self._stream = self._container.add_stream("libx264", rate=self._fps, options=options)
-            self._stream.height, self._stream.width = frame.shape[:2]
+            self._stream.height, self._stream.width = height, width = frame.shape[:2]
             self._stream.pix_fmt = "yuv420p"
-        self._last = frame
-        self._container.mux(self._stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+            self._picture = av.VideoFrame(width, height, "rgb24")
+            plane = self._picture.planes[0]  # its lines may be longer than the picture is wide
+            lines = np.frombuffer(plane, np.uint8).reshape(height, plane.line_size)
+            self._pixels = lines[:, : 3 * width].reshape(height, width, 3, copy=False)
+        self._pixels[:] = frame
+        self._encode()
+
+    def _encode(self) -> None:
+        """Append what is in the buffer; the encoder copies it, converted."""
+        self._container.mux(self._stream.encode(self._picture))
 
     def finish(self) -> Path | None:
         """Hold the last frame, close the file and give it its name; None when nothing was filmed."""
         if self._container is None:
             return None
         for _ in range(LAST_FRAMES):
-            self.add(self._last)
+            self._encode()
         self._container.mux(self._stream.encode())
         self._container.close()
         self._container = None

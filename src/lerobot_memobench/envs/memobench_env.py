@@ -15,7 +15,15 @@ from lerobot_memobench.envs.episode import HORIZON, PROMPT_LIMIT, Episode
 from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.envs.episode_record import episode_record
 from lerobot_memobench.envs.film import Film
-from lerobot_memobench.envs.observations import IMAGE_SIZE, METADATA, PROMPT, action_space, observation_space
+from lerobot_memobench.envs.observations import (
+    ACTION_DIM,
+    IMAGE_SIZE,
+    METADATA,
+    PROMPT,
+    action_space,
+    observation_space,
+)
+from lerobot_memobench.envs.prompting import RESET, STEPS
 from lerobot_memobench.envs.protocol import SEED_BASE
 from lerobot_memobench.files import file_name
 from lerobot_memobench.sim.rendering import RenderSettings
@@ -48,12 +56,14 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         log_dir: str | None = None,
         referent: str = "fixed",
         prompt_video: bool = True,
+        prompt_in: str = STEPS,
         horizon: int = HORIZON,
         render: str = "default",
         render_every: int = 1,
         replan_steps: int | None = None,
         expert_action: bool = False,
         oracle_memory: bool = False,
+        films: int | None = None,
         videos: bool = False,
         seed_base: int = SEED_BASE,
     ) -> None:
@@ -65,12 +75,13 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._episode: Episode | None = None
         self._oracle_memory = oracle_memory
         self._describe(0)
-        self.observation_space = observation_space(expert_action)
+        self.observation_space = observation_space(expert_action, render_every)
         self.action_space = action_space()
         protocol = {
             "seed_base": seed_base,
             "referent": referent,
             "prompt_video": prompt_video,
+            "prompt_in": prompt_in,
             "horizon": horizon,
             "replan_steps": replan_steps,
             "render": render,
@@ -78,14 +89,18 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             "oracle_memory": oracle_memory,
         }
         self._log = EpisodeLog(log_dir, protocol) if log_dir is not None else None
-        self._videos = Path(log_dir) / "videos" if log_dir is not None and videos else None
+        self._videos = Path(log_dir) / "videos" if log_dir is not None else None
+        self._filmed = range(films or 0)
+        self._films_all = videos
         self._film: Film | None = None
+        self._watched = True
         self._settings: dict[str, Any] = {
             "referent": referent,
             "prompt_video": prompt_video,
             "horizon": horizon,
             "render": RenderSettings(IMAGE_SIZE, IMAGE_SIZE, render),
         }
+        self._prompt_in = prompt_in
         self._render_every, self._replan_steps = render_every, replan_steps
         self._expert_action, self._seed_base = expert_action, seed_base
         self._next_seed = seed_base
@@ -99,27 +114,42 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     @property
     def _max_episode_steps(self) -> int:
-        """Upper bound for LeRobot's loop: prompt and execution. The horizon itself counts execution steps."""
-        prompt = self._settings["prompt_video"] and self._task.prompt is not None
+        """Upper bound for LeRobot's loop: what it steps through. The horizon itself counts execution steps."""
+        prompt = self._settings["prompt_video"] and self._task.prompt is not None and self._prompt_in == STEPS
         return int(self._settings["horizon"]) + (PROMPT_LIMIT if prompt else 0)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start the episode of a seed; without one, of the seed after the last."""
+        """Start the episode of a seed; without one, of the seed after the last.
+
+        With the prompt played in here (`prompt_in`), the first observation is that of the first execution frame.
+        """
         super().reset(seed=seed)
         seed = self._next_seed if seed is None else int(seed)
         self._next_seed = seed + 1
         self._started = time.monotonic()
-        self._over = False
+        self._over, self._watched = False, True
         self.episode.reset(seed)
         self._describe(0)
-        self._images = self.episode.images()
+        self._draw()
         self._discard_film()
-        if self._videos is not None:
-            self._film = Film(self._videos / f"{self.task}.{seed - self._seed_base}.mp4", METADATA["render_fps"])
+        number = seed - self._seed_base
+        if self._videos is not None and (self._films_all or number in self._filmed):
+            self._film = Film(self._videos / f"{self.task}.{number}.mp4", METADATA["render_fps"])
             self._film.add(self.render())
+        if self._prompt_in == RESET and self.episode.phase == PROMPT:
+            self._play_prompt()
         return self._observation(), self._info()
+
+    def _play_prompt(self) -> None:
+        """Let the prompt run to its end, where the scene is restored; only a film watches it."""
+        while self.episode.phase == PROMPT:
+            self.episode.step(np.zeros(ACTION_DIM, np.float32))
+            if self._film is not None or self.episode.phase != PROMPT:
+                self._draw()
+            if self._film is not None:
+                self._film.add(self.render())
 
     def step(self, action: NDArray[np.float32]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Advance by one control step of 50 ms. The reward is 1 at success, else 0."""
@@ -128,14 +158,34 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         completed = episode.progress.index
         episode.step(np.asarray(action, dtype=np.float32))
         self._describe(completed)
-        if episode.phase == PROMPT or episode.exec_steps % self._render_every == 0 or episode.done:
-            self._images = episode.images()
+        if self._is_seen():
+            self._draw()
         if self._film is not None:
             self._film.add(self.render())
         if episode.done and not self._over:
             self._end()
         success = episode.success
         return self._observation(), float(success), success, episode.done and not success, self._info()
+
+    def _draw(self) -> None:
+        self._images, self._picture_step = self.episode.images(), self.episode.step_index
+
+    def watch(self, watched: bool) -> None:
+        """Say whether somebody looks at the frames that follow, until the next reset or another word.
+
+        A frame that nobody looks at is not drawn: its observation holds the pictures drawn last. The first and the last
+        frame of the execution always are.
+        """
+        self._watched = watched
+
+    def _is_seen(self) -> bool:
+        """Whether the present frame is drawn."""
+        episode = self.episode
+        if episode.done or episode.step_index == episode.exec_start:
+            return True
+        if not self._watched and self._film is None:
+            return False
+        return episode.phase == PROMPT or episode.exec_steps % self._render_every == 0
 
     def _end(self) -> None:
         """Close the books of an episode that has just ended."""
@@ -174,6 +224,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             "phase": np.array([episode.phase], dtype=np.float32),
             "step": np.array([episode.step_index], dtype=np.float32),
         }
+        if self._render_every > 1:
+            observation["picture_step"] = np.array([self._picture_step], dtype=np.float32)
         if self._expert_action:
             observation["expert_action"] = episode.expert_action()
         return observation

@@ -45,8 +45,11 @@ def policy_names() -> dict[str, str]:
     }
 
 
-def observation_space(expert_action: bool) -> spaces.Dict:
-    """Return the space of observations, with the scripted expert's action on request."""
+def observation_space(expert_action: bool, render_every: int = 1) -> spaces.Dict:
+    """Return the space of observations, with the scripted expert's action on request.
+
+    Where not every step is drawn, ``picture_step`` tells which step the pictures show.
+    """
     image = spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
     parts: dict[str, spaces.Space[Any]] = {
         "pixels": spaces.Dict(dict.fromkeys(IMAGE_KEYS, image)),
@@ -56,6 +59,8 @@ def observation_space(expert_action: bool) -> spaces.Dict:
         "phase": spaces.Box(PROMPT, EXECUTION, (1,), np.float32),
         "step": spaces.Box(0, np.inf, (1,), np.float32),
     }
+    if render_every > 1:
+        parts["picture_step"] = spaces.Box(0, np.inf, (1,), np.float32)
     if expert_action:
         parts["expert_action"] = action_space()
     return spaces.Dict(parts)

@@ -9,10 +9,13 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypedDict
+
+from annotated_types import Ge, Le
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.files import write_file
+from lerobot_memobench.files.reading import Count, Name, Whole, read_json
 
 PROTOCOL_FILE = "protocol.json"
 
@@ -23,6 +26,7 @@ SETTINGS = (
     "seed_base",
     "referent",
     "prompt_video",
+    "prompt_in",
     "horizon",
     "replan_steps",
     "render",
@@ -31,10 +35,32 @@ SETTINGS = (
 )
 """What must agree for two evaluations to be one, or to be compared."""
 
+OF_THE_POLICY = ("prompt_in",)
+"""Those of them that follow from what a policy can take in: evaluations of two policies may differ in them, which is
+told, the parts of one may not."""
+
 EXTENT = ("tasks", "episodes")
 """How much was run: it may differ, the episodes in common still compare."""
 
 POLICY = "policy"
+
+MOST_EPISODES = 100_000
+"""Of one task. Every episode that was asked for and is missing is counted, so a file must not ask for any number."""
+
+
+class Protocol(TypedDict, total=False):
+    """What ``protocol.json`` and a card may say; a setting in which joined episodes differ is a list of its values."""
+
+    tasks: list[Name]
+    episodes: Annotated[int, Ge(0), Le(MOST_EPISODES)]
+    seed_base: Whole | list[Whole]
+    referent: Name | list[Name]
+    prompt_video: bool | None
+    horizon: Count | None
+    replan_steps: Count | list[Count | None] | None
+    render: Name | None
+    render_every: Count | None
+    oracle_memory: bool | None
 
 
 def differences(
@@ -86,15 +112,12 @@ def read_protocol_file(directory: Path) -> dict[str, Any]:
     Raises:
         MemobenchError: the file is none of this package's.
     """
-    path = directory / PROTOCOL_FILE
     try:
-        found = json.loads(path.read_text())
+        found: dict[str, Any] = read_json(
+            directory / PROTOCOL_FILE, Protocol, "remove the file, or evaluate into another folder"
+        )
     except FileNotFoundError:
         return {}
-    except ValueError as error:
-        raise MemobenchError(f"{path} is not JSON ({error}); remove it or evaluate into another folder") from None
-    if not isinstance(found, dict):
-        raise MemobenchError(f"{path} holds no JSON object; remove it or evaluate into another folder")
     return found
 
 

@@ -1,44 +1,49 @@
-"""One run at a time in a folder, or one after another at a file."""
+"""One run at a time in a folder, or one after another at a file.
+
+The locks are the kernel's: they end with the process, however it ends, and are never taken for ones left behind.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from lerobot_memobench.errors import MemobenchError
+from filelock import lock_descriptor
+
+from lerobot_memobench.errors import MemobenchError, unsupported_system
 
 
 @contextlib.contextmanager
 def locked(staging: Path, out: Path) -> Iterator[None]:
     """Let one run at a time write to ``out``.
 
-    The lock is the kernel's, is held on the folder ``staging`` itself, leaves nothing behind and ends with the process.
+    The lock is held on the folder ``staging`` itself and leaves nothing behind.
 
     Raises:
-        MemobenchError: another run holds it.
+        MemobenchError: another run holds it, or the system is Windows, which locks no folders.
     """
-    import fcntl
-
+    if sys.platform == "win32":
+        raise MemobenchError(unsupported_system())
     descriptor = os.open(staging, os.O_RDONLY)
     try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise MemobenchError(
-                f"another run is writing to {out}; wait for it to end or name another folder"
-            ) from None
+        if not lock_descriptor(descriptor, blocking=False):
+            raise MemobenchError(f"another run is writing to {out}; wait for it to end or name another folder")
         yield
     finally:
         os.close(descriptor)
 
 
 @contextlib.contextmanager
-def taking_turns(path: Path) -> Iterator[None]:
-    """Hold a lock file; whoever comes next, on this machine, waits. A kill releases it."""
-    import fcntl
+def taking_turns(path: Path, wait: Callable[[], None] = lambda: None) -> Iterator[None]:
+    """Hold a lock file, which stays; whoever comes next, on this machine, calls ``wait``, then waits.
 
+    A kill releases it.
+    """
     with path.open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+        if not lock_descriptor(file.fileno(), blocking=False):
+            wait()
+            lock_descriptor(file.fileno())
         yield

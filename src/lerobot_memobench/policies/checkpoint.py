@@ -2,18 +2,47 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files import file_name
+from lerobot_memobench.files.reading import read_json as read_json_file
 
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
 ADAPTER_FILE = "adapter_model.safetensors"
 PREPROCESSOR_FILE = "policy_preprocessor.json"
 POSTPROCESSOR_FILE = "policy_postprocessor.json"
+ADVICE = "copy or train the checkpoint again"
+
+
+class Feature(TypedDict, total=False):
+    """A column that is normalised."""
+
+    type: str
+
+
+class StepConfig(TypedDict, total=False):
+    """What is used of a normalising step's settings."""
+
+    norm_map: dict[str, str]
+    features: dict[str, Feature]
+
+
+class Step(TypedDict, total=False):
+    """A step of a processor, as LeRobot saves it."""
+
+    registry_name: str
+    state_file: str | None
+    config: StepConfig
+
+
+class Processor(TypedDict, total=False):
+    """A processor's file."""
+
+    steps: list[Step]
 
 
 def looks_local(text: str) -> bool:
@@ -54,18 +83,14 @@ def checkpoint_type(path: str) -> str | None:
     return name
 
 
-def read_json(path: Path) -> dict[str, Any]:
+def read_json(path: Path, schema: Any = dict[str, Any]) -> dict[str, Any]:
     """Return the object in a JSON file, or tell what is wrong with it."""
     try:
-        content = json.loads(path.read_text())
-    except OSError:
+        content: dict[str, Any] = read_json_file(path, schema, ADVICE)
+    except FileNotFoundError:
         raise MemobenchError(
             f"{path} is missing; expected a whole checkpoint folder as lerobot-train saves it"
         ) from None
-    except ValueError as error:
-        raise MemobenchError(f"{path} is not JSON ({error}); copy or train the checkpoint again") from None
-    if not isinstance(content, dict):
-        raise MemobenchError(f"{path} holds no JSON object; copy or train the checkpoint again")
     return content
 
 
@@ -87,8 +112,8 @@ def check_checkpoint(path: str) -> None:
     if not any((folder / name).is_file() for name in (WEIGHTS_FILE, ADAPTER_FILE)):
         raise MemobenchError(f"the checkpoint {folder} holds no weights ({WEIGHTS_FILE}); copy or train it again")
     for name in (PREPROCESSOR_FILE, POSTPROCESSOR_FILE):
-        for step in read_json(folder / name).get("steps", []):
-            if isinstance(step, Mapping) and str(step.get("registry_name", "")).endswith("normalizer_processor"):
+        for step in read_json(folder / name, Processor).get("steps", []):
+            if str(step.get("registry_name", "")).endswith("normalizer_processor"):
                 _check_statistics(folder, name, step)
 
 
@@ -104,7 +129,7 @@ def _check_statistics(folder: Path, file: str, step: Mapping[str, Any]) -> None:
     state_file = step.get("state_file")
     present: set[str] = set()
     if isinstance(state_file, str):
-        present = _tensor_names(folder / state_file)
+        present = _tensor_names(folder / file_name(state_file, f"state_file in {folder / file}"))
     missing = [key for key in needed if not any(name.startswith(f"{key}.") for name in present)]
     if missing:
         raise MemobenchError(
@@ -130,5 +155,5 @@ def _tensor_names(path: Path) -> set[str]:
     try:
         with safe_open(path, framework="numpy") as file:
             return set(file.keys())
-    except SafetensorError as error:
+    except (SafetensorError, OSError) as error:
         raise MemobenchError(f"{path} cannot be read ({error}); copy or train the checkpoint again") from None

@@ -32,6 +32,10 @@ class UntrainedPolicy(PreTrainedPolicy):
             "--policy.type=memobench_mem."
         )
 
+    def looks_next(self) -> bool:
+        """Whether it looks at the pictures of the next observation: one that only acts by other signals never does."""
+        return False
+
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Return one step at a time, so the chunk is (B, 1, 7)."""
         return self.select_action(batch).unsqueeze(1)

@@ -68,9 +68,16 @@ def chosen_class(config: type, key: str, flags: Sequence[str], file: Mapping[str
     name = flag_value(flags, f"{key}.type")
     section = file.get(key)
     if not path and not name and isinstance(section, Mapping):
-        path, name = section.get("path"), section.get("type")
+        path, name = (_text(key, section, word) for word in ("path", "type"))
     if path:
         name = checkpoint_type(path)
     elif name and name not in known:
         raise MemobenchError(f"there is no {key} {name!r}, {nearest(name, known)}")
     return known.get(name) if name else None
+
+
+def _text(key: str, section: Mapping[str, Any], word: str) -> str | None:
+    value = section.get(word)
+    if value is not None and not isinstance(value, str):
+        raise MemobenchError(f"the configuration file says {key}.{word}: {str(value)[:80]}; expected a name")
+    return value

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, cast
 
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import check_checkpoint
+from lerobot_memobench.policies.freshness import REFUSAL
 from lerobot_memobench.settings.lerobot_commands import quiet
 from lerobot_memobench.settings.translation import LerobotSettings
 
@@ -38,17 +40,32 @@ def env_config(settings: LerobotSettings) -> EnvConfig | None:
     return cast("EnvConfig | None", _parsed(settings, "env"))
 
 
+def check_pictures(policy: PreTrainedConfig | None, environment: EnvConfig | None) -> None:
+    """Refuse an environment that repeats pictures to a policy that remembers the frames between its plans.
+
+    Raises:
+        MemobenchError: it would remember one step's picture as another's.
+    """
+    if getattr(policy, "watches", False) and getattr(environment, "render_every", 1) > 1:
+        raise MemobenchError(f"env.render_every is {getattr(environment, 'render_every', 1)}; {REFUSAL}")
+
+
 def _is_known(settings: LerobotSettings, key: str) -> bool:
     return key in settings.chosen and not settings.has("config_path")
 
 
 def _parsed(settings: LerobotSettings, key: str) -> Any:
     import draccus
+    import yaml
 
     if not _is_known(settings, key):
         return None
-    with quiet():
-        return draccus.parse(settings.chosen[key], args=_overrides(settings, key))
+    try:
+        with quiet():
+            return draccus.parse(settings.chosen[key], args=_overrides(settings, key))
+    except yaml.YAMLError as error:  # LeRobot reads every value as YAML
+        problem = " ".join(str(error).split())
+        raise MemobenchError(f"a value of {key}. cannot be read ({problem}); put it in quotes within quotes") from None
 
 
 def _overrides(settings: LerobotSettings, key: str) -> list[str]:

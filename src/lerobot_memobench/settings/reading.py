@@ -54,8 +54,11 @@ def read_config_file(words: Words) -> dict[str, Any]:
     if not path.is_file():
         return {}  # a repository: LeRobot fetches it
     try:
-        content = yaml.safe_load(path.read_text())
-    except yaml.YAMLError as error:
+        content = yaml.safe_load(path.read_bytes())
+    except OSError as error:
+        raise MemobenchError(f"config_path={given} cannot be read ({error.strerror or error})") from None
+    except (yaml.YAMLError, ValueError, TypeError, KeyError, RecursionError, AttributeError) as error:
+        # Beside its own errors, PyYAML lets through those of dates, numbers and keys that are none.
         problem = " ".join(str(error).split())
         raise MemobenchError(f"config_path={given} is neither YAML nor JSON: {problem}") from None
     if not isinstance(content, dict):

@@ -19,7 +19,9 @@ SHORT_FORMS: dict[str, dict[str, tuple[str, ...]]] = {
         "port": ("policy.port",),
         "dialect": ("policy.dialect",),
         "prompt_video": ("env.prompt_video",),
+        "prompt_in": ("env.prompt_in",),
         "horizon": ("env.horizon",),
+        "films": ("env.films",),
         "episodes": ("eval.n_episodes",),
         "batch_size": ("eval.batch_size",),
     },
@@ -31,3 +33,6 @@ CHOOSING = ("policy", "env", "dataset")
 
 #: Words of `lerobot eval env=memobench` that say how it is run, not what (see `engine.orders`).
 EVALUATION_WORDS = ("resume", "shard", "shards", "workers", "executor", "executor_option")
+
+#: Words of `lerobot train` that are none of LeRobot's (see `settings.training`).
+TRAINING_WORDS = ("prompt_frames",)

@@ -3,16 +3,33 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 from lerobot_memobench.datasets.lerobot_format import DEFAULT_REPO_ID
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.settings.configurations import env_config, policy_config
+from lerobot_memobench.settings.configurations import check_pictures, env_config, policy_config
+from lerobot_memobench.settings.fields import checked_value
 from lerobot_memobench.settings.translation import LerobotSettings
+from lerobot_memobench.settings.words import Words
 
 INFO_FILE = Path("meta") / "info.json"
+PROMPT_FRAMES = "prompt_frames"
 TRAINED = ("policy.type", "policy.path", "reward_model.type", "reward_model.path")
 """What may say what is trained."""
+
+
+def take_prompt_frames(words: Words) -> tuple[bool | None, Words]:
+    """Return whether prompt frames are trained on, None where it is left to the policy; and the words without it.
+
+    Raises:
+        MemobenchError: it is neither true nor false.
+    """
+    given = [value for key, value in words.settings if key == PROMPT_FRAMES]
+    rest = [(key, value) for key, value in words.settings if key != PROMPT_FRAMES]
+    known = {"true": True, "false": False}
+    choice = known.get(checked_value(PROMPT_FRAMES, bool, given[-1])) if given else None
+    return choice, replace(words, settings=rest)
 
 
 def complete_training(settings: LerobotSettings) -> LerobotSettings:
@@ -27,8 +44,7 @@ def complete_training(settings: LerobotSettings) -> LerobotSettings:
             raise MemobenchError("name a policy: policy=memobench_mem")
         settings = with_places(settings)
     check_dataset(settings)
-    policy_config(settings)
-    env_config(settings)
+    check_pictures(policy_config(settings), env_config(settings))
     settings = with_logging(settings)
     cores = os.cpu_count() or 4
     if cores < 4 and not from_file:  # LeRobot's default of 4 loaders would only wait for one another

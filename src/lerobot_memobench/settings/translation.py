@@ -10,7 +10,7 @@ from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.settings import fields
 from lerobot_memobench.settings.choices import choice_flags, chosen_class
 from lerobot_memobench.settings.flags import flag_value, has_flag, without_flag
-from lerobot_memobench.settings.short_forms import CHOOSING, EVALUATION_WORDS, SHORT_FORMS
+from lerobot_memobench.settings.short_forms import CHOOSING, EVALUATION_WORDS, SHORT_FORMS, TRAINING_WORDS
 from lerobot_memobench.settings.words import Words
 
 
@@ -96,7 +96,7 @@ def _field_flags(command: str, config: type, chosen: Mapping[str, type], key: st
         annotation = fields.annotation_of(config, key, chosen.get)
     except KeyError:
         known = [*CHOOSING, *SHORT_FORMS.get(command, {}), *fields.all_keys(config, chosen.get)]
-        known += EVALUATION_WORDS if command == "eval" else ()
+        known += {"eval": EVALUATION_WORDS, "train": TRAINING_WORDS}.get(command, ())
         raise MemobenchError(f"lerobot {command} has no setting {key!r}, {nearest(key, known)}") from None
     return [f"--{key}={fields.checked_value(key, annotation, value)}"]
 

@@ -124,9 +124,21 @@ class OSCController:
         """Write the controls for one physics step into ``data.ctrl``."""
         low, high = self._torque_limits
         data.ctrl[self._arm] = np.minimum(np.maximum(self.torques(data), low), high)
-        moved = self.gripper + _CLOSING * (self.config.gripper_speed * np.sign(gripper_action))
+        moved = self.gripper + self.gripper_change(gripper_action)
         self.gripper = np.minimum(np.maximum(moved, -1.0), 1.0)
         data.ctrl[self._fingers] = self._finger_bias + self._finger_scale * self.gripper
+
+    def gripper_change(self, gripper_action: float) -> Array:
+        """Return by how much the fingers' command moves in one physics step, (2,)."""
+        change: Array = _CLOSING * (self.config.gripper_speed * np.sign(gripper_action))
+        return change
+
+    def advance(self, data: mujoco.MjData, gripper_action: float, substeps: int) -> None:
+        """Hold the goal over physics steps; ``data`` must hold, and then holds, what `torques` needs."""
+        for _ in range(substeps):
+            self.apply(data, gripper_action)
+            mujoco.mj_step2(self._model, data)
+            mujoco.mj_step1(self._model, data)
 
 
 def orientation_error(desired: Array, present: Array) -> Array:

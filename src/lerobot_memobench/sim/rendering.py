@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.errors import MemobenchError, nearest, unsupported_system
 from lerobot_memobench.sim.drawing.drawlist import build_draw_list
 from lerobot_memobench.sim.drawing.rasterizer import Rasterizer
 
@@ -43,6 +43,9 @@ shadows. In software `fast` costs about 0.6 of `default` and `high` three times 
 ROOM = ("room", "kitchen_table")
 """Bodies that cast no shadow: what theirs would fall on is under or behind them."""
 
+BACKGROUND = ("kitchen_table", "mount0_torso", "mount0_pedestal", "robot0_link0", "room")
+"""Bodies that stand behind others, nearest first: drawn last in this order, most of their pixels are taken already."""
+
 
 @dataclass(frozen=True)
 class RenderSettings:
@@ -63,8 +66,10 @@ def gl_backend() -> str:
     """Return the backend to render with: ``MUJOCO_GL`` where set, else the first whose library is installed.
 
     Raises:
-        MemobenchError: when no usable library is there.
+        MemobenchError: when no usable library is there, as on any system but Linux.
     """
+    if problem := unsupported_system():
+        raise MemobenchError(problem)
     wanted = os.environ.get("MUJOCO_GL", "").lower()
     if wanted == "glfw":
         if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
@@ -127,8 +132,9 @@ class Renderer:
     def __init__(self, model: mujoco.MjModel, settings: RenderSettings) -> None:
         quality = QUALITIES[settings.quality]
         self._context = _thread.current()
+        draw_list = build_draw_list(model, BACKGROUND, ROOM)
         self._rasterizer: Rasterizer | None = Rasterizer(
-            model, build_draw_list(model, ROOM), settings.width, settings.height, quality.samples, quality.shadow_map
+            model, draw_list, settings.width, settings.height, quality.samples, quality.shadow_map
         )
 
     def render(

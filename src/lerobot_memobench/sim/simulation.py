@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.sim import robot
-from lerobot_memobench.sim.controller import OSCController
+from lerobot_memobench.sim.compiled_controller import make_controller
 from lerobot_memobench.sim.placement import Placement, Placer
 from lerobot_memobench.sim.rendering import Highlight, Image, RenderSettings, get_renderer
 from lerobot_memobench.sim.scene import AGENTVIEW, SUBSTEPS, get_scene, state_size
@@ -57,11 +57,13 @@ class Simulation:
         self.render_settings = render or RenderSettings()
         self._scene = scene
         self.model: mujoco.MjModel = copy.copy(scene.model)
+        # robosuite's force and torque sensors cost time in every physics step, and nobody reads them.
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR.value
         self.data = mujoco.MjData(self.model)
         self.assets = scene.assets
         self.world = World(task, self.model, self.data, scene.assets)
         self.highlights: tuple[Highlight, ...] = ()
-        self._controller = OSCController(self.model)
+        self._controller = make_controller(self.model)
         self._placer = Placer(task, self.model, self.data, scene.assets)
         self._hand = self.model.body(robot.HAND_BODY).id
         self._grip = self.model.site(robot.GRIP_SITE).id
@@ -116,10 +118,7 @@ class Simulation:
                 f"an action holds a value that is not finite: {action.tolist()}; check the policy's output"
             )
         self._controller.set_goal(self.data, action.astype(np.float64, copy=False))
-        for _ in range(SUBSTEPS):
-            self._controller.apply(self.data, float(action[6]))
-            mujoco.mj_step2(self.model, self.data)
-            mujoco.mj_step1(self.model, self.data)
+        self._controller.advance(self.data, float(action[6]), SUBSTEPS)
 
     # --- state ----------------------------------------------------------------------------------------------
 

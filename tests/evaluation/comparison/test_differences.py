@@ -92,6 +92,14 @@ def test_settings_beside_the_log_count(tmp_path: Path, setting: str, value: Any)
         compared(a, b)
 
 
+def test_who_sees_the_prompt_is_the_policys_and_told(tmp_path: Path) -> None:
+    settings = {"seed_base": 7, "referent": "fixed", "prompt_in": "steps"}
+    a, b = logs.evaluation(tmp_path / "a"), logs.evaluation(tmp_path / "b")
+    (a / "protocol.json").write_text(json.dumps(settings))
+    (b / "protocol.json").write_text(json.dumps({**settings, "prompt_in": "reset"}))
+    assert compared(a, b).notes[0] == "compared although prompt_in: steps and reset"
+
+
 def test_other_seeds_are_other_episodes(tmp_path: Path) -> None:
     a, b = logs.evaluation(tmp_path / "a"), logs.evaluation(tmp_path / "b", seed=99)
     with pytest.raises(MemobenchError, match="seed"):

@@ -243,6 +243,16 @@ def test_lerobots_own_videos_serve_where_nothing_was_filmed(tmp_path: Path) -> N
     assert find_videos(tmp_path, records)[0] == {}
 
 
+def test_a_memory_type_that_is_a_path_leads_nowhere(tmp_path: Path) -> None:
+    """LeRobot's record of a run and our log agree on a group that is a path to somebody else's video."""
+    (tmp_path / "run" / "videos").mkdir(parents=True)
+    group = "../../outside/temporal"
+    write_frames(tmp_path / "outside" / f"temporal_{task_index(STOVE)}" / "eval_episode_0.mp4", 12)
+    entry = {"task_group": group, "task_id": task_index(STOVE), "metrics": {"successes": [True]}}
+    (tmp_path / "run" / "eval_info.json").write_text(json.dumps({"per_task": [entry]}))
+    assert find_videos(tmp_path / "run", [record(memory_type=group)]) == ({}, [])
+
+
 def write_frames(path: Path, count: int) -> None:
     import av
 

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.cli.memobench import main
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.necessity.demonstrations import Demonstration, Moment
 from lerobot_memobench.evaluation.necessity.pictures import Picture
 from lerobot_memobench.evaluation.necessity.question import Settings, variants_of
 from lerobot_memobench.evaluation.necessity.report import markdown, rows, verdict, write
 from lerobot_memobench.evaluation.necessity.scene import PIXEL_EXACT
-from lerobot_memobench.evaluation.necessity.study import study
+from lerobot_memobench.evaluation.necessity.study import pictures_path, study
 from lerobot_memobench.tasks.catalogue import get_task
 
 from .drawn import scene
@@ -64,6 +65,12 @@ def test_a_picture_met_twice_in_an_episode_is_found(monkeypatch: pytest.MonkeyPa
     files = write(tmp_path, [result])
     assert [path.name for path in files] == ["necessity.json", "necessity.md", "aliased_pairs.png"]
     assert "| 25.0 | 0.0 | 25.0 | 100.0 |" in files[1].read_text()
+
+
+def test_results_that_name_a_path_lead_to_no_picture(tmp_path: Path) -> None:
+    """A result's names come from a file; a picture from elsewhere would be drawn into the figure."""
+    with pytest.raises(MemobenchError, match=r"is '\.\./\.\./secret\.fixed\.7\.png', which names no file"):
+        pictures_path(tmp_path, "../../secret", "fixed", 7)
 
 
 def test_goals_behind_one_picture_are_weighed_together(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.hdf5.layout import Unusable
+from lerobot_memobench.files.reading import Malformed, parsed
 
 if TYPE_CHECKING:
     import h5py
@@ -40,9 +40,9 @@ def text_attribute(group: h5py.Group, key: str, required: bool = False) -> Any:
 def json_object(text: str, what: str) -> dict[str, Any]:
     """Return the JSON object that ``text`` holds; ``what`` it is goes into the message."""
     try:
-        value = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise Unusable(f"{what} is no valid JSON ({error})") from None
+        value = parsed(text)
+    except Malformed as error:
+        raise Unusable(f"{what} is no valid JSON: {error}") from None
     if not isinstance(value, dict):
         raise Unusable(f"{what} holds a {type(value).__name__}, expected a JSON object")
     return value

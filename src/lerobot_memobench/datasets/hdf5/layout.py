@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,6 +36,21 @@ class Problem:
 
 class Unusable(MemobenchError):
     """A file or group that is not in the layout; the message is the reason alone."""
+
+
+@contextlib.contextmanager
+def usable_or_named() -> Iterator[None]:
+    """Let nothing but a MemobenchError out of a block that reads a file: whatever a file says, it ends only itself.
+
+    To be kept around reading alone: an error in writing, such as a full disk, is not the file's.
+    """
+    try:
+        yield
+    except MemobenchError:
+        raise
+    except Exception as error:
+        told = " ".join(str(error).split())[:200]
+        raise Unusable(f"what it says cannot be used ({type(error).__name__}: {told})") from error
 
 
 def truth_to_intervals(satisfied: NDArray[np.bool_]) -> list[list[list[int]]]:

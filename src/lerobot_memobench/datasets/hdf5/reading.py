@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.demonstration import ACTION_DIM
+from lerobot_memobench.datasets.hdf5.attributes import read_extras
 from lerobot_memobench.datasets.hdf5.checks import array, demo_number, finite, first_line, json_object, text_attribute
-from lerobot_memobench.datasets.hdf5.layout import EXTRAS, IMAGE_NAMES, Image, Unusable
+from lerobot_memobench.datasets.hdf5.layout import IMAGE_NAMES, Image, Unusable
 from lerobot_memobench.errors import MemobenchError
 
 if TYPE_CHECKING:
@@ -137,7 +138,7 @@ class PublishedFile:
             actions=finite("actions", actions[:]).astype(np.float32),
             metadata=json_object(text_attribute(group, "meta_data", required=True), "meta_data"),
             model_file=text_attribute(group, "model_file") or "",
-            extras={key: group.attrs[key] for key in EXTRAS if key in group.attrs},
+            extras=read_extras(group),
             image_size=image_size,
         )
 

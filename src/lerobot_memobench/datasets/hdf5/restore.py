@@ -7,7 +7,6 @@ predicates are evaluated on the states, with the latches and orders that a rollo
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -74,7 +73,7 @@ def _told_truth(task: Task, demo: PublishedDemo, exec_start: int) -> NDArray[np.
     frames = key_frames(task, demo, exec_start)
     intervals = demo.extras.get("satisfied_intervals")
     if intervals is not None:
-        return truth_from_intervals(json.loads(intervals), len(demo.states))
+        return truth_from_intervals(intervals, len(demo.states))
     if frames and min(frames) >= 0:
         known: NDArray[np.bool_] = np.arange(len(demo.states))[:, None] >= np.array(frames)
         return known
@@ -128,7 +127,7 @@ def fixture_poses(sim: Simulation, task: Task, demo: PublishedDemo) -> dict[str,
     """Return where the fixtures stood: as this package wrote it, else by ``model_file``, else their regions' middle."""
     names = list(sim.fixture_poses())
     if "fixture_poses" in demo.extras:
-        return {name: np.array(pose) for name, pose in json.loads(demo.extras["fixture_poses"]).items()}
+        return {name: np.array(pose) for name, pose in demo.extras["fixture_poses"].items()}
     try:
         found = read_fixture_poses(demo.model_file, names) if demo.model_file.strip() else {}
     except MemobenchError as error:

@@ -17,6 +17,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     image_key,
     is_dataset,
 )
+from lerobot_memobench.datasets.lerobot_format.reading import episodes_where
 
 __all__ = [
     "DEFAULT_REPO_ID",
@@ -25,6 +26,7 @@ __all__ = [
     "assemble",
     "check_destination",
     "dataset_features",
+    "episodes_where",
     "image_key",
     "is_dataset",
     "write_dataset",

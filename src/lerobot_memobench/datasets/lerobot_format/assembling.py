@@ -91,7 +91,8 @@ def assemble(
     build = out / STAGING / f"{TEMPORARY}dataset"
     shutil.rmtree(build, ignore_errors=True)
     build.mkdir(parents=True)
-    features = _write_lerobot(written, build, repo_id) if LEROBOT in formats else {}
+    versions = (manifest or {}).get("request", {}).get("versions")
+    features = _write_lerobot(written, build, repo_id, versions) if LEROBOT in formats else {}
     if HDF5 in formats:
         _write_hdf5(written, build / HDF5_FOLDER)
     _write_manifest(episodes, manifest or {}, build)
@@ -101,7 +102,9 @@ def assemble(
     return out
 
 
-def _write_lerobot(written: Sequence[StagedEpisode], build: Path, repo_id: str) -> dict[str, dict[str, Any]]:
+def _write_lerobot(
+    written: Sequence[StagedEpisode], build: Path, repo_id: str, versions: dict[str, str] | None
+) -> dict[str, dict[str, Any]]:
     """Write the LeRobotDataset of the episodes into ``build``; return its features."""
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
@@ -116,7 +119,7 @@ def _write_lerobot(written: Sequence[StagedEpisode], build: Path, repo_id: str) 
         use_videos=written[0].has_images,
         metadata_buffer_size=len(written) + 1,  # one table: types of its columns come from all episodes
     )
-    write_frames(meta, written, write_videos(meta, written))
+    write_frames(meta, written, write_videos(meta, written), versions)
     meta.finalize()
     for path in part.iterdir():
         path.replace(build / path.name)

@@ -40,6 +40,8 @@ COLUMNS = {
     "coarse_subgoal": "the same at the coarse level",
     "memory": "the checkpoints completed in order before this frame, as text (oracle memory); empty at the start",
     "language_persistent": "LeRobot's language rows, styles `subtask` and `memory`, for its training recipes",
+    "episode_info": "JSON at an episode's first frame, else empty: all of the table below, and versions, because "
+    "LeRobot's dataset tools keep the columns of frames alone",
 }
 
 EPISODE_COLUMNS = {
@@ -81,8 +83,7 @@ def write_card(
         "states, actions and labels; `states/` holds the simulator's states (1 + nq + nv numbers per frame).",
         _failures(failed, len(episodes)),
         _left_out(left_out),
-        "## Statistics",
-        *_statistics(written, failed, storage_of(folder, solved)),
+        *statistics_section(written, failed, storage_of(folder, solved)),
         "## Columns",
         *_columns(features),
         "## Licence",
@@ -130,10 +131,12 @@ def _introduction(written: Sequence[dict[str, Any]], repo_id: str) -> list[str]:
     ]
 
 
-def _statistics(
+def statistics_section(
     written: Sequence[dict[str, Any]], failed: Sequence[StagedEpisode], storage: dict[str, float]
 ) -> list[str]:
+    """Return the paragraphs of the card's statistics, from what is known of each episode."""
     return [
+        "## Statistics",
         "Steps are frames: control steps of 50 ms, prompt video included. The paper's rows are those of its "
         "demonstrations (appendix, family level statistics), stored as HDF5; storage here is that of the "
         "LeRobotDataset: videos as they are, everything else in proportion to the frames.",
@@ -162,7 +165,8 @@ def _columns(features: dict[str, dict[str, Any]]) -> list[str]:
         ),
         "LeRobot's own columns are there too: `task`, `timestamp`, `frame_index`, `episode_index`, `index`, "
         "`task_index`.",
-        "Per episode, in `meta/episodes`:",
+        "Per episode, in `meta/episodes` (after LeRobot's dataset tools: `episodes=episodes_where(folder, "
+        'memory_type="spatial")` with `from lerobot_memobench.datasets.lerobot_format import episodes_where`):',
         markdown(["column", "meaning"], [[f"`{key}`", meaning] for key, meaning in EPISODE_COLUMNS.items()]),
         "`meta/stats.json` holds mean, standard deviation, range and the quantiles q01, q10, q50, q90, q99; those of "
         "numbers are exact over all frames, those of images over sampled frames.",

@@ -13,14 +13,29 @@ from lerobot_memobench.datasets.staging.episode import StagedEpisode
 
 
 def storage_of(folder: Path, episodes: Sequence[StagedEpisode]) -> dict[str, float]:
-    """Return bytes per memory type, and their ``total``; what belongs to no episode is shared out by frames."""
-    total = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file() and "hdf5" not in path.parts)
+    """Return bytes per memory type, and their ``total``; what belongs to no episode is shared out by frames.
+
+    The manifest is not counted: it says what was asked for, and the same episodes are of the same size.
+    """
+    kept = [folder / part for part in ("data", "meta", "states", "videos")]
+    total = sum(path.stat().st_size for part in kept for path in part.rglob("*") if path.is_file())
     videos = sum(episode.video_bytes for episode in episodes)
     frames = sum(episode.info["frames"] for episode in episodes)
     found: dict[str, float] = {"total": float(total)}
     for episode in episodes:
         share = episode.video_bytes + (total - videos) * episode.info["frames"] / frames
         found[episode.info["memory_type"]] = found.get(episode.info["memory_type"], 0.0) + share
+    return found
+
+
+def storage_by_frames(folder: Path, infos: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Return the same of a dataset of which only its files are known: all of it is shared out by frames."""
+    kept = [path for part in ("data", "meta", "videos") for path in (folder / part).rglob("*") if path.is_file()]
+    total = sum(path.stat().st_size for path in kept)
+    frames = sum(info["frames"] for info in infos)
+    found = {"total": float(total)}
+    for info in infos:
+        found[info["memory_type"]] = found.get(info["memory_type"], 0.0) + total * info["frames"] / frames
     return found
 
 

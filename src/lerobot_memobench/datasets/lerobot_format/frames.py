@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.demonstration import CAMERAS, FPS
 from lerobot_memobench.datasets.lerobot_format.layout import image_key
+from lerobot_memobench.datasets.lerobot_format.record import EPISODE_INFO, EpisodeRecord
 from lerobot_memobench.datasets.lerobot_format.tables import ParquetFiles, frames_table, states_table
 from lerobot_memobench.datasets.staging.episode import StagedEpisode
 from lerobot_memobench.datasets.statistics import Stats, numeric_stats
@@ -23,7 +23,10 @@ EPISODES_PER_STATES_FILE = 100
 
 
 def write_frames(
-    meta: LeRobotDatasetMetadata, episodes: Sequence[StagedEpisode], places: Sequence[dict[str, Any]]
+    meta: LeRobotDatasetMetadata,
+    episodes: Sequence[StagedEpisode],
+    places: Sequence[dict[str, Any]],
+    versions: Mapping[str, str] | None = None,
 ) -> None:
     """Write data/, states/ and the metadata; one row group per episode, files of LeRobot's size.
 
@@ -31,10 +34,11 @@ def write_frames(
         meta: of the dataset to be.
         episodes: its episodes, in their order.
         places: where each one's videos are (`write_videos`).
+        versions: of the packages that made them.
     """
     from lerobot.datasets.io_utils import write_stats
 
-    frames = _FrameWriter(meta)
+    frames = _FrameWriter(meta, versions)
     for episode, place in zip(episodes, places, strict=True):
         frames.add(episode, place)
     meta.stats = frames.finish() | _image_statistics(episodes)
@@ -44,8 +48,8 @@ def write_frames(
 class _FrameWriter:
     """Writes episode after episode and keeps their numbers for the statistics of the whole."""
 
-    def __init__(self, meta: LeRobotDatasetMetadata) -> None:
-        self._meta = meta
+    def __init__(self, meta: LeRobotDatasetMetadata, versions: Mapping[str, str] | None) -> None:
+        self._meta, self._versions = meta, versions
         self._data = ParquetFiles(meta.root, meta.data_path)
         self._states = ParquetFiles(meta.root, STATES_PATH)
         self._numbers: dict[str, list[NDArray]] = {}
@@ -61,7 +65,8 @@ class _FrameWriter:
         task = str(episode.info["language"])
         meta.save_episode_tasks([task])
         arrays = episode.arrays()
-        columns = self._columns(arrays, int(episode.info["frames"]), task)
+        record = EpisodeRecord.model_validate(episode.info | {"versions": self._versions})
+        columns = self._columns(arrays, int(episode.info["frames"]), task, record)
         self._data.write(frames_table(columns, episode, meta.features))
         self._states.write(states_table(arrays["states"], number))
         length = len(columns["index"])
@@ -73,11 +78,13 @@ class _FrameWriter:
             "dataset_to_index": start + length,
             **place,
         }
-        meta.save_episode(number, length, [task], self._count(columns, episode), place | _episode_columns(episode))
+        meta.save_episode(number, length, [task], self._count(columns, episode), place | record.in_meta())
 
-    def _columns(self, arrays: dict[str, NDArray], length: int, task: str) -> dict[str, NDArray]:
+    def _columns(self, arrays: dict[str, NDArray], length: int, task: str, record: EpisodeRecord) -> dict[str, NDArray]:
         task_index = self._meta.get_task_index(task)
         assert task_index is not None
+        info = np.full(length, "", dtype=object)
+        info[0] = record.in_frames()
         columns: dict[str, NDArray] = {
             "observation.state": arrays["proprio"],
             "action": arrays["actions"],
@@ -86,6 +93,7 @@ class _FrameWriter:
             "episode_index": np.full(length, self._episodes),
             "index": self._frames + np.arange(length),
             "task_index": np.full(length, task_index),
+            EPISODE_INFO: info,
         }
         return columns | {key: arrays[key] for key in self._meta.features if key in arrays}
 
@@ -113,16 +121,3 @@ def _image_statistics(episodes: Sequence[StagedEpisode]) -> dict[str, Stats]:
 
     found = [_camera_statistics(episode) for episode in episodes if episode.has_images]
     return aggregate_stats(found) if found else {}
-
-
-def _episode_columns(episode: StagedEpisode) -> dict[str, Any]:
-    """Return the project's own columns of meta/episodes."""
-    info = episode.info
-    plain = ("task_name", "memory_type", "family", "operations", "seed", "referent", "variant", "success")
-    return {key: info[key] for key in plain} | {
-        "exec_start_index": info["exec_start_index"],
-        "key_frames": np.array(info["key_frames"], dtype=np.int64),
-        "scene_hash": info["scene_hash"],
-        "fixture_poses": json.dumps(info["fixture_poses"]),
-        "digest": info["digest"],
-    }

@@ -7,6 +7,7 @@ from typing import Any
 
 from lerobot_memobench.datasets.demonstration import ACTION_DIM, CAMERAS, PROPRIO_DIM
 from lerobot_memobench.datasets.labels import MAX_CHECKPOINTS
+from lerobot_memobench.datasets.lerobot_format.record import EPISODE_INFO
 from lerobot_memobench.datasets.staging.folders import STAGING
 from lerobot_memobench.errors import MemobenchError
 
@@ -50,6 +51,7 @@ def dataset_features(image_size: tuple[int, int] | None) -> dict[str, dict[str, 
         "coarse_subgoal": feature("string"),
         "memory": feature("string"),
         "language_persistent": feature("language"),
+        EPISODE_INFO: feature("string"),
     }
 
 

@@ -1,67 +1,150 @@
-"""Read a dataset of this package back: what it says of each episode, and an episode's frames."""
+"""Read a dataset of this package back: what it says of each episode, and an episode's frames.
+
+LeRobot's dataset tools may have edited it since; what they leave is read from the frames (`record`).
+"""
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
+from lerobot_memobench.datasets.lerobot_format.record import EPISODE_INFO, EpisodeRecord, from_frames, from_meta
 from lerobot_memobench.datasets.lerobot_format.tables import LANGUAGE
 from lerobot_memobench.errors import MemobenchError
 
+if TYPE_CHECKING:
+    import pyarrow as pa
+
 Columns = dict[str, Any]
 
+STRANGER = (
+    "it tells neither task nor seed: another program made it, or LeRobot's tools edited a dataset that was written "
+    f"before its frames had the column {EPISODE_INFO}, and dropped what meta/episodes said; generate it again"
+)
+"""Of an episode without a record."""
 
-def episode_rows(folder: Path) -> list[dict[str, Any]]:
-    """Return the rows of ``meta/episodes``, one per episode.
+
+@dataclass(frozen=True)
+class EpisodePlace:
+    """An episode in a dataset.
+
+    Attributes:
+        index: its number in the dataset.
+        start: its first frame in the dataset's global index.
+        length: frames.
+        record: what the dataset says of it; None where it says nothing that this package wrote.
+    """
+
+    index: int
+    start: int
+    length: int
+    record: EpisodeRecord | None
+
+
+def list_episodes(folder: Path) -> list[EpisodePlace]:
+    """Return what a dataset says of each of its episodes, in their order.
 
     Raises:
-        MemobenchError: the folder is no dataset, or one without the benchmark's columns.
+        MemobenchError: the folder is no dataset, or a record in it is damaged.
     """
-    import pyarrow.parquet as pq
+    _check(folder)
+    rows = _rows(folder)
+    first = _read(folder / "data", ("episode_index", EPISODE_INFO), [("frame_index", "==", 0)]).to_pylist()
+    told = {int(row["episode_index"]): row.get(EPISODE_INFO) for row in first}
+    return [_place(folder, row, told.get(row["episode_index"])) for row in rows]
 
-    if not is_dataset(folder):
-        raise MemobenchError(f"{folder} is no dataset (there is no meta/info.json); name one that was generated")
-    rows: list[dict[str, Any]] = pq.read_table(folder / "meta" / "episodes").to_pylist()
-    _check_columns(folder, rows[0], ("task_name", "memory_type", "exec_start_index", "key_frames"))
-    return rows
+
+def episodes_where(folder: Path | str, **wanted: Any) -> list[int]:
+    """Return the numbers of a dataset's episodes of which all that is ``wanted`` holds, for LeRobot's ``episodes``.
+
+    ``LeRobotDataset(…, episodes=episodes_where(folder, memory_type="spatial"))`` is what LeRobot's ``episode_filter``
+    does, also after LeRobot's dataset tools have dropped the columns that such a filter needs.
+
+    Raises:
+        MemobenchError: a word that a record (`EpisodeRecord`) does not have, or no such episode.
+    """
+    unknown = sorted(set(wanted) - set(EpisodeRecord.model_fields))
+    if unknown:
+        raise MemobenchError(f"found {unknown[0]!r}, expected one of {', '.join(EpisodeRecord.model_fields)}")
+    records = {place.index: place.record for place in list_episodes(Path(folder)) if place.record is not None}
+    found = [n for n, record in records.items() if all(getattr(record, k) == v for k, v in wanted.items())]
+    if not found:
+        told = ", ".join(f"{key}={value!r}" for key, value in wanted.items())
+        raise MemobenchError(f"{folder} has no episode with {told}; see `memobench describe {folder}` for what it has")
+    return found
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedEpisode:
-    """An episode of a dataset on disk: ``columns`` per frame and what meta/episodes says."""
+    """An episode of a dataset on disk: ``columns`` per frame and what the dataset says of the whole."""
 
     task_name: str
     variant: int
     seed: int
+    referent: str
     exec_start: int
     columns: Columns
     whole: dict[str, Any]
 
 
 def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
-    """Read an episode of a dataset that this package made; without states/, its columns lack ``states``."""
-    import pyarrow.parquet as pq
+    """Read an episode of a dataset that this package made; without states/, its columns lack ``states``.
 
+    Raises:
+        MemobenchError: no dataset, no such episode, or one that this package did not make.
+    """
     root = Path(root)
-    if not is_dataset(root):
-        raise MemobenchError(f"{root} is no dataset (there is no meta/info.json); name the folder of a generated one")
-    rows = pq.read_table(root / "meta" / "episodes", filters=[("episode_index", "==", episode_index)]).to_pylist()
+    _check(root)
+    rows = _rows(root, episode_index)
     if len(rows) != 1:
         raise MemobenchError(f"{root} has no episode {episode_index}; see total_episodes in its meta/info.json")
-    meta = rows[0]
-    _check_columns(root, meta, ("task_name", "variant", "seed", "exec_start_index"))
     columns = _read_columns(root, episode_index)
-    whole = {key: meta[key] for key in ("success", "key_frames", "scene_hash") if key in meta}
-    if "fixture_poses" in meta:
-        whole["fixture_poses"] = json.loads(meta["fixture_poses"])
+    record = _place(root, rows[0], columns.pop(EPISODE_INFO, [None])[0]).record
+    if record is None:
+        raise MemobenchError(STRANGER)
+    told = record.model_dump(include={"success", "key_frames", "scene_hash", "fixture_poses", "digest"})
+    whole = {key: value for key, value in told.items() if value is not None}
     if LANGUAGE in columns:
         whole[LANGUAGE] = columns[LANGUAGE][0]
-    return RecordedEpisode(meta["task_name"], meta["variant"], meta["seed"], meta["exec_start_index"], columns, whole)
+    return RecordedEpisode(
+        record.task_name, record.variant, record.seed, record.referent, record.exec_start_index, columns, whole
+    )
+
+
+def _check(folder: Path) -> None:
+    if not is_dataset(folder):
+        raise MemobenchError(f"{folder} is no dataset (there is no meta/info.json); name one that was generated")
+
+
+def _rows(folder: Path, episode_index: int | None = None) -> list[dict[str, Any]]:
+    """The rows of meta/episodes, or that of one episode, in their order and without statistics."""
+    own = ("episode_index", "length", "dataset_from_index", *EpisodeRecord.model_fields)
+    chosen = None if episode_index is None else [("episode_index", "==", episode_index)]
+    return _read(folder / "meta" / "episodes", own, chosen).sort_by("episode_index").to_pylist()
+
+
+def _place(folder: Path, row: dict[str, Any], told: str | None) -> EpisodePlace:
+    number = int(row["episode_index"])
+    record = from_frames(told, f"{folder}, episode {number}") if told else from_meta(row)
+    return EpisodePlace(number, int(row["dataset_from_index"]), int(row["length"]), record)
+
+
+def _read(folder: Path, names: tuple[str, ...], chosen: list[tuple[str, str, int]] | None) -> pa.Table:
+    """Those of the columns that are there, of all files: merged ones need not have the same."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    tables = []
+    for path in sorted(folder.rglob("*.parquet")):
+        there = set(pq.read_schema(path).names)
+        tables.append(pq.read_table(path, columns=[name for name in names if name in there], filters=chosen))
+    if not tables:
+        raise MemobenchError(f"{folder} holds no parquet file: the dataset is not whole; fetch or generate it again")
+    return pa.concat_tables(tables, promote_options="permissive")
 
 
 def _read_columns(root: Path, episode_index: int) -> Columns:
@@ -76,14 +159,9 @@ def _read_columns(root: Path, episode_index: int) -> Columns:
         is_text = name == LANGUAGE or isinstance(values[0], str)
         columns[name] = values if is_text else np.array(values)
     for name in ("action", "observation.state"):
-        columns[name] = columns[name].astype(np.float32)
+        if name in columns:
+            columns[name] = columns[name].astype(np.float32)
     if (root / "states").is_dir():
         states = pq.read_table(root / "states", filters=chosen).sort_by("frame_index")
         columns["states"] = np.array(states.column("state").to_pylist(), dtype=np.float64)
     return columns
-
-
-def _check_columns(root: Path, row: dict[str, Any], needed: tuple[str, ...]) -> None:
-    missing = [key for key in needed if key not in row]
-    if missing:
-        raise MemobenchError(f"{root} lacks {', '.join(missing)} in meta/episodes: this package did not make it")

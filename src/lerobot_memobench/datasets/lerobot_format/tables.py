@@ -51,7 +51,7 @@ def _array(values: NDArray, kind: pa.DataType) -> pa.Array:
 
     if values.ndim == 2:
         return pa.FixedSizeListArray.from_arrays(pa.array(values.ravel(), type=kind.value_type), type=kind)
-    return pa.array(values.tolist() if values.dtype.kind == "U" else values, type=kind)
+    return pa.array(values.tolist() if values.dtype.kind in "UO" else values, type=kind)
 
 
 def _language(episode: StagedEpisode, feature: Any) -> pa.Array:

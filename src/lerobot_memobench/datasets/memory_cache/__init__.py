@@ -6,15 +6,18 @@ frames of history without decoding a video (delta timestamps are fixed offsets a
 so far").
 """
 
-from lerobot_memobench.datasets.memory_cache.building import (
-    FrameEncoder,
-    Progress,
-    TextEncoder,
-    build_memory_cache,
-)
+from lerobot_memobench.datasets.memory_cache.building import build_memory_cache
+from lerobot_memobench.datasets.memory_cache.encoding import FrameEncoder, Progress
 from lerobot_memobench.datasets.memory_cache.frame_table import resolve_subgoals
-from lerobot_memobench.datasets.memory_cache.layout import FOLDER, CacheMeta, dataset_fingerprint, read_meta
+from lerobot_memobench.datasets.memory_cache.layout import (
+    FOLDER,
+    CacheMeta,
+    dataset_fingerprint,
+    find_cache,
+    read_meta,
+)
 from lerobot_memobench.datasets.memory_cache.reading import MemoryCache
+from lerobot_memobench.datasets.memory_cache.tables import TextEncoder
 
 __all__ = [
     "FOLDER",
@@ -25,6 +28,7 @@ __all__ = [
     "TextEncoder",
     "build_memory_cache",
     "dataset_fingerprint",
+    "find_cache",
     "read_meta",
     "resolve_subgoals",
 ]

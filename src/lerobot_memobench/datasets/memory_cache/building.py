@@ -2,70 +2,34 @@
 
 from __future__ import annotations
 
-import json
+import logging
 import os
 import shutil
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
 
-import numpy as np
-import torch
-from torch import Tensor
-
-from lerobot_memobench.datasets.memory_cache.decoding import FrameReader, frame_reader
+from lerobot_memobench.datasets.memory_cache.decoding import frame_reader
+from lerobot_memobench.datasets.memory_cache.encoding import Encoding, FrameEncoder, Progress
 from lerobot_memobench.datasets.memory_cache.frame_table import FrameTable, read_frame_table
 from lerobot_memobench.datasets.memory_cache.layout import (
-    DONE_FILE,
     FOLDER,
     FORMAT,
-    META_FILE,
     TOKENS_FILE,
     CacheMeta,
     dataset_fingerprint,
-    read_meta,
+    readable_meta,
     slot_starts,
+    texts_file,
 )
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files import draft_of, remove_drafts, write_file
+from lerobot_memobench.datasets.memory_cache.room import free_bytes, in_words, reserve, telling_of_the_disk
+from lerobot_memobench.datasets.memory_cache.tables import TextEncoder, add_embeddings, write_meta, write_tables
+from lerobot_memobench.files import remove_drafts
 from lerobot_memobench.jobs.locking import taking_turns
 
+logger = logging.getLogger(__name__)
+
 MOST_THREADS = 8
-
-Progress = Callable[[int, int], None]
-"""Called as progress(episodes done, episodes in all)."""
-
-
-class FrameEncoder(Protocol):
-    """The frozen vision tower: images (N, 3, H, W) in [0, 1] -> tokens (N, P, D) bfloat16."""
-
-    tokens_per_frame: int
-    dim: int
-
-    @property
-    def key(self) -> str:
-        """Identity of the tower: weights and input size."""
-
-    def __call__(self, images: Tensor) -> Tensor:
-        """Encode."""
-
-
-class TextEncoder(Protocol):
-    """The frozen text encoder: texts -> embeddings (N, dim) float32."""
-
-    @property
-    def key(self) -> str:
-        """Identity of the encoder."""
-
-    @property
-    def dim(self) -> int:
-        """Width of an embedding."""
-
-    def __call__(self, texts: Sequence[str]) -> Tensor:
-        """Encode."""
 
 
 def build_memory_cache(
@@ -79,11 +43,14 @@ def build_memory_cache(
     batch_size: int = 64,
     workers: int | None = None,
     progress: Progress | None = None,
+    place: Path | None = None,
+    tell: Callable[[str], None] = logger.info,
 ) -> Path:
     """Build, or finish building, the cache ``<root>/memory_cache/<name>``; a fitting complete one is left alone.
 
     A killed build goes on with the first episode it did not finish. A cache that does not fit is made again. A second
-    builder (another rank) waits, and finds the work done.
+    builder (another rank) waits, and finds the work done. Room for the whole is taken on the disk before anything is
+    encoded.
 
     Args:
         root: folder of a LeRobotDataset v3.0.
@@ -92,34 +59,33 @@ def build_memory_cache(
         batch_size: frames per pass of the tower.
         workers: threads that decode videos ahead of the tower; as many as there are cores, up to 8, by default.
         progress: called with (episodes done, episodes in all), first with what is done already.
+        place: folder in which the cache's is made, where it is not to lie beside the dataset.
+        tell: told what is made, and how large it will be, before it is made.
 
     Returns:
         The cache's folder.
 
     Raises:
-        MemobenchError: ``root`` is no dataset, or has no such camera.
+        MemobenchError: ``root`` is no dataset, or has no such camera; or the disk has no room, and then nothing of a
+            cache that was begun is left, and of one that was gone on with the episodes that it had finished.
     """
     root = Path(root)
-    fingerprint = dataset_fingerprint(root, camera)
-    folder = root / FOLDER / name
-    folder.parent.mkdir(exist_ok=True)
-    with taking_turns(folder.parent / f"{name}.lock"):
-        table = read_frame_table(root)
-        meta = _describe(table, fingerprint, frames, texts, camera, stride)
-        complete = replace(meta, complete=True)
-        existing = _existing(root, name)
-        if existing == complete:
-            if progress:
-                progress(table.num_episodes, table.num_episodes)
-            return folder
-        read = frame_reader(root, camera)
-        if existing != meta:
-            _begin(folder, meta, table, texts)
-        remove_drafts(folder)
-        work = _Work(folder, meta, table, batch_size, workers or min(_cores(), MOST_THREADS))
-        work.write_tokens(frames, read, progress)
-        _write_json(folder / META_FILE, asdict(complete))
-    return folder
+    fingerprint, table = dataset_fingerprint(root, camera), read_frame_table(root)
+    meta = _describe(table, fingerprint, frames, texts, camera, stride)
+    progress = progress or (lambda _done, _all: None)
+    work = _Work(root, (place or root / FOLDER) / name, meta, table, texts, tell)
+    if work.is_done:  # read without a lock: it may lie where nobody may write
+        progress(table.num_episodes, table.num_episodes)
+        return work.folder
+    read = frame_reader(root, camera)
+    with telling_of_the_disk(work.folder):
+        work.folder.parent.mkdir(parents=True, exist_ok=True)
+        with taking_turns(work.folder.parent / f"{name}.lock", work.wait):
+            begun = work.begin()
+            encoding = Encoding(work.folder, begun, table, batch_size, workers or min(_cores(), MOST_THREADS))
+            encoding.run(frames, read, progress)
+            write_meta(work.folder, replace(begun, complete=True))
+    return work.folder
 
 
 def _describe(
@@ -142,129 +108,74 @@ def _describe(
     )
 
 
-def _existing(root: Path, name: str) -> CacheMeta | None:
-    """What is there already; what cannot be read counts as nothing."""
-    try:
-        return read_meta(root, name)
-    except MemobenchError:
-        return None
-
-
 def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-# --- tables ---------------------------------------------------------------------------------------------------
-
-
-def _begin(folder: Path, meta: CacheMeta, table: FrameTable, texts: TextEncoder) -> None:
-    """Write everything but the tokens, whose place is made; ``meta.json`` last."""
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir()
-    _save_array(folder / DONE_FILE, np.zeros(table.num_episodes, dtype=np.uint8))
-    _save_array(folder / "episodes.npy", table.episodes)
-    _save_array(folder / "phase.npy", table.phase)
-    _write_subgoals(folder, table, texts)
-    _write_memory(folder, table)
-    with (folder / TOKENS_FILE).open("wb") as file:
-        file.truncate(2 * int(np.prod(meta.shape)))
-    _write_json(folder / META_FILE, asdict(meta))
-
-
-def _write_subgoals(folder: Path, table: FrameTable, texts: TextEncoder) -> None:
-    unique = sorted({text for values in table.subgoals.values() for text in values if text})
-    number = {text: row for row, text in enumerate(unique)}
-    embeddings = texts(unique).to(torch.float32).numpy() if unique else np.zeros((0, texts.dim), np.float32)
-    for level, values in table.subgoals.items():
-        _save_array(folder / f"subgoal-{level}.npy", np.array([number.get(text, -1) for text in values], np.int32))
-    _write_json(folder / "texts.json", unique)
-    _save_array(folder / "texts.npy", embeddings)
-
-
-def _write_memory(folder: Path, table: FrameTable) -> None:
-    if table.memory is not None:
-        unique, rows = np.unique(np.array(table.memory, dtype=object), return_inverse=True)
-        _save_array(folder / "memory.npy", rows.astype(np.int32))
-        _write_json(folder / "memory.json", unique.tolist())
-
-
-def _write_json(path: Path, value: Any) -> None:
-    write_file(path, json.dumps(value, indent=1))
-
-
-def _save_array(path: Path, array: np.ndarray) -> None:
-    with draft_of(path) as draft:
-        np.save(draft, array)
-
-
-# --- tokens ---------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Part:
-    """Frames of one episode that the tower takes at once."""
-
-    episode: int
-    frames: list[int]
-    slot: int  # where the first one's tokens go
-    last: bool  # of its episode
-
-
 @dataclass(frozen=True)
 class _Work:
-    """A cache whose tokens are being written."""
+    """A cache that is wanted, and what is there of it."""
 
+    root: Path
     folder: Path
     meta: CacheMeta
     table: FrameTable
-    batch_size: int
-    workers: int
+    texts: TextEncoder
+    tell: Callable[[str], None]
 
-    def write_tokens(self, frames: FrameEncoder, read: FrameReader, progress: Progress | None) -> None:
-        """Encode every episode that is not marked done; its mark is written after its tokens have reached the file.
+    @property
+    def fitting(self) -> CacheMeta | None:
+        """What is there and fits, complete or not; begun with another text encoder perhaps."""
+        there = readable_meta(self.root, self.folder.name, self.folder.parent)
+        if there is None or replace(there, complete=False, texts_key=self.meta.texts_key) != self.meta:
+            return None
+        return there
 
-        Videos are decoded in threads, a few parts ahead; the tower takes the parts in their order, so that the file is
-        the same whatever the number of threads, and a killed build has finished the first so many episodes.
-        """
-        tokens = np.memmap(self.folder / TOKENS_FILE, dtype=np.uint16, mode="r+", shape=self.meta.shape)
-        done = np.load(self.folder / DONE_FILE, mmap_mode="r+")
-        tell = progress or (lambda _done, _total: None)
-        tell(int(done.sum()), len(done))
-        with ThreadPoolExecutor(self.workers, thread_name_prefix="decode") as pool:
-            parts = self._parts(np.flatnonzero(done == 0).tolist())
-            for part, images in _ahead(pool, 2 * self.workers, parts, lambda part: read(part.episode, part.frames)):
-                encoded = frames(images).to("cpu", torch.bfloat16).contiguous()
-                tokens[part.slot : part.slot + len(part.frames)] = encoded.view(torch.uint16).numpy()
-                if part.last:
-                    tokens.flush()
-                    done[part.episode] = 1
-                    done.flush()
-                    tell(int(done.sum()), len(done))
+    @property
+    def is_done(self) -> bool:
+        """Whether nothing is left to do."""
+        there = self.fitting
+        if there is None or not there.complete:
+            return False
+        return (self.folder / texts_file(there.texts_key, self.texts.key)).is_file()
 
-    def _parts(self, episodes: Sequence[int]) -> Iterator[_Part]:
-        slots = slot_starts(self.table.episodes, self.meta.stride)
-        lengths = np.diff(self.table.episodes)
-        for episode in episodes:
-            wanted = list(range(0, int(lengths[episode]), self.meta.stride))
-            for first in range(0, len(wanted), self.batch_size):
-                end = first + self.batch_size
-                yield _Part(episode, wanted[first:end], int(slots[episode]) + first, end >= len(wanted))
+    def wait(self) -> None:
+        """Say that somebody else is at it."""
+        logger.warning("Another process is making the memory cache %s; waiting for it to finish.", self.folder)
 
+    def begin(self) -> CacheMeta:
+        """Make everything but the tokens, for which room is taken; return what is there now."""
+        there = self.fitting
+        if there is None:
+            self._make_room()
+            there = self._begin_anew()
+        else:
+            remove_drafts(self.folder)
+            reserve(self.folder / TOKENS_FILE, self.meta.bytes)
+            add_embeddings(self.folder, there, self.texts)
+        return there
 
-def _ahead[Item, Result](
-    pool: ThreadPoolExecutor, number: int, items: Iterator[Item], work: Callable[[Item], Result]
-) -> Iterator[tuple[Item, Result]]:
-    """Yield (item, work(item)) in order, with at most ``number`` items begun before they are asked for."""
-    waiting: deque[tuple[Item, Future[Result]]] = deque()
-    try:
-        for item in items:
-            waiting.append((item, pool.submit(work, item)))
-            if len(waiting) >= number:
-                oldest, future = waiting.popleft()
-                yield oldest, future.result()
-        while waiting:
-            oldest, future = waiting.popleft()
-            yield oldest, future.result()
-    finally:
-        for _, future in waiting:
-            future.cancel()
+    def _make_room(self) -> None:
+        """Say what will be made, and take away what lies in its place."""
+        if self.folder.exists():
+            self.tell(
+                f"The memory cache {self.folder} cannot be used (its dataset has changed since, or an earlier version "
+                "made it): it is made again."
+            )
+            shutil.rmtree(self.folder)
+        self.tell(
+            f"The memory cache {self.folder} takes {in_words(self.meta.bytes)}: {self.meta.slots:,} frames of "
+            f"{in_words(self.meta.frame_bytes)}; {in_words(free_bytes(self.folder))} are free there."
+        )
+
+    def _begin_anew(self) -> CacheMeta:
+        """Begin a cache; nothing of it is left where that fails."""
+        self.folder.mkdir()
+        try:
+            reserve(self.folder / TOKENS_FILE, self.meta.bytes)
+            write_tables(self.folder, self.table, self.texts)
+            write_meta(self.folder, self.meta)
+        except BaseException:
+            shutil.rmtree(self.folder, ignore_errors=True)
+            raise
+        return self.meta

@@ -1,6 +1,8 @@
 """Where a memory cache lies, what is in it, and whether it fits.
 
-Layout of ``<dataset>/memory_cache/<name>/``::
+Caches made with another tower (weights, input size, pooling), camera or stride have other names and lie side by side.
+
+Layout of ``<dataset>/memory_cache/<name>/``, or of ``<name>/`` in a folder that was chosen for caches::
 
     meta.json       what the cache was made from (keys), sizes, and whether it is complete
     tokens.bin      bfloat16 (slots, P, D), seen as uint16; slot = one stored frame, episodes one after the other
@@ -9,24 +11,25 @@ Layout of ``<dataset>/memory_cache/<name>/``::
     phase.npy       uint8 (frames,): 0 prompt, 1 execution
     subgoal-<level>.npy  int32 (frames,): row of texts.json for the frame's subgoal, -1 for none
     texts.json, texts.npy    the unique subgoals and their embeddings, float32 (texts, d_t)
+    texts-<hash>.npy         their embeddings by a text encoder that was used later
     memory.npy, memory.json    int32 (frames,): row of the frame's oracle memory text; the unique texts
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, get_type_hints
 
 import numpy as np
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files.reading import read_json
 
 FOLDER = "memory_cache"
 FORMAT = 2
-META_FILE, TOKENS_FILE, DONE_FILE = "meta.json", "tokens.bin", "done.npy"
+META_FILE, TOKENS_FILE, DONE_FILE, TEXTS_FILE = "meta.json", "tokens.bin", "done.npy", "texts.json"
 _SAMPLE = 1 << 16
 """Bytes of a video read for its fingerprint, at its start, middle and end."""
 
@@ -38,7 +41,7 @@ class CacheMeta:
     format: int
     dataset: str  # fingerprint of the dataset's content
     frames_key: str  # identity of the vision tower
-    texts_key: str  # identity of the text encoder
+    texts_key: str  # identity of the text encoder that it was begun with
     camera: str
     stride: int
     tokens_per_frame: int
@@ -53,13 +56,22 @@ class CacheMeta:
         """Shape (slots, P, D) of the tokens."""
         return self.slots, self.tokens_per_frame, self.dim
 
+    @property
+    def frame_bytes(self) -> int:
+        """Bytes of one stored frame's tokens: 64 KiB at full size."""
+        return 2 * self.tokens_per_frame * self.dim
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of all tokens, next to which the rest is small."""
+        return self.slots * self.frame_bytes
+
     def mismatch(self, wanted: dict[str, Any]) -> str | None:
         """Why the cache does not fit, as the end of a sentence; None when it does."""
         reasons = {
             "format": "has an older format",
             "dataset": "is stale: the dataset's frames changed after it was made",
             "frames_key": "is foreign: another vision tower (other weights or input size) made it",
-            "texts_key": "is foreign: another text encoder made it",
             "camera": f"is foreign: it shows camera '{self.camera}', and '{wanted.get('camera')}' is asked for",
             "stride": f"is foreign: it was made with stride {self.stride}, and stride {wanted.get('stride')} is asked "
             "for",
@@ -67,20 +79,68 @@ class CacheMeta:
         return next((reasons[key] for key, value in wanted.items() if getattr(self, key) != value), None)
 
 
+META_SCHEMA: Any = TypedDict("META_SCHEMA", get_type_hints(CacheMeta))  # type: ignore[misc]
+"""What the file must hold before it is a `CacheMeta`."""
+
+SIZES = ("stride", "tokens_per_frame", "dim", "slots")
+
+
 def fix_hint(root: Path) -> str:
     """What a user types when a cache does not fit."""
     return f"Make it again with `memobench cache {root}`."
 
 
-def read_meta(root: Path, name: str) -> CacheMeta | None:
-    """Description of a cache, complete or not; None when there is none."""
-    path = Path(root) / FOLDER / name / META_FILE
+def read_meta(root: Path, name: str, place: Path | None = None) -> CacheMeta | None:
+    """Description of a cache, complete or not; None when there is none.
+
+    Args:
+        place: folder that holds caches; the one beside the dataset ``root`` when None.
+    """
+    path = (place or Path(root) / FOLDER) / name / META_FILE
     if not path.is_file():
         return None
+    advice = f"it is not a memory cache this version can read. {fix_hint(Path(root))}"
+    found = read_json(path, META_SCHEMA, advice)
+    if set(found) != set(META_SCHEMA.__annotations__) or min(map(found.__getitem__, SIZES)) < 1:
+        raise MemobenchError(f"{path}: {advice}")
+    return CacheMeta(**found)
+
+
+def readable_meta(root: Path, name: str, place: Path | None = None) -> CacheMeta | None:
+    """Like `read_meta`; what cannot be read counts as nothing."""
     try:
-        return CacheMeta(**json.loads(path.read_text()))
-    except (TypeError, json.JSONDecodeError):
-        raise MemobenchError(f"{path} is not a memory cache this version can read. {fix_hint(Path(root))}") from None
+        return read_meta(root, name, place)
+    except MemobenchError:
+        return None
+
+
+def find_cache(
+    root: Path, prefix: str, *, frames_key: str, camera: str, stride: int, place: Path | None = None
+) -> Path:
+    """Return where the cache with these contents lies, or is to lie.
+
+    Args:
+        root: folder of the dataset.
+        prefix: what its name begins with, for people; it need not tell caches apart.
+        place: folder that holds caches, of several datasets perhaps; the one beside the dataset when None.
+    """
+    if place is not None:
+        parts = [dataset_fingerprint(root, camera), frames_key, camera, str(stride)]
+        return place / f"{root.resolve().name}-{prefix}-{_short(*parts)}"
+    folder = root / FOLDER / f"{prefix}-{_short(frames_key, camera, str(stride))}"
+    earlier = None if folder.exists() else readable_meta(root, prefix)  # versions before the hash
+    if earlier is not None and earlier.mismatch({"frames_key": frames_key, "camera": camera, "stride": stride}) is None:
+        return root / FOLDER / prefix
+    return folder
+
+
+def texts_file(first: str, key: str) -> str:
+    """Name of the embeddings by the text encoder ``key``, in a cache that was begun with the encoder ``first``."""
+    return "texts.npy" if key == first else f"texts-{_short(key)}.npy"
+
+
+def _short(*parts: str) -> str:
+    return hashlib.blake2b("\n".join(parts).encode(), digest_size=4).hexdigest()
 
 
 def dataset_fingerprint(root: Path, camera: str) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,36 +13,69 @@ from lerobot_memobench.datasets.memory_cache.frame_table import LEVEL_COLUMNS, M
 from lerobot_memobench.datasets.memory_cache.layout import (
     FOLDER,
     FORMAT,
+    TEXTS_FILE,
     TOKENS_FILE,
     CacheMeta,
     dataset_fingerprint,
     fix_hint,
     read_meta,
     slot_starts,
+    texts_file,
 )
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files import file_name
+from lerobot_memobench.files.reading import read_json
 
 
 class MemoryCache:
     """A complete cache, read through memory maps. Open one with :meth:`open`."""
 
-    def __init__(self, folder: Path, meta: CacheMeta) -> None:
+    def __init__(self, folder: Path, meta: CacheMeta, texts_key: str | None = None) -> None:
         self.folder, self.meta = folder, meta
         self.episodes: np.ndarray = np.load(folder / "episodes.npy")
         self.phase: np.ndarray = np.load(folder / "phase.npy")
         self.slots = slot_starts(self.episodes, meta.stride)
         self._tokens = np.memmap(folder / TOKENS_FILE, dtype=np.uint16, mode="r", shape=meta.shape)
         self._subgoals = {
-            level: resolve_subgoals(np.load(folder / f"subgoal-{level}.npy"), self.episodes) for level in meta.levels
+            level: resolve_subgoals(
+                np.load(folder / file_name(f"subgoal-{level}.npy", "the table of a level")), self.episodes
+            )
+            for level in meta.levels
         }
-        self.texts: list[str] = json.loads((folder / "texts.json").read_text())
-        self.text_embeddings = torch.from_numpy(np.load(folder / "texts.npy"))
+        self.texts: list[str] = read_json(folder / TEXTS_FILE, list[str], "it is damaged")
+        embeddings = folder / texts_file(meta.texts_key, texts_key or meta.texts_key)
+        self.text_embeddings = torch.from_numpy(np.load(embeddings))
         self._memory: np.ndarray | None = np.load(folder / "memory.npy") if meta.oracle else None
-        self.memories: list[str] = json.loads((folder / "memory.json").read_text()) if meta.oracle else []
+        self.memories: list[str] = read_json(folder / "memory.json", list[str], "it is damaged") if meta.oracle else []
+        self._check()
+
+    def _check(self) -> None:
+        """Raise a ValueError unless the tables are those of one dataset."""
+        frames, episodes = self.num_frames, len(self.episodes)
+        tables = [(rows, len(self.texts)) for rows in self._subgoals.values()]
+        tables += [] if self._memory is None else [(self._memory, len(self.memories))]
+        fitting = (
+            episodes > 0
+            and (np.diff(self.episodes) > 0).all()
+            and (self.episodes[0], self.slots[-1]) == (0, self.meta.slots)
+            and self.phase.shape == (frames,)
+            and self.text_embeddings.shape[:1] == (len(self.texts),)
+            and all(rows.shape == (frames,) and rows.max(initial=-1) < count for rows, count in tables)
+        )
+        if not fitting:
+            raise ValueError("its tables are not of one dataset")
 
     @classmethod
     def open(
-        cls, root: Path, name: str, *, frames_key: str, camera: str, stride: int, texts_key: str | None = None
+        cls,
+        root: Path,
+        name: str,
+        *,
+        frames_key: str,
+        camera: str,
+        stride: int,
+        texts_key: str | None = None,
+        place: Path | None = None,
     ) -> MemoryCache:
         """Open ``<root>/memory_cache/<name>`` after checking that it fits.
 
@@ -51,15 +83,16 @@ class MemoryCache:
             root: folder of the LeRobotDataset.
             frames_key: identity of the vision tower that will read the cache.
             texts_key: identity of the text encoder; None when no text is needed.
+            place: folder that holds caches, where it is not the one beside the dataset.
 
         Raises:
             MemobenchError: no cache, an unfinished one, one of another dataset (stale), or one made by another tower,
                 camera, stride or text encoder (foreign). The message names the reason and the fix.
         """
         root = Path(root)
-        meta = read_meta(root, name)
+        meta, folder = read_meta(root, name, place), (place or root / FOLDER) / name
         if meta is None:
-            raise MemobenchError(f"{root} has no memory cache '{name}'. {fix_hint(root)}")
+            raise MemobenchError(f"{folder.parent} has no memory cache '{name}'. {fix_hint(root)}")
         wanted = {
             "format": FORMAT,
             "dataset": dataset_fingerprint(root, camera),
@@ -67,16 +100,20 @@ class MemoryCache:
             "camera": camera,
             "stride": stride,
         }
-        if texts_key is not None:
-            wanted["texts_key"] = texts_key
         reason = meta.mismatch(wanted)
+        if reason is None and texts_key is not None and not (folder / texts_file(meta.texts_key, texts_key)).is_file():
+            reason = "is foreign: another text encoder made it"
         if reason:
-            raise MemobenchError(f"The memory cache {root / FOLDER / name} {reason}. {fix_hint(root)}")
+            raise MemobenchError(f"The memory cache {folder} {reason}. {fix_hint(root)}")
         if not meta.complete:
+            raise MemobenchError(f"The memory cache {folder} is not finished. Go on with `memobench cache {root}`.")
+        try:
+            return cls(folder, meta, texts_key)
+        except Exception as error:  # NumPy answers damaged arrays with errors of every type
+            told = " ".join(str(error).split())[:200]
             raise MemobenchError(
-                f"The memory cache {root / FOLDER / name} is not finished. Go on with `memobench cache {root}`."
-            )
-        return cls(root / FOLDER / name, meta)
+                f"The memory cache {folder} is damaged ({told}). Delete that folder. {fix_hint(root)}"
+            ) from None
 
     @property
     def num_frames(self) -> int:

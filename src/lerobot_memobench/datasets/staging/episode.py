@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NotRequired, TypedDict
 
 import numpy as np
+from annotated_types import Len
 from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.language import LanguageRow
@@ -15,6 +15,7 @@ from lerobot_memobench.datasets.staging.folders import file_hash
 from lerobot_memobench.datasets.statistics import Stats
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.files import file_name
+from lerobot_memobench.files.reading import Count, Malformed, Number, Whole, checked, read_json
 
 RECORD_FILE = "episode.json"
 ARRAYS_FILE = "arrays.npz"
@@ -23,6 +24,61 @@ HDF5_FILE = "demonstration.hdf5"
 LEROBOT, HDF5 = "lerobot", "hdf5"
 FORMATS = (LEROBOT, HDF5)
 """What a run can make of its episodes."""
+
+ADVICE = "it is damaged; delete the folder that it is in and run the command again"
+
+
+class Info(TypedDict):
+    """What meta/episodes, manifest and card say of an episode (see ``episode_info``)."""
+
+    task_name: str
+    memory_type: str
+    family: str
+    language: str
+    operations: str
+    seed: Whole
+    referent: str
+    variant: Count
+    success: bool
+    frames: Count
+    exec_start_index: Count
+    key_frames: list[Whole]
+    scene_hash: str
+    fixture_poses: dict[str, list[Number]]
+    digest: str
+
+
+class Identity(TypedDict):
+    """What is known of an episode that could not be made."""
+
+    task_name: str
+    seed: Whole
+
+
+class Row(TypedDict, total=False):
+    """One of LeRobot's persistent language rows; `datasets.language` writes them."""
+
+    role: str
+    content: str | None
+    style: str | None
+    timestamp: Number
+
+
+Frames = Annotated[list[Count], Len(1, 1)]
+"""Over how many frames a statistic is, (1,)."""
+Pixels = Annotated[list[Annotated[list[Annotated[list[Number], Len(1, 1)]], Len(1, 1)]], Len(3, 3)]
+"""A statistic of a camera's channels, (3, 1, 1)."""
+
+
+class Record(TypedDict):
+    """``episode.json``."""
+
+    failure: str | None
+    info: Identity
+    language_persistent: list[Row]
+    image_stats: dict[str, dict[str, Pixels | Frames]]
+    files: dict[str, str]
+    hdf5: NotRequired[dict[str, Any] | None]
 
 
 @dataclass(frozen=True)
@@ -95,13 +151,20 @@ class StagedEpisode:
 def read_staged(folder: Path) -> StagedEpisode | None:
     """Return the finished episode in ``folder``, or None when there is none."""
     try:
-        return StagedEpisode(folder, json.loads((folder / RECORD_FILE).read_text()))
+        record = read_json(folder / RECORD_FILE, Record, ADVICE)
     except FileNotFoundError:
         return None
-    except json.JSONDecodeError as error:
-        raise MemobenchError(
-            f"{folder / RECORD_FILE} is damaged ({error}); delete the folder and generate again"
-        ) from None
+    if record["failure"] is None:
+        _check_info(folder, record["info"])
+    return StagedEpisode(folder, record)
+
+
+def _check_info(folder: Path, info: dict[str, Any]) -> None:
+    """Refuse an episode of which not all is told that a dataset says of it."""
+    try:
+        checked(info, Info)
+    except Malformed as error:
+        raise MemobenchError(f"{folder / RECORD_FILE}: {error} in info; {ADVICE}") from None
 
 
 class StagedJob:

@@ -13,6 +13,7 @@ from lerobot_memobench.datasets.staging.episode import LEROBOT
 from lerobot_memobench.datasets.staging.folders import STAGING, clean_temporaries
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.files import remove_drafts, write_file
+from lerobot_memobench.files.reading import read_json, short
 from lerobot_memobench.jobs.locking import locked
 
 REQUEST_FILE = "request.json"
@@ -46,7 +47,7 @@ def _check_request(staging: Path, request: dict[str, Any], out: Path, advice: st
     """Remember the request in an unfinished run's folder; raise where it was another one."""
     path = staging / REQUEST_FILE
     try:
-        earlier = json.loads(path.read_text())
+        earlier = read_json(path, dict[str, Any], "delete the folder that it is in to start anew")
     except FileNotFoundError:
         write_file(path, json.dumps(request, indent=1), durable=True)
         return
@@ -58,4 +59,5 @@ def compare_requests(earlier: dict[str, Any], request: dict[str, Any], what: str
     earlier = {"formats": [LEROBOT], **earlier}  # written before there were two
     for key, value in request.items():
         if earlier.get(key) != value:
-            raise MemobenchError(f"{what} with {key}={earlier.get(key)!r}, now {value!r} was asked for; {advice}")
+            there = short(earlier.get(key))
+            raise MemobenchError(f"{what} with {key}={there}, now {short(value)} was asked for; {advice}")

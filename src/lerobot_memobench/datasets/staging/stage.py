@@ -105,9 +105,11 @@ class EpisodeStage:
                 "were recorded; give one per frame and camera, or none"
             )
         found = labels(demo)
+        info = episode_info(demo)
+        _check_storable(info, found.columns())
         record = {
             "failure": None,
-            "info": episode_info(demo),
+            "info": info,
             "language_persistent": persistent_rows(found),
             "image_stats": self._close_videos(),
         }
@@ -130,6 +132,19 @@ class EpisodeStage:
             camera: {name: value.tolist() for name, value in histograms.stats().items()}
             for camera, histograms in self._histograms.items()
         }
+
+
+def _check_storable(info: Mapping[str, Any], columns: Mapping[str, Any]) -> None:
+    """Raise unless a dataset's tables can hold the episode: one that they cannot would end the others with it."""
+    texts = [sorted(set(values)) for values in columns.values() if isinstance(values, list)]
+    try:
+        json.dumps([info, texts], ensure_ascii=False).encode()
+        np.array([info["seed"], info["variant"]], dtype=np.int64)
+    except (UnicodeEncodeError, OverflowError) as error:
+        raise MemobenchError(
+            f"{info['task_name']!r}: a text that is no Unicode, or a number of more than 64 bits, cannot be stored "
+            f"({error}); correct the task's texts or the seed"
+        ) from None
 
 
 def stage_demonstration(demo: Demonstration, folder: Path, formats: Collection[str] = (LEROBOT,)) -> StagedEpisode:

@@ -13,7 +13,7 @@ from lerobot_memobench.evaluation.comparison.pairing import ALLOWED, Pair, commo
 from lerobot_memobench.evaluation.documents.evaluation_tables import AVERAGE
 from lerobot_memobench.evaluation.documents.sentences import count_of
 from lerobot_memobench.evaluation.metrics.rates import METRICS, value_of
-from lerobot_memobench.evaluation.records.protocol import differences
+from lerobot_memobench.evaluation.records.protocol import OF_THE_POLICY, differences
 from lerobot_memobench.evaluation.records.runs import Run
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 
@@ -100,7 +100,7 @@ def _refuse_unlike(a: Run, b: Run, allow: Collection[str]) -> None:
             raise MemobenchError(
                 f"found --allow {name!r}, expected a setting of the protocol, {nearest(name, ALLOWED)}"
             )
-    found = differences(a.protocol, b.protocol, ignore=set(allow))
+    found = differences(a.protocol, b.protocol, ignore={*OF_THE_POLICY, *allow})
     if found:
         raise MemobenchError(
             f"{a.folder} and {b.folder} were not run under one protocol ({'; '.join(found)}), so their difference is "

@@ -36,7 +36,7 @@ def terminal(report: Report, headings: bool = True) -> RenderableType:
 def text(report: Report) -> str:
     """Return what the terminal shows, as text for a file."""
     out = io.StringIO()
-    Console(file=out, width=WIDTH, highlight=False).print(terminal(report))
+    Console(file=out, width=WIDTH, highlight=False, markup=False).print(terminal(report))
     return "\n".join(line.rstrip() for line in out.getvalue().splitlines()).strip("\n") + "\n"
 
 

@@ -13,12 +13,15 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.necessity.any_order import search
 from lerobot_memobench.evaluation.necessity.demonstrations import follow
+from lerobot_memobench.evaluation.necessity.kept import KeptScene, KeptSearch
 from lerobot_memobench.evaluation.necessity.laboratory import Laboratory
 from lerobot_memobench.evaluation.necessity.question import Settings, fingerprint, variants_of
 from lerobot_memobench.evaluation.necessity.scene import EXAMPLES, Scene
-from lerobot_memobench.files import draft_of, write_file
+from lerobot_memobench.files import draft_of, file_name, write_file
+from lerobot_memobench.files.reading import read_json
 from lerobot_memobench.tasks.task import Task
 
 if TYPE_CHECKING:
@@ -52,12 +55,12 @@ class Study:
     def scene(self, seed: int) -> dict[str, Any]:
         """Return what the demonstrations from one start show."""
         mark = fingerprint(self.task, self.referent, self.settings)
-        return _kept(self._path(str(seed)), mark, lambda: self._observe(seed))
+        return _kept(self._path(str(seed)), KeptScene, mark, lambda: self._observe(seed))
 
     def search(self) -> dict[str, Any]:
         """Return the ways to the goal that were found from the first start, in any order."""
         mark = fingerprint(self.task, self.referent, self.settings, search=True)
-        return _kept(self._path("search"), mark, self._search)
+        return _kept(self._path("search"), KeptSearch, mark, self._search)
 
     def result(self) -> Result:
         """Return what scenes and search say together; without need of a memory there is no search."""
@@ -112,8 +115,12 @@ def _mean_of(tables: Sequence[dict[str, float]]) -> dict[str, float] | None:
 
 
 def pictures_path(out: Path, task: str, referent: str, seed: int) -> Path:
-    """Return where a scene's first aliased pair lies: a strip of both moments, two cameras each."""
-    return out / "pictures" / f"{task}.{referent}.{seed}.png"
+    """Return where a scene's first aliased pair lies: a strip of both moments, two cameras each.
+
+    Raises:
+        MemobenchError: the names, which may come from a file of results, lead elsewhere.
+    """
+    return out / "pictures" / file_name(f"{task}.{referent}.{seed}.png", f"the name of a picture of results in {out}")
 
 
 def _write_pair(scene: Scene, path: Path) -> None:
@@ -128,14 +135,14 @@ def _write_pair(scene: Scene, path: Path) -> None:
         Image.fromarray(strip).save(draft, optimize=True)
 
 
-def _kept(path: Path, mark: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+def _kept(path: Path, schema: Any, mark: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     """Return what ``path`` holds if it answers this question, else what ``make`` returns, written there."""
     try:
-        found = json.loads(path.read_text())
-        if isinstance(found, dict) and found.get("fingerprint") == mark:
+        found: dict[str, Any] = read_json(path, schema, "it is made again")
+        if found["fingerprint"] == mark:
             return found
-    except (OSError, ValueError):
-        pass
+    except (FileNotFoundError, MemobenchError):
+        pass  # as good as absent
     result = {"fingerprint": mark, **make()}
     path.parent.mkdir(parents=True, exist_ok=True)
     write_file(path, json.dumps(result, indent=1) + "\n")

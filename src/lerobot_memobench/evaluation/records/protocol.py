@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.envs.episode_log import read_episodes
-from lerobot_memobench.envs.protocol import EXTENT, POLICY, SETTINGS, differences, read_protocol_file
+from lerobot_memobench.envs.protocol import EXTENT, OF_THE_POLICY, POLICY, SETTINGS, differences, read_protocol_file
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.records.card_schema import Card, WholeCard
+from lerobot_memobench.files.reading import read_json
 
-__all__ = ["CARD_FILE", "EXTENT", "POLICY", "SETTINGS", "differences", "protocol_of_log", "read_card", "read_protocol"]
+__all__ = [
+    "CARD_FILE",
+    "EXTENT",
+    "OF_THE_POLICY",
+    "POLICY",
+    "SETTINGS",
+    "differences",
+    "protocol_of_log",
+    "read_card",
+    "read_protocol",
+]
 
 CARD_FILE = "card.json"
 
@@ -21,8 +32,8 @@ def read_protocol(folder: str | Path) -> dict[str, Any]:
 
     Keys: ``tasks`` (names, sorted) and ``episodes`` (per task; the largest number where they differ) as asked for, or
     as found in the log where nobody wrote down what was asked for; ``seed_base``, ``referent``, ``prompt_video``,
-    ``horizon``, ``replan_steps``, ``render``, ``render_every`` as far as they are known; ``policy``, what is known of
-    the policy ({} for plain ``lerobot-eval``).
+    ``prompt_in``, ``horizon``, ``replan_steps``, ``render``, ``render_every`` as far as they are known; ``policy``,
+    what is known of the policy ({} for plain ``lerobot-eval``).
 
     Raises:
         MemobenchError: there is no evaluation in the folder.
@@ -54,18 +65,21 @@ def _note(found: dict[str, Any], key: str, values: list[Any]) -> None:
         found[key] = distinct[0] if len(distinct) == 1 else sorted(distinct, key=str)
 
 
-def read_card(path: Path) -> dict[str, Any]:
-    """Return a result card (see ``evaluation.card``).
+def read_card(path: Path, *, whole: bool = False) -> dict[str, Any]:
+    """Return a result card (see ``engine.card``).
+
+    Args:
+        whole: nothing of it may be left out, as reports allow.
 
     Raises:
         MemobenchError: it is missing or none.
     """
     try:
-        found = json.loads(path.read_text())
-    except OSError as error:
-        raise MemobenchError(f"the card {path} cannot be read ({error.strerror or error})") from None
-    except ValueError as error:
-        raise MemobenchError(f"the card {path} is not JSON ({error})") from None
-    if not isinstance(found, dict) or not isinstance(found.get("protocol"), dict):
-        raise MemobenchError(f"{path} is no result card; expected a {CARD_FILE} that `lerobot eval` wrote")
+        found: dict[str, Any] = read_json(
+            path, WholeCard if whole else Card, "it is no result card as `lerobot eval` writes it"
+        )
+    except FileNotFoundError:
+        raise MemobenchError(
+            f"the card {path} cannot be read (it is missing); name a {CARD_FILE} that `lerobot eval` wrote"
+        ) from None
     return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from lerobot.configs import PreTrainedConfig
 
@@ -13,3 +14,5 @@ from lerobot_memobench.policies.untrained import UntrainedConfig
 @dataclass
 class MemobenchExpertConfig(UntrainedConfig):
     """Nothing to choose: the action comes from the environment's expert (``--env.expert_action=true``)."""
+
+    knows_phases: ClassVar[bool] = True

@@ -24,26 +24,47 @@ class WeightAverage:
         self.average: dict[str, Tensor] = {
             name: parameter.detach().to(torch.float32, copy=True) for name, parameter in self.parameters.items()
         }
+        self._cast: dict[str, Tensor] = {}  # the average in another precision, until it moves on
 
     @torch.no_grad()
     def update(self) -> None:
         """Move the average towards the current weights by one step."""
+        self._cast.clear()
         decay = min(self.decay, (1 + self.updates) / (10 + self.updates))
         self.updates += 1
         weights = [parameter.detach().to(torch.float32) for parameter in self.parameters.values()]
         torch._foreach_lerp_([self.average[name] for name in self.parameters], weights, 1.0 - decay)
 
     @contextmanager
-    def applied(self) -> Iterator[None]:
-        """Let the module hold the average inside the block. For float32 parameters nothing is copied."""
+    def applied(self, dtypes: Mapping[nn.Parameter, torch.dtype] | None = None) -> Iterator[None]:
+        """Let the module hold the average inside the block.
+
+        Nothing is copied for float32 parameters, and what is cast is cast once for all blocks until the next update:
+        an evaluation enters one for every plan.
+
+        Args:
+            dtypes: parameters that are to hold the average in another precision than their own.
+        """
         trained = {name: parameter.data for name, parameter in self.parameters.items()}
         try:
             for name, parameter in self.parameters.items():
-                parameter.data = self.average[name].to(parameter.dtype)
+                parameter.data = self._as(name, (dtypes or {}).get(parameter, parameter.dtype))
             yield
         finally:
             for name, parameter in self.parameters.items():
                 parameter.data = trained[name]
+
+    def keep(self) -> None:
+        """Let the module hold the average for good."""
+        for name, parameter in self.parameters.items():
+            parameter.data = self.average[name]
+
+    def _as(self, name: str, dtype: torch.dtype) -> Tensor:
+        if self.average[name].dtype == dtype:
+            return self.average[name]
+        if name not in self._cast or self._cast[name].dtype != dtype:
+            self._cast[name] = self.average[name].to(dtype)
+        return self._cast[name]
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, str]]:
         """Tensors and metadata for a safetensors file beside one that holds the averaged module.
@@ -57,10 +78,18 @@ class WeightAverage:
         return tensors, {"updates": str(self.updates)}
 
     @torch.no_grad()
-    def restore(self, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
-        """Undo :meth:`state` in a module that holds the average: it goes on with the trained weights."""
+    def restore(self, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> list[str]:
+        """Undo :meth:`state` in a module that holds the average: it goes on with the trained weights.
+
+        Returns:
+            Names of parameters that the state does not know; their average begins with what they are now.
+        """
         self.updates = int(metadata["updates"])
+        self._cast.clear()
         for name, parameter in self.parameters.items():
+            if f"weights.{name}" not in tensors:
+                continue
             device = parameter.device
             self.average[name] = tensors.get(f"average.{name}", parameter.detach()).to(device, torch.float32, copy=True)
             parameter.copy_(tensors[f"weights.{name}"].to(device))
+        return [name for name in self.parameters if f"weights.{name}" not in tensors]

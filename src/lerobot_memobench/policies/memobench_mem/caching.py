@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 
-from lerobot_memobench.datasets.memory_cache import MemoryCache, Progress, build_memory_cache, read_meta
+from lerobot_memobench.datasets.memory_cache import MemoryCache, Progress, build_memory_cache, find_cache
 from lerobot_memobench.policies.memobench_mem.backbone import SizedPaliGemmaWithExpert
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.language.text_encoders import (
@@ -57,57 +59,55 @@ def cache_dataset(
     batch_size: int = 64,
     workers: int | None = None,
     progress: Progress | None = None,
+    tell: Callable[[str], None] = logger.info,
 ) -> Path:
-    """Make (or finish) the cache that ``config`` reads beside the dataset at ``root``.
+    """Make (or finish) the cache that ``config`` reads of the dataset at ``root``.
 
     Args:
         config: a policy configuration, for example ``MemobenchMemConfig(size="tiny", memory_stride=1)``.
         weights: checkpoint whose image tower is used, see :func:`load_perception`.
         workers: threads that decode videos ahead of the tower; by the cores of the machine when None.
         progress: called with (episodes done, episodes in all).
+        tell: told where it lies and how large it will be, before it is made.
 
     Returns:
-        The cache's folder, ``<root>/memory_cache/<size>-stride<n>``.
+        The cache's folder, ``<root>/memory_cache/<size>-stride<n>-<hash>``, or below ``config.memory_cache_dir``.
     """
-    return build_memory_cache(
-        root,
-        config.cache_name,
-        load_perception(config, weights),
-        _text_encoder(config),
-        camera=config.memory_camera,
-        stride=config.memory_stride,
-        batch_size=batch_size,
-        workers=workers,
-        progress=progress,
-    )
+    perception = load_perception(config, weights)
+    return _build(root, config, perception, batch_size=batch_size, workers=workers, progress=progress, tell=tell)
 
 
 def open_cache(root: Path, config: MemobenchMemConfig, perception: Perception) -> MemoryCache:
-    """Open the cache that ``config`` reads beside the dataset at ``root``; make it when there is none.
+    """Open the cache that ``config`` reads of the dataset at ``root``; make or finish it first where that is needed.
+
+    Of several processes (the ranks of a training run) one makes it, and the others wait.
 
     Raises:
-        MemobenchError: the cache there is stale, or made by another perception or text encoder.
+        MemobenchError: it cannot be made, for want of room say.
     """
-    texts = _text_encoder(config)
-    if read_meta(root, config.cache_name) is None:
-        logger.info("No memory cache beside %s yet: encoding its frames once.", root)
-        build_memory_cache(
-            root,
-            config.cache_name,
-            perception,
-            texts,
-            camera=perception.remembers,
-            stride=config.memory_stride,
-            progress=lambda done, count: logger.info("memory cache: %d of %d episodes", done, count),
-        )
+    folder = _build(
+        root,
+        config,
+        perception,
+        progress=lambda done, count: logger.info("memory cache: %d of %d episodes", done, count),
+    )
     return MemoryCache.open(
         root,
-        config.cache_name,
+        folder.name,
         frames_key=perception.key,
         camera=perception.remembers,
         stride=config.memory_stride,
-        texts_key=None if config.align == "none" else texts.key,
+        texts_key=None if config.align == "none" else _text_encoder(config).key,
+        place=folder.parent,
     )
+
+
+def _build(root: Path, config: MemobenchMemConfig, perception: Perception, **how: Any) -> Path:
+    """Make or finish the cache of what ``perception`` remembers, beside the dataset or where ``config`` says."""
+    place = None if config.memory_cache_dir is None else Path(config.memory_cache_dir).expanduser()
+    seen: dict[str, Any] = {"camera": perception.remembers, "stride": config.memory_stride}
+    folder = find_cache(root, config.cache_name, frames_key=perception.key, place=place, **seen)
+    return build_memory_cache(root, folder.name, perception, _text_encoder(config), place=folder.parent, **seen, **how)
 
 
 def _text_encoder(config: MemobenchMemConfig) -> WordTextEncoder | SiglipTextEncoder:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 from lerobot.configs import PreTrainedConfig
@@ -18,6 +19,8 @@ from lerobot_memobench.policies.memobench_mem.weights import (
     checkpoint_file,
     load_exactly,
 )
+
+logger = logging.getLogger(__name__)
 
 
 def read_config(source: str | Path, config: PreTrainedConfig | None, revision: str | None) -> MemobenchMemConfig:
@@ -65,14 +68,16 @@ def save_training_weights(average: WeightAverage, folder: Path) -> None:
 
 
 def restore_average(average: WeightAverage, source: str | Path, revision: str | None) -> WeightAverage | None:
-    """Go on with a checkpoint's trained weights and their average; None where it has none that fit."""
+    """Go on with a checkpoint's trained weights and their average; None where it has none.
+
+    What the checkpoint did not train (another objective's head, a part that was frozen) begins its average anew.
+    """
     path = checkpoint_file(source, TRAINING_FILE, revision)
     if path is None:
         return None
     with safe_open(path, framework="pt") as file:
         metadata = file.metadata()
-    tensors = load_file(path)
-    if not all(f"weights.{name}" in tensors for name in average.parameters):
-        return None
-    average.restore(tensors, metadata)
+    new = average.restore(load_file(path), metadata)
+    if new:
+        logger.info("The average goes on from '%s'; that of %s begins anew.", source, ", ".join(new))
     return average

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from typing import ClassVar
 
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
@@ -35,6 +36,8 @@ def _choose(field: str, given: str, known: tuple[str, ...]) -> None:
 class MemobenchMemConfig(PI05Config):
     """pi0.5's fields plus the memory's. Fields that are ``None`` here take the size's value after construction."""
 
+    knows_phases: ClassVar[bool] = True
+
     size: str = "tiny"
     """``tiny`` (from scratch, trains on a CPU) or ``pi05`` (3.2 B)."""
 
@@ -44,6 +47,7 @@ class MemobenchMemConfig(PI05Config):
     # -- alignment
     align: str = "none"
     align_weight: float | None = None
+    """Weight of the alignment loss; none or 0: the paper's for this objective (``align=none`` trains without one)."""
     subgoal_level: str = "intermediate"
     shuffle_subgoals: bool = False
     """Control of the paper: the subgoal texts of an episode change places among themselves."""
@@ -63,6 +67,8 @@ class MemobenchMemConfig(PI05Config):
     tokens_per_frame: int = TOKENS_PER_FRAME
     memory_stride: int = 1
     """Every how many control steps a frame enters the history (and the cache)."""
+    memory_cache_dir: str | None = None
+    """Folder for memory caches, of several datasets perhaps; none: ``memory_cache`` in the dataset's folder."""
 
     # -- training
     prompt_loss: bool = False
@@ -96,15 +102,16 @@ class MemobenchMemConfig(PI05Config):
         dims = self.dimensions
         if self.image_resolution is None:
             self.image_resolution = (dims.vision.image, dims.vision.image)
-        if self.tokenizer_max_length is None:
-            self.tokenizer_max_length = dims.tokenizer_max_length
-            if self.oracle_memory and dims.tokenizer == "words":
-                self.tokenizer_max_length += ORACLE_TOKENS
+        # A checkpoint without oracle memory holds the length of prompts without it, which would cut the text off.
+        if self.tokenizer_max_length in (None, dims.tokenizer_max_length):
+            room = ORACLE_TOKENS if self.oracle_memory and dims.tokenizer == "words" else 0
+            self.tokenizer_max_length = dims.tokenizer_max_length + room
         if self.optimizer_lr is None:
             self.optimizer_lr = dims.learning_rate
         self.tokenizer_name = self.tokenizer_name or dims.tokenizer
         self.text_encoder = self.text_encoder or dims.text_encoder
-        if self.align_weight is None:
+        # A checkpoint with align=none holds a weight of 0, with which another objective would change nothing.
+        if not self.align_weight:
             self.align_weight = ALIGN_WEIGHTS[self.align]
         super().__post_init__()
         self._check_numbers()
@@ -150,6 +157,9 @@ class MemobenchMemConfig(PI05Config):
                 "name an alignment too."
             )
 
+    # No field: LeRobot asks it of a configuration when it makes its sampler (see `execution_frames`).
+    drop_n_last_frames = 0
+
     @property
     def dimensions(self) -> Dimensions:
         """Dimensions of this size."""
@@ -167,8 +177,13 @@ class MemobenchMemConfig(PI05Config):
         return "none" if self.integration == "none" else "frame_sampling"
 
     @property
+    def watches(self) -> bool:
+        """Whether frames count that are seen between two plans."""
+        return self.memory != "none"
+
+    @property
     def cache_name(self) -> str:
-        """Name of the memory cache this policy reads, below ``<dataset>/memory_cache``."""
+        """What the name of the memory cache begins with that this policy reads."""
         return f"{self.size}-stride{self.memory_stride}"
 
     def get_scheduler_preset(self) -> WarmupFractionSchedulerConfig:

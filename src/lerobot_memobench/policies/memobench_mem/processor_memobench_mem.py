@@ -19,11 +19,9 @@ from lerobot.processor import (
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.language.tokenizer import WordTokenizerProcessorStep, make_vocabulary
-from lerobot_memobench.policies.memobench_mem.memory.registry import make_mechanism
-from lerobot_memobench.policies.memobench_mem.processing.gather_memory import GatherMemoryProcessorStep
+from lerobot_memobench.policies.memobench_mem.processing.gather_memory import GatherMemoryProcessorStep, gathering
 from lerobot_memobench.policies.memobench_mem.processing.oracle_memory import OracleMemoryProcessorStep
-from lerobot_memobench.policies.memobench_mem.processing.training_cache import training_cache
-from lerobot_memobench.tasks.memory_text import with_memory
+from lerobot_memobench.policies.memobench_mem.processing.training_run import prompt_texts, training_run
 
 
 def make_memobench_mem_pre_post_processors(
@@ -59,8 +57,8 @@ def make_memobench_mem_pre_post_processors(
     input_steps: list[ProcessorStep] = [
         steps.rename_observations,
         steps.add_batch_dim,
-        _gather_memory(config),
-        *([OracleMemoryProcessorStep()] if config.oracle_memory else []),
+        GatherMemoryProcessorStep(**gathering(config)),
+        OracleMemoryProcessorStep(enabled=config.oracle_memory),
         relative,
         steps.normalize,  # before the prompt, which spells the normalised state out
         Pi05PrepareStateTokenizerProcessorStep(max_state_dim=config.max_state_dim),
@@ -75,17 +73,6 @@ def make_memobench_mem_pre_post_processors(
     return make_policy_processor_pipelines(input_steps=input_steps, output_steps=output_steps)
 
 
-def _gather_memory(config: MemobenchMemConfig) -> GatherMemoryProcessorStep:
-    return GatherMemoryProcessorStep(
-        frames=make_mechanism(config.memory, config.memory_frames).frames,
-        align=config.align,
-        subgoal_level=config.subgoal_level,
-        shuffle_subgoals=config.shuffle_subgoals,
-        shuffle_seed=config.shuffle_seed,
-        memory=config.memory,
-    )
-
-
 def _tokenizer(config: MemobenchMemConfig, meta: Any | None) -> TokenizerProcessorStep:
     options = {"max_length": config.tokenizer_max_length, "padding_side": "right", "padding": "max_length"}
     if config.tokenizer_name != "words":
@@ -96,8 +83,6 @@ def _tokenizer(config: MemobenchMemConfig, meta: Any | None) -> TokenizerProcess
                 f"The tokenizer '{config.tokenizer_name}' could not be loaded: give a folder that holds PaliGemma's "
                 "tokenizer by --policy.tokenizer_name, or log in to the hub, where it is gated."
             ) from error
-    tasks = [] if meta is None or meta.tasks is None else [str(task) for task in meta.tasks.index]
-    cache = training_cache()
-    if config.oracle_memory and cache is not None:
-        tasks += [with_memory("", memory) for memory in cache.memories]
-    return WordTokenizerProcessorStep(vocabulary=make_vocabulary(tasks, config.dimensions.vocabulary), **options)
+    run = training_run()
+    texts = prompt_texts(config, meta, None if run is None else run.cache)
+    return WordTokenizerProcessorStep(vocabulary=make_vocabulary(texts, config.dimensions.vocabulary), **options)

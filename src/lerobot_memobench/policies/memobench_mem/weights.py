@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 from huggingface_hub import hf_hub_download
@@ -11,10 +10,11 @@ from safetensors import safe_open
 from torch import Tensor, nn
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.checkpoint import Processor, read_json
 
 MODEL_FILE = "model.safetensors"
 TRAINING_FILE = "training_weights.safetensors"
-_PREPROCESSOR_FILE = "policy_preprocessor.json"
+PREPROCESSOR_FILE = "policy_preprocessor.json"
 
 
 def checkpoint_file(source: str | Path, name: str, revision: str | None = None) -> Path | None:
@@ -57,12 +57,10 @@ def require_statistics(source: str | Path, revision: str | None = None) -> None:
         MemobenchError: a file or a statistic is missing.
     """
     fix = "copy the preprocessor files of its training run into it, or train again"
-    path = checkpoint_file(source, _PREPROCESSOR_FILE, revision)
+    path = checkpoint_file(source, PREPROCESSOR_FILE, revision)
     if path is None:
-        raise MemobenchError(
-            f"The checkpoint '{source}' has no {_PREPROCESSOR_FILE}, so it cannot be evaluated; {fix}."
-        )
-    steps = json.loads(path.read_text())["steps"]
+        raise MemobenchError(f"The checkpoint '{source}' has no {PREPROCESSOR_FILE}, so it cannot be evaluated; {fix}.")
+    steps = read_json(path, Processor).get("steps", [])
     step = next((step for step in steps if step.get("registry_name") == "normalizer_processor"), None)
     state = None if step is None or not step.get("state_file") else step["state_file"]
     file = None if state is None else checkpoint_file(source, state, revision)

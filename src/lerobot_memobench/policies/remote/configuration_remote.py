@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from lerobot.configs import PreTrainedConfig
 
@@ -36,6 +37,8 @@ class RemoteConfig(UntrainedConfig):
         retry: how long a server that went away is waited for, s.
         label: what is served, in your words; it goes onto the result card, since a server does not tell it.
     """
+
+    knows_phases: ClassVar[bool] = True
 
     host: str = "127.0.0.1"
     port: int | None = None
@@ -81,6 +84,11 @@ class RemoteConfig(UntrainedConfig):
     def remembers(self) -> bool:
         """Whether the server has a memory."""
         return self.spoken.memory if self.memory is None else self.memory
+
+    @property
+    def watches(self) -> bool:
+        """Whether frames count that are seen between two plans: a server that buffers frames gets all of them."""
+        return self.spoken.buffers
 
     @property
     def max_environments(self) -> int | None:

@@ -38,14 +38,15 @@ class Actor:
     def forget(self) -> None:
         """A rollout begins: whatever comes next is another episode."""
         self._step: int | None = None
-        self._prompt = False
+        self._prompt = self._rests = False
         self._queue: deque[Action] = deque()
 
     def act(self, row: Row) -> Action:
         """Return the action (7,) for the present observation; the server may be asked."""
         told = row.scalar("step")
         step = told if told is not None else (0 if self._step is None else self._step + 1)
-        if step == self._step or (told is not None and row.blank):
+        self._rests = step == self._step or (told is not None and row.blank)
+        if self._rests:
             self._step = step
             return np.zeros(ACTION_SIZE, np.float32)  # the episode has ended, or was never run
         if self._step is None or step < self._step:
@@ -64,14 +65,25 @@ class Actor:
             self._queue.extend(self.session.ask(row)[: self.config.n_action_steps])
         return self._queue.popleft()
 
+    def looks_next(self) -> bool:
+        """Whether the server is sent the pictures of the next observation; the first of an execution it always is."""
+        if self._rests or self._step is None:
+            return not self._rests
+        if self._prompt:
+            return self._shows_prompt(self._step + 1)
+        return self.config.spoken.buffers or not self._queue
+
+    def _shows_prompt(self, step: int) -> bool:
+        """Whether the server sees the prompt's frame at a step."""
+        every = self.config.history_every or self.config.n_action_steps
+        return self.config.send_prompt and (self.config.spoken.buffers or step % every == 0)
+
     def _see_prompt(self, row: Row, step: int) -> Action:
         """Show the server the prompt, in which actions have no effect."""
         self._prompt = True
-        if self.config.send_prompt:
-            if self.config.spoken.buffers:
-                self.session.watch(row)
-            elif step % (self.config.history_every or self.config.n_action_steps) == 0:
-                self.session.ask(row)
+        if self._shows_prompt(step):
+            show = self.session.watch if self.config.spoken.buffers else self.session.ask
+            show(row)
         return np.zeros(ACTION_SIZE, np.float32)
 
 
@@ -96,6 +108,10 @@ class RemotePolicy(UntrainedPolicy):
         self._actors[0].session.connect()
         for actor in self._actors:
             actor.forget()
+
+    def looks_next(self) -> bool:
+        """Whether a server is sent the pictures of the next observation."""
+        return any(actor.looks_next() for actor in self._actors)
 
     def _add_actor(self) -> None:
         addresses = self.config.addresses()

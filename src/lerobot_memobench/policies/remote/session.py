@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.freshness import PICTURE_STEP, require_fresh
 from lerobot_memobench.policies.remote.answers import read_actions
 from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
 from lerobot_memobench.policies.remote.dialects import IMAGE, STATE
@@ -91,6 +92,7 @@ class Session:
     def watch(self, row: Row) -> None:
         """Note a frame that is not asked about; a server that buffers frames gets it with the next question."""
         if self._dialect.buffers:
+            require_fresh(row.scalar("step"), row.scalar(PICTURE_STEP))
             self._frames.append((self._image(row, IMAGE), np.asarray(row.get(STATE), np.float32)))
 
     def execution_starts(self) -> None:

@@ -34,70 +34,82 @@ Floats = NDArray[np.float32]
 class DrawList:
     """The triangles of a scene.
 
-    ``vertices``: structured array of `VERTEX`, in the frames of their geoms. ``indices``: three per triangle.
-    ``geoms``: model ids of the rows of the table. ``casting``: how many of the indices, from the first on, belong to
-    geoms that cast shadows. ``layers``: (L, LAYER_SIZE, LAYER_SIZE, 3) textures, the first one white.
+    ``vertices``: structured array of `VERTEX`, in the frames of their geoms. ``indices``: three per triangle, in the
+    order of ``geoms``, the model ids of the rows of the table. ``still`` and ``moving``: the indices again of geoms
+    that cast shadows, without and with a joint between them and the world; ``still_rows``: rows of the former.
+    ``layers``: (L, LAYER_SIZE, LAYER_SIZE, 3) textures, the first one white.
     """
 
     vertices: NDArray[np.void]
     indices: NDArray[np.uint32]
     geoms: NDArray[np.int64]
-    casting: int
+    still: NDArray[np.uint32]
+    moving: NDArray[np.uint32]
+    still_rows: NDArray[np.int64]
     layers: NDArray[np.uint8]
     materials: Floats
 
-    def table(self, model: mujoco.MjModel, data: mujoco.MjData) -> Floats:
-        """Return poses, colours and materials of the present state, (geoms, ROWS, 4)."""
-        table = np.empty((len(self.geoms), ROWS, 4), dtype=np.float32)
+    def fill(self, table: Floats, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        """Write poses, colours and materials of the present state into a table, (geoms, ROWS, 4)."""
         table[:, :3, :3] = data.geom_xmat[self.geoms].reshape(-1, 3, 3)
         table[:, :3, 3] = data.geom_xpos[self.geoms]
         table[:, 3] = colours(model, self.geoms)
         table[:, 4] = self.materials
-        return table
 
 
-def build_draw_list(model: mujoco.MjModel, shadowless: tuple[str, ...] = ()) -> DrawList:
+def build_draw_list(
+    model: mujoco.MjModel, background: tuple[str, ...] = (), shadowless: tuple[str, ...] = ()
+) -> DrawList:
     """Collect the visual geoms of a model.
 
     Args:
         model: a compiled scene.
-        shadowless: bodies that cast no shadow: drawn last, since they fill what the others leave free.
+        background: bodies to draw last, in this order, since they fill what the others leave free.
+        shadowless: bodies that cast no shadow.
 
     Raises:
         MemobenchError: for a visual geom of a shape that is not drawn here.
     """
-    casters, background = _visual_geoms(model, shadowless)
-    parts, indices, start = [], [], 0
-    for row, geom in enumerate(casters + background):
+    geoms = np.array(_visual_geoms(model, background), dtype=np.int64)
+    parts, indices, start = [], [np.zeros(0, np.uint32)], 0
+    for row, geom in enumerate(geoms.tolist()):
         positions, normals, uv, triangles = triangles_of(model, geom)
         part = np.zeros(len(positions), dtype=VERTEX)
         part["position"], part["normal"], part["uv"], part["geom"] = positions, normals, uv, row
         parts.append(part)
         indices.append((triangles + start).astype(np.uint32).ravel())
         start += len(part)
+    bodies = model.geom_bodyid[geoms]
+    casting = ~np.isin(bodies, _bodies(model, shadowless))
+    still = model.body_weldid[bodies] == 0
     layers, layer_of = _layers(model)
-    geoms = np.array(casters + background, dtype=np.int64)
+
+    def indices_of(rows: NDArray[np.bool_]) -> NDArray[np.uint32]:
+        return np.concatenate([indices[0], *(indices[1 + row] for row in np.flatnonzero(rows))])
+
     return DrawList(
         np.concatenate(parts) if parts else np.zeros(0, VERTEX),
-        np.concatenate(indices) if indices else np.zeros(0, np.uint32),
+        np.concatenate(indices),
         geoms,
-        sum(part.size for part in indices[: len(casters)]),
+        indices_of(casting & still),
+        indices_of(casting & ~still),
+        np.flatnonzero(casting & still),
         layers,
         _materials(model, geoms, layer_of),
     )
 
 
-def _visual_geoms(model: mujoco.MjModel, shadowless: tuple[str, ...]) -> tuple[list[int], list[int]]:
-    """Return the ids of visual geoms that cast shadows, and of the others, the last added first."""
-    bodies = {model.body(name).id for name in shadowless if _has_body(model, name)}
+def _visual_geoms(model: mujoco.MjModel, background: tuple[str, ...]) -> list[int]:
+    """Return the ids of visual geoms in the order in which they are drawn."""
+    place = {body: k for k, body in enumerate(_bodies(model, background))}
     visual = [geom for geom in range(model.ngeom) if model.geom_group[geom] == VISUAL_GROUP]
-    background = [geom for geom in visual if int(model.geom_bodyid[geom]) in bodies]
-    # The table hides much of floor and walls, which were added before it.
-    return [geom for geom in visual if geom not in background], background[::-1]
+    return sorted(visual, key=lambda geom: place.get(int(model.geom_bodyid[geom]), -1))
 
 
-def _has_body(model: mujoco.MjModel, name: str) -> bool:
-    return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) >= 0
+def _bodies(model: mujoco.MjModel, names: tuple[str, ...]) -> list[int]:
+    """Return the ids of those bodies that the model has."""
+    ids = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) for name in names]
+    return [body for body in ids if body >= 0]
 
 
 def colours(model: mujoco.MjModel, geoms: NDArray[np.int64]) -> Floats:

@@ -14,11 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.drawing.drawlist import LAYER_SIZE, ROWS, VERTEX, DrawList, Floats
+from lerobot_memobench.sim.drawing.calls import frame_calls
+from lerobot_memobench.sim.drawing.drawlist import LAYER_SIZE, ROWS, VERTEX, DrawList
 from lerobot_memobench.sim.drawing.resources import Resources
-from lerobot_memobench.sim.drawing.shaders import ATTRIBUTES, TEXTURE_UNITS, scene_program, shadow_program
+from lerobot_memobench.sim.drawing.shaders import ATTRIBUTES, TEXTURE_UNITS, scene_program
+from lerobot_memobench.sim.drawing.shadows import ShadowMap
 from lerobot_memobench.sim.drawing.shapes import disc
-from lerobot_memobench.sim.drawing.views import camera_matrix, light_matrix
+from lerobot_memobench.sim.drawing.views import View
 
 Image = NDArray[np.uint8]
 Disc = tuple[NDArray[np.floating], float, float, Sequence[float]]
@@ -26,8 +28,6 @@ Disc = tuple[NDArray[np.floating], float, float, Sequence[float]]
 
 HIGHLIGHTS = 16
 """Translucent discs that fit into a frame."""
-
-_UNIFORMS = ("projection", "light", "eye", "ambient", "light_to", "light_diffuse", "light_specular")
 
 
 class Rasterizer:
@@ -46,29 +46,38 @@ class Rasterizer:
     ) -> None:
         from OpenGL import GL
 
-        self._gl = GL
+        self._gl, self._call = GL, frame_calls()
         self._list, self._width, self._height = draw_list, width, height
-        self._lights = [
+        lights = [
             i
             for i in range(model.nlight)
             if model.light_active[i] and model.light_type[i] == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL.value
         ]
-        casting = [i for i in self._lights if model.light_castshadow[i]]
-        self._caster = casting[0] if casting and shadow_size and draw_list.casting else None
-        self._resources = Resources(GL, width, height)
+        casting = [i for i in lights if model.light_castshadow[i]]
+        casters = draw_list.still.size + draw_list.moving.size
+        caster = casting[0] if casting and shadow_size and casters else None
+        self._view = View(model, lights, caster, height, width)
+        self._resources = Resources(GL, self._call, width, height)
         self._sent: bytes | None = None
         self._make_vertices()
-        self._make_table()
+        self._make_tables()
         self._make_textures()
         self._make_targets(samples)
-        if self._caster is not None:
-            self._make_shadow_map(shadow_size)
-        self._make_programs()
+        self._shadows: ShadowMap | None = None
+        if caster is not None:
+            first = draw_list.indices.size
+            self._shadows = ShadowMap(GL, self._call, self._resources, draw_list, shadow_size, first)
+        # The headlight goes before the other lights.
+        shadowed = None if caster is None else 1 + lights.index(caster)
+        self._program = self._resources.program(scene_program(GL, 1 + len(lights), shadowed))
 
     # --- set up ---------------------------------------------------------------------------------------------
 
     def _make_vertices(self) -> None:
-        """Upload the scene's triangles and, behind them, one disc per highlight, each with its row of the table."""
+        """Upload the scene's triangles and, behind them, one disc per highlight, each with its row of the table.
+
+        The buffer of indices holds what a camera sees, the shadows' casters again, and the discs.
+        """
         GL = self._gl
         positions, normals, uv, triangles = disc()
         discs = np.zeros((HIGHLIGHTS, len(positions)), dtype=VERTEX)
@@ -78,7 +87,9 @@ class Rasterizer:
         disc_indices = (triangles.reshape(1, -1) + steps).astype(np.uint32)
         self._disc_size = int(triangles.size)
         vertices = np.concatenate([self._list.vertices, discs.ravel()])
-        indices = np.concatenate([self._list.indices, disc_indices.ravel()])
+        scene = (self._list.indices, self._list.still, self._list.moving)
+        self._first_disc = sum(part.size for part in scene)
+        indices = np.concatenate([*scene, disc_indices.ravel()])
 
         self._array = self._resources.vertex_array()
         self._resources.buffer(GL.GL_ARRAY_BUFFER, vertices.view(np.uint8), GL.GL_STATIC_DRAW)
@@ -91,13 +102,14 @@ class Rasterizer:
                 location, count, GL.GL_FLOAT, GL.GL_FALSE, VERTEX.itemsize, ctypes.c_void_p(offset)
             )
 
-    def _make_table(self) -> None:
-        """Make the texture that tells the shader of each geom; `_send` fills it."""
+    def _make_tables(self) -> None:
+        """Make what tells the shaders of each geom, a texture, and of the view, a block; `draw` fills both."""
         GL = self._gl
         self._table = np.zeros((len(self._list.geoms) + HIGHLIGHTS, ROWS, 4), dtype=np.float32)
         self._table_buffer = self._resources.buffer(GL.GL_TEXTURE_BUFFER, self._table, GL.GL_STREAM_DRAW)
         self._resources.texture(TEXTURE_UNITS["geoms"], GL.GL_TEXTURE_BUFFER)
         GL.glTexBuffer(GL.GL_TEXTURE_BUFFER, GL.GL_RGBA32F, self._table_buffer)
+        self._view_buffer = self._resources.buffer(GL.GL_UNIFORM_BUFFER, self._view.block, GL.GL_STREAM_DRAW)
 
     def _make_textures(self) -> None:
         GL = self._gl
@@ -116,42 +128,15 @@ class Rasterizer:
         GL, make = self._gl, self._resources
         samples = min(samples, int(GL.glGetIntegerv(GL.GL_MAX_SAMPLES)))
         self._target = make.framebuffer()
-        make.renderbuffer(GL.GL_RGBA8, GL.GL_COLOR_ATTACHMENT0, samples)
-        make.renderbuffer(GL.GL_DEPTH_COMPONENT24, GL.GL_DEPTH_ATTACHMENT, samples)
+        size = (self._width, self._height)
+        make.renderbuffer(GL.GL_RGBA8, GL.GL_COLOR_ATTACHMENT0, samples, size)
+        make.renderbuffer(GL.GL_DEPTH_COMPONENT24, GL.GL_DEPTH_ATTACHMENT, samples, size)
         make.check_framebuffer()
         self._result = self._target
         if samples:
             self._result = make.framebuffer()
-            make.renderbuffer(GL.GL_RGBA8, GL.GL_COLOR_ATTACHMENT0, 0)
+            make.renderbuffer(GL.GL_RGBA8, GL.GL_COLOR_ATTACHMENT0, 0, size)
             make.check_framebuffer()
-
-    def _make_shadow_map(self, size: int) -> None:
-        GL = self._gl
-        self._shadow_size = size
-        self._shadow_frame = self._resources.framebuffer()
-        texture = self._resources.texture(TEXTURE_UNITS["shadows"], GL.GL_TEXTURE_2D)
-        GL.glTexImage2D(
-            GL.GL_TEXTURE_2D, 0, GL.GL_DEPTH_COMPONENT16, size, size, 0, GL.GL_DEPTH_COMPONENT,
-            GL.GL_UNSIGNED_SHORT, None,
-        )  # fmt: skip
-        self._resources.sample(GL.GL_TEXTURE_2D, GL.GL_LINEAR, GL.GL_CLAMP_TO_BORDER)
-        GL.glTexParameterfv(GL.GL_TEXTURE_2D, GL.GL_TEXTURE_BORDER_COLOR, np.ones(4, dtype=np.float32))
-        GL.glTexParameteri(GL.GL_TEXTURE_2D, GL.GL_TEXTURE_COMPARE_MODE, GL.GL_COMPARE_REF_TO_TEXTURE)
-        GL.glTexParameteri(GL.GL_TEXTURE_2D, GL.GL_TEXTURE_COMPARE_FUNC, GL.GL_LEQUAL)
-        GL.glFramebufferTexture2D(GL.GL_FRAMEBUFFER, GL.GL_DEPTH_ATTACHMENT, GL.GL_TEXTURE_2D, texture, 0)
-        GL.glDrawBuffer(GL.GL_NONE)
-        GL.glReadBuffer(GL.GL_NONE)
-        self._resources.check_framebuffer()
-
-    def _make_programs(self) -> None:
-        GL = self._gl
-        # The headlight goes first.
-        caster = None if self._caster is None else 1 + self._lights.index(self._caster)
-        self._program = self._resources.program(scene_program(GL, 1 + len(self._lights), caster))
-        self._at = {name: GL.glGetUniformLocation(self._program, name) for name in _UNIFORMS}
-        if self._caster is not None:
-            self._shadow_program = self._resources.program(shadow_program(GL))
-            self._shadow_light = GL.glGetUniformLocation(self._shadow_program, "light")
 
     # --- draw -----------------------------------------------------------------------------------------------
 
@@ -167,29 +152,35 @@ class Rasterizer:
         if len(discs) > HIGHLIGHTS:
             raise MemobenchError(f"there are {len(discs)} highlights in a frame; at most {HIGHLIGHTS} can be drawn")
         self._enter()
-        light = np.eye(4, dtype=np.float32) if self._caster is None else light_matrix(model, data, self._caster)
-        if self._send(model, data, discs) and self._caster is not None:
-            self._draw_shadows(light)
-        self._draw_scene(model, data, camera, light)
+        self._send_view(model, data, camera)
+        if self._send_geoms(model, data, discs) and self._shadows is not None:
+            self._shadows.draw(self._table, self._view.block["light"])
+        self._draw_scene()
         if discs:
             self._draw_discs(len(discs))
         return self._read()
 
     def _enter(self) -> None:
         """Set the context's state, which other renderers share."""
-        GL = self._gl
-        GL.glBindVertexArray(self._array)
+        GL, call = self._gl, self._call
+        call.glBindVertexArray(self._array)
         self._resources.bind_textures()
-        GL.glEnable(GL.GL_DEPTH_TEST)
-        GL.glEnable(GL.GL_CULL_FACE)
-        GL.glDisable(GL.GL_BLEND)
-        GL.glDepthMask(GL.GL_TRUE)
+        call.glEnable(GL.GL_DEPTH_TEST)
+        call.glEnable(GL.GL_CULL_FACE)
+        call.glDisable(GL.GL_BLEND)
+        call.glDepthMask(GL.GL_TRUE)
 
-    def _send(self, model: mujoco.MjModel, data: mujoco.MjData, discs: Sequence[Disc]) -> bool:
+    def _send_view(self, model: mujoco.MjModel, data: mujoco.MjData, camera: int) -> None:
+        GL, call = self._gl, self._call
+        block = self._view.look(model, data, camera)
+        call.glBindBufferBase(GL.GL_UNIFORM_BUFFER, 0, self._view_buffer)  # 0 is where a program's first block reads
+        call.glBufferData(GL.GL_UNIFORM_BUFFER, block.nbytes, block.ctypes.data, GL.GL_STREAM_DRAW)
+
+    def _send_geoms(self, model: mujoco.MjModel, data: mujoco.MjData, discs: Sequence[Disc]) -> bool:
         """Bring the table up to date; return whether it had to be, False where the last frame was of the same state."""
-        GL = self._gl
+        GL, call = self._gl, self._call
         rows = len(self._list.geoms)
-        self._table[:rows] = self._list.table(model, data)
+        self._list.fill(self._table[:rows], model, data)
         for k, (position, radius, half_height, rgba) in enumerate(discs):
             row = self._table[rows + k]
             row[:3] = np.diag([radius, radius, half_height]) @ np.eye(3, 4)
@@ -199,72 +190,45 @@ class Rasterizer:
         if state == self._sent:
             return False
         self._sent = state
-        GL.glBindBuffer(GL.GL_TEXTURE_BUFFER, self._table_buffer)
-        GL.glBufferData(GL.GL_TEXTURE_BUFFER, self._table.nbytes, self._table, GL.GL_STREAM_DRAW)
+        call.glBindBuffer(GL.GL_TEXTURE_BUFFER, self._table_buffer)
+        call.glBufferData(GL.GL_TEXTURE_BUFFER, self._table.nbytes, self._table.ctypes.data, GL.GL_STREAM_DRAW)
         return True
 
-    def _draw_shadows(self, light: Floats) -> None:
-        GL = self._gl
-        GL.glBindFramebuffer(GL.GL_FRAMEBUFFER, self._shadow_frame)
-        GL.glViewport(0, 0, self._shadow_size, self._shadow_size)
-        GL.glClear(GL.GL_DEPTH_BUFFER_BIT)
-        GL.glUseProgram(self._shadow_program)
-        GL.glUniformMatrix4fv(self._shadow_light, 1, GL.GL_TRUE, light)
-        GL.glFrontFace(GL.GL_CCW)
-        # Pushed away from the light by more than a texel's slope, or surfaces would speckle themselves.
-        GL.glEnable(GL.GL_POLYGON_OFFSET_FILL)
-        GL.glPolygonOffset(2.0, 4.0)
-        GL.glDrawElements(GL.GL_TRIANGLES, self._list.casting, GL.GL_UNSIGNED_INT, None)
-        GL.glDisable(GL.GL_POLYGON_OFFSET_FILL)
-
-    def _draw_scene(self, model: mujoco.MjModel, data: mujoco.MjData, camera: int, light: Floats) -> None:
-        GL = self._gl
-        GL.glBindFramebuffer(GL.GL_FRAMEBUFFER, self._target)
-        GL.glViewport(0, 0, self._width, self._height)
-        GL.glClearColor(0.0, 0.0, 0.0, 1.0)
-        GL.glClear(GL.GL_COLOR_BUFFER_BIT | GL.GL_DEPTH_BUFFER_BIT)
-        GL.glUseProgram(self._program)
-        projection = camera_matrix(model, data, camera, self._height, self._width)
-        GL.glUniformMatrix4fv(self._at["projection"], 1, GL.GL_TRUE, projection)
-        GL.glUniformMatrix4fv(self._at["light"], 1, GL.GL_TRUE, light)
-        GL.glUniform3fv(self._at["eye"], 1, data.cam_xpos[camera].astype(np.float32))
-        self._set_lights(model, data, data.cam_xmat[camera].reshape(3, 3)[:, 2])
-        GL.glFrontFace(GL.GL_CW)  # frames are drawn upside down
-        GL.glDrawElements(GL.GL_TRIANGLES, self._list.indices.size, GL.GL_UNSIGNED_INT, None)
-
-    def _set_lights(self, model: mujoco.MjModel, data: mujoco.MjData, back: NDArray[np.floating]) -> None:
-        """Tell the shader of the lights; ``back`` (3,) is the way from what is seen to the camera, the headlight."""
-        GL, head, chosen = self._gl, model.vis.headlight, self._lights
-        ambient = head.ambient + model.light_ambient[chosen].sum(axis=0)
-        towards = np.vstack([back, -data.light_xdir[chosen]]).astype(np.float32)
-        diffuse = np.vstack([head.diffuse, model.light_diffuse[chosen]]).astype(np.float32)
-        specular = np.vstack([head.specular, model.light_specular[chosen]]).astype(np.float32)
-        GL.glUniform3fv(self._at["ambient"], 1, ambient.astype(np.float32))
-        GL.glUniform3fv(self._at["light_to"], len(towards), towards)
-        GL.glUniform3fv(self._at["light_diffuse"], len(towards), diffuse)
-        GL.glUniform3fv(self._at["light_specular"], len(towards), specular)
+    def _draw_scene(self) -> None:
+        GL, call = self._gl, self._call
+        call.glBindFramebuffer(GL.GL_FRAMEBUFFER, self._target)
+        call.glViewport(0, 0, self._width, self._height)
+        call.glClearColor(0.0, 0.0, 0.0, 1.0)
+        call.glClear(GL.GL_COLOR_BUFFER_BIT | GL.GL_DEPTH_BUFFER_BIT)
+        call.glUseProgram(self._program)
+        call.glFrontFace(GL.GL_CW)  # frames are drawn upside down
+        call.glDrawElements(GL.GL_TRIANGLES, self._list.indices.size, GL.GL_UNSIGNED_INT, 0)
 
     def _draw_discs(self, count: int) -> None:
-        GL = self._gl
-        start = ctypes.c_void_p(4 * self._list.indices.size)
-        GL.glEnable(GL.GL_BLEND)
-        GL.glBlendFunc(GL.GL_SRC_ALPHA, GL.GL_ONE_MINUS_SRC_ALPHA)
-        GL.glDepthMask(GL.GL_FALSE)
-        GL.glDrawElements(GL.GL_TRIANGLES, count * self._disc_size, GL.GL_UNSIGNED_INT, start)
-        GL.glDepthMask(GL.GL_TRUE)
-        GL.glDisable(GL.GL_BLEND)
+        GL, call = self._gl, self._call
+        call.glEnable(GL.GL_BLEND)
+        call.glBlendFunc(GL.GL_SRC_ALPHA, GL.GL_ONE_MINUS_SRC_ALPHA)
+        call.glDepthMask(GL.GL_FALSE)
+        call.glDrawElements(GL.GL_TRIANGLES, count * self._disc_size, GL.GL_UNSIGNED_INT, 4 * self._first_disc)
+        call.glDepthMask(GL.GL_TRUE)
+        call.glDisable(GL.GL_BLEND)
 
     def _read(self) -> Image:
-        GL = self._gl
+        GL, call = self._gl, self._call
         size = (self._width, self._height)
         if self._result != self._target:
-            GL.glBindFramebuffer(GL.GL_READ_FRAMEBUFFER, self._target)
-            GL.glBindFramebuffer(GL.GL_DRAW_FRAMEBUFFER, self._result)
-            GL.glBlitFramebuffer(0, 0, *size, 0, 0, *size, GL.GL_COLOR_BUFFER_BIT, GL.GL_NEAREST)
-        GL.glBindFramebuffer(GL.GL_FRAMEBUFFER, self._result)
-        GL.glPixelStorei(GL.GL_PACK_ALIGNMENT, 1)
+            call.glBindFramebuffer(GL.GL_READ_FRAMEBUFFER, self._target)
+            call.glBindFramebuffer(GL.GL_DRAW_FRAMEBUFFER, self._result)
+            call.glBlitFramebuffer(0, 0, *size, 0, 0, *size, GL.GL_COLOR_BUFFER_BIT, GL.GL_NEAREST)
+        call.glBindFramebuffer(GL.GL_FRAMEBUFFER, self._result)
+        call.glPixelStorei(GL.GL_PACK_ALIGNMENT, 1)
         image = np.empty((self._height, self._width, 3), dtype=np.uint8)
-        GL.glReadPixels(0, 0, *size, GL.GL_RGB, GL.GL_UNSIGNED_BYTE, image)
+        call.glReadPixels(0, 0, *size, GL.GL_RGB, GL.GL_UNSIGNED_BYTE, image.ctypes.data)
+        if error := call.glGetError():
+            raise MemobenchError(
+                f"the GL driver failed to draw a frame (error {error:#06x}); try render=fast or another MUJOCO_GL, and "
+                "see `memobench doctor`"
+            )
         return image
 
     def free(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,11 +16,12 @@ class Resources:
 
     Args:
         GL: PyOpenGL's module: it fixes its platform on import, so only who has a context imports it.
+        call: the functions of a frame.
         width, height: size of the frames, pixels.
     """
 
-    def __init__(self, GL: Any, width: int, height: int) -> None:
-        self._gl, self.width, self.height = GL, width, height
+    def __init__(self, GL: Any, call: SimpleNamespace, width: int, height: int) -> None:
+        self._gl, self._call, self.width, self.height = GL, call, width, height
         self._arrays: list[int] = []
         self._buffers: list[int] = []
         self._textures: list[tuple[int, Any, int]] = []
@@ -69,8 +71,8 @@ class Resources:
             self._bind(unit, target, name)
 
     def _bind(self, unit: int, target: Any, name: int) -> None:
-        self._gl.glActiveTexture(self._gl.GL_TEXTURE0 + unit)
-        self._gl.glBindTexture(target, name)
+        self._call.glActiveTexture(self._gl.GL_TEXTURE0 + unit)
+        self._call.glBindTexture(target, name)
 
     def framebuffer(self) -> int:
         """Make a framebuffer and bind it."""
@@ -79,13 +81,13 @@ class Resources:
         self._gl.glBindFramebuffer(self._gl.GL_FRAMEBUFFER, name)
         return name
 
-    def renderbuffer(self, kind: Any, attachment: Any, samples: int) -> None:
-        """Give the framebuffer that is bound a place for pixels or depths."""
+    def renderbuffer(self, kind: Any, attachment: Any, samples: int, size: tuple[int, int]) -> None:
+        """Give the framebuffer that is bound a place for pixels or depths of a width and height."""
         GL = self._gl
         name = int(GL.glGenRenderbuffers(1))
         self._renderbuffers.append(name)
         GL.glBindRenderbuffer(GL.GL_RENDERBUFFER, name)
-        GL.glRenderbufferStorageMultisample(GL.GL_RENDERBUFFER, samples, kind, self.width, self.height)
+        GL.glRenderbufferStorageMultisample(GL.GL_RENDERBUFFER, samples, kind, *size)
         GL.glFramebufferRenderbuffer(GL.GL_FRAMEBUFFER, attachment, GL.GL_RENDERBUFFER, name)
 
     def check_framebuffer(self) -> None:

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from lerobot_memobench.errors import MemobenchError
 
 _VERTEX_SHADER = """#version 140
 const int LIGHTS = %(lights)d;
 const int CASTER = %(caster)d;
 uniform samplerBuffer geoms;
-uniform mat4 projection;
-uniform mat4 light;
-uniform vec3 eye;
-uniform vec3 ambient;
-uniform vec3 light_to[LIGHTS];
-uniform vec3 light_diffuse[LIGHTS];
-uniform vec3 light_specular[LIGHTS];
+layout(std140) uniform Frame {
+    mat4 light;
+    mat4 projection;
+    vec4 eye;
+    vec4 ambient;
+    vec4 light_to[LIGHTS];
+    vec4 light_diffuse[LIGHTS];
+    vec4 light_specular[LIGHTS];
+};
 in vec3 position;
 in vec3 normal;
 in vec2 uv;
@@ -32,14 +36,14 @@ void main() {
     vec4 local = vec4(position, 1.0);
     vec3 world = vec3(dot(x, local), dot(y, local), dot(z, local));
     vec3 n = normalize(vec3(dot(x.xyz, normal), dot(y.xyz, normal), dot(z.xyz, normal)));
-    vec3 v = normalize(eye - world);
-    steady = vec4((ambient + material.z) * colour.rgb, colour.a);
+    vec3 v = normalize(eye.xyz - world);
+    steady = vec4((ambient.xyz + material.z) * colour.rgb, colour.a);
     shadowed = vec3(0.0);
     for (int i = 0; i < LIGHTS; i++) {
-        float facing = dot(n, light_to[i]);
+        float facing = dot(n, light_to[i].xyz);
         if (facing > 0.0) {
-            float glint = pow(max(dot(n, normalize(light_to[i] + v)), 0.0), max(material.y, 1.0));
-            vec3 part = facing * light_diffuse[i] * colour.rgb + glint * material.x * light_specular[i];
+            float glint = pow(max(dot(n, normalize(light_to[i].xyz + v)), 0.0), max(material.y, 1.0));
+            vec3 part = facing * light_diffuse[i].xyz * colour.rgb + glint * material.x * light_specular[i].xyz;
             if (i == CASTER) shadowed += part; else steady.rgb += part;
         }
     }
@@ -65,7 +69,7 @@ void main() {
 
 _SHADOW_VERTEX_SHADER = """#version 140
 uniform samplerBuffer geoms;
-uniform mat4 light;
+layout(std140) uniform Frame { mat4 light; };
 in vec3 position;
 in float geom;
 void main() {
@@ -88,6 +92,27 @@ ATTRIBUTES = ("position", "normal", "uv", "geom")
 
 TEXTURE_UNITS = {"geoms": 0, "textures": 1, "shadows": 2}
 """Unit of each sampler: the table of geoms, their textures, the shadow map."""
+
+
+def frame_block(lights: int) -> np.dtype[np.void]:
+    """Return the layout of the block ``Frame``, which both programs read: matrices by columns, vectors of four.
+
+    Args:
+        lights: how many there are.
+    """
+    light = ("<f4", (lights, 4))
+    matrix, vector = ("<f4", (4, 4)), ("<f4", 4)
+    return np.dtype(
+        [
+            ("light", *matrix),
+            ("projection", *matrix),
+            ("eye", *vector),
+            ("ambient", *vector),
+            ("light_to", *light),
+            ("light_diffuse", *light),
+            ("light_specular", *light),
+        ]
+    )
 
 
 def scene_program(GL: Any, lights: int, caster: int | None) -> int:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from lerobot.configs import PolicyFeature
 
 from lerobot_memobench.datasets.memory_cache import dataset_fingerprint
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.files import write_file
+from lerobot_memobench.files.reading import read_json
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 
 ALIGNMENTS = ("none", "semantic", "contrastive", "framewise")
@@ -63,7 +65,7 @@ def claim_folder(out: Path, root: Path, settings: StudySettings) -> None:
     del wanted["seeds"]
     path = out / "settings.json"
     if path.is_file():
-        there = json.loads(path.read_text())
+        there = read_json(path, dict[str, Any], "name another --out, or remove the file")
         different = [key for key in wanted if there.get(key) != wanted[key]]
         if different:
             raise MemobenchError(

@@ -17,12 +17,14 @@ from typing import Any
 import torch
 from lerobot.policies import make_policy
 
-from lerobot_memobench.datasets.memory_cache import MemoryCache
+from lerobot_memobench.datasets.memory_cache import MemoryCache, read_meta
 from lerobot_memobench.files import write_file
+from lerobot_memobench.files.reading import read_json
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
 from lerobot_memobench.studies.alignment.baselines import measure_baselines
 from lerobot_memobench.studies.alignment.figure import draw
 from lerobot_memobench.studies.alignment.frames import Frames, Say
+from lerobot_memobench.studies.alignment.kept import KeptBaselines, KeptRun, kept_or_made
 from lerobot_memobench.studies.alignment.measures import Measures
 from lerobot_memobench.studies.alignment.questions import make_questions
 from lerobot_memobench.studies.alignment.settings import ALIGNMENTS, StudySettings, claim_folder
@@ -44,31 +46,31 @@ class Study:
         self.frames = Frames(root, out / "frames", say)
         config = settings.config("semantic")
         folder = cache_dataset(root, config, progress=lambda done, count: say(f"memory cache: {done} of {count}"))
-        meta = json.loads((folder / "meta.json").read_text())
-        keys = {key: meta[key] for key in ("frames_key", "camera", "stride", "texts_key")}
-        self.cache = MemoryCache.open(root, folder.name, **keys)
+        meta = read_meta(root, folder.name)
+        assert meta is not None  # it was made a moment ago
+        self.cache = MemoryCache.open(
+            root,
+            folder.name,
+            frames_key=meta.frames_key,
+            camera=meta.camera,
+            stride=meta.stride,
+            texts_key=meta.texts_key,
+        )
         self.split = split_frames(self.frames, self.cache.phase, settings)
         self.questions = make_questions(self.cache, settings.level, self.split, self.frames.tasks)
         self.measures = Measures(self.cache, self.frames, self.questions, config.memory_frames, settings.action_batches)
 
     def run(self, align: str, seed: int) -> dict[str, Any]:
         """Train and measure one policy."""
-        return self._once(f"{align}-{seed}", lambda: self._run(align, seed))
+        return self._once(f"{align}-{seed}", KeptRun, lambda: self._run(align, seed))
 
     def baselines(self) -> dict[str, Any]:
         """Measure what needs no training."""
-        return self._once("baselines", self._baselines)
+        return self._once("baselines", KeptBaselines, self._baselines)
 
-    def _once(self, name: str, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    def _once(self, name: str, schema: Any, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         """Return a finished result of that name, or do the work and write it."""
-        path = self.out / "runs" / f"{name}.json"
-        if path.is_file():
-            read: dict[str, Any] = json.loads(path.read_text())
-            return read
-        found = work()
-        path.parent.mkdir(exist_ok=True)
-        write_file(path, json.dumps(found, indent=1))
-        return found
+        return kept_or_made(self.out / "runs" / f"{name}.json", schema, work)
 
     def _run(self, align: str, seed: int) -> dict[str, Any]:
         started = time.process_time()
@@ -107,7 +109,7 @@ def run_study(root: Path, out: Path, settings: StudySettings, say: Say) -> tuple
     # Seed by seed, so that an unfinished study already compares all objectives.
     runs = [study.run(align, seed) for seed in range(settings.seeds) for align in ALIGNMENTS]
     summary = {
-        "settings": json.loads((out / "settings.json").read_text()) | {"seeds": settings.seeds},
+        "settings": read_json(out / "settings.json", dict[str, Any], "it has changed") | {"seeds": settings.seeds},
         "tasks": len(set(study.frames.tasks.tolist())),
         "episodes": len(study.frames.episodes) - 1,
         "candidates": len(study.questions.candidates),

@@ -1,14 +1,13 @@
 """Which video belongs to which rollout, and how it comes into the report's folder.
 
-``env.videos=true`` films every episode as ``<log_dir>/videos/<task>.<episode>.mp4`` (``envs.film``): one frame at the
-start, one per control step of prompt and execution, the last one held. LeRobot's own evaluation leaves
+``env.films`` and ``env.videos`` film episodes as ``<log_dir>/videos/<task>.<episode>.mp4`` (``envs.film``): one frame
+at the start, one per control step of prompt and execution, the last one held. Plain ``lerobot-eval`` leaves
 ``videos/<memory type>_<task id>/eval_episode_<k>.mp4`` of its first ten episodes, without the last frame. In both,
 frame k shows the world after k control steps.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections import Counter
@@ -20,6 +19,7 @@ from lerobot_memobench.envs.film import LAST_FRAMES
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics.rollouts import Record
 from lerobot_memobench.files import draft_of, file_name
+from lerobot_memobench.files.reading import parsed
 
 VIDEOS = "videos"
 LEROBOT_INFO = "eval_info.json"
@@ -40,7 +40,7 @@ def find_videos(folder: Path, records: Sequence[Record]) -> tuple[dict[int, Path
     found: dict[int, Path] = {}
     misfits: list[str] = []
     for k, record in enumerate(records):
-        if not _names_a_file(record):
+        if not _names_a_file(episode_id(record)):
             continue
         film = folder / VIDEOS / f"{record['task']}.{record['episode']}.mp4"
         if film.is_file():
@@ -61,10 +61,10 @@ def find_videos(folder: Path, records: Sequence[Record]) -> tuple[dict[int, Path
     return found, [f"Videos that do not clearly belong to a logged rollout were left out: {named}."]
 
 
-def _names_a_file(record: Record) -> bool:
+def _names_a_file(name: str) -> bool:
     """Whether a rollout's name may be a file's: a log is only text, which must not lead out of these folders."""
     try:
-        return bool(file_name(episode_id(record), "a rollout's name"))
+        return bool(file_name(name, "a rollout's name"))
     except MemobenchError:
         return False
 
@@ -96,13 +96,15 @@ def _lerobot_videos(folder: Path, records: Sequence[Record]) -> dict[int, Path]:
     its list of successes is that of the task's logged rollouts, which it is not after a resumed or a sharded run.
     """
     try:
-        info: Any = json.loads((folder / LEROBOT_INFO).read_text())
+        info: Any = parsed((folder / LEROBOT_INFO).read_bytes())
         entries = [(e["task_group"], e["task_id"], e["metrics"]["successes"]) for e in info["per_task"]]
     except (OSError, ValueError, KeyError, TypeError):
         return {}
     by_task = _positions(records)
     found: dict[int, Path] = {}
     for group, task_id, successes in entries:
+        if not _names_a_file(f"{group}_{task_id}"):
+            continue
         for positions in by_task.values():
             rollouts = [records[k] for k in positions]
             if rollouts[0]["memory_type"] != group or [r["success"] for r in rollouts] != successes:

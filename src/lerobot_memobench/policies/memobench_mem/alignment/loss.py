@@ -9,6 +9,7 @@ from torch import Tensor
 
 from lerobot_memobench.policies.memobench_mem.alignment.objectives import Alignment, retrieval_accuracy
 from lerobot_memobench.policies.memobench_mem.memory.batch import TEXT, TEXT_MASK
+from lerobot_memobench.policies.memobench_mem.ranks import joint, mean_over_ranks
 
 
 def alignment_loss(
@@ -21,15 +22,17 @@ def alignment_loss(
 ) -> tuple[Tensor, dict[str, float]]:
     """Align memory tokens (B, L, d_m), of which ``mask`` (B, L) is real, with the texts of a batch.
 
+    With several ranks the batch is that of all of them together, and the average of the ranks' losses is its loss.
+
     Args:
         encoder: parameters of what made the memory; the gradient that they get from this loss is logged.
 
     Returns:
-        The weighted loss (scalar), and numbers to log; none where no sample has a text.
+        The weighted loss (scalar), and numbers to log; none where no sample of any rank has a text.
     """
     memory = memory.to(torch.float32)  # means over hundreds of tokens and cosines, under mixed precision too
     text, text_mask = batch[TEXT].to(memory), batch[TEXT_MASK].to(memory.device)
-    if not bool(text_mask.any()):
+    if not bool(mean_over_ranks(text_mask.any().float())):
         # Still touch every parameter, so that distributed training sees the same graph on all ranks.
         return 0.0 * sum(parameter.sum() for parameter in alignment.parameters()), {}
     usable = alignment.usable(memory, mask, text, text_mask)
@@ -42,5 +45,5 @@ def alignment_loss(
         gradients = torch.autograd.grad(weighted, list(encoder), retain_graph=True)
         logged["align_grad_norm"] = torch.stack([gradient.norm() for gradient in gradients]).norm().item()
     with torch.no_grad():
-        logged["align_top1"] = retrieval_accuracy(*alignment.pairs(*usable))
+        logged["align_top1"] = retrieval_accuracy(*map(joint, alignment.pairs(*usable)))
     return weighted, logged | alignment.numbers()

@@ -15,6 +15,7 @@ from einops import rearrange
 from torch import Tensor, nn
 
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.policies.memobench_mem.ranks import joint, mean_over_ranks, world_size
 
 POSITIVE_SIMILARITY = 0.99  # texts more similar than this are the same subgoal
 INITIAL_TEMPERATURE = 0.07
@@ -76,11 +77,14 @@ class SemanticAlignment(Alignment):
     def forward(self, memory: Tensor, memory_mask: Tensor, text: Tensor) -> Tensor:
         """Loss (scalar) from memory (B, L, d_m), memory_mask (B, L), text (B, d_t)."""
         z, t = self.pairs(memory, memory_mask, text)
-        return (1.0 - (z * t).sum(dim=-1)).mean()
+        return (1.0 - (z * t).sum(dim=-1)).sum() / mean_over_ranks(z.new_tensor(len(z)))
 
 
 class ContrastiveAlignment(SemanticAlignment):
-    """Two-way retrieval within the batch; repeated subgoals are positives, rows of targets sum to one."""
+    """Two-way retrieval within the batch, that of all ranks together.
+
+    Repeated subgoals are positives; rows of targets sum to one.
+    """
 
     def __init__(self, memory_dim: int, text_dim: int) -> None:
         super().__init__(memory_dim, text_dim)
@@ -88,7 +92,7 @@ class ContrastiveAlignment(SemanticAlignment):
 
     def forward(self, memory: Tensor, memory_mask: Tensor, text: Tensor) -> Tensor:
         """Loss (scalar) from memory (B, L, d_m), memory_mask (B, L), text (B, d_t)."""
-        z, t = self.pairs(memory, memory_mask, text)
+        z, t = map(joint, self.pairs(memory, memory_mask, text))
         logits = z @ t.T / self.log_temperature.exp()
         positive = same_text(t).to(logits.dtype)
         target = positive / positive.sum(dim=1, keepdim=True)
@@ -142,7 +146,9 @@ class FramewiseAlignment(Alignment):
         # A frame without text may hold any numbers, not-a-number too, so they are replaced before they are used.
         text = F.normalize(torch.where(rearrange(valid, "b f -> b f 1"), text, torch.ones_like(text)), dim=-1)
         weights = self.weights(valid)
-        return (weights * (1.0 - (z * text).sum(dim=-1))).sum() / weights.sum().clamp(min=0.5)
+        return (weights * (1.0 - (z * text).sum(dim=-1))).sum() / mean_over_ranks(weights.sum()).clamp(
+            min=0.5 / world_size()
+        )
 
 
 def retrieval_accuracy(memory: Tensor, text: Tensor) -> float:

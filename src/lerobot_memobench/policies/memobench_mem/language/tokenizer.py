@@ -16,6 +16,7 @@ from tokenizers.pre_tokenizers import Split
 from tokenizers.processors import TemplateProcessing
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.memobench_mem.processing.training_run import training_run
 
 _WORD = re.compile(r"\w+|[^\w\s]")
 _SPECIAL = ("<pad>", "<unk>", "<bos>", "<eos>")
@@ -31,12 +32,16 @@ def make_vocabulary(texts: Iterable[str], size: int) -> list[str]:
 
     The commonest words stay when there are more than ``size`` in all.
     """
-    fixed = [*_SPECIAL, *"-:;,.", "task", "state", "action", *map(str, range(256))]
+    return extend([*_SPECIAL, *"-:;,.", "task", "state", "action", *map(str, range(256))], texts, size)
+
+
+def extend(vocabulary: Sequence[str], texts: Iterable[str], size: int) -> list[str]:
+    """Return a vocabulary and behind it, sorted, the words of ``texts`` that it lacks: the commonest up to ``size``."""
     counts = Counter(word for text in texts for word in words(text))
-    for word in fixed:
+    for word in vocabulary:
         counts.pop(word, None)
     ranked = sorted(counts, key=lambda word: (-counts[word], word))
-    return fixed + sorted(ranked[: max(0, size - len(fixed))])
+    return [*vocabulary, *sorted(ranked[: max(0, size - len(vocabulary))])]
 
 
 def make_word_tokenizer(vocabulary: Sequence[str]) -> Any:
@@ -56,7 +61,11 @@ def make_word_tokenizer(vocabulary: Sequence[str]) -> Any:
 @dataclass
 @ProcessorStepRegistry.register(name="memobench_word_tokenizer")
 class WordTokenizerProcessorStep(TokenizerProcessorStep):
-    """LeRobot's tokenizer step with the word tokenizer; its words are saved in the checkpoint's processor file."""
+    """LeRobot's tokenizer step with the word tokenizer; its words are saved in the checkpoint's processor file.
+
+    A step that is rebuilt from a checkpoint for training takes the length of that run's prompts, and learns the words
+    of its dataset that it does not have, behind its own, which keep their numbers.
+    """
 
     vocabulary: list[str] = field(default_factory=list)
 
@@ -66,6 +75,11 @@ class WordTokenizerProcessorStep(TokenizerProcessorStep):
                 "The checkpoint's preprocessor has no 'vocabulary' for its word tokenizer; save the policy again with "
                 "its preprocessor."
             )
+        run = training_run()
+        if run is not None:
+            assert run.config.tokenizer_max_length is not None  # set by the configuration
+            self.max_length = run.config.tokenizer_max_length
+            self.vocabulary = extend(self.vocabulary, run.prompt_texts(), run.config.dimensions.vocabulary)
         self.tokenizer = make_word_tokenizer(self.vocabulary)
         super().__post_init__()
 

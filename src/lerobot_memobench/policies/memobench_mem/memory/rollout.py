@@ -17,6 +17,7 @@ class Row:
     """History of one environment: the clock's last step, and what is kept of its episode."""
 
     last_step: int | None = None
+    frozen: bool = False
     kept: list[Frame] = field(default_factory=list)
 
 
@@ -67,8 +68,13 @@ class RolloutMemory:
         started = last is None or step < last
         if started:
             self.rows[number] = Row()
-        self.rows[number].last_step = step
+        self.rows[number].last_step, self.rows[number].frozen = step, step == last
         return started, step == last
+
+    def writes_next(self) -> bool:
+        """Whether the frame after a row's present one is written."""
+        moving = [row.last_step for row in self.rows if row.last_step is not None and not row.frozen]
+        return self.mechanism.frames > 0 and any((step + 1) % self.stride == 0 for step in moving)
 
     def gather(self, rows: Sequence[int]) -> MemoryBatch:
         """Return what plans of some rows read."""

@@ -19,6 +19,7 @@ from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 from torch import Tensor
 
 from lerobot_memobench.datasets.memory_cache import MemoryCache
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.batch import MASK, PHASE, STEPS, TOKENS, collate_frames
 from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import FrameSampling
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryMechanism
@@ -30,7 +31,14 @@ from lerobot_memobench.policies.memobench_mem.processing.subgoals import (
     texts_of_frames,
     texts_of_histories,
 )
-from lerobot_memobench.policies.memobench_mem.processing.training_cache import require_cache
+from lerobot_memobench.policies.memobench_mem.processing.training_run import require_cache, training_run
+
+
+def gathering(config: MemobenchMemConfig) -> dict[str, Any]:
+    """Return the fields of a policy's `GatherMemoryProcessorStep`."""
+    same = ("align", "subgoal_level", "shuffle_subgoals", "shuffle_seed", "memory")
+    frames = make_mechanism(config.memory, config.memory_frames).frames
+    return {"frames": frames} | {name: getattr(config, name) for name in same}
 
 
 @dataclass
@@ -42,6 +50,9 @@ class GatherMemoryProcessorStep(ProcessorStep):
     (B,), and with an alignment ``memory.text`` and ``memory.text_mask``: (B, d_t) and (B,) for the frame itself, or
     with ``framewise`` (B, F, d_t) and (B, F) for the frames of the history. With ``frames`` 0 (``integration=none``)
     there is no history, and only ``phase`` is added.
+
+    A step that is rebuilt from a checkpoint has the settings of the run that wrote it; with its first training batch it
+    takes those of the policy that is trained now. One that is given a ``cache`` keeps its own.
     """
 
     frames: int = 32
@@ -53,18 +64,26 @@ class GatherMemoryProcessorStep(ProcessorStep):
     cache: MemoryCache | None = field(default=None, repr=False)
     _texts: np.ndarray | None = field(default=None, init=False, repr=False)
 
+    def __post_init__(self) -> None:
+        self._run = None if self.cache is not None else training_run()
+
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         """Return the transition with what was looked up."""
         extra = transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}
         if "index" not in extra or transition.get(TransitionKey.ACTION) is None:
             return transition
-        cache = require_cache(self.cache)
+        self._follow_run()
+        cache = require_cache(self.cache, self._run)
         transition = transition.copy()
         transition[TransitionKey.COMPLEMENTARY_DATA] = {
             **extra,
             **self.gather(cache, extra["index"].reshape(-1).tolist()),
         }
         return transition
+
+    def _follow_run(self) -> None:
+        for name, value in gathering(self._run.config).items() if self._run is not None else ():
+            setattr(self, name, value)
 
     @property
     def mechanism(self) -> MemoryMechanism:

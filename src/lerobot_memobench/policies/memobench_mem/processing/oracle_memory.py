@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.lerobot_types import EnvTransition, TransitionKey
@@ -10,7 +11,7 @@ from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 
 from lerobot_memobench.datasets.memory_cache import MemoryCache
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem.processing.training_cache import require_cache
+from lerobot_memobench.policies.memobench_mem.processing.training_run import require_cache, training_run
 from lerobot_memobench.tasks.memory_text import MARK, with_memory
 
 
@@ -21,10 +22,17 @@ class OracleMemoryProcessorStep(ProcessorStep):
 
     Training samples take it from the dataset's column ``memory``. In a rollout the environment, which alone knows what
     has been done, writes the same words into its instruction; one that does not is refused, because the policy would
-    be scored without the memory it was trained on.
+    be scored without the memory it was trained on. A step that is not ``enabled`` does nothing; one that is rebuilt
+    from a checkpoint does as the policy says that is about to be trained, if there is one.
     """
 
+    enabled: bool = True
     cache: MemoryCache | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        self._run = None if self.cache is not None else training_run()
+        if self._run is not None:
+            self.enabled = self._run.config.oracle_memory
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         """Return the transition with memory text in its tasks.
@@ -32,10 +40,13 @@ class OracleMemoryProcessorStep(ProcessorStep):
         Raises:
             MemobenchError: a rollout's instruction brings none.
         """
+        if not self.enabled:
+            return transition
         extra = transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}
         tasks = extra.get("task") or []
         if "index" in extra and transition.get(TransitionKey.ACTION) is not None:
-            memories = require_cache(self.cache).memory_texts(extra["index"].reshape(-1).tolist())
+            cache = require_cache(self.cache, self._run)
+            memories = cache.memory_texts(extra["index"].reshape(-1).tolist())
             tasks = [with_memory(task, memory) for task, memory in zip(tasks, memories, strict=True)]
         elif not tasks or not all(MARK in task for task in tasks):
             raise MemobenchError(
@@ -45,6 +56,10 @@ class OracleMemoryProcessorStep(ProcessorStep):
         transition = transition.copy()
         transition[TransitionKey.COMPLEMENTARY_DATA] = {**extra, "task": tasks}
         return transition
+
+    def get_config(self) -> dict[str, Any]:
+        """Return what the processor file holds."""
+        return {"enabled": self.enabled}
 
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]

@@ -1,11 +1,15 @@
-"""What LeRobot's evaluation loop is made to do beside its own: run parts of a task, seed each batch by itself.
+"""What LeRobot's evaluation loop is made to do beside its own: run parts of a task, seed each batch, draw what is seen.
 
-The only module that changes anything of LeRobot's. It was written against the loop of one version: what it relies on
-is listed in tests/engine/test_lerobot_loop.py, whose failures say what to look at when LeRobot moves on.
+With `lerobot_training` the only module that changes anything of LeRobot's. It was written against the loop of one
+version: what it relies on is listed in tests/engine/test_lerobot_loop.py, whose failures say what to look at when
+LeRobot moves on.
 
 LeRobot seeds Python, NumPy and torch once per run, so what a sampling policy draws in an episode depends on all that
 ran before it. Here each batch is seeded from the run's seed, the task and the batch's first episode: an evaluation
 that is resumed or shared among machines draws what an undisturbed one draws.
+
+Frames are drawn for those who look at them (``rollout``), and the environment films (``env.films``): LeRobot would
+render ten episodes of each task a second time.
 """
 
 from __future__ import annotations
@@ -29,8 +33,11 @@ KEEPS_ITS_NOISE = ("memobench_mem",)
 """Policies that seed each episode's noise themselves, from torch's initial seed: it must stay the run's."""
 
 
-def check_version() -> None:
-    """Refuse another LeRobot than the one whose loop is known: another one may run other episodes, or unseeded ones.
+def check_version(part: str = "evaluation loop") -> None:
+    """Refuse another LeRobot than the one whose loops are known: another one may run other episodes, or unseeded ones.
+
+    Args:
+        part: what is steered, for the message.
 
     Raises:
         MemobenchError: it is installed.
@@ -38,7 +45,7 @@ def check_version() -> None:
     found = metadata.version("lerobot")
     if found != LEROBOT:
         raise MemobenchError(
-            f"lerobot {found} is installed, and the benchmark steers the evaluation loop of lerobot {LEROBOT}; install "
+            f"lerobot {found} is installed, and the benchmark steers the {part} of lerobot {LEROBOT}; install "
             f"lerobot=={LEROBOT} (make setup)"
         )
 
@@ -55,7 +62,11 @@ def calm_output() -> None:
 
 @contextmanager
 def steered(seed: int | None, ranges: Mapping[tuple[str, int], list[Range]] | None = None) -> Iterator[None]:
-    """While this lasts, LeRobot's loop seeds each batch and runs only ``ranges`` (everything when None).
+    """While this lasts, LeRobot's loop seeds batches, draws what is looked at, films nothing and runs only ``ranges``.
+
+    Args:
+        seed: of the run; batches are not seeded when None.
+        ranges: by LeRobot's name of a task the runs of it; everything when None.
 
     Raises:
         MemobenchError: the installed LeRobot is another than the one whose loop is known here.
@@ -63,15 +74,31 @@ def steered(seed: int | None, ranges: Mapping[tuple[str, int], list[Range]] | No
     check_version()
     from lerobot.scripts import lerobot_eval
 
+    from lerobot_memobench.engine.loop.rollout import sparing
+
     run_one, rollout = lerobot_eval.run_one, lerobot_eval.rollout
+    lerobot_eval.run_one = _unfilmed(run_one)
     if ranges is not None:
-        lerobot_eval.run_one = _only(run_one, ranges)
+        lerobot_eval.run_one = _only(lerobot_eval.run_one, ranges)
+    lerobot_eval.rollout = sparing(rollout, lambda: lerobot_eval.inside_slurm())
     if seed is not None:
-        lerobot_eval.rollout = _seeded(rollout, seed)
+        lerobot_eval.rollout = _seeded(lerobot_eval.rollout, seed)
     try:
         yield
     finally:
         lerobot_eval.run_one, lerobot_eval.rollout = run_one, rollout
+
+
+def _unfilmed(run_one: Callable[..., Any]) -> Callable[..., Any]:
+    """Wrap LeRobot's evaluation of one task: it renders no episode, and makes no folder for films."""
+
+    @functools.wraps(run_one)
+    def run(task_group: str, task_id: int, env: Any, **settings: Any) -> tuple[str, int, dict[str, Any]]:
+        imagines = getattr(getattr(settings.get("policy"), "config", None), "save_predicted_video", False)
+        folder = settings["videos_dir"] if imagines else None  # a world model's own videos stay
+        return run_one(task_group, task_id, env, **{**settings, "max_episodes_rendered": 0, "videos_dir": folder})
+
+    return run
 
 
 def _only(run_one: Callable[..., Any], ranges: Mapping[tuple[str, int], list[Range]]) -> Callable[..., Any]:

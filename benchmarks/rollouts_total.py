@@ -1,0 +1,12 @@
+"""Hours that 1,500 rollouts with images take here, replanning every 5 steps, from a sample of all tasks: one JSON line.
+
+python benchmarks/rollouts_total.py [tasks]
+"""
+
+import json
+import sys
+
+from lerobot_memobench.bench.total import rollouts_total
+
+if __name__ == "__main__":
+    print(json.dumps(rollouts_total(*sys.argv[1:2])))

@@ -1,0 +1,154 @@
+"""``lerobot eval`` itself, per control step: beside the bare vector environment, and stock robosuite in LeRobot's loop.
+
+What is timed lasts from the first step of an episode to LeRobot's figures of it, films written: start-up and reset are
+apart. The policies act at random and cost nothing; how often they look at pictures is what differs.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import statistics
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.bench.line import Line
+from lerobot_memobench.bench.machine import TASK, machine
+from lerobot_memobench.bench.sides import stock_open
+from lerobot_memobench.bench.stock_env import StockEnv
+from lerobot_memobench.bench.stopwatch import Cost, stopwatch
+from lerobot_memobench.engine.defaults import FIRST_SEED
+from lerobot_memobench.engine.planning import plan_line
+from lerobot_memobench.engine.run import run_evaluation
+from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.policies.memobench_random.modeling_memobench_random import MemobenchRandomPolicy
+
+NEVER, EACH, FIFTH = 0, 1, 5
+"""Steps from one look at the pictures to the next."""
+LINES = {
+    "eval_loop_each_frame_seen": (EACH, 0),
+    "eval_loop_every_5th_seen": (FIFTH, 0),
+    "eval_loop_none_seen": (NEVER, 0),
+    "eval_loop_filmed": (EACH, 1),
+}
+"""Line -> steps between looks, and how many episodes are filmed."""
+
+
+@contextmanager
+def looking_every(steps: int) -> Iterator[None]:
+    """While this lasts, the random policy looks at every ``steps``-th observation, at none with 0."""
+    calls = itertools.count(1)
+    with patch.object(MemobenchRandomPolicy, "looks_next", lambda self: bool(steps) and next(calls) % steps == 0):
+        yield
+
+
+def evaluate_once(every: int, films: int, steps: int, task: str = TASK) -> Cost:
+    """Return what a step of ``lerobot eval`` costs, in an episode of so many."""
+    words = ["env=memobench", f"tasks={task}", "policy=memobench_random", "prompt_video=false", f"films={films}"]
+    words += ["episodes=1", "batch_size=1", f"horizon={steps}"]
+    with tempfile.TemporaryDirectory() as out, looking_every(every), stopwatch() as watch:
+        run_evaluation(plan_line([*words, f"output_dir={Path(out) / 'run'}"]), lambda text: None)
+    return watch.cost
+
+
+def step_bare(every: int, steps: int, task: str = TASK) -> Cost:
+    """Return what a step of our vector environment costs by itself, its pictures drawn as often as they are seen."""
+    watched = True
+    with tempfile.TemporaryDirectory() as out, stopwatch() as watch:
+        config = MemobenchEnvConfig(tasks=task, prompt_video=False, horizon=steps, log_dir=out)
+        ((env,),) = (suite.values() for suite in config.create_envs(1).values())
+        env.reset(seed=[FIRST_SEED])
+        for number, action in enumerate(_moves(steps), start=1):
+            looks = bool(every) and number % every == 0
+            if looks != watched:
+                env.call("watch", looks)
+                watched = looks
+            env.step(action)
+        watch.end()
+        env.close()
+    return watch.cost
+
+
+def _moves(steps: int) -> NDArray[np.float32]:
+    """Return what the random policy does, (steps, 1, 7)."""
+    return np.random.default_rng(0).uniform(-1, 1, (steps, 1, 7)).astype(np.float32)
+
+
+def evaluate_stock(stock: Any, films: int, steps: int) -> Cost:
+    """Return what a step of stock robosuite costs in LeRobot's own loop, with its films."""
+    from lerobot.envs.utils import freeze_after_episode_end
+    from lerobot.scripts import lerobot_eval
+
+    from lerobot_memobench.policies.memobench_random.configuration_memobench_random import MemobenchRandomConfig
+    from lerobot_memobench.policies.pass_through import pass_through
+
+    env = gym.vector.SyncVectorEnv([freeze_after_episode_end(lambda: StockEnv(stock, steps))])
+    before, after = pass_through("cpu")
+    with tempfile.TemporaryDirectory() as out, stopwatch() as watch:
+        lerobot_eval.eval_policy(
+            env=env,
+            policy=MemobenchRandomPolicy(MemobenchRandomConfig()),
+            env_preprocessor=_same,
+            env_postprocessor=_same,
+            preprocessor=before,
+            postprocessor=after,
+            n_episodes=1,
+            max_episodes_rendered=films,
+            videos_dir=Path(out),
+            start_seed=0,
+        )
+    return watch.cost
+
+
+def _same(given: Any) -> Any:
+    return given
+
+
+def eval_loop(task: str = TASK, rounds: int = 5, steps: int = 100, their_steps: int = 20) -> list[Line]:
+    """A control step of ``lerobot eval``, by how often the policy looks at pictures, and with a film."""
+    import lerobot_memobench.registration  # noqa: F401 - makes the policy known
+
+    logging.disable(logging.WARNING)
+    try:
+        with stock_open(True) as stock:
+            sides: dict[tuple[str, int], Callable[[], Cost]] = {}
+            for name, (every, films) in LINES.items():
+                sides[name, 0] = lambda every=every, films=films: evaluate_once(every, films, steps, task)  # type: ignore[misc]
+                sides["bare", every] = lambda every=every: step_bare(every, steps, task)  # type: ignore[misc]
+                sides["stock", films] = lambda films=films: evaluate_stock(stock, films, their_steps)  # type: ignore[misc]
+            costs = _turns(sides, rounds)
+    finally:
+        logging.disable(logging.NOTSET)
+    return [
+        _line(name, costs[name, 0], costs["stock", films], costs["bare", every], {"task": task})
+        for name, (every, films) in LINES.items()
+    ]
+
+
+def _turns[Side](sides: dict[Side, Callable[[], Cost]], rounds: int) -> dict[Side, Cost]:
+    """Return the medians of all sides, which take turns; the first round, which compiles and loads, does not count."""
+    found: dict[Side, list[Cost]] = {side: [] for side in sides}
+    for _ in range(rounds + 1):
+        for side, measure in sides.items():
+            found[side].append(measure())
+    return {side: Cost(*map(statistics.median, zip(*costs[1:], strict=True))) for side, costs in found.items()}
+
+
+def _line(name: str, ours: Cost, theirs: Cost, bare: Cost, detail: dict[str, Any]) -> Line:
+    beside = {
+        "bare": round(1e3 * bare.wall, 3),
+        "over_bare": round(ours.wall / bare.wall - 1, 3),
+        "cpu": round(1e3 * ours.cpu, 3),
+        "bare_cpu": round(1e3 * bare.cpu, 3),
+        "over_bare_cpu": round(ours.cpu / bare.cpu - 1, 3),
+    }
+    mine, other = round(1e3 * ours.wall, 3), round(1e3 * theirs.wall, 3)
+    return Line(name, mine, other, round(theirs.wall / ours.wall, 2), "ms", machine(), {**detail, **beside})

@@ -1,0 +1,76 @@
+"""A dataset of LeRobot's without the frames of its prompts, in which actions have no effect.
+
+LeRobot draws its samples, and looks back from them, within the bounds that a dataset's metadata tell of each episode.
+Here they begin at the first execution frame, which the column ``phase`` tells: it is there in generated, converted and
+downloaded datasets, and LeRobot's dataset tools keep it.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch.utils.data import Dataset, Subset
+
+from lerobot_memobench.datasets.demonstration import EXECUTION
+from lerobot_memobench.errors import MemobenchError
+
+PHASE = "phase"
+COLUMNS = {PHASE, "simple_subgoal"}
+"""What a dataset of ours has: ``phase`` alone may be anybody's."""
+BEGIN, END = "dataset_from_index", "dataset_to_index"
+
+
+def leave_out_prompts(dataset: Any) -> int:
+    """Move the bounds of a dataset's episodes to their execution; return how many frames that leaves out.
+
+    Args:
+        dataset: LeRobot's, opened to be read. One without our columns stays as it is.
+
+    Raises:
+        MemobenchError: it is streamed; LeRobot then takes its frames as they come.
+    """
+    if not set(dataset.meta.features) >= COLUMNS:
+        return 0
+    if not hasattr(dataset.hf_dataset, "data"):
+        raise MemobenchError(
+            "a dataset that is streamed cannot be trained on without its prompt frames; use dataset.streaming=false, "
+            "or prompt_frames=true to train on them"
+        )
+    episodes = dataset.meta.episodes
+    begin, end = (np.array(episodes[name], dtype=np.int64) for name in (BEGIN, END))
+    starts = _starts(dataset, begin, end)
+    dataset.meta.episodes = episodes.remove_columns(BEGIN).add_column(BEGIN, starts)
+    return int((starts - begin).sum())
+
+
+def _starts(dataset: Any, begin: NDArray[np.int64], end: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return each episode's first execution frame, its end where it has none; episodes not opened stay as they are."""
+    episode, index = (_column(dataset, name) for name in ("episode_index", "index"))
+    acting = _column(dataset, PHASE) == EXECUTION
+    starts = begin.copy()
+    opened = np.unique(episode)
+    starts[opened] = end[opened]
+    np.minimum.at(starts, episode[acting], index[acting])
+    return starts
+
+
+def _column(dataset: Any, name: str) -> NDArray[np.int64]:
+    column: NDArray[np.int64] = dataset.hf_dataset.data.column(name).to_numpy()
+    return column
+
+
+class ExecutionFrames(Subset[Any]):
+    """The execution frames of a dataset, one by one: LeRobot walks through a held-out part without its bounds.
+
+    Attributes:
+        hf_dataset: the tasks of these frames, where LeRobot looks for them.
+    """
+
+    def __init__(self, dataset: Dataset[Any]) -> None:
+        acting = np.flatnonzero(_column(dataset, PHASE) == EXECUTION)
+        super().__init__(dataset, acting.tolist())
+        tasks = dataset.hf_dataset.data.table.select(["task_index"])
+        self.hf_dataset = SimpleNamespace(data=tasks.take(acting))

@@ -1,0 +1,72 @@
+"""What LeRobot keeps of a dataset in ``meta/info.json``, as far as it is used here; and reading what may be damaged."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, NotRequired, TypedDict
+
+from annotated_types import Ge, Le
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files.reading import Count, read_json
+
+INFO_FILE = Path("meta") / "info.json"
+ADVICE = "the dataset is damaged; generate it or take it from its source again"
+
+
+class Info(TypedDict):
+    """A dataset as a whole. Each of its episodes is looked at, so their number is no arbitrary one."""
+
+    codebase_version: str
+    total_episodes: Annotated[int, Ge(0), Le(10_000_000)]
+    total_frames: NotRequired[Count]
+    fps: NotRequired[Annotated[int, Ge(1), Le(10_000)]]
+    features: dict[str, dict[str, Any]]
+
+
+def read_info(folder: Path) -> dict[str, Any]:
+    """Return ``meta/info.json`` of the dataset in ``folder``.
+
+    Raises:
+        MemobenchError: there is none, or it is none of LeRobot's.
+    """
+    try:
+        found: dict[str, Any] = read_json(folder / INFO_FILE, Info, ADVICE)
+    except FileNotFoundError:
+        raise MemobenchError(f"{folder} is no dataset (there is no {INFO_FILE}); name one that was generated") from None
+    return found
+
+
+@contextlib.contextmanager
+def undamaged(folder: Path) -> Iterator[None]:
+    """Let nothing but a `MemobenchError` out of a block that does nothing but read the dataset in ``folder``.
+
+    LeRobot, pyarrow and PyAV answer damaged files with errors of every type.
+    """
+    try:
+        yield
+    except MemobenchError:
+        raise
+    except Exception as error:
+        told = " ".join(str(error).split())[:200]
+        raise MemobenchError(f"{folder} cannot be read ({type(error).__name__}: {told}); {ADVICE}") from error
+
+
+def episode_count(folder: Path) -> int:
+    """Return how many episodes the dataset in ``folder`` has, as ``meta/info.json`` and ``meta/episodes`` both say.
+
+    Raises:
+        MemobenchError: they cannot be read, or disagree.
+    """
+    import pyarrow.parquet as pq
+
+    told = int(read_info(folder)["total_episodes"])
+    with undamaged(folder):
+        rows = sum(pq.read_metadata(path).num_rows for path in (folder / "meta" / "episodes").rglob("*.parquet"))
+    if rows != told:
+        raise MemobenchError(
+            f"{folder / INFO_FILE} tells of {told} episodes, {folder}/meta/episodes of {rows}; {ADVICE}"
+        )
+    return told

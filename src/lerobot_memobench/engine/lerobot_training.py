@@ -1,0 +1,70 @@
+"""What LeRobot's training is made to do beside its own: leave the frames of prompts out.
+
+With `loop` and `policies.memobench_mem.execution_frames`, which draws that policy's batches, all that changes anything
+of LeRobot's; what it relies on is listed in tests/engine/test_lerobot_training.py. Whether prompt frames are wanted is
+decided where the policy is known for sure: when LeRobot, its configuration complete, has opened the datasets.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import ModuleType
+from typing import Any
+
+from lerobot_memobench.datasets.execution_frames import ExecutionFrames, leave_out_prompts
+from lerobot_memobench.engine.loop.steering import check_version
+from lerobot_memobench.envs.prompting import knows_phases
+
+logger = logging.getLogger(__name__)
+
+MAKE = "make_train_eval_datasets"
+"""The function by which LeRobot's training opens the datasets to train on and to measure the loss on."""
+
+
+@contextmanager
+def trained_on(prompt_frames: bool | None) -> Iterator[None]:
+    """While this lasts, LeRobot trains on prompt frames too, or on none; None: on none unless the policy knows phases.
+
+    Raises:
+        MemobenchError: the installed LeRobot is another than the one whose training is known here.
+    """
+    before = steer(prompt_frames)
+    try:
+        yield
+    finally:
+        for module, make in before.items():
+            setattr(module, MAKE, make)
+
+
+def steer(prompt_frames: bool | None) -> dict[ModuleType, Callable[..., Any]]:
+    """As `trained_on`, for good; return what was replaced."""
+    check_version("training")
+    from lerobot.scripts import lerobot_train
+
+    modules = [module for module in (lerobot_train, sys.modules["__main__"]) if hasattr(module, MAKE)]  # `python -m`
+    before = {module: getattr(module, MAKE) for module in modules}
+    for module, make in before.items():
+        setattr(module, MAKE, _leaving_out(make, prompt_frames))
+    return before
+
+
+def _leaving_out(make: Callable[..., Any], prompt_frames: bool | None) -> Callable[..., Any]:
+    """Wrap what opens LeRobot's datasets: those that it returns hold no prompts where none are wanted."""
+
+    @functools.wraps(make)
+    def run(config: Any) -> Any:
+        train, held_out = make(config)
+        wanted = config.policy is None or knows_phases(config.policy) if prompt_frames is None else prompt_frames
+        if wanted:
+            return train, held_out
+        count = leave_out_prompts(train)
+        logger.info("%d frames of prompts are left out of the %d to train on", count, train.num_frames)
+        if held_out is not None and leave_out_prompts(held_out):
+            held_out = ExecutionFrames(held_out)
+        return train, held_out
+
+    return run

@@ -1,0 +1,56 @@
+"""Where does the prompt play: in steps that the policy sees, or within `reset`? It depends on what the policy knows.
+
+A policy that knows phases declares it on the class of its configuration, ``knows_phases: ClassVar[bool] = True``: it
+waits while `observation.phase` is 0, and plans anew when it becomes 1. Any other policy would act on a recording, and
+its queue would still hold those actions when the scene is restored. To it an episode begins at its first execution
+frame.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+AUTO, STEPS, RESET = "auto", "steps", "reset"
+PLACES = (AUTO, STEPS, RESET)
+"""Values of ``env.prompt_in``."""
+
+
+def knows_phases(policy: object) -> bool:
+    """Return whether a policy's configuration, or its class, declares that it knows phases."""
+    return bool(getattr(policy, "knows_phases", False))
+
+
+def prompt_in(policy: object | None) -> str:
+    """Return `STEPS` or `RESET`, as suits a policy's configuration or its class; `STEPS` where none is known."""
+    return STEPS if policy is None or knows_phases(policy) else RESET
+
+
+def policy_being_run() -> type | None:
+    """Return the class of the configuration of the policy on LeRobot's command line, None where none is told.
+
+    An environment's configuration does not hold the policy; LeRobot's parser tells it.
+    """
+    from lerobot.configs import PreTrainedConfig, parser
+
+    path = parser.get_path_arg("policy")
+    if path is not None:
+        overrides = [*parser.get_yaml_overrides("policy"), *(parser.get_cli_overrides("policy") or [])]
+        return type(PreTrainedConfig.from_pretrained(path, cli_overrides=overrides))
+    name = parser.get_type_arg("policy") or _type_in_file(parser.parse_arg("config_path"))
+    known: dict[str, type] = PreTrainedConfig.get_known_choices()
+    return known.get(name) if name is not None else None
+
+
+def _type_in_file(path: str | None) -> str | None:
+    """Return the policy type in a local file of LeRobot's settings, or in a checkpoint's folder; None without one."""
+    if path is None:
+        return None
+    file = Path(path) / "train_config.json" if Path(path).is_dir() else Path(path)
+    try:
+        name: Any = yaml.safe_load(file.read_text())["policy"]["type"]
+    except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError):
+        return None
+    return name if isinstance(name, str) else None

@@ -1,0 +1,244 @@
+"""The loop of `OSCController.advance`, compiled: the same operations in the same order by the same libraries.
+
+MuJoCo, numpy's BLAS and scipy's LAPACK are called at their addresses, so that every bit is that of the Python loop.
+Memory that they are told of belongs to the caller: what is made in here may be freed while its address is in use.
+
+To import this needs numba and a place where it may keep what it compiled; `functions` needs numpy's own BLAS.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import importlib
+from typing import Any, NamedTuple
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, types
+from numba.extending import get_cython_function_address, intrinsic
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+_BY_ROWS, _AS_IS, _TRANSPOSED = np.int32(101), np.int32(111), np.int32(112)
+"""CBLAS's words for the layout of a matrix."""
+_DOUBLE = 8
+_INT = 4
+
+
+class Functions(NamedTuple):
+    """Addresses of what is called."""
+
+    step1: int
+    step2: int
+    site_jacobian: int
+    full_mass: int
+    gemv: int
+    gemm: int
+    posv: int
+
+
+class Arm(NamedTuple):
+    """What an arm's controller knows for good: first velocity and position, gains, limits, actuators."""
+
+    site: int
+    dof: int
+    qpos: int
+    kp: float
+    kd: float
+    null_kp: float
+    null_kd: float
+    home: Array
+    low: Array
+    high: Array
+    finger_bias: Array
+    finger_scale: Array
+    actuators: NDArray[np.int64]
+    fingers: NDArray[np.int64]
+
+
+class State(NamedTuple):
+    """The simulation's own memory: positions, velocities, pose of the grip site, mass matrix, bias forces, controls."""
+
+    qpos: Array
+    qvel: Array
+    position: Array
+    rotation: Array
+    mass: Array
+    bias: Array
+    ctrl: Array
+
+
+class Scratch(NamedTuple):
+    """Memory of intermediate results, made by `scratch`."""
+
+    jacobian: Array
+    mass: Array
+    factors: tuple[Array, Array, Array]
+    twist: Array
+    product: Array
+    columns: Array
+    inverse: Array
+    wrench: Array
+    pull: Array
+    posture: Array
+    torques: Array
+    sizes: NDArray[np.int32]
+    upper: NDArray[np.uint8]
+
+
+def functions() -> Functions:
+    """Return the addresses, of the functions that numpy, scipy and MuJoCo's bindings themselves call.
+
+    Raises:
+        AttributeError: numpy was built with another BLAS, or the libraries cannot be asked.
+    """
+    # A module's library answers for those that it was linked with.
+    physics, blas = (
+        ctypes.CDLL(importlib.import_module(name).__file__)
+        for name in ("mujoco._functions", "numpy._core._multiarray_umath")
+    )
+
+    def address(function: Any) -> int:
+        return int(ctypes.cast(function, ctypes.c_void_p).value or 0)
+
+    return Functions(
+        address(physics.mj_step1),
+        address(physics.mj_step2),
+        address(physics.mj_jacSite),
+        address(physics.mj_fullM),
+        address(blas.scipy_cblas_dgemv64_),
+        address(blas.scipy_cblas_dgemm64_),
+        get_cython_function_address("scipy.linalg.cython_lapack", "dposv"),
+    )
+
+
+def scratch(nv: int) -> Scratch:
+    """Return memory for a model of so many degrees of freedom."""
+    empty = np.empty
+    return Scratch(
+        empty((6, nv)), empty((nv, nv)), (empty((3, 3)), empty((6, 6)), empty((7, 7))), empty(6), empty((3, 3)),
+        empty((6, 7)), empty((6, 6)), empty(6), empty(6), empty(7), empty(7), np.zeros(3, np.int32),
+        np.array([ord("U")], np.uint8),
+    )  # fmt: skip
+
+
+def _call_of(_typing: Any, address: Any, arguments: Any) -> Any:
+    """Call a C function that returns nothing. Unlike a function of ctypes it can be kept in numba's cache."""
+
+    def generate(context: Any, builder: Any, _signature: Any, values: Any) -> Any:
+        pointer, packed = values
+        passed = [builder.extract_value(packed, k) for k in range(len(arguments))]
+        kind = ir.FunctionType(ir.VoidType(), [value.type for value in passed])
+        builder.call(builder.inttoptr(pointer, kind.as_pointer()), passed)
+        return context.get_dummy_value()
+
+    return types.void(address, arguments), generate
+
+
+_call: Any = intrinsic(_call_of)
+
+
+@njit(nogil=True)
+def _times(f, matrix, transposed, vector, out):  # type: ignore[no-untyped-def]
+    """out = matrix @ vector, or its transpose's."""
+    rows, columns = matrix.shape
+    _call(
+        f.gemv,
+        (_BY_ROWS, transposed, rows, columns, 1.0, matrix.ctypes.data, matrix.strides[0] // _DOUBLE,
+         vector.ctypes.data, 1, 0.0, out.ctypes.data, 1),
+    )  # fmt: skip
+
+
+@njit(nogil=True)
+def _times_transposed(f, a, b, out):  # type: ignore[no-untyped-def]
+    """out = a @ b.T."""
+    _call(
+        f.gemm,
+        (_BY_ROWS, _AS_IS, _TRANSPOSED, a.shape[0], b.shape[0], a.shape[1], 1.0, a.ctypes.data,
+         a.strides[0] // _DOUBLE, b.ctypes.data, b.strides[0] // _DOUBLE, 0.0, out.ctypes.data, out.shape[1]),
+    )  # fmt: skip
+
+
+@njit(nogil=True)
+def _solve(f, s, matrix, factor, b):  # type: ignore[no-untyped-def]
+    """b = matrix⁻¹ b for a positive definite matrix and each row of b; factor is overwritten."""
+    rows = matrix.shape[0]
+    for k in range(rows):
+        for j in range(rows):
+            factor[j, k] = matrix[k, j]  # LAPACK goes by columns
+    s.sizes[0], s.sizes[1] = rows, b.size // rows
+    n = s.sizes.ctypes.data
+    _call(
+        f.posv,
+        (s.upper.ctypes.data, n, n + _INT, factor.ctypes.data, n, b.ctypes.data, n, n + 2 * _INT),
+    )  # fmt: skip
+
+
+@njit(nogil=True)
+def _clip(value, low, high):  # type: ignore[no-untyped-def]
+    """Return a value within limits; what is not a number stays so."""
+    return low if value < low else high if value > high else value
+
+
+@njit(nogil=True)
+def _torques(f, model, data, arm, position, rotation, x, s):  # type: ignore[no-untyped-def]
+    """s.torques = `OSCController.torques`."""
+    _call(
+        f.site_jacobian,
+        (model, data, s.jacobian.ctypes.data, s.jacobian[3:].ctypes.data, np.int32(arm.site)),
+    )
+    _call(f.full_mass, (model, s.mass.ctypes.data, x.mass.ctypes.data))
+    dofs = slice(arm.dof, arm.dof + 7)
+    jacobian, mass, velocity = s.jacobian[:, dofs], s.mass[dofs, dofs], x.qvel[dofs]
+    third, sixth, seventh = s.factors
+    _times(f, jacobian, _AS_IS, velocity, s.twist)
+    _times_transposed(f, rotation, x.rotation, s.product)
+    for k in range(3):
+        s.wrench[k] = arm.kp * (position[k] - x.position[k]) - arm.kd * s.twist[k]
+        after, last = (k + 1) % 3, (k + 2) % 3
+        error = 0.5 * (s.product[last, after] - s.product[after, last])
+        s.wrench[3 + k] = arm.kp * error - arm.kd * s.twist[3 + k]
+
+    for k in range(6):
+        for j in range(7):
+            s.columns[k, j] = jacobian[k, j]
+    _solve(f, s, mass, seventh, s.columns)
+    _times_transposed(f, jacobian, s.columns, s.inverse)
+    _solve(f, s, s.inverse[:3, :3], third, s.wrench[:3])
+    _solve(f, s, s.inverse[3:, 3:], third, s.wrench[3:])
+    for k in range(7):
+        s.torques[k] = arm.null_kp * (arm.home[k] - x.qpos[arm.qpos + k]) - arm.null_kd * velocity[k]
+    _times(f, mass, _AS_IS, s.torques, s.posture)
+    _times(f, s.columns, _AS_IS, s.posture, s.pull)
+    _solve(f, s, s.inverse, sixth, s.pull)
+    for k in range(6):
+        s.wrench[k] -= s.pull[k]
+    _times(f, jacobian, _TRANSPOSED, s.wrench, s.torques)
+    for k in range(7):
+        s.torques[k] = s.torques[k] + x.bias[arm.dof + k] + s.posture[k]
+
+
+@njit(nogil=True, cache=True)
+def advance(f, model, data, arm, position, rotation, gripper, moved, x, s, substeps):  # type: ignore[no-untyped-def]
+    """Hold a goal over physics steps.
+
+    Args:
+        f: `Functions`.
+        model, data: addresses of MuJoCo's structures.
+        arm: `Arm`.
+        position, rotation: the goal, (3,) and (3, 3).
+        gripper: the fingers' command, (2,), brought up to date in place.
+        moved: its change per physics step, (2,).
+        x: `State`.
+        s: `Scratch`.
+        substeps: how many physics steps.
+    """
+    for _ in range(substeps):
+        _torques(f, model, data, arm, position, rotation, x, s)
+        for k in range(7):
+            x.ctrl[arm.actuators[k]] = _clip(s.torques[k], arm.low[k], arm.high[k])
+        for k in range(2):
+            gripper[k] = _clip(gripper[k] + moved[k], -1.0, 1.0)
+            x.ctrl[arm.fingers[k]] = arm.finger_bias[k] + arm.finger_scale[k] * gripper[k]
+        _call(f.step2, (model, data))
+        _call(f.step1, (model, data))

@@ -1,0 +1,161 @@
+"""Logs, protocols and cards, damaged in any way: every command that reads them ends in a result or a sentence."""
+
+from __future__ import annotations
+
+import json
+import random
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lerobot_memobench.cli import controls, figures
+from lerobot_memobench.cli.html import html
+from lerobot_memobench.cli.merge import merge
+from lerobot_memobench.cli.report import ReportFormat, compare, report
+from lerobot_memobench.engine import rerun as again
+from lerobot_memobench.engine.card import new_card, with_episodes, write_card
+from lerobot_memobench.engine.resume import earlier_batch_size, resumed_card
+from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.envs.protocol import check_protocol, write_protocol
+
+from .. import mutations
+from . import logs
+
+STOVE, DRAWER = "press_the_stove_button_four_times", "two_of_them"
+SETTINGS: dict[str, Any] = {
+    "seed_base": 7,
+    "referent": "fixed",
+    "prompt_video": True,
+    "horizon": 1200,
+    "replan_steps": 5,
+    "render": "fast",
+    "render_every": 1,
+    "oracle_memory": False,
+}
+
+
+def card_of(folder: Path) -> dict[str, Any]:
+    start = {
+        "command": ["lerobot", "eval"],
+        "batch_size": 2,
+        "versions": {"python": "3.12", "mujoco": "3"},
+        "git_commit": None,
+        "machine": {"cpu": "some", "cores": 2, "gpu": None},
+        "gl": {"GL backend": "egl"},
+    }
+    records = read_episodes(folder)
+    card = new_card(
+        protocol={"tasks": sorted({record["task"] for record in records}), "episodes": 4, **SETTINGS},
+        policy={"type": "act", "seed": 7, "settings": {"n_action_steps": 5, "chunk_size": 50}},
+        checkpoint={"path": "somewhere", "revision": None, "files": {"model.safetensors": "0" * 64}},
+        trained_on={"repo_id": "me/it", "steps": 5},
+        task_files={"one": "abc", "two_of_them": "def"},
+        flags=["--env.type=memobench", "--env.tasks=one,two_of_them", "--eval.n_episodes=4"],
+        runs=[start],
+    )
+    return with_episodes(card, records)
+
+
+def whole_evaluation(folder: Path, successes: int) -> Path:
+    """A folder with all that an evaluation leaves, but films: one worker's file beside the merged one."""
+    logs.evaluation(folder, successes, steps=40, prompt_steps=0, variant=0, wall_s=1.5)
+    lines = (folder / "episodes.jsonl").read_text().splitlines(keepends=True)
+    (folder / "episodes").mkdir()
+    worker = [json.dumps({**json.loads(line), "written_at": 1.0}) + "\n" for line in lines[:3]]
+    (folder / "episodes" / "one.1.jsonl").write_text("".join(worker))
+    write_protocol(folder, SETTINGS)
+    write_card(folder, card_of(folder))
+    info = {"per_task": [{"task_group": "temporal", "task_id": 0, "metrics": {"successes": [True, False]}}]}
+    (folder / "eval_info.json").write_text(json.dumps(info))
+    return folder
+
+
+class Bench:
+    """Two whole evaluations, the first of which is damaged, and the commands that read it."""
+
+    def __init__(self, tmp_path: Path) -> None:
+        self.whole = tmp_path / "whole"
+        self.run, self.other, self.out = (self.whole / name for name in ("run", "other", "out"))
+        self.source = tmp_path / "source"
+        whole_evaluation(self.source / "run", 2)
+        whole_evaluation(self.source / "other", 1)
+        self.card = card_of(self.source / "run")
+        self.commands: list[tuple[Callable[[random.Random], object], int]] = [
+            (lambda _: report([str(self.run)], list(ReportFormat), None, self.out), 30),
+            (lambda _: report([str(self.run), f"b={self.other}"], list(ReportFormat), None, None), 20),
+            (lambda _: compare(str(self.run), str(self.other), ["scene_hash"], None, None, 0, 100), 20),
+            (lambda _: html([self.run, self.other], self.out), 20),
+            (lambda _: merge(self.out, [self.run]), 20),
+            (lambda _: merge(self.run, [self.other]), 20),
+            (lambda _: resumed_card(self.run, self.card, lambda _: None), 20),
+            (lambda _: earlier_batch_size(self.run), 5),
+            (lambda _: check_protocol(self.run, SETTINGS), 5),
+            (lambda _: self.rerun(), 20),
+            (lambda _: controls.oracle([self.run], [self.other], None, 100, self.out), 5),
+            (lambda _: controls.shuffled(self.run, self.other, None, 100, self.out), 5),
+            (lambda _: controls.granularity(self.run, self.other, self.other, None, self.out), 5),
+            *((lambda _, draw=draw: draw([str(self.run)], None, out=self.out), 1) for draw in DRAWN),
+        ]
+
+    def rerun(self) -> None:
+        """All that `memobench rerun` does with a card before and after the run."""
+        told = again.repeatable_card(self.run)
+        again.check_policy(told)
+        again.differences_here(told)
+
+    def use(self, rng: random.Random) -> object:
+        calls, weights = zip(*self.commands, strict=True)
+        return rng.choices(calls, weights)[0](rng)
+
+
+DRAWN: tuple[Callable[..., None], ...] = (
+    figures.radar,
+    figures.correlations,
+    figures.failures,
+    figures.prefix,
+    figures.replan,
+)
+
+
+def check(tmp_path: Path, files: str, count: int) -> tuple[int, int]:
+    bench = Bench(tmp_path)
+
+    def prepare(rng: random.Random) -> None:
+        mutations.fresh_copy(bench.source, bench.whole)
+        mutations.damage(bench.run / rng.choice(files.split()), rng)
+
+    found = mutations.ends_well(range(count), prepare, bench.use, bench.whole, ("run", "other", "out"))
+    return found["result"], found["refused"]
+
+
+KINDS = {
+    "log": "episodes.jsonl episodes.jsonl episodes/one.1.jsonl",
+    "protocol": "protocol.json",
+    "card": "card.json",
+    "lerobot's own": "eval_info.json",
+}
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A command that takes a name out of a file for a path would leave something in one of these folders."""
+    (tmp_path / "whole").mkdir()
+    monkeypatch.chdir(tmp_path / "whole")
+    monkeypatch.setattr(again, "gl_facts", lambda: {"GL backend": "egl"})  # no context for a look at a card
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_damaged_evaluations(tmp_path: Path, kind: str) -> None:
+    results, refused = check(tmp_path, KINDS[kind], 150)
+    assert results > 20
+    assert refused > (5 if kind != "lerobot's own" else -1)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(7200)
+@pytest.mark.parametrize("kind", KINDS)
+def test_many_damaged_evaluations(tmp_path: Path, kind: str) -> None:
+    results, refused = check(tmp_path, KINDS[kind], 10_000)
+    print(f"{kind}: {results} results, {refused} refused")

@@ -1,0 +1,49 @@
+"""`lerobot-train --peft…`: adapters in pi0.5, memory and heads whole."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from small_policy import batch_of, made_for_training
+
+from lerobot_memobench.policies.memobench_mem.adapters import trained_whole
+
+
+def _whole(policy: object) -> set[str]:
+    """Parameters below the modules that peft is told to train whole; it compares the ends of names."""
+    names = policy._get_default_peft_targets()["modules_to_save"]  # type: ignore[attr-defined]
+    modules = [name for name, _ in policy.named_modules() if any(name.endswith(end) for end in names)]  # type: ignore[attr-defined]
+    return {name for name, _ in policy.named_parameters() if any(name.startswith(f"{m}.") for m in modules)}  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("integration", ["modulation", "context", "none"])
+def test_memory_and_heads_are_trained_whole_and_nothing_else(dataset_root: Path, integration: str) -> None:
+    align = "none" if integration == "none" else "contrastive"
+    policy, *_ = made_for_training(dataset_root, integration=integration, align=align)
+    own = {f"model.{name}" for name in policy.model.memory_parameters()}
+    own |= {name for name, _ in policy.named_parameters() if name.startswith("alignment.")}
+    assert _whole(policy) == own
+    assert bool(own) == (integration != "none")
+
+
+def test_what_is_asked_for_is_trained_whole_too(dataset_root: Path) -> None:
+    policy, *_ = made_for_training(dataset_root)
+    assert trained_whole(policy, ["action_out_proj"]) == ["action_out_proj", *trained_whole(policy)]
+    assert trained_whole(policy, ["modulator"]).count("modulator") == 1
+
+
+def test_adapters_are_made_beside_memory_and_heads(dataset_root: Path, tmp_path: Path) -> None:
+    pytest.importorskip("peft")
+    policy, before, _, dataset = made_for_training(dataset_root, align="contrastive")
+    policy.save_pretrained(tmp_path)
+    policy.config.pretrained_path = str(tmp_path)
+    wrapped = policy.wrap_with_peft(peft_cli_overrides={"method_type": "LORA", "r": 2})
+    wrapped.train()
+    loss, logged = wrapped.forward(before(batch_of(dataset, [3, 50, 80])))
+    loss.backward()
+    assert logged["align_grad_norm"] > 0
+    learning = {name for name, p in wrapped.named_parameters() if p.requires_grad and p.grad is not None}
+    for part in ("lora_A", "model.memory.", "modulator", "memory_to_expert", "alignment"):
+        assert any(part in name for name in learning), part
+    assert policy.average is None

@@ -1,0 +1,181 @@
+"""pi0.5 with its memory, really run: at full size (slow, 24 GiB), and by the same steps at the small one."""
+
+from __future__ import annotations
+
+import resource
+import time
+from types import MethodType
+
+import pytest
+import torch
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.policies.pi05.configuration_pi05 import PI05Config
+from lerobot.policies.pi05.modeling_pi05 import PaliGemmaWithExpertModel, PI05Pytorch
+from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
+from torch import Tensor
+
+from lerobot_memobench.policies.memobench_mem.backbone import SizedPI05
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import Frame
+from lerobot_memobench.policies.memobench_mem.memory.rollout import Row
+from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from lerobot_memobench.policies.memobench_mem.random_weights import fill_buffers, random_policy
+
+CAMERA = "observation.images.image"
+FRAMES, PROMPT, CHUNK = 32, 60, 50
+MACHINE_GIB = 24
+
+
+def _config(size: str) -> MemobenchMemConfig:
+    """The VLM frozen, bfloat16; 32 frames are remembered."""
+    config = MemobenchMemConfig(size=size, device="cpu", push_to_hub=False, dtype="bfloat16", train_expert_only=True)
+    side = config.image_size[0]
+    config.input_features = {
+        CAMERA: PolicyFeature(type=FeatureType.VISUAL, shape=(3, side, side)),
+        "observation.state": PolicyFeature(type=FeatureType.STATE, shape=(8,)),
+    }
+    config.output_features = {"action": PolicyFeature(type=FeatureType.ACTION, shape=(7,))}
+    return config
+
+
+def _batch(config: MemobenchMemConfig) -> dict[str, Tensor]:
+    """One preprocessed training sample whose memory is full."""
+    torch.manual_seed(1)
+    length = config.tokenizer_max_length
+    assert length is not None
+    return {
+        CAMERA: torch.rand(1, 3, *config.image_size),
+        "observation.state": torch.rand(1, 8),
+        OBS_LANGUAGE_TOKENS: torch.randint(4, 250, (1, length)),
+        OBS_LANGUAGE_ATTENTION_MASK: torch.arange(length)[None] < min(length, PROMPT),
+        "action": torch.rand(1, CHUNK, 7),
+        "action_is_pad": torch.zeros(1, CHUNK, dtype=torch.bool),
+        "phase": torch.ones(1, dtype=torch.int64),
+        "memory.tokens": torch.randn(1, FRAMES, 16, config.dimensions.vlm.width).to(torch.bfloat16),
+        "memory.steps": torch.arange(FRAMES)[None] * 11,
+        "memory.mask": torch.ones(1, FRAMES, dtype=torch.bool),
+    }
+
+
+def _lerobots(policy: MemobenchMemPolicy) -> PI05Pytorch:
+    """LeRobot's own model over the policy's weights: a second set would not fit."""
+    config = policy.config
+    with torch.device("meta"):
+        if config.size == "pi05":
+            theirs = PI05Pytorch(PI05Config(device="cpu", dtype="bfloat16", train_expert_only=True))
+        else:
+            theirs = SizedPI05(config)
+            pair = theirs.paligemma_with_expert
+            pair.embed_image = MethodType(PaliGemmaWithExpertModel.embed_image, pair)
+    own = dict(policy.model.named_parameters())
+    for path, module in theirs.named_modules():
+        for key, wanted in list(module.named_parameters(recurse=False)):
+            ours = own[policy.model.place_of(f"{path}.{key}")]
+            assert (ours.dtype, ours.shape) == (wanted.dtype, wanted.shape), f"{path}.{key}"
+            setattr(module, key, ours)
+    fill_buffers(theirs, torch.device("cpu"))
+    return theirs.eval()
+
+
+def _memory(batch: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    return batch["memory.tokens"], batch["memory.steps"], batch["memory.mask"]
+
+
+@torch.no_grad()
+def _equals_lerobots(policy: MemobenchMemPolicy, batch: dict[str, Tensor]) -> None:
+    theirs = _lerobots(policy)
+    actions = torch.nn.functional.pad(batch["action"], (0, policy.config.max_action_dim - 7))
+    inputs = {
+        "images": [batch[CAMERA] * 2 - 1],
+        "img_masks": [torch.ones(1, dtype=torch.bool)],
+        "tokens": batch[OBS_LANGUAGE_TOKENS],
+        "masks": batch[OBS_LANGUAGE_ATTENTION_MASK],
+        "actions": actions,
+        "noise": torch.randn(actions.shape),
+        "time": torch.full((1,), 0.3),
+    }
+    policy.model.set_memory(*_memory(batch))
+    ours = policy.model.forward(**inputs)
+    assert torch.isfinite(ours).all()
+    assert ours.abs().max() > 0
+    assert torch.equal(ours, theirs.forward(**inputs))
+
+
+def _plan(policy: MemobenchMemPolicy, batch: dict[str, Tensor]) -> Tensor:
+    """The actions planned in the middle of an episode of which 32 frames are remembered."""
+    tokens, steps, _ = _memory(batch)
+    kept = [Frame(int(step), seen) for step, seen in zip(steps[0], tokens[0], strict=True)]
+    policy.reset()
+    policy.history.rows = [Row(last_step=kept[-1].step, kept=kept)]
+    keys = (CAMERA, "observation.state", OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK)
+    observation = {key: batch[key] for key in keys} | {"observation.step": torch.tensor([[kept[-1].step + 1.0]])}
+    planned = policy.predict_action_chunk(observation)
+    assert len(policy.history.rows[0].kept) == FRAMES + 1
+    return planned
+
+
+def _step(policy: MemobenchMemPolicy, batch: dict[str, Tensor]) -> None:
+    """One update of memory and action expert; the gradients stay."""
+    with torch.no_grad():
+        for name, parameter in policy.named_parameters():
+            if ".modulation." in name:
+                parameter.normal_(std=0.02)  # at zero, the encoder behind it would get no gradient
+    policy.train()
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+    loss, _ = policy.forward(batch)
+    loss.backward()
+    torch.nn.utils.clip_grad_norm_(policy.get_optim_params(), 1.0)
+    optimizer.step()
+    policy.update()
+    assert torch.isfinite(loss)
+
+
+def _group(name: str) -> str:
+    """Which of the trained parts a parameter belongs to."""
+    for part, word in (("modulators", ".modulator."), ("expert", ".gemma_expert."), ("memory", "model.memory")):
+        if word in name:
+            return part
+    return "projections of actions and time"
+
+
+def _peak_gib() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+
+
+@pytest.mark.parametrize("size", ["tiny", pytest.param("pi05", marks=pytest.mark.slow)])
+def test_it_is_built_equals_pi05_plans_and_trains(size: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """One test, because two workers would hold two policies. Prints seconds and peak memory of each part."""
+    started, found = time.perf_counter(), []
+
+    def note(what: str) -> None:
+        found.append(f"{what}: {time.perf_counter() - started:.0f} s since the start, peak {_peak_gib():.1f} GiB")
+
+    before = _peak_gib()
+    policy = random_policy(_config(size)).eval()
+    weights = sum(p.nbytes for p in policy.parameters()) / 2**30
+    note(f"{size} built, weights {weights:.1f} GiB")
+    assert not any(tensor.is_meta for tensor in (*policy.parameters(), *policy.buffers()))
+    assert _peak_gib() < before + 1.1 * weights + 1.0
+    batch = _batch(policy.config)
+    _equals_lerobots(policy, batch)
+    note("forward equals LeRobot's")
+    planned = _plan(policy, batch)
+    assert planned.shape == (1, CHUNK, 7)
+    assert torch.isfinite(planned).all()
+    note("planned")
+    samples = {name: p.detach().flatten()[:4096].clone() for name, p in policy.named_parameters()}
+    modulations = {name for name in samples if ".modulation." in name}
+    _step(policy, batch)
+    trained = {name: p for name, p in policy.named_parameters() if p.requires_grad}
+    note(f"trained {sum(p.numel() for p in trained.values()) / 1e6:.0f} M parameters")
+    moved = {
+        name
+        for name, p in policy.named_parameters()
+        if name not in modulations and not torch.equal(p.detach().flatten()[:4096], samples[name].to(p.dtype))
+    }
+    assert {_group(name) for name in moved} == {_group(name) for name in trained}
+    assert moved <= set(trained)
+    assert not any("paligemma_with_expert.paligemma." in name for name in trained)
+    assert _peak_gib() < MACHINE_GIB
+    with capsys.disabled():
+        print("\n" + "\n".join(found))

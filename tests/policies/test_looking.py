@@ -1,0 +1,210 @@
+"""A policy that says it does not look at the next observation acts the same whatever pictures that one holds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lerobot.configs import FeatureType, PolicyFeature
+from policy_server import PolicyServer
+from remote_case import counting, make
+from small_policy import made_for_training
+from test_other_policies import _tiny_paligemma, tiny_smolvlm  # noqa: F401 - fixtures
+from torch import Tensor
+
+from lerobot_memobench.engine.loop.looking import looking
+from lerobot_memobench.policies.memobench_expert.configuration_memobench_expert import MemobenchExpertConfig
+from lerobot_memobench.policies.memobench_expert.modeling_memobench_expert import MemobenchExpertPolicy
+from lerobot_memobench.policies.memobench_random.configuration_memobench_random import MemobenchRandomConfig
+from lerobot_memobench.policies.memobench_random.modeling_memobench_random import MemobenchRandomPolicy
+
+CAMERAS = ("observation.images.image", "observation.images.wrist_image")
+IMAGE = PolicyFeature(type=FeatureType.VISUAL, shape=(3, 96, 96))
+FEATURES: dict[str, Any] = {
+    "input_features": {
+        **dict.fromkeys(CAMERAS, IMAGE),
+        "observation.state": PolicyFeature(type=FeatureType.STATE, shape=(8,)),
+    },
+    "output_features": {"action": PolicyFeature(type=FeatureType.ACTION, shape=(7,))},
+    "device": "cpu",
+}
+STEPS, PLAN = 10, 3
+Row = tuple[int, int]
+"""Control step and phase of an environment."""
+
+
+def observation(rows: Sequence[Row], time: int, **more: Any) -> dict[str, Any]:
+    """What LeRobot's loop hands a policy; other pictures at each step."""
+    generator = torch.Generator().manual_seed(time)
+    return {
+        **{key: torch.rand(len(rows), 3, 96, 96, generator=generator) for key in CAMERAS},
+        "observation.state": torch.rand(len(rows), 8, generator=generator),
+        "observation.step": torch.tensor([[float(step)] for step, _ in rows]),
+        "observation.phase": torch.tensor([[float(phase)] for _, phase in rows]),
+        "observation.expert_action": torch.rand(len(rows), 7, generator=generator),
+        "observation.language.tokens": torch.ones(len(rows), 8, dtype=torch.long),
+        "observation.language.attention_mask": torch.ones(len(rows), 8, dtype=torch.bool),
+        "task": ["turn on the stove"] * len(rows),
+        **more,
+    }
+
+
+def acted(
+    policy: Any, clock: Callable[[int], Sequence[Row]], blind: bool, before: Callable[[Any], Any] = lambda batch: batch
+) -> tuple[Tensor, list[int]]:
+    """Return a rollout's actions (time, rows, 7), and when the policy looked; what it does not look at is nonsense.
+
+    As the environment does it, the first frame of an episode and that of its execution are shown in any case.
+    """
+    torch.manual_seed(0)
+    policy.reset()
+    looks, seen, actions = looking(policy), [], []
+    shown, phases = True, None
+    for time in range(STEPS):
+        rows = clock(time)
+        shown = shown or phases != [phase for _, phase in rows]
+        phases = [phase for _, phase in rows]
+        batch = observation(rows, time)
+        if shown:
+            seen.append(time)
+        elif blind:
+            batch |= {key: torch.full((len(rows), 3, 96, 96), torch.nan) for key in CAMERAS}
+        with torch.inference_mode():
+            actions.append(policy.select_action(before(batch)))
+        shown = looks()
+    return torch.stack(actions), seen
+
+
+def check(policy: Any, clock: Callable[[int], Sequence[Row]], looked: Sequence[int], **more: Any) -> None:
+    blind, seen = acted(policy, clock, blind=True, **more)
+    assert seen == list(looked)
+    assert blind.isfinite().all()
+    assert torch.equal(blind, acted(policy, clock, blind=False, **more)[0])
+
+
+def execution(time: int) -> list[Row]:
+    """Two environments that act at once."""
+    return [(time, 1), (time, 1)]
+
+
+def prompts(time: int) -> list[Row]:
+    """Two environments with prompts of 3 and 5 steps, of which the first ends at step 8."""
+    return [(min(time, 8), int(time >= 3)), (time, int(time >= 5))]
+
+
+EVERY_PLAN = range(0, STEPS, PLAN)
+
+
+def act(**fields: Any) -> Any:
+    from lerobot.policies.act.configuration_act import ACTConfig
+    from lerobot.policies.act.modeling_act import ACTPolicy
+
+    small = {"dim_model": 32, "n_heads": 2, "dim_feedforward": 64, "n_encoder_layers": 1, "n_vae_encoder_layers": 1}
+    sizes = {**small, "chunk_size": 4, "n_action_steps": PLAN, "latent_dim": 8, "pretrained_backbone_weights": None}
+    return ACTPolicy(ACTConfig(**{**FEATURES, **sizes, **fields}))
+
+
+def test_act() -> None:
+    check(act(), execution, EVERY_PLAN)
+    check(act(temporal_ensemble_coeff=0.01, n_action_steps=1), execution, range(STEPS))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_tiny_paligemma")
+def test_pi0() -> None:
+    from lerobot.policies.pi0.modeling_pi0 import PI0Config, PI0Policy
+
+    sizes = {"chunk_size": 4, "n_action_steps": PLAN, "num_inference_steps": 2, "dtype": "float32"}
+    check(PI0Policy(PI0Config(**FEATURES, **sizes)), execution, EVERY_PLAN)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_tiny_paligemma")
+def test_pi05() -> None:
+    from lerobot.policies.pi05.modeling_pi05 import PI05Config, PI05Policy
+
+    sizes = {"chunk_size": 4, "n_action_steps": PLAN, "num_inference_steps": 2, "dtype": "float32"}
+    check(PI05Policy(PI05Config(**FEATURES, **sizes)), execution, EVERY_PLAN)
+
+
+@pytest.mark.slow
+def test_smolvla(tiny_smolvlm: Path) -> None:  # noqa: F811 - the fixture
+    from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
+    from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
+
+    sizes = {"chunk_size": 4, "n_action_steps": PLAN, "num_steps": 2, "num_vlm_layers": 2}
+    policy = SmolVLAPolicy(SmolVLAConfig(**FEATURES, **sizes, vlm_model_name=str(tiny_smolvlm)))
+    check(policy, execution, EVERY_PLAN)
+
+
+def test_diffusion_looks_at_every_step() -> None:
+    """It keeps pictures of two steps: what it saw last but one is part of a plan."""
+    from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
+    from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
+
+    sizes = {"down_dims": (16, 32), "num_inference_steps": 2, "horizon": 8, "n_groups": 4, "n_action_steps": PLAN}
+    sizes |= {"diffusion_step_embed_dim": 16, "crop_shape": (84, 84), "pretrained_backbone_weights": None}
+    policy = DiffusionPolicy(DiffusionConfig(**FEATURES, **sizes))
+    assert acted(policy, execution, blind=True)[1] == list(range(STEPS))
+
+
+def test_who_acts_in_a_way_of_its_own_always_looks() -> None:
+    class Watchful(type(act())):  # type: ignore[misc]
+        def select_action(self, batch: dict[str, Tensor]) -> Tensor:
+            return super().select_action(batch)  # type: ignore[no-any-return]
+
+    policy = act()
+    assert not looking_after_a_plan(policy)
+    policy.__class__ = Watchful
+    assert looking_after_a_plan(policy)
+    assert looking(object())()
+
+
+def looking_after_a_plan(policy: Any) -> bool:
+    policy.reset()
+    policy.select_action(observation(execution(0), 0))
+    return looking(policy)()
+
+
+def test_the_expert_and_the_random_policy_never_look() -> None:
+    check(MemobenchExpertPolicy(MemobenchExpertConfig()), prompts, [0, 3, 5])
+    policy = MemobenchRandomPolicy(MemobenchRandomConfig())
+    assert acted(policy, prompts, blind=True)[1] == [0, 3, 5]
+
+
+@pytest.mark.parametrize(
+    ("fields", "looked"),
+    [
+        ({"memory_stride": 1}, range(STEPS)),
+        # Every fourth frame is remembered. Plans begin at 3 and 5, the first frames of execution, and last three steps.
+        # At 9 row 0 would plan again: that its episode has ended is known only then.
+        ({"memory_stride": 4}, [0, 3, 4, 5, 6, 8, 9]),
+        ({"integration": "none"}, [0, 3, 5, 6, 8, 9]),
+    ],
+    ids=["stride1", "stride4", "none"],
+)
+def test_a_memory_looks_at_what_it_stores_and_plans_from(
+    fields: dict[str, Any], looked: Sequence[int], dataset_root: Path, tmp_path: Path
+) -> None:
+    policy, before, _, _ = made_for_training(dataset_root, n_action_steps=PLAN, **fields)
+    check(policy, prompts, looked, before=before)
+
+
+@pytest.mark.parametrize(
+    ("fields", "looked"),
+    [
+        ({"dialect": "openpi", "history_every": 2}, [0, 2, 3, 4, 5, 6, 8, 9]),
+        ({"dialect": "openpi", "send_prompt": False}, [0, 3, 5, 6, 8, 9]),
+        ({"dialect": "robomme"}, range(STEPS)),
+        ({"dialect": "robomme", "send_prompt": False}, [0, *range(3, STEPS)]),
+    ],
+    ids=["openpi", "openpi-blind", "robomme", "robomme-blind"],
+)
+def test_a_server_is_sent_what_it_is_asked_about(fields: dict[str, Any], looked: Sequence[int]) -> None:
+    with PolicyServer(counting) as one, PolicyServer(counting) as other:
+        servers = f"127.0.0.1:{one.port},127.0.0.1:{other.port}"
+        policy = make(one, servers=servers, n_action_steps=PLAN, **fields)
+        check(policy, prompts, looked)
