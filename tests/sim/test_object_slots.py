@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import mujoco
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim import object_slots, simulation
@@ -66,6 +68,13 @@ def test_the_layout_tells_how_to_read_it() -> None:
     assert all(start == sum(size for _, _, size in starts[:k]) for k, (_, start, _) in enumerate(starts))
     assert len(set(told["classes"])) == len(told["classes"])
     assert {"drawer", "door", "knob", "butter", "wooden_cabinet"} <= set(told["classes"])
+
+
+def test_the_command_prints_the_layout(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["objects", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == layout()
+    assert main(["objects"]) == 0
+    assert "16 slots" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("name", task_names())

@@ -19,6 +19,7 @@ from lerobot_memobench.cli.generate import generate
 from lerobot_memobench.cli.html import html
 from lerobot_memobench.cli.merge import merge, rerun
 from lerobot_memobench.cli.necessity import necessity
+from lerobot_memobench.cli.objects import objects
 from lerobot_memobench.cli.recipe import recipe
 from lerobot_memobench.cli.report import agreement, compare, report
 from lerobot_memobench.cli.simulator import bench, gallery
@@ -41,6 +42,7 @@ app = typer.Typer(
 
 COMMANDS: tuple[Callable[..., int | None], ...] = (
     tasks,
+    objects,
     generate,
     cache,
     data.convert,
