@@ -283,7 +283,7 @@ def test_card(dataset):
     card = DatasetCard.load(dataset.root / "README.md")
     assert "LeRobot" in card.data.tags
     assert card.data.license == "apache-2.0"
-    for column in dataset_features((SIZE, SIZE)):
+    for column in dataset_features((SIZE, SIZE), objects=True):
         assert f"`{column}`" in card.text
     assert "| object | here | 1 | 2 | 60 | 30.00 | 30.00 | 30.00 | 30 | 0." in card.text
     assert "|  | paper | 5 | 250 | 121,276 | 485.10 | 492.00 | 526.00 | 556 | 44.53 GiB |" in card.text
