@@ -172,7 +172,8 @@ def test_dataloader_batches(dataset):
     assert batch["observation.images.image"].shape == (4, 3, SIZE, SIZE)
 
 
-def test_policy_features_are_images_state_and_action_only(dataset):
+def test_policy_features_are_images_objects_state_and_action_only(dataset):
+    from lerobot.configs import FeatureType
     from lerobot.utils.feature_utils import dataset_to_policy_features
 
     features = dataset_to_policy_features(dataset.meta.features)
@@ -180,8 +181,10 @@ def test_policy_features_are_images_state_and_action_only(dataset):
         "observation.images.image",
         "observation.images.wrist_image",
         "observation.state",
+        "observation.environment_state",
         "action",
     }
+    assert features["observation.environment_state"].type is FeatureType.ENV
     assert features["observation.images.image"].shape == (3, SIZE, SIZE)
 
 

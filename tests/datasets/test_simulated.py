@@ -25,9 +25,9 @@ from lerobot_memobench.datasets.generation import generate
 from lerobot_memobench.datasets.labels import labels
 from lerobot_memobench.datasets.lerobot_format import is_dataset, write_dataset
 from lerobot_memobench.datasets.lerobot_format.reading import read_episode
+from lerobot_memobench.datasets.perturbation import Perturbation
 from lerobot_memobench.datasets.recording import HOLD_FRAMES, PATIENCE, record_demonstration
 from lerobot_memobench.datasets.replay import replay
-from lerobot_memobench.datasets.perturbation import Perturbation
 from lerobot_memobench.datasets.validate import Verdict, exit_status, validate
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.object_slots import SLOTS, STARTS
