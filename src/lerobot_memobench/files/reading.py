@@ -8,7 +8,8 @@ may write more. pydantic is imported when the first file is read, which costs as
 from __future__ import annotations
 
 import codecs
-from collections.abc import Iterable, Mapping
+import contextlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -103,6 +104,24 @@ def checked(value: Any, schema: Any) -> Any:
     except ValidationError as error:
         raise Malformed(_told(error.errors(include_url=False), value)) from None
     return value
+
+
+@contextlib.contextmanager
+def refusing(told: Callable[[str], MemobenchError]) -> Iterator[None]:
+    """Let nothing but a `MemobenchError` out of a block that does nothing but read what may be damaged.
+
+    LeRobot, pyarrow, PyAV, h5py and NumPy answer damaged files with errors of every type. To be kept around reading
+    alone: an error in writing, such as a full disk, is not the file's.
+
+    Args:
+        told: makes the error, from what was raised in at most a line.
+    """
+    try:
+        yield
+    except MemobenchError:
+        raise
+    except Exception as error:
+        raise told(f"{type(error).__name__}: {' '.join(str(error).split())[:200]}") from error
 
 
 @cache
