@@ -136,7 +136,9 @@ def _told(errors: Iterable[ErrorDetails], value: Any) -> str:
     first, *others = [(*_place(error["loc"], value), error) for error in errors]
     place, found, error = first
     if error["type"] == "missing":
-        missing = [str(e["loc"][-1]) for p, _, e in (first, *others) if e["type"] == "missing" and p == place]
+        missing = dict.fromkeys(
+            str(e["loc"][-1]) for p, _, e in (first, *others) if e["type"] == "missing" and p == place
+        )
         return f"found no {', '.join(missing)}" + (f" in {place}" if place else "")
     alternatives = dict.fromkeys(_expected(e) for p, _, e in (first, *others) if p == place)
     return f"found {f'{place} = ' if place else ''}{short(found)}, expected {' or '.join(alternatives)}"
@@ -152,7 +154,7 @@ def _place(location: Iterable[int | str], value: Any) -> tuple[str, Any]:
             text, value = f"{text}[{part}]", value[part]
         else:
             break
-    return short(text) if len(text) > LONGEST else text, value
+    return cut(text), value
 
 
 def _expected(error: ErrorDetails) -> str:
@@ -164,5 +166,9 @@ def _expected(error: ErrorDetails) -> str:
 
 def short(value: Any) -> str:
     """Return what was found, as far as a sentence can hold it."""
-    text = repr(value)
+    return cut(repr(value))
+
+
+def cut(text: str) -> str:
+    """Return a text, as far as a sentence can hold it."""
     return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"
