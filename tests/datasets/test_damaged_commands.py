@@ -5,6 +5,7 @@ Each ends in a result or in a sentence, whether a value, a text, a column or a b
 
 from __future__ import annotations
 
+import contextlib
 import random
 from collections import Counter
 from collections.abc import Callable
@@ -75,26 +76,23 @@ def any_bytes(folder: Path, rng: random.Random) -> None:
 
 
 def any_column(folder: Path, rng: random.Random) -> None:
-    """A value of a parquet file, or a column of it that is missing, of another type or of another length."""
+    """A parquet file with another value, which may change its column's type, without a column, or without rows."""
     path = rng.choice(sorted(folder.rglob("*.parquet")))
     table = pq.read_table(path)
+    if rng.random() < 0.05:
+        pq.write_table(table.slice(0, rng.randrange(table.num_rows)), path)
+        return
     number = rng.randrange(table.num_columns)
-    values = table.column(number).to_pylist()
-    if rng.random() < 0.2:
-        table = table.remove_column(number)
+    name, values = table.column_names[number], table.column(number).to_pylist()
+    row = rng.randrange(len(values))
+    if isinstance(values[row], str) and values[row][:1] in ("{", "[") and rng.random() < 0.8:
+        values[row] = mutations.mutated_json(values[row].encode(), rng).decode(errors="replace")
     else:
-        row = rng.randrange(len(values))
-        text = isinstance(values[row], str) and values[row][:1] in "{["
-        values[row] = (
-            mutations.mutated_json(values[row].encode(), rng).decode(errors="replace")
-            if text and rng.random() < 0.8
-            else mutations.mutated_value(values[row], rng)
-        )
-        try:
-            table = table.set_column(number, table.column_names[number], pa.array(values))
-        except (pa.ArrowException, TypeError, ValueError, OverflowError):  # parquet holds no such value
-            table = table.drop_columns([table.column_names[number]])
-    pq.write_table(table if rng.random() < 0.95 else table.slice(0, rng.randrange(len(values))), path)
+        values[row] = mutations.mutated_value(values[row], rng)
+    pq.write_table(table.drop_columns([name]), path)
+    if rng.random() < 0.8:
+        with contextlib.suppress(pa.ArrowException, TypeError, ValueError, OverflowError):  # parquet has no such value
+            pq.write_table(table.set_column(number, name, pa.array(values)), path)
 
 
 def any_attribute(folder: Path, rng: random.Random) -> None:
@@ -193,9 +191,7 @@ def check(source: Path, tmp_path: Path, kind: str, slow: bool, monkeypatch: pyte
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_damaged_data(source: Path, tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = check(source, tmp_path, kind, False, monkeypatch)
-    assert found["result"] > 3
-    assert found["refused"] > (0 if KINDS[kind][2] == DATASET else -1)  # of files, what cannot be used is told
+    assert check(source, tmp_path, kind, False, monkeypatch)["result"] > 3
 
 
 def test_what_is_whole_gives_a_result(source: Path, tmp_path: Path) -> None:
