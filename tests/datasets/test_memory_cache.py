@@ -200,7 +200,7 @@ def test_damaged_texts_of_an_unfinished_cache_are_told(root: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         build_memory_cache(root, "test", _Frames(stop_after=45), _Texts(), batch_size=10)
     (root / FOLDER / "test" / "texts.json").write_text('["a", 5')
-    with pytest.raises(MemobenchError, match=r"texts.json: it is not JSON .*; delete .*/test, it is made again"):
+    with pytest.raises(MemobenchError, match=r"texts.json: it is not JSON .*; delete .*/test, and it is made again"):
         build_memory_cache(root, "test", _Frames(), _Texts("others"))
 
 

@@ -111,14 +111,15 @@ def _differing(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -> 
         if isinstance(value, Mapping) and isinstance(other, Mapping):
             found += _differing(value, other, f"{prefix}{key}.")
         else:
-            found.append(f"{cut(f'{prefix}{key}')}: {cut(_text(value))} and {cut(_text(other))}")
+            found.append(f"{cut(f'{prefix}{key}')}: {_text(value)} and {_text(other)}")
     return found
 
 
 def _text(value: Any) -> str:
-    if isinstance(value, list) and len(value) > 3:
-        return f"{', '.join(map(str, value[:3]))}, … ({len(value)})"
-    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+    if not isinstance(value, list):
+        return cut(str(value))
+    shown = ", ".join(cut(str(each)) for each in value[:3])
+    return f"{shown}, … ({len(value)})" if len(value) > 3 else shown
 
 
 def read_protocol_file(directory: Path) -> dict[str, Any]:

@@ -71,13 +71,13 @@ def array(group: h5py.Group, name: str, shape: tuple[int | None, ...], *dtypes: 
 
 
 def finite(name: str, values: NDArray) -> NDArray:
-    """Return (T, n) numbers after checking that none is infinite, missing, or more than the simulator takes."""
+    """Return (T, n) numbers after checking that none is infinite, missing, or too large."""
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if bad.size:
         raise Unusable(f"{name} holds a value that is not finite at frame {bad[0]}")
     bad = np.flatnonzero((np.abs(values) > LARGEST).any(axis=1))
     if bad.size:
-        raise Unusable(f"{name} holds a value beyond {LARGEST:g} at frame {bad[0]}, which no simulation gives")
+        raise Unusable(f"{name} holds a value beyond {LARGEST:g} at frame {bad[0]}, more than the simulator takes")
     return values
 
 

@@ -13,6 +13,7 @@ from lerobot_memobench.datasets.memory_cache.frame_table import LEVEL_COLUMNS, M
 from lerobot_memobench.datasets.memory_cache.layout import (
     FOLDER,
     FORMAT,
+    TEXTS_FILE,
     TOKENS_FILE,
     CacheMeta,
     dataset_fingerprint,
@@ -21,10 +22,9 @@ from lerobot_memobench.datasets.memory_cache.layout import (
     slot_starts,
     texts_file,
 )
-from lerobot_memobench.datasets.memory_cache.tables import read_texts
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.files import file_name
-from lerobot_memobench.files.reading import read_json, refusing
+from lerobot_memobench.files.reading import read_json
 
 
 class MemoryCache:
@@ -42,7 +42,7 @@ class MemoryCache:
             )
             for level in meta.levels
         }
-        self.texts: list[str] = read_texts(folder)
+        self.texts: list[str] = read_json(folder / TEXTS_FILE, list[str], "it is damaged")
         embeddings = folder / texts_file(meta.texts_key, texts_key or meta.texts_key)
         self.text_embeddings = torch.from_numpy(np.load(embeddings))
         self._memory: np.ndarray | None = np.load(folder / "memory.npy") if meta.oracle else None
@@ -107,9 +107,13 @@ class MemoryCache:
             raise MemobenchError(f"The memory cache {folder} {reason}. {fix_hint(root)}")
         if not meta.complete:
             raise MemobenchError(f"The memory cache {folder} is not finished. Go on with `memobench cache {root}`.")
-        damaged = f"The memory cache {folder} is damaged ({{}}). Delete that folder. {fix_hint(root)}"
-        with refusing(lambda why: MemobenchError(damaged.format(why))):
+        try:
             return cls(folder, meta, texts_key)
+        except Exception as error:  # NumPy answers damaged arrays with errors of every type
+            told = " ".join(str(error).split())[:200]
+            raise MemobenchError(
+                f"The memory cache {folder} is damaged ({told}). Delete that folder. {fix_hint(root)}"
+            ) from None
 
     @property
     def num_frames(self) -> int:

@@ -54,13 +54,8 @@ def add_embeddings(folder: Path, meta: CacheMeta, texts: TextEncoder) -> None:
     """Write what another text encoder makes of the texts beside what the cache has; nothing if it is there."""
     path = folder / texts_file(meta.texts_key, texts.key)
     if not path.is_file():
-        _save_embeddings(path, read_texts(folder), texts)
-
-
-def read_texts(folder: Path) -> list[str]:
-    """Return the unique subgoals of a cache, in the order of their embeddings."""
-    found: list[str] = read_json(folder / TEXTS_FILE, list[str], f"delete {folder}, it is made again")
-    return found
+        unique = read_json(folder / TEXTS_FILE, list[str], f"delete {folder}, and it is made again")
+        _save_embeddings(path, unique, texts)
 
 
 def read_done(folder: Path, episodes: int) -> np.ndarray:
