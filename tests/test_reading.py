@@ -11,7 +11,7 @@ from typing import Any, NotRequired, TypedDict
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files.reading import Count, Malformed, Name, Number, checked, parsed, read_json
+from lerobot_memobench.files.reading import Count, Malformed, Name, Number, checked, parsed, read_json, refusing
 
 
 class Part(TypedDict):
@@ -89,3 +89,18 @@ def test_commands_that_read_no_file_do_not_wait_for_the_library() -> None:
         "sys.exit('pydantic' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("error", [KeyError("a"), OSError(5, "bad\n\ndisk"), RecursionError("x" * 5_000)])
+def test_whatever_a_library_raises_is_a_line(error: Exception) -> None:
+    with pytest.raises(MemobenchError) as told, refusing(lambda why: MemobenchError(f"it is damaged ({why})")):
+        raise error
+    assert str(told.value).startswith(f"it is damaged ({type(error).__name__}: ")
+    assert "\n" not in str(told.value)
+    assert len(str(told.value)) < 300
+
+
+@pytest.mark.parametrize("error", [MemobenchError("as it was"), KeyboardInterrupt("as it was")])
+def test_what_is_told_already_and_what_is_no_damage_passes(error: BaseException) -> None:
+    with pytest.raises(type(error), match=r"^as it was$"), refusing(lambda why: MemobenchError("another")):
+        raise error

@@ -139,6 +139,19 @@ def test_finished_run_is_only_reported(tasks, recorded, tmp_path):
     assert tree_hash(tmp_path / "ds") == before
 
 
+@pytest.mark.parametrize("frames", [None, "absent", "5"])
+def test_a_manifest_that_does_not_say_how_long_an_episode_is(tasks, recorded, tmp_path, frames):
+    run(tasks, tmp_path / "ds")
+    file = tmp_path / "ds" / "manifest.json"
+    manifest = json.loads(file.read_text())
+    manifest["episodes"][0]["frames"] = frames
+    if frames == "absent":
+        del manifest["episodes"][0]["frames"]
+    file.write_text(json.dumps(manifest))
+    with pytest.raises(MemobenchError, match=r"found (no frames in )?episodes\[0\].*take the dataset from its source"):
+        run(tasks, tmp_path / "ds")
+
+
 def test_resume_makes_only_what_is_missing(tasks, recorded, tmp_path, monkeypatch):
     reference = tree_hash_of_run(tasks, tmp_path / "undisturbed")
     inner = recording.record

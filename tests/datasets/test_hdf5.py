@@ -133,6 +133,11 @@ def _nan(old):
     return old
 
 
+def _huge(old):
+    old[3, 1] = -1e30
+    return old
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
@@ -144,6 +149,7 @@ def _nan(old):
         (_put("actions", lambda old: old.astype(np.int64)), "actions has type int64, expected float32 or float64"),
         (_put("states", lambda old: old.astype(np.float32)), "states has type float32, expected float64"),
         (_put("states", _nan), "states holds a value that is not finite at frame 3"),
+        (_put("states", _huge), r"states holds a value beyond 1e\+10 at frame 3, more than the simulator takes"),
         (_put("obs/agentview_image", lambda old: old.astype(np.float32)), "agentview_image has type float32"),
         (_put("obs/agentview_image", lambda old: old[:, :16]), "cameras have different sizes"),
         (_attribute("num_samples", None), "attribute 'num_samples' is missing"),

@@ -181,6 +181,29 @@ def test_a_killed_build_goes_on(root: Path) -> None:
     assert whole.read_bytes() == resumed
 
 
+@pytest.mark.parametrize("content", [b"", b"\x93NUMPY\x01", b"PK\x03\x04", None])
+def test_a_build_that_does_not_know_how_far_it_was_begins_again(root: Path, content: bytes | None) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        build_memory_cache(root, "test", _Frames(stop_after=45), _Texts(), batch_size=10)
+    done = root / FOLDER / "test" / "done.npy"
+    if content is None:
+        np.save(done, np.ones(7, np.uint8))  # of another dataset
+    else:
+        done.write_bytes(content)
+    rest = _Frames()
+    build_memory_cache(root, "test", rest, _Texts())
+    assert rest.seen == 94
+    assert np.load(done).tolist() == [1, 1, 1]
+
+
+def test_damaged_texts_of_an_unfinished_cache_are_told(root: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        build_memory_cache(root, "test", _Frames(stop_after=45), _Texts(), batch_size=10)
+    (root / FOLDER / "test" / "texts.json").write_text('["a", 5')
+    with pytest.raises(MemobenchError, match=r"texts.json: it is not JSON .*; delete .*/test, and it is made again"):
+        build_memory_cache(root, "test", _Frames(), _Texts("others"))
+
+
 def test_the_number_of_threads_changes_nothing(root: Path) -> None:
     whole = root / FOLDER / "test" / "tokens.bin"
     contents = []

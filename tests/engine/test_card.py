@@ -13,8 +13,11 @@ import pytest
 from lerobot_memobench.engine.card import extended, joined_runs, new_card, with_episodes, write_card
 from lerobot_memobench.engine.card_markdown import markdown
 from lerobot_memobench.engine.machine import run_facts
+from lerobot_memobench.engine.merging import merge
 from lerobot_memobench.engine.outcomes import disagreement, outcome
 from lerobot_memobench.engine.policy_identity import checkpoint_files, policy_facts, training_facts, tree_hash
+from lerobot_memobench.engine.resume import resumed_card
+from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records.protocol import read_card
 
@@ -53,6 +56,17 @@ def card(**changes: Any) -> dict[str, Any]:
         "runs": [run_facts(["lerobot", "eval"], 2, {"GL backend": "egl"})],
     }
     return new_card(**{**parts, **changes})
+
+
+@pytest.mark.parametrize("missing", ["tasks", "episodes"])
+def test_an_evaluation_goes_on_only_from_a_card_that_says_what_was_asked_for(tmp_path: Path, missing: str) -> None:
+    EpisodeLog(tmp_path, {}).append(record("a"))
+    now = card()
+    write_card(tmp_path, {**now, "protocol": {key: now["protocol"][key] for key in now["protocol"] if key != missing}})
+    with pytest.raises(MemobenchError, match=f"card.json: found no {missing} in protocol"):
+        resumed_card(tmp_path, now, print)
+    with pytest.raises(MemobenchError, match=f"card.json: found no {missing} in protocol"):
+        merge(tmp_path / "out", [tmp_path])
 
 
 def test_a_card_is_read_back_as_it_was(tmp_path: Path) -> None:

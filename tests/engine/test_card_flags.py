@@ -48,7 +48,8 @@ def make_checkpoint(folder: Path, kind: str = "memobench_random") -> None:
 
 
 def card(flags: Any, **changes: Any) -> dict[str, Any]:
-    parts: dict[str, Any] = {"protocol": {"tasks": [STOVE]}, "policy": {}, "checkpoint": None, "trained_on": None}
+    asked = {"tasks": [STOVE], "episodes": 1}
+    parts: dict[str, Any] = {"protocol": asked, "policy": {}, "checkpoint": None, "trained_on": None}
     runs = [run_facts(["lerobot", "eval"], 1, {})]
     return with_episodes(new_card(**{**parts, "task_files": {}, "flags": [], "runs": runs}), [RECORD]) | {
         "flags": flags,

@@ -140,6 +140,11 @@ def test_a_streamed_dataset_is_refused_in_one_sentence(root: Path) -> None:
     with pytest.raises(MemobenchError, match=r"prompt_frames=true to train on them"):
         opened(root, act(), streaming=True)
     opened(root, act(), prompt_frames=True, streaming=True)
+    ours = MemobenchMemConfig(device="cpu", push_to_hub=False)
+    with pytest.raises(MemobenchError, match=r"memobench_mem draws execution frames alone.*policy.prompt_loss=true"):
+        opened(root, ours, streaming=True)
+    ours.prompt_loss = True
+    opened(root, ours, streaming=True)
 
 
 # --- by the commands ---

@@ -12,6 +12,8 @@ from safetensors.numpy import save_file
 
 from lerobot_memobench.engine.policy_identity import training_facts
 from lerobot_memobench.policies.checkpoint import check_checkpoint, checkpoint_type
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.saved_steps import require_agreement
 from lerobot_memobench.policies.memobench_mem.weights import require_statistics
 from lerobot_memobench.settings.reading import read_settings
 from lerobot_memobench.settings.words import split_words
@@ -67,6 +69,7 @@ def check(tmp_path: Path, files: list[str], count: int) -> tuple[int, int]:
         check_checkpoint(str(folder))
         checkpoint_type(str(folder))
         require_statistics(folder)
+        require_agreement(folder, None, MemobenchMemConfig(device="cpu"), training=True)
 
     found = mutations.ends_well(range(count), prepare, use, whole, ("it",))
     return found["result"], found["refused"]

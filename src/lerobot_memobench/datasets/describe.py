@@ -16,6 +16,7 @@ import numpy as np
 from lerobot_memobench.datasets.demonstration import CAMERAS
 from lerobot_memobench.datasets.lerobot_format.card import statistics_section
 from lerobot_memobench.datasets.lerobot_format.card_tables import ordered_types, storage_by_frames
+from lerobot_memobench.datasets.lerobot_format.info import undamaged
 from lerobot_memobench.datasets.lerobot_format.layout import MANIFEST_FILE, image_key
 from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, list_episodes
 from lerobot_memobench.datasets.manifest import read_manifest
@@ -25,6 +26,7 @@ from lerobot_memobench.files import draft_of, write_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from PIL.Image import Image as Picture
 
 LENGTHS_FIGURE, STORYBOARD_FIGURE, TABLES_FILE = "lengths.png", "storyboard.jpg", "tables.md"
 OURS, THEIRS = "#0072B2", "#E69F00"
@@ -55,23 +57,29 @@ def describe(folder: Path, out: Path, say: Say = lambda _: None) -> list[Path]:
     Raises:
         MemobenchError: the folder is no dataset, or none of its episodes is one of this benchmark.
     """
-    rows = _known(folder, say)
+    rows, hashes = _known(folder, say), folder / MANIFEST_FILE
+    with undamaged(folder):
+        card = _card_tables(folder)
+        tables = card or _tables_of(folder, rows)
+        board = storyboard(folder, rows) if (folder / "videos").is_dir() else None
+        manifest = read_manifest(folder) if hashes.is_file() else _manifest_of(rows)
+    if card is None:
+        say(EDITED)
     out.mkdir(parents=True, exist_ok=True)
     found = [draw_lengths(rows, out / LENGTHS_FIGURE)]
-    if (folder / "videos").is_dir():
-        found.append(draw_storyboard(folder, rows, out / STORYBOARD_FIGURE))
-    tables, hashes = _card_tables(folder), folder / MANIFEST_FILE
-    if tables is None:
-        say(EDITED)
-    found.append(write_file(out / TABLES_FILE, tables or _tables_of(folder, rows)))
-    manifest = read_manifest(folder) if hashes.is_file() else _manifest_of(rows)
+    if board is not None:
+        found.append(out / STORYBOARD_FIGURE)
+        with draft_of(found[-1]) as draft:
+            board.save(draft, quality=88, optimize=True)
+    found.append(write_file(out / TABLES_FILE, tables))
     found.append(write_file(out / MANIFEST_FILE, short_manifest(manifest)))
     return found
 
 
 def _known(folder: Path, say: Say) -> list[dict[str, Any]]:
     """Return what the dataset says of its episodes, without those that another program made."""
-    places = list_episodes(folder)
+    with undamaged(folder):
+        places = list_episodes(folder)
     rows = [
         place.record.model_dump() | {"episode_index": place.index, "length": place.length, "start": place.start}
         for place in places
@@ -180,7 +188,7 @@ def _draw_types(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     axes.legend(frameon=False)
 
 
-def draw_storyboard(folder: Path, rows: Sequence[Mapping[str, Any]], path: Path) -> Path:
+def storyboard(folder: Path, rows: Sequence[Mapping[str, Any]]) -> Picture:
     """Draw one episode per memory type: the prompt's middle, the start, and the frame of each checkpoint."""
     from lerobot.datasets import LeRobotDataset
     from PIL import Image, ImageDraw, ImageFont
@@ -205,9 +213,7 @@ def draw_storyboard(folder: Path, rows: Sequence[Mapping[str, Any]], path: Path)
             sheet.paste(picture, (left, top + title))
             words = textwrap.fill(f"{frame}: {text}", 30, max_lines=3, placeholder=" …")
             draw.multiline_text((left + 2, top + title + FRAME + 1), words, fill="black", font=font, spacing=1)
-    with draft_of(path) as draft:
-        sheet.save(draft, quality=88, optimize=True)
-    return path
+    return sheet
 
 
 def _moments(dataset: Any, row: Mapping[str, Any]) -> list[tuple[int, str]]:

@@ -41,20 +41,22 @@ def leave_out_prompts(dataset: Any) -> int:
         )
     episodes = dataset.meta.episodes
     begin, end = (np.array(episodes[name], dtype=np.int64) for name in (BEGIN, END))
-    starts = _starts(dataset, begin, end)
+    acting = _column(dataset, PHASE) == EXECUTION
+    starts = first_frames(begin, end, np.sort(_column(dataset, "index")[acting]))
+    starts = np.where(np.isin(np.arange(len(begin)), _column(dataset, "episode_index")), starts, begin)  # those opened
     dataset.meta.episodes = episodes.remove_columns(BEGIN).add_column(BEGIN, starts)
     return int((starts - begin).sum())
 
 
-def _starts(dataset: Any, begin: NDArray[np.int64], end: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return each episode's first execution frame, its end where it has none; episodes not opened stay as they are."""
-    episode, index = (_column(dataset, name) for name in ("episode_index", "index"))
-    acting = _column(dataset, PHASE) == EXECUTION
-    starts = begin.copy()
-    opened = np.unique(episode)
-    starts[opened] = end[opened]
-    np.minimum.at(starts, episode[acting], index[acting])
-    return starts
+def first_frames(begin: NDArray[np.int64], end: NDArray[np.int64], acting: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return each episode's first execution frame (E,), its end where it has none.
+
+    Args:
+        begin: (E,) first frames of the episodes. end: (E,) the frames after their last.
+        acting: all execution frames, ascending.
+    """
+    found: NDArray[np.int64] = np.minimum(np.append(acting, end.max(initial=0))[acting.searchsorted(begin)], end)
+    return found
 
 
 def _column(dataset: Any, name: str) -> NDArray[np.int64]:

@@ -11,14 +11,25 @@ from lerobot_memobench.files.reading import Count, Whole, read_json
 ADVICE = "it is no manifest that this package wrote; take the dataset from its source again"
 
 
-class ManifestRow(TypedDict):
-    """An episode that was asked for: its hash, or why there is none."""
+class Asked(TypedDict):
+    """An episode that was asked for."""
 
     task_name: str
     seed: Whole
-    failure: str | None
     digest: NotRequired[str | None]
-    frames: NotRequired[Count | None]
+
+
+class Made(Asked):
+    """An episode that is there."""
+
+    failure: None
+    frames: Count
+
+
+class Failed(Asked):
+    """One that is not, and why."""
+
+    failure: str
 
 
 class LeftOut(TypedDict):
@@ -32,7 +43,7 @@ class LeftOut(TypedDict):
 class Manifest(TypedDict):
     """What all manifests hold, and what those of `generate` and of `convert` do."""
 
-    episodes: list[ManifestRow]
+    episodes: list[Made | Failed]
     request: NotRequired[dict[str, Any]]
     left_out: NotRequired[list[LeftOut]]
 

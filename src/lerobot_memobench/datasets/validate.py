@@ -19,6 +19,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
 from lerobot_memobench.datasets.lerobot_format.reading import read_episode
 from lerobot_memobench.datasets.replay import replay
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files.reading import refusing
 from lerobot_memobench.jobs.processes import process_pool
 from lerobot_memobench.tasks.task import Task
 
@@ -51,11 +52,10 @@ class _Check:
     def run(self) -> Verdict:
         """Replay it."""
         try:
-            return Verdict(self.name, self._replay())
-        except MemobenchError as error:
+            with refusing(lambda why: MemobenchError(f"it cannot be read ({why})")):
+                return Verdict(self.name, self._replay())
+        except MemobenchError as error:  # whatever one episode says, the others are replayed
             return Verdict(self.name, str(error))
-        except Exception as error:  # whatever one episode says, the others are replayed
-            return Verdict(self.name, f"it cannot be read ({type(error).__name__}: {error})")
 
     def _replay(self) -> str | None:
         if self.index is not None:

@@ -59,7 +59,19 @@ def held(plan: EvaluationPlan) -> Iterator[None]:
         if not has_log(plan.log):
             remove_card(plan.log)
             for folder in new:
-                remove_empty(folder)
+                _remove_empty(folder)
+
+
+@contextmanager
+def made(folder: Path) -> Iterator[None]:
+    """Make a folder for as long as it is written to; of a new one nothing that is empty stays behind."""
+    new = not folder.exists()
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    finally:
+        if new:
+            _remove_empty(folder)
 
 
 def _clean(folder: Path) -> None:
@@ -71,7 +83,7 @@ def _clean(folder: Path) -> None:
             draft.unlink(missing_ok=True)
 
 
-def remove_empty(folder: Path) -> None:
+def _remove_empty(folder: Path) -> None:
     """Remove a folder and those below it, as far as they hold nothing."""
     if not folder.is_dir():
         return

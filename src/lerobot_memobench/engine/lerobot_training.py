@@ -18,6 +18,7 @@ from typing import Any
 from lerobot_memobench.datasets.execution_frames import ExecutionFrames, leave_out_prompts
 from lerobot_memobench.engine.loop.steering import check_version
 from lerobot_memobench.envs.prompting import knows_phases
+from lerobot_memobench.errors import MemobenchError
 
 logger = logging.getLogger(__name__)
 
@@ -57,6 +58,7 @@ def _leaving_out(make: Callable[..., Any], prompt_frames: bool | None) -> Callab
 
     @functools.wraps(make)
     def run(config: Any) -> Any:
+        _check_streaming(config)
         train, held_out = make(config)
         wanted = config.policy is None or knows_phases(config.policy) if prompt_frames is None else prompt_frames
         if wanted:
@@ -68,3 +70,12 @@ def _leaving_out(make: Callable[..., Any], prompt_frames: bool | None) -> Callab
         return train, held_out
 
     return run
+
+
+def _check_streaming(config: Any) -> None:
+    """Refuse to stream to a policy that draws its own execution frames: it would get prompts, which do not count."""
+    if config.dataset.streaming and getattr(config.policy, "prompt_loss", True) is False:
+        raise MemobenchError(
+            f"policy={config.policy.type} draws execution frames alone, and dataset.streaming=true leaves no choice of "
+            "frames; use dataset.streaming=false, or policy.prompt_loss=true to train on prompts as well"
+        )

@@ -81,12 +81,12 @@ def _joined_settings(protocols: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _wanted(card: Mapping[str, Any]) -> list[tuple[str, int]]:
-    """Return (task, episode) of all that a card's evaluation was asked for, as far as it tells."""
+    """Return (task, episode) of all that a card's evaluation was asked for."""
     asked, policy = card["protocol"], card["policy"]
     base = asked.get("seed_base")
     first = (policy.get("seed") or 0) - base if policy and isinstance(base, int) else 0
-    episodes = range(first, first + asked.get("episodes", 0))
-    return [(task, episode) for task in asked.get("tasks", []) for episode in episodes]
+    episodes = range(first, first + asked["episodes"])
+    return [(task, episode) for task in asked["tasks"] for episode in episodes]
 
 
 def _check_protocols(protocols: Mapping[Path, Mapping[str, Any]]) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NotRequired, TypedDict
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files import file_hash
 from lerobot_memobench.files.reading import Count, read_json
 
 if TYPE_CHECKING:
@@ -85,9 +86,3 @@ def tree_hash(files: Mapping[str, str]) -> str:
     """Return one sha256 for many: of the lines ``<sha256>  <name>`` in the order of names, as sha256sum prints them."""
     lines = "".join(f"{files[name]}  {name}\n" for name in sorted(files))
     return hashlib.sha256(lines.encode()).hexdigest()
-
-
-def file_hash(path: Path) -> str:
-    """Return the sha256 of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

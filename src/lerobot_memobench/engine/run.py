@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from lerobot_memobench.engine.card import with_episodes, write_card
-from lerobot_memobench.engine.folder import check_new, held, remove_empty
+from lerobot_memobench.engine.folder import check_new, held, made
 from lerobot_memobench.engine.lerobot_command import call_lerobot
 from lerobot_memobench.engine.loop.steering import calm_output, steered
 from lerobot_memobench.engine.plan import EvaluationPlan
@@ -55,18 +55,16 @@ def run_evaluation(plan: EvaluationPlan, tell: Tell) -> Ended:
 def _run_lerobot(plan: EvaluationPlan, card: dict[str, Any], ranges: Ranges | None, tell: Tell) -> Ended:
     """Run LeRobot's evaluation on what is left, in the folder that is held meanwhile."""
     calm_output()
-    status, left = 1, None
+    status = 1
     try:
         with held(plan), steered(plan.seed, ranges):
             if card["protocol"]:
                 write_card(plan.log, card)
             left = remainder(plan, ranges)
-            left.output.mkdir(parents=True, exist_ok=True)  # LeRobot makes it for films of its own only
-            status = call_lerobot("eval", left.lerobot_flags)
+            with made(left.output):  # LeRobot makes it for films of its own only
+                status = call_lerobot("eval", left.lerobot_flags)
             return Ended(status, None if status else _finish(plan, card))
     finally:
-        if left is not None:
-            remove_empty(left.output)
         if status and has_log(plan.log):
             tell(
                 f"the episodes that ended are in {plan.log}; `memobench report {plan.log}` reports them, the same "

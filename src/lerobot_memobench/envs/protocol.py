@@ -15,7 +15,7 @@ from annotated_types import Ge, Le
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.files import write_file
-from lerobot_memobench.files.reading import Count, Name, Whole, read_json
+from lerobot_memobench.files.reading import Count, Name, Whole, cut, read_json
 
 PROTOCOL_FILE = "protocol.json"
 
@@ -48,11 +48,12 @@ MOST_EPISODES = 100_000
 """Of one task. Every episode that was asked for and is missing is counted, so a file must not ask for any number."""
 
 
-class Protocol(TypedDict, total=False):
-    """What ``protocol.json`` and a card may say; a setting in which joined episodes differ is a list of its values."""
+Episodes = Annotated[int, Ge(0), Le(MOST_EPISODES)]
 
-    tasks: list[Name]
-    episodes: Annotated[int, Ge(0), Le(MOST_EPISODES)]
+
+class Settings(TypedDict, total=False):
+    """Under what it was run; a setting in which joined episodes differ is a list of its values."""
+
     seed_base: Whole | list[Whole]
     referent: Name | list[Name]
     prompt_video: bool | None
@@ -61,6 +62,20 @@ class Protocol(TypedDict, total=False):
     render: Name | None
     render_every: Count | None
     oracle_memory: bool | None
+
+
+class Protocol(Settings, total=False):
+    """What ``protocol.json`` and a card may say."""
+
+    tasks: list[Name]
+    episodes: Episodes
+
+
+class WholeProtocol(Settings):
+    """What a card must say from which an evaluation is gone on with: how much was asked for."""
+
+    tasks: list[Name]
+    episodes: Episodes
 
 
 def differences(
@@ -96,14 +111,15 @@ def _differing(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -> 
         if isinstance(value, Mapping) and isinstance(other, Mapping):
             found += _differing(value, other, f"{prefix}{key}.")
         else:
-            found.append(f"{prefix}{key}: {_text(value)} and {_text(other)}")
+            found.append(f"{cut(f'{prefix}{key}')}: {_text(value)} and {_text(other)}")
     return found
 
 
 def _text(value: Any) -> str:
-    if isinstance(value, list) and len(value) > 3:
-        return f"{', '.join(map(str, value[:3]))}, … ({len(value)})"
-    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+    if not isinstance(value, list):
+        return cut(str(value))
+    shown = ", ".join(cut(str(each)) for each in value[:3])
+    return f"{shown}, … ({len(value)})" if len(value) > 3 else shown
 
 
 def read_protocol_file(directory: Path) -> dict[str, Any]:

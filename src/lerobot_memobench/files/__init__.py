@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import secrets
 import sys
@@ -72,6 +73,12 @@ def file_name(text: object, what: str) -> str:
             f"{what} is {str(text)[:80]!r}, which names no file; expected letters, digits, spaces and _-,.+ alone"
         )
     return text
+
+
+def file_hash(path: Path) -> str:
+    """Return the sha256 (hex) of a file."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _to_disk(path: Path) -> None:

@@ -8,7 +8,8 @@ may write more. pydantic is imported when the first file is read, which costs as
 from __future__ import annotations
 
 import codecs
-from collections.abc import Iterable, Mapping
+import contextlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -105,6 +106,24 @@ def checked(value: Any, schema: Any) -> Any:
     return value
 
 
+@contextlib.contextmanager
+def refusing(told: Callable[[str], MemobenchError]) -> Iterator[None]:
+    """Let nothing but a `MemobenchError` out of a block that does nothing but read what may be damaged.
+
+    LeRobot, pyarrow, PyAV, h5py and NumPy answer damaged files with errors of every type. To be kept around reading
+    alone: an error in writing, such as a full disk, is not the file's.
+
+    Args:
+        told: makes the error, from what was raised in at most a line.
+    """
+    try:
+        yield
+    except MemobenchError:
+        raise
+    except Exception as error:
+        raise told(f"{type(error).__name__}: {' '.join(str(error).split())[:200]}") from error
+
+
 @cache
 def _adapter(schema: Any) -> TypeAdapter[Any]:
     from pydantic import TypeAdapter
@@ -117,7 +136,9 @@ def _told(errors: Iterable[ErrorDetails], value: Any) -> str:
     first, *others = [(*_place(error["loc"], value), error) for error in errors]
     place, found, error = first
     if error["type"] == "missing":
-        missing = [str(e["loc"][-1]) for p, _, e in (first, *others) if e["type"] == "missing" and p == place]
+        missing = dict.fromkeys(
+            str(e["loc"][-1]) for p, _, e in (first, *others) if e["type"] == "missing" and p == place
+        )
         return f"found no {', '.join(missing)}" + (f" in {place}" if place else "")
     alternatives = dict.fromkeys(_expected(e) for p, _, e in (first, *others) if p == place)
     return f"found {f'{place} = ' if place else ''}{short(found)}, expected {' or '.join(alternatives)}"
@@ -133,7 +154,7 @@ def _place(location: Iterable[int | str], value: Any) -> tuple[str, Any]:
             text, value = f"{text}[{part}]", value[part]
         else:
             break
-    return short(text) if len(text) > LONGEST else text, value
+    return cut(text), value
 
 
 def _expected(error: ErrorDetails) -> str:
@@ -145,5 +166,9 @@ def _expected(error: ErrorDetails) -> str:
 
 def short(value: Any) -> str:
     """Return what was found, as far as a sentence can hold it."""
-    text = repr(value)
+    return cut(repr(value))
+
+
+def cut(text: str) -> str:
+    """Return a text, as far as a sentence can hold it."""
     return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"

@@ -120,3 +120,11 @@ def test_extent_and_policy_count_when_asked_for() -> None:
 def test_what_one_side_does_not_tell_is_no_difference() -> None:
     assert differences({"horizon": 600}, {"referent": "fixed"}) == []
     assert differences({**SETTINGS, "policy": {"type": "act"}}, {**SETTINGS, "policy": {}}, policy=True) == []
+
+
+def test_a_difference_of_any_length_is_a_part_of_a_sentence() -> None:
+    (found,) = differences({"render": "a" * 5_000}, {"render": ["b" * 5_000]})
+    assert found == f"render: {'a' * 79}… and {'b' * 79}…"
+    (found,) = differences({"policy": {"k" * 5_000: 1}}, {"policy": {"k" * 5_000: 2}}, policy=True)
+    assert found.endswith("kkk…: 1 and 2")
+    assert len(found) < 100

@@ -14,6 +14,9 @@ from lerobot_memobench.files.reading import Malformed, parsed
 if TYPE_CHECKING:
     import h5py
 
+LARGEST = 1e10
+"""MuJoCo takes a state with a larger number for an unstable simulation, and puts the initial one in its place."""
+
 
 def demo_number(name: str) -> int | None:
     """Return k of a group demo_k, None for other names."""
@@ -68,10 +71,13 @@ def array(group: h5py.Group, name: str, shape: tuple[int | None, ...], *dtypes: 
 
 
 def finite(name: str, values: NDArray) -> NDArray:
-    """Return (T, n) numbers after checking that none is infinite or missing."""
+    """Return (T, n) numbers after checking that none is infinite, missing, or too large."""
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if bad.size:
         raise Unusable(f"{name} holds a value that is not finite at frame {bad[0]}")
+    bad = np.flatnonzero((np.abs(values) > LARGEST).any(axis=1))
+    if bad.size:
+        raise Unusable(f"{name} holds a value beyond {LARGEST:g} at frame {bad[0]}, more than the simulator takes")
     return values
 
 

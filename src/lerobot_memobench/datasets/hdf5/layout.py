@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files.reading import refusing
 
 IMAGE_NAMES = {"image": "agentview_image", "wrist_image": "robot0_eye_in_hand_image"}
 """Camera of this package -> dataset of the published layout."""
@@ -38,19 +39,9 @@ class Unusable(MemobenchError):
     """A file or group that is not in the layout; the message is the reason alone."""
 
 
-@contextlib.contextmanager
-def usable_or_named() -> Iterator[None]:
-    """Let nothing but a MemobenchError out of a block that reads a file: whatever a file says, it ends only itself.
-
-    To be kept around reading alone: an error in writing, such as a full disk, is not the file's.
-    """
-    try:
-        yield
-    except MemobenchError:
-        raise
-    except Exception as error:
-        told = " ".join(str(error).split())[:200]
-        raise Unusable(f"what it says cannot be used ({type(error).__name__}: {told})") from error
+def usable_or_named() -> AbstractContextManager[None]:
+    """As `refusing`: whatever a file says, it ends only itself."""
+    return refusing(lambda why: Unusable(f"what it says cannot be used ({why})"))
 
 
 def truth_to_intervals(satisfied: NDArray[np.bool_]) -> list[list[list[int]]]:

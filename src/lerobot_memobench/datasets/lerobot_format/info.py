@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated, Any, NotRequired, TypedDict
 
 from annotated_types import Ge, Le
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files.reading import Count, read_json
+from lerobot_memobench.files.reading import Count, read_json, refusing
 
 INFO_FILE = Path("meta") / "info.json"
 ADVICE = "the dataset is damaged; generate it or take it from its source again"
@@ -39,19 +38,9 @@ def read_info(folder: Path) -> dict[str, Any]:
     return found
 
 
-@contextlib.contextmanager
-def undamaged(folder: Path) -> Iterator[None]:
-    """Let nothing but a `MemobenchError` out of a block that does nothing but read the dataset in ``folder``.
-
-    LeRobot, pyarrow and PyAV answer damaged files with errors of every type.
-    """
-    try:
-        yield
-    except MemobenchError:
-        raise
-    except Exception as error:
-        told = " ".join(str(error).split())[:200]
-        raise MemobenchError(f"{folder} cannot be read ({type(error).__name__}: {told}); {ADVICE}") from error
+def undamaged(folder: Path) -> AbstractContextManager[None]:
+    """As `refusing`, for reading the dataset in ``folder``."""
+    return refusing(lambda why: MemobenchError(f"{folder} cannot be read ({why}); {ADVICE}"))
 
 
 def episode_count(folder: Path) -> int:

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from lerobot_memobench.datasets.memory_cache.decoding import FrameReader
 from lerobot_memobench.datasets.memory_cache.frame_table import FrameTable
-from lerobot_memobench.datasets.memory_cache.layout import DONE_FILE, TOKENS_FILE, CacheMeta, slot_starts
-from lerobot_memobench.datasets.memory_cache.tables import write_done
+from lerobot_memobench.datasets.memory_cache.layout import TOKENS_FILE, CacheMeta, slot_starts
+from lerobot_memobench.datasets.memory_cache.tables import read_done, write_done
 
 Progress = Callable[[int, int], None]
 """Called as progress(episodes done, episodes in all)."""
@@ -69,7 +69,7 @@ class Encoding:
         the same whatever the number of threads, and a killed build has finished the first so many episodes. Tokens
         are written, not mapped: a disk that refuses a mapped page kills the process (SIGBUS).
         """
-        done = np.load(self.folder / DONE_FILE)
+        done = read_done(self.folder, self.table.num_episodes)
         progress(int(done.sum()), len(done))
         with (
             (self.folder / TOKENS_FILE).open("r+b") as file,

@@ -15,6 +15,7 @@ from torch import Tensor
 from lerobot_memobench.datasets.memory_cache.frame_table import FrameTable
 from lerobot_memobench.datasets.memory_cache.layout import DONE_FILE, META_FILE, TEXTS_FILE, CacheMeta, texts_file
 from lerobot_memobench.files import draft_of, write_file
+from lerobot_memobench.files.reading import read_json
 
 
 class TextEncoder(Protocol):
@@ -53,7 +54,18 @@ def add_embeddings(folder: Path, meta: CacheMeta, texts: TextEncoder) -> None:
     """Write what another text encoder makes of the texts beside what the cache has; nothing if it is there."""
     path = folder / texts_file(meta.texts_key, texts.key)
     if not path.is_file():
-        _save_embeddings(path, json.loads((folder / TEXTS_FILE).read_text()), texts)
+        unique = read_json(folder / TEXTS_FILE, list[str], f"delete {folder}, and it is made again")
+        _save_embeddings(path, unique, texts)
+
+
+def read_done(folder: Path, episodes: int) -> np.ndarray:
+    """Return which episodes (E,) are done, uint8; none, where the file is damaged or gone."""
+    try:
+        done = np.load(folder / DONE_FILE)
+    except Exception:  # NumPy answers damaged arrays with errors of every type
+        done = None
+    whole = isinstance(done, np.ndarray) and done.dtype == np.uint8 and done.shape == (episodes,)
+    return done if whole and (done <= 1).all() else np.zeros(episodes, dtype=np.uint8)
 
 
 def write_meta(folder: Path, meta: CacheMeta) -> None:

@@ -11,10 +11,9 @@ from annotated_types import Len
 from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.language import LanguageRow
-from lerobot_memobench.datasets.staging.folders import file_hash
 from lerobot_memobench.datasets.statistics import Stats
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files import file_name
+from lerobot_memobench.files import file_hash, file_name
 from lerobot_memobench.files.reading import Count, Malformed, Number, Whole, checked, read_json
 
 RECORD_FILE = "episode.json"

@@ -26,10 +26,11 @@ from lerobot_memobench.datasets.staging.episode import (
     StagedEpisode,
     read_staged,
 )
-from lerobot_memobench.datasets.staging.folders import file_hash, flush_to_disk, temporary_folder
+from lerobot_memobench.datasets.staging.folders import flush_to_disk, temporary_folder
 from lerobot_memobench.datasets.statistics import ImageHistograms
 from lerobot_memobench.datasets.video import VideoWriter
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files import file_hash
 
 
 def episode_info(demo: Demonstration) -> dict[str, Any]:

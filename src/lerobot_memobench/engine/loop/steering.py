@@ -1,8 +1,8 @@
 """What LeRobot's evaluation loop is made to do beside its own: run parts of a task, seed each batch, draw what is seen.
 
-With `lerobot_training` the only module that changes anything of LeRobot's. It was written against the loop of one
-version: what it relies on is listed in tests/engine/test_lerobot_loop.py, whose failures say what to look at when
-LeRobot moves on.
+With `lerobot_training`, and `policies.memobench_mem.execution_frames` for that policy's batches, all that changes
+anything of LeRobot's. It was written against the loop of one version: what it relies on is listed in
+tests/engine/test_lerobot_loop.py, whose failures say what to look at when LeRobot moves on.
 
 LeRobot seeds Python, NumPy and torch once per run, so what a sampling policy draws in an episode depends on all that
 ran before it. Here each batch is seeded from the run's seed, the task and the batch's first episode: an evaluation

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, NotRequired, TypedDict
 from annotated_types import Ge, Le, MinLen
 
 from lerobot_memobench.envs.episode_log import CheckpointRecord, Outcome
-from lerobot_memobench.envs.protocol import Protocol
+from lerobot_memobench.envs.protocol import Protocol, WholeProtocol
 from lerobot_memobench.files.reading import LARGEST, Count, Name, Whole
 
 
@@ -79,7 +79,7 @@ class WholeCard(TypedDict):
 
     format: Literal[1]
     written: NotRequired[str]
-    protocol: Protocol
+    protocol: WholeProtocol
     policy: Policy
     checkpoint: Checkpoint | None
     trained_on: dict[str, Any] | None

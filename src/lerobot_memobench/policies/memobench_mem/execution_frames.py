@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import functools
 import inspect
-import itertools
 from typing import Any
 
 import numpy as np
 from lerobot.datasets.sampler import EpisodeAwareSampler
+
+from lerobot_memobench.datasets.demonstration import PROMPT
+from lerobot_memobench.datasets.execution_frames import first_frames
 
 
 class FromStarts(int):
@@ -37,8 +39,7 @@ def execution_starts(episodes: np.ndarray, phase: np.ndarray) -> np.ndarray:
     Args:
         episodes: (E + 1,) first frame of each episode, and the number of frames N. phase: (N,) 0 in the prompt.
     """
-    ranges = itertools.pairwise(episodes.tolist())
-    return np.array([start + np.argmax([*(phase[start:end] != 0), True]) for start, end in ranges], dtype=np.int64)
+    return first_frames(episodes[:-1], episodes[1:], np.flatnonzero(phase != PROMPT))
 
 
 def _teach(sampler: type[Any]) -> None:

@@ -6,12 +6,12 @@ their new settings; the rest would keep the checkpoint's, whatever the configura
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.checkpoint import Processor, read_json
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.weights import PREPROCESSOR_FILE, checkpoint_file
 
@@ -29,8 +29,8 @@ def require_agreement(source: str | Path, revision: str | None, config: Memobenc
     path = checkpoint_file(source, PREPROCESSOR_FILE, revision)
     if path is None:
         return
-    entries = json.loads(path.read_text())["steps"]
-    steps = {entry.get("registry_name"): entry.get("config") or {} for entry in entries}
+    entries = read_json(path, Processor).get("steps", [])
+    steps = {entry.get("registry_name", ""): entry.get("config", {}) for entry in entries}
     for field, held in _held(steps, config, training):
         asked = getattr(config, field)
         if asked != held:
