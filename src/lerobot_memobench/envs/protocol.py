@@ -24,6 +24,7 @@ SEED_BASE = 7
 
 SETTINGS = (
     "seed_base",
+    "obs_type",
     "referent",
     "prompt_video",
     "prompt_in",
@@ -54,6 +55,7 @@ class Protocol(TypedDict, total=False):
     tasks: list[Name]
     episodes: Annotated[int, Ge(0), Le(MOST_EPISODES)]
     seed_base: Whole | list[Whole]
+    obs_type: Name | None
     referent: Name | list[Name]
     prompt_video: bool | None
     horizon: Count | None
