@@ -21,6 +21,7 @@ from lerobot_memobench.envs.observations import EXECUTION, PROMPT
 from lerobot_memobench.envs.protocol import read_protocol_file
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.html.videos import frame_count
+from lerobot_memobench.policies.untrained import UntrainedConfig
 from lerobot_memobench.sim import rendering
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots
@@ -207,7 +208,8 @@ def policy(kind: str, *seen: FeatureType, **more: Any) -> Any:
     ("config", "needed"),
     [
         (None, None),
-        (policy("memobench_random"), None),
+        (policy("pi05"), None),  # before it has seen a dataset
+        (policy("memobench_random", FeatureType.VISUAL, perception=UntrainedConfig.perception), None),
         (policy("act", FeatureType.VISUAL), PIXELS),
         (policy("act", FeatureType.ENV), OBJECTS),
         (policy("diffusion", FeatureType.ENV, FeatureType.VISUAL), BOTH),

@@ -20,7 +20,7 @@ READ_OBJECTS = ("act", "diffusion", "tdmpc")
 def obs_type_of(policy: Any) -> str | None:
     """Return what a policy must be shown by its configuration; None where that is not known, or nothing is needed.
 
-    A policy that says by ``perception`` how it sees (`pixels` or `objects`) is taken at its word.
+    A policy that says by ``perception`` what it sees (`pixels`, `objects` or `any`) is taken at its word.
     """
     perception = getattr(policy, "perception", None)
     if policy is None or perception is not None:
