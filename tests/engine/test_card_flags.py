@@ -184,6 +184,7 @@ OF_THE_RUN = {
     "prompt_video": BOOLEAN,
     "prompt_in": st.sampled_from(["auto", "steps", "reset"]),
     "horizon": COUNT,
+    "obs_type": st.sampled_from(["pixels_agent_pos", "both"]),
     "env.render": st.sampled_from(["fast", "high"]),
     "env.render_every": st.just("1"),
     "env.videos": BOOLEAN,

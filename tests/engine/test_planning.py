@@ -10,6 +10,7 @@ import pytest
 
 import lerobot_memobench.registration  # noqa: F401
 from lerobot_memobench.engine.grid import Shard
+from lerobot_memobench.engine.plan_card import card_of
 from lerobot_memobench.engine.planning import plan_line
 from lerobot_memobench.engine.resume import remainder
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
@@ -65,6 +66,56 @@ def test_repeated_pictures_are_refused_for_policies_that_remember(policy: list[s
     with pytest.raises(MemobenchError, match=r"env.render_every is 5; leave env.render_every at 1"):
         plan_line(["env=memobench", f"tasks={STOVE}", *policy, "env.render_every=5"])
     assert plan_line([*LINE, "env.render_every=5"]).grid is not None
+
+
+OBJECTS = "environment_state_agent_pos"
+
+
+def checkpoint(folder: Path, *seen: str) -> str:
+    """A checkpoint of LeRobot's act as far as planning looks at one."""
+    inputs = {
+        "pictures": {"observation.images.image": {"type": "VISUAL", "shape": [3, 256, 256]}},
+        "objects": {"observation.environment_state": {"type": "ENV", "shape": [208]}},
+    }
+    features = {key: value for name in seen for key, value in inputs[name].items()}
+    folder.mkdir()
+    (folder / "config.json").write_text(json.dumps({"type": "act", "input_features": features}))
+    (folder / "model.safetensors").touch()
+    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
+        (folder / name).write_text(json.dumps({"steps": []}))
+    return f"policy={folder}"
+
+
+@pytest.mark.parametrize(
+    ("seen", "shown"),
+    [(("pictures",), "pixels_agent_pos"), (("objects",), OBJECTS), (("objects", "pictures"), "both")],
+)
+def test_a_checkpoint_is_shown_what_it_was_trained_on(seen: tuple[str, ...], shown: str, tmp_path: Path) -> None:
+    line = [*LINE[:-1], checkpoint(tmp_path / "act", *seen)]
+    plan = plan_line(line)
+    assert plan.environment is not None
+    assert plan.environment.protocol["obs_type"] == shown
+    other = OBJECTS if shown != OBJECTS else "pixels_agent_pos"
+    with pytest.raises(MemobenchError, match=rf"env.obs_type is {other}, which does not show what the policy sees"):
+        plan_line([*line, f"obs_type={other}"])
+
+
+def test_objects_alone_need_nothing_to_draw_with(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Unless films are asked for."""
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    plan = plan_line([*LINE, f"obs_type={OBJECTS}"])
+    assert flag_value(plan.lerobot_flags, "env.films") == "0"
+    assert card_of(plan)["runs"][0]["gl"] == {}
+    for words in (
+        [],
+        ["obs_type=both"],
+        [f"obs_type={OBJECTS}", "films=1"],
+        [f"obs_type={OBJECTS}", "env.videos=true"],
+    ):
+        with pytest.raises(MemobenchError, match="MUJOCO_GL"):
+            plan_line([*LINE, *words])
 
 
 def test_going_on_keeps_the_earlier_batch_size() -> None:

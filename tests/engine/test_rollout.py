@@ -18,7 +18,9 @@ from lerobot.scripts import lerobot_eval
 from lerobot_memobench.engine.loop.rollout import sparing
 from lerobot_memobench.envs import episode
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.envs.obs_types import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.sim.object_layout import SIZE
 from lerobot_memobench.sim.rendering import close_renderers, gl_backend
 
 sys.path[:0] = [str(Path(__file__).parents[1] / "policies")]
@@ -28,7 +30,7 @@ PROMPT, HORIZON, PLAN = 6, 9, 4
 STATISTICS = {
     key: {"mean": torch.full((size,), 0.1), "std": torch.full((size,), 0.7), "min": -torch.ones(size)}
     | {"max": torch.ones(size), "q01": -torch.ones(size), "q99": torch.ones(size)}
-    for key, size in (("observation.state", 8), ("action", 7))
+    for key, size in (("observation.state", 8), ("observation.environment_state", SIZE), ("action", 7))
 }
 
 
@@ -73,7 +75,9 @@ def configured(name: str, config: MemobenchEnvConfig, **fields: Any) -> tuple[An
     return get_policy_class(name)(settings), settings
 
 
-def rolled(rollout: Any, rows: int, log: Path, name: str, films: int = 0, **fields: Any) -> dict[str, torch.Tensor]:
+def rolled(
+    rollout: Any, rows: int, log: Path, name: str, films: int = 0, obs_type: str = PIXELS, **fields: Any
+) -> dict[str, torch.Tensor]:
     """Return what a rollout of a fresh policy in fresh environments returns."""
     torch.manual_seed(7)
     config = MemobenchEnvConfig(
@@ -83,6 +87,7 @@ def rolled(rollout: Any, rows: int, log: Path, name: str, films: int = 0, **fiel
         expert_action=name == "memobench_expert",
         log_dir=str(log),
         films=films,
+        obs_type=obs_type,
     )
     ((env,),) = (suite.values() for suite in config.create_envs(rows).values())
     policy, settings = configured(name, config, **fields)
@@ -137,6 +142,56 @@ def test_a_rollout_is_lerobots(case: str, rows: int, drawn: list[int], tmp_path:
         assert sorted(drawn) == sorted(rows * looked)
     else:  # whether it sees the prompt is the environment's to say
         assert len(drawn) < everything
+
+
+@pytest.fixture
+def found(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The step of each observation whose objects are looked for."""
+    steps: list[int] = []
+    look = episode.Episode.objects
+
+    def objects(self: episode.Episode) -> Any:
+        steps.append(self.step_index)
+        return look(self)
+
+    monkeypatch.setattr(episode.Episode, "objects", objects)
+    return steps
+
+
+DIFFUSION = {"down_dims": (16, 32), "num_inference_steps": 2, "horizon": 8, "n_groups": 4, "n_action_steps": PLAN}
+DIFFUSION |= {"diffusion_step_embed_dim": 16, "crop_shape": (84, 84), "pretrained_backbone_weights": None}
+
+
+@pytest.mark.parametrize("obs_type", [OBJECTS, BOTH])
+@pytest.mark.parametrize(
+    ("name", "fields", "spares"),
+    [
+        ("act", ACT, True),
+        ("diffusion", DIFFUSION, False),
+        ("memobench_expert", {}, True),
+        ("memobench_random", {}, True),
+    ],
+)
+def test_a_rollout_on_objects_is_lerobots(
+    name: str, fields: dict[str, Any], spares: bool, obs_type: str, drawn: list[int], found: list[int], tmp_path: Path
+) -> None:
+    theirs = rolled(lerobot_eval.rollout, 2, tmp_path / "theirs", name, obs_type=obs_type, **fields)
+    everything = 2 * (theirs["action"].shape[1] + 1)
+    assert len(found) == everything
+    assert len(drawn) == (0 if obs_type == OBJECTS else everything)
+    found.clear()
+    ours = rolled(sparing(lerobot_eval.rollout, lambda: True), 2, tmp_path / "ours", name, obs_type=obs_type, **fields)
+    for key, values in theirs.items():
+        assert torch.equal(ours[key], values), key
+    assert bool(theirs["action"].any())
+    assert (len(found) < everything) == spares
+
+
+def test_a_memory_of_pictures_refuses_to_be_shown_objects_alone(tmp_path: Path) -> None:
+    with pytest.raises(
+        MemobenchError, match=r"no 'observation.images.image', .* set env.obs_type=pixels_agent_pos, or"
+    ):
+        rolled(lerobot_eval.rollout, 1, tmp_path, "memobench_mem", obs_type=OBJECTS, **MEMORY)
 
 
 @pytest.mark.parametrize("use_async", [False, True])

@@ -300,6 +300,7 @@ def test_render_is_annotated() -> None:
         ({"tasks": "turn_on_the_stofe_and_turn_it_off"}, "turn_on_the_stove_and_turn_it_off"),
         ({"referent": "randon"}, "did you mean 'random'"),
         ({"render": "ultra"}, "env.render is 'ultra'"),
+        ({"obs_type": "state"}, "env.obs_type is 'state'"),
         ({"prompt_in": "rest"}, "env.prompt_in is 'rest'; did you mean 'reset'"),
         ({"horizon": 0}, "env.horizon is 0"),
         ({"render_every": 0}, "env.render_every is 0"),

@@ -18,17 +18,26 @@ from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.lerobot_format import write_dataset
 from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.envs.protocol import read_protocol_file
 from lerobot_memobench.policies.memobench_mem.language.tokenizer import make_vocabulary, make_word_tokenizer
+from lerobot_memobench.sim.object_layout import SIZE
 from lerobot_memobench.tasks.catalogue import get_task
 
 TASK = "turn_on_the_stove_and_turn_it_off"
 LENGTH, PROMPT, SIDE = 12, 4, 256
-INPUTS = {"observation.images.image", "observation.images.wrist_image", "observation.state"}
+STATE, OBJECTS = "observation.state", "observation.environment_state"
+PICTURES = {"observation.images.image", "observation.images.wrist_image"}
+INPUTS = {*PICTURES, STATE}
 
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two short demonstrations with every column that `memobench generate` writes, and images of the real size."""
+    """Two short demonstrations as files of others hold them: pictures of the real size, and no objects."""
+    return written(tmp_path_factory.mktemp("others"), pictures=True, objects=False)
+
+
+def written(folder: Path, *, pictures: bool, objects: bool) -> Path:
+    """Two short demonstrations with every column that `memobench generate` writes, as far as asked for."""
     task = get_task(TASK)
     rng = np.random.default_rng(3)
     satisfied = np.zeros((LENGTH, len(task.checkpoints)), np.bool_)
@@ -45,7 +54,8 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
             states=rng.normal(size=(LENGTH, 5)),
             actions=rng.uniform(-1, 1, size=(LENGTH, 7)).astype(np.float32),
             proprio=rng.normal(size=(LENGTH, 8)).astype(np.float32),
-            images=dict.fromkeys(("image", "wrist_image"), frames),
+            images=dict.fromkeys(("image", "wrist_image"), frames) if pictures else None,
+            objects=rng.normal(size=(LENGTH, SIZE)).astype(np.float32) if objects else None,
             exec_start=PROMPT,
             satisfied=satisfied,
             success=True,
@@ -53,30 +63,34 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
             scene_hash="abc",
         )
 
-    root = tmp_path_factory.mktemp("others") / "demonstrations"
-    return write_dataset((demonstration(seed) for seed in (10_000, 10_001)), root)
+    return write_dataset((demonstration(seed) for seed in (10_000, 10_001)), folder / "demonstrations")
 
 
-def train_and_roll_out(dataset: Path, out: Path, *policy: str) -> None:
-    """One optimiser step and one short episode by the two commands, as a user types them; check what came of both."""
+def train_and_roll_out(dataset: Path, out: Path, *policy: str, inputs: set[str] = INPUTS) -> dict[str, Any]:
+    """One optimiser step and one short episode by the two commands, as a user types them; check what came of both.
+
+    Returns the protocol of the evaluation.
+    """
     run = out / "train"
     words = ("steps=1", "batch_size=2", "num_workers=0", "save_freq=1", f"output_dir={run}", "policy.device=cpu")
     assert main(["train", *policy, f"dataset={dataset}", *words]) == 0
     checkpoint = run / "checkpoints" / "last" / "pretrained_model"
     config = json.loads((checkpoint / "config.json").read_text())
     # Phase, checkpoints, subgoals and language rows are for memory policies: to others they are no input.
-    assert set(config["input_features"]) == INPUTS
+    assert set(config["input_features"]) == inputs
     assert set(config["output_features"]) == {"action"}
-    assert normalised(checkpoint) <= {*INPUTS, "action"} | KEPT
+    assert normalised(checkpoint, inputs) <= {*inputs, "action"} | KEPT
     words = (f"tasks={TASK}", "episodes=1", "horizon=3", "env.render=fast", f"output_dir={out / 'eval'}")
     assert main(["eval", "env=memobench", f"policy={run}", *words]) == 0
     (record,) = read_episodes(out / "eval")
     assert record["steps"] == 3
+    return read_protocol_file(out / "eval")
 
 
 #: LeRobot keeps the statistics of every column in the file; which of them are used its step's features say.
 KEPT = {
     "phase",
+    "executed_action",
     "checkpoint.index",
     "checkpoint.operation",
     "checkpoint.completed",
@@ -85,37 +99,40 @@ KEPT = {
 }
 
 
-def normalised(checkpoint: Path) -> set[str]:
+def normalised(checkpoint: Path, inputs: set[str]) -> set[str]:
     """Return the columns whose statistics a checkpoint's preprocessor holds; check which of them it applies."""
     steps = json.loads((checkpoint / "policy_preprocessor.json").read_text())["steps"]
     (step,) = [step for step in steps if step.get("registry_name") == "normalizer_processor"]
-    assert set(step["config"]["features"]) == {*INPUTS, "action"}
+    assert set(step["config"]["features"]) == {*inputs, "action"}
     with safe_open(checkpoint / step["state_file"], framework="numpy") as file:
         return {name.rpartition(".")[0] for name in file.keys()}  # noqa: SIM118
 
 
-def test_act(dataset: Path, tmp_path: Path) -> None:
-    train_and_roll_out(
-        dataset,
-        tmp_path,
-        *("policy=act", "policy.pretrained_backbone_weights=null", "policy.dim_model=32", "policy.n_heads=2"),
-        *("policy.dim_feedforward=64", "policy.n_encoder_layers=1", "policy.n_vae_encoder_layers=1"),
-        *("policy.chunk_size=4", "policy.n_action_steps=4", "policy.latent_dim=8"),
-    )
+ACT = (
+    *("policy=act", "policy.pretrained_backbone_weights=null", "policy.dim_model=32", "policy.n_heads=2"),
+    *("policy.dim_feedforward=64", "policy.n_encoder_layers=1", "policy.n_vae_encoder_layers=1"),
+    *("policy.chunk_size=4", "policy.n_action_steps=4", "policy.latent_dim=8"),
+)
+DIFFUSION = (
+    *("policy=diffusion", "policy.down_dims=[16,32]", "policy.num_inference_steps=2", "policy.horizon=8"),
+    *("policy.diffusion_step_embed_dim=16", "policy.n_groups=4", "policy.n_action_steps=2"),
+    *("policy.pretrained_backbone_weights=null", "policy.crop_shape=[84,84]", "policy.spatial_softmax_num_keypoints=8"),
+)
 
 
-def test_diffusion(dataset: Path, tmp_path: Path) -> None:
-    train_and_roll_out(
-        dataset,
-        tmp_path,
-        *("policy=diffusion", "policy.down_dims=[16,32]", "policy.num_inference_steps=2", "policy.horizon=8"),
-        *("policy.diffusion_step_embed_dim=16", "policy.n_groups=4", "policy.n_action_steps=2"),
-        *(
-            "policy.pretrained_backbone_weights=null",
-            "policy.crop_shape=[84,84]",
-            "policy.spatial_softmax_num_keypoints=8",
-        ),
-    )
+@pytest.mark.parametrize("policy", [ACT, DIFFUSION], ids=["act", "diffusion"])
+def test_on_pictures(policy: tuple[str, ...], dataset: Path, tmp_path: Path) -> None:
+    assert train_and_roll_out(dataset, tmp_path, *policy)["obs_type"] == "pixels_agent_pos"
+
+
+@pytest.mark.parametrize("policy", [ACT, DIFFUSION], ids=["act", "diffusion"])
+@pytest.mark.parametrize("pictures", [False, True])
+def test_on_objects(policy: tuple[str, ...], pictures: bool, tmp_path: Path) -> None:
+    """The evaluation shows what the policy was trained on, without a word."""
+    inputs = {STATE, OBJECTS} | (PICTURES if pictures else set())
+    dataset = written(tmp_path, pictures=pictures, objects=True)
+    protocol = train_and_roll_out(dataset, tmp_path, *policy, inputs=inputs)
+    assert protocol["obs_type"] == ("both" if pictures else "environment_state_agent_pos")
 
 
 # --- those with a language model ---

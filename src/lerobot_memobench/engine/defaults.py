@@ -8,6 +8,7 @@ from pathlib import Path
 
 from lerobot_memobench.engine.orders import Orders
 from lerobot_memobench.engine.resume import earlier_batch_size
+from lerobot_memobench.envs.obs_types import OBJECTS
 from lerobot_memobench.settings.translation import LerobotSettings
 
 ENVIRONMENT = "memobench"
@@ -17,7 +18,8 @@ FIRST_SEED = 7
 EPISODES = 50
 LARGEST_BATCH = 64
 FILMS = 10
-"""Episodes of each task that are filmed, as many as LeRobot renders of an environment without films of its own."""
+"""Episodes of each task that are filmed, as many as LeRobot renders of an environment without films of its own;
+none where only objects are seen, so that nothing is drawn unasked."""
 
 
 def with_policy(settings: LerobotSettings) -> LerobotSettings:
@@ -73,7 +75,7 @@ def with_protocol(settings: LerobotSettings, n_action_steps: int | None) -> Lero
         settings = settings.default("policy.device", "cpu")
     if n_action_steps is not None:
         settings = settings.default("env.replan_steps", n_action_steps)
-    return settings.default("env.films", FILMS)
+    return settings.default("env.films", 0 if settings.get("env.obs_type") == OBJECTS else FILMS)
 
 
 def unused_folder(settings: LerobotSettings) -> Path:

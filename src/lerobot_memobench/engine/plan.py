@@ -55,6 +55,11 @@ class EvaluationPlan:
         return self.settings.get("policy.path")
 
     @property
+    def draws(self) -> bool:
+        """Whether pictures are drawn, as far as is known."""
+        return self.environment is None or self.environment.draws
+
+    @property
     def lerobot_flags(self) -> list[str]:
         """What ``lerobot-eval`` is called with."""
         return [*self.settings.flags, f"--{OUTPUT}={self.output}", f"--{LOG}={self.log}"]

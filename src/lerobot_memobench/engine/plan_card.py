@@ -19,7 +19,7 @@ from lerobot_memobench.policies.checkpoint import ADAPTER_FILE, WEIGHTS_FILE, lo
 
 
 def card_of(plan: EvaluationPlan) -> dict[str, Any]:
-    """Return the card of an evaluation that is about to begin. Hashes the checkpoint, opens a GL context."""
+    """Return the card of an evaluation that is about to begin. Hashes the checkpoint, opens a GL context if need be."""
     shard = plan.orders.shard
     card = new_card(
         protocol=_protocol(plan),
@@ -28,7 +28,7 @@ def card_of(plan: EvaluationPlan) -> dict[str, Any]:
         trained_on=None,
         task_files=_task_files(plan),
         flags=plan.portable_flags,
-        runs=[run_facts(plan.command, plan.batch, gl_facts())],
+        runs=[run_facts(plan.command, plan.batch, gl_facts() if plan.draws else {})],
         shard=None if shard is None else str(shard),
     )
     return with_checkpoint(card, plan.policy_path)

@@ -14,10 +14,11 @@ from lerobot_memobench.engine.defaults import ENVIRONMENT, unused_folder, with_b
 from lerobot_memobench.engine.grid import Grid, Place
 from lerobot_memobench.engine.orders import Orders, take_orders
 from lerobot_memobench.engine.plan import LOG, OUTPUT, EvaluationPlan
+from lerobot_memobench.envs.obs_types import PIXELS, obs_type_of
 from lerobot_memobench.envs.prompting import prompt_in
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import check_checkpoint
-from lerobot_memobench.settings.configurations import check_pictures, env_config, policy_config
+from lerobot_memobench.settings.configurations import check_sight, env_config, policy_config
 from lerobot_memobench.settings.flags import whole_number
 from lerobot_memobench.settings.reading import read_settings
 from lerobot_memobench.settings.translation import LerobotSettings
@@ -66,16 +67,17 @@ def make_plan(settings: LerobotSettings, orders: Orders, command: Sequence[str])
     log = Path(settings.get(LOG) or output)
     settings = settings.changed(OUTPUT, output).changed(LOG, log)
     settings = with_batch_size(settings, orders, log, getattr(policy, "max_environments", None))
+    if obs_type_of(policy) not in (None, PIXELS):
+        settings = settings.default("env.obs_type", obs_type_of(policy))
     settings = with_protocol(settings, getattr(policy, "n_action_steps", None))
     if policy is not None:  # else LeRobot's process finds out
         settings = settings.default("env.prompt_in", prompt_in(policy))
     environment = cast("MemobenchEnvConfig | None", env_config(settings))
-    check_pictures(policy, environment)
+    check_sight(policy, environment)
     if environment is None and orders.any:
         raise MemobenchError("resume=, shard= and shards= cannot go with config_path=; give its settings on the line")
     grid = None if environment is None else make_grid(settings, environment)
-    check_rendering()
-    return EvaluationPlan(
+    plan = EvaluationPlan(
         settings=settings.without(OUTPUT, LOG),
         policy=policy,
         environment=environment,
@@ -87,6 +89,9 @@ def make_plan(settings: LerobotSettings, orders: Orders, command: Sequence[str])
         orders=orders,
         command=tuple(command),
     )
+    if plan.draws:
+        check_rendering()
+    return plan
 
 
 def check_rendering() -> None:

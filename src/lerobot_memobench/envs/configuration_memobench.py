@@ -17,7 +17,14 @@ import gymnasium as gym
 from lerobot.configs import PolicyFeature
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_memobench.envs.observations import METADATA, action_space, observation_space, policy_features, policy_names
+from lerobot_memobench.envs.obs_types import OBJECTS, OBS_TYPES, PIXELS
+from lerobot_memobench.envs.observations import (
+    METADATA,
+    action_space,
+    observation_space,
+    policy_features,
+    policy_names,
+)
 from lerobot_memobench.envs.prompting import AUTO, PLACES, policy_being_run, prompt_in
 from lerobot_memobench.envs.protocol import SEED_BASE, SETTINGS, check_protocol
 from lerobot_memobench.errors import MemobenchError, nearest
@@ -32,6 +39,8 @@ class MemobenchEnvConfig(EnvConfig):
         tasks: `all`, memory types or task names, separated by commas.
         task: the same, for those used to LeRobot's field.
         task_dir: a folder in the published format to run instead of the catalogue (one task, or a tree of them).
+        obs_type: what is seen beside the arm's state: `pixels_agent_pos`, pictures; `environment_state_agent_pos`, what
+            they would show as object slots (`observation.environment_state`), and nothing is drawn; or `both`.
         referent: `fixed`, the published goals, or `random`: by seed another admissible referent or order.
         prompt_video: whether object and procedural tasks begin with their prompt video.
         prompt_in: `steps`, the policy sees the prompt step by step, with `phase` 0; `reset`, it plays before the first
@@ -57,6 +66,7 @@ class MemobenchEnvConfig(EnvConfig):
     tasks: str = "all"
     task_dir: str | None = None
     fps: int = 20
+    obs_type: str = PIXELS
     referent: str = "fixed"
     prompt_video: bool = True
     prompt_in: str = AUTO
@@ -78,6 +88,7 @@ class MemobenchEnvConfig(EnvConfig):
         if self.fps != 20:
             raise MemobenchError(f"fps is {self.fps}; the benchmark's control rate is 20, leave it out")
         for name, value, known in (
+            ("obs_type", self.obs_type, OBS_TYPES),
             ("referent", self.referent, ("fixed", "random")),
             ("prompt_in", self.prompt_in, PLACES),
             ("render", self.render, ("fast", "default", "high")),
@@ -89,11 +100,19 @@ class MemobenchEnvConfig(EnvConfig):
                 raise MemobenchError(f"env.{name} is {number}; expected a whole number from 1 on")
         if self.films is not None and self.films < 0:
             raise MemobenchError(f"env.films is {self.films}; expected a whole number of episodes from 0 on")
+        if self.obs_type != PIXELS:
+            self.features, self.features_map = policy_features(self.obs_type), policy_names(self.obs_type)
+
+    @property
+    def draws(self) -> bool:
+        """Whether a picture is ever asked for, to be observed or to be filmed."""
+        return self.obs_type != OBJECTS or bool(self.films) or self.videos
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
         """What every sub-environment is made with."""
         return {
+            "obs_type": self.obs_type,
             "referent": self.referent,
             "prompt_video": self.prompt_video,
             "prompt_in": self.resolved_prompt_in(),
@@ -154,9 +173,8 @@ class MemobenchEnvConfig(EnvConfig):
 
         if use_async_envs:
             # What a vector environment must know before its workers exist.
-            return _LazyAsyncVectorEnv(
-                make, observation_space(self.expert_action, self.render_every), action_space(), METADATA
-            )
+            space = observation_space(self.expert_action, self.render_every, self.obs_type)
+            return _LazyAsyncVectorEnv(make, space, action_space(), METADATA)
         # LeRobot freezes finished rows of its own async envs only; a sync row would be reset and go on.
         return gym.vector.SyncVectorEnv(
             [freeze_after_episode_end(one) for one in make], autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP

@@ -10,11 +10,11 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.envs.annotate import annotate
 from lerobot_memobench.envs.episode import HORIZON, PROMPT_LIMIT, Episode
 from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.envs.episode_record import episode_record
 from lerobot_memobench.envs.film import Film
+from lerobot_memobench.envs.obs_types import PIXELS
 from lerobot_memobench.envs.observations import (
     ACTION_DIM,
     IMAGE_SIZE,
@@ -25,6 +25,7 @@ from lerobot_memobench.envs.observations import (
 )
 from lerobot_memobench.envs.prompting import RESET, STEPS
 from lerobot_memobench.envs.protocol import SEED_BASE
+from lerobot_memobench.envs.sight import Sight
 from lerobot_memobench.files import file_name
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.tasks.loading import load_task
@@ -34,10 +35,11 @@ from lerobot_memobench.tasks.memory_text import memory_text, with_memory
 class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     """One task of the benchmark.
 
-    Observation: ``pixels/image`` and ``pixels/wrist_image`` uint8 (256, 256, 3) upright; ``agent_pos`` float32 (8,):
-    end-effector position (3, m), axis-angle (3, rad), fingers (2, m); ``phase`` (1,): 0 while the prompt video plays
-    and actions have no effect, 1 in execution; ``step`` (1,): control steps since the episode began; on request
-    ``expert_action`` (7,).
+    Observation: ``pixels/image`` and ``pixels/wrist_image`` uint8 (256, 256, 3) upright, or ``environment_state``
+    float32 (208,): the visible objects (`sim.object_layout`), or both; ``agent_pos`` float32 (8,): end-effector
+    position (3, m), axis-angle (3, rad), fingers (2, m); ``phase`` (1,): 0 while the prompt video plays and actions
+    have no effect, 1 in execution; ``step`` (1,): control steps since the episode began; on request ``expert_action``
+    (7,).
 
     Action: float32 (7,) in [−1, 1]: end-effector displacement (±5 cm, ±0.5 rad per unit), gripper (−1 opens, 1 closes).
 
@@ -54,6 +56,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         folder: str,
         *,
         log_dir: str | None = None,
+        obs_type: str = PIXELS,
         referent: str = "fixed",
         prompt_video: bool = True,
         prompt_in: str = STEPS,
@@ -75,10 +78,11 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._episode: Episode | None = None
         self._oracle_memory = oracle_memory
         self._describe(0)
-        self.observation_space = observation_space(expert_action, render_every)
+        self.observation_space = observation_space(expert_action, render_every, obs_type)
         self.action_space = action_space()
         protocol = {
             "seed_base": seed_base,
+            "obs_type": obs_type,
             "referent": referent,
             "prompt_video": prompt_video,
             "prompt_in": prompt_in,
@@ -93,7 +97,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._filmed = range(films or 0)
         self._films_all = videos
         self._film: Film | None = None
-        self._watched = True
+        self._sight = Sight(obs_type, render_every)
         self._settings: dict[str, Any] = {
             "referent": referent,
             "prompt_video": prompt_video,
@@ -101,7 +105,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             "render": RenderSettings(IMAGE_SIZE, IMAGE_SIZE, render),
         }
         self._prompt_in = prompt_in
-        self._render_every, self._replan_steps = render_every, replan_steps
+        self._replan_steps = replan_steps
         self._expert_action, self._seed_base = expert_action, seed_base
         self._next_seed = seed_base
 
@@ -129,10 +133,10 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         seed = self._next_seed if seed is None else int(seed)
         self._next_seed = seed + 1
         self._started = time.monotonic()
-        self._over, self._watched = False, True
+        self._over = False
         self.episode.reset(seed)
         self._describe(0)
-        self._draw()
+        self._sight.begin(self.episode)
         self._discard_film()
         number = seed - self._seed_base
         if self._videos is not None and (self._films_all or number in self._filmed):
@@ -144,12 +148,11 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     def _play_prompt(self) -> None:
         """Let the prompt run to its end, where the scene is restored; only a film watches it."""
+        self._sight.watched = False
         while self.episode.phase == PROMPT:
             self.episode.step(np.zeros(ACTION_DIM, np.float32))
-            if self._film is not None or self.episode.phase != PROMPT:
-                self._draw()
-            if self._film is not None:
-                self._film.add(self.render())
+            self._see()
+        self._sight.watched = True
 
     def step(self, action: NDArray[np.float32]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Advance by one control step of 50 ms. The reward is 1 at success, else 0."""
@@ -158,34 +161,21 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         completed = episode.progress.index
         episode.step(np.asarray(action, dtype=np.float32))
         self._describe(completed)
-        if self._is_seen():
-            self._draw()
-        if self._film is not None:
-            self._film.add(self.render())
+        self._see()
         if episode.done and not self._over:
             self._end()
         success = episode.success
         return self._observation(), float(success), success, episode.done and not success, self._info()
 
-    def _draw(self) -> None:
-        self._images, self._picture_step = self.episode.images(), self.episode.step_index
+    def _see(self) -> None:
+        """Look at the present frame, and film it where the episode is filmed."""
+        self._sight.look(self.episode, filmed=self._film is not None)
+        if self._film is not None:
+            self._film.add(self.render())
 
     def watch(self, watched: bool) -> None:
-        """Say whether somebody looks at the frames that follow, until the next reset or another word.
-
-        A frame that nobody looks at is not drawn: its observation holds the pictures drawn last. The first and the last
-        frame of the execution always are.
-        """
-        self._watched = watched
-
-    def _is_seen(self) -> bool:
-        """Whether the present frame is drawn."""
-        episode = self.episode
-        if episode.done or episode.step_index == episode.exec_start:
-            return True
-        if not self._watched and self._film is None:
-            return False
-        return episode.phase == PROMPT or episode.exec_steps % self._render_every == 0
+        """Say whether somebody looks at the frames that follow, until the next reset or another word; see `Sight`."""
+        self._sight.watched = watched
 
     def _end(self) -> None:
         """Close the books of an episode that has just ended."""
@@ -219,13 +209,11 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     def _observation(self) -> dict[str, Any]:
         episode = self.episode
         observation: dict[str, Any] = {
-            "pixels": dict(self._images),
+            **self._sight.observed(),
             "agent_pos": episode.sim.proprio(),
             "phase": np.array([episode.phase], dtype=np.float32),
             "step": np.array([episode.step_index], dtype=np.float32),
         }
-        if self._render_every > 1:
-            observation["picture_step"] = np.array([self._picture_step], dtype=np.float32)
         if self._expert_action:
             observation["expert_action"] = episode.expert_action()
         return observation
@@ -239,8 +227,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         }
 
     def render(self) -> NDArray[np.uint8]:
-        """Return both cameras side by side under what is being remembered and done; the frame drawn last."""
-        return annotate(self._images, self.episode)
+        """Return both cameras side by side under what is being remembered and done; see `Sight.frame`."""
+        return self._sight.frame(self.episode)
 
     def close(self) -> None:
         """Let the scene go; the next reset compiles or fetches it anew."""

@@ -10,7 +10,10 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from lerobot.configs import FeatureType, PolicyFeature
-from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
+
+from lerobot_memobench.envs.obs_types import OBJECTS, PIXELS
+from lerobot_memobench.sim.object_layout import SIZE
 
 IMAGE_SIZE = 256
 """Height and width of a picture, pixels."""
@@ -26,41 +29,52 @@ PROMPT, EXECUTION = 0, 1
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}
 
 
-def policy_features() -> dict[str, PolicyFeature]:
+def policy_features(obs_type: str = PIXELS) -> dict[str, PolicyFeature]:
     """Return LeRobot's description of actions and observations, by the environment's names."""
     image = PolicyFeature(type=FeatureType.VISUAL, shape=(IMAGE_SIZE, IMAGE_SIZE, 3))
+    objects = {"environment_state": PolicyFeature(type=FeatureType.ENV, shape=(SIZE,))}
     return {
         ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(ACTION_DIM,)),
-        **{f"pixels/{name}": image for name in IMAGE_KEYS},
+        **dict.fromkeys(_pictures(obs_type), image),
+        **(objects if obs_type != PIXELS else {}),
         "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(PROPRIO_DIM,)),
     }
 
 
-def policy_names() -> dict[str, str]:
+def policy_names(obs_type: str = PIXELS) -> dict[str, str]:
     """Return what each of `policy_features` is called at the policy."""
     return {
         ACTION: ACTION,
-        **{f"pixels/{name}": f"{OBS_IMAGES}.{name}" for name in IMAGE_KEYS},
+        **_pictures(obs_type),
+        **({"environment_state": OBS_ENV_STATE} if obs_type != PIXELS else {}),
         "agent_pos": OBS_STATE,
     }
 
 
-def observation_space(expert_action: bool, render_every: int = 1) -> spaces.Dict:
+def _pictures(obs_type: str) -> dict[str, str]:
+    """Return the pictures' names, here and at the policy."""
+    return {} if obs_type == OBJECTS else {f"pixels/{name}": f"{OBS_IMAGES}.{name}" for name in IMAGE_KEYS}
+
+
+def observation_space(expert_action: bool, render_every: int = 1, obs_type: str = PIXELS) -> spaces.Dict:
     """Return the space of observations, with the scripted expert's action on request.
 
     Where not every step is drawn, ``picture_step`` tells which step the pictures show.
     """
-    image = spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
     parts: dict[str, spaces.Space[Any]] = {
-        "pixels": spaces.Dict(dict.fromkeys(IMAGE_KEYS, image)),
         "agent_pos": spaces.Box(-np.inf, np.inf, (PROPRIO_DIM,), np.float32),
         # LeRobot passes numeric keys that it does not know on as `observation.<key>`, so a policy with a memory can
         # tell by itself when each row of a batch starts and stands still.
         "phase": spaces.Box(PROMPT, EXECUTION, (1,), np.float32),
         "step": spaces.Box(0, np.inf, (1,), np.float32),
     }
-    if render_every > 1:
-        parts["picture_step"] = spaces.Box(0, np.inf, (1,), np.float32)
+    if obs_type != OBJECTS:
+        image = spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
+        parts["pixels"] = spaces.Dict(dict.fromkeys(IMAGE_KEYS, image))
+        if render_every > 1:
+            parts["picture_step"] = spaces.Box(0, np.inf, (1,), np.float32)
+    if obs_type != PIXELS:
+        parts["environment_state"] = spaces.Box(-np.inf, np.inf, (SIZE,), np.float32)
     if expert_action:
         parts["expert_action"] = action_space()
     return spaces.Dict(parts)

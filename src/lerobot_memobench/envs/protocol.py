@@ -24,6 +24,7 @@ SEED_BASE = 7
 
 SETTINGS = (
     "seed_base",
+    "obs_type",
     "referent",
     "prompt_video",
     "prompt_in",
@@ -55,6 +56,7 @@ class Settings(TypedDict, total=False):
     """Under what it was run; a setting in which joined episodes differ is a list of its values."""
 
     seed_base: Whole | list[Whole]
+    obs_type: Name | None
     referent: Name | list[Name]
     prompt_video: bool | None
     horizon: Count | None

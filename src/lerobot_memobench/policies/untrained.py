@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from lerobot.configs import PreTrainedConfig
 from lerobot.optim import AdamWConfig, LRSchedulerConfig
@@ -11,6 +12,9 @@ from lerobot.optim import AdamWConfig, LRSchedulerConfig
 @dataclass
 class UntrainedConfig(PreTrainedConfig):
     """Answers to what LeRobot asks every policy's configuration, of one that is never trained."""
+
+    perception: ClassVar[str] = "any"
+    """Whatever is observed will do (`envs.obs_types`), also where a checkpoint lists pictures among its features."""
 
     device: str | None = "cpu"
     push_to_hub: bool = False

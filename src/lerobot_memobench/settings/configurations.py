@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, cast
 
+from lerobot_memobench.envs.obs_types import OBJECTS, check_obs_type, obs_type_of
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import check_checkpoint
 from lerobot_memobench.policies.freshness import REFUSAL
@@ -40,13 +41,16 @@ def env_config(settings: LerobotSettings) -> EnvConfig | None:
     return cast("EnvConfig | None", _parsed(settings, "env"))
 
 
-def check_pictures(policy: PreTrainedConfig | None, environment: EnvConfig | None) -> None:
-    """Refuse an environment that repeats pictures to a policy that remembers the frames between its plans.
+def check_sight(policy: PreTrainedConfig | None, environment: EnvConfig | None) -> None:
+    """Refuse an environment that does not show what the policy sees, or not at each step at which it remembers it.
 
     Raises:
-        MemobenchError: it would remember one step's picture as another's.
+        MemobenchError: pictures or objects would be missing, or one step's picture remembered as another's.
     """
-    if getattr(policy, "watches", False) and getattr(environment, "render_every", 1) > 1:
+    if environment is not None and environment.type == "memobench":
+        check_obs_type(policy, environment.obs_type)
+    remembers_pictures = getattr(policy, "watches", False) and obs_type_of(policy) != OBJECTS
+    if remembers_pictures and getattr(environment, "render_every", 1) > 1:
         raise MemobenchError(f"env.render_every is {getattr(environment, 'render_every', 1)}; {REFUSAL}")
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from lerobot_memobench.datasets.lerobot_format import DEFAULT_REPO_ID
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.settings.configurations import check_pictures, env_config, policy_config
+from lerobot_memobench.settings.configurations import check_sight, env_config, policy_config
 from lerobot_memobench.settings.fields import checked_value
 from lerobot_memobench.settings.translation import LerobotSettings
 from lerobot_memobench.settings.words import Words
@@ -44,7 +44,7 @@ def complete_training(settings: LerobotSettings) -> LerobotSettings:
             raise MemobenchError("name a policy: policy=memobench_mem")
         settings = with_places(settings)
     check_dataset(settings)
-    check_pictures(policy_config(settings), env_config(settings))
+    check_sight(policy_config(settings), env_config(settings))
     settings = with_logging(settings)
     cores = os.cpu_count() or 4
     if cores < 4 and not from_file:  # LeRobot's default of 4 loaders would only wait for one another

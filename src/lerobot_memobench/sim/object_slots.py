@@ -20,25 +20,10 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.assets.asset import Articulation, Asset
 from lerobot_memobench.sim.assets.builder import VISUAL_GROUP
 from lerobot_memobench.sim.assets.registry import known_classes, split_class
+from lerobot_memobench.sim.object_layout import FIELDS, SIZE, SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.simulation import CAMERAS, Simulation
 
-SLOTS = 16
-"""Things that an observation has room for. The catalogue's fullest scene has ten."""
-
-FIELDS = {"present": 1, "class": 1, "position": 3, "rotation": 6, "joint": 1, "highlighted": 1}
-"""Numbers of a slot, in order.
-
-``present``: 1, or 0 for an empty slot, which is all zeros. ``class``: index into `classes`. ``position``: of the
-thing's origin in the world, m. ``rotation``: the first two columns of its rotation matrix. ``joint``: position of a
-drawer (m), door or knob (rad), else 0. ``highlighted``: 1 while it stands in a highlight of the prompt.
-"""
-
-WIDTH = sum(FIELDS.values())
-SIZE = SLOTS * WIDTH
-"""Length of the observation."""
-
-STARTS = dict(zip(FIELDS, np.cumsum([0, *FIELDS.values()])[:-1].tolist(), strict=True))
-"""Field -> where it begins in its slot."""
+__all__ = ["FIELDS", "SIZE", "SLOTS", "STARTS", "WIDTH", "ObjectSlots", "Thing", "classes", "layout"]
 
 POINTS = 24
 """Points of a thing to which rays run."""

@@ -1,4 +1,4 @@
-"""Which policies look at the pictures of the next observation: those that do not are not drawn any.
+"""Which policies look at the next observation: for those that do not, nothing is drawn and no objects are found.
 
 A policy of ours says so itself, by its method ``looks_next``. LeRobot's policies that plan chunks look when their queue
 of planned actions is empty; each is known by the very function that was read (tests/engine/test_lerobot_loop.py), so a
@@ -37,7 +37,7 @@ KNOWN: dict[tuple[str, str], Callable[[Any], bool]] = {
 
 
 def looking(policy: Any) -> Callable[[], bool]:
-    """Return what tells, before a step, whether a policy looks at the pictures of the observation after it."""
+    """Return what tells, before a step, whether a policy looks at pictures or objects of the observation after it."""
     own = getattr(policy, "looks_next", None)
     if own is not None:
         return own

@@ -1,8 +1,8 @@
 """LeRobot's loop over control steps, in which pictures are drawn and converted only for a policy that looks at them.
 
 It takes the same steps in the same order as ``lerobot_eval.rollout`` and returns the same tensors. Between two looks a
-policy is handed the pictures that it saw last, which it has said it will not read; everything else of an observation
-is of the present.
+policy is handed the pictures and objects that it saw last, which it has said it will not read; everything else of an
+observation is of the present.
 """
 
 from __future__ import annotations

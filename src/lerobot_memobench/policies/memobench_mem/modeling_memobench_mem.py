@@ -44,6 +44,7 @@ from lerobot_memobench.policies.memobench_mem.precision import Precision
 from lerobot_memobench.policies.memobench_mem.processing.training_run import TrainingRun, begin_training
 from lerobot_memobench.policies.memobench_mem.saved_steps import require_agreement
 from lerobot_memobench.policies.memobench_mem.weights import require_statistics, weights_file
+from lerobot_memobench.policies.shown import cure
 
 # A saved pipeline is built right after its policy, by the names under which its steps register when imported.
 from lerobot_memobench.policies.memobench_mem import processor_memobench_mem  # noqa: F401  # isort: skip
@@ -306,11 +307,7 @@ class MemobenchMemPolicy(PI05Policy):
         """Take the current frames of all rows into their histories; return steps, new episodes and frozen rows."""
         seen = self.perception.remembers
         if seen not in batch:
-            cameras = ", ".join(key for key in batch if key.startswith("observation.images.")) or "none"
-            raise MemobenchError(
-                f"The observation has no '{seen}', which this policy remembers; it has {cameras}. "
-                "Map its names with --rename_map."
-            )
+            raise MemobenchError(f"The observation has no '{seen}', which this policy remembers; {cure(seen, batch)}")
         count = len(batch[seen])
         if OBS_STEP in batch:
             steps = [round(step) for step in batch[OBS_STEP].reshape(count, -1)[:, 0].tolist()]

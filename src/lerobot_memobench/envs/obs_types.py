@@ -1,0 +1,47 @@
+"""What is seen beside the arm's state: pictures, the objects on them, or both? Names, and what a policy needs.
+
+Cheap to import: no LeRobot.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from lerobot_memobench.errors import MemobenchError
+
+PIXELS, OBJECTS, BOTH = "pixels_agent_pos", "environment_state_agent_pos", "both"
+OBS_TYPES = (PIXELS, OBJECTS, BOTH)
+"""Values of ``env.obs_type``; the first two by LeRobot's names."""
+
+READ_OBJECTS = ("act", "diffusion", "tdmpc")
+"""Policies of LeRobot's that read `observation.environment_state` where they were trained on it; others ignore it."""
+
+
+def obs_type_of(policy: Any) -> str | None:
+    """Return what a policy must be shown by its configuration; None where that is not known, or nothing is needed.
+
+    A policy that says by ``perception`` what it sees (`pixels`, `objects` or `any`) is taken at its word.
+    """
+    perception = getattr(policy, "perception", None)
+    if policy is None or perception is not None:
+        return {"objects": OBJECTS, "pixels": PIXELS}.get(str(perception))
+    objects = policy.type in READ_OBJECTS and policy.env_state_feature is not None
+    if policy.image_features:
+        return BOTH if objects else PIXELS
+    return OBJECTS if objects else None
+
+
+def check_obs_type(policy: Any, shown: str) -> None:
+    """Refuse to show a policy something else than it sees.
+
+    Args:
+        policy: its configuration.
+        shown: what the environment observes.
+
+    Raises:
+        MemobenchError: pictures or objects that it needs would be missing.
+    """
+    needed = obs_type_of(policy)
+    if needed is not None and shown not in (needed, BOTH):
+        wanted = BOTH if needed == BOTH else f"{needed} or {BOTH}"
+        raise MemobenchError(f"env.obs_type is {shown}, which does not show what the policy sees; set it to {wanted}")
