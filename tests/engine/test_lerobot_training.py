@@ -76,6 +76,14 @@ def opened(root: Path, policy: Any, prompt_frames: bool | None = None, **setting
         return lerobot_train.make_train_eval_datasets(config)  # type: ignore[no-any-return]
 
 
+def test_a_kind_of_observation_that_is_not_there_is_told(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = TrainPipelineConfig(DatasetConfig("memobench/synthetic", root=str(root)), policy=act())
+    with trained_on(None, "environment_state_agent_pos"), pytest.raises(MemobenchError, match="but the dataset has"):
+        lerobot_train.make_train_eval_datasets(config)
+    assert main(["train", "policy=act", f"dataset={root}", "obs_type=environment"]) == 2
+    assert "found obs_type=environment, did you mean 'environment_state_agent_pos'" in capsys.readouterr().err
+
+
 def drawn(dataset: LeRobotDataset, last: int = 0) -> set[int]:
     """Return the frames that LeRobot's sampler draws."""
     bounds = dataset.meta.episodes

@@ -89,6 +89,8 @@ def train_and_roll_out(dataset: Path, out: Path, *policy: str, inputs: set[str] 
 
 #: LeRobot keeps the statistics of every column in the file; which of them are used its step's features say.
 KEPT = {
+    *PICTURES,
+    OBJECTS,
     "phase",
     "executed_action",
     "checkpoint.index",
@@ -126,13 +128,22 @@ def test_on_pictures(policy: tuple[str, ...], dataset: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("policy", [ACT, DIFFUSION], ids=["act", "diffusion"])
-@pytest.mark.parametrize("pictures", [False, True])
-def test_on_objects(policy: tuple[str, ...], pictures: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("pictures", "said", "seen"),
+    [
+        (False, None, "environment_state_agent_pos"),
+        (True, None, "pixels_agent_pos"),
+        (True, "environment_state_agent_pos", "environment_state_agent_pos"),
+        (True, "both", "both"),
+    ],
+)
+def test_on_objects(policy: tuple[str, ...], pictures: bool, said: str | None, seen: str, tmp_path: Path) -> None:
     """The evaluation shows what the policy was trained on, without a word."""
-    inputs = {STATE, OBJECTS} | (PICTURES if pictures else set())
+    of = {"pixels_agent_pos": PICTURES, "environment_state_agent_pos": {OBJECTS}, "both": PICTURES | {OBJECTS}}
     dataset = written(tmp_path, pictures=pictures, objects=True)
-    protocol = train_and_roll_out(dataset, tmp_path, *policy, inputs=inputs)
-    assert protocol["obs_type"] == ("both" if pictures else "environment_state_agent_pos")
+    words = policy if said is None else (*policy, f"obs_type={said}")
+    protocol = train_and_roll_out(dataset, tmp_path, *words, inputs={STATE} | of[seen])
+    assert protocol["obs_type"] == seen
 
 
 # --- those with a language model ---

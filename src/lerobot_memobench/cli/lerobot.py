@@ -59,9 +59,9 @@ def run(words: Sequence[str]) -> int:
 
 def train(words: Words) -> int:
     """Run ``lerobot train`` with the benchmark's defaults, checked."""
-    from lerobot_memobench.settings.training import complete_training, take_prompt_frames
+    from lerobot_memobench.settings.training import complete_training, take_training_words
 
-    prompt_frames, words = take_prompt_frames(resolve_recipe(words))
+    prompt_frames, obs_type, words = take_training_words(resolve_recipe(words))
     check_task_names(words)
     settings = read_settings("train", words)
     if words.wants_help:
@@ -69,7 +69,7 @@ def train(words: Words) -> int:
     from lerobot_memobench.engine.lerobot_training import trained_on
 
     settings = complete_training(settings)
-    with trained_on(prompt_frames):
+    with trained_on(prompt_frames, obs_type):
         return call_lerobot("train", settings.flags)
 
 

@@ -1,8 +1,10 @@
-"""What LeRobot's training is made to do beside its own: leave the frames of prompts out.
+"""What LeRobot's training is made to do beside its own: leave the frames of prompts out, and say what a policy sees.
 
 With `loop` and `policies.memobench_mem.execution_frames`, which draws that policy's batches, all that changes anything
 of LeRobot's; what it relies on is listed in tests/engine/test_lerobot_training.py. Whether prompt frames are wanted is
-decided where the policy is known for sure: when LeRobot, its configuration complete, has opened the datasets.
+decided where the policy is known for sure: when LeRobot, its configuration complete, has opened the datasets. So is
+what a policy sees: our datasets hold pictures and, beside them, what shows in them as objects, and LeRobot would give
+both to its own policies.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from typing import Any
 
 from lerobot_memobench.datasets.execution_frames import ExecutionFrames, leave_out_prompts
 from lerobot_memobench.engine.loop.steering import check_version
+from lerobot_memobench.envs.obs_types import OBJECTS, PIXELS
 from lerobot_memobench.envs.prompting import knows_phases
 from lerobot_memobench.errors import MemobenchError
 
@@ -27,13 +30,16 @@ MAKE = "make_train_eval_datasets"
 
 
 @contextmanager
-def trained_on(prompt_frames: bool | None) -> Iterator[None]:
+def trained_on(prompt_frames: bool | None, obs_type: str | None = None) -> Iterator[None]:
     """While this lasts, LeRobot trains on prompt frames too, or on none; None: on none unless the policy knows phases.
+
+    ``obs_type`` is what a policy that does not know phases sees (`envs.obs_types.OBS_TYPES`); None: pictures where
+    the dataset has them, else objects.
 
     Raises:
         MemobenchError: the installed LeRobot is another than the one whose training is known here.
     """
-    before = steer(prompt_frames)
+    before = steer(prompt_frames, obs_type)
     try:
         yield
     finally:
@@ -41,7 +47,7 @@ def trained_on(prompt_frames: bool | None) -> Iterator[None]:
             setattr(module, MAKE, make)
 
 
-def steer(prompt_frames: bool | None) -> dict[ModuleType, Callable[..., Any]]:
+def steer(prompt_frames: bool | None, obs_type: str | None = None) -> dict[ModuleType, Callable[..., Any]]:
     """As `trained_on`, for good; return what was replaced."""
     check_version("training")
     from lerobot.scripts import lerobot_train
@@ -49,17 +55,18 @@ def steer(prompt_frames: bool | None) -> dict[ModuleType, Callable[..., Any]]:
     modules = [module for module in (lerobot_train, sys.modules["__main__"]) if hasattr(module, MAKE)]  # `python -m`
     before = {module: getattr(module, MAKE) for module in modules}
     for module, make in before.items():
-        setattr(module, MAKE, _leaving_out(make, prompt_frames))
+        setattr(module, MAKE, _steered(make, prompt_frames, obs_type))
     return before
 
 
-def _leaving_out(make: Callable[..., Any], prompt_frames: bool | None) -> Callable[..., Any]:
+def _steered(make: Callable[..., Any], prompt_frames: bool | None, obs_type: str | None) -> Callable[..., Any]:
     """Wrap what opens LeRobot's datasets: those that it returns hold no prompts where none are wanted."""
 
     @functools.wraps(make)
     def run(config: Any) -> Any:
         _check_streaming(config)
         train, held_out = make(config)
+        _choose_inputs(config.policy, train.meta.features, obs_type)
         wanted = config.policy is None or knows_phases(config.policy) if prompt_frames is None else prompt_frames
         if wanted:
             return train, held_out
@@ -79,3 +86,25 @@ def _check_streaming(config: Any) -> None:
             f"policy={config.policy.type} draws execution frames alone, and dataset.streaming=true leaves no choice of "
             "frames; use dataset.streaming=false, or policy.prompt_loss=true to train on prompts as well"
         )
+
+
+def _choose_inputs(policy: Any, features: dict[str, Any], obs_type: str | None) -> None:
+    """Tell a policy's configuration what it sees, as LeRobot would from all that a dataset holds."""
+    from lerobot.configs import FeatureType
+    from lerobot.utils.feature_utils import dataset_to_policy_features
+
+    if policy is None or policy.input_features or knows_phases(policy):
+        return
+    inputs = {key: f for key, f in dataset_to_policy_features(features).items() if f.type is not FeatureType.ACTION}
+    pictures = any(feature.type is FeatureType.VISUAL for feature in inputs.values())
+    seen = obs_type or (PIXELS if pictures else OBJECTS)
+    unseen = {PIXELS: FeatureType.ENV, OBJECTS: FeatureType.VISUAL}.get(seen)
+    chosen = {key: feature for key, feature in inputs.items() if feature.type is not unseen}
+    if obs_type is not None and not {FeatureType.VISUAL, FeatureType.ENV} & {
+        feature.type for feature in chosen.values()
+    }:
+        raise MemobenchError(
+            f"obs_type={obs_type} was asked for, but the dataset has {', '.join(inputs)}; choose another obs_type, or "
+            "generate a dataset that has it"
+        )
+    policy.input_features = chosen

@@ -36,4 +36,4 @@ CHOOSING = ("policy", "env", "dataset")
 EVALUATION_WORDS = ("resume", "shard", "shards", "workers", "executor", "executor_option")
 
 #: Words of `lerobot train` that are none of LeRobot's (see `settings.training`).
-TRAINING_WORDS = ("prompt_frames",)
+TRAINING_WORDS = ("prompt_frames", "obs_type")

@@ -7,29 +7,35 @@ from dataclasses import replace
 from pathlib import Path
 
 from lerobot_memobench.datasets.lerobot_format import DEFAULT_REPO_ID
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.envs.obs_types import OBS_TYPES
+from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.settings.configurations import check_sight, env_config, policy_config
 from lerobot_memobench.settings.fields import checked_value
+from lerobot_memobench.settings.short_forms import TRAINING_WORDS
 from lerobot_memobench.settings.translation import LerobotSettings
 from lerobot_memobench.settings.words import Words
 
 INFO_FILE = Path("meta") / "info.json"
-PROMPT_FRAMES = "prompt_frames"
 TRAINED = ("policy.type", "policy.path", "reward_model.type", "reward_model.path")
 """What may say what is trained."""
 
 
-def take_prompt_frames(words: Words) -> tuple[bool | None, Words]:
-    """Return whether prompt frames are trained on, None where it is left to the policy; and the words without it.
+def take_training_words(words: Words) -> tuple[bool | None, str | None, Words]:
+    """Return whether prompt frames are trained on, and what a policy is to see, each None where it is not said; and the
+    words without these.
 
     Raises:
-        MemobenchError: it is neither true nor false.
+        MemobenchError: the first is neither true nor false, or the second no kind of observation.
     """
-    given = [value for key, value in words.settings if key == PROMPT_FRAMES]
-    rest = [(key, value) for key, value in words.settings if key != PROMPT_FRAMES]
+    given = dict(item for item in words.settings if item[0] in TRAINING_WORDS)
+    of_env = {"obs_type"} if any(key == "env" for key, _ in words.settings) else set()  # it is a setting of it, too
+    rest = [item for item in words.settings if item[0] in of_env or item[0] not in TRAINING_WORDS]
     known = {"true": True, "false": False}
-    choice = known.get(checked_value(PROMPT_FRAMES, bool, given[-1])) if given else None
-    return choice, replace(words, settings=rest)
+    prompt_frames, obs_type = given.get("prompt_frames"), given.get("obs_type")
+    if obs_type is not None and obs_type not in OBS_TYPES:
+        raise MemobenchError(f"found obs_type={obs_type}, {nearest(obs_type, OBS_TYPES)}")
+    wanted = None if prompt_frames is None else known.get(checked_value("prompt_frames", bool, prompt_frames))
+    return wanted, obs_type, replace(words, settings=rest)
 
 
 def complete_training(settings: LerobotSettings) -> LerobotSettings:
