@@ -163,6 +163,11 @@ class Task:
         return self.twin_of or self.name
 
     @property
+    def title(self) -> str:
+        """What the task asks in all of its variants: its instruction, or its name where they differ in it."""
+        return self.name.replace("_", " ") if any(one.language for one in self.variants) else self.language
+
+    @property
     def operations(self) -> str:
         """Operation labels of the checkpoints at the evaluated level, e.g. "SUC"."""
         return "".join(checkpoint.operation for checkpoint in self.checkpoints)
