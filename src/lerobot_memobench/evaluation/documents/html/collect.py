@@ -22,7 +22,7 @@ from lerobot_memobench.evaluation.metrics.rates import Rate, Row, percent
 from lerobot_memobench.evaluation.metrics.rollouts import Record, operations
 from lerobot_memobench.evaluation.metrics.summary import Summary, summarise
 from lerobot_memobench.evaluation.records.protocol import CARD_FILE, read_card
-from lerobot_memobench.evaluation.records.runs import folder_names, read_rollouts
+from lerobot_memobench.evaluation.records.runs import check_one_suite, folder_names, read_rollouts
 from lerobot_memobench.tasks.catalogue import find_tasks, get_task, task_names
 from lerobot_memobench.tasks.failures import FAILURES
 from lerobot_memobench.tasks.formula import format_formula
@@ -54,6 +54,7 @@ def read_runs(folders: Sequence[str | Path]) -> list[Run]:
         path = Path(folder) / CARD_FILE
         card = read_card(path) if path.is_file() else {}
         runs.append(Run(name, Path(folder), records, notes, card))
+    check_one_suite({run.folder: run.records for run in runs})
     return runs
 
 
