@@ -73,7 +73,8 @@ def replay(recorded: Demonstration | RecordedEpisode, *, task: Task | None = Non
 def resimulate(task: Task, seed: int, actions: NDArray[np.float32], exec_start: int) -> Demonstration:
     """Apply (T, 7) float32 actions, starting in the scene of ``seed``; return the demonstration they make.
 
-    It has no images. At frame ``exec_start`` the scene goes back to where it began, as after a prompt video.
+    It has no images. At frame ``exec_start`` the scene goes back to where it began, as after a prompt video that hides
+    nothing.
     """
     sim = Simulation(task)
     sim.reset(seed)
@@ -84,7 +85,9 @@ def resimulate(task: Task, seed: int, actions: NDArray[np.float32], exec_start: 
     success = False
     for frame, action in enumerate(actions):
         if frame == exec_start and frame > 0:
-            sim.restore(start)
+            if task.prompt is None or task.prompt.restores:
+                sim.restore(start)
+            sim.begin_execution()
         sim.highlights = highlights_at(task, sim, frame) if frame < exec_start else ()
         states.append(sim.state())
         proprio.append(sim.proprio())

@@ -21,7 +21,7 @@ from lerobot_memobench.sim.rendering import Image, RenderSettings
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.formula import Atom, atoms
 from lerobot_memobench.tasks.progress import Progress
-from lerobot_memobench.tasks.task import Task
+from lerobot_memobench.tasks.task import STRICT, Task
 
 HORIZON = 1200
 """Execution steps before an episode is cut off (paper, section 5.1)."""
@@ -35,8 +35,9 @@ class Episode:
 
     Args:
         task: the published task.
-        referent: `fixed`, the catalogue's goal, or `random`, one of the task's variants by seed.
-        prompt_video: whether object and procedural tasks begin with their prompt.
+        referent: `fixed`, the catalogue's goal, or `random`, one of the task's variants by seed; of the strict suite
+            one of the variants always.
+        prompt_video: whether tasks that have a prompt begin with it; what a prompt hides is hidden unseen without.
         horizon: execution steps before truncation.
         render: size and quality of frames.
 
@@ -73,7 +74,8 @@ class Episode:
     def reset(self, seed: int) -> None:
         """Start the episode of a seed. Everything that follows is a function of task, settings, seed and actions."""
         self.seed = int(seed)
-        self.task = task = referent_of(self.published, self.seed) if self.referent == "random" else self.published
+        draws = self.referent == "random" or self.published.drawn
+        self.task = task = referent_of(self.published, self.seed) if draws else self.published
         self.sim.reset(self.seed)
         self.scene_hash = self.sim.scene_hash()
         self._start = self.sim.snapshot()
@@ -86,7 +88,8 @@ class Episode:
         self._siblings = list(_wrong_atoms(task))
         self._expert: Expert | None = None
         self._demonstrator: Iterator[NDArray[np.float32]] | None = None
-        if self.prompt_video:
+        hides = task.prompt is not None and not task.prompt.restores
+        if self.prompt_video or hides:
             self._prompt = PromptDemonstrator(task, self.sim, self._rng(2))
             self._demonstrator = self._prompt.actions()
             self._next_prompt_action = next(self._demonstrator, None)
@@ -94,13 +97,23 @@ class Episode:
                 self._begin_execution()
         else:
             self._begin_execution()
+        if hides and not self.prompt_video:
+            self._hide_unseen()
+
+    def _hide_unseen(self) -> None:
+        """Play the prompt before the first frame: without it there would be nothing to find."""
+        while self.phase == PROMPT:
+            self.step(np.zeros(ACTION_DIM, np.float32))
+        self.step_index = self.exec_start = 0
 
     def _begin_execution(self) -> None:
-        """Put the scene back exactly as it was and hand over to the policy."""
+        """Put the scene back exactly as it was, unless something was hidden in it, and hand over to the policy."""
         if self.step_index:
             self.prompt_shown = self._prompt.shown
             self.sim.highlights = ()
-            self.sim.restore(self._start)
+            if self.task.prompt is None or self.task.prompt.restores:
+                self.sim.restore(self._start)
+        self.sim.begin_execution()
         self._demonstrator = None
         self.exec_start = self.step_index
         self.progress.reset()
@@ -121,9 +134,14 @@ class Episode:
         return self.phase == EXECUTION and self.progress.success
 
     @property
+    def lost(self) -> bool:
+        """The goal can no longer be reached; told of strict tasks only, the published ones run to their horizon."""
+        return self.task.suite == STRICT and self.phase == EXECUTION and self.progress.lost
+
+    @property
     def done(self) -> bool:
-        """Ended by success or horizon; satisfied checkpoints alone end nothing."""
-        return self.success or self.exec_steps >= self.horizon
+        """Ended by success, horizon or loss; satisfied checkpoints alone end nothing."""
+        return self.success or self.exec_steps >= self.horizon or self.lost
 
     def step(self, action: NDArray[np.floating]) -> None:
         """Advance by one control step; during the prompt the given action has no effect."""

@@ -30,6 +30,7 @@ from lerobot_memobench.files import file_name
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.tasks.loading import load_task
 from lerobot_memobench.tasks.memory_text import memory_text, with_memory
+from lerobot_memobench.tasks.task import PUBLISHED
 
 
 class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
@@ -57,6 +58,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         *,
         log_dir: str | None = None,
         obs_type: str = PIXELS,
+        suite: str = PUBLISHED,
         referent: str = "fixed",
         prompt_video: bool = True,
         prompt_in: str = STEPS,
@@ -81,6 +83,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self.observation_space = observation_space(expert_action, render_every, obs_type)
         self.action_space = action_space()
         protocol = {
+            "suite": suite,
             "seed_base": seed_base,
             "obs_type": obs_type,
             "referent": referent,
@@ -155,7 +158,10 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._sight.watched = True
 
     def step(self, action: NDArray[np.float32]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Advance by one control step of 50 ms. The reward is 1 at success, else 0."""
+        """Advance by one control step of 50 ms. The reward is 1 at success, else 0.
+
+        An episode terminates by success and, of a strict task, by the loss of its goal; the horizon truncates it.
+        """
         episode = self.episode
         # A dataset's labels count what was completed before a frame; what this step completes is told one frame later.
         completed = episode.progress.index
@@ -164,8 +170,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._see()
         if episode.done and not self._over:
             self._end()
-        success = episode.success
-        return self._observation(), float(success), success, episode.done and not success, self._info()
+        success, ended = episode.success, episode.success or episode.lost
+        return self._observation(), float(success), ended, episode.done and not ended, self._info()
 
     def _see(self) -> None:
         """Look at the present frame, and film it where the episode is filmed."""

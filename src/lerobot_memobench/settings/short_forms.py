@@ -9,6 +9,7 @@ EVERYWHERE: dict[str, tuple[str, ...]] = {
     "replan": ("policy.n_action_steps", "env.replan_steps"),
     "tasks": ("env.tasks",),
     "obs_type": ("env.obs_type",),
+    "suite": ("env.suite",),
     "referent": ("env.referent",),
 }
 

@@ -13,7 +13,8 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.bddl.problem import Problem
 from lerobot_memobench.tasks.bddl.reading import parse_bddl
 from lerobot_memobench.tasks.formula import LATCHES, atoms
-from lerobot_memobench.tasks.metadata import Metadata, read_text
+from lerobot_memobench.tasks.metadata import Metadata
+from lerobot_memobench.tasks.metadata_file import read_text
 from lerobot_memobench.tasks.task import (
     BDDL_FILE,
     MEMORY_TYPES,
@@ -73,6 +74,10 @@ def load_task(folder: str | Path, require_metadata: bool = True) -> Task:
         folder=folder,
         bddl_text=text,
         metadata=metadata.data,
+        suite=metadata.suite(),
+        twin_of=metadata.text("twin_of") or None,
+        drawn=metadata.flag("drawn"),
+        spoilt_as=metadata.failure_class("spoilt_as"),
     )
 
 

@@ -182,6 +182,8 @@ def _read_off(
         proprio.append(sim.proprio())
         sim.highlights = highlights_at(task, sim, frame) if frame < prompt else ()
         objects.append(look.observe())
+        if frame == exec_start:
+            sim.begin_execution()
         if evaluate and frame > exec_start:  # the world is evaluated after a control step, see Demonstration
             success = progress.step(sim.holds) or success
         satisfied.append(progress.satisfied)
