@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lerobot_memobench.cli.console import console, counting
+from lerobot_memobench.cli.console import Count, console, counting
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 
 if TYPE_CHECKING:
-    from lerobot_memobench.evaluation.necessity.study import Result
+    from lerobot_memobench.evaluation.necessity.question import Settings
+    from lerobot_memobench.evaluation.necessity.study import Study
+    from lerobot_memobench.jobs.job import Advance, ProgressCallback
     from lerobot_memobench.tasks.task import Task
 
 
@@ -32,7 +34,7 @@ def necessity(
     ] = WhichReferent.BOTH,
     episodes: Annotated[int, typer.Option(min=1, help="Scenes per task, from seed 7 on.")] = 3,
     budget: Annotated[
-        int, typer.Option(min=0, help="Steps simulated per task in search of other ways to the goal; 0: no search.")
+        int, typer.Option(min=0, help="Steps simulated per scene in search of other ways to the goal; 0: no search.")
     ] = 10_000,
     tolerance: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Share of differing pixels up to which pictures look the same.")
@@ -40,24 +42,24 @@ def necessity(
     out: Annotated[Path, typer.Option(help="Folder of the results; the same command goes on there.")] = Path(
         "outputs/necessity"
     ),
+    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     page: Annotated[
         Path | None, typer.Option(help="Markdown page whose table is made anew, between its marks.")
     ] = None,
 ) -> int:
     """Find moments that look the same and need different answers; print what a policy without memory can reach."""
+    from lerobot_memobench.evaluation.necessity.pieces import PIECES, make
     from lerobot_memobench.evaluation.necessity.question import REFERENTS, Settings
     from lerobot_memobench.evaluation.necessity.report import put_into_page, terminal_table, write
-    from lerobot_memobench.evaluation.necessity.study import study
 
     settings = Settings(episodes=episodes, budget=budget, tolerance=tolerance)
     referents = REFERENTS if referent is WhichReferent.BOTH else (referent.value,)
-    jobs = _jobs([get_task(name) for name in resolve_tasks(tasks)], referents)
+    studies = _studies([get_task(name) for name in resolve_tasks(tasks)], referents, settings, out)
     screen = console()
-    results: list[Result] = []
-    with counting(screen, "tasks", len(jobs)) as count:
-        for task, setting in jobs:
-            results.append(study(task, setting if task.num_variants > 1 else REFERENTS[0], settings, out))
-            count(len(results), len(jobs), f"{task.name}, referent {setting}")
+    for piece, unit in PIECES.items():
+        with counting(screen, unit) as count:
+            make(studies, piece, workers, _telling(count))
+    results = [study.result() for study in studies]
     written = write(out, results)
     if page is not None:
         written.append(put_into_page(page, results))
@@ -67,8 +69,21 @@ def necessity(
     return 0
 
 
-def _jobs(tasks: Sequence[Task], referents: Sequence[str]) -> list[tuple[Task, str]]:
+def _telling(count: Count) -> ProgressCallback:
+    def tell(news: Advance) -> None:
+        count(news.done, news.total, f"{news.task_name}, seed {news.seed}", found=news.found)
+
+    return tell
+
+
+def _studies(tasks: Sequence[Task], referents: Sequence[str], settings: Settings, out: Path) -> list[Study]:
     """Return every task with every setting of the referent; with one goal only, all settings are the same."""
+    from lerobot_memobench.evaluation.necessity.question import REFERENTS
+    from lerobot_memobench.evaluation.necessity.study import Study
+
     return [
-        (task, setting) for task in tasks for setting in referents if task.num_variants > 1 or setting == referents[0]
+        Study(task, setting if task.num_variants > 1 else REFERENTS[0], settings, out)
+        for task in tasks
+        for setting in referents
+        if task.num_variants > 1 or setting == referents[0]
     ]

@@ -138,7 +138,7 @@ def test_the_command_shows_a_table_and_names_its_files(
     words = ["necessity", "--tasks", f"{PAN},{MILK}", "--episodes", "1", "--budget", "0", "--out", str(tmp_path)]
     assert main(words) == 0
     out = capsys.readouterr().out
-    assert "3/3" in out, "the stove once, the milk under both settings"
+    assert "3/3 scene of" in out, "the stove once, the milk under both settings"
     assert all(str(tmp_path / name) in out for name in ("necessity.json", "necessity.md", "aliased_pairs.png"))
     results = json.loads((tmp_path / "necessity.json").read_text())
     assert [(r["referent"], r["memory_needed"]) for r in results] == [

@@ -47,7 +47,7 @@ def _confirmed(laboratory: Laboratory, found: Exploration, policy: Policy, setti
         nearest = int(np.argmin(apart))
         return policy.get(found.graph.pictures[nearest]) if apart[nearest] <= settings.tolerance else None
 
-    return sum(walk(laboratory, variant, act, settings.horizon) for variant in laboratory.variants)
+    return walk(laboratory, laboratory.variants, act, settings.horizon)
 
 
 def _when(found: Exploration, picture: int) -> list[str]:

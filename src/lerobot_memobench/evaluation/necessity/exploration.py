@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import TYPE_CHECKING
@@ -103,27 +103,30 @@ class _Explorer:
 
 def walk(
     laboratory: Laboratory,
-    task: Task,
+    tasks: Sequence[Task],
     policy: Callable[[tuple[Picture, ...]], str | None],
     horizon: int = HORIZON,
-) -> bool:
-    """Let a policy without memory act from pictures alone; return whether the task's goal came true in time.
+) -> int:
+    """Let a policy without memory act from pictures alone; return how many of the tasks' goals came true in time.
+
+    Such a policy goes the same way whatever the goal, so it goes once and every goal is looked for on the way.
 
     Args:
         policy: pictures with the arm at home → answer; None where it has none.
     """
     laboratory.sim.restore(laboratory.start)
-    progress = Progress(task)
-    progress.reset()
-    done = False
+    waiting = [Progress(task) for task in tasks]
+    steps = 0
 
     def listen(_: frozenset[Atom]) -> None:
-        nonlocal done
-        done = done or (progress.step(laboratory.sim.holds) and progress.steps <= horizon)
+        nonlocal steps
+        steps += 1
+        if steps <= horizon:
+            waiting[:] = [progress for progress in waiting if not progress.step(laboratory.sim.holds)]
 
-    while not done and progress.steps < horizon:
+    while waiting and steps < horizon:
         answer = policy(photograph(laboratory.sim))
         if answer is None:
-            return False
-        laboratory.do(answer, listen, horizon - progress.steps)
-    return done
+            break
+        laboratory.do(answer, listen, horizon - steps)
+    return len(tasks) - len(waiting)

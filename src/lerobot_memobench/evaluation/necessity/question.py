@@ -45,11 +45,15 @@ def variants_of(task: Task, referent: str) -> list[Task]:
     return [task.variant(k) for k in task.random_variants]
 
 
-def fingerprint(task: Task, referent: str, settings: Settings, search: bool = False) -> str:
-    """Return what a scene's result, or that of the search, must carry to be an answer to the same question."""
-    other = ("episodes", "seed_base") if search else ("episodes", "seed_base", "budget")
+def fingerprint(task: Task, referent: str, settings: Settings, searched: int | None = None) -> str:
+    """Return what a kept answer must carry to be one to the same question.
+
+    Args:
+        searched: for the search, the seed of the start; None for the result of a scene, which has its seed in its name.
+    """
+    other = ("episodes", "seed_base") if searched is not None else ("episodes", "seed_base", "budget")
     asked = {key: value for key, value in asdict(settings).items() if key not in other}
-    if search:
-        asked["seed"] = settings.seed_base
+    if searched is not None:
+        asked["seed"] = searched
     said = json.dumps([VERSION, referent, asked, task.bddl_text, task.metadata], sort_keys=True)
     return hashlib.sha256(said.encode()).hexdigest()[:16]
