@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lerobot_memobench.cli.console import Count, console, counting
+from lerobot_memobench.cli.suite import Suite, WhichSuite
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ class WhichReferent(StrEnum):
 
 def necessity(
     tasks: Annotated[str, typer.Option(help="all, memory types or task names, separated by commas.")] = "all",
+    suite: WhichSuite = Suite.PUBLISHED,
     referent: Annotated[
         WhichReferent, typer.Option(help="Goal of object and procedural tasks: fixed, random, or both settings.")
     ] = WhichReferent.BOTH,
@@ -54,7 +56,7 @@ def necessity(
 
     settings = Settings(episodes=episodes, budget=budget, tolerance=tolerance)
     referents = REFERENTS if referent is WhichReferent.BOTH else (referent.value,)
-    studies = _studies([get_task(name) for name in resolve_tasks(tasks)], referents, settings, out)
+    studies = _studies([get_task(name) for name in resolve_tasks(tasks, suite)], referents, settings, out)
     screen = console()
     for piece, unit in PIECES.items():
         with counting(screen, unit) as count:
@@ -77,13 +79,8 @@ def _telling(count: Count) -> ProgressCallback:
 
 
 def _studies(tasks: Sequence[Task], referents: Sequence[str], settings: Settings, out: Path) -> list[Study]:
-    """Return every task with every setting of the referent; with one goal only, all settings are the same."""
-    from lerobot_memobench.evaluation.necessity.question import REFERENTS
+    """Return every task with every setting of the referent that says something of its own."""
+    from lerobot_memobench.evaluation.necessity.question import settings_of
     from lerobot_memobench.evaluation.necessity.study import Study
 
-    return [
-        Study(task, setting if task.num_variants > 1 else REFERENTS[0], settings, out)
-        for task in tasks
-        for setting in referents
-        if task.num_variants > 1 or setting == referents[0]
-    ]
+    return [Study(task, setting, settings, out) for task in tasks for setting in settings_of(task, referents)]

@@ -8,7 +8,14 @@ from itertools import groupby
 from typing import TYPE_CHECKING
 
 from lerobot_memobench.evaluation.necessity.demonstrations import HORIZON
-from lerobot_memobench.evaluation.necessity.graph import Graph, Move
+from lerobot_memobench.evaluation.necessity.graph import (
+    GoalWatch,
+    Graph,
+    Memories,
+    Move,
+    advance_all,
+    is_decided,
+)
 from lerobot_memobench.evaluation.necessity.home import SETTLE
 from lerobot_memobench.evaluation.necessity.laboratory import Laboratory, Place
 from lerobot_memobench.evaluation.necessity.pictures import Picture, photograph
@@ -26,6 +33,7 @@ class Exploration:
 
     Attributes:
         graph: states and moves; pictures are numbered by node until somebody groups them.
+        starts: node at which each goal's execution begins.
         pictures: what is seen at each node. true: which atoms of the goals hold there.
         moves, steps: how many of either were simulated.
     """
@@ -33,12 +41,15 @@ class Exploration:
     graph: Graph
     pictures: list[tuple[Picture, ...]]
     true: list[frozenset[Atom]]
+    starts: list[int]
     moves: int = 0
     steps: int = 0
 
 
 def explore(laboratory: Laboratory, budget: int, horizon: int = HORIZON) -> Exploration:
     """Try every answer at every state that can be reached before the horizon, nearest states first.
+
+    States in which every goal is reached or lost are left alone.
 
     Args:
         budget: control steps after which no further state is begun; those that are left stay without moves.
@@ -50,7 +61,7 @@ def explore(laboratory: Laboratory, budget: int, horizon: int = HORIZON) -> Expl
 
 
 class _Explorer:
-    """Grows an exploration state by state; it begins with the start.
+    """Grows an exploration state by state; it begins with the starts.
 
     Attributes:
         found: what is known so far.
@@ -58,19 +69,43 @@ class _Explorer:
 
     def __init__(self, laboratory: Laboratory, horizon: int) -> None:
         self._laboratory, self._horizon = laboratory, horizon
-        laboratory.sim.restore(laboratory.start)
+        self._watches = [GoalWatch(task.goal) for task in laboratory.variants]
         self._snapshots: list[Snapshot] = []
         self._places: list[Place] = []
         self._cost: list[int] = []
         """Least control steps known in which each node is reached."""
-        self.found = Exploration(Graph([]), [], [])
-        self._reach(0)
+        self.found = Exploration(Graph([]), [], [], [])
+        for start in laboratory.starts:
+            laboratory.sim.restore(start)
+            self.found.starts.append(self._reach(0))
 
     def nearest(self) -> int | None:
         """Return the node that is reached soonest of those that are not explored and lie before the horizon."""
-        moves = self.found.graph.moves
-        waiting = [node for node, cost in enumerate(self._cost) if node not in moves and cost < self._horizon]
+        graph = self.found.graph
+        graph.decided = set(range(len(self._cost))) - self._undecided()
+        waiting = [
+            node
+            for node, cost in enumerate(self._cost)
+            if node not in graph.moves and node not in graph.decided and cost < self._horizon
+        ]
         return min(waiting, key=self._cost.__getitem__, default=None)
+
+    def _undecided(self) -> set[int]:
+        """Return the nodes that can be reached with a goal that is neither reached nor lost."""
+        found: set[int] = set()
+        for start in set(self.found.starts):
+            watches = [watch for watch, its in zip(self._watches, self.found.starts, strict=True) if its == start]
+            waiting: list[tuple[int, Memories]] = [(start, (0,) * len(watches))]
+            known: set[tuple[int, Memories]] = set(waiting)
+            while waiting:
+                node, memories = waiting.pop()
+                for move in self.found.graph.moves.get(node, {}).values():
+                    after = (move.to, advance_all(watches, memories, move))
+                    if after not in known and not is_decided(after[1]):
+                        known.add(after)
+                        waiting.append(after)
+            found |= {node for node, _ in known}
+        return found
 
     def expand(self, node: int) -> None:
         """Try every answer at a node."""
@@ -107,26 +142,27 @@ def walk(
     policy: Callable[[tuple[Picture, ...]], str | None],
     horizon: int = HORIZON,
 ) -> int:
-    """Let a policy without memory act from pictures alone; return how many of the tasks' goals came true in time.
+    """Let a policy without memory act from pictures alone, from where a simulation is; return how many goals came true.
 
     Such a policy goes the same way whatever the goal, so it goes once and every goal is looked for on the way.
 
     Args:
+        tasks: whose goals are looked for within the horizon.
         policy: pictures with the arm at home → answer; None where it has none.
     """
-    laboratory.sim.restore(laboratory.start)
     waiting = [Progress(task) for task in tasks]
-    steps = 0
+    steps = reached = 0
 
     def listen(_: frozenset[Atom]) -> None:
-        nonlocal steps
+        nonlocal steps, reached
         steps += 1
         if steps <= horizon:
-            waiting[:] = [progress for progress in waiting if not progress.step(laboratory.sim.holds)]
+            reached += sum([progress.step(laboratory.sim.holds) for progress in waiting])
+            waiting[:] = [progress for progress in waiting if not progress.success and not progress.lost]
 
     while waiting and steps < horizon:
         answer = policy(photograph(laboratory.sim))
         if answer is None:
             break
         laboratory.do(answer, listen, horizon - steps)
-    return len(tasks) - len(waiting)
+    return reached

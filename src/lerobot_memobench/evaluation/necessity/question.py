@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 from lerobot_memobench.evaluation.necessity.demonstrations import HORIZON
@@ -12,6 +13,8 @@ from lerobot_memobench.tasks.task import Task
 VERSION = 1
 """Raised when results change, so that old ones are made again."""
 REFERENTS = ("fixed", "random")
+DRAWN = "drawn"
+"""The referent of tasks whose every episode draws its goal."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +41,15 @@ class Settings:
         return range(self.seed_base, self.seed_base + self.episodes)
 
 
+def settings_of(task: Task, referents: Sequence[str]) -> tuple[str, ...]:
+    """Return which referents to look at of those asked for: with one goal all are the same, a draw leaves no choice."""
+    if task.drawn:
+        return (DRAWN,)
+    return tuple(referents) if task.num_variants > 1 else REFERENTS[:1]
+
+
 def variants_of(task: Task, referent: str) -> list[Task]:
-    """Return the goals that may lie behind the same start: the published one, or all that a random referent draws."""
+    """Return the goals that may lie behind the same start: the published one, or all that are drawn."""
     if referent == "fixed" or task.num_variants == 1:
         return [task]
     return [task.variant(k) for k in task.random_variants]
