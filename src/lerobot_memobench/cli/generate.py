@@ -10,6 +10,7 @@ import typer
 from rich.table import Table
 
 from lerobot_memobench.cli.console import console, counting
+from lerobot_memobench.cli.suite import Suite, WhichSuite
 from lerobot_memobench.settings.words import executor_options
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 
@@ -44,6 +45,7 @@ class Executor(StrEnum):
 def generate(
     out: Annotated[Path, typer.Option(help="Folder of the dataset that is made.")],
     tasks: Annotated[str, typer.Option(help="all, memory types or task names, separated by commas.")] = "all",
+    suite: WhichSuite = Suite.PUBLISHED,
     episodes: Annotated[int, typer.Option(min=1, help="Demonstrations per task.")] = 50,
     seed_base: Annotated[int, typer.Option(help="Demonstration i uses the seed seed_base + i.")] = 10_000,
     referent: Annotated[
@@ -69,7 +71,7 @@ def generate(
     """
     options = executor_options(executor_option or [])
     named: dict[str, Any] = {} if repo_id is None else {"repo_id": repo_id}
-    chosen = [get_task(name) for name in resolve_tasks(tasks)]
+    chosen = [get_task(name) for name in resolve_tasks(tasks, suite)]
     from lerobot_memobench.datasets.generation import generate as run
 
     screen = console()

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lerobot_memobench.cli.console import console, counting
+from lerobot_memobench.cli.suite import Suite, WhichSuite
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 
 if TYPE_CHECKING:
@@ -27,6 +28,7 @@ class WhichReferent(StrEnum):
 
 def necessity(
     tasks: Annotated[str, typer.Option(help="all, memory types or task names, separated by commas.")] = "all",
+    suite: WhichSuite = Suite.PUBLISHED,
     referent: Annotated[
         WhichReferent, typer.Option(help="Goal of object and procedural tasks: fixed, random, or both settings.")
     ] = WhichReferent.BOTH,
@@ -51,7 +53,7 @@ def necessity(
 
     settings = Settings(episodes=episodes, budget=budget, tolerance=tolerance)
     referents = REFERENTS if referent is WhichReferent.BOTH else (referent.value,)
-    jobs = _jobs([get_task(name) for name in resolve_tasks(tasks)], referents)
+    jobs = _jobs([get_task(name) for name in resolve_tasks(tasks, suite)], referents)
     screen = console()
     results: list[Result] = []
     with counting(screen, "tasks", len(jobs)) as count:

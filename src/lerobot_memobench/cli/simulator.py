@@ -8,17 +8,19 @@ from typing import Annotated
 import typer
 
 from lerobot_memobench.cli.console import console
+from lerobot_memobench.cli.suite import Suite, WhichSuite
 
 
 def gallery(
     out: Annotated[Path, typer.Option(help="Folder of the pictures; those of the same name are replaced.")] = Path(
         "outputs/gallery"
     ),
+    suite: WhichSuite = Suite.PUBLISHED,
 ) -> None:
     """Draw every task's initial scene, every object from all sides, every fixture open and closed."""
     from lerobot_memobench.sim.gallery import write_gallery
 
-    for picture in write_gallery(out):
+    for picture in write_gallery(out, suite):
         console().print(str(picture), soft_wrap=True)
 
 

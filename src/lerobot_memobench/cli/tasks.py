@@ -12,21 +12,23 @@ import typer
 from rich.table import Table
 
 from lerobot_memobench.cli.console import console
+from lerobot_memobench.cli.suite import Suite, WhichSuite
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import find_tasks, get_task, task_names, task_record
 from lerobot_memobench.tasks.loading import load_task
-from lerobot_memobench.tasks.task import Task
+from lerobot_memobench.tasks.task import PUBLISHED, Task
 
 
 def tasks(
     as_json: Annotated[bool, typer.Option("--json", help="Print everything about each task as JSON.")] = False,
+    suite: WhichSuite = Suite.PUBLISHED,
     folder: Annotated[
         Path | None,
         typer.Option("--dir", help="A task folder, or a folder of them, instead of the catalogue."),
     ] = None,
 ) -> int:
     """List the benchmark's tasks, or those of a folder."""
-    found, problems = load_tasks(folder)
+    found, problems = load_tasks(folder, suite)
     if as_json:
         print(json.dumps(records(found), indent=1))
     else:
@@ -36,14 +38,14 @@ def tasks(
     return 1 if problems else 0
 
 
-def load_tasks(folder: Path | None) -> tuple[list[Task], list[str]]:
-    """Return the catalogue's tasks, or those below a folder and what keeps others of them from loading.
+def load_tasks(folder: Path | None, suite: str = PUBLISHED) -> tuple[list[Task], list[str]]:
+    """Return the tasks of a suite, or those below a folder and what keeps others of them from loading.
 
     Raises:
         MemobenchError: no task is there, or none can be loaded.
     """
     if folder is None:
-        return [get_task(name) for name in task_names()], []
+        return [get_task(name) for name in task_names(suite=suite)], []
     found, problems = [], []
     for place in find_tasks(folder):
         try:

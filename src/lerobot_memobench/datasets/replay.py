@@ -67,7 +67,8 @@ def replay(recorded: Demonstration | RecordedEpisode, *, task: Task | None = Non
 def resimulate(task: Task, seed: int, actions: NDArray[np.float32], exec_start: int) -> Demonstration:
     """Apply (T, 7) float32 actions, starting in the scene of ``seed``; return the demonstration they make.
 
-    It has no images. At frame ``exec_start`` the scene goes back to where it began, as after a prompt video.
+    It has no images. At frame ``exec_start`` the scene goes back to where it began, as after a prompt video that hides
+    nothing.
     """
     sim = Simulation(task)
     sim.reset(seed)
@@ -77,7 +78,9 @@ def resimulate(task: Task, seed: int, actions: NDArray[np.float32], exec_start: 
     success = False
     for frame, action in enumerate(actions):
         if frame == exec_start and frame > 0:
-            sim.restore(start)
+            if task.prompt is None or task.prompt.restores:
+                sim.restore(start)
+            sim.begin_execution()
         states.append(sim.state())
         proprio.append(sim.proprio())
         satisfied.append(progress.satisfied)

@@ -34,7 +34,7 @@ NUMBERS = (
 REACHING_OUT = ("push_to_hub", "private", "use_peft", "trust_remote_code", "discover_packages_path")
 """Truth values of a policy by which more than its numbers changes."""
 WORDS = (
-    *("job_name", "env.task", "env.tasks", "env.referent", "env.prompt_in", "env.render"),
+    *("job_name", "env.task", "env.tasks", "env.suite", "env.referent", "env.prompt_in", "env.render"),
     *("policy.size", "policy.align", "policy.subgoal_level", "policy.integration", "policy.memory_camera"),
     *("policy.dtype", "policy.dialect", "policy.gripper"),
 )

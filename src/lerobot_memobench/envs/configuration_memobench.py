@@ -21,6 +21,7 @@ from lerobot_memobench.envs.observations import METADATA, action_space, observat
 from lerobot_memobench.envs.prompting import AUTO, PLACES, policy_being_run, prompt_in
 from lerobot_memobench.envs.protocol import SEED_BASE, SETTINGS, check_protocol
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.tasks.task import PUBLISHED, SUITES
 
 
 @EnvConfig.register_subclass("memobench")
@@ -29,10 +30,12 @@ class MemobenchEnvConfig(EnvConfig):
     """The benchmark's 30 tasks, as LeRobot's suites: temporal, spatial, object, procedural.
 
     Args:
+        suite: `published`, or `strict`: the twins of the 30 tasks that cannot be solved without a memory.
         tasks: `all`, memory types or task names, separated by commas.
         task: the same, for those used to LeRobot's field.
         task_dir: a folder in the published format to run instead of the catalogue (one task, or a tree of them).
-        referent: `fixed`, the published goals, or `random`: by seed another admissible referent or order.
+        referent: `fixed`, the published goals, or `random`: by seed another admissible referent or order. Strict tasks
+            are drawn by seed whatever is said here.
         prompt_video: whether object and procedural tasks begin with their prompt video.
         prompt_in: `steps`, the policy sees the prompt step by step, with `phase` 0; `reset`, it plays before the first
             observation; `auto`: in steps for a policy that knows phases, in reset for any other (`envs.prompting`).
@@ -53,6 +56,7 @@ class MemobenchEnvConfig(EnvConfig):
         resume: leave out the episodes that the log in `log_dir` holds already.
     """
 
+    suite: str = PUBLISHED
     task: str | None = None
     tasks: str = "all"
     task_dir: str | None = None
@@ -78,6 +82,7 @@ class MemobenchEnvConfig(EnvConfig):
         if self.fps != 20:
             raise MemobenchError(f"fps is {self.fps}; the benchmark's control rate is 20, leave it out")
         for name, value, known in (
+            ("suite", self.suite, SUITES),
             ("referent", self.referent, ("fixed", "random")),
             ("prompt_in", self.prompt_in, PLACES),
             ("render", self.render, ("fast", "default", "high")),
@@ -94,6 +99,7 @@ class MemobenchEnvConfig(EnvConfig):
     def gym_kwargs(self) -> dict[str, Any]:
         """What every sub-environment is made with."""
         return {
+            "suite": self.suite,
             "referent": self.referent,
             "prompt_video": self.prompt_video,
             "prompt_in": self.resolved_prompt_in(),
@@ -119,11 +125,16 @@ class MemobenchEnvConfig(EnvConfig):
         from lerobot_memobench.tasks.loading import load_task
 
         if self.task_dir is not None:
-            return [
-                (load_task(folder).memory_type, index, folder) for index, folder in enumerate(find_tasks(self.task_dir))
-            ]
+            loaded = [load_task(folder) for folder in find_tasks(self.task_dir)]
+            for task in loaded:
+                if task.suite != self.suite:
+                    raise MemobenchError(
+                        f"{task.folder} holds a task of the {task.suite} suite and env.suite is {self.suite}; say "
+                        f"suite={task.suite} for folders of such tasks"
+                    )
+            return [(task.memory_type, index, task.folder) for index, task in enumerate(loaded)]
         spec = self.task if self.task is not None else self.tasks
-        tasks = [get_task(name) for name in resolve_tasks(spec)]
+        tasks = [get_task(name) for name in resolve_tasks(spec, self.suite)]
         return [(task.memory_type, task_index(task.name), task.folder) for task in tasks]
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:

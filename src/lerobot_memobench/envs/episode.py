@@ -20,7 +20,7 @@ from lerobot_memobench.sim.rendering import Image, RenderSettings
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.formula import Atom, atoms
 from lerobot_memobench.tasks.progress import Progress
-from lerobot_memobench.tasks.task import Task
+from lerobot_memobench.tasks.task import STRICT, Task
 
 HORIZON = 1200
 """Execution steps before an episode is cut off (paper, section 5.1)."""
@@ -34,7 +34,8 @@ class Episode:
 
     Args:
         task: the published task.
-        referent: `fixed`, the catalogue's goal, or `random`, one of the task's variants by seed.
+        referent: `fixed`, the catalogue's goal, or `random`, one of the task's variants by seed; of the strict suite
+            one of the variants always.
         prompt_video: whether object and procedural tasks begin with their prompt.
         horizon: execution steps before truncation.
         render: size and quality of frames.
@@ -71,7 +72,8 @@ class Episode:
     def reset(self, seed: int) -> None:
         """Start the episode of a seed. Everything that follows is a function of task, settings, seed and actions."""
         self.seed = int(seed)
-        self.task = task = referent_of(self.published, self.seed) if self.referent == "random" else self.published
+        draws = self.referent == "random" or self.published.drawn
+        self.task = task = referent_of(self.published, self.seed) if draws else self.published
         self.sim.reset(self.seed)
         self.scene_hash = self.sim.scene_hash()
         self._start = self.sim.snapshot()
@@ -94,11 +96,13 @@ class Episode:
             self._begin_execution()
 
     def _begin_execution(self) -> None:
-        """Put the scene back exactly as it was and hand over to the policy."""
+        """Put the scene back exactly as it was, unless something was hidden in it, and hand over to the policy."""
         if self.step_index:
             self.prompt_shown = self._prompt.shown
             self.sim.highlights = ()
-            self.sim.restore(self._start)
+            if self.task.prompt is None or self.task.prompt.restores:
+                self.sim.restore(self._start)
+        self.sim.begin_execution()
         self._demonstrator = None
         self.exec_start = self.step_index
         self.progress.reset()
@@ -119,9 +123,14 @@ class Episode:
         return self.phase == EXECUTION and self.progress.success
 
     @property
+    def lost(self) -> bool:
+        """The goal can no longer be reached; told of strict tasks only, the published ones run to their horizon."""
+        return self.task.suite == STRICT and self.phase == EXECUTION and self.progress.lost
+
+    @property
     def done(self) -> bool:
-        """Ended by success or horizon; satisfied checkpoints alone end nothing."""
-        return self.success or self.exec_steps >= self.horizon
+        """Ended by success, horizon or loss; satisfied checkpoints alone end nothing."""
+        return self.success or self.exec_steps >= self.horizon or self.lost
 
     def step(self, action: NDArray[np.floating]) -> None:
         """Advance by one control step; during the prompt the given action has no effect."""

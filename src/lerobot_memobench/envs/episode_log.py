@@ -47,6 +47,8 @@ class Outcome(TypedDict, total=False):
     prompt_steps: Count | None
     steps: Count | None
     failure: Name | None
+    suite: Name
+    lost: bool
     scene_hash: Name | None
 
 

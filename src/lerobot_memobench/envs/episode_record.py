@@ -6,6 +6,7 @@ from typing import Any
 
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.tasks.failures import classify_failure
+from lerobot_memobench.tasks.task import PUBLISHED
 
 
 def episode_record(episode: Episode, *, seed_base: int, replan_steps: int | None, wall_s: float) -> dict[str, Any]:
@@ -35,7 +36,8 @@ def episode_record(episode: Episode, *, seed_base: int, replan_steps: int | None
                 task.checkpoints, progress.first_step, progress.ordered_step, strict=True
             )
         ],
-        "failure": classify_failure(task, progress.first_step, episode.success, episode.drifted),
+        "failure": classify_failure(task, progress.first_step, episode.success, episode.drifted, episode.lost),
+        **({} if task.suite == PUBLISHED else {"suite": task.suite, "lost": episode.lost}),
         "scene_hash": episode.scene_hash,
         "wall_s": round(wall_s, 3),
     }

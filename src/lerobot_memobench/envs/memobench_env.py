@@ -29,6 +29,7 @@ from lerobot_memobench.files import file_name
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.tasks.loading import load_task
 from lerobot_memobench.tasks.memory_text import memory_text, with_memory
+from lerobot_memobench.tasks.task import PUBLISHED
 
 
 class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
@@ -54,6 +55,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         folder: str,
         *,
         log_dir: str | None = None,
+        suite: str = PUBLISHED,
         referent: str = "fixed",
         prompt_video: bool = True,
         prompt_in: str = STEPS,
@@ -78,6 +80,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self.observation_space = observation_space(expert_action, render_every)
         self.action_space = action_space()
         protocol = {
+            "suite": suite,
             "seed_base": seed_base,
             "referent": referent,
             "prompt_video": prompt_video,

@@ -16,6 +16,7 @@ from annotated_types import Ge, Le
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.files import write_file
 from lerobot_memobench.files.reading import Count, Name, Whole, read_json
+from lerobot_memobench.tasks.task import PUBLISHED
 
 PROTOCOL_FILE = "protocol.json"
 
@@ -23,6 +24,7 @@ SEED_BASE = 7
 """Seed of evaluation episode 0 (paper, section 5.1)."""
 
 SETTINGS = (
+    "suite",
     "seed_base",
     "referent",
     "prompt_video",
@@ -53,6 +55,7 @@ class Protocol(TypedDict, total=False):
 
     tasks: list[Name]
     episodes: Annotated[int, Ge(0), Le(MOST_EPISODES)]
+    suite: Name
     seed_base: Whole | list[Whole]
     referent: Name | list[Name]
     prompt_video: bool | None
@@ -73,7 +76,8 @@ def differences(
 ) -> list[str]:
     """Return the settings in which two protocols differ, each as ``horizon: 1200 and 600``.
 
-    A setting that one of them does not tell (logs of other tools) is not a difference.
+    A setting that one of them does not tell (logs of other tools) is not a difference. Where the suite is not told it
+    is the published one: there was no other.
 
     Args:
         extent: whether tasks and number of episodes are compared as well.
@@ -81,7 +85,8 @@ def differences(
         ignore: settings that may differ.
     """
     left_out = {*ignore, POLICY, *(() if extent else EXTENT)}
-    found = _differing({k: v for k, v in a.items() if k not in left_out}, b)
+    told = {"suite": PUBLISHED, **a}
+    found = _differing({k: v for k, v in told.items() if k not in left_out}, {"suite": PUBLISHED, **b})
     if policy:
         found += _differing(a.get(POLICY) or {}, b.get(POLICY) or {}, f"{POLICY}.")
     return found
@@ -124,7 +129,7 @@ def read_protocol_file(directory: Path) -> dict[str, Any]:
 def check_protocol(directory: Path, settings: Mapping[str, Any]) -> bool:
     """Return whether the folder holds this protocol already; raise where it holds another one."""
     earlier = read_protocol_file(directory)
-    found = differences(earlier, settings)
+    found = differences(earlier, settings) if earlier else []
     if found:
         raise MemobenchError(
             f"{directory} holds episodes of another protocol ({'; '.join(found)}, the first value being that of the "

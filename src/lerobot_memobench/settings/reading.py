@@ -11,7 +11,8 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.settings.lerobot_commands import config_class, load_command, register_plugins
 from lerobot_memobench.settings.translation import LerobotSettings, translate
 from lerobot_memobench.settings.words import Words
-from lerobot_memobench.tasks.catalogue import resolve_tasks
+from lerobot_memobench.tasks.catalogue import check_suite, resolve_tasks
+from lerobot_memobench.tasks.task import PUBLISHED
 
 
 def read_settings(command: str, words: Words) -> LerobotSettings:
@@ -35,8 +36,9 @@ def check_task_names(words: Words) -> None:
     environment = settings.get("env", words.value("env.type"))
     tasks = settings.get("tasks", words.value("env.tasks"))
     own_folder = "env.task_dir" in settings or words.value("env.task_dir")
-    if environment == "memobench" and tasks is not None and not own_folder:
-        resolve_tasks(tasks)
+    if environment == "memobench" and not own_folder:
+        suite = check_suite(settings.get("suite", words.value("env.suite") or PUBLISHED))
+        resolve_tasks(tasks or "all", suite)
 
 
 def read_config_file(words: Words) -> dict[str, Any]:

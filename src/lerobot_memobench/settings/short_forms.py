@@ -8,6 +8,7 @@ EVERYWHERE: dict[str, tuple[str, ...]] = {
     "device": ("policy.device",),
     "replan": ("policy.n_action_steps", "env.replan_steps"),
     "tasks": ("env.tasks",),
+    "suite": ("env.suite",),
     "referent": ("env.referent",),
 }
 

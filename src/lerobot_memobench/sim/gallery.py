@@ -25,6 +25,7 @@ from lerobot_memobench.sim.assets.registry import build_asset
 from lerobot_memobench.sim.rendering import Renderer, RenderSettings
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
+from lerobot_memobench.tasks.task import PUBLISHED
 
 Pixels = NDArray[np.uint8]
 
@@ -231,11 +232,11 @@ def draw_fixtures(classes: Sequence[str] | None = None, size: int = 224) -> Imag
     return grid(cells, 2, label=14, lines=1)
 
 
-def write_gallery(folder: str | Path) -> list[Path]:
-    """Write ``tasks.png``, ``objects.png`` and ``fixtures.png`` into a folder and return their paths."""
+def write_gallery(folder: str | Path, suite: str = PUBLISHED) -> list[Path]:
+    """Write ``tasks.png`` of a suite, ``objects.png`` and ``fixtures.png`` into a folder and return their paths."""
     folder = Path(folder)
     return [
-        save(draw_tasks(), folder / "tasks.png"),
+        save(draw_tasks(task_names(suite=suite)), folder / "tasks.png"),
         save(draw_objects(), folder / "objects.png"),
         save(draw_fixtures(), folder / "fixtures.png"),
     ]

@@ -17,8 +17,9 @@ from lerobot_memobench.sim.compiled_controller import make_controller
 from lerobot_memobench.sim.placement import Placement, Placer
 from lerobot_memobench.sim.rendering import Highlight, Image, RenderSettings, get_renderer
 from lerobot_memobench.sim.scene import AGENTVIEW, SUBSTEPS, get_scene, state_size
+from lerobot_memobench.sim.start import Start
 from lerobot_memobench.sim.world import World
-from lerobot_memobench.tasks.formula import Atom
+from lerobot_memobench.tasks.formula import SINCE_START, Atom
 from lerobot_memobench.tasks.task import Task
 
 Array = NDArray[np.float64]
@@ -63,6 +64,7 @@ class Simulation:
         self.data = mujoco.MjData(self.model)
         self.assets = scene.assets
         self.world = World(task, self.model, self.data, scene.assets)
+        self._start = Start(self.model, self.data, tuple(task.objects))
         self.highlights: tuple[Highlight, ...] = ()
         self._controller = make_controller(self.model)
         self._placer = Placer(task, self.model, self.data, scene.assets)
@@ -80,7 +82,7 @@ class Simulation:
 
         Equal seeds of equal tasks give bit-equal states, whatever was simulated before.
         """
-        rng = np.random.default_rng([seed, zlib.crc32(self.task.name.encode())])
+        rng = np.random.default_rng([seed, zlib.crc32(self.task.scene_name.encode())])
         self._rewind()
         self._placement = self._placer.draw(rng)
         self._settle()
@@ -106,6 +108,12 @@ class Simulation:
             self._controller.gripper = np.array([1.0, -1.0])
         for _ in range(STABILISATION_STEPS):
             self.step(NO_OP)
+        self._start.mark_hand()
+        self.begin_execution()
+
+    def begin_execution(self) -> None:
+        """Take the places of all things now for those that ``inplace`` compares with."""
+        self._start.mark_things()
 
     def step(self, action: NDArray[np.floating]) -> None:
         """Advance by one control step of 50 ms.
@@ -240,7 +248,7 @@ class Simulation:
 
     def holds(self, atom: Atom) -> bool:
         """Return whether an atom of the task language is true now."""
-        return self.world.holds(atom)
+        return (self._start if atom.predicate in SINCE_START else self.world).holds(atom)
 
 
 def axis_angle(quaternion: Array) -> Array:

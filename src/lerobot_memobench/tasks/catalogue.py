@@ -1,4 +1,4 @@
-"""The catalogue: the benchmark's 30 tasks, as folders beside this module."""
+"""The catalogue: the benchmark's 30 published tasks and their 30 strict twins, as folders beside this module."""
 
 from __future__ import annotations
 
@@ -10,36 +10,52 @@ from typing import Any
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.tasks.formula import to_lists
 from lerobot_memobench.tasks.loading import load_task
-from lerobot_memobench.tasks.task import BDDL_FILE, MEMORY_TYPES, Task
+from lerobot_memobench.tasks.task import BDDL_FILE, MEMORY_TYPES, PUBLISHED, SUITES, Task
 
-#: <memory type>/<task name>/{task_config.bddl, task_config.meta.json}
+#: <suite>/<memory type>/<task name>/{task_config.bddl, task_config.meta.json}; names are unique over both suites.
 CATALOGUE_DIR = Path(__file__).parent / "catalogue"
 
 
 @lru_cache(maxsize=1)
 def _folders() -> dict[str, Path]:
-    """Task name -> folder, by memory type (temporal, spatial, object, procedural), then by name."""
+    """Task name -> folder, by suite, memory type (temporal, spatial, object, procedural), then by name."""
     found: dict[str, Path] = {}
-    for memory_type in MEMORY_TYPES:
-        for folder in sorted((CATALOGUE_DIR / memory_type).iterdir(), key=lambda path: path.name):
-            if (folder / BDDL_FILE).is_file():
-                found[folder.name] = folder
+    for suite in SUITES:
+        for memory_type in MEMORY_TYPES:
+            for folder in sorted((CATALOGUE_DIR / suite / memory_type).iterdir(), key=lambda path: path.name):
+                if (folder / BDDL_FILE).is_file():
+                    found[folder.name] = folder
     return found
 
 
-def task_names(memory_types: str | Iterable[str] | None = None) -> list[str]:
-    """Return the names of all tasks, or of those of one or several memory types, in catalogue order."""
+def _suite_of(name: str) -> str:
+    return _folders()[name].parent.parent.name
+
+
+def check_suite(suite: str, what: str = "suite") -> str:
+    """Return the name of a suite; an unknown one is an error, in which ``what`` says where it was given."""
+    if suite not in SUITES:
+        raise MemobenchError(f"{what} is {suite!r}; {nearest(suite, SUITES)}")
+    return suite
+
+
+def task_names(memory_types: str | Iterable[str] | None = None, suite: str | None = PUBLISHED) -> list[str]:
+    """Return the names of a suite's tasks, or of those of one or several memory types, in catalogue order.
+
+    ``suite=None`` stands for both suites, the published one first.
+    """
+    there = [name for name in _folders() if suite is None or _suite_of(name) == check_suite(suite)]
     if memory_types is None:
-        return list(_folders())
+        return there
     wanted = [memory_types] if isinstance(memory_types, str) else list(memory_types)
     for memory_type in wanted:
         if memory_type not in MEMORY_TYPES:
             raise MemobenchError(f"found the memory type {memory_type!r}, expected one of {', '.join(MEMORY_TYPES)}")
-    return [name for name, folder in _folders().items() if folder.parent.name in wanted]
+    return [name for name in there if _folders()[name].parent.name in wanted]
 
 
 def task_index(name: str) -> int:
-    """Return the stable number of a task: its position in ``task_names()``."""
+    """Return the stable number of a task: its position in ``task_names(suite=None)``."""
     get_task(name)
     return list(_folders()).index(name)
 
@@ -52,27 +68,28 @@ def get_task(name: str) -> Task:
     return load_task(_folders()[name])
 
 
-def resolve_tasks(spec: str | Iterable[str]) -> list[str]:
-    """Return the task names meant by "all", memory types, names, or several of them separated by commas.
+def resolve_tasks(spec: str | Iterable[str], suite: str = PUBLISHED) -> list[str]:
+    """Return the task names of a suite meant by "all", memory types, names, or several of them separated by commas.
 
     Names that hold commas themselves are recognised. The order given is kept and repetitions are dropped.
     """
+    check_suite(suite)
     if not isinstance(spec, str):
-        return list(dict.fromkeys(name for part in spec for name in resolve_tasks(part)))
+        return list(dict.fromkeys(name for part in spec for name in resolve_tasks(part, suite)))
     pieces = spec.split(",")
     chosen: list[str] = []
     start = 0
     while start < len(pieces):
         for end in range(len(pieces), start, -1):
             word = ",".join(pieces[start:end]).strip()
-            found = _expand(word)
+            found = _expand(word, suite)
             if found:
                 chosen += found
                 start = end
                 break
         else:
             word = pieces[start].strip()
-            hint = nearest(word, ["all", *MEMORY_TYPES, *_folders()])
+            hint = nearest(word, ["all", *MEMORY_TYPES, *task_names(suite=suite)])
             raise MemobenchError(
                 f"found {word!r} among the tasks, expected 'all', a memory type ({', '.join(MEMORY_TYPES)}) "
                 f"or a task's name, {hint}"
@@ -80,12 +97,17 @@ def resolve_tasks(spec: str | Iterable[str]) -> list[str]:
     return list(dict.fromkeys(chosen))
 
 
-def _expand(word: str) -> list[str]:
-    if word == "all":
-        return task_names()
-    if word in MEMORY_TYPES:
-        return task_names(word)
-    return [word] if word in _folders() else []
+def _expand(word: str, suite: str) -> list[str]:
+    """Return the tasks that a word means, none for an unknown one."""
+    if word == "all" or word in MEMORY_TYPES:
+        return task_names(None if word == "all" else word, suite)
+    if word not in _folders():
+        return []
+    if _suite_of(word) != suite:
+        raise MemobenchError(
+            f"{word!r} is a task of the {_suite_of(word)} suite; say suite={_suite_of(word)} to run it"
+        )
+    return [word]
 
 
 def task_record(task: Task, state_dim: int) -> dict[str, Any]:
@@ -93,6 +115,7 @@ def task_record(task: Task, state_dim: int) -> dict[str, Any]:
     return {
         "name": task.name,
         "memory_type": task.memory_type,
+        **({} if task.suite == PUBLISHED else {"suite": task.suite, "twin_of": task.twin_of}),
         "family": task.family,
         "language": task.language,
         "objects": _by_class(task.objects),

@@ -1,4 +1,4 @@
-"""What formulas mean over time: latches, and the order and hold of ``Then``.
+"""Formulas evaluated step by step, with latches; what the operators mean over time is `tasks.nodes`'s.
 
 Nothing of a simulator: `Evaluator.step` asks ``holds(atom)``. Semantics: the benchmark's task files (BDDL goals and
 metadata goals), paper section on executable checkpoints.
@@ -6,73 +6,13 @@ metadata goals), paper section on executable checkpoints.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 
-from lerobot_memobench.tasks.formula import LATCHES, And, Atom, Formula, Not, Or, Then, atoms, children
+from lerobot_memobench.tasks.formula import LATCHES, Atom, Formula, atoms
+from lerobot_memobench.tasks.nodes.build import build
 
 #: Consecutive control steps for which a child of ``Then`` must hold before it counts as done.
 HOLD_STEPS = 10
-
-_Read = Callable[[Atom], bool]
-
-
-class _Node:
-    """One place in a formula's tree, with what it remembers of earlier steps."""
-
-    def __init__(self, parts: Sequence[_Node] = ()) -> None:
-        self.parts = parts
-
-    def reset(self) -> None:
-        """Forget earlier steps."""
-        for part in self.parts:
-            part.reset()
-
-    def value(self, read: _Read) -> bool:
-        """Take one step and return what is true in it; ``read`` answers atoms."""
-        raise NotImplementedError
-
-
-class _AtomNode(_Node):
-    def __init__(self, atom: Atom) -> None:
-        super().__init__()
-        self.atom = atom
-
-    def value(self, read: _Read) -> bool:
-        return read(self.atom)
-
-
-class _GateNode(_Node):
-    """And, Or and Not. Lists, not generators: a nested ``Then`` must see every step."""
-
-    def __init__(self, parts: Sequence[_Node], gate: Callable[[list[bool]], bool]) -> None:
-        super().__init__(parts)
-        self.gate = gate
-
-    def value(self, read: _Read) -> bool:
-        return self.gate([part.value(read) for part in self.parts])
-
-
-class _ThenNode(_Node):
-    """Counts how long the current child has held; the next child is first looked at in the step after."""
-
-    def __init__(self, parts: Sequence[_Node], hold_steps: int) -> None:
-        super().__init__(parts)
-        self.hold_steps = hold_steps
-        self.done = self.held = 0
-
-    def reset(self) -> None:
-        super().reset()
-        self.done = self.held = 0
-
-    def value(self, read: _Read) -> bool:
-        if self.done < len(self.parts):
-            self.held = self.held + 1 if self.parts[self.done].value(read) else 0
-            if self.held >= self.hold_steps:
-                self.done, self.held = self.done + 1, 0
-        return self.done == len(self.parts)
-
-
-_GATES: dict[type, Callable[[list[bool]], bool]] = {And: all, Or: any, Not: lambda values: not values[0]}
 
 
 class Evaluator:
@@ -89,23 +29,14 @@ class Evaluator:
 
     def __init__(self, formulas: Iterable[Formula], hold_steps: int = HOLD_STEPS) -> None:
         self.formulas = tuple(formulas)
-        self._thens: list[_ThenNode] = []
-        self._nodes = [self._build(formula, hold_steps) for formula in self.formulas]
+        self._nodes = [build(formula, hold_steps) for formula in self.formulas]
+        self._remembering = [node for root in self._nodes for node in root.walk() if node.memory]
         found = {atom for formula in self.formulas for atom in atoms(formula) if atom.predicate in LATCHES}
         self._sources = {atom: Atom(LATCHES[atom.predicate], atom.args) for atom in sorted(found, key=str)}
         self._latched: set[Atom] = set()
 
-    def _build(self, formula: Formula, hold_steps: int) -> _Node:
-        if isinstance(formula, Atom):
-            return _AtomNode(formula)
-        parts = [self._build(child, hold_steps) for child in children(formula)]
-        if isinstance(formula, Then):
-            self._thens.append(_ThenNode(parts, hold_steps))
-            return self._thens[-1]
-        return _GateNode(parts, _GATES[type(formula)])
-
     def reset(self) -> None:
-        """Forget latches and ``Then`` progress."""
+        """Forget all earlier steps."""
         self._latched.clear()
         for node in self._nodes:
             node.reset()
@@ -116,9 +47,14 @@ class Evaluator:
         return frozenset(self._latched)
 
     @property
-    def memory(self) -> tuple[frozenset[Atom], tuple[tuple[int, int], ...]]:
-        """What of earlier steps decides later values: latches, and how far each ``Then`` has come. Hashable."""
-        return self.latched, tuple((node.done, node.held) for node in self._thens)
+    def memory(self) -> tuple[frozenset[Atom], tuple[tuple[int, ...], ...]]:
+        """What of earlier steps decides later values: latches, and what each operator remembers. Hashable."""
+        return self.latched, tuple(node.memory for node in self._remembering)
+
+    @property
+    def settled(self) -> tuple[bool | None, ...]:
+        """Per formula the value that it has at every later step, whatever happens; None while that is open."""
+        return tuple(node.settled for node in self._nodes)
 
     def step(self, holds: Callable[[Atom], bool]) -> tuple[bool, ...]:
         """Take one control step of the world, answered by ``holds``, and return the value of each formula."""

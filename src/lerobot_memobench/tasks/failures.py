@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from lerobot_memobench.tasks.task import Task
 
-#: Failure classes in the order of the report.
+#: Failure classes of the published tasks, in the order of the report.
 FAILURES = (
     "storage_failure",
     "stale_memory",
@@ -18,14 +18,19 @@ FAILURES = (
 _BY_OPERATION = {"S": "storage_failure", "U": "stale_memory", "C": "compression_collapse"}
 
 
-def classify_failure(task: Task, first_steps: Sequence[int | None], success: bool, drift: bool = False) -> str | None:
+def classify_failure(
+    task: Task, first_steps: Sequence[int | None], success: bool, drift: bool = False, lost: bool = False
+) -> str | None:
     """Return the failure class of an execution of ``task``, or None when it succeeded.
 
     Args:
         first_steps: (K,) per checkpoint the first execution step at which its predicate held, None for never.
         success: the goal held at termination.
         drift: a wrong sibling of the referent or of the target satisfied the relation (object tasks).
+        lost: the goal could no longer be reached (strict tasks).
     """
+    if lost and task.spoilt_as is not None:
+        return task.spoilt_as
     return classify(task.operations, first_steps, success, drift)
 
 

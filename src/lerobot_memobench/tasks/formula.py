@@ -1,13 +1,14 @@
-"""Formulas of goals and checkpoints: trees of atoms under ``And``, ``Or``, ``Not`` and ``Then``.
+"""Formulas of goals and checkpoints: trees of atoms under operators, the published four and the strict suite's five.
 
 What an atom means is the world's business; what operators and latches (``wasopen``, ``wasturnedon``) mean over time
-is `tasks.evaluator`'s. Here stand the words of the language, how formulas are made, walked through and written.
+is `tasks.nodes`'s (the table is in ``docs/formulas.md``). Here stand the words of the language, how formulas are made,
+walked through and written.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from lerobot_memobench.errors import MemobenchError, nearest
@@ -22,10 +23,18 @@ PREDICATES: dict[str, tuple[str, int]] = {
     "turnoff": ("TurnOff", 1),
     "wasopen": ("WasOpen", 1),
     "wasturnedon": ("WasTurnedOn", 1),
+    "handhome": ("HandHome", 0),
+    "inplace": ("InPlace", 1),
 }
 
 #: Latched predicate -> the predicate of the world that sets it.
 LATCHES: dict[str, str] = {"wasopen": "open", "wasturnedon": "turnon"}
+
+#: Predicates that compare the present with how the execution began; they say nothing of a starting state.
+SINCE_START = frozenset({"handhome", "inplace"})
+
+#: Largest number in a formula: more steps than any episode has.
+MAX_NUMBER = 100_000
 
 #: Formulas deeper than this are refused (no task comes near; it keeps recursion bounded on malformed files).
 MAX_DEPTH = 40
@@ -70,10 +79,56 @@ class Then:
     children: tuple[Formula, ...]
 
 
-Formula = Atom | And | Or | Not | Then
+@dataclass(frozen=True)
+class Never:
+    """True as long as the child has not been true in any step so far; false for good from then on."""
 
+    child: Formula
+
+
+@dataclass(frozen=True)
+class Hold:
+    """True when the child has been true in each of the last ``number`` steps, the present one included."""
+
+    number: int
+    child: Formula
+
+
+@dataclass(frozen=True)
+class Exactly:
+    """True while the child has come true (after a step in which it was false, or at first) ``number`` times so far."""
+
+    number: int
+    child: Formula
+
+
+@dataclass(frozen=True)
+class When:
+    """Of two children, the first moment of the first decides: true from then on if the second is true in that step.
+
+    False before; false for good when the second is false in that step.
+    """
+
+    children: tuple[Formula, ...]
+
+
+@dataclass(frozen=True)
+class Round:
+    """True in the step in which the last child comes true after the ones before it, in order; then it begins anew."""
+
+    children: tuple[Formula, ...]
+
+
+Counted = Hold | Exactly
+Formula = Atom | And | Or | Not | Then | Never | Hold | Exactly | When | Round
+
+_OPERATORS = (And, Or, Not, Then, Never, Hold, Exactly, When, Round)
 #: Word (lower case) -> operator; its class's name is the spelling in BDDL.
-OPERATORS: dict[str, type[And] | type[Or] | type[Not] | type[Then]] = {"and": And, "or": Or, "not": Not, "then": Then}
+OPERATORS: dict[str, type[Formula]] = {made.__name__.lower(): made for made in _OPERATORS}
+
+#: Operators over a fixed number of formulas; the others take one or more.
+_PARTS: dict[type[Formula], int] = {Not: 1, Never: 1, Hold: 1, Exactly: 1, When: 2}
+_WORDS = {1: "exactly one", 2: "exactly two"}
 
 
 # --- making ---
@@ -96,23 +151,41 @@ def make_atom(predicate: str, args: Sequence[str], where: str = "formula") -> At
 
 
 def is_operator(word: str) -> bool:
-    """Return whether ``word`` is And, Or, Not or Then in any case."""
+    """Return whether ``word`` is an operator's, in any case."""
     return word.lower() in OPERATORS
 
 
-def make_operator(operator: str, parts: Sequence[Formula], where: str = "formula") -> Formula:
-    """Return ``operator`` (any case) over its parts; ``Not`` takes one, the others at least one."""
+def takes_number(word: str) -> bool:
+    """Return whether ``word`` is an operator whose formula follows a number, such as ``Exactly 2``."""
+    return word.lower() in ("hold", "exactly")
+
+
+def make_operator(
+    operator: str, parts: Sequence[Formula], where: str = "formula", number: int | None = None
+) -> Formula:
+    """Return ``operator`` (any case) over its parts; `Hold` and `Exactly` need a ``number`` from 1 on."""
     key = operator.lower()
     if key not in OPERATORS:
         raise MemobenchError(f"{where}: found the operator {operator!r}, {nearest(key, OPERATORS)}")
     made = OPERATORS[key]
     if not parts:
         raise MemobenchError(f"{where}: found {made.__name__} with nothing in it, expected at least one formula")
-    if not issubclass(made, Not):
-        return made(tuple(parts))
-    if len(parts) != 1:
-        raise MemobenchError(f"{where}: found Not over {len(parts)} formulas, expected exactly one")
-    return Not(parts[0])
+    if len(parts) != _PARTS.get(made, len(parts)):
+        raise MemobenchError(
+            f"{where}: found {made.__name__} over {len(parts)} formulas, expected {_WORDS[_PARTS[made]]}"
+        )
+    if takes_number(key):
+        return made(check_number(number, made.__name__, where), parts[0])  # type: ignore[call-arg, arg-type]
+    if key in ("not", "never"):
+        return made(parts[0])  # type: ignore[call-arg, arg-type]
+    return made(tuple(parts))  # type: ignore[call-arg, arg-type]
+
+
+def check_number(number: Any, after: str, where: str) -> int:
+    """Return the number that stands after an operator's word; raise where it is none from 1 on."""
+    if not isinstance(number, int) or isinstance(number, bool) or not 1 <= number <= MAX_NUMBER:
+        raise MemobenchError(f"{where}: found {number!r} after {after}, expected a whole number from 1 to {MAX_NUMBER}")
+    return number
 
 
 # --- walking ---
@@ -122,7 +195,7 @@ def children(formula: Formula) -> tuple[Formula, ...]:
     """Return the direct parts of ``formula`` (none for an atom)."""
     if isinstance(formula, Atom):
         return ()
-    return (formula.child,) if isinstance(formula, Not) else formula.children
+    return (formula.child,) if isinstance(formula, Not | Never | Hold | Exactly) else formula.children
 
 
 def atoms(formula: Formula) -> Iterator[Atom]:
@@ -137,9 +210,9 @@ def rename(formula: Formula, names: Mapping[str, str]) -> Formula:
     """Return ``formula`` with entity names replaced, all at once (so ``{"a": "b", "b": "a"}`` swaps)."""
     if isinstance(formula, Atom):
         return Atom(formula.predicate, tuple(names.get(arg, arg) for arg in formula.args))
-    if isinstance(formula, Not):
-        return Not(rename(formula.child, names))
-    return type(formula)(tuple(rename(child, names) for child in formula.children))
+    if isinstance(formula, Not | Never | Hold | Exactly):
+        return replace(formula, child=rename(formula.child, names))
+    return replace(formula, children=tuple(rename(child, names) for child in formula.children))
 
 
 # --- writing ---
@@ -149,12 +222,19 @@ def to_lists(formula: Formula) -> list[Any]:
     """Return ``formula`` as nested lists of lower-case words: the inverse of ``parse_formula``."""
     if isinstance(formula, Atom):
         return [formula.predicate, *formula.args]
-    return [type(formula).__name__.lower(), *(to_lists(child) for child in children(formula))]
+    number = [formula.number] if isinstance(formula, Counted) else []
+    return [type(formula).__name__.lower(), *number, *(to_lists(child) for child in children(formula))]
 
 
 def format_formula(formula: Formula) -> str:
     """Return ``formula`` in BDDL on one line, e.g. ``(And (On a b) (Not (Open c)))``."""
     if isinstance(formula, Atom):
-        return f"({PREDICATES[formula.predicate][0]} {' '.join(formula.args)})"
+        return f"({' '.join((PREDICATES[formula.predicate][0], *formula.args))})"
     inside = " ".join(format_formula(child) for child in children(formula))
-    return f"({type(formula).__name__} {inside})"
+    return f"({head_of(formula)} {inside})"
+
+
+def head_of(formula: Formula) -> str:
+    """Return what stands before an operator's formulas in BDDL, e.g. ``And`` or ``Exactly 2``."""
+    word = type(formula).__name__
+    return f"{word} {formula.number}" if isinstance(formula, Counted) else word

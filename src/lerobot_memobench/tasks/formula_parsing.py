@@ -6,7 +6,15 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.tasks.formula import MAX_DEPTH, OPERATORS, Formula, is_operator, make_atom, make_operator
+from lerobot_memobench.tasks.formula import (
+    MAX_DEPTH,
+    OPERATORS,
+    Formula,
+    is_operator,
+    make_atom,
+    make_operator,
+    takes_number,
+)
 
 _KEYS = ", ".join(map(repr, OPERATORS))
 
@@ -15,8 +23,9 @@ def parse_formula(value: Any, where: str = "formula") -> Formula:
     """Read a formula from nested lists or JSON objects.
 
     ``["And", ["On", "a", "b"]]`` and ``{"and": [["on", "a", "b"]]}`` are the same. Words are read in any
-    case, the two shapes may be mixed, and an operator may hold a bare atom instead of a list. Raises
-    ``MemobenchError`` whose message starts with ``where``.
+    case, the two shapes may be mixed, and an operator may hold a bare atom instead of a list. A number stands before
+    the formula: ``["exactly", 2, ["open", "a"]]``, ``{"exactly": [2, ["open", "a"]]}``. Raises ``MemobenchError``
+    whose message starts with ``where``.
     """
     return _parse(value, where, 0)
 
@@ -31,7 +40,8 @@ def _parse(value: Any, where: str, depth: int) -> Formula:
     else:
         raise MemobenchError(f"{where}: found {short(value)}, expected a formula such as ['on', 'a', 'b']")
     if is_operator(head):
-        return make_operator(head, [_parse(item, where, depth + 1) for item in items], where)
+        number, parts = (items[0], items[1:]) if takes_number(head) and items else (None, items)
+        return make_operator(head, [_parse(item, where, depth + 1) for item in parts], where, number)
     for item in items:
         if not isinstance(item, str) or not item:
             raise MemobenchError(f"{where}: found {short(item)} as an argument of {head!r}, expected an entity name")

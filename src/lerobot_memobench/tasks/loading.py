@@ -73,6 +73,10 @@ def load_task(folder: str | Path, require_metadata: bool = True) -> Task:
         folder=folder,
         bddl_text=text,
         metadata=metadata.data,
+        suite=metadata.suite(),
+        twin_of=metadata.text("twin_of") or None,
+        drawn=metadata.flag("drawn"),
+        spoilt_as=metadata.failure_class("spoilt_as"),
     )
 
 

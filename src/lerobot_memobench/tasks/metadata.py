@@ -4,8 +4,9 @@ Keys (K checkpoints): ``memory`` (K lists of three texts: coarse, intermediate, 
 three labels, 0 Storage, 1 Update, 2 Compression, per text level), ``subtask_goals`` (K formulas). Optional:
 ``key_frame`` (K integers), ``timestep_exec_start_idx`` (integer or list of integers), ``demo_summary`` (text). Of this
 project, optional too: ``memory_type``, ``family``, ``prompt`` ({"kind", "target"}), ``variants`` (list of {"memory",
-and optionally "substitute", "order", "subtask_goals", "goal", "demo_summary", "replaces_published"}). Other keys are
-kept in ``Task.metadata`` untouched.
+and optionally "substitute", "order", "subtask_goals", "goal", "demo_summary", "language", "prompt",
+"replaces_published"}), and of the strict suite ``suite``, ``twin_of``, ``drawn``, ``spoilt_as`` (see `Task`). A hiding
+is the prompt {"kind": "hide", "places": [[thing, drawer], ...]}. Other keys are kept in ``Task.metadata`` untouched.
 """
 
 from __future__ import annotations
@@ -22,11 +23,15 @@ from lerobot_memobench.tasks.formula_parsing import parse_formula, short
 from lerobot_memobench.tasks.task import (
     MEMORY_TYPES,
     OPERATIONS,
+    PUBLISHED,
+    STRICT_FAILURES,
+    SUITES,
     Checkpoint,
     MemoryType,
     Operation,
     Prompt,
     PromptKind,
+    Suite,
     Texts,
     Variant,
 )
@@ -44,6 +49,8 @@ _VARIANT_KEYS = {
     "subtask_goals",
     "goal",
     "demo_summary",
+    "language",
+    "prompt",
     "replaces_published",
 }
 
@@ -133,6 +140,27 @@ class Metadata:
             raise self._error("memory_type", value, f"one of {', '.join(MEMORY_TYPES)}")
         return cast(MemoryType | None, value)
 
+    def suite(self) -> Suite:
+        """Return the suite that the task belongs to: the published one unless the file says another."""
+        value = self.data.get("suite", PUBLISHED)
+        if value not in SUITES:
+            raise self._error("suite", value, f"one of {', '.join(SUITES)}")
+        return cast(Suite, value)
+
+    def flag(self, key: str) -> bool:
+        """Return an optional truth value, False where it is not given."""
+        value = self.data.get(key, False)
+        if not isinstance(value, bool):
+            raise self._error(key, value, "true or false")
+        return value
+
+    def failure_class(self, key: str) -> str | None:
+        """Return an optional class of failure that only strict tasks have, None where it is not given."""
+        value = self.data.get(key)
+        if value is not None and value not in STRICT_FAILURES:
+            raise self._error(key, value, f"one of {', '.join(STRICT_FAILURES)}")
+        return cast(str | None, value)
+
     # --- checkpoints ---
 
     def checkpoints(self) -> tuple[Checkpoint, ...]:
@@ -189,17 +217,29 @@ class Metadata:
     def prompt(self) -> Prompt | None:
         """Return what the prompt video shows; the file must say it, with null for no prompt."""
         value = self.data["prompt"]
-        if value is None:
-            return None
-        if not isinstance(value, dict) or not set(value) <= {"kind", "target"}:
-            raise self._error("prompt", value, 'null or {"kind": ..., "target": ...}')
+        return None if value is None else self._prompt(value, "prompt")
+
+    def _prompt(self, value: Any, place: str) -> Prompt:
+        if not isinstance(value, dict) or not set(value) <= {"kind", "target", "places"}:
+            raise self._error(place, value, 'null or {"kind": ..., "target": ...}')
         kind = value.get("kind")
         if kind not in get_args(PromptKind):
-            raise self._error("prompt.kind", kind, f"one of {', '.join(get_args(PromptKind))}")
-        target = value.get("target")
-        if target is None and kind != "routine":
-            raise self._error("prompt.target", target, f"the object that a prompt of kind {kind!r} shows")
-        return Prompt(cast(PromptKind, kind), None if target is None else self._name(target, "prompt.target"))
+            raise self._error(f"{place}.kind", kind, f"one of {', '.join(get_args(PromptKind))}")
+        target, places = value.get("target"), self._places(value.get("places", []), f"{place}.places")
+        if (kind == "hide") != bool(places):
+            raise self._error(f"{place}.places", places, "a list of [thing, drawer] for a hiding, nothing for others")
+        if target is None and kind not in ("routine", "hide"):
+            raise self._error(f"{place}.target", target, f"the object that a prompt of kind {kind!r} shows")
+        named = None if target is None else self._name(target, f"{place}.target")
+        return Prompt(cast(PromptKind, kind), named, places)
+
+    def _places(self, value: Any, place: str) -> tuple[tuple[str, str], ...]:
+        if not isinstance(value, list) or not all(isinstance(pair, list) and len(pair) == 2 for pair in value):
+            raise self._error(place, value, "a list of [thing, drawer]")
+        found = tuple((self._name(thing, place), self._name(drawer, place)) for thing, drawer in value)
+        if any(thing not in self.problem.objects or drawer not in self.problem.regions for thing, drawer in found):
+            raise self._error(place, value, "objects in regions, as [thing, drawer]")
+        return found
 
     def _name(self, value: Any, place: str) -> str:
         kind = self.problem.entity_kind(value) if isinstance(value, str) else None
@@ -237,6 +277,8 @@ class Metadata:
             goals=None if goals is None else self._formulas(goals, f"{place}.subtask_goals"),
             goal=None if value.get("goal") is None else self._formula(value["goal"], f"{place}.goal"),
             demo_summary=_text(value, "demo_summary", f"{self.path}, {place}"),
+            language=_text(value, "language", f"{self.path}, {place}"),
+            prompt=None if value.get("prompt") is None else self._prompt(value["prompt"], f"{place}.prompt"),
             replaces_published=value.get("replaces_published", False),
         )
 

@@ -38,6 +38,11 @@ class Progress:
         self.ordered_step: list[int | None] = [None] * count
         self.index = 0
 
+    @property
+    def lost(self) -> bool:
+        """The goal can no longer be reached, whatever is done."""
+        return self._evaluator.settled[0] is False
+
     def step(self, holds: Callable[[Atom], bool]) -> bool:
         """Take in the state after one control step, answered by ``holds``; return ``success``."""
         self.steps += 1

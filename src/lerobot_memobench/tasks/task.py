@@ -17,11 +17,17 @@ from lerobot_memobench.tasks.formula import Atom, Formula, rename
 
 MemoryType = Literal["temporal", "spatial", "object", "procedural"]
 Operation = Literal["S", "U", "C"]
-PromptKind = Literal["routine", "pick", "point", "highlight"]
+PromptKind = Literal["routine", "pick", "point", "highlight", "hide"]
+Suite = Literal["published", "strict"]
 Texts = tuple[str, str, str]
 
 MEMORY_TYPES: tuple[MemoryType, ...] = get_args(MemoryType)
 OPERATIONS: tuple[Operation, ...] = get_args(Operation)
+SUITES: tuple[Suite, ...] = get_args(Suite)
+PUBLISHED, STRICT = SUITES
+#: Classes of failure that only strict tasks have (`Task.spoilt_as`): the event was done too seldom or too often; the
+#: thing was looked for where it is not.
+STRICT_FAILURES = ("miscount", "wrong_place")
 LEVELS = ("coarse", "intermediate", "fine")
 #: The level whose operation labels are evaluated (paper: intermediate).
 DEFAULT_LEVEL = 1
@@ -52,15 +58,25 @@ class Checkpoint:
 
 @dataclass(frozen=True)
 class Prompt:
-    """What the prompt video shows: a routine, or ``target`` being picked up, pointed at or highlighted."""
+    """What the prompt video shows: a routine, ``target`` being picked up, pointed at or highlighted, or a hiding.
+
+    Attributes:
+        places: of a hiding, thing -> drawer in the order shown. The execution begins from the scene as it left it.
+    """
 
     kind: PromptKind
     target: str | None = None
+    places: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def restores(self) -> bool:
+        """Whether the scene is put back as it was before the execution begins."""
+        return self.kind != "hide"
 
 
 @dataclass(frozen=True)
 class Variant:
-    """Another admissible referent or order of a task, in the same scene and with the same instruction.
+    """Another admissible referent, order or number of a task, in the same scene.
 
     Attributes:
         substitute: names replaced, all at once, in goal, checkpoint goals and prompt target.
@@ -70,6 +86,8 @@ class Variant:
         goals: checkpoint goals per position in place of substituted and reordered ones.
         goal: goal in place of the substituted one.
         demo_summary: what the demonstration does.
+        language: instruction in place of the task's.
+        prompt: what the prompt video shows in place of the substituted one.
         replaces_published: the published goal is looser than this variant's (it would accept another order),
             so variant 0 is not drawn.
     """
@@ -80,6 +98,8 @@ class Variant:
     goals: tuple[Formula, ...] | None = None
     goal: Formula | None = None
     demo_summary: str = ""
+    language: str = ""
+    prompt: Prompt | None = None
     replaces_published: bool = False
 
 
@@ -92,10 +112,14 @@ class Task:
         objects, fixtures: instance -> class, in the file's order.
         regions: full name (``<target>_<region>``) -> region.
         init: starting state; objects in regions are sampled, others rest on what they name.
-        prompt: what the prompt video shows; None for temporal and spatial tasks.
+        prompt: what the prompt video shows; None for the published temporal and spatial tasks.
         variants: the alternatives to the published task: ``variant(k)`` for k >= 1.
         variant_index: which variant this is.
         bddl_text, metadata: the files as read.
+        suite: what it belongs to; an episode of the strict suite ends when its goal can no longer be reached.
+        twin_of: the published task in whose scene it takes place; None for a task of its own.
+        drawn: every episode draws its variant by seed, whatever referent is asked for.
+        spoilt_as: failure class of an episode whose goal could no longer be reached; None for that of its checkpoints.
     """
 
     name: str
@@ -117,6 +141,10 @@ class Task:
     metadata: dict[str, Any] = field(repr=False)
     variant_index: int = 0
     published: Task | None = field(default=None, repr=False)
+    suite: Suite = "published"
+    twin_of: str | None = None
+    drawn: bool = False
+    spoilt_as: str | None = None
 
     # Two tasks are the same when their files and variant are: pickled copies in worker processes stay equal
     # and hashable.
@@ -128,6 +156,11 @@ class Task:
 
     def __hash__(self) -> int:
         return hash((self.name, self.bddl_text, self.variant_index))
+
+    @property
+    def scene_name(self) -> str:
+        """The name by which seeds draw the scene: a twin's is its published task's, seed for seed."""
+        return self.twin_of or self.name
 
     @property
     def operations(self) -> str:
@@ -159,11 +192,12 @@ class Task:
             dataclasses.replace(checkpoint, goal=goal, language=language)
             for checkpoint, goal, language in zip(base.checkpoints, goals, chosen.languages, strict=True)
         )
-        prompt = base.prompt
+        prompt = chosen.prompt or base.prompt
         if prompt is not None and prompt.target is not None:
             prompt = dataclasses.replace(prompt, target=chosen.substitute.get(prompt.target, prompt.target))
         return dataclasses.replace(
             base,
+            language=chosen.language or base.language,
             goal=chosen.goal or rename(base.goal, chosen.substitute),
             checkpoints=checkpoints,
             prompt=prompt,

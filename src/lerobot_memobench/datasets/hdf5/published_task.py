@@ -36,7 +36,7 @@ def task_of(file: PublishedFile, demo: PublishedDemo) -> Task:
         metadata["timestep_exec_start_idx"] = -1
     memory_type = _folder_name(file.attribute("memory_type") or _memory_type(name, file) or UNKNOWN, "memory_type")
     task = _load(name, memory_type, file.bddl_text, json.dumps(metadata, sort_keys=True))
-    if name in task_names():
+    if name in task_names(suite=None):
         known = get_task(name)
         if "family" not in metadata:
             task = replace(task, family=known.family)
@@ -63,7 +63,7 @@ def _folder_name(text: str, what: str) -> str:
 
 
 def _memory_type(name: str, file: PublishedFile) -> str:
-    if name in task_names():
+    if name in task_names(suite=None):
         return get_task(name).memory_type
     folders = [*PurePosixPath(file.bddl_name.replace("\\", "/")).parts, *file.path.resolve().parts]
     return next((folder for folder in reversed(folders) if folder in MEMORY_TYPES), "")

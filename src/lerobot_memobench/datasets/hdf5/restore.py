@@ -170,6 +170,8 @@ def _read_off(
     for frame, state in enumerate(states):
         sim.set_state(state, poses)
         proprio.append(sim.proprio())
+        if frame == exec_start:
+            sim.begin_execution()
         if evaluate and frame > exec_start:  # the world is evaluated after a control step, see Demonstration
             success = progress.step(sim.holds) or success
         satisfied.append(progress.satisfied)

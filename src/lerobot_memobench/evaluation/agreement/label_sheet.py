@@ -126,7 +126,7 @@ def _released(row: Mapping[str, str], where: str) -> str | None:
         return _label(row[RELEASED], where, RELEASED)
     if not {"task", "checkpoint"} <= set(row):
         return None
-    if row["task"] not in task_names():
+    if row["task"] not in task_names(suite=None):
         try:
             get_task(row["task"])
         except MemobenchError as error:

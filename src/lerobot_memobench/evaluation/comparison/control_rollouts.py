@@ -96,7 +96,7 @@ def with_labels_of_level(levels: Mapping[str, Sequence[Record]]) -> dict[str, li
         index = LEVELS.index(level)
         labels = {
             name: [checkpoint.operations_by_level[index] for checkpoint in get_task(name).checkpoints]
-            for name in {record["task"] for record in records} & set(task_names())
+            for name in {record["task"] for record in records} & set(task_names(suite=None))
         }
         own[level] = relabelled(records, labels)
     return own

@@ -9,7 +9,11 @@ from lerobot_memobench.tasks.formula import Atom, Formula, atoms, rename
 
 _THING = ("object", "fixture")
 _JOINTED = ("fixture", "region")
-_KINDS: dict[str, tuple[tuple[str, ...], ...]] = {"on": (_THING, (*_THING, "region")), "in": (_THING, ("region",))}
+_KINDS: dict[str, tuple[tuple[str, ...], ...]] = {
+    "on": (_THING, (*_THING, "region")),
+    "in": (_THING, ("region",)),
+    "inplace": (("object",),),
+}
 """Predicate -> what each of its arguments may be; the others speak of what can be opened or switched."""
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 from lerobot_memobench.tasks.bddl.problem import Problem
 from lerobot_memobench.tasks.bddl.sexpr import Node, Reader
@@ -10,12 +11,16 @@ from lerobot_memobench.tasks.formula import (
     LATCHES,
     MAX_DEPTH,
     PREDICATES,
+    SINCE_START,
     Atom,
     Formula,
     is_operator,
     make_atom,
     make_operator,
+    takes_number,
 )
+
+_NOT_IN_INIT = {*LATCHES, *SINCE_START}
 
 
 def read_goal(reader: Reader, problem: Problem, section: Node, nodes: list[Node]) -> Formula:
@@ -32,10 +37,17 @@ def _formula(reader: Reader, problem: Problem, node: Node, depth: int = 0) -> Fo
     head, rest = reader.head(node, expected)
     where = reader.where(node)
     if is_operator(head):
-        return make_operator(head, [_formula(reader, problem, item, depth + 1) for item in rest], where)
+        number = _number(reader, rest.pop(0)) if takes_number(head) and rest else None
+        return make_operator(head, [_formula(reader, problem, item, depth + 1) for item in rest], where, number)
     assert node.items is not None
     args = [reader.word(item, f"an entity name as argument of {node.items[0].word}") for item in rest]
     return problem.resolve(make_atom(node.items[0].word, args, where), where)
+
+
+def _number(reader: Reader, node: Node) -> Any:
+    """Return the whole number at ``node``, or the word that stands there instead."""
+    word = reader.word(node, "a whole number")
+    return int(word) if word.isascii() and word.isdigit() and len(word) < 10 else word
 
 
 def read_init(reader: Reader, problem: Problem, section: Node, nodes: list[Node]) -> tuple[Atom, ...]:
@@ -61,8 +73,8 @@ def read_init(reader: Reader, problem: Problem, section: Node, nodes: list[Node]
 
 def _init_atom(reader: Reader, problem: Problem, node: Node) -> Atom:
     head, _ = reader.head(node, "an atom such as (On a b)")
-    if is_operator(head) or head in LATCHES:
-        allowed = ", ".join(spelling for key, (spelling, _) in PREDICATES.items() if key not in LATCHES)
+    if is_operator(head) or head in _NOT_IN_INIT:
+        allowed = ", ".join(spelling for key, (spelling, _) in PREDICATES.items() if key not in _NOT_IN_INIT)
         raise reader.error(node, f"{head!r} in :init", f"one of {allowed}")
     atom = _formula(reader, problem, node)
     assert isinstance(atom, Atom)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from lerobot_memobench.tasks.bddl.problem import Problem, Region
-from lerobot_memobench.tasks.formula import Atom, Formula, children, format_formula
+from lerobot_memobench.tasks.formula import Atom, Formula, children, format_formula, head_of
 
 LONGEST_ROW = 110
 """Columns from which a formula gets a line per child."""
@@ -54,7 +54,7 @@ def _goal(formula: Formula, indent: str) -> list[str]:
     flat = indent + format_formula(formula)
     if len(flat) <= LONGEST_ROW or isinstance(formula, Atom):
         return [flat]
-    rows = [f"{indent}({type(formula).__name__}"]
+    rows = [f"{indent}({head_of(formula)}"]
     for part in children(formula):
         rows += _goal(part, indent + "  ")
     rows[-1] += ")"

@@ -59,7 +59,7 @@ def read_runs(folders: Sequence[str | Path]) -> list[Run]:
 
 def task_source(task_dir: str | Path | None) -> dict[str, Task]:
     """Return the tasks whose texts are known: the catalogue's, and those of a folder in the published format."""
-    known = {name: get_task(name) for name in task_names()}
+    known = {name: get_task(name) for name in task_names(suite=None)}
     if task_dir is not None:
         known |= {folder.name: load_task(folder) for folder in find_tasks(task_dir)}
     return known

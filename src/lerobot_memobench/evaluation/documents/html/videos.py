@@ -131,7 +131,7 @@ def _task_number(name: str) -> int | None:
     """The number under which LeRobot runs a task of the catalogue."""
     from lerobot_memobench.tasks.catalogue import task_names
 
-    names = task_names()
+    names = task_names(suite=None)
     return names.index(name) if name in names else None
 
 

@@ -1,0 +1,175 @@
+"""Counting: how often is in the instruction, and nothing in sight tells how often it has been done."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from folders import Setting, Twin
+from words import HOME, TIMES, Texts, ready, region, times
+
+from lerobot_memobench.tasks.formula import And, Atom, Exactly, Formula, Hold, Round, When
+
+REST = 40
+"""Control steps of rest by which a policy says that it is done."""
+
+
+@dataclass(frozen=True)
+class Counted:
+    """An event to be counted.
+
+    Attributes:
+        asked: what the instruction asks for. did: what a memory says of it.
+        begun, ended: atoms between which the event is under way, and how a memory tells the first (coarse,
+            intermediate, fine).
+        things: what stands loose in the scene.
+    """
+
+    name: str
+    published: str
+    asked: str
+    coarse: str
+    did: str
+    fine: str
+    begun: Atom
+    ended: Atom
+    opened: Texts
+    things: tuple[str, ...]
+
+
+def _drawer(drawer: str) -> Counted:
+    place = region(drawer)
+    return Counted(
+        f"check_the_{drawer}_drawer_a_given_number_of_times",
+        f"check_the_{drawer}_drawer_of_the_cabinet",
+        f"check the {drawer} drawer of the cabinet",
+        f"{drawer} drawer inspected",
+        f"pulled the {drawer} drawer out and pushed it shut",
+        f"pulled the cabinet's {drawer} drawer out to look inside and pushed it shut again",
+        Atom("open", (place,)),
+        Atom("close", (place,)),
+        (
+            f"{drawer} drawer pulled out",
+            f"pulled the {drawer} drawer out",
+            f"pulled the cabinet's {drawer} drawer out until it stood open",
+        ),
+        ("akita_black_bowl_1",),
+    )
+
+
+def _stove(suffix: str, where: str, things: tuple[str, ...]) -> Counted:
+    return Counted(
+        f"turn_the_stove_on_and_off{suffix}_a_given_number_of_times",
+        f"turn_on_the_stove_and_turn_it_off{suffix}",
+        f"turn the stove{where} on and off",
+        "stove lit and off again",
+        "switched the stove on and off again",
+        "rotated the stove's knob until the burner glowed red and rotated it back until the burner was dark",
+        Atom("turnon", ("flat_stove_1",)),
+        Atom("turnoff", ("flat_stove_1",)),
+        ("stove lit", "switched the stove on", "rotated the stove's knob until the burner glowed red"),
+        things,
+    )
+
+
+EVENTS = (
+    Counted(
+        "open_and_close_the_microwave_a_given_number_of_times",
+        "open_and_close_the_microwave",
+        "open and close the microwave",
+        "microwave open and shut again",
+        "swung the microwave's door open and shut it again",
+        "pulled the microwave's door open and then pushed it back until it was shut",
+        Atom("open", ("microwave_1",)),
+        Atom("close", ("microwave_1",)),
+        (
+            "microwave door swung open",
+            "swung the microwave's door open",
+            "pulled the handle of the microwave until its door stood open",
+        ),
+        ("white_bowl_1", "plate_1"),
+    ),
+    _drawer("top"),
+    _drawer("middle"),
+    _stove("", "", ("chefmate_8_frypan_1", "moka_pot_1")),
+    _stove("_near_the_shelf", " near the shelf", ("chefmate_8_frypan_1", "white_bowl_1")),
+)
+
+
+def twins() -> list[Twin]:
+    """Return the five counting tasks."""
+    return [
+        Twin(
+            event.name,
+            event.published,
+            "counting",
+            "SUUC",
+            tuple(_setting(event, number) for number in TIMES),
+            spoilt_as="miscount",
+        )
+        for event in EVENTS
+    ]
+
+
+def _setting(event: Counted, number: int) -> Setting:
+    before = ready(*event.things)
+    goal = When((Hold(REST, And((HOME, event.ended))), times(number, before, event.begun, event.ended)))
+    steps = [*_checkpoints(event, number, before), (goal, _rested(event, number))]
+    return Setting(
+        f"{event.asked} {TIMES[number]}",
+        goal,
+        tuple(formula for formula, _ in steps),
+        tuple(texts for _, texts in steps),
+        f"{event.asked[0].upper()}{event.asked[1:]} {TIMES[number]}, coming home after each time, and then rest.",
+    )
+
+
+def _checkpoints(event: Counted, number: int, before: Formula) -> list[tuple[Formula, Texts]]:
+    """Return three moments, whatever the number: the labels of a task's checkpoints are those of all its variants."""
+    underway = [(_begun(event, k, before), _opened(event, k, number)) for k in range(1, number + 1)]
+    complete = [(_done(event, k, before), _counted(event, k, number)) for k in range(1, number + 1)]
+    if number == 1:
+        return [underway[0], complete[0], (And((_done(event, 1, before), HOME)), _home(event))]
+    return complete if number == 3 else [complete[0], underway[1], complete[1]]
+
+
+def _done(event: Counted, number: int, before: Formula) -> Formula:
+    return Exactly(number, Round((before, event.begun, event.ended)))
+
+
+def _begun(event: Counted, number: int, before: Formula) -> Formula:
+    return Exactly(number, Round((before, event.begun)))
+
+
+def _counted(event: Counted, done: int, asked: int) -> Texts:
+    left = {0: "nothing is left to do", 1: "once more to go", 2: "two more to go"}[asked - done]
+    return (
+        f"{event.coarse}, {done} of {asked}",
+        f"{event.did}, {TIMES[done]} by now",
+        f"{event.fine}, {TIMES[done]} by now; {TIMES[asked]} is asked for, so {left}",
+    )
+
+
+def _opened(event: Counted, k: int, asked: int) -> Texts:
+    which = {1: "the first", 2: "the second", 3: "the third"}[k]
+    coarse, intermediate, fine = event.opened
+    return (
+        f"{coarse}, {k} of {asked}",
+        f"{intermediate} for {which} time",
+        f"{fine}, for {which} of {asked} time{'s' if asked > 1 else ''}",
+    )
+
+
+def _home(event: Counted) -> Texts:
+    return (
+        "hand home",
+        "brought the hand home after the one time",
+        f"{event.fine}, and brought the hand home; once is asked for, so nothing more is to be begun",
+    )
+
+
+def _rested(event: Counted, number: int) -> Texts:
+    return (
+        f"done {TIMES[number]}, at rest",
+        f"{event.did}, {TIMES[number]} in all, and came to rest",
+        f"{event.fine}, {TIMES[number]} in all as the instruction asks, then came home and began nothing more",
+    )

@@ -1,0 +1,128 @@
+"""Write one twin as a task folder: the published task's scene, with its own instruction, goal and metadata."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from lerobot_memobench.files import write_file
+from lerobot_memobench.tasks.bddl.problem import Region
+from lerobot_memobench.tasks.bddl.reading import parse_bddl
+from lerobot_memobench.tasks.bddl.writing import format_bddl
+from lerobot_memobench.tasks.catalogue import CATALOGUE_DIR, get_task
+from lerobot_memobench.tasks.formula import Formula, to_lists
+from lerobot_memobench.tasks.task import BDDL_FILE, METADATA_FILE, STRICT, Prompt, Task
+
+LONGEST_ROW = 110
+"""Columns up to which a JSON value stands on one line."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One thing that a seed can draw: instruction, goal, and what a memory should say (K checkpoints)."""
+
+    language: str
+    goal: Formula
+    checkpoints: tuple[Formula, ...]
+    memory: tuple[tuple[str, str, str], ...]
+    demo_summary: str
+    prompt: Prompt | None = None
+
+
+@dataclass(frozen=True)
+class Twin:
+    """A strict task: the settings that a seed draws from, the first of which stands in the BDDL file.
+
+    Attributes:
+        operations: S, U or C per checkpoint, the same at every level of language.
+        regions: places that the published file does not name.
+    """
+
+    name: str
+    published: str
+    family: str
+    operations: str
+    settings: tuple[Setting, ...]
+    spoilt_as: str | None = None
+    regions: tuple[Region, ...] = field(default_factory=tuple)
+
+    @property
+    def scene(self) -> Task:
+        """The published task."""
+        return get_task(self.published)
+
+    @property
+    def folder(self) -> Path:
+        """Where it stands in the catalogue."""
+        return CATALOGUE_DIR / STRICT / self.scene.memory_type / self.name
+
+
+def files(twin: Twin) -> dict[str, str]:
+    """Return file name -> text of a twin's folder."""
+    problem = parse_bddl(twin.scene.bddl_text, twin.published)
+    first = twin.settings[0]
+    regions = problem.regions | {region.full_name: region for region in twin.regions}
+    problem = replace(problem, language=first.language, goal=first.goal, regions=regions)
+    comment = f"Strict twin, family {twin.family}, in the scene of\n{twin.published}."
+    return {BDDL_FILE: format_bddl(problem, comment), METADATA_FILE: _json(_metadata(twin)) + "\n"}
+
+
+def write(twin: Twin) -> None:
+    """Write a twin's folder, whatever is there."""
+    twin.folder.mkdir(parents=True, exist_ok=True)
+    for name, text in files(twin).items():
+        write_file(twin.folder / name, text)
+
+
+def _metadata(twin: Twin) -> dict[str, Any]:
+    first, *others = twin.settings
+    count = len(twin.operations)
+    assert all(len(one.checkpoints) == len(one.memory) == count for one in twin.settings), twin.name
+    return {
+        "suite": STRICT,
+        "twin_of": twin.published,
+        "drawn": True,
+        **({"spoilt_as": twin.spoilt_as} if twin.spoilt_as else {}),
+        "memory_type": twin.scene.memory_type,
+        "family": twin.family,
+        "demo_summary": first.demo_summary,
+        "prompt": _prompt(first.prompt),
+        "key_frame": [-1] * count,
+        "operating_type": [["SUC".index(operation)] * 3 for operation in twin.operations],
+        "subtask_goals": [to_lists(goal) for goal in first.checkpoints],
+        "memory": [list(texts) for texts in first.memory],
+        "variants": [_variant(one, first) for one in others],
+    }
+
+
+def _variant(one: Setting, first: Setting) -> dict[str, Any]:
+    return {
+        **({"language": one.language} if one.language != first.language else {}),
+        "goal": to_lists(one.goal),
+        **({"prompt": _prompt(one.prompt)} if one.prompt != first.prompt else {}),
+        "subtask_goals": [to_lists(goal) for goal in one.checkpoints],
+        "memory": [list(texts) for texts in one.memory],
+        "demo_summary": one.demo_summary,
+    }
+
+
+def _prompt(prompt: Prompt | None) -> dict[str, Any] | None:
+    if prompt is None:
+        return None
+    if prompt.places:
+        return {"kind": prompt.kind, "places": [list(pair) for pair in prompt.places]}
+    return {"kind": prompt.kind, "target": prompt.target}
+
+
+def _json(value: Any, indent: str = "") -> str:
+    """Return JSON with each value on one line where it fits."""
+    flat = json.dumps(value, ensure_ascii=False)
+    if len(indent) + len(flat) <= LONGEST_ROW or not isinstance(value, dict | list):
+        return flat
+    deeper = indent + "  "
+    if isinstance(value, dict):
+        rows = [f"{deeper}{json.dumps(key)}: {_json(item, deeper)}" for key, item in value.items()]
+        return "{\n" + ",\n".join(rows) + f"\n{indent}}}"
+    return "[\n" + ",\n".join(f"{deeper}{_json(item, deeper)}" for item in value) + f"\n{indent}]"

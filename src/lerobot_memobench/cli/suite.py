@@ -1,0 +1,22 @@
+"""The option ``--suite`` of the commands that look at the catalogue's tasks."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated
+
+import typer
+
+from lerobot_memobench.tasks.task import PUBLISHED, STRICT
+
+
+class Suite(StrEnum):
+    """Which thirty tasks are meant."""
+
+    PUBLISHED = PUBLISHED
+    STRICT = STRICT
+
+
+WhichSuite = Annotated[
+    Suite, typer.Option(help="published: the thirty tasks as published; strict: their twins that need a memory.")
+]
