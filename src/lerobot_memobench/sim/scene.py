@@ -12,7 +12,7 @@ from lerobot_memobench.sim.assets.asset import Asset
 from lerobot_memobench.sim.assets.kitchen import build_kitchen
 from lerobot_memobench.sim.assets.registry import build_asset
 from lerobot_memobench.sim.catches import add_catches
-from lerobot_memobench.tasks.task import Task
+from lerobot_memobench.tasks.task import STRICT, Task
 
 TABLE = "kitchen_table"
 TABLE_TOP = 0.90
@@ -80,7 +80,7 @@ def scene_spec(task: Task) -> tuple[mujoco.MjSpec, dict[str, Asset]]:
     for name, class_name in task.objects.items():
         assets[name] = build_asset(spec, spec.worldbody, name, class_name)
         spec.body(name).add_freejoint(name=f"{name}_joint0")
-    if task.suite == "strict":
+    if task.suite == STRICT:
         add_catches(spec, assets)
     return spec, assets
 

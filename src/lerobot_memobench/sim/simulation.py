@@ -20,7 +20,7 @@ from lerobot_memobench.sim.scene import AGENTVIEW, SUBSTEPS, get_scene, state_si
 from lerobot_memobench.sim.start import Start
 from lerobot_memobench.sim.world import World
 from lerobot_memobench.tasks.formula import SINCE_START, Atom
-from lerobot_memobench.tasks.task import Task
+from lerobot_memobench.tasks.task import STRICT, Task
 
 Array = NDArray[np.float64]
 
@@ -57,7 +57,7 @@ class Simulation:
         self.task = task
         self.render_settings = render or RenderSettings()
         self._scene = scene
-        self._strict = task.suite == "strict"
+        self._strict = task.suite == STRICT
         self.model: mujoco.MjModel = copy.copy(scene.model)
         # robosuite's force and torque sensors cost time in every physics step, and nobody reads them.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR.value
