@@ -9,12 +9,14 @@ from collections.abc import Iterable
 
 import counting
 import finding
+import ordering
+import prompted
 from folders import Twin, write
 
 
 def twins() -> Iterable[Twin]:
     """Return all twins."""
-    return [*counting.twins(), *finding.twins()]
+    return [*counting.twins(), *ordering.twins(), *finding.twins(), *prompted.twins()]
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +38,7 @@ class Twin:
     Attributes:
         operations: S, U or C per checkpoint, the same at every level of language.
         regions: places that the published file does not name.
+        moved: start regions in place of the published ones of the same name.
     """
 
     name: str
@@ -46,7 +47,8 @@ class Twin:
     operations: str
     settings: tuple[Setting, ...]
     spoilt_as: str | None = None
-    regions: tuple[Region, ...] = field(default_factory=tuple)
+    regions: tuple[Region, ...] = ()
+    moved: tuple[Region, ...] = ()
 
     @property
     def scene(self) -> Task:
@@ -63,7 +65,7 @@ def files(twin: Twin) -> dict[str, str]:
     """Return file name -> text of a twin's folder."""
     problem = parse_bddl(twin.scene.bddl_text, twin.published)
     first = twin.settings[0]
-    regions = problem.regions | {region.full_name: region for region in twin.regions}
+    regions = problem.regions | {region.full_name: region for region in (*twin.regions, *twin.moved)}
     problem = replace(problem, language=first.language, goal=first.goal, regions=regions)
     comment = f"Strict twin, family {twin.family}, in the scene of\n{twin.published}."
     return {BDDL_FILE: format_bddl(problem, comment), METADATA_FILE: _json(_metadata(twin)) + "\n"}

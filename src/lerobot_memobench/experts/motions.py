@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from lerobot_memobench.experts.doors import close_door, open_door
 from lerobot_memobench.experts.grasping import pick
-from lerobot_memobench.experts.handles import close_drawer, open_drawer, outward_of, turn_knob
+from lerobot_memobench.experts.handles import close_drawer, open_drawer, turn_knob
 from lerobot_memobench.experts.leaning import pointing
 from lerobot_memobench.experts.placing import put_at, put_in_drawer, put_on, put_on_region
+from lerobot_memobench.experts.surroundings import outward_of
 from lerobot_memobench.experts.travel import Held, go_home
 
 __all__ = [
