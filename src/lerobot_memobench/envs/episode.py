@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.envs.observations import ACTION_DIM, EXECUTION, IMAGE_KEYS, PROMPT
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.experts.blind import BlindRoutine
 from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.experts.prompts import PromptDemonstrator
 from lerobot_memobench.sim.rendering import Image, RenderSettings
 from lerobot_memobench.sim.simulation import Simulation
+from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.formula import Atom, atoms
 from lerobot_memobench.tasks.progress import Progress
 from lerobot_memobench.tasks.task import STRICT, Task
@@ -85,6 +87,7 @@ class Episode:
         self.drifted = False
         self._siblings = list(_wrong_atoms(task))
         self._expert: Expert | None = None
+        self._blind: BlindRoutine | None = None
         self._demonstrator: Iterator[NDArray[np.float32]] | None = None
         if self.prompt_video:
             self._prompt = PromptDemonstrator(task, self.sim, self._rng(2))
@@ -157,6 +160,18 @@ class Episode:
         if self._expert is None:
             self._expert = Expert(self.task, self.sim, self._rng(3))
         return self._expert.act()
+
+    def blind_action(self) -> NDArray[np.float32]:
+        """Return what the published routine does now, blind to prompt and instruction, (7,); zeros during the prompt.
+
+        Ask once per step.
+        """
+        if self.phase == PROMPT:
+            return np.zeros(ACTION_DIM, dtype=np.float32)
+        if self._blind is None:
+            routine = get_task(self.published.twin_of) if self.published.twin_of else self.published
+            self._blind = BlindRoutine(routine, self.sim, self._rng(3))
+        return self._blind.act()
 
     @property
     def expert_done(self) -> bool:

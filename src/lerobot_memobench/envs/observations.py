@@ -45,8 +45,8 @@ def policy_names() -> dict[str, str]:
     }
 
 
-def observation_space(expert_action: bool, render_every: int = 1) -> spaces.Dict:
-    """Return the space of observations, with the scripted expert's action on request.
+def observation_space(expert_action: bool, render_every: int = 1, blind_action: bool = False) -> spaces.Dict:
+    """Return the space of observations, with the actions of the scripted expert or the blind routine on request.
 
     Where not every step is drawn, ``picture_step`` tells which step the pictures show.
     """
@@ -63,6 +63,8 @@ def observation_space(expert_action: bool, render_every: int = 1) -> spaces.Dict
         parts["picture_step"] = spaces.Box(0, np.inf, (1,), np.float32)
     if expert_action:
         parts["expert_action"] = action_space()
+    if blind_action:
+        parts["blind_action"] = action_space()
     return spaces.Dict(parts)
 
 

@@ -115,12 +115,10 @@ class Laboratory:
 
     def _shut_away(self, thing: str) -> bool:
         """Whether a thing lies in a closed drawer: an expert that looks into the simulator would know which."""
-        drawers = [f"{name}_{region}" for name, asset in self.sim.assets.items() for region in asset.articulations]
-        return thing in self.sim.task.objects and any(
-            self.sim.holds(Atom("in", (thing, drawer))) and self.sim.holds(Atom("close", (drawer,)))
-            for drawer in drawers
-            if drawer not in self.sim.assets and self.sim.world.articulation(drawer)[0].kind == "drawer"
-        )
+        if thing not in self.sim.task.objects:
+            return False
+        drawers = [f"{name}_{part}" for name, asset in self.sim.assets.items() for part in asset.articulations if part]
+        return any(self.sim.holds(Atom("in", (thing, it))) and self.sim.holds(Atom("close", (it,))) for it in drawers)
 
     def place(self) -> Place:
         """Return where things are now."""
