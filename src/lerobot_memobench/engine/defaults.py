@@ -23,7 +23,7 @@ FILMS = 10
 
 
 def with_policy(settings: LerobotSettings) -> LerobotSettings:
-    """Return settings with the scripted expert where no policy is named; the environment offers it, or the blind, its action."""
+    """Return settings with the scripted expert where no policy is named; a scripted policy is offered its action."""
     if not settings.has("policy.path"):
         settings = settings.default("policy.type", EXPERT)
     name = settings.get("policy.type")

@@ -1,4 +1,4 @@
-"""A routine without a memory: the published task's, again and again, whatever a prompt showed or an instruction says."""
+"""A routine without a memory: the published task's, again and again, whatever was shown or is asked."""
 
 from __future__ import annotations
 

@@ -58,6 +58,8 @@ class Demonstration:
 REST = "rest"
 """The answer to do nothing more."""
 HOME = Atom("handhome", ())
+STILL = 0.001
+"""Change of proprioception (m, rad) in a step up to which the hand stands still."""
 
 
 def rest_steps(formula: Formula) -> int:
@@ -109,12 +111,12 @@ def follow(task: Task, sim: Simulation, seed: int, horizon: int = HORIZON) -> De
 
 
 class _Watcher:
-    """Photographs decisions, and where a goal asks for rest, the last coming home as the decision to rest."""
+    """Photographs decisions, and where a goal asks for rest, the hand come home at last as the decision to rest."""
 
     def __init__(self, task: Task, sim: Simulation) -> None:
         self._sim, self._home = sim, Home(sim)
         self._rests = rest_steps(task.goal) > 0
-        self._was_home = True
+        self._was_home, self._before = True, sim.proprio()
         self._noted: list[tuple[Atom, Moment]] = []
         self._rest: Moment | None = None
 
@@ -124,13 +126,15 @@ class _Watcher:
         self._rest = None
 
     def look_for_rest(self, step: int) -> None:
-        """Photograph the hand's coming home: if nothing follows, this is where it decided to rest."""
+        """Photograph the hand that has come home and stands: if nothing follows, this is where it decided to rest."""
         if not self._rests:
             return
-        now = self._sim.holds(HOME)
-        if now and not self._was_home:
+        now = self._sim.proprio()
+        still = bool(np.abs(now - self._before).max() <= STILL)
+        if self._sim.holds(HOME) and still and not self._was_home:
             self._rest = self._photograph(REST, step)
-        self._was_home = now
+        self._was_home = self._sim.holds(HOME) and (still or self._was_home)
+        self._before = now
 
     def moments(self, success: bool) -> tuple[Moment, ...]:
         """Return the decisions of an episode that has ended."""
