@@ -99,9 +99,7 @@ class Episode:
         """Put the scene back exactly as it was, unless something was hidden in it, and hand over to the policy."""
         if self.step_index:
             self.prompt_shown = self._prompt.shown
-            self.sim.highlights = ()
-            if self.task.prompt is None or self.task.prompt.restores:
-                self.sim.restore(self._start)
+            self.sim.end_prompt(self._start)
         self.sim.begin_execution()
         self._demonstrator = None
         self.exec_start = self.step_index
