@@ -1,17 +1,18 @@
-"""Write the strict suite's task folders: ``python scripts/strict_suite``.
+"""Write the strict suite's task folders: ``python scripts/strict_suite``; ``--check`` says which are not as written.
 
-The folders are the data; this is how their thirty times three texts and formulas are kept alike. A test compares both.
+The folders are the data; this is how thirty tasks' formulas and texts are kept alike.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable
 
 import counting
 import finding
 import ordering
 import prompted
-from folders import Twin, write
+from folders import Twin, files, write
 
 
 def twins() -> Iterable[Twin]:
@@ -19,7 +20,19 @@ def twins() -> Iterable[Twin]:
     return [*counting.twins(), *ordering.twins(), *finding.twins(), *prompted.twins()]
 
 
+def stale() -> list[str]:
+    """Return the files that are missing or say something else than is written here."""
+    return [
+        str(path)
+        for twin in twins()
+        for path, text in ((twin.folder / name, text) for name, text in files(twin).items())
+        if not path.is_file() or path.read_text(encoding="utf-8") != text
+    ]
+
+
 if __name__ == "__main__":
+    if "--check" in sys.argv[1:]:
+        sys.exit("\n".join(stale()) or 0)
     for twin in twins():
         write(twin)
         print(twin.folder)

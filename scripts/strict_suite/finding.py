@@ -86,7 +86,7 @@ def _setting(asked: Thing, drawer: str, hidden: tuple[tuple[Thing, str], ...]) -
     place = region(drawer)
     wrong = tuple(Atom("open", (region(other),)) for other in DRAWERS if other != drawer)
     on_table = Atom("on", (asked.instance, SPOT.full_name))
-    goal: Formula = And((Never(Or(wrong)), on_table))
+    goal: Formula = And((Never(Or(wrong)), Atom("wasopen", (place,)), on_table))
     checkpoints = (Atom("open", (place,)), Not(Atom("in", (asked.instance, place))), goal)
     return Setting(
         f"find the {asked.words} in the cabinet and put it on the table",

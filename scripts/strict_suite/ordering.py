@@ -11,16 +11,11 @@ from words import DRAWERS, Texts, ready, region
 from lerobot_memobench.tasks.bddl.problem import Region
 from lerobot_memobench.tasks.formula import And, Atom, Exactly, Formula, Not, Or, Round, When
 
-BOWL, PAN, WHITE, STOVE, MICROWAVE = (
-    "akita_black_bowl_1",
-    "chefmate_8_frypan_1",
-    "white_bowl_1",
-    "flat_stove_1",
-    "microwave_1",
-)
+BOWL, PAN, WHITE = "akita_black_bowl_1", "chefmate_8_frypan_1", "white_bowl_1"
+STOVE, MICROWAVE = "flat_stove_1", "microwave_1"
 ASIDE = Region("akita_black_bowl_init_region", "kitchen_table", ((0.175, 0.125, 0.225, 0.175),))
-"""Where the bowl stands while all drawers are checked: where it stands as published the hand at the lowest handle pushes
-it, and a moved bowl would tell which drawer has been open."""
+"""Where the bowl stands while all drawers are checked: where it stands as published, the hand at the lowest handle
+pushes it, and a moved bowl would tell which drawer has been open."""
 
 Event = tuple[Atom, Atom]
 """Atoms between which something is under way."""
@@ -98,7 +93,7 @@ def _checked(order: Sequence[str]) -> tuple[Texts, Texts, Texts]:
         (
             "every drawer inspected once",
             f"pulled out and shut the {a}, the {b} and the {c} drawer, each once",
-            f"looked into the cabinet's {c} drawer and pushed it shut; {a}, {b} and {c} have been inspected in this order",
+            f"looked into the cabinet's {c} drawer and pushed it shut; {a}, {b} and {c} were inspected in this order",
         ),
     )
 
@@ -174,7 +169,7 @@ def _bowl_on_plate() -> Twin:
             (
                 "bowl moved to plate",
                 "moved the white bowl onto the plate",
-                "with the microwave opened and shut once, took the white bowl from its top and set it down on the plate",
+                "with the microwave opened and shut once, set the white bowl from its top down on the plate",
             ),
         ),
     )

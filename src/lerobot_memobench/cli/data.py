@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lerobot_memobench.cli.console import console, counting
+from lerobot_memobench.cli.suite import OfSuite
 
 if TYPE_CHECKING:
     from lerobot_memobench.datasets.validate import Verdict
@@ -54,11 +55,15 @@ def convert(
 def validate(
     folder: Annotated[Path, typer.Argument(help="Folder of a dataset, of HDF5 files of this package, or of both.")],
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    suite: OfSuite = None,
 ) -> int:
     """Replay every episode in the simulator; report the first disagreement of each."""
+    from lerobot_memobench.datasets.suites import check_suite_of
     from lerobot_memobench.datasets.validate import exit_status
     from lerobot_memobench.datasets.validate import validate as run
 
+    if suite is not None:
+        check_suite_of(folder, suite)
     screen = console()
     with counting(screen, "episodes") as count:
 
@@ -90,10 +95,14 @@ def push(
 def describe(
     folder: Annotated[Path, typer.Argument(help="Folder of a finished dataset.")],
     out: Annotated[Path | None, typer.Option(help="Where to; DATASET/description when left out.")] = None,
+    suite: OfSuite = None,
 ) -> int:
     """Keep of a dataset what fits into a repository: figures, the card's tables, the hash of every episode."""
     from lerobot_memobench.datasets.describe import describe as run
+    from lerobot_memobench.datasets.suites import check_suite_of
 
+    if suite is not None:
+        check_suite_of(folder, suite)
     screen = console()
     for file in run(folder, out or folder / "description", say=lambda text: screen.print(text, markup=False)):
         screen.print(str(file), soft_wrap=True)

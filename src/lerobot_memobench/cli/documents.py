@@ -59,12 +59,15 @@ ENDINGS = {
 
 def given_runs(folders: list[str] | None, with_: Beside | None) -> tuple[list[Run], bool]:
     """Return the evaluations and whether the paper's figures are drawn; one of both is needed."""
+    from lerobot_memobench.evaluation.documents.beside_paper import check_beside
     from lerobot_memobench.evaluation.records.runs import read_runs
 
     paper = with_ is Beside.PAPER
     if not folders and not paper:
         raise MemobenchError("there is nothing to draw; name folders of evaluations, or --with paper, or both")
-    return (read_runs(folders) if folders else []), paper
+    runs = read_runs(folders) if folders else []
+    check_beside(runs, paper)
+    return runs, paper
 
 
 def show_report(report: Report, name: str, formats: Sequence[ReportFormat] | None, out: Path | None) -> None:

@@ -11,6 +11,7 @@ import typer
 from lerobot_memobench.cli.console import console
 from lerobot_memobench.cli.documents import Folders, With, given_runs
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.tasks.task import PUBLISHED
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -144,7 +145,7 @@ def _chosen(spec: str, runs: list[Run]) -> list[str]:
     there = {name: memory_type for run in runs for name, memory_type in run.summary.memory_type_of.items()}
     if spec in there:
         return [spec]
-    chosen = resolve_tasks(spec)
+    chosen = resolve_tasks(spec, runs[0].protocol.get("suite", PUBLISHED) if runs else PUBLISHED)
     return [name for name in chosen if name in there] or chosen
 
 

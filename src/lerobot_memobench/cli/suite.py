@@ -20,3 +20,6 @@ class Suite(StrEnum):
 WhichSuite = Annotated[
     Suite, typer.Option(help="published: the thirty tasks as published; strict: their twins that need a memory.")
 ]
+OfSuite = Annotated[
+    Suite | None, typer.Option(help="Refuse a dataset that holds tasks of another suite; any when left out.")
+]

@@ -73,5 +73,5 @@ def task_table(found: Sequence[Task]) -> Table:
         if k and task.memory_type != found[k - 1].memory_type:
             table.add_section()
         prompt = task.prompt.kind if task.prompt else ""
-        table.add_row(task.memory_type, task.name, task.operations, prompt, task.language)
+        table.add_row(task.memory_type, task.name, task.operations, prompt, task.title)
     return table

@@ -80,6 +80,7 @@ def generate(
             f"{len(tasks)} tasks, {episodes} episodes, {workers} workers were asked for; each must be at least 1"
         )
     check_executor(executor, executor_options)
+    _check_prompts(tasks, prompt_video)
     settings = RecordingSettings(referent, images, image_size, prompt_video, hold_frames)
     plan = _Plan(tuple(tasks), episodes, seed_base, settings, _checked_formats(formats, images))
     if is_finished(out):
@@ -100,6 +101,15 @@ def generate(
         if not complete:
             return GenerationSummary(None, summarise([], tasks, out).tasks, submitted=True)
         return _assemble(plan, jobs, out, repo_id)
+
+
+def _check_prompts(tasks: Sequence[Task], prompt_video: bool) -> None:
+    hiding = next((task for task in tasks if task.prompt is not None and not task.prompt.restores), None)
+    if hiding is not None and not prompt_video:
+        raise MemobenchError(
+            f"demonstrations of {hiding.name} were asked for without its prompt video, which hides what is to be "
+            "found; leave out --no-prompt-video"
+        )
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ class Episode:
         task: the published task.
         referent: `fixed`, the catalogue's goal, or `random`, one of the task's variants by seed; of the strict suite
             one of the variants always.
-        prompt_video: whether object and procedural tasks begin with their prompt.
+        prompt_video: whether tasks that have a prompt begin with it; what a prompt hides is hidden unseen without.
         horizon: execution steps before truncation.
         render: size and quality of frames.
 
@@ -89,7 +89,8 @@ class Episode:
         self._expert: Expert | None = None
         self._blind: BlindRoutine | None = None
         self._demonstrator: Iterator[NDArray[np.float32]] | None = None
-        if self.prompt_video:
+        hides = task.prompt is not None and not task.prompt.restores
+        if self.prompt_video or hides:
             self._prompt = PromptDemonstrator(task, self.sim, self._rng(2))
             self._demonstrator = self._prompt.actions()
             self._next_prompt_action = next(self._demonstrator, None)
@@ -97,14 +98,20 @@ class Episode:
                 self._begin_execution()
         else:
             self._begin_execution()
+        if hides and not self.prompt_video:
+            self._hide_unseen()
+
+    def _hide_unseen(self) -> None:
+        """Play the prompt before the first frame: without it there would be nothing to find."""
+        while self.phase == PROMPT:
+            self.step(np.zeros(ACTION_DIM, np.float32))
+        self.step_index = self.exec_start = 0
 
     def _begin_execution(self) -> None:
         """Put the scene back exactly as it was, unless something was hidden in it, and hand over to the policy."""
         if self.step_index:
             self.prompt_shown = self._prompt.shown
-            self.sim.highlights = ()
-            if self.task.prompt is None or self.task.prompt.restores:
-                self.sim.restore(self._start)
+            self.sim.end_prompt(self._start)
         self.sim.begin_execution()
         self._demonstrator = None
         self.exec_start = self.step_index

@@ -156,7 +156,10 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
                 self._film.add(self.render())
 
     def step(self, action: NDArray[np.float32]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Advance by one control step of 50 ms. The reward is 1 at success, else 0."""
+        """Advance by one control step of 50 ms. The reward is 1 at success, else 0.
+
+        An episode terminates by success and, of a strict task, by the loss of its goal; the horizon truncates it.
+        """
         episode = self.episode
         # A dataset's labels count what was completed before a frame; what this step completes is told one frame later.
         completed = episode.progress.index
@@ -168,8 +171,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             self._film.add(self.render())
         if episode.done and not self._over:
             self._end()
-        success = episode.success
-        return self._observation(), float(success), success, episode.done and not success, self._info()
+        success, ended = episode.success, episode.success or episode.lost
+        return self._observation(), float(success), ended, episode.done and not ended, self._info()
 
     def _draw(self) -> None:
         self._images, self._picture_step = self.episode.images(), self.episode.step_index

@@ -62,7 +62,7 @@ def lean_from_fixtures(hand: Hand, name: str, target: Array) -> Array:
     """Return by how much and whither the hand should lean to keep clear of tall fixtures beside it, (3,), rad."""
     drawer = drawer_around(hand, name)
     if drawer is not None:
-        return DRAWER_LEAN * outward_of(hand, drawer)
+        return DRAWER_LEAN * outward_of(hand, hand.sim.world.articulation(drawer)[0])
     lean = np.zeros(3)
     for centre, rotation, half in tall_boxes(hand, name):
         local = rotation.T @ (target - centre)

@@ -37,12 +37,12 @@ def outward_of(hand: Hand, articulation: Articulation) -> Array:
     return outward / np.linalg.norm(outward)
 
 
-def drawer_around(hand: Hand, name: str) -> Articulation | None:
-    """Return the drawer in which a thing lies, if any."""
+def drawer_around(hand: Hand, name: str) -> str | None:
+    """Return the region of the drawer in which a thing lies, if any."""
     for asset in hand.sim.assets.values():
         for region, articulation in asset.articulations.items():
             if articulation.kind == "drawer" and hand.sim.holds(Atom("in", (name, asset.regions[region]))):
-                return articulation
+                return asset.regions[region]
     return None
 
 

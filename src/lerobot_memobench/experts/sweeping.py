@@ -20,7 +20,7 @@ LEAD = 0.16
 GRIP_BELOW = 0.018
 """How far under a handle's upper end it is taken, m."""
 PUSH_IN, PUSH_BELOW = 0.045, 0.030
-"""Where a door is pushed: so far from its upper edge's end towards the hinge, beside the handle, and so far below, m."""
+"""Where a door is pushed: beside the handle towards the hinge by so much, and so far below its upper edge, m."""
 BEFORE, TOUCHING = 0.06, 0.018
 """Distance of the hand from the panel's middle before and while it pushes, m."""
 STEPS = 150

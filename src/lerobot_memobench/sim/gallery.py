@@ -132,7 +132,7 @@ def draw_tasks(names: Sequence[str] | None = None, seed: int = SEED, size: int =
         task = get_task(name)
         sim = Simulation(task, RenderSettings(size, size, "high"))
         sim.reset(seed)
-        cells.append((f"{task.memory_type}: {task.language}", sim.render("agentview")))
+        cells.append((f"{task.memory_type}: {task.title}", sim.render("agentview")))
     return grid(cells, min(columns, len(cells)), label=11, lines=3)
 
 

@@ -187,6 +187,14 @@ class Simulation:
         self._controller.gripper = snapshot.gripper.copy()
         mujoco.mj_step1(self.model, self.data)
 
+    def end_prompt(self, start: Snapshot) -> None:
+        """Undo what a prompt video has done since ``start``: all of it, or, where it hid something, the arm alone."""
+        self.highlights = ()
+        if self.task.prompt is None or self.task.prompt.restores:
+            self.restore(start)
+        else:
+            self.restore_arm(start)
+
     def restore_arm(self, snapshot: Snapshot) -> None:
         """Put arm, fingers and controller back as in a snapshot, to the bit; all other things stay as they are.
 
@@ -226,6 +234,11 @@ class Simulation:
     def eef_pose(self) -> tuple[Array, Array]:
         """Return position (3,) and rotation (3, 3) of the grip site, between the finger tips."""
         return self.data.site_xpos[self._grip].copy(), self.data.site_xmat[self._grip].reshape(3, 3).copy()
+
+    @property
+    def home(self) -> tuple[Array, Array]:
+        """Position (3,) and rotation (3, 3) of the grip site after the scene has settled."""
+        return self._start.home
 
     def gripper_opening(self) -> float:
         """Return the distance between the fingers, m."""

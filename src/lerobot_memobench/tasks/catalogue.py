@@ -32,6 +32,11 @@ def _suite_of(name: str) -> str:
     return _folders()[name].parent.parent.name
 
 
+def suite_of(name: str) -> str | None:
+    """Return the suite of a task of the catalogue, None for a name that is not in it."""
+    return _suite_of(name) if name in _folders() else None
+
+
 def check_suite(suite: str, what: str = "suite") -> str:
     """Return the name of a suite; an unknown one is an error, in which ``what`` says where it was given."""
     if suite not in SUITES:

@@ -1,17 +1,15 @@
 """Formulas of goals and checkpoints: trees of atoms under operators, the published four and the strict suite's five.
 
 What an atom means is the world's business; what operators and latches (``wasopen``, ``wasturnedon``) mean over time
-is `tasks.nodes`'s (the table is in ``docs/formulas.md``). Here stand the words of the language, how formulas are made,
-walked through and written.
+is `tasks.nodes`'s (the table is in ``docs/formulas.md``). Here stand the words of the language, how formulas are
+walked through and written; `tasks.formula_making` makes checked ones.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
-
-from lerobot_memobench.errors import MemobenchError, nearest
 
 #: Predicate (lower case) -> (spelling in BDDL, number of arguments).
 PREDICATES: dict[str, tuple[str, int]] = {
@@ -126,29 +124,6 @@ _OPERATORS = (And, Or, Not, Then, Never, Hold, Exactly, When, Round)
 #: Word (lower case) -> operator; its class's name is the spelling in BDDL.
 OPERATORS: dict[str, type[Formula]] = {made.__name__.lower(): made for made in _OPERATORS}
 
-#: Operators over a fixed number of formulas; the others take one or more.
-_PARTS: dict[type[Formula], int] = {Not: 1, Never: 1, Hold: 1, Exactly: 1, When: 2}
-_WORDS = {1: "exactly one", 2: "exactly two"}
-
-
-# --- making ---
-
-
-def make_atom(predicate: str, args: Sequence[str], where: str = "formula") -> Atom:
-    """Return a checked atom; ``where`` (file and line) opens the message of a ``MemobenchError``."""
-    key = predicate.lower()
-    if key not in PREDICATES:
-        hint = nearest(key, [*PREDICATES, *OPERATORS])
-        raise MemobenchError(f"{where}: found the unknown predicate or operator {predicate!r}, {hint}")
-    spelling, arity = PREDICATES[key]
-    if len(args) != arity:
-        raise MemobenchError(
-            f"{where}: found {len(args)} argument(s) after {spelling}, expected {arity} entity name(s)"
-        )
-    if len(set(args)) != len(args):
-        raise MemobenchError(f"{where}: found {spelling} with {args[0]!r} twice, expected two different entities")
-    return Atom(key, tuple(args))
-
 
 def is_operator(word: str) -> bool:
     """Return whether ``word`` is an operator's, in any case."""
@@ -158,34 +133,6 @@ def is_operator(word: str) -> bool:
 def takes_number(word: str) -> bool:
     """Return whether ``word`` is an operator whose formula follows a number, such as ``Exactly 2``."""
     return word.lower() in ("hold", "exactly")
-
-
-def make_operator(
-    operator: str, parts: Sequence[Formula], where: str = "formula", number: int | None = None
-) -> Formula:
-    """Return ``operator`` (any case) over its parts; `Hold` and `Exactly` need a ``number`` from 1 on."""
-    key = operator.lower()
-    if key not in OPERATORS:
-        raise MemobenchError(f"{where}: found the operator {operator!r}, {nearest(key, OPERATORS)}")
-    made = OPERATORS[key]
-    if not parts:
-        raise MemobenchError(f"{where}: found {made.__name__} with nothing in it, expected at least one formula")
-    if len(parts) != _PARTS.get(made, len(parts)):
-        raise MemobenchError(
-            f"{where}: found {made.__name__} over {len(parts)} formulas, expected {_WORDS[_PARTS[made]]}"
-        )
-    if takes_number(key):
-        return made(check_number(number, made.__name__, where), parts[0])  # type: ignore[call-arg, arg-type]
-    if key in ("not", "never"):
-        return made(parts[0])  # type: ignore[call-arg, arg-type]
-    return made(tuple(parts))  # type: ignore[call-arg, arg-type]
-
-
-def check_number(number: Any, after: str, where: str) -> int:
-    """Return the number that stands after an operator's word; raise where it is none from 1 on."""
-    if not isinstance(number, int) or isinstance(number, bool) or not 1 <= number <= MAX_NUMBER:
-        raise MemobenchError(f"{where}: found {number!r} after {after}, expected a whole number from 1 to {MAX_NUMBER}")
-    return number
 
 
 # --- walking ---

@@ -11,10 +11,9 @@ from lerobot_memobench.tasks.formula import (
     OPERATORS,
     Formula,
     is_operator,
-    make_atom,
-    make_operator,
     takes_number,
 )
+from lerobot_memobench.tasks.formula_making import make_atom, make_operator
 
 _KEYS = ", ".join(map(repr, OPERATORS))
 
@@ -40,7 +39,8 @@ def _parse(value: Any, where: str, depth: int) -> Formula:
     else:
         raise MemobenchError(f"{where}: found {short(value)}, expected a formula such as ['on', 'a', 'b']")
     if is_operator(head):
-        number, parts = (items[0], items[1:]) if takes_number(head) and items else (None, items)
+        numbered = takes_number(head) and items and not isinstance(items[0], (list, tuple, Mapping))
+        number, parts = (items[0], items[1:]) if numbered else (None, items)
         return make_operator(head, [_parse(item, where, depth + 1) for item in parts], where, number)
     for item in items:
         if not isinstance(item, str) or not item:

@@ -13,7 +13,8 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.bddl.problem import Problem
 from lerobot_memobench.tasks.bddl.reading import parse_bddl
 from lerobot_memobench.tasks.formula import LATCHES, atoms
-from lerobot_memobench.tasks.metadata import Metadata, read_text
+from lerobot_memobench.tasks.metadata import Metadata
+from lerobot_memobench.tasks.metadata_file import read_text
 from lerobot_memobench.tasks.task import (
     BDDL_FILE,
     MEMORY_TYPES,

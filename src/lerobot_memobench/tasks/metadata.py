@@ -11,7 +11,6 @@ is the prompt {"kind": "hide", "places": [[thing, drawer], ...]}. Other keys are
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast, get_args
@@ -20,6 +19,7 @@ from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.tasks.bddl.problem import Problem
 from lerobot_memobench.tasks.formula import Formula, rename
 from lerobot_memobench.tasks.formula_parsing import parse_formula, short
+from lerobot_memobench.tasks.metadata_file import HOLDS, json_object
 from lerobot_memobench.tasks.task import (
     MEMORY_TYPES,
     OPERATIONS,
@@ -37,11 +37,6 @@ from lerobot_memobench.tasks.task import (
 )
 
 _REQUIRED = ("memory", "operating_type", "subtask_goals")
-_HOLDS = (
-    "'memory' (three texts per checkpoint: coarse, intermediate, fine), 'operating_type' (three labels per checkpoint: "
-    "0 Storage, 1 Update, 2 Compression), 'subtask_goals' (one formula per checkpoint) and 'key_frame' (-1 per "
-    "checkpoint)"
-)
 _VARIANT_KEYS = {
     "memory",
     "substitute",
@@ -53,44 +48,6 @@ _VARIANT_KEYS = {
     "prompt",
     "replaces_published",
 }
-
-
-def read_text(path: Path, holds: str) -> str:
-    """Return a file's text; ``holds`` says what should be in it, for the message when it cannot be read."""
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise MemobenchError(f"{path} is missing, expected a file that holds {holds}") from None
-    except UnicodeDecodeError as error:
-        raise MemobenchError(
-            f"{path}: found a byte at offset {error.start} that is no UTF-8, expected UTF-8 text"
-        ) from None
-    except OSError as error:
-        raise MemobenchError(f"{path} cannot be read ({error.strerror}), expected a file that holds {holds}") from None
-
-
-def _json_object(path: Path) -> dict[str, Any]:
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        keys = [key for key, _ in pairs]
-        for key in keys:
-            if keys.count(key) > 1:
-                raise MemobenchError(f"{path}: found the key {key!r} twice in one object, expected it once")
-        return dict(pairs)
-
-    text = read_text(path, _HOLDS)
-    try:
-        data = json.loads(text, object_pairs_hook=unique)
-    except json.JSONDecodeError as error:
-        raise MemobenchError(
-            f"{path}, line {error.lineno}: found no valid JSON ({error.msg}), expected an object"
-        ) from None
-    except MemobenchError:
-        raise
-    except (ValueError, RecursionError) as error:
-        raise MemobenchError(f"{path}: found JSON that cannot be read ({error}), expected an object") from None
-    if not isinstance(data, dict):
-        raise MemobenchError(f"{path}: found {short(data)}, expected a JSON object that holds {_HOLDS}")
-    return data
 
 
 def _is_int(value: Any) -> bool:
@@ -119,11 +76,11 @@ class Metadata:
     @classmethod
     def read(cls, path: Path, problem: Problem) -> Metadata:
         """Read a file that must be there."""
-        data = _json_object(path)
+        data = json_object(path)
         missing = [key for key in _REQUIRED if key not in data]
         if missing:
             lacks = ", ".join(map(repr, missing))
-            raise MemobenchError(f"{path} lacks {lacks}, expected an object that holds {_HOLDS}")
+            raise MemobenchError(f"{path} lacks {lacks}, expected an object that holds {HOLDS}")
         return cls(path, problem, data)
 
     def _error(self, place: str, found: Any, expected: str) -> MemobenchError:

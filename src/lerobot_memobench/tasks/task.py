@@ -118,7 +118,7 @@ class Task:
         bddl_text, metadata: the files as read.
         suite: what it belongs to; an episode of the strict suite ends when its goal can no longer be reached.
         twin_of: the published task in whose scene it takes place; None for a task of its own.
-        drawn: every episode draws its variant by seed, whatever referent is asked for.
+        drawn: every episode draws its variant by seed, whatever referent is asked for; a variant is not drawn again.
         spoilt_as: failure class of an episode whose goal could no longer be reached; None for that of its checkpoints.
     """
 
@@ -163,6 +163,11 @@ class Task:
         return self.twin_of or self.name
 
     @property
+    def title(self) -> str:
+        """What the task asks in all of its variants: its instruction, or its name where they differ in it."""
+        return self.name.replace("_", " ") if any(one.language for one in self.variants) else self.language
+
+    @property
     def operations(self) -> str:
         """Operation labels of the checkpoints at the evaluated level, e.g. "SUC"."""
         return "".join(checkpoint.operation for checkpoint in self.checkpoints)
@@ -179,7 +184,7 @@ class Task:
         return tuple(range(first, self.num_variants))
 
     def variant(self, k: int) -> Task:
-        """Return the task with goal, checkpoints, texts and prompt of variant ``k``; 0 is as published."""
+        """Return the task with instruction, goal, checkpoints, texts and prompt of variant ``k``; 0 is as published."""
         base = self.published or self
         if k == 0:
             return base
@@ -204,4 +209,5 @@ class Task:
             demo_summary=chosen.demo_summary or base.demo_summary,
             variant_index=k,
             published=base,
+            drawn=False,
         )

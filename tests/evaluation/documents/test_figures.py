@@ -14,6 +14,7 @@ from lerobot_memobench.evaluation.documents.figures import correlations, entries
 from lerobot_memobench.evaluation.records.runs import Run, read_runs
 from lerobot_memobench.paper import published_rows
 from lerobot_memobench.tasks.failures import FAILURES
+from lerobot_memobench.tasks.task import STRICT_FAILURES
 
 from .. import logs
 
@@ -145,7 +146,7 @@ def test_replan_curves(runs: list[Run]) -> None:
 
 def test_operations_have_the_colours_of_the_videos() -> None:
     assert {key: "#" + bytes(colour).hex() for key, colour in OPERATION_COLOURS.items()} == style.OPERATION_COLOURS
-    assert list(style.OUTCOMES) == ["success", *FAILURES]
+    assert list(style.OUTCOMES) == ["success", *FAILURES, *STRICT_FAILURES]
     assert len({look.hatch for look in style.OUTCOMES.values()}) == len(style.OUTCOMES)
 
 

@@ -11,7 +11,7 @@ from lerobot_memobench.evaluation.records.protocol import SETTINGS
 from lerobot_memobench.evaluation.records.runs import Run
 
 SCENES = "scene_hash"
-ALLOWED = (*SETTINGS, SCENES)
+ALLOWED = (*(name for name in SETTINGS if name != "suite"), SCENES)
 """What may differ between both when asked for by name."""
 
 Pair = tuple[Record, Record]

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.tables import Cell, Count, Section, Table
 from lerobot_memobench.evaluation.documents.wide_tables import run_row, wide_table
 from lerobot_memobench.evaluation.metrics.rates import METRICS, Rate
 from lerobot_memobench.evaluation.records.runs import Run
 from lerobot_memobench.paper import PublishedRow, failure_taxonomy, published_rows
-from lerobot_memobench.tasks.task import MEMORY_TYPES
+from lerobot_memobench.tasks.task import MEMORY_TYPES, PUBLISHED
 
 PAPER_PROTOCOL = {"referent": "fixed", "prompt_video": True, "horizon": 1200, "seed_base": 7}
 PAPER_TASKS, PAPER_EPISODES = 30, 50
@@ -20,6 +21,20 @@ TABLES = (
     ("paper-reference", "Beside the paper's oracle memory and MemER", ("oracle", "memer")),
 )
 """Key, title, and which of the paper's tables it holds."""
+
+
+def check_beside(runs: Sequence[Run], paper: bool) -> None:
+    """Refuse to stand the paper's figures (``paper``) beside those of other tasks than it published.
+
+    Raises:
+        MemobenchError: naming the first such evaluation.
+    """
+    other = next((run for run in runs if run.protocol.get("suite", PUBLISHED) != PUBLISHED), None)
+    if paper and other is not None:
+        raise MemobenchError(
+            f"{other.folder} is an evaluation of the {other.protocol['suite']} suite, the paper's figures are of the "
+            "published one; leave out --with paper"
+        )
 
 
 def beside_paper(runs: Sequence[Run]) -> Section:

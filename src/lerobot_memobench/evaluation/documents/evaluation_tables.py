@@ -8,7 +8,6 @@ from lerobot_memobench.evaluation.documents.sentences import count_of
 from lerobot_memobench.evaluation.documents.tables import Cell, Count, Name, Numbers, Table, figure
 from lerobot_memobench.evaluation.metrics.rates import METRICS, Rate, Row
 from lerobot_memobench.evaluation.metrics.summary import Summary
-from lerobot_memobench.tasks.failures import FAILURES
 
 AVERAGE = "average of memory types"
 
@@ -99,6 +98,13 @@ def prefix(summary: Summary) -> Table:
 # --- failures ---
 
 
+STRICT_NOTES = {
+    "miscount": " Miscount: the event was done too seldom or too often.",
+    "wrong_place": " Wrong place: the thing was looked for where it is not.",
+}
+"""Classes that only strict tasks have -> what the table says of them."""
+
+
 def failures(summary: Summary) -> Table:
     """Return how rollouts ended, in all and by memory type."""
     counts: dict[str, Mapping[str, int]] = {"all": outcomes(summary, summary.tasks)}
@@ -106,7 +112,7 @@ def failures(summary: Summary) -> Table:
         counts[memory_type] = outcomes(summary, _tasks_of(summary, memory_type))
     total = summary.rollouts
     rows: list[tuple[Cell, ...]] = []
-    for outcome in ("success", *FAILURES):
+    for outcome in ("success", *summary.failures):
         found = [Count(column[outcome]) for column in counts.values()]
         rows.append((outcome.replace("_", " "), *found, Rate(found[0] / total, total)))
     return Table(
@@ -117,7 +123,7 @@ def failures(summary: Summary) -> Table:
         note=(
             "A failed rollout is named after the first checkpoint that was never satisfied: Storage, Update (stale "
             "memory) or Compression; reference drift where a wrong sibling took the place; execution failure where "
-            "all checkpoints were satisfied."
+            "all checkpoints were satisfied." + "".join(STRICT_NOTES.get(name, "") for name in summary.failures)
         ),
         rules=frozenset({1}),
     )
@@ -126,7 +132,7 @@ def failures(summary: Summary) -> Table:
 def outcomes(summary: Summary, names: Iterable[str]) -> dict[str, int]:
     """Return how the rollouts of some tasks ended: success, then every class of failure -> rollouts."""
     names = list(names)
-    found = {failure: sum(summary.failures_of[name][failure] for name in names) for failure in FAILURES}
+    found = {failure: sum(summary.failures_of[name].get(failure, 0) for name in names) for failure in summary.failures}
     return {"success": sum(summary.tasks[name]["SR"].n for name in names) - sum(found.values()), **found}
 
 

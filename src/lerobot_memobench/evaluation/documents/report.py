@@ -17,7 +17,7 @@ from lerobot_memobench.envs.episode_log import read_episodes, write_episodes
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.evaluation.documents import evaluation_tables as tables
 from lerobot_memobench.evaluation.documents import formats, sentences
-from lerobot_memobench.evaluation.documents.beside_paper import beside_paper
+from lerobot_memobench.evaluation.documents.beside_paper import beside_paper, check_beside
 from lerobot_memobench.evaluation.documents.replan_sweep import sweep
 from lerobot_memobench.evaluation.documents.report_csv import HEADER, csv_rows
 from lerobot_memobench.evaluation.documents.report_json import report_data
@@ -100,7 +100,11 @@ def build(runs: Sequence[Run], paper: bool = False) -> Report:
 
     Args:
         paper: stand the published figures beside.
+
+    Raises:
+        MemobenchError: the published figures are wanted beside those of other tasks.
     """
+    check_beside(runs, paper)
     found = []
     if len(runs) > 1:
         found.append(Section("Evaluations", (overview(runs),)))

@@ -8,6 +8,9 @@ from collections.abc import Iterable
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.evaluation.metrics.rollouts import Record
 from lerobot_memobench.tasks.failures import FAILURES, classify
+from lerobot_memobench.tasks.task import STRICT_FAILURES
+
+_ALL = (*FAILURES, *STRICT_FAILURES)
 
 
 def failure_of(record: Record) -> str | None:
@@ -22,15 +25,14 @@ def failure_of(record: Record) -> str | None:
     if logged is None:
         checkpoints = record["checkpoints"]
         return classify([c["operation"] for c in checkpoints], [c["first_step"] for c in checkpoints], False)
-    if logged not in FAILURES:
+    if logged not in _ALL:
         raise MemobenchError(
-            f"a rollout of {record['task']!r} has the unknown failure class {logged!r}, "
-            + nearest(str(logged), FAILURES)
+            f"a rollout of {record['task']!r} has the unknown failure class {logged!r}, " + nearest(str(logged), _ALL)
         )
     return str(logged)
 
 
 def failure_counts(records: Iterable[Record]) -> dict[str, int]:
-    """Return class -> number of failed rollouts, every class in the report's order."""
+    """Return class -> number of failed rollouts, in the report's order: every published class, strict ones as found."""
     found = Counter(failure_of(record) for record in records)
-    return {name: found[name] for name in FAILURES}
+    return {name: found[name] for name in _ALL if name in FAILURES or found[name]}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from lerobot_memobench.envs.protocol import EXTENT, OF_THE_POLICY, POLICY, SETTI
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records.card_schema import Card, WholeCard
 from lerobot_memobench.files.reading import read_json
+from lerobot_memobench.tasks.task import PUBLISHED
 
 __all__ = [
     "CARD_FILE",
@@ -19,6 +20,7 @@ __all__ = [
     "POLICY",
     "SETTINGS",
     "differences",
+    "one_suite",
     "protocol_of_log",
     "read_card",
     "read_protocol",
@@ -31,9 +33,9 @@ def read_protocol(folder: str | Path) -> dict[str, Any]:
     """Return the protocol of the evaluation in ``folder``.
 
     Keys: ``tasks`` (names, sorted) and ``episodes`` (per task; the largest number where they differ) as asked for, or
-    as found in the log where nobody wrote down what was asked for; ``seed_base``, ``referent``, ``prompt_video``,
-    ``prompt_in``, ``horizon``, ``replan_steps``, ``render``, ``render_every`` as far as they are known; ``policy``,
-    what is known of the policy ({} for plain ``lerobot-eval``).
+    as found in the log where nobody wrote down what was asked for; ``suite``; ``seed_base``, ``referent``,
+    ``prompt_video``, ``prompt_in``, ``horizon``, ``replan_steps``, ``render``, ``render_every`` as far as they are
+    known; ``policy``, what is known of the policy ({} for plain ``lerobot-eval``).
 
     Raises:
         MemobenchError: there is no evaluation in the folder.
@@ -41,6 +43,8 @@ def read_protocol(folder: str | Path) -> dict[str, Any]:
     folder = Path(folder)
     card = read_card(folder / CARD_FILE) if (folder / CARD_FILE).is_file() else {}
     told: dict[str, Any] = {**card.get("protocol", {}), **read_protocol_file(folder)}
+    if told:
+        told.setdefault("suite", PUBLISHED)  # written before there was another
     if not set(EXTENT) <= set(told) or not set(SETTINGS) <= set(told):
         told = {**protocol_of_log(read_episodes(folder)), **told}
     return {**told, POLICY: card.get(POLICY, {})}
@@ -54,9 +58,25 @@ def protocol_of_log(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
     if all(record.get("seed") is not None for record in records):
         _note(found, "seed_base", [record["seed"] - record["episode"] for record in records])
+    found["suite"] = one_suite(records)
     for key in ("referent", "replan_steps"):
         _note(found, key, [record[key] for record in records if key in record])
     return found
+
+
+def one_suite(records: Iterable[Mapping[str, Any]]) -> str:
+    """Return the suite of an evaluation's rollouts.
+
+    Raises:
+        MemobenchError: they are of several.
+    """
+    there = {record.get("suite", PUBLISHED) for record in records} or {PUBLISHED}
+    if len(there) > 1:
+        raise MemobenchError(
+            f"the rollouts are of the suites {' and '.join(sorted(there))}; report each suite by itself"
+        )
+    (suite,) = there
+    return str(suite)
 
 
 def _note(found: dict[str, Any], key: str, values: list[Any]) -> None:

@@ -17,7 +17,7 @@ from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics.rollouts import Record, mixtures
 from lerobot_memobench.evaluation.metrics.summary import Summary, summarise
-from lerobot_memobench.evaluation.records.protocol import POLICY, read_protocol
+from lerobot_memobench.evaluation.records.protocol import POLICY, one_suite, read_protocol
 
 HASH_DIGITS = 8
 
@@ -59,7 +59,8 @@ def read_runs(words: Sequence[str | Path]) -> list[Run]:
     """Read evaluations given as ``FOLDER`` or ``NAME=FOLDER``.
 
     Raises:
-        MemobenchError: a folder holds no rollouts, is given twice, or one method has two results at one interval.
+        MemobenchError: a folder holds no rollouts or is given twice, one method has two results at one interval, or
+            the suites differ.
     """
     given = [_split(word) for word in words]
     if not given:
@@ -69,7 +70,24 @@ def read_runs(words: Sequence[str | Path]) -> list[Run]:
     for (label, folder), name in zip(given, names, strict=True):
         records, notes = read_rollouts(folder)
         runs.append(Run(name, label or "", folder, records, read_protocol(folder), notes))
+    check_one_suite({run.folder: run.records for run in runs})
     return _with_methods(runs)
+
+
+def check_one_suite(records: Mapping[Path, Sequence[Record]]) -> None:
+    """Refuse evaluations (folder -> rollouts) of several suites: their figures are of other tasks.
+
+    Raises:
+        MemobenchError: naming two of them.
+    """
+    suites = {folder: one_suite(rollouts) for folder, rollouts in records.items()}
+    (first, reference), *others = suites.items()
+    for folder, suite in others:
+        if suite != reference:
+            raise MemobenchError(
+                f"{first} is an evaluation of the {reference} suite and {folder} one of the {suite} suite; report each "
+                "suite by itself"
+            )
 
 
 def read_rollouts(folder: str | Path) -> tuple[list[dict[str, Any]], list[str]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 from lerobot_memobench.tasks.bddl.problem import Problem
 from lerobot_memobench.tasks.bddl.sexpr import Node, Reader
@@ -15,10 +14,9 @@ from lerobot_memobench.tasks.formula import (
     Atom,
     Formula,
     is_operator,
-    make_atom,
-    make_operator,
     takes_number,
 )
+from lerobot_memobench.tasks.formula_making import make_atom, make_operator
 
 _NOT_IN_INIT = {*LATCHES, *SINCE_START}
 
@@ -37,16 +35,15 @@ def _formula(reader: Reader, problem: Problem, node: Node, depth: int = 0) -> Fo
     head, rest = reader.head(node, expected)
     where = reader.where(node)
     if is_operator(head):
-        number = _number(reader, rest.pop(0)) if takes_number(head) and rest else None
+        number = _number(rest.pop(0).word) if takes_number(head) and rest and rest[0].items is None else None
         return make_operator(head, [_formula(reader, problem, item, depth + 1) for item in rest], where, number)
     assert node.items is not None
     args = [reader.word(item, f"an entity name as argument of {node.items[0].word}") for item in rest]
     return problem.resolve(make_atom(node.items[0].word, args, where), where)
 
 
-def _number(reader: Reader, node: Node) -> Any:
-    """Return the whole number at ``node``, or the word that stands there instead."""
-    word = reader.word(node, "a whole number")
+def _number(word: str) -> int | str:
+    """Return a word as the whole number that it is, or as it stands."""
     return int(word) if word.isascii() and word.isdigit() and len(word) < 10 else word
 
 

@@ -45,6 +45,8 @@ OUTCOMES: dict[str, Look] = {
     "compression_collapse": Look(OPERATION_COLOURS["C"], "...."),
     "reference_drift": Look("#f0e442", "||||"),
     "execution_failure": Look("#d55e00", "xxxx"),
+    "miscount": Look("#cc79a7", "++++"),
+    "wrong_place": Look("#8a8a8a", "oooo"),
 }
 """Outcome -> look; the colours are those of the HTML report."""
 

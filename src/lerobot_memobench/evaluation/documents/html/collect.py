@@ -17,12 +17,12 @@ from lerobot_memobench.evaluation.documents.evaluation_tables import outcomes
 from lerobot_memobench.evaluation.documents.html.videos import episode_id
 from lerobot_memobench.evaluation.documents.sentences import count_of, settings_phrases
 from lerobot_memobench.evaluation.documents.tables import OPERATION_NAMES
-from lerobot_memobench.evaluation.metrics.failures import failure_of
+from lerobot_memobench.evaluation.metrics.failures import failure_counts, failure_of
 from lerobot_memobench.evaluation.metrics.rates import Rate, Row, percent
 from lerobot_memobench.evaluation.metrics.rollouts import Record, operations
 from lerobot_memobench.evaluation.metrics.summary import Summary, summarise
 from lerobot_memobench.evaluation.records.protocol import CARD_FILE, read_card
-from lerobot_memobench.evaluation.records.runs import folder_names, read_rollouts
+from lerobot_memobench.evaluation.records.runs import check_one_suite, folder_names, read_rollouts
 from lerobot_memobench.tasks.catalogue import find_tasks, get_task, task_names
 from lerobot_memobench.tasks.failures import FAILURES
 from lerobot_memobench.tasks.formula import format_formula
@@ -54,6 +54,7 @@ def read_runs(folders: Sequence[str | Path]) -> list[Run]:
         path = Path(folder) / CARD_FILE
         card = read_card(path) if path.is_file() else {}
         runs.append(Run(name, Path(folder), records, notes, card))
+    check_one_suite({run.folder: run.records for run in runs})
     return runs
 
 
@@ -81,7 +82,7 @@ def page_data(runs: Sequence[Run], videos: Sequence[Mapping[int, str]], known: M
             key: {"name": OPERATION_NAMES[key], "colour": "#" + bytes(colour).hex()}
             for key, colour in OPERATION_COLOURS.items()
         },
-        "failures": list(FAILURES),
+        "failures": list(dict.fromkeys([*FAILURES, *(name for run in runs for name in failure_counts(run.records))])),
         "tasks": tasks_data([record for run in runs for record in run.records], known),
         "runs": [run_data(run, addresses) for run, addresses in zip(runs, videos, strict=True)],
     }
@@ -100,7 +101,7 @@ def tasks_data(records: Iterable[Record], known: Mapping[str, Task]) -> dict[str
         task = known.get(name)
         result[name] = {
             "memory_type": record["memory_type"],
-            "language": task.language if task else name.replace("_", " "),
+            "language": task.title if task else name.replace("_", " "),
             "variants": {
                 str(k): variant_data(task.variant(k))
                 for k in sorted(variant for its_name, variant in seen if its_name == name)

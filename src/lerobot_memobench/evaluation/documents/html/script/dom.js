@@ -76,6 +76,8 @@ const OUTCOMES = {
     letter: "X",
     why: "Every checkpoint held at some step, the goal did not at the end.",
   },
+  miscount: { words: "miscount", letter: "N", why: "The event was done too seldom or too often." },
+  wrong_place: { words: "wrong place", letter: "P", why: "The thing was looked for where it is not." },
 };
 
 const outcomeMark = (outcome) =>

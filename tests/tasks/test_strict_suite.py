@@ -1,0 +1,357 @@
+"""The thirty strict twins: whole, in the published scenes, and each goal reached by its own routine only."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.tasks.bddl.reading import parse_bddl
+from lerobot_memobench.tasks.bddl.writing import format_bddl
+from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks, suite_of, task_index, task_names, task_record
+from lerobot_memobench.tasks.failures import classify_failure
+from lerobot_memobench.tasks.formula import Atom, Exactly, Formula, When, atoms, children, format_formula, to_lists
+from lerobot_memobench.tasks.formula_parsing import parse_formula
+from lerobot_memobench.tasks.progress import Progress
+from lerobot_memobench.tasks.task import MEMORY_TYPES, STRICT, Task
+
+SCRIPT = Path(__file__).parents[2] / "scripts" / "strict_suite"
+NAMES = task_names(suite=STRICT)
+TIMES = ("once", "twice", "three times")
+DRAWERS = ("top", "middle", "bottom")
+MOVED = {"check_all_three_drawers_once_each_in_the_given_order": {"kitchen_table_akita_black_bowl_init_region"}}
+HOME = Atom("handhome", ())
+
+
+def variants(name: str) -> list[Task]:
+    task = get_task(name)
+    return [task.variant(k) for k in range(task.num_variants)]
+
+
+def of_family(*families: str) -> list[str]:
+    return [name for name in NAMES if get_task(name).family in families]
+
+
+# --- the catalogue ---
+
+
+def test_thirty_twins_of_the_thirty_published_tasks() -> None:
+    assert Counter(get_task(name).memory_type for name in NAMES) == dict(zip(MEMORY_TYPES, (10, 10, 5, 5), strict=True))
+    assert sorted(str(get_task(name).twin_of) for name in NAMES) == sorted(task_names())
+    assert task_names(suite=None) == task_names() + NAMES
+    assert len(set(task_names(suite=None))) == 60
+    assert [task_index(name) for name in NAMES] == list(range(30, 60))
+    families = {"counting": 5, "ordering": 5, "hidden_thing": 5, "two_hidden_things": 5}
+    assert Counter(get_task(name).family for name in NAMES) == families | {"only_referent": 5, "strict_procedure": 5}
+    assert Counter("".join(get_task(name).operations for name in NAMES)) == {"S": 30, "U": 31, "C": 20}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_twin_stands_in_the_published_scene(name: str) -> None:
+    task = get_task(name)
+    published = get_task(str(task.twin_of))
+    assert (task.suite, suite_of(name), task.drawn) == (STRICT, STRICT, True)
+    assert (task.objects, task.fixtures, task.init) == (published.objects, published.fixtures, published.init)
+    other = {key for key, region in published.regions.items() if task.regions[key] != region}
+    assert other == MOVED.get(name, set())
+    assert task.memory_type == published.memory_type == task.folder.parent.name
+    assert task.scene_name == published.name
+    assert parse_bddl(format_bddl(parse_bddl(task.bddl_text))) == parse_bddl(task.bddl_text)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_variants_are_complete_and_different(name: str) -> None:
+    found = variants(name)
+    shown = [(task.language, format_formula(task.goal), task.prompt) for task in found]
+    assert len(set(shown)) == len(found)
+    for task in found:
+        assert task.operations == get_task(name).operations
+        assert task.demo_summary
+        for formula in (task.goal, *(checkpoint.goal for checkpoint in task.checkpoints)):
+            assert parse_formula(to_lists(formula)) == formula
+        for texts in (checkpoint.language for checkpoint in task.checkpoints):
+            coarse, intermediate, fine = texts
+            assert all(text == " ".join(text.split()) for text in texts)
+            assert len(coarse) <= len(intermediate) + 12
+            assert len(intermediate) < len(fine)
+        said = [checkpoint.language for checkpoint in task.checkpoints]
+        assert len(set(said)) == len(said), "two checkpoints say the same"
+    assert len({task.demo_summary for task in found}) == len(found) or get_task(name).family == "two_hidden_things"
+
+
+def test_the_folders_are_what_the_script_writes() -> None:
+    done = subprocess.run([sys.executable, str(SCRIPT), "--check"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_suite_knows_its_own_tasks_only() -> None:
+    published = task_names()[0]
+    assert resolve_tasks("all", STRICT) == NAMES
+    assert resolve_tasks("object,temporal", STRICT) == task_names("object", STRICT) + task_names("temporal", STRICT)
+    assert resolve_tasks(NAMES[3], STRICT) == [NAMES[3]]
+    with pytest.raises(MemobenchError, match="is a task of the strict suite; say suite=strict to run it"):
+        resolve_tasks(NAMES[3])
+    with pytest.raises(MemobenchError, match="is a task of the published suite; say suite=published"):
+        resolve_tasks(f"object,{published}", STRICT)
+    with pytest.raises(MemobenchError, match=r"suite is 'strikt'.*strict"):
+        task_names(suite="strikt")
+    assert suite_of("a_task_of_mine") is None
+
+
+def test_a_record_tells_suite_and_twin() -> None:
+    told = task_record(get_task(NAMES[0]), 71)
+    assert (told["suite"], told["twin_of"]) == (STRICT, get_task(NAMES[0]).twin_of)
+    assert not {"suite", "twin_of"} & set(task_record(get_task(task_names()[0]), 71))
+
+
+# --- the instruction names the draw ---
+
+
+def numbers(formula: Formula) -> set[int]:
+    own = {formula.number} if isinstance(formula, Exactly) else set()
+    return own.union(*(numbers(child) for child in children(formula)))
+
+
+@pytest.mark.parametrize("name", of_family("counting"))
+def test_counting_asks_for_the_number_in_its_instruction(name: str) -> None:
+    for number, task in enumerate(variants(name), start=1):
+        assert task.language.endswith(TIMES[number - 1])
+        assert numbers(task.goal) == {number}
+        assert TIMES[number - 1] in task.checkpoints[-1].language[1]
+
+
+def test_the_drawers_are_asked_for_in_every_order() -> None:
+    orders = set()
+    for task in variants("check_all_three_drawers_once_each_in_the_given_order"):
+        said = tuple(sorted(DRAWERS, key=task.language.index))
+        whens = [part for part in children(task.goal) if isinstance(part, When)]
+        later = [next(atoms(part)).args[0] for part in whens]
+        assert list(said[1:]) == [name.split("_")[-2] for name in later]
+        orders.add(said)
+    assert len(orders) == 6
+
+
+@pytest.mark.parametrize("name", of_family("hidden_thing", "two_hidden_things"))
+def test_a_hiding_shows_where_the_thing_asked_for_is(name: str) -> None:
+    draws = Counter()
+    for task in variants(name):
+        (on_table,) = [atom for atom in atoms(task.goal) if atom.predicate == "on"]
+        assert task.prompt is not None
+        assert not task.prompt.restores
+        places = dict(task.prompt.places)
+        thing = on_table.args[0]
+        assert task.checkpoints[0].goal == Atom("open", (places[thing],))
+        assert len(set(places.values())) == len(places)
+        assert thing.split("_")[0].replace("beefsteak", "tomato") in task.language
+        draws[thing, places[thing]] += 1
+    assert len(set(draws.values())) == 1, "every drawer is as likely"
+    assert len(draws) == 3 * len(task.prompt.places)
+
+
+# --- goals against routines, on paper ---
+
+
+class Table:
+    """What holds in a scene on paper, step by step."""
+
+    def __init__(self, task: Task) -> None:
+        self.true = {HOME, *(Atom("inplace", (thing,)) for thing in task.objects)}
+        self.true |= {atom for atom in task.init if atom.predicate == "on" and atom.args[0] in task.objects}
+        for fixture in ("microwave_1", "flat_stove_1", *(f"wooden_cabinet_1_{drawer}_region" for drawer in DRAWERS)):
+            self.true |= {Atom("close", (fixture,)), Atom("turnoff", (fixture,))}
+        self.steps: list[set[Atom]] = []
+        self.stay(2)
+
+    def stay(self, steps: int = 12) -> None:
+        """Let so many steps pass."""
+        self.steps += [set(self.true)] * steps
+
+    def away(self) -> None:
+        """Move the hand to work."""
+        self.true.discard(HOME)
+        self.stay(3)
+
+    def home(self, steps: int = 3) -> None:
+        """Bring the hand home and wait."""
+        self.true.add(HOME)
+        self.stay(steps)
+
+    def turn(self, name: str, begun: bool, words: tuple[str, str]) -> None:
+        """Open, shut or switch something."""
+        now, before = (words[0], words[1]) if begun else (words[1], words[0])
+        self.true.discard(Atom(before, (name,)))
+        self.stay(2)
+        self.true.add(Atom(now, (name,)))
+        self.stay(2)
+
+    def use(self, name: str, words: tuple[str, str]) -> None:
+        """Open and shut something, or switch it on and off."""
+        self.away()
+        self.turn(name, True, words)
+        self.turn(name, False, words)
+
+    def carry(self, thing: str, place: Atom) -> None:
+        """Lift a thing and put it down."""
+        self.away()
+        self.true = {atom for atom in self.true if not (atom.predicate in ("on", "in") and atom.args[0] == thing)}
+        self.true.discard(Atom("inplace", (thing,)))
+        self.stay(3)
+        self.true.add(place)
+        self.stay()
+
+
+DOOR, SWITCH = ("open", "close"), ("turnon", "turnoff")
+
+
+def play(task: Task, steps: list[set[Atom]]) -> Progress:
+    """Follow a routine until the episode would end."""
+    progress = Progress(task)
+    for state in steps:
+        if progress.step(state.__contains__) or progress.lost:
+            break
+    return progress
+
+
+def fixture_of(task: Task) -> tuple[str, tuple[str, str]]:
+    """What a counting task counts."""
+    atom = next(a for a in atoms(task.goal) if a.predicate in ("open", "turnon"))
+    return atom.args[0], DOOR if atom.predicate == "open" else SWITCH
+
+
+@pytest.mark.parametrize("name", of_family("counting"))
+@pytest.mark.parametrize("asked", [1, 2, 3])
+@pytest.mark.parametrize("done", [0, 1, 2, 3, 4])
+def test_only_the_asked_number_and_then_rest(name: str, asked: int, done: int) -> None:
+    task = variants(name)[asked - 1]
+    table = Table(task)
+    for _ in range(done):
+        table.use(*fixture_of(task))
+        table.home()
+    end = len(table.steps)
+    table.home(60)
+    progress = play(task, table.steps)
+    assert (progress.success, progress.lost) == (done == asked, done != asked)
+    assert progress.success is False or progress.steps - end > 36, "success came before the rest"
+    failure = classify_failure(task, progress.first_step, progress.success, lost=progress.lost)
+    assert failure == (None if done == asked else "miscount")
+    if done == asked:
+        assert None not in progress.ordered_step
+
+
+@pytest.mark.parametrize("name", of_family("counting"))
+def test_no_count_without_coming_home_and_none_kept_in_moved_things(name: str) -> None:
+    task = variants(name)[1]
+    spoil: list[Callable[[Table], None]] = [
+        lambda table: None,
+        lambda table: table.true.add(HOME) or table.true.discard(Atom("inplace", (next(iter(task.objects)),))),  # type: ignore[func-returns-value]
+    ]
+    for between in spoil:
+        table = Table(task)
+        table.use(*fixture_of(task))
+        between(table)
+        table.stay(3)
+        table.use(*fixture_of(task))
+        table.home(60)
+        assert play(task, table.steps).lost
+
+
+def orderings() -> Iterator[tuple[Task, list[Callable[[Table], None]]]]:
+    """Each ordering task's variants with the routine that they ask for."""
+
+    def drawer(which: str) -> Callable[[Table], None]:
+        return lambda table: table.use(f"wooden_cabinet_1_{which}_region", DOOR)
+
+    def stow(table: Table) -> None:
+        table.away()
+        table.turn("wooden_cabinet_1_top_region", True, DOOR)
+        table.carry("akita_black_bowl_1", Atom("in", ("akita_black_bowl_1", "wooden_cabinet_1_top_region")))
+        table.turn("wooden_cabinet_1_top_region", False, DOOR)
+
+    def carry(thing: str, place: str) -> Callable[[Table], None]:
+        return lambda table: table.carry(thing, Atom("on", (thing, place)))
+
+    for task in variants("check_all_three_drawers_once_each_in_the_given_order"):
+        yield task, [drawer(which) for which in sorted(DRAWERS, key=task.language.index)]
+    pan = "chefmate_8_frypan_1"
+    for name, routine in (
+        ("check_the_middle_drawer_once_then_put_the_black_bowl_in_the_top_drawer", [drawer("middle"), stow]),
+        (
+            "open_and_close_the_microwave_once_then_put_the_white_bowl_on_the_plate",
+            [lambda table: table.use("microwave_1", DOOR), carry("white_bowl_1", "plate_1")],
+        ),
+        (
+            "turn_the_stove_on_and_off_once_then_put_the_frying_pan_on_it",
+            [lambda table: table.use("flat_stove_1", SWITCH), carry(pan, "flat_stove_1_cook_region")],
+        ),
+        (
+            "turn_the_stove_on_and_off_once_then_put_the_frying_pan_on_the_shelf",
+            [lambda table: table.use("flat_stove_1", SWITCH), carry(pan, "wooden_two_layer_shelf_1_top_side")],
+        ),
+    ):
+        yield get_task(name), routine
+
+
+def routine_of(task: Task, moves: list[Callable[[Table], None]], home: bool = True) -> Progress:
+    table = Table(task)
+    for move in moves:
+        move(table)
+        if home:
+            table.home()
+    return play(task, table.steps)
+
+
+def test_ordering_takes_each_event_once_and_in_order() -> None:
+    seen = set()
+    for task, moves in orderings():
+        seen.add(task.name)
+        right = routine_of(task, moves)
+        assert right.success, task.name
+        assert None not in right.ordered_step
+        assert routine_of(task, moves[::-1]).lost, f"{task.name}: the other way round"
+        assert routine_of(task, [moves[0], *moves]).lost, f"{task.name}: the first event twice"
+        assert routine_of(task, [moves[0], moves[0], *moves]).lost
+        assert routine_of(task, moves, home=False).lost, f"{task.name}: not home in between"
+        assert not routine_of(task, moves[:-1]).success
+        assert routine_of(task, moves[1:]).lost, f"{task.name}: the first event left out"
+    assert seen == set(of_family("ordering"))
+
+
+@pytest.mark.parametrize("name", of_family("hidden_thing", "two_hidden_things"))
+def test_only_the_right_drawer_leads_to_the_hidden_thing(name: str) -> None:
+    for task in variants(name):
+        (on_table,) = [atom for atom in atoms(task.goal) if atom.predicate == "on"]
+        assert task.prompt is not None
+        right = dict(task.prompt.places)[on_table.args[0]]
+        for opened in (f"wooden_cabinet_1_{drawer}_region" for drawer in DRAWERS):
+            table = Table(task)
+            table.true = {a for a in table.true if a.predicate != "on"}
+            table.true |= {Atom("in", pair) for pair in task.prompt.places}
+            table.turn(opened, True, DOOR)
+            table.carry(on_table.args[0], on_table)
+            progress = play(task, table.steps)
+            assert (progress.success, progress.lost) == (opened == right, opened != right)
+            failure = classify_failure(task, progress.first_step, progress.success, lost=progress.lost)
+            assert failure == (None if opened == right else "wrong_place")
+
+
+@pytest.mark.parametrize("name", of_family("only_referent", "strict_procedure"))
+def test_what_another_video_shows_cannot_be_mended(name: str) -> None:
+    def moves(task: Task) -> list[Atom]:
+        return [atom for checkpoint in task.checkpoints for atom in atoms(checkpoint.goal)]
+
+    found = variants(name)
+    for task in found:
+        for other in found:
+            table = Table(task)
+            first, then = (other, task) if other is not task else (task, None)
+            for one in (first, then):
+                for atom in moves(one) if one is not None else ():
+                    table.carry(atom.args[0], atom)
+            progress = play(task, table.steps)
+            assert progress.success == (other is task), f"{task.variant_index} after {other.variant_index}"
+            assert progress.lost == (other is not task)
