@@ -48,12 +48,19 @@ def necessity(
     page: Annotated[
         Path | None, typer.Option(help="Markdown page whose table is made anew, between its marks.")
     ] = None,
+    beside: Annotated[
+        Path | None,
+        typer.Option(
+            help="necessity.json of the published tasks; the page's table then shows them beside their twins."
+        ),
+    ] = None,
 ) -> int:
     """Find moments that look the same and need different answers; print what a policy without memory can reach."""
     from lerobot_memobench.evaluation.necessity.pieces import PIECES, make
     from lerobot_memobench.evaluation.necessity.question import REFERENTS, Settings
-    from lerobot_memobench.evaluation.necessity.report import put_into_page, terminal_table, write
+    from lerobot_memobench.evaluation.necessity.report import put_into_page, read_results, terminal_table, write
 
+    published = None if beside is None else read_results(beside)  # now, not after the simulation
     settings = Settings(episodes=episodes, budget=budget, tolerance=tolerance)
     referents = REFERENTS if referent is WhichReferent.BOTH else (referent.value,)
     studies = _studies([get_task(name) for name in resolve_tasks(tasks, suite)], referents, settings, out)
@@ -64,7 +71,7 @@ def necessity(
     results = [study.result() for study in studies]
     written = write(out, results)
     if page is not None:
-        written.append(put_into_page(page, results))
+        written.append(put_into_page(page, results, published))
     screen.print(terminal_table(results))
     for path in written:
         screen.print(str(path), soft_wrap=True)

@@ -14,9 +14,10 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.necessity.demonstrations import Demonstration, Moment
 from lerobot_memobench.evaluation.necessity.pictures import Picture
 from lerobot_memobench.evaluation.necessity.question import Settings, variants_of
-from lerobot_memobench.evaluation.necessity.report import markdown, rows, verdict, write
+from lerobot_memobench.evaluation.necessity.report import markdown, rows, write
 from lerobot_memobench.evaluation.necessity.scene import PIXEL_EXACT
 from lerobot_memobench.evaluation.necessity.study import pictures_path, study
+from lerobot_memobench.evaluation.necessity.verdicts import verdict
 from lerobot_memobench.tasks.catalogue import get_task
 
 from .drawn import scene

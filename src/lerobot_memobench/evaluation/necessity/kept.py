@@ -111,3 +111,20 @@ class KeptSearch(TypedDict):
     of: Count
     complete: bool
     policy: list[Rule]
+
+
+class Found(TypedDict):
+    """What the searches of a task found."""
+
+    deterministic: Number
+    confirmed: Count
+    of: Count
+
+
+class KeptResult(TypedDict):
+    """What of `study.Result` stands beside a twin's."""
+
+    task: str
+    referent: str
+    in_order: InOrder | None
+    any_order: Found | None
