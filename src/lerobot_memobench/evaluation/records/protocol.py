@@ -43,9 +43,7 @@ def read_protocol(folder: str | Path) -> dict[str, Any]:
     folder = Path(folder)
     card = read_card(folder / CARD_FILE) if (folder / CARD_FILE).is_file() else {}
     told: dict[str, Any] = {**card.get("protocol", {}), **read_protocol_file(folder)}
-    if told:
-        told.setdefault("suite", PUBLISHED)  # written before there was another
-    if not set(EXTENT) <= set(told) or not set(SETTINGS) <= set(told):
+    if not {*EXTENT, *SETTINGS} - {"suite"} <= set(told):  # without a suite it is of the time when there was one
         told = {**protocol_of_log(read_episodes(folder)), **told}
     return {**told, POLICY: card.get(POLICY, {})}
 
@@ -58,7 +56,8 @@ def protocol_of_log(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
     if all(record.get("seed") is not None for record in records):
         _note(found, "seed_base", [record["seed"] - record["episode"] for record in records])
-    found["suite"] = one_suite(records)
+    if (suite := one_suite(records)) != PUBLISHED:
+        found["suite"] = suite
     for key in ("referent", "replan_steps"):
         _note(found, key, [record[key] for record in records if key in record])
     return found
