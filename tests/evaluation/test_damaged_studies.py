@@ -38,6 +38,7 @@ SEARCH = {
     "confirmed": 1,
     "of": 1,
     "complete": True,
+    "exhausted": True,
     "policy": [{"when": ["a"], "do": "b"}],
 }
 SCORES = {"all": 0.5, "own_task": 0.5}

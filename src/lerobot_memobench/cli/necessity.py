@@ -36,7 +36,7 @@ def necessity(
     ] = WhichReferent.BOTH,
     episodes: Annotated[int, typer.Option(min=1, help="Scenes per task, from seed 7 on.")] = 3,
     budget: Annotated[
-        int, typer.Option(min=0, help="Steps simulated per scene in search of other ways to the goal; 0: no search.")
+        int, typer.Option(min=0, help="Steps simulated per start in search of other ways to the goal; 0: no search.")
     ] = 10_000,
     tolerance: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Share of differing pixels up to which pictures look the same.")

@@ -216,6 +216,6 @@ def test_a_hidden_thing_in_the_simulator(gl: None, tmp_path: Path) -> None:
     assert result["expert"] == {"n": 3, "success": 3}
     assert result["in_order"]["as_it_happens"] == pytest.approx(1 / 3)
     found = result["any_order"]
-    assert (found["confirmed"], found["of"], found["complete"]) == (1, 3, True)
+    assert (found["confirmed"], found["of"], found["exhausted"]) == (1, 3, True)
     assert found["deterministic"] == found["stochastic"] == pytest.approx(1 / 3)
     assert verdict(result) == "yes"

@@ -23,7 +23,7 @@ def result(task: str, referent: str, found: float | None, confirmed: int = 0) ->
     any_order = None
     if found is not None:
         in_order["deterministic"] = 0.0
-        any_order = {"deterministic": found, "stochastic": 0.21, "confirmed": confirmed, "of": 9, "complete": True}
+        any_order = {"deterministic": found, "stochastic": 0.21, "confirmed": confirmed, "of": 9, "exhausted": True}
     expert = {"n": 9, "success": 9}
     return {
         "task": task,

@@ -38,6 +38,7 @@ def search(laboratory: Laboratory, settings: Settings) -> dict[str, Any]:
         "moves": found.moves,
         "steps": found.steps,
         "complete": graph.complete,
+        "exhausted": found.exhausted,
         "policy": [rule for group in groups for rule in group["policy"]],
     }
 

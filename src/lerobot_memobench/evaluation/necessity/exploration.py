@@ -36,6 +36,7 @@ class Exploration:
         starts: node at which each goal's execution begins.
         pictures: what is seen at each node. true: which atoms of the goals hold there.
         moves, steps: how many of either were simulated.
+        exhausted: no state is left that can be reached before the horizon and matters; the budget cut nothing off.
     """
 
     graph: Graph
@@ -44,6 +45,7 @@ class Exploration:
     starts: list[int]
     moves: int = 0
     steps: int = 0
+    exhausted: bool = False
 
 
 def explore(laboratory: Laboratory, budget: int, horizon: int = HORIZON) -> Exploration:
@@ -52,11 +54,14 @@ def explore(laboratory: Laboratory, budget: int, horizon: int = HORIZON) -> Expl
     States in which every goal is reached or lost are left alone.
 
     Args:
-        budget: control steps after which no further state is begun; those that are left stay without moves.
+        budget: control steps after which no further state is begun; those that are left stay without moves. Starts that
+            differ have one each.
     """
     explorer = _Explorer(laboratory, horizon)
+    budget *= len(set(explorer.found.starts))
     while (node := explorer.nearest()) is not None and explorer.found.steps < budget:
         explorer.expand(node)
+    explorer.found.exhausted = node is None
     return explorer.found
 
 

@@ -110,6 +110,7 @@ class KeptSearch(TypedDict):
     confirmed: Count
     of: Count
     complete: bool
+    exhausted: bool
     policy: list[Rule]
 
 

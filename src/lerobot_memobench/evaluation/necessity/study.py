@@ -116,7 +116,7 @@ def _over_searches(searches: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {
         **{key: sum(found[key] for found in searches) / len(searches) for key in ("deterministic", "stochastic")},
         **{key: sum(found[key] for found in searches) for key in ("confirmed", "of")},
-        "complete": all(found["complete"] for found in searches),
+        **{key: all(found[key] for found in searches) for key in ("complete", "exhausted")},
         "policy": searches[0]["policy"],
     }
 

@@ -43,7 +43,7 @@ def _strict(result: Result) -> list[str]:
     if any_order is not None:
         found = [
             f"{figure(any_order['deterministic'])} ({any_order['confirmed']}/{any_order['of']})",
-            figure(any_order["stochastic"]) + ("" if any_order["complete"] else " ≥"),
+            figure(any_order["stochastic"]) + ("" if any_order["exhausted"] else " ≥"),
         ]
     happens = NOT_APPLICABLE if in_order is None else figure(in_order["as_it_happens"])
     return [str(result["variants"]), *found, happens, f"{expert['success']}/{expert['n']}", verdict(result)]
