@@ -157,7 +157,8 @@ def _failure_reason(demo: Demonstration, episode: Episode) -> str | None:
     if not demo.success:
         index, count = episode.progress.index, len(demo.task.checkpoints)
         steps = episode.progress.steps
-        how = f"in {episode.horizon} steps" if steps >= episode.horizon else f"by step {steps}, the expert's plan over"
+        end = "and no longer to be" if episode.lost else "the expert's plan over"
+        how = f"in {episode.horizon} steps" if steps >= episode.horizon else f"by step {steps}, {end}"
         return f"goal not reached {how} ({index} of {count} checkpoints completed)"
     return None
 

@@ -36,9 +36,10 @@ def check_task_names(words: Words) -> None:
     environment = settings.get("env", words.value("env.type"))
     tasks = settings.get("tasks", words.value("env.tasks"))
     own_folder = "env.task_dir" in settings or words.value("env.task_dir")
-    if environment == "memobench" and not own_folder:
-        suite = check_suite(settings.get("suite", words.value("env.suite") or PUBLISHED))
-        resolve_tasks(tasks or "all", suite)
+    suite = settings.get("suite", words.value("env.suite"))
+    in_a_file = suite is None and words.value("config_path") is not None
+    if environment == "memobench" and not own_folder and not in_a_file:
+        resolve_tasks(tasks or "all", check_suite(suite or PUBLISHED))
 
 
 def read_config_file(words: Words) -> dict[str, Any]:

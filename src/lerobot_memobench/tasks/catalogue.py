@@ -108,10 +108,8 @@ def _expand(word: str, suite: str) -> list[str]:
         return task_names(None if word == "all" else word, suite)
     if word not in _folders():
         return []
-    if _suite_of(word) != suite:
-        raise MemobenchError(
-            f"{word!r} is a task of the {_suite_of(word)} suite; say suite={_suite_of(word)} to run it"
-        )
+    if (own := _suite_of(word)) != suite:
+        raise MemobenchError(f"{word!r} is a task of the {own} suite; say suite={own}, or --suite {own}")
     return [word]
 
 
