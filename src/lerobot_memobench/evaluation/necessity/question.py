@@ -25,7 +25,8 @@ class Settings:
         episodes: scenes (seeds) per task; with `referent=random` each is demonstrated once per variant.
         seed_base: the first of their seeds.
         tolerance: share of pixels without a like pixel within two, up to which pictures look the same.
-        budget: control steps, per different start, after which the search for other ways to the goal begins no new state; 0 leaves it out.
+        budget: control steps, per different start, after which the search for other ways to the goal begins no new
+            state; 0 leaves it out.
         horizon: execution steps.
     """
 
