@@ -4,6 +4,7 @@ The configuration modules register themselves when imported; they import neither
 """
 
 import lerobot_memobench.envs.configuration_memobench
+import lerobot_memobench.policies.memobench_blind.configuration_memobench_blind
 import lerobot_memobench.policies.memobench_expert.configuration_memobench_expert
 import lerobot_memobench.policies.memobench_mem.configuration_memobench_mem
 import lerobot_memobench.policies.memobench_random.configuration_memobench_random

@@ -62,8 +62,8 @@ def roll(env: gym.vector.VectorEnv, seeds: list[int], steps: int) -> tuple[list[
     return list(env.call("scene_hash")), observation
 
 
-def check_batches(name: str, tmp_path: Path, steps: int, seeds: list[int]) -> None:
-    alone = vector(name, 1, tmp_path / "alone")
+def check_batches(name: str, tmp_path: Path, steps: int, seeds: list[int], **settings: Any) -> None:
+    alone = vector(name, 1, tmp_path / "alone", **settings)
     hashes, images = [], []
     for seed in seeds:
         (found,), observation = roll(alone, [seed], steps)
@@ -72,7 +72,7 @@ def check_batches(name: str, tmp_path: Path, steps: int, seeds: list[int]) -> No
     alone.close()
     assert len(set(hashes)) == len(seeds)
     for use_async in (False, True):
-        env = vector(name, len(seeds), tmp_path / f"async_{use_async}", use_async)
+        env = vector(name, len(seeds), tmp_path / f"async_{use_async}", use_async, **settings)
         try:
             together, observation = roll(env, seeds, steps)
             assert together == hashes, f"async {use_async}"
@@ -89,6 +89,33 @@ def test_batch_of_one_and_four_sync_and_async(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", task_names())
 def test_batches_of_all_tasks(name: str, tmp_path: Path) -> None:
     check_batches(name, tmp_path, 30, SEEDS)
+
+
+OF_EACH_FAMILY = [
+    "check_the_top_drawer_a_given_number_of_times",
+    "turn_the_stove_on_and_off_once_then_put_the_frying_pan_on_it",
+    "find_the_charger_hidden_in_one_of_the_drawers",
+    "find_the_charger_or_the_cap_hidden_in_two_of_the_drawers",
+    "put_only_the_milk_pointed_out_in_the_prompt_video_on_the_plate",
+    "assemble_strictly_in_the_order_demonstrated_in_the_prompt_video",
+]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        OF_EACH_FAMILY[0],
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in task_names(suite="strict")
+            if name != OF_EACH_FAMILY[0]
+        ),
+    ],
+)
+def test_batches_of_strict_tasks(name: str, tmp_path: Path) -> None:
+    """The prompt is played in the reset: what is compared is the execution, after things were hidden."""
+    seeds = SEEDS if name in OF_EACH_FAMILY else SEEDS[:2]
+    check_batches(name, tmp_path, 12, seeds, suite="strict", prompt_in="reset")
 
 
 def test_observation_matches_its_space() -> None:

@@ -38,6 +38,7 @@ SEARCH = {
     "confirmed": 1,
     "of": 1,
     "complete": True,
+    "exhausted": True,
     "policy": [{"when": ["a"], "do": "b"}],
 }
 SCORES = {"all": 0.5, "own_task": 0.5}
@@ -85,7 +86,7 @@ def test_damaged_sheets(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
 def test_what_a_necessity_study_keeps_is_used_or_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also where its fingerprint is right."""
     monkeypatch.setattr(Study, "_observe", lambda self, seed: SCENE)
-    monkeypatch.setattr(Study, "_search", lambda self: SEARCH)
+    monkeypatch.setattr(Study, "_explore", lambda self, seed: SEARCH)
 
     def study(folder: Path) -> Study:
         return Study(get_task(TASK), "fixed", Settings(episodes=2), folder)
@@ -93,7 +94,8 @@ def test_what_a_necessity_study_keeps_is_used_or_made_again(tmp_path: Path, monk
     def use(folder: Path) -> None:
         write(folder, [study(folder).result()])
 
-    assert check(tmp_path, lambda folder: study(folder).result(), use, mutations.mutated_json, 200) == 0
+    # Only a folder that stands where a result is kept (one damage in a hundred) is refused.
+    assert 0 < check(tmp_path, lambda folder: study(folder).result(), use, mutations.mutated_json, 200) < 8
 
 
 def test_what_an_alignment_study_keeps_is_used_or_refused(tmp_path: Path) -> None:

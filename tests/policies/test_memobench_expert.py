@@ -9,6 +9,7 @@ from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.memobench_blind.configuration_memobench_blind import MemobenchBlindConfig
 from lerobot_memobench.policies.memobench_expert.configuration_memobench_expert import MemobenchExpertConfig
 
 
@@ -27,27 +28,30 @@ class _EnvConfig:
     }
 
 
-def test_action_passes_through_lerobots_pipeline() -> None:
-    config = MemobenchExpertConfig()
+@pytest.mark.parametrize(
+    ("config", "offered"), [(MemobenchExpertConfig(), "expert_action"), (MemobenchBlindConfig(), "blind_action")]
+)
+def test_action_passes_through_lerobots_pipeline(config: MemobenchExpertConfig, offered: str) -> None:
     policy = make_policy(config, env_cfg=_EnvConfig())  # type: ignore[arg-type]
     before, after = make_pre_post_processors(config)
-    assert isinstance(policy, get_policy_class("memobench_expert"))
+    assert isinstance(policy, get_policy_class(config.type))
     assert not list(policy.parameters())
     expected = torch.rand(3, 7)
     observation = {
         "observation.images.image": torch.rand(3, 3, 8, 8),
         "observation.state": torch.rand(3, 8),
-        "observation.expert_action": expected,
+        f"observation.{offered}": expected,
         "task": ["a", "b", "c"],
     }
     policy.reset()
     assert torch.equal(after(policy.select_action(before(observation))), expected)
     assert policy.predict_action_chunk(observation).shape == (3, 1, 7)
+    del observation[f"observation.{offered}"]
+    with pytest.raises(MemobenchError, match=f"--env.{offered}=true"):
+        policy.select_action(observation)
 
 
-def test_it_says_what_it_lacks() -> None:
+def test_it_cannot_be_trained() -> None:
     policy = get_policy_class("memobench_expert")(MemobenchExpertConfig())
-    with pytest.raises(MemobenchError, match=r"--env.expert_action=true"):
-        policy.select_action({"observation.state": torch.rand(1, 8)})
     with pytest.raises(MemobenchError, match="cannot be trained"):
         policy.forward({})

@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lerobot_memobench.cli.console import console, counting
+from lerobot_memobench.cli.console import Count, console, counting
 from lerobot_memobench.cli.suite import Suite, WhichSuite
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 
 if TYPE_CHECKING:
-    from lerobot_memobench.evaluation.necessity.study import Result
+    from lerobot_memobench.evaluation.necessity.question import Settings
+    from lerobot_memobench.evaluation.necessity.study import Study
+    from lerobot_memobench.jobs.job import Advance, ProgressCallback
     from lerobot_memobench.tasks.task import Task
 
 
@@ -34,7 +36,7 @@ def necessity(
     ] = WhichReferent.BOTH,
     episodes: Annotated[int, typer.Option(min=1, help="Scenes per task, from seed 7 on.")] = 3,
     budget: Annotated[
-        int, typer.Option(min=0, help="Steps simulated per task in search of other ways to the goal; 0: no search.")
+        int, typer.Option(min=0, help="Steps simulated per start in search of other ways to the goal; 0: no search.")
     ] = 10_000,
     tolerance: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Share of differing pixels up to which pictures look the same.")
@@ -42,35 +44,50 @@ def necessity(
     out: Annotated[Path, typer.Option(help="Folder of the results; the same command goes on there.")] = Path(
         "outputs/necessity"
     ),
+    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     page: Annotated[
         Path | None, typer.Option(help="Markdown page whose table is made anew, between its marks.")
     ] = None,
+    beside: Annotated[
+        Path | None,
+        typer.Option(
+            help="necessity.json of the published tasks; the page's table then shows them beside their twins."
+        ),
+    ] = None,
 ) -> int:
     """Find moments that look the same and need different answers; print what a policy without memory can reach."""
+    from lerobot_memobench.evaluation.necessity.pieces import PIECES, make
     from lerobot_memobench.evaluation.necessity.question import REFERENTS, Settings
-    from lerobot_memobench.evaluation.necessity.report import put_into_page, terminal_table, write
-    from lerobot_memobench.evaluation.necessity.study import study
+    from lerobot_memobench.evaluation.necessity.report import put_into_page, read_results, terminal_table, write
 
+    published = None if beside is None else read_results(beside)  # now, not after the simulation
     settings = Settings(episodes=episodes, budget=budget, tolerance=tolerance)
     referents = REFERENTS if referent is WhichReferent.BOTH else (referent.value,)
-    jobs = _jobs([get_task(name) for name in resolve_tasks(tasks, suite)], referents)
+    studies = _studies([get_task(name) for name in resolve_tasks(tasks, suite)], referents, settings, out)
     screen = console()
-    results: list[Result] = []
-    with counting(screen, "tasks", len(jobs)) as count:
-        for task, setting in jobs:
-            results.append(study(task, setting if task.num_variants > 1 else REFERENTS[0], settings, out))
-            count(len(results), len(jobs), f"{task.name}, referent {setting}")
+    for piece, unit in PIECES.items():
+        with counting(screen, unit) as count:
+            make(studies, piece, workers, _telling(count))
+    results = [study.result() for study in studies]
     written = write(out, results)
     if page is not None:
-        written.append(put_into_page(page, results))
+        written.append(put_into_page(page, results, published))
     screen.print(terminal_table(results))
     for path in written:
         screen.print(str(path), soft_wrap=True)
     return 0
 
 
-def _jobs(tasks: Sequence[Task], referents: Sequence[str]) -> list[tuple[Task, str]]:
-    """Return every task with every setting of the referent; with one goal only, all settings are the same."""
-    return [
-        (task, setting) for task in tasks for setting in referents if task.num_variants > 1 or setting == referents[0]
-    ]
+def _telling(count: Count) -> ProgressCallback:
+    def tell(news: Advance) -> None:
+        count(news.done, news.total, f"{news.task_name}, seed {news.seed}", found=news.found)
+
+    return tell
+
+
+def _studies(tasks: Sequence[Task], referents: Sequence[str], settings: Settings, out: Path) -> list[Study]:
+    """Return every task with every setting of the referent that says something of its own."""
+    from lerobot_memobench.evaluation.necessity.question import settings_of
+    from lerobot_memobench.evaluation.necessity.study import Study
+
+    return [Study(task, setting, settings, out) for task in tasks for setting in settings_of(task, referents)]

@@ -85,8 +85,7 @@ def resimulate(task: Task, seed: int, actions: NDArray[np.float32], exec_start: 
     success = False
     for frame, action in enumerate(actions):
         if frame == exec_start and frame > 0:
-            if task.prompt is None or task.prompt.restores:
-                sim.restore(start)
+            sim.end_prompt(start)
             sim.begin_execution()
         sim.highlights = highlights_at(task, sim, frame) if frame < exec_start else ()
         states.append(sim.state())

@@ -13,6 +13,8 @@ from lerobot_memobench.settings.translation import LerobotSettings
 
 ENVIRONMENT = "memobench"
 EXPERT = "memobench_expert"
+SCRIPTED = {EXPERT: "env.expert_action", "memobench_blind": "env.blind_action"}
+"""Policies whose actions the environment offers, and by which setting it does."""
 FIRST_SEED = 7
 """Episode i of the protocol uses seed 7 + i."""
 EPISODES = 50
@@ -23,12 +25,12 @@ none where only objects are seen, so that nothing is drawn unasked."""
 
 
 def with_policy(settings: LerobotSettings) -> LerobotSettings:
-    """Return settings with the scripted expert where no policy is named; the environment offers it its action."""
+    """Return settings with the scripted expert where no policy is named; a scripted policy is offered its action."""
     if not settings.has("policy.path"):
         settings = settings.default("policy.type", EXPERT)
     name = settings.get("policy.type")
-    if name == EXPERT:
-        settings = settings.default("env.expert_action", True)
+    if name in SCRIPTED:
+        settings = settings.default(SCRIPTED[name], True)
     return settings if name is None else settings.choosing("policy", name)
 
 

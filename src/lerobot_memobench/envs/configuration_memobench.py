@@ -55,6 +55,8 @@ class MemobenchEnvConfig(EnvConfig):
             in between refuses it; `observation.picture_step` tells such a one which step it is shown.
         replan_steps: that number, noted in the episode log.
         expert_action: offer the scripted expert's action as `observation.expert_action`.
+        blind_action: offer that of the published routine, blind to prompt and instruction, as
+            `observation.blind_action`.
         oracle_memory: write what has been completed so far behind the instruction (the paper's oracle memory control),
             word for word as the column `memory` of a dataset says it for the same frame.
         log_dir: where the episode log goes; LeRobot's output folder when left out.
@@ -79,6 +81,7 @@ class MemobenchEnvConfig(EnvConfig):
     render_every: int = 1
     replan_steps: int | None = None
     expert_action: bool = False
+    blind_action: bool = False
     oracle_memory: bool = False
     log_dir: str | None = None
     films: int | None = None
@@ -127,6 +130,7 @@ class MemobenchEnvConfig(EnvConfig):
             "render_every": self.render_every,
             "replan_steps": self.replan_steps,
             "expert_action": self.expert_action,
+            "blind_action": self.blind_action,
             "oracle_memory": self.oracle_memory,
             "films": self.films,
             "videos": self.videos,
@@ -184,7 +188,7 @@ class MemobenchEnvConfig(EnvConfig):
 
         if use_async_envs:
             # What a vector environment must know before its workers exist.
-            space = observation_space(self.expert_action, self.render_every, self.obs_type)
+            space = observation_space(self.expert_action, self.render_every, self.obs_type, self.blind_action)
             return _LazyAsyncVectorEnv(make, space, action_space(), METADATA)
         # LeRobot freezes finished rows of its own async envs only; a sync row would be reset and go on.
         return gym.vector.SyncVectorEnv(

@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.envs.observations import ACTION_DIM, EXECUTION, IMAGE_KEYS, PROMPT
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.experts.blind import BlindRoutine
 from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.experts.prompts import PromptDemonstrator
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.rendering import Image, RenderSettings
 from lerobot_memobench.sim.simulation import Simulation
+from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.formula import Atom, atoms
 from lerobot_memobench.tasks.progress import Progress
 from lerobot_memobench.tasks.task import STRICT, Task
@@ -87,6 +89,7 @@ class Episode:
         self.drifted = False
         self._siblings = list(_wrong_atoms(task))
         self._expert: Expert | None = None
+        self._blind: BlindRoutine | None = None
         self._demonstrator: Iterator[NDArray[np.float32]] | None = None
         hides = task.prompt is not None and not task.prompt.restores
         if self.prompt_video or hides:
@@ -110,9 +113,7 @@ class Episode:
         """Put the scene back exactly as it was, unless something was hidden in it, and hand over to the policy."""
         if self.step_index:
             self.prompt_shown = self._prompt.shown
-            self.sim.highlights = ()
-            if self.task.prompt is None or self.task.prompt.restores:
-                self.sim.restore(self._start)
+            self.sim.end_prompt(self._start)
         self.sim.begin_execution()
         self._demonstrator = None
         self.exec_start = self.step_index
@@ -168,6 +169,18 @@ class Episode:
         if self._expert is None:
             self._expert = Expert(self.task, self.sim, self._rng(3))
         return self._expert.act()
+
+    def blind_action(self) -> NDArray[np.float32]:
+        """Return what the published routine does now, blind to prompt and instruction, (7,); zeros during the prompt.
+
+        Ask once per step.
+        """
+        if self.phase == PROMPT:
+            return np.zeros(ACTION_DIM, dtype=np.float32)
+        if self._blind is None:
+            routine = get_task(self.published.twin_of) if self.published.twin_of else self.published
+            self._blind = BlindRoutine(routine, self.sim, self._rng(3))
+        return self._blind.act()
 
     @property
     def expert_done(self) -> bool:

@@ -40,7 +40,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     float32 (208,): the visible objects (`sim.object_layout`), or both; ``agent_pos`` float32 (8,): end-effector
     position (3, m), axis-angle (3, rad), fingers (2, m); ``phase`` (1,): 0 while the prompt video plays and actions
     have no effect, 1 in execution; ``step`` (1,): control steps since the episode began; on request ``expert_action``
-    (7,).
+    (7,), ``blind_action`` (7,).
 
     Action: float32 (7,) in [−1, 1]: end-effector displacement (±5 cm, ±0.5 rad per unit), gripper (−1 opens, 1 closes).
 
@@ -67,6 +67,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         render_every: int = 1,
         replan_steps: int | None = None,
         expert_action: bool = False,
+        blind_action: bool = False,
         oracle_memory: bool = False,
         films: int | None = None,
         videos: bool = False,
@@ -80,7 +81,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._episode: Episode | None = None
         self._oracle_memory = oracle_memory
         self._describe(0)
-        self.observation_space = observation_space(expert_action, render_every, obs_type)
+        self.observation_space = observation_space(expert_action, render_every, obs_type, blind_action)
         self.action_space = action_space()
         protocol = {
             "suite": suite,
@@ -109,7 +110,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         }
         self._prompt_in = prompt_in
         self._replan_steps = replan_steps
-        self._expert_action, self._seed_base = expert_action, seed_base
+        self._expert_action, self._blind_action, self._seed_base = expert_action, blind_action, seed_base
         self._next_seed = seed_base
 
     @property
@@ -222,6 +223,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         }
         if self._expert_action:
             observation["expert_action"] = episode.expert_action()
+        if self._blind_action:
+            observation["blind_action"] = episode.blind_action()
         return observation
 
     def _info(self) -> dict[str, Any]:

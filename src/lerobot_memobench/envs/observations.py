@@ -56,8 +56,10 @@ def _pictures(obs_type: str) -> dict[str, str]:
     return {} if obs_type == OBJECTS else {f"pixels/{name}": f"{OBS_IMAGES}.{name}" for name in IMAGE_KEYS}
 
 
-def observation_space(expert_action: bool, render_every: int = 1, obs_type: str = PIXELS) -> spaces.Dict:
-    """Return the space of observations, with the scripted expert's action on request.
+def observation_space(
+    expert_action: bool, render_every: int = 1, obs_type: str = PIXELS, blind_action: bool = False
+) -> spaces.Dict:
+    """Return the space of observations, with the actions of the scripted expert or the blind routine on request.
 
     Where not every step is drawn, ``picture_step`` tells which step the pictures show.
     """
@@ -77,6 +79,8 @@ def observation_space(expert_action: bool, render_every: int = 1, obs_type: str 
         parts["environment_state"] = spaces.Box(-np.inf, np.inf, (SIZE,), np.float32)
     if expert_action:
         parts["expert_action"] = action_space()
+    if blind_action:
+        parts["blind_action"] = action_space()
     return spaces.Dict(parts)
 
 

@@ -42,7 +42,7 @@ PUSH_GAP = 0.06
 
 
 @dataclass(frozen=True)
-class _Door:
+class Door:
     """Where a hinged door stands now. Directions are level unit vectors (3,), places are (3,), m."""
 
     q: float
@@ -56,7 +56,7 @@ class _Door:
     """A place on the upper edge, half way into the panel, near the handle."""
 
 
-def _door(hand: Hand, name: str, ahead: float = 0.0) -> _Door:
+def door_now(hand: Hand, name: str, ahead: float = 0.0) -> Door:
     """Return a door's geometry, turned ``ahead`` by an angle of its joint, rad."""
     articulation, q = hand.sim.world.articulation(name)
     joint = hand.sim.data.joint(articulation.joint)
@@ -70,7 +70,7 @@ def _door(hand: Hand, name: str, ahead: float = 0.0) -> _Door:
     along = along if along @ lever > 0 else -along
     edge = _edge(hand, name, handle, outward, along)
     turn = Rotation.from_rotvec(joint.xaxis * ahead)
-    return _Door(
+    return Door(
         q + ahead,
         hinge,
         hinge + turn.apply(lever),
@@ -95,7 +95,7 @@ def _owner(hand: Hand, name: str) -> str:
     return max((other for other in hand.sim.assets if name == other or name.startswith(f"{other}_")), key=len)
 
 
-def _wanted(q: float, articulation: Articulation, opening: bool) -> bool:
+def wanted(q: float, articulation: Articulation, opening: bool) -> bool:
     """Return whether a door is open, or closed, with a little to spare."""
     assert articulation.open_below is not None
     assert articulation.closed_above is not None
@@ -107,7 +107,7 @@ def open_door(hand: Hand, name: str) -> Doing:
     articulation, _ = hand.sim.world.articulation(name)
     assert articulation.open_below is not None
     for _ in range(ATTEMPTS):
-        if far(_door(hand, name).handle) < REACH:
+        if far(door_now(hand, name).handle) < REACH:
             yield from _pull_door(hand, name)
         if hand.sim.world.articulation(name)[1] >= articulation.open_below:
             yield from _swing_door(hand, name, opening=True)
@@ -121,7 +121,7 @@ def close_door(hand: Hand, name: str) -> Doing:
     articulation, _ = hand.sim.world.articulation(name)
     assert articulation.closed_above is not None
     for _ in range(ATTEMPTS):
-        door = _door(hand, name)
+        door = door_now(hand, name)
         if far(door.handle + PUSH_GAP * door.outward) > REACH:
             yield from _swing_door(hand, name, opening=False)
         yield from _push_door(hand, name)
@@ -134,13 +134,13 @@ def _pull_door(hand: Hand, name: str) -> Steps:
     """Take the upper end of an upright handle between the fingers and follow the door's arc."""
     articulation, _ = hand.sim.world.articulation(name)
     up = (articulation.handle.length / 2 - 0.018) * UP
-    flip = np.sign(_door(hand, name).along @ EASY_CLOSING) or 1.0
+    flip = np.sign(door_now(hand, name).along @ EASY_CLOSING) or 1.0
 
     def at(height: float, ahead: float = 0.0) -> Callable[[], Array]:
-        return lambda: _door(hand, name, ahead).handle + up + height * UP
+        return lambda: door_now(hand, name, ahead).handle + up + height * UP
 
     def turned(ahead: float = 0.0) -> Array:
-        return frame(DOWN, flip * _door(hand, name, ahead).along)
+        return frame(DOWN, flip * door_now(hand, name, ahead).along)
 
     yield from rise(hand, OPEN, 0.26)
     yield from hand.move(at(HOVER + 0.02), turned, OPEN, tolerance=0.012, turn_tolerance=0.08)
@@ -148,8 +148,8 @@ def _pull_door(hand: Hand, name: str) -> Steps:
     yield from hand.close()
     way = np.sign(articulation.open_q - articulation.closed_q)
     for _ in range(160):
-        door = _door(hand, name)
-        if _wanted(door.q, articulation, True) or far(door.handle) > REACH:
+        door = door_now(hand, name)
+        if wanted(door.q, articulation, True) or far(door.handle) > REACH:
             break
         if length(hand.position - door.handle - up) > LOST:
             break
@@ -163,22 +163,22 @@ def _swing_door(hand: Hand, name: str, opening: bool) -> Steps:
     goal = articulation.open_below if opening else articulation.closed_q
     assert goal is not None
     way = float(np.sign(goal - start))
-    flip = np.sign(_door(hand, name, (goal - start) / 2).outward @ EASY_CLOSING) or 1.0
+    flip = np.sign(door_now(hand, name, (goal - start) / 2).outward @ EASY_CLOSING) or 1.0
 
     def turned(ahead: float = 0.0) -> Array:
         # A door that stands wide open is taken with the fingers pointing outwards: upright, the hand is too short.
-        door = _door(hand, name, ahead)
+        door = door_now(hand, name, ahead)
         return leaning(flip * door.outward, reach_lean(hand, door.edge, STRETCHED))
 
     def at(back: float, ahead: float = 0.0) -> Callable[[], Array]:
-        return lambda: _door(hand, name, ahead).edge - back * turned(ahead)[:, 2]
+        return lambda: door_now(hand, name, ahead).edge - back * turned(ahead)[:, 2]
 
     yield from rise(hand, OPEN, 0.26)
     yield from hand.move(at(HOVER), turned, OPEN, tolerance=0.012, turn_tolerance=0.08)
     yield from hand.move(at(-EDGE_DEPTH), turned, OPEN, tolerance=0.006, speed=0.6, timeout=60)
     yield from hand.close()
     for _ in range(160):
-        door = _door(hand, name)
+        door = door_now(hand, name)
         if _swung(hand, door, articulation, opening):
             break
         lead = way * min(SWING_LEAD, abs(goal - door.q) + EASE)
@@ -186,9 +186,9 @@ def _swing_door(hand: Hand, name: str, opening: bool) -> Steps:
     yield from let_go(hand)
 
 
-def _swung(hand: Hand, door: _Door, articulation: Articulation, opening: bool) -> bool:
+def _swung(hand: Hand, door: Door, articulation: Articulation, opening: bool) -> bool:
     """Return whether swinging ends: the door is where it should be, can be pushed shut, or has slipped away."""
-    if _wanted(door.q, articulation, opening):
+    if wanted(door.q, articulation, opening):
         return True
     if not opening and far(door.handle + PUSH_GAP * door.outward) < REACH - 0.04:
         return True
@@ -199,25 +199,25 @@ def _push_door(hand: Hand, name: str) -> Steps:
     """Push a door shut with closed fingers on the outside of its handle."""
     articulation, _ = hand.sim.world.articulation(name)
     way = float(np.sign(articulation.closed_q - articulation.open_q))
-    flip = np.sign(_door(hand, name).along @ EASY_CLOSING) or 1.0
+    flip = np.sign(door_now(hand, name).along @ EASY_CLOSING) or 1.0
 
     def at(gap: float, height: float = 0.0, ahead: float = 0.0) -> Array:
-        door = _door(hand, name, ahead)
+        door = door_now(hand, name, ahead)
         return door.handle + gap * door.outward + height * UP
 
     def turned(ahead: float = 0.0) -> Array:
-        return frame(DOWN, flip * _door(hand, name, ahead).along)
+        return frame(DOWN, flip * door_now(hand, name, ahead).along)
 
     yield from rise(hand, CLOSED, 0.26)
     yield from hand.move(lambda: at(PUSH_GAP, 0.15), turned, CLOSED, tolerance=0.02, turn_tolerance=0.1)
     yield from hand.move(lambda: at(PUSH_GAP), turned, CLOSED, tolerance=0.012, turn_tolerance=0.1)
     for _ in range(160):
-        door = _door(hand, name)
-        if _wanted(door.q, articulation, False):
+        door = door_now(hand, name)
+        if wanted(door.q, articulation, False):
             break
         if abs(float((hand.position - door.handle) @ door.along)) > 0.04:
             break
         yield hand.toward(at(0.01, 0.0, way * SWING_LEAD), turned(), CLOSED, speed=0.8)
-    back = hand.position + 0.06 * _door(hand, name).outward
+    back = hand.position + 0.06 * door_now(hand, name).outward
     yield from hand.move(back, hand.rotation, CLOSED, tolerance=0.02, turn_tolerance=1.0, timeout=40)
     yield from rise(hand, CLOSED, 0.26)

@@ -10,11 +10,26 @@ from numpy.typing import NDArray
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.experts import motions
 from lerobot_memobench.experts.hand import OPEN, UP, Hand
+from lerobot_memobench.experts.plans import Step, counts, plan_of
+from lerobot_memobench.experts.surroundings import drawer_around
 from lerobot_memobench.sim.scene import TABLE, TABLE_TOP
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.evaluator import Evaluator
-from lerobot_memobench.tasks.formula import LATCHES, And, Atom, Formula, Not, Or, Then
-from lerobot_memobench.tasks.task import Task
+from lerobot_memobench.tasks.formula import (
+    LATCHES,
+    And,
+    Atom,
+    Exactly,
+    Formula,
+    Hold,
+    Never,
+    Not,
+    Or,
+    Round,
+    Then,
+    When,
+)
+from lerobot_memobench.tasks.task import STRICT, Task
 
 Doing = Generator[NDArray[np.float32], None, None]
 
@@ -25,21 +40,30 @@ REPAIRS = 3
 
 
 def steps_of(formula: Formula) -> list[Atom]:
-    """Return the atoms to bring about, in order. What must not be (`Not`) is nothing to do; of an `Or` the first."""
+    """Return the atoms to bring about, in order. What must not be (`Not`) is nothing to do; of an `Or` the first.
+
+    How often something is to be done is not in here: see `plans.plan_of`.
+    """
     match formula:
         case Atom():
             return [formula]
-        case And(children) | Then(children):
+        case And(children) | Then(children) | Round(children):
             return [atom for child in children for atom in steps_of(child)]
+        case When((moment, then)):
+            return [*steps_of(then), *steps_of(moment)]
+        case Exactly(child=child) | Hold(child=child):
+            return steps_of(child)
         case Or(children):
             return steps_of(children[0]) if children else []
-        case Not():
+        case Not() | Never():
             return []
     raise TypeError(f"not a formula: {formula!r}")
 
 
 class Expert:
     """Solve a task by its checkpoints, in order, then by whatever of the goal is still open.
+
+    A goal that counts events is its own plan: what is true of the present does not tell what has been done.
 
     It looks into the simulator, as a demonstrator with perfect sight would, and says one action per control step.
 
@@ -80,6 +104,10 @@ class Expert:
         return self.hand.rest(OPEN)
 
     def _plan(self) -> Doing:
+        if counts(self.task.goal):
+            for step in plan_of(self.task.goal):
+                yield from self._take(step)
+            return
         for checkpoint in self.task.checkpoints:
             for atom in steps_of(checkpoint.goal):
                 yield from self.achieve(atom)
@@ -90,22 +118,32 @@ class Expert:
             for atom in missing:
                 yield from self.achieve(atom)
 
+    def _take(self, step: Step) -> Doing:
+        """Bring an atom about, or rest at home."""
+        if isinstance(step, Atom):
+            yield from self.achieve(step)
+            return
+        for _ in range(step.number):
+            yield self.hand.toward(*self.sim.home, OPEN)
+
     def _holds(self, atom: Atom) -> bool:
         if atom.predicate in LATCHES:
             return atom in self._watch.latched
         return self.sim.holds(atom)
 
     def achieve(self, atom: Atom) -> Doing:
-        """Bring one atom about, unless it is already so."""
+        """Bring one atom about, unless it is already so; for home that is not near enough."""
+        hand = self.hand
+        if atom.predicate == "handhome":
+            yield from motions.come_home(hand, *self.sim.home)
+            return
         if self._holds(atom):
             return
-        hand = self.hand
         match atom.predicate, atom.args:
             case (("open" | "wasopen"), (name,)):
                 yield from self._open(name)
             case "close", (name,):
-                door = self.sim.world.articulation(name)[0].kind == "door"
-                yield from motions.close_door(hand, name) if door else motions.close_drawer(hand, name)
+                yield from self._close(name)
             case (("turnon" | "wasturnedon"), (name,)):
                 yield from motions.turn_knob(hand, name, on=True)
             case "turnoff", (name,):
@@ -128,6 +166,9 @@ class Expert:
         on_object = support in self.sim.assets
         place = self.sim.body_pose(support)[0] if on_object else self._middle_of(support)
         place = place - self.sim.assets[name].bottom * UP
+        drawer = drawer_around(self.hand, name)
+        if drawer is not None:
+            yield from self.achieve(Atom("open", (drawer,)))
         held = yield from motions.pick(self.hand, name, place=place)
         if held is None:
             return
@@ -146,8 +187,20 @@ class Expert:
         return centre + rotation @ np.array([0.0, 0.0, self.sim.site_half_size(region)[2]])
 
     def _open(self, name: str) -> Doing:
-        door = self.sim.world.articulation(name)[0].kind == "door"
-        yield from motions.open_door(self.hand, name) if door else motions.open_drawer(self.hand, name)
+        if self.sim.world.articulation(name)[0].kind != "door":
+            yield from motions.open_drawer(self.hand, name)
+        elif self.task.suite == STRICT:
+            yield from motions.pull_open(self.hand, name)
+        else:
+            yield from motions.open_door(self.hand, name)
+
+    def _close(self, name: str) -> Doing:
+        if self.sim.world.articulation(name)[0].kind != "door":
+            yield from motions.close_drawer(self.hand, name)
+        elif self.task.suite == STRICT:
+            yield from motions.push_shut(self.hand, name)
+        else:
+            yield from motions.close_door(self.hand, name)
 
     def _put_in(self, name: str, region: str) -> Doing:
         drawers = [

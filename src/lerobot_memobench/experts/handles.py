@@ -9,18 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from lerobot_memobench.experts.grasping import ATTEMPTS, HOVER
 from lerobot_memobench.experts.hand import CLOSED, OPEN, UP, Array, Hand, cross, downward, frame, length
+from lerobot_memobench.experts.surroundings import outward_of
 from lerobot_memobench.experts.travel import LOST, Doing, Steps, let_go, rise
 from lerobot_memobench.sim.assets.asset import Articulation
 
 TILT = np.radians(35)
 """How far the hand points down when it takes a handle: enough for the flange to clear the table."""
-
-
-def outward_of(hand: Hand, articulation: Articulation) -> Array:
-    """Return the horizontal direction (3,) in which a drawer opens."""
-    axis = hand.sim.data.joint(articulation.joint).xaxis * np.sign(articulation.open_q - articulation.closed_q)
-    outward = axis * np.array([1.0, 1.0, 0.0])
-    return outward / np.linalg.norm(outward)
 
 
 def _at_handle(hand: Hand, articulation: Articulation, tilt: float) -> tuple[Array, Array, Array]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lerobot_memobench.experts.hand import COMFORTABLE, DOWN, UP, Array, Hand, cross, frame, length, unit
-from lerobot_memobench.experts.surroundings import in_the_way, tall_boxes
+from lerobot_memobench.experts.surroundings import drawer_around, in_the_way, outward_of, tall_boxes
 from lerobot_memobench.sim.robot import BASE_POSITION
 
 BESIDE = 0.085
@@ -14,6 +14,8 @@ MOST_LEAN = np.radians(32)
 """How far the hand leans at most to keep clear of something or to reach a far place, rad."""
 UNDER_LEAN = np.radians(44)
 """The same for what lies under something, rad."""
+DRAWER_LEAN = np.radians(14)
+"""How far the hand leans out of the front to reach into a drawer: clear of the handles above, and of its own front."""
 MORE_LEAN = (0.0, 0.12, -0.12, 0.24, -0.24, 0.36, -0.36, 0.48, -0.48)
 """Leans tried, in this order, to keep the hand off its neighbours, rad."""
 
@@ -58,6 +60,9 @@ def pointing(hand: Hand, place: Array) -> Array:
 
 def lean_from_fixtures(hand: Hand, name: str, target: Array) -> Array:
     """Return by how much and whither the hand should lean to keep clear of tall fixtures beside it, (3,), rad."""
+    drawer = drawer_around(hand, name)
+    if drawer is not None:
+        return DRAWER_LEAN * outward_of(hand, hand.sim.world.articulation(drawer)[0])
     lean = np.zeros(3)
     for centre, rotation, half in tall_boxes(hand, name):
         local = rotation.T @ (target - centre)

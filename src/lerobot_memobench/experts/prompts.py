@@ -1,6 +1,7 @@
-"""What the prompt videos of object and procedural tasks show, acted out by the arm.
+"""What prompt videos show, acted out by the arm.
 
-The scene is restored exactly afterwards by whoever plays the prompt; here it only has to be shown.
+Whoever plays the prompt restores the scene exactly afterwards, or, where it hid something, the arm alone; here it only
+has to be shown.
 """
 
 from __future__ import annotations
@@ -15,11 +16,15 @@ from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.experts.hand import CLOSED, OPEN, UP, Array, Hand
 from lerobot_memobench.sim.rendering import Highlight
 from lerobot_memobench.sim.simulation import Simulation
+from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task
 
 PAUSE = 8
 """Still frames before and after, so that the video has a first and a last picture."""
 HIGHLIGHT_STEPS = 50
+BRISK = 1.25
+"""How much faster than at work the hand hides things: two of them fit into a prompt video."""
+HOME = Atom("handhome", ())
 
 
 class PromptDemonstrator:
@@ -54,6 +59,9 @@ class PromptDemonstrator:
                 yield from self._point(hand)
             case "highlight":
                 yield from self._highlight(hand)
+            case "hide":
+                yield from self._hide()
+                return
         yield from motions.go_home(hand, position, rotation)
         yield from hand.wait(PAUSE, OPEN)
 
@@ -67,6 +75,20 @@ class PromptDemonstrator:
             yield expert.act()
         self.shown = expert.succeeded
         yield from motions.go_home(expert.hand, *home)
+
+    def _hide(self) -> Generator[NDArray[np.float32], None, None]:
+        """Put each thing into its drawer and shut that, then come home; shown if all are out of sight."""
+        expert = Expert(self._task, self._sim, self._rng)
+        expert.hand.speed = min(1.0, BRISK * expert.hand.speed)
+        hidden = [
+            atom
+            for thing, drawer in self._prompt.places
+            for atom in (Atom("in", (thing, drawer)), Atom("close", (drawer,)))
+        ]
+        for atom in (*hidden, HOME):
+            yield from expert.achieve(atom)
+        yield from expert.hand.wait(PAUSE, OPEN)
+        self.shown = all(self._sim.holds(atom) for atom in (*hidden, HOME))
 
     def _pick(self, hand: Hand) -> Generator[NDArray[np.float32], None, None]:
         place, turned = self._sim.body_pose(self._referent())

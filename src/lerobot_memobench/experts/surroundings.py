@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from lerobot_memobench.experts.hand import Array, Hand
-from lerobot_memobench.sim.assets.asset import Asset
+from lerobot_memobench.sim.assets.asset import Articulation, Asset
+from lerobot_memobench.tasks.formula import Atom
 
 FINGER_REACH = 0.0095
 """How far the finger tips stand out under the grip site, m."""
@@ -27,6 +28,22 @@ CLEAR = 0.025
 def corners(asset: Asset) -> Array:
     """Return the corners (3, 8) of an asset's bounding box in its frame, m."""
     return np.array(np.meshgrid(*zip(asset.low, asset.high, strict=True))).reshape(3, -1)
+
+
+def outward_of(hand: Hand, articulation: Articulation) -> Array:
+    """Return the horizontal direction (3,) in which a drawer opens."""
+    axis = hand.sim.data.joint(articulation.joint).xaxis * np.sign(articulation.open_q - articulation.closed_q)
+    outward = axis * np.array([1.0, 1.0, 0.0])
+    return outward / np.linalg.norm(outward)
+
+
+def drawer_around(hand: Hand, name: str) -> str | None:
+    """Return the region of the drawer in which a thing lies, if any."""
+    for asset in hand.sim.assets.values():
+        for region, articulation in asset.articulations.items():
+            if articulation.kind == "drawer" and hand.sim.holds(Atom("in", (name, asset.regions[region]))):
+                return asset.regions[region]
+    return None
 
 
 def tall_boxes(hand: Hand, name: str) -> list[tuple[Array, Array, Array]]:

@@ -18,6 +18,10 @@ Doing = Generator[NDArray[np.float32], None, bool]
 """A motion: yields actions (7,), returns whether it did what it is for."""
 LOST = 0.05
 """Distance between hand and thing, beyond that at the grasp, at which it counts as dropped, m."""
+EXACT_DISTANCE, EXACT_ANGLE = 0.0002, 0.0005
+"""How near to its pose a hand that has come home stands, m and rad."""
+SETTLING = 18
+"""Control steps within which it gets there, once it is near."""
 HAND_BESIDE = 0.05
 """How far the hand reaches sideways on its way, m."""
 
@@ -110,3 +114,22 @@ def go_home(hand: Hand, position: Array, rotation: Array) -> Steps:
     """Rise and go back to a pose with the fingers open."""
     yield from rise(hand, OPEN, 0.2)
     yield from hand.move(position, rotation, OPEN, tolerance=0.012, turn_tolerance=0.08)
+
+
+def come_home(hand: Hand, position: Array, rotation: Array) -> Steps:
+    """Go back to a pose so exactly that a picture does not tell where the hand has been; nothing when it is there.
+
+    Short of `Hold`-long rests: it ends after `SETTLING` steps, however near it is.
+    """
+    if _exact(hand, position, rotation):
+        return
+    yield from go_home(hand, position, rotation)
+    for _ in range(SETTLING):
+        if _exact(hand, position, rotation):
+            break
+        yield hand.toward(position, rotation, OPEN)
+
+
+def _exact(hand: Hand, position: Array, rotation: Array) -> bool:
+    distance, angle = hand.error(position, rotation)
+    return distance < EXACT_DISTANCE and angle < EXACT_ANGLE

@@ -32,6 +32,10 @@ ARM_START = (0.0, -0.161037389, 0.0, -2.44459747, 0.0, 2.22675220, np.pi / 4)
 GRIPPER_START = (0.020833, -0.020833)
 """Finger positions at reset, m."""
 
+GRIPPER_OPEN = (0.04, -0.04)
+"""Finger positions of the open hand, m. They creep towards it for seconds: fingers that stand there from the start, as
+in the strict suite, do not tell how long ago they were closed."""
+
 ARM_JOINTS = tuple(f"robot0_joint{i}" for i in range(1, 8))
 FINGER_JOINTS = ("gripper0_finger_joint1", "gripper0_finger_joint2")
 ARM_ACTUATORS = tuple(f"robot0_torq_j{i}" for i in range(1, 8))

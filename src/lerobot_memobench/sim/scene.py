@@ -11,7 +11,8 @@ from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.assets.asset import Asset
 from lerobot_memobench.sim.assets.kitchen import build_kitchen
 from lerobot_memobench.sim.assets.registry import build_asset
-from lerobot_memobench.tasks.task import Task
+from lerobot_memobench.sim.catches import add_catches
+from lerobot_memobench.tasks.task import STRICT, Task
 
 TABLE = "kitchen_table"
 TABLE_TOP = 0.90
@@ -35,13 +36,13 @@ CACHED_SCENES = 4
 class Scene:
     """A compiled scene. The model is shared: whoever changes it works on a copy."""
 
-    key: tuple[str, str]
+    key: tuple[str, str, str]
     model: mujoco.MjModel
     assets: dict[str, Asset]
     """Every fixture but the table, then every object, by instance name."""
 
 
-_scenes: OrderedDict[tuple[str, str], Scene] = OrderedDict()
+_scenes: OrderedDict[tuple[str, str, str], Scene] = OrderedDict()
 
 
 def get_scene(task: Task) -> Scene:
@@ -49,7 +50,7 @@ def get_scene(task: Task) -> Scene:
 
     Variants of a task (another referent) share the scene: they differ in goal, not in what stands on the table.
     """
-    key = (task.name, task.bddl_text)
+    key = (task.name, task.suite, task.bddl_text)
     if key in _scenes:
         _scenes.move_to_end(key)
         return _scenes[key]
@@ -79,6 +80,8 @@ def scene_spec(task: Task) -> tuple[mujoco.MjSpec, dict[str, Asset]]:
     for name, class_name in task.objects.items():
         assets[name] = build_asset(spec, spec.worldbody, name, class_name)
         spec.body(name).add_freejoint(name=f"{name}_joint0")
+    if task.suite == STRICT:
+        add_catches(spec, assets)
     return spec, assets
 
 

@@ -20,7 +20,7 @@ from lerobot_memobench.sim.scene import AGENTVIEW, SUBSTEPS, get_scene, state_si
 from lerobot_memobench.sim.start import Start
 from lerobot_memobench.sim.world import World
 from lerobot_memobench.tasks.formula import SINCE_START, Atom
-from lerobot_memobench.tasks.task import Task
+from lerobot_memobench.tasks.task import STRICT, Task
 
 Array = NDArray[np.float64]
 
@@ -57,6 +57,7 @@ class Simulation:
         self.task = task
         self.render_settings = render or RenderSettings()
         self._scene = scene
+        self._strict = task.suite == STRICT
         self.model: mujoco.MjModel = copy.copy(scene.model)
         # robosuite's force and torque sensors cost time in every physics step, and nobody reads them.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR.value
@@ -97,12 +98,14 @@ class Simulation:
         """Put the arm at its start; things are placed next."""
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[self._arm_qpos] = robot.ARM_START
-        self.data.qpos[self._finger_qpos] = robot.GRIPPER_START
+        self.data.qpos[self._finger_qpos] = robot.GRIPPER_OPEN if self._strict else robot.GRIPPER_START
 
     def _settle(self) -> None:
         self.highlights = ()
         mujoco.mj_step1(self.model, self.data)
         self._controller.reset(self.data)
+        if self._strict:
+            self._controller.gripper = np.array([1.0, -1.0])
         for _ in range(STABILISATION_STEPS):
             self.step(NO_OP)
         self._start.mark_hand()
@@ -184,6 +187,26 @@ class Simulation:
         self._controller.gripper = snapshot.gripper.copy()
         mujoco.mj_step1(self.model, self.data)
 
+    def end_prompt(self, start: Snapshot) -> None:
+        """Undo what a prompt video has done since ``start``: all of it, or, where it hid something, the arm alone."""
+        self.highlights = ()
+        if self.task.prompt is None or self.task.prompt.restores:
+            self.restore(start)
+        else:
+            self.restore_arm(start)
+
+    def restore_arm(self, snapshot: Snapshot) -> None:
+        """Put arm, fingers and controller back as in a snapshot, to the bit; all other things stay as they are.
+
+        Joint angles too, not only the hand's pose: seven joints can hold one pose in many ways, and which one it is
+        would tell where the arm has come from.
+        """
+        qpos, qvel = self.data.qpos.copy(), self.data.qvel.copy()
+        self.restore(snapshot)
+        others = max(self._finger_qpos) + 1  # the arm comes first in the model, its fingers last of it
+        self.data.qpos[others:], self.data.qvel[others:] = qpos[others:], qvel[others:]
+        mujoco.mj_step1(self.model, self.data)
+
     def scene_hash(self) -> str:
         """Return a short hash of the present state and of where the fixtures stand."""
         digest = hashlib.sha256(self.state().tobytes())
@@ -211,6 +234,11 @@ class Simulation:
     def eef_pose(self) -> tuple[Array, Array]:
         """Return position (3,) and rotation (3, 3) of the grip site, between the finger tips."""
         return self.data.site_xpos[self._grip].copy(), self.data.site_xmat[self._grip].reshape(3, 3).copy()
+
+    @property
+    def home(self) -> tuple[Array, Array]:
+        """Position (3,) and rotation (3, 3) of the grip site after the scene has settled."""
+        return self._start.home
 
     def gripper_opening(self) -> float:
         """Return the distance between the fingers, m."""

@@ -39,6 +39,11 @@ class Start:
         """Take the hand's present pose for its home."""
         self._position, self._rotation, self._opening = self._hand()
 
+    @property
+    def home(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Position (3,) and rotation (3, 3) of the grip site at home."""
+        return self._position, self._rotation
+
     def mark_things(self) -> None:
         """Take every thing's present place for its own."""
         self._places = {name: self._data.xpos[body].copy() for name, body in self._bodies.items()}

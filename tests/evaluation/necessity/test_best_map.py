@@ -6,8 +6,8 @@ import pytest
 
 from lerobot_memobench.evaluation.necessity.best_map import best_map
 from lerobot_memobench.evaluation.necessity.best_probabilities import best_probabilities
-from lerobot_memobench.evaluation.necessity.graph import Graph, Move
-from lerobot_memobench.tasks.formula import And, Atom, Formula, Not, Then
+from lerobot_memobench.evaluation.necessity.graph import LOST, GoalWatch, Graph, Move
+from lerobot_memobench.tasks.formula import And, Atom, Exactly, Formula, Hold, Never, Not, Or, Round, Then, When
 
 TOP, MIDDLE = Atom("open", ("top",)), Atom("open", ("middle",))
 BOTH_SEEN = And(
@@ -124,3 +124,80 @@ def test_success_counts_at_the_step_it_comes_not_at_the_end_of_the_move() -> Non
     assert best_map(graph, [goal], horizon=100)[0] == 1.0
     assert best_map(graph, [goal], horizon=99)[0] == 0.0
     assert best_probabilities(graph, [goal], horizon=100) == 1.0
+
+
+# --- the strict suite: rests, losses, several starts ---
+
+HOME = Atom("handhome", ())
+OPEN, SHUT = Atom("open", ("door",)), Atom("close", ("door",))
+
+
+def door() -> Graph:
+    """A door that is opened and shut, and rests: node 0 shut, node 1 open; nothing tells how often it has been."""
+    rest = {node: Move(node, 52, ((frozenset({HOME, (SHUT, OPEN)[node]}), 52),)) for node in (0, 1)}
+    leaving = (frozenset({HOME, SHUT}), 2)
+    opened = Move(1, 100, (leaving, (frozenset({SHUT}), 78), (frozenset({OPEN}), 8), (frozenset({HOME, OPEN}), 12)))
+    shut = Move(0, 100, ((frozenset({OPEN}), 80), (frozenset({SHUT}), 8), (frozenset({HOME, SHUT}), 12)))
+    return Graph([0, 1], {0: {"open": opened, "rest": rest[0]}, 1: {"shut": shut, "rest": rest[1]}})
+
+
+def times(number: int) -> Formula:
+    """Open and shut the door so often, then rest: the first rest decides."""
+    return When((Hold(40, And((HOME, SHUT))), Exactly(number, Round((HOME, OPEN, SHUT)))))
+
+
+@pytest.mark.parametrize(("number", "best"), [(1, 1 / 4), (2, 4 / 27), (3, 27 / 256)])
+def test_who_does_not_count_stops_by_chance(number: int, best: float) -> None:
+    """At the shut door the best probabilities go on as often as they must, and stop once: p to the n times 1 - p."""
+    assert best_map(door(), [times(number)], horizon=1200) == (0.0, {})
+    assert best_probabilities(door(), [times(number)], horizon=1200) == pytest.approx(best, abs=1e-3)
+
+
+def test_who_may_rest_before_the_first_event_and_knows_it_gains_nothing() -> None:
+    """A rest at the start is lost at once, and told so: nobody needs to explore what comes after."""
+    watch = GoalWatch(times(1))
+    moves = door().moves
+    assert watch.advance(0, moves[0]["rest"]) == (LOST, None)
+    assert watch.advance(LOST, moves[0]["open"]) == (LOST, None)
+    once = watch.advance(watch.advance(0, moves[0]["open"])[0], moves[1]["shut"])[0]
+    assert watch.advance(once, moves[0]["rest"]) == (once, 28), "twelve steps at home were part of the rest"
+
+
+def hidden() -> tuple[Graph, list[Formula], list[int]]:
+    """A thing in one of three drawers: three starts that look the same, and a wrong drawer ends it."""
+    moves: dict[int, dict[str, Move]] = {}
+    pictures = [0, 0, 0]
+    for place in range(3):
+        moves[place] = {}
+        for drawer in range(3):
+            opened = frozenset({Atom("open", (f"drawer_{drawer}",))})
+            moves[place][f"open {drawer}"] = Move(len(pictures), 100, ((opened, 100),))
+            if drawer == place:
+                on_table = frozenset({*opened, Atom("on", ("thing", "table"))})
+                moves[len(pictures)] = {"take": Move(len(pictures), 100, ((on_table, 100),))}
+            pictures.append(1 + drawer if drawer == place else 10 + drawer)
+    goals: list[Formula] = [
+        And(
+            (
+                Never(Or(tuple(Atom("open", (f"drawer_{k}",)) for k in range(3) if k != place))),
+                Atom("on", ("thing", "table")),
+            )
+        )
+        for place in range(3)
+    ]
+    return Graph(pictures, moves), goals, [0, 1, 2]
+
+
+def test_what_was_hidden_is_found_by_one_map_from_one_start_in_three() -> None:
+    graph, goals, starts = hidden()
+    share, policy = best_map(graph, goals, 1200, starts)
+    assert share == pytest.approx(1 / 3)
+    assert policy[0].startswith("open")
+    assert best_probabilities(graph, goals, 1200, starts) == pytest.approx(1 / 3, abs=1e-6)
+
+
+def test_starts_that_look_different_are_each_answered() -> None:
+    graph, goals, starts = hidden()
+    graph.pictures[1], graph.pictures[2] = 20, 21
+    assert best_map(graph, goals, 1200, starts)[0] == 1.0
+    assert best_probabilities(graph, goals, 1200, starts) == 1.0

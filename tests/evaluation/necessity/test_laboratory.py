@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from lerobot_memobench.evaluation.necessity.demonstrations import rest_steps
 from lerobot_memobench.evaluation.necessity.laboratory import answers_of
 from lerobot_memobench.evaluation.necessity.question import variants_of
 from lerobot_memobench.tasks.catalogue import get_task
@@ -20,3 +21,10 @@ def test_answers_are_what_the_expert_does_in_some_variant() -> None:
     stacks = answers_of(variants_of(get_task(STACK), "random"))
     assert len(stacks) == 6
     assert {atom.predicate for atom in stacks} == {"on"}
+
+
+def test_where_the_hand_stands_is_no_answer_and_rest_is_as_long_as_the_goal_says() -> None:
+    twin = get_task("turn_the_stove_on_and_off_a_given_number_of_times")
+    assert {atom.predicate for atom in answers_of(variants_of(twin, "drawn"))} == {"turnon", "turnoff"}
+    assert rest_steps(twin.goal) == 40
+    assert rest_steps(get_task(PAN).goal) == 0

@@ -14,9 +14,10 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.necessity.demonstrations import Demonstration, Moment
 from lerobot_memobench.evaluation.necessity.pictures import Picture
 from lerobot_memobench.evaluation.necessity.question import Settings, variants_of
-from lerobot_memobench.evaluation.necessity.report import markdown, rows, verdict, write
+from lerobot_memobench.evaluation.necessity.report import markdown, rows, write
 from lerobot_memobench.evaluation.necessity.scene import PIXEL_EXACT
 from lerobot_memobench.evaluation.necessity.study import pictures_path, study
+from lerobot_memobench.evaluation.necessity.verdicts import verdict
 from lerobot_memobench.tasks.catalogue import get_task
 
 from .drawn import scene
@@ -89,6 +90,22 @@ def test_goals_behind_one_picture_are_weighed_together(monkeypatch: pytest.Monke
     assert result["in_order"]["as_it_happens"] == pytest.approx(1 / 5), "the arm is at home when the prompt ends"
 
 
+def test_what_the_instruction_says_can_be_told_apart(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The same picture asks for other answers under other instructions: that needs no memory, stopping in time does."""
+    task = get_task("turn_the_stove_on_and_off_a_given_number_of_times")
+    dark, lit = scene(), scene(gone=True)
+    on_off = [("on", dark, 0.0), ("off", lit, 0.1)]
+    by_hand(monkeypatch, {k: demonstration(*on_off * (k + 1), ("rest", dark, 0.0)) for k in range(3)})
+    result = study(task, "drawn", Settings(episodes=1, budget=0), tmp_path)
+    assert result["aliased"] == {"at_home": 3, "pixel_exact": 3, "as_it_happens": 3}
+    assert result["in_order"]["stochastic"] == pytest.approx((1 / 4 + 4 / 27 + 27 / 256) / 3)
+    assert result["in_order"]["as_it_happens"] == 0.0
+    other = {k: demonstration((f"take {k}", dark, 0.0)) for k in range(3)}
+    by_hand(monkeypatch, other)
+    result = study(task, "drawn", Settings(episodes=1, budget=0, tolerance=0.01), tmp_path)
+    assert (result["aliased"]["at_home"], verdict(result)) == (0, "no")
+
+
 def test_an_expert_that_fails_leaves_no_figure(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     by_hand(monkeypatch, {0: demonstration(("on", scene(), 0.0), success=False)})
     result = study(get_task(PAN), "fixed", Settings(episodes=1), tmp_path)
@@ -138,7 +155,7 @@ def test_the_command_shows_a_table_and_names_its_files(
     words = ["necessity", "--tasks", f"{PAN},{MILK}", "--episodes", "1", "--budget", "0", "--out", str(tmp_path)]
     assert main(words) == 0
     out = capsys.readouterr().out
-    assert "3/3" in out, "the stove once, the milk under both settings"
+    assert "3/3 scene of" in out, "the stove once, the milk under both settings"
     assert all(str(tmp_path / name) in out for name in ("necessity.json", "necessity.md", "aliased_pairs.png"))
     results = json.loads((tmp_path / "necessity.json").read_text())
     assert [(r["referent"], r["memory_needed"]) for r in results] == [
@@ -176,3 +193,29 @@ def test_two_cartons_in_the_simulator(gl: None, tmp_path: Path) -> None:
     fixed = study(get_task(MILK), "fixed", Settings(episodes=1, budget=1500), tmp_path)
     assert fixed["in_order"]["deterministic"] == 1.0
     assert verdict(fixed) == "no"
+
+
+@pytest.mark.slow
+def test_counting_in_the_simulator(gl: None, tmp_path: Path) -> None:
+    """The dark stove comes back with the hand at home; who does not count stops by chance, and no map ever stops."""
+    task = get_task("turn_the_stove_on_and_off_a_given_number_of_times")
+    result = study(task, "drawn", Settings(episodes=1), tmp_path)
+    assert result["expert"] == {"n": 3, "success": 3}
+    assert result["in_order"]["deterministic"] == result["in_order"]["as_it_happens"] == 0.0
+    found = result["any_order"]
+    assert (found["deterministic"], found["complete"]) == (0.0, True)
+    assert 1 / 6 < found["stochastic"] < 1 / 4
+    assert verdict(result) == "yes"
+
+
+@pytest.mark.slow
+def test_a_hidden_thing_in_the_simulator(gl: None, tmp_path: Path) -> None:
+    """Three starts look the same, and a wrong drawer ends the search for the thing."""
+    task = get_task("find_the_artichoke_hidden_in_one_of_the_drawers")
+    result = study(task, "drawn", Settings(episodes=1), tmp_path)
+    assert result["expert"] == {"n": 3, "success": 3}
+    assert result["in_order"]["as_it_happens"] == pytest.approx(1 / 3)
+    found = result["any_order"]
+    assert (found["confirmed"], found["of"], found["exhausted"]) == (1, 3, True)
+    assert found["deterministic"] == found["stochastic"] == pytest.approx(1 / 3)
+    assert verdict(result) == "yes"

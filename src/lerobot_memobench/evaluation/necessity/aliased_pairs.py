@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.necessity.question import DRAWN
 from lerobot_memobench.evaluation.necessity.study import Result, pictures_path
+from lerobot_memobench.tasks.catalogue import get_task
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,9 +24,10 @@ CAMERAS = ("third person", "wrist")
 
 
 def figure(out: Path, results: Sequence[Result]) -> bytes | None:
-    """Return a PNG of up to two aliased pairs: both moments side by side, and what is right at each; None without any.
+    """Return a PNG of a few aliased pairs: both moments side by side, and what is right at each; None without any.
 
-    One pair within an episode and one between goals are preferred: the two ways in which memory is needed.
+    One pair within an episode and one between goals, the two ways in which memory is needed; of drawn tasks one of each
+    family.
     """
     shown = _chosen(out, results)
     if not shown:
@@ -40,7 +43,7 @@ def _chosen(out: Path, results: Sequence[Result]) -> list[tuple[Result, Strip]]:
 
     shown: list[tuple[Result, Strip]] = []
     for result in results:
-        if not result["examples"] or any(_within_episode(other) == _within_episode(result) for other, _ in shown):
+        if not result["examples"] or any(_kind(other) == _kind(result) for other, _ in shown):
             continue
         path = pictures_path(out, result["task"], result["referent"], result["examples"][0]["seed"])
         if path.is_file():
@@ -48,8 +51,10 @@ def _chosen(out: Path, results: Sequence[Result]) -> list[tuple[Result, Strip]]:
     return shown
 
 
-def _within_episode(result: Result) -> bool:
-    """Whether the first pair lies within one episode."""
+def _kind(result: Result) -> str | bool:
+    """Return the family of a drawn task; of others whether the first pair lies within one episode."""
+    if result["referent"] == DRAWN:
+        return get_task(result["task"]).family
     pair = result["examples"][0]
     return bool(pair["a"]["variant"] == pair["b"]["variant"])
 
@@ -76,7 +81,7 @@ def _small_png(plot: Figure) -> bytes:
     from PIL import Image
 
     buffer = io.BytesIO()
-    plot.savefig(buffer, dpi=110, format="png")
+    plot.savefig(buffer, dpi=110 if len(plot.axes) <= 8 else 64, format="png")
     small = Image.open(buffer).convert("RGB").quantize(192, dither=Image.Dither.NONE)
     buffer = io.BytesIO()
     small.save(buffer, "PNG", optimize=True)

@@ -18,28 +18,56 @@ from lerobot_memobench.tasks.formula import format_formula
 
 
 def search(laboratory: Laboratory, settings: Settings) -> dict[str, Any]:
-    """Return the best policies without memory that were found, and whether the simulator confirms the best map."""
+    """Return the best policies without memory that were found, and whether the simulator confirms the best maps.
+
+    A policy reads the instruction: goals with the same one share a policy, others have one of their own.
+    """
     found = explore(laboratory, settings.budget, settings.horizon)
     graph = found.graph
     graph.pictures = classes(differences(found.pictures), settings.tolerance)
-    goals = [variant.goal for variant in laboratory.variants]
-    share, policy = best_map(graph, goals, settings.horizon)
+    groups = [_best(laboratory, found, group, settings) for group in _by_instruction(laboratory)]
+    goals = len(laboratory.variants)
     return {
         "seed": laboratory.seed,
-        "deterministic": share,
-        "confirmed": _confirmed(laboratory, found, policy, settings) if share > 0 else 0,
-        "of": len(goals),
-        "stochastic": best_probabilities(graph, goals, settings.horizon),
+        "deterministic": sum(len(group["goals"]) * group["deterministic"] for group in groups) / goals,
+        "confirmed": sum(group["confirmed"] for group in groups),
+        "of": goals,
+        "stochastic": sum(len(group["goals"]) * group["stochastic"] for group in groups) / goals,
         "states": len(graph.pictures),
         "pictures": len(set(graph.pictures)),
         "moves": found.moves,
         "steps": found.steps,
         "complete": graph.complete,
+        "exhausted": found.exhausted,
+        "policy": [rule for group in groups for rule in group["policy"]],
+    }
+
+
+def _by_instruction(laboratory: Laboratory) -> list[list[int]]:
+    """Return the goals, as places in the row of variants, that one instruction asks for."""
+    groups: dict[str, list[int]] = {}
+    for place, variant in enumerate(laboratory.variants):
+        groups.setdefault(variant.language, []).append(place)
+    return list(groups.values())
+
+
+def _best(laboratory: Laboratory, found: Exploration, group: Sequence[int], settings: Settings) -> dict[str, Any]:
+    """Return how far the best policies come at the goals of one instruction."""
+    goals = [laboratory.variants[place].goal for place in group]
+    starts = [found.starts[place] for place in group]
+    share, policy = best_map(found.graph, goals, settings.horizon, starts)
+    return {
+        "goals": group,
+        "deterministic": share,
+        "confirmed": _confirmed(laboratory, found, group, policy, settings) if share > 0 else 0,
+        "stochastic": best_probabilities(found.graph, goals, settings.horizon, starts),
         "policy": [{"when": _when(found, picture), "do": answer} for picture, answer in policy.items()],
     }
 
 
-def _confirmed(laboratory: Laboratory, found: Exploration, policy: Policy, settings: Settings) -> int:
+def _confirmed(
+    laboratory: Laboratory, found: Exploration, group: Sequence[int], policy: Policy, settings: Settings
+) -> int:
     """Return how many goals come true in the simulator when the map acts; it knows the nearest picture it explored."""
 
     def act(seen: Sequence[Picture]) -> str | None:
@@ -47,7 +75,13 @@ def _confirmed(laboratory: Laboratory, found: Exploration, policy: Policy, setti
         nearest = int(np.argmin(apart))
         return policy.get(found.graph.pictures[nearest]) if apart[nearest] <= settings.tolerance else None
 
-    return sum(walk(laboratory, variant, act, settings.horizon) for variant in laboratory.variants)
+    confirmed = 0
+    for start in dict.fromkeys(found.starts[place] for place in group):
+        together = [place for place in group if found.starts[place] == start]
+        laboratory.sim.restore(laboratory.starts[together[0]])
+        tasks = [laboratory.variants[place] for place in together]
+        confirmed += walk(laboratory, tasks, act, settings.horizon)
+    return confirmed
 
 
 def _when(found: Exploration, picture: int) -> list[str]:

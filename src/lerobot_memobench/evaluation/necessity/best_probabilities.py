@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.evaluation.necessity.best_map import best_map
-from lerobot_memobench.evaluation.necessity.graph import GoalWatch, Graph
+from lerobot_memobench.evaluation.necessity.graph import LOST, GoalWatch, Graph
 from lerobot_memobench.tasks.formula import Formula
 
 STRIDE = 25
@@ -42,29 +42,37 @@ class _Walk:
     layers: list[slice]
 
 
-def best_probabilities(graph: Graph, goals: Sequence[Formula], horizon: int, seed: int = 0) -> float:
+def best_probabilities(
+    graph: Graph, goals: Sequence[Formula], horizon: int, starts: Sequence[int] = (), seed: int = 0
+) -> float:
     """Return the success of the best probabilities of answers given the picture, over equally likely goals.
 
     Looked for by expectation maximisation over walks that succeed, from an even start, from the best map made a little
     uncertain, and from random ones: a bound that is reached, not one that is proven to be the largest.
+
+    Args:
+        starts: as of `best_map`.
     """
-    value, policy = best_map(graph, goals, horizon)
+    starts = starts or (0,) * len(goals)
+    value, policy = best_map(graph, goals, horizon, starts)
     answers, pictures = graph.answers, sorted(set(graph.pictures))
     if not answers:
         return 0.0
-    walks = [_unfold(graph, GoalWatch(goal), horizon, answers, pictures) for goal in goals]
+    walks = [
+        _unfold(graph, _reachable(graph, GoalWatch(goal), horizon, start), answers, pictures)
+        for goal, start in zip(goals, starts, strict=True)
+    ]
     rng = np.random.default_rng(seed)
     even = np.full((len(pictures), len(answers)), 1.0 / len(answers))
     likely = 0.05 * even
     for row, picture in enumerate(pictures):
         likely[row, answers.index(policy.get(picture, answers[0]))] += 0.95
-    starts = [even, likely, *(rng.dirichlet(np.ones(len(answers)), len(pictures)) for _ in range(RESTARTS))]
-    return max(value, *(_climb(start, walks) for start in starts))
+    tried = [even, likely, *(rng.dirichlet(np.ones(len(answers)), len(pictures)) for _ in range(RESTARTS))]
+    return max(value, *(_climb(begin, walks) for begin in tried))
 
 
-def _unfold(graph: Graph, watch: GoalWatch, horizon: int, answers: Sequence[str], pictures: Sequence[int]) -> _Walk:
+def _unfold(graph: Graph, layers: _Layers, answers: Sequence[str], pictures: Sequence[int]) -> _Walk:
     """Return every state that can be reached before the horizon and from which the goal can be."""
-    layers = _reachable(graph, watch, horizon)
     alive = _hopeful(layers)
     index = {state: k for k, state in enumerate(state for layer in layers for state in layer if state in alive)}
     to = np.full((len(index), len(answers)), _FAILURE, dtype=np.intp)
@@ -81,9 +89,9 @@ def _unfold(graph: Graph, watch: GoalWatch, horizon: int, answers: Sequence[str]
     )
 
 
-def _reachable(graph: Graph, watch: GoalWatch, horizon: int) -> _Layers:
+def _reachable(graph: Graph, watch: GoalWatch, horizon: int, start: int) -> _Layers:
     layers: _Layers = [{} for _ in range(horizon // STRIDE + 1)]
-    layers[0][0, 0, 0] = {}
+    layers[0][start, 0, 0] = {}
     for layer in layers:
         for (node, memory, used), leads in layer.items():  # only later layers grow: a move takes a stride or more
             for answer, move in graph.moves.get(node, {}).items():
@@ -91,6 +99,8 @@ def _reachable(graph: Graph, watch: GoalWatch, horizon: int) -> _Layers:
                 later = (move.to, after, used + max(1, -(-move.steps // STRIDE)))
                 if step is not None:
                     leads[answer] = _SUCCESS if used * STRIDE + step <= horizon else _FAILURE
+                elif after == LOST:
+                    leads[answer] = _FAILURE
                 elif later[2] < len(layers):
                     layers[later[2]].setdefault(later, {})
                     leads[answer] = later
@@ -99,7 +109,7 @@ def _reachable(graph: Graph, watch: GoalWatch, horizon: int) -> _Layers:
 
 def _hopeful(layers: _Layers) -> set[_State]:
     """Return the start and the states from which the goal can be reached."""
-    alive: set[_State] = {(0, 0, 0)}
+    alive = set(layers[0])
     for layer in reversed(layers):
         alive |= {
             state for state, leads in layer.items() if any(to == _SUCCESS or to in alive for to in leads.values())

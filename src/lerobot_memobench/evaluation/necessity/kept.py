@@ -1,12 +1,57 @@
-"""Of which types is what a necessity study keeps? Anything else in its files is made again."""
+"""What a necessity study keeps, and of which types it is. Anything else in its files is made again."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal, TypedDict
 
 from annotated_types import Len, MaxLen
 
-from lerobot_memobench.files.reading import Count, Number, Whole
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files import write_file
+from lerobot_memobench.files.reading import Count, Number, Whole, read_json
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A result on disk, or still to be made.
+
+    Attributes:
+        path: its file.
+        schema: of what types it is. fingerprint: of the question that it answers.
+        make: makes it.
+    """
+
+    path: Path
+    schema: Any
+    fingerprint: str
+    make: Callable[[], dict[str, Any]]
+
+    def found(self) -> dict[str, Any] | None:
+        """Return what the file holds if it answers this question; None if not, whatever else it holds."""
+        try:
+            found: dict[str, Any] = read_json(self.path, self.schema, "it is made again")
+        except (FileNotFoundError, MemobenchError):
+            return None
+        return found if found["fingerprint"] == self.fingerprint else None
+
+    def get(self) -> dict[str, Any]:
+        """Return the result, made and written where there is none.
+
+        Raises:
+            MemobenchError: a folder stands in its place.
+        """
+        found = self.found()
+        if found is None:
+            if self.path.is_dir():
+                raise MemobenchError(f"{self.path} is a folder, expected a result; remove it, or name another --out")
+            found = {"fingerprint": self.fingerprint, **self.make()}
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            write_file(self.path, json.dumps(found, indent=1) + "\n")
+        return found
 
 
 class Said(TypedDict):
@@ -65,4 +110,22 @@ class KeptSearch(TypedDict):
     confirmed: Count
     of: Count
     complete: bool
+    exhausted: bool
     policy: list[Rule]
+
+
+class Found(TypedDict):
+    """What the searches of a task found."""
+
+    deterministic: Number
+    confirmed: Count
+    of: Count
+
+
+class KeptResult(TypedDict):
+    """What of `study.Result` stands beside a twin's."""
+
+    task: str
+    referent: str
+    in_order: InOrder | None
+    any_order: Found | None

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.evaluation.necessity.demonstrations import HORIZON, answer_of, expert_of
+from lerobot_memobench.evaluation.necessity.demonstrations import HORIZON, REST, answer_of, expert_of, rest_steps
 from lerobot_memobench.evaluation.necessity.home import Home
-from lerobot_memobench.tasks.formula import Atom, Formula, atoms
+from lerobot_memobench.evaluation.necessity.starts import begin
+from lerobot_memobench.tasks.formula import SINCE_START, Atom, Formula, atoms
 from lerobot_memobench.tasks.task import Task
 
 if TYPE_CHECKING:
-    from lerobot_memobench.sim.simulation import Simulation
+    from lerobot_memobench.sim.simulation import Simulation, Snapshot
 
 SAME_PLACE = 0.02
 """Distance up to which an object is where it was when states of the exploration are told apart, m."""
@@ -30,7 +31,7 @@ def answers_of(variants: Sequence[Task]) -> list[Atom]:
     found: dict[Atom, None] = {}
     for task in variants:
         for formula in (*(checkpoint.goal for checkpoint in task.checkpoints), task.goal):
-            found.update((answer_of(atom), None) for atom in steps_of(formula))
+            found.update((answer_of(atom), None) for atom in steps_of(formula) if atom.predicate not in SINCE_START)
     return list(found)
 
 
@@ -59,16 +60,24 @@ class Laboratory:
         variants: the task and its variants, which share the scene.
         sim: its simulation.
         seed: of the start.
+
+    Attributes:
+        answers: what can be done: `REST` where a goal asks for rest, and what the expert does.
+        starts: where each variant's execution begins; the same for all but those whose prompt changes the scene.
     """
 
     def __init__(self, variants: Sequence[Task], sim: Simulation, seed: int) -> None:
         self.variants, self.sim, self.seed = variants, sim, seed
-        self.answers = {str(atom): atom for atom in answers_of(variants)}
         goals: list[Formula] = [task.goal for task in variants]
+        self._deeds = {str(atom): atom for atom in answers_of(variants)}
+        self._rest = max(rest_steps(goal) for goal in goals)
+        self.answers = (*self._deeds, REST) if self._rest else tuple(self._deeds)
         self._atoms = sorted({answer_of(atom) for goal in goals for atom in atoms(goal)}, key=str)
-        sim.reset(seed)
+        self.starts: list[Snapshot] = []
+        for variant in variants:
+            begin(variant, sim, seed)
+            self.starts.append(sim.snapshot())
         self.home = Home(sim)
-        self.start = sim.snapshot()
 
     def true(self) -> frozenset[Atom]:
         """Return the atoms of the goals that hold now."""
@@ -81,20 +90,35 @@ class Laboratory:
             listen: told the atoms that hold after each step.
             limit: steps after which the answer is broken off.
         """
-        atom = self.answers[answer]
         steps = 0
-        if not self.sim.holds(atom):
-            expert = expert_of(self.variants[0], self.sim, self.seed)
-            for action in expert.achieve(atom):
-                if steps >= limit:
-                    break
-                self.sim.step(np.clip(action, -1.0, 1.0))
-                steps += 1
-                listen(self.true())
+        for action in self._motion(answer):
+            if steps >= limit:
+                break
+            self.sim.step(np.clip(action, -1.0, 1.0))
+            steps += 1
+            listen(self.true())
         for _ in self.home.settle():
             steps += 1
             listen(self.true())
         return steps
+
+    def _motion(self, answer: str) -> Iterator[NDArray[np.floating]]:
+        """Yield the actions of an answer; none where it is so already, or nobody can see what to take."""
+        from lerobot_memobench.sim.simulation import NO_OP
+
+        if answer == REST:
+            yield from (NO_OP for _ in range(self._rest))
+            return
+        atom = self._deeds[answer]
+        if not self.sim.holds(atom) and not self._shut_away(atom.args[0]):
+            yield from expert_of(self.variants[0], self.sim, self.seed).achieve(atom)
+
+    def _shut_away(self, thing: str) -> bool:
+        """Whether a thing lies in a closed drawer: an expert that looks into the simulator would know which."""
+        if thing not in self.sim.task.objects:
+            return False
+        drawers = [f"{name}_{part}" for name, asset in self.sim.assets.items() for part in asset.articulations if part]
+        return any(self.sim.holds(Atom("in", (thing, it))) and self.sim.holds(Atom("close", (it,))) for it in drawers)
 
     def place(self) -> Place:
         """Return where things are now."""

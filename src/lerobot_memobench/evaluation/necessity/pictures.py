@@ -7,6 +7,7 @@ from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
@@ -36,20 +37,40 @@ def unmatched(a: Picture, b: Picture, shift: int = SHIFT, colour: int = COLOUR) 
         shift: how far away a like pixel may be, pixels.
         colour: how far its channels may differ.
     """
-    first, second = a.astype(np.int16), b.astype(np.int16)
-    rows, columns = np.nonzero(np.abs(first - second).max(axis=-1) > colour)
-    if not len(rows):
+    if np.array_equal(a, b):
         return 0.0
-    worst = 0
-    for here, there in ((first, second), (second, first)):
-        padded = np.pad(there, ((shift, shift), (shift, shift), (0, 0)), mode="edge")
-        found = np.zeros(len(rows), dtype=bool)
-        for dy in range(2 * shift + 1):
-            for dx in range(2 * shift + 1):
-                near = padded[rows + dy, columns + dx] - here[rows, columns]
-                found |= np.abs(near).max(axis=-1) <= colour
-        worst = max(worst, int((~found).sum()))
-    return worst / first.shape[0] / first.shape[1]
+    first, second = a.astype(np.int16), b.astype(np.int16)
+    worst = max(_lacking(first, second, shift, colour), _lacking(second, first, shift, colour))
+    return float(worst / first.shape[0] / first.shape[1])
+
+
+@njit
+def _lacking(here: NDArray[np.int16], there: NDArray[np.int16], shift: int, colour: int) -> int:
+    """Return how many pixels of one picture have no like pixel near the same place in the other."""
+    height, width, _ = here.shape
+    lacking = 0
+    for y in range(height):
+        for x in range(width):
+            if not _like(here, y, x, there, y, x, colour):  # most are like the one at the very place
+                lacking += not _near(here, y, x, there, shift, colour)
+    return lacking
+
+
+@njit
+def _near(here: NDArray[np.int16], y: int, x: int, there: NDArray[np.int16], shift: int, colour: int) -> bool:
+    for v in range(max(y - shift, 0), min(y + shift + 1, there.shape[0])):
+        for u in range(max(x - shift, 0), min(x + shift + 1, there.shape[1])):
+            if _like(here, y, x, there, v, u, colour):
+                return True
+    return False
+
+
+@njit
+def _like(here: NDArray[np.int16], y: int, x: int, there: NDArray[np.int16], v: int, u: int, colour: int) -> bool:
+    like = True
+    for channel in range(3):
+        like &= abs(here[y, x, channel] - there[v, u, channel]) <= colour
+    return like
 
 
 def difference(a: Sequence[Picture], b: Sequence[Picture]) -> float:

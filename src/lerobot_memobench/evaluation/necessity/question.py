@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 from lerobot_memobench.evaluation.necessity.demonstrations import HORIZON
@@ -12,6 +13,8 @@ from lerobot_memobench.tasks.task import Task
 VERSION = 1
 """Raised when results change, so that old ones are made again."""
 REFERENTS = ("fixed", "random")
+DRAWN = "drawn"
+"""The referent of tasks whose every episode draws its goal."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +25,8 @@ class Settings:
         episodes: scenes (seeds) per task; with `referent=random` each is demonstrated once per variant.
         seed_base: the first of their seeds.
         tolerance: share of pixels without a like pixel within two, up to which pictures look the same.
-        budget: control steps after which the search for other ways to the goal begins no new state; 0 leaves it out.
+        budget: control steps, per different start, after which the search for other ways to the goal begins no new
+            state; 0 leaves it out.
         horizon: execution steps.
     """
 
@@ -38,18 +42,29 @@ class Settings:
         return range(self.seed_base, self.seed_base + self.episodes)
 
 
+def settings_of(task: Task, referents: Sequence[str]) -> tuple[str, ...]:
+    """Return which referents to look at of those asked for: with one goal all are the same, a draw leaves no choice."""
+    if task.drawn:
+        return (DRAWN,)
+    return tuple(referents) if task.num_variants > 1 else REFERENTS[:1]
+
+
 def variants_of(task: Task, referent: str) -> list[Task]:
-    """Return the goals that may lie behind the same start: the published one, or all that a random referent draws."""
+    """Return the goals that may lie behind the same start: the published one, or all that are drawn."""
     if referent == "fixed" or task.num_variants == 1:
         return [task]
     return [task.variant(k) for k in task.random_variants]
 
 
-def fingerprint(task: Task, referent: str, settings: Settings, search: bool = False) -> str:
-    """Return what a scene's result, or that of the search, must carry to be an answer to the same question."""
-    other = ("episodes", "seed_base") if search else ("episodes", "seed_base", "budget")
+def fingerprint(task: Task, referent: str, settings: Settings, searched: int | None = None) -> str:
+    """Return what a kept answer must carry to be one to the same question.
+
+    Args:
+        searched: for the search, the seed of the start; None for the result of a scene, which has its seed in its name.
+    """
+    other = ("episodes", "seed_base") if searched is not None else ("episodes", "seed_base", "budget")
     asked = {key: value for key, value in asdict(settings).items() if key not in other}
-    if search:
-        asked["seed"] = settings.seed_base
+    if searched is not None:
+        asked["seed"] = searched
     said = json.dumps([VERSION, referent, asked, task.bddl_text, task.metadata], sort_keys=True)
     return hashlib.sha256(said.encode()).hexdigest()[:16]

@@ -11,30 +11,14 @@ from typing import Any
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.tables import NOT_APPLICABLE, figure
 from lerobot_memobench.evaluation.necessity.aliased_pairs import figure as pairs_figure
+from lerobot_memobench.evaluation.necessity.kept import KeptResult
 from lerobot_memobench.evaluation.necessity.study import Result
+from lerobot_memobench.evaluation.necessity.twins import bounds, side_by_side
+from lerobot_memobench.evaluation.necessity.verdicts import VERDICTS, verdict
 from lerobot_memobench.files import write_file
+from lerobot_memobench.files.reading import read_json
 
 JSON_FILE, MARKDOWN_FILE, FIGURE_FILE = "necessity.json", "necessity.md", "aliased_pairs.png"
-
-VERDICTS = {
-    "no": "pictures decide every step of the demonstrated routine: no memory is needed",
-    "order": "the demonstrated order needs memory; another order that the goal accepts does not",
-    "yes": "no order found reaches the goal from pictures alone: memory is needed",
-    "order?": "the demonstrated order needs memory; other ways were not looked for",
-    "unknown": "the expert solved none of the scenes, so nothing can be said",
-}
-
-
-def verdict(result: Result) -> str:
-    """Return which of `VERDICTS` holds."""
-    in_order, any_order = result["in_order"], result["any_order"]
-    if in_order is None:
-        return "unknown"
-    if in_order["deterministic"] >= 1.0:
-        return "no"
-    if any_order is None:
-        return "order?"
-    return "order" if any_order["confirmed"] == any_order["of"] else "yes"
 
 
 @dataclass(frozen=True)
@@ -128,6 +112,7 @@ def markdown(results: Sequence[Result]) -> str:
         f"Moments that count as looking the same differ in at most {100 * same:.2f} % of the pixels of a camera, those "
         f"that count as different in at least {100 * other:.2f} %.",
         "",
+        *([bounds(results), ""] if bounds(results) else []),
         "### Ways to the goal that need no memory",
         "",
     ]
@@ -152,8 +137,25 @@ def _ways(results: Sequence[Result]) -> list[str]:
 PAGE_BEGIN, PAGE_END = "<!-- made by `memobench necessity --page`: -->", "<!-- end of what it made -->"
 
 
-def put_into_page(page: Path, results: Sequence[Result]) -> Path:
+def read_results(path: Path) -> list[Result]:
+    """Return the results that another run wrote into its ``necessity.json``.
+
+    Raises:
+        MemobenchError: it is missing, cannot be read or holds something else.
+    """
+    advice = f"name the {JSON_FILE} that `memobench necessity` wrote"
+    try:
+        found: list[Result] = read_json(path, list[KeptResult], advice)
+    except FileNotFoundError:
+        raise MemobenchError(f"there is no {path}; {advice}") from None
+    return found
+
+
+def put_into_page(page: Path, results: Sequence[Result], beside: Sequence[Result] | None = None) -> Path:
     """Put the table into a Markdown page, between its two marks; return the page.
+
+    Args:
+        beside: results of the published tasks; then the table shows those and their twins, which ``results`` are of.
 
     Raises:
         MemobenchError: there is no such page, or it lacks the marks.
@@ -170,7 +172,8 @@ def put_into_page(page: Path, results: Sequence[Result]) -> Path:
         raise MemobenchError(
             f"the page {page} lacks the lines {PAGE_BEGIN!r} and {PAGE_END!r}; put them where the table goes"
         )
-    return write_file(page, f"{before}{begin}\n\n{markdown(results)}\n{end}{after}")
+    table = markdown(results) if beside is None else side_by_side(beside, results)
+    return write_file(page, f"{before}{begin}\n\n{table}\n{end}{after}")
 
 
 def write(out: Path, results: Sequence[Result]) -> list[Path]:

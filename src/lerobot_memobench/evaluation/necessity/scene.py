@@ -46,10 +46,12 @@ class Scene:
     def __init__(self, variants: Sequence[Task], shown: Sequence[Demonstration], tolerance: float) -> None:
         self._owners: list[int] = []
         self._moments: list[Moment] = []
+        self._asked: list[str] = []
         for variant, demonstration in zip(variants, shown, strict=True):
             if demonstration.success:
                 self._moments += demonstration.moments
                 self._owners += [variant.variant_index] * len(demonstration.moments)
+                self._asked += [variant.language] * len(demonstration.moments)
         self._tolerance = tolerance
         self._differences = differences([moment.at_home for moment in self._moments])
         self._pictures = classes(self._differences, tolerance)
@@ -80,9 +82,12 @@ class Scene:
         return np.concatenate([*self._moments[i].at_home, *self._moments[j].at_home], axis=1)
 
     def _histories(self, pictures: Sequence[int]) -> list[History]:
+        """Return a history per demonstration; what is seen under different instructions can be told apart."""
         rows: dict[int, list[Decision]] = {}
-        for owner, moment, picture in zip(self._owners, self._moments, pictures, strict=True):
-            rows.setdefault(owner, []).append(Decision(picture, moment.answer))
+        instructions = list(dict.fromkeys(self._asked))
+        for owner, asked, moment, picture in zip(self._owners, self._asked, self._moments, pictures, strict=True):
+            seen = picture + instructions.index(asked) * len(self._moments)
+            rows.setdefault(owner, []).append(Decision(seen, moment.answer))
         return [tuple(row) for row in rows.values()]
 
     @cached_property
@@ -91,7 +96,9 @@ class Scene:
         return [
             (i, j)
             for i, j in combinations(range(len(self._moments)), 2)
-            if self._pictures[i] == self._pictures[j] and self._moments[i].answer != self._moments[j].answer
+            if self._pictures[i] == self._pictures[j]
+            and self._asked[i] == self._asked[j]
+            and self._moments[i].answer != self._moments[j].answer
         ]
 
     def _example(self, seed: int, i: int, j: int) -> dict[str, Any]:

@@ -6,26 +6,25 @@ are.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.necessity.any_order import search
 from lerobot_memobench.evaluation.necessity.demonstrations import follow
-from lerobot_memobench.evaluation.necessity.kept import KeptScene, KeptSearch
+from lerobot_memobench.evaluation.necessity.kept import Kept, KeptScene, KeptSearch
 from lerobot_memobench.evaluation.necessity.laboratory import Laboratory
 from lerobot_memobench.evaluation.necessity.question import Settings, fingerprint, variants_of
 from lerobot_memobench.evaluation.necessity.scene import EXAMPLES, Scene
-from lerobot_memobench.files import draft_of, file_name, write_file
-from lerobot_memobench.files.reading import read_json
+from lerobot_memobench.files import draft_of, file_name
 from lerobot_memobench.tasks.task import Task
 
 if TYPE_CHECKING:
     from lerobot_memobench.sim.simulation import Simulation
+
+Piece = Literal["scene", "search"]
+"""What is made and kept one at a time, for each seed."""
 
 Result = Mapping[str, Any]
 """What is found about a task: JSON values."""
@@ -39,55 +38,62 @@ def study(task: Task, referent: str, settings: Settings, out: Path) -> Result:
 class Study:
     """One task under one referent setting: what is on disk is read, the rest is simulated and kept.
 
-    Scenes and the search do not depend on one another; processes may make them in one folder.
+    Scenes and searches do not depend on one another; processes may make them in one folder.
     """
 
     def __init__(self, task: Task, referent: str, settings: Settings, out: Path) -> None:
         self.task, self.referent, self.settings, self.out = task, referent, settings, out
         self.variants = variants_of(task, referent)
 
-    @cached_property
-    def _sim(self) -> Simulation:
-        from lerobot_memobench.sim.simulation import Simulation
+    def piece(self, piece: Piece, seed: int) -> Kept:
+        """Return what a scene's demonstrations show, or which ways to the goal are found from its start in any order.
 
-        return Simulation(self.task)
+        It is on disk, or made when it is asked for.
+        """
+        if piece == "scene":
+            mark, path = fingerprint(self.task, self.referent, self.settings), self._path(str(seed))
+            return Kept(path, KeptScene, mark, lambda: self._observe(seed))
+        mark, path = fingerprint(self.task, self.referent, self.settings, seed), self._path(f"search.{seed}")
+        return Kept(path, KeptSearch, mark, lambda: self._explore(seed))
 
-    def scene(self, seed: int) -> dict[str, Any]:
-        """Return what the demonstrations from one start show."""
-        mark = fingerprint(self.task, self.referent, self.settings)
-        return _kept(self._path(str(seed)), KeptScene, mark, lambda: self._observe(seed))
-
-    def search(self) -> dict[str, Any]:
-        """Return the ways to the goal that were found from the first start, in any order."""
-        mark = fingerprint(self.task, self.referent, self.settings, search=True)
-        return _kept(self._path("search"), KeptSearch, mark, self._search)
+    @property
+    def searched(self) -> bool:
+        """Whether other ways to the goal are looked for: without need of a memory there is no search."""
+        in_order = _mean_of([scene["in_order"] for scene in self._all("scene") if scene["in_order"]])
+        return in_order is not None and in_order["deterministic"] < 1.0 and self.settings.budget > 0
 
     def result(self) -> Result:
-        """Return what scenes and search say together; without need of a memory there is no search."""
-        summary = _over_scenes([self.scene(seed) for seed in self.settings.seeds], len(self.variants))
-        in_order = summary["in_order"]
-        searched = in_order is not None and in_order["deterministic"] < 1.0 and self.settings.budget > 0
+        """Return what scenes and searches say together."""
         return {
             "task": self.task.name,
             "memory_type": self.task.memory_type,
             "referent": self.referent,
             "settings": asdict(self.settings),
             "has_variants": self.task.num_variants > 1,
-            **summary,
-            "any_order": self.search() if searched else None,
+            **_over_scenes(self._all("scene"), len(self.variants)),
+            "any_order": _over_searches(self._all("search")) if self.searched else None,
         }
+
+    def _all(self, piece: Piece) -> list[dict[str, Any]]:
+        return [self.piece(piece, seed).get() for seed in self.settings.seeds]
 
     def _path(self, what: str) -> Path:
         return self.out / "results" / f"{self.task.name}.{self.referent}.{what}.json"
 
     def _observe(self, seed: int) -> dict[str, Any]:
-        shown = [follow(variant, self._sim, seed, self.settings.horizon) for variant in self.variants]
+        sim = self._simulation()
+        shown = [follow(variant, sim, seed, self.settings.horizon) for variant in self.variants]
         scene = Scene(self.variants, shown, self.settings.tolerance)
         _write_pair(scene, pictures_path(self.out, self.task.name, self.referent, seed))
         return scene.result(seed)
 
-    def _search(self) -> dict[str, Any]:
-        return search(Laboratory(self.variants, self._sim, self.settings.seed_base), self.settings)
+    def _explore(self, seed: int) -> dict[str, Any]:
+        return search(Laboratory(self.variants, self._simulation(), seed), self.settings)
+
+    def _simulation(self) -> Simulation:
+        from lerobot_memobench.sim.simulation import Simulation
+
+        return Simulation(self.task)
 
 
 def _over_scenes(scenes: Sequence[Mapping[str, Any]], variants: int) -> dict[str, Any]:
@@ -102,6 +108,16 @@ def _over_scenes(scenes: Sequence[Mapping[str, Any]], variants: int) -> dict[str
         "examples": [example for scene in scenes for example in scene["examples"]][:EXAMPLES],
         "largest_same": max(scene["largest_same"] for scene in scenes),
         "smallest_different": min(scene["smallest_different"] for scene in scenes),
+    }
+
+
+def _over_searches(searches: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return what the searches of a task say together; the policy is the first one's."""
+    return {
+        **{key: sum(found[key] for found in searches) / len(searches) for key in ("deterministic", "stochastic")},
+        **{key: sum(found[key] for found in searches) for key in ("confirmed", "of")},
+        **{key: all(found[key] for found in searches) for key in ("complete", "exhausted")},
+        "policy": searches[0]["policy"],
     }
 
 
@@ -133,17 +149,3 @@ def _write_pair(scene: Scene, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with draft_of(path) as draft:
         Image.fromarray(strip).save(draft, optimize=True)
-
-
-def _kept(path: Path, schema: Any, mark: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """Return what ``path`` holds if it answers this question, else what ``make`` returns, written there."""
-    try:
-        found: dict[str, Any] = read_json(path, schema, "it is made again")
-        if found["fingerprint"] == mark:
-            return found
-    except (FileNotFoundError, MemobenchError):
-        pass  # as good as absent
-    result = {"fingerprint": mark, **make()}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_file(path, json.dumps(result, indent=1) + "\n")
-    return result

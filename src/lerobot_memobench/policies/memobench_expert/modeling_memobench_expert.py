@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 from torch import Tensor
 
@@ -10,14 +10,17 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_expert.configuration_memobench_expert import MemobenchExpertConfig
 from lerobot_memobench.policies.untrained_policy import UntrainedPolicy
 
-EXPERT_ACTION = "observation.expert_action"
-
 
 class MemobenchExpertPolicy(UntrainedPolicy):
-    """Parameter-less policy. ``select_action`` returns ``batch["observation.expert_action"]``, (B, 7) float32."""
+    """Parameter-less policy. ``select_action`` returns ``batch["observation.expert_action"]``, (B, 7) float32.
+
+    Attributes:
+        offered: the environment's setting, and the part of the observation, with the action.
+    """
 
     config_class = MemobenchExpertConfig
     name = "memobench_expert"
+    offered: ClassVar[str] = "expert_action"
 
     def __init__(self, config: MemobenchExpertConfig, **kwargs: Any) -> None:
         super().__init__(config)
@@ -27,14 +30,15 @@ class MemobenchExpertPolicy(UntrainedPolicy):
         """The expert lives in the environment, so there is no state to clear."""
 
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Return the expert's action (B, 7) in [-1, 1] for the current observation.
+        """Return the action (B, 7) in [-1, 1] that the environment offers for the current observation.
 
         Raises:
-            MemobenchError: the environment was made without ``expert_action``.
+            MemobenchError: the environment was made without ``offered``.
         """
-        if EXPERT_ACTION not in batch:
+        key = f"observation.{self.offered}"
+        if key not in batch:
             raise MemobenchError(
-                f"The policy 'memobench_expert' found no '{EXPERT_ACTION}' in the observation: pass "
-                "--env.expert_action=true, or use `lerobot eval env=memobench`, which sets it."
+                f"The policy '{self.name}' found no '{key}' in the observation: pass --env.{self.offered}=true, or use "
+                "`lerobot eval env=memobench`, which sets it."
             )
-        return batch[EXPERT_ACTION]
+        return batch[key]

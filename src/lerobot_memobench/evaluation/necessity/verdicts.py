@@ -1,0 +1,25 @@
+"""Is a memory needed? What the figures of a task come to."""
+
+from __future__ import annotations
+
+from lerobot_memobench.evaluation.necessity.study import Result
+
+VERDICTS = {
+    "no": "pictures decide every step of the demonstrated routine: no memory is needed",
+    "order": "the demonstrated order needs memory; another order that the goal accepts does not",
+    "yes": "no order found reaches the goal from pictures alone: memory is needed",
+    "order?": "the demonstrated order needs memory; other ways were not looked for",
+    "unknown": "the expert solved none of the scenes, so nothing can be said",
+}
+
+
+def verdict(result: Result) -> str:
+    """Return which of `VERDICTS` holds."""
+    in_order, any_order = result["in_order"], result["any_order"]
+    if in_order is None:
+        return "unknown"
+    if in_order["deterministic"] >= 1.0:
+        return "no"
+    if any_order is None:
+        return "order?"
+    return "order" if any_order["confirmed"] == any_order["of"] else "yes"

@@ -1,0 +1,1 @@
+"""The published routine, repeated blindly, seen as a LeRobot policy."""

@@ -1,0 +1,35 @@
+"""The blind routine does the published task, and again when it is done."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lerobot_memobench.envs.episode import Episode
+from lerobot_memobench.tasks.catalogue import get_task
+from lerobot_memobench.tasks.formula import Atom
+
+STOVE = "turn_on_the_stove_and_turn_it_off"
+COUNTED = "turn_the_stove_on_and_off_a_given_number_of_times"
+LIT = Atom("turnon", ("flat_stove_1",))
+
+
+def test_the_published_task_is_done_and_begun_again() -> None:
+    episode = Episode(get_task(STOVE))
+    episode.reset(20_001)
+    lit = [False]
+    succeeded = False
+    for _ in range(600):
+        episode.step(episode.blind_action())
+        succeeded = succeeded or episode.success
+        lit.append(episode.sim.holds(LIT))
+    assert succeeded
+    assert np.count_nonzero(np.diff(np.array(lit, dtype=int)) == 1) > 1, "it goes on after the goal has come true"
+
+
+def test_who_cannot_count_fails_the_twin() -> None:
+    episode = Episode(get_task(COUNTED))
+    for seed in (20_001, 20_002, 20_003):
+        episode.reset(seed)
+        while not episode.done:
+            episode.step(episode.blind_action())
+        assert not episode.success

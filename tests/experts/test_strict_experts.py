@@ -1,0 +1,144 @@
+"""Experts count, keep an order and find what was hidden; prompts that hide are shown whole."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lerobot_memobench.envs.episode import Episode
+from lerobot_memobench.envs.observations import EXECUTION
+from lerobot_memobench.experts.plans import counts, plan_of
+from lerobot_memobench.tasks.catalogue import get_task, task_names
+from lerobot_memobench.tasks.formula import Atom
+from lerobot_memobench.tasks.formula_parsing import parse_formula
+from lerobot_memobench.tasks.progress import Progress
+from lerobot_memobench.tasks.task import Task
+
+MICROWAVE = "open_and_close_the_microwave_a_given_number_of_times"
+BOWL = "check_the_middle_drawer_once_then_put_the_black_bowl_in_the_top_drawer"
+DRAWERS = "check_all_three_drawers_once_each_in_the_given_order"
+STOVE = "turn_the_stove_on_and_off_once_then_put_the_frying_pan_on_it"
+CHARGER = "find_the_charger_hidden_in_one_of_the_drawers"
+PAIR = "find_the_charger_or_the_cap_hidden_in_two_of_the_drawers"
+SMOOTH = 0.25
+"""Largest change of an action's component from one step to the next."""
+
+
+def words(task: Task) -> list[str]:
+    """Return a plan in short: predicate and the last word of what it is about, without the cabinet's name."""
+    return [
+        " ".join((step.predicate, *step.args[-1:])).replace("wooden_cabinet_1_", "").replace("_region", "")
+        if isinstance(step, Atom)
+        else f"rest {step.number}"
+        for step in plan_of(task.goal)
+    ]
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_a_round_is_planned_as_often_as_asked_for_and_then_a_rest(number: int) -> None:
+    around = ["handhome", "open microwave_1", "close microwave_1"]
+    rest = ["handhome", "close microwave_1", "rest 40"]
+    assert words(get_task(MICROWAVE).variant(number - 1)) == around * number + rest
+
+
+def test_what_is_counted_twice_is_planned_once() -> None:
+    once = ["exactly", 1, ["round", ["open", "d"], ["close", "d"]]]
+    from_home = ["exactly", 1, ["round", ["handhome"], ["open", "d"], ["close", "d"]]]
+    goal = parse_formula(["and", from_home, once])
+    assert counts(goal)
+    assert plan_of(goal) == [Atom("handhome", ()), Atom("open", ("d",)), Atom("close", ("d",))]
+
+
+def test_things_are_put_away_before_the_drawer_is_shut() -> None:
+    plan = words(get_task(BOWL))
+    assert plan[:5] == ["handhome", "open middle", "close middle", "handhome", "open top"]
+    assert plan.index("in top") < plan.index("close top")
+
+
+def test_each_event_of_an_order_is_planned_once() -> None:
+    task = get_task(DRAWERS)
+    for k in range(task.num_variants):
+        opened = [step.split()[1] for step in words(task.variant(k)) if step.startswith("open")]
+        unlike = [name for name, before in zip(opened, [None, *opened], strict=False) if name != before]
+        assert sorted(unlike) == ["bottom", "middle", "top"]
+
+
+def test_every_counting_goal_is_reached_by_its_plan_without_physics() -> None:
+    """Atoms of a plan made true one after the other, each for some steps, make the goal true."""
+    for name in task_names("temporal", suite="strict"):
+        base = get_task(name)
+        for k in range(base.num_variants):
+            assert follows(base.variant(k)), (name, k)
+
+
+def follows(task: Task) -> bool:
+    """Return whether the goal comes true on paper when the plan is carried out."""
+    undone = {"open": "close", "turnon": "turnoff"}
+    ends = undone | {closed: opened for opened, closed in undone.items()}
+    plan = plan_of(task.goal)
+    moved = [step for step in plan if isinstance(step, Atom) and step.predicate in undone]
+    true = {Atom(undone[step.predicate], step.args) for step in moved}
+    true |= {Atom("handhome", ())} | {Atom("inplace", (thing,)) for thing in task.objects}
+    progress = Progress(task)
+    for step in plan:
+        if isinstance(step, Atom) and step not in true:
+            true -= {Atom("handhome", ()), Atom(ends.get(step.predicate, ""), step.args)}
+            if step.predicate in ("in", "on"):
+                true.discard(Atom("inplace", step.args[:1]))
+            true.add(step)
+        for _ in range(1 if isinstance(step, Atom) else step.number):
+            progress.step(true.__contains__)
+    return progress.success
+
+
+def play(task: Task, seed: int) -> Episode:
+    """Let the expert act until the episode ends; check that it went as a demonstration must."""
+    episode = Episode(task)
+    episode.reset(seed)
+    actions = []
+    while not episode.done:
+        action = episode.expert_action()
+        if episode.phase == EXECUTION:
+            actions.append(action)
+        episode.step(action)
+    assert episode.success
+    assert None not in episode.progress.ordered_step
+    assert episode.prompt_shown is not False
+    assert np.abs(actions).max() <= 1.0
+    assert np.abs(np.diff(np.array(actions)[:, :6], axis=0)).max() <= SMOOTH
+    return episode
+
+
+@pytest.mark.parametrize(("name", "variant"), [(MICROWAVE, 2), (DRAWERS, 5), (STOVE, 0), (CHARGER, 2)])
+def test_solves_a_twin_of_each_family(name: str, variant: int) -> None:
+    play(get_task(name).variant(variant), 20_000)
+
+
+def test_comes_home_between_events_and_does_not_rest_there() -> None:
+    episode = Episode(get_task("check_the_top_drawer_a_given_number_of_times").variant(1))
+    episode.reset(20_000)
+    home = Atom("handhome", ())
+    visits, longest, now = 0, 0, 0
+    while episode.progress.index < 3:  # two events done
+        episode.step(episode.expert_action())
+        there = episode.sim.holds(home)
+        visits += there and not now
+        now = now + 1 if there else 0
+        longest = max(longest, now)
+    assert visits >= 2
+    assert longest < 40
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("name", task_names(suite="strict"))
+def test_solves_every_variant(name: str) -> None:
+    base = get_task(name)
+    for k in range(base.num_variants):
+        play(base.variant(k), 20_000 + k)
+
+
+@pytest.mark.slow
+def test_two_hidings_fit_into_a_prompt() -> None:
+    for seed in range(20_000, 20_005):
+        assert play(get_task(PAIR), seed).prompt_shown

@@ -1,0 +1,77 @@
+"""What is left near its closed end goes back to where it began; what stands open, and all published scenes, stay."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from lerobot_memobench.sim import robot
+from lerobot_memobench.sim.scene import scene_spec
+from lerobot_memobench.sim.simulation import NO_OP, Simulation
+from lerobot_memobench.tasks.catalogue import get_task, task_names
+
+DRAWER = ("check_the_top_drawer_a_given_number_of_times", "wooden_cabinet_1_top_region")
+DOOR = ("open_and_close_the_microwave_a_given_number_of_times", "microwave_1")
+KNOB = ("turn_the_stove_on_and_off_a_given_number_of_times", "flat_stove_1")
+AT_REST = 1e-9
+"""Distance from the start at which a joint has come to rest, m or rad."""
+
+
+def left_at(name: str, thing: str, q: float, steps: int = 20) -> tuple[float, float]:
+    """Return where a joint was after the reset, and where it is some steps after it was left at ``q``."""
+    sim = Simulation(get_task(name))
+    sim.reset(20_000)
+    articulation, start = sim.world.articulation(thing)
+    sim.data.joint(articulation.joint).qpos[0] = q
+    sim.data.joint(articulation.joint).qvel[0] = 0.0
+    mujoco.mj_step1(sim.model, sim.data)
+    for _ in range(steps):
+        sim.step(NO_OP)
+    return start, sim.world.articulation(thing)[1]
+
+
+@pytest.mark.parametrize(
+    ("place", "q"),
+    [
+        pytest.param(DRAWER, 0.0001, id="drawer that just counts as shut"),
+        pytest.param(DRAWER, 0.0049, id="drawer pushed nearly home"),
+        pytest.param(DRAWER, 0.0099, id="drawer as deep as the published ones go"),
+        pytest.param(DOOR, -0.0049, id="door that just counts as shut"),
+        pytest.param(DOOR, -0.0005, id="door nearly shut"),
+        pytest.param(KNOB, -0.0001, id="knob that just counts as off"),
+        pytest.param(KNOB, 0.03, id="knob a little on"),
+    ],
+)
+def test_what_is_nearly_closed_goes_back_to_where_it_began(place: tuple[str, str], q: float) -> None:
+    start, now = left_at(*place, q)
+    assert abs(now - start) < AT_REST
+
+
+@pytest.mark.parametrize(("place", "q"), [(DRAWER, -0.03), (DRAWER, -0.15), (DOOR, -0.2), (KNOB, 0.32), (KNOB, 0.6)])
+def test_what_stands_open_stays_where_it_was_left(place: tuple[str, str], q: float) -> None:
+    assert abs(left_at(*place, q)[1] - q) < 1e-4
+
+
+def test_the_start_does_not_move() -> None:
+    sim = Simulation(get_task(DRAWER[0]))
+    sim.reset(20_000)
+    start = sim.data.qpos.copy()
+    for _ in range(100):
+        sim.step(NO_OP)
+    np.testing.assert_allclose(sim.data.qpos, start, atol=1e-4)
+    assert abs(sim.data.qpos[7] - robot.GRIPPER_OPEN[0]) < 1e-4
+
+
+@pytest.mark.parametrize("name", task_names("temporal"))
+def test_published_scenes_have_no_catches(name: str) -> None:
+    spec, _ = scene_spec(get_task(name))
+    assert not spec.tendons
+    assert all(tuple(joint.range) == (-0.16, 0.01) for joint in spec.joints if joint.name.endswith("_level"))
+
+
+@pytest.mark.parametrize("name", task_names("temporal", suite="strict"))
+def test_every_strict_joint_has_one(name: str) -> None:
+    spec, assets = scene_spec(get_task(name))
+    joints = [articulation.joint for asset in assets.values() for articulation in asset.articulations.values()]
+    assert sorted(tendon.name for tendon in spec.tendons) == sorted(f"{joint}_catch" for joint in joints)
