@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.sim.object_slots import SIZE
 from lerobot_memobench.tasks import Atom, Checkpoint, Task
 
 MakeTask = Callable[..., Task]
@@ -91,6 +92,7 @@ def make_demo(make_task: MakeTask) -> MakeDemo:
             success=success,
             fixture_poses={"cabinet": np.arange(7.0)},
             scene_hash="abc",
+            objects=rng.normal(size=(length, SIZE)).astype(np.float32),
         )
 
     return make

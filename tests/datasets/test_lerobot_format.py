@@ -172,7 +172,8 @@ def test_dataloader_batches(dataset):
     assert batch["observation.images.image"].shape == (4, 3, SIZE, SIZE)
 
 
-def test_policy_features_are_images_state_and_action_only(dataset):
+def test_policy_features_are_images_objects_state_and_action_only(dataset):
+    from lerobot.configs import FeatureType
     from lerobot.utils.feature_utils import dataset_to_policy_features
 
     features = dataset_to_policy_features(dataset.meta.features)
@@ -180,8 +181,10 @@ def test_policy_features_are_images_state_and_action_only(dataset):
         "observation.images.image",
         "observation.images.wrist_image",
         "observation.state",
+        "observation.environment_state",
         "action",
     }
+    assert features["observation.environment_state"].type is FeatureType.ENV
     assert features["observation.images.image"].shape == (3, SIZE, SIZE)
 
 
@@ -283,7 +286,7 @@ def test_card(dataset):
     card = DatasetCard.load(dataset.root / "README.md")
     assert "LeRobot" in card.data.tags
     assert card.data.license == "apache-2.0"
-    for column in dataset_features((SIZE, SIZE)):
+    for column in dataset_features((SIZE, SIZE), objects=True):
         assert f"`{column}`" in card.text
     assert "| object | here | 1 | 2 | 60 | 30.00 | 30.00 | 30.00 | 30 | 0." in card.text
     assert "|  | paper | 5 | 250 | 121,276 | 485.10 | 492.00 | 526.00 | 556 | 44.53 GiB |" in card.text

@@ -25,10 +25,12 @@ from lerobot_memobench.datasets.generation import generate
 from lerobot_memobench.datasets.labels import labels
 from lerobot_memobench.datasets.lerobot_format import is_dataset, write_dataset
 from lerobot_memobench.datasets.lerobot_format.reading import read_episode
+from lerobot_memobench.datasets.perturbation import Perturbation
 from lerobot_memobench.datasets.recording import HOLD_FRAMES, PATIENCE, record_demonstration
 from lerobot_memobench.datasets.replay import replay
 from lerobot_memobench.datasets.validate import Verdict, exit_status, validate
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.sim.object_slots import SLOTS, STARTS
 from lerobot_memobench.tasks import get_task
 from lerobot_memobench.tasks.catalogue import task_names
 
@@ -140,6 +142,52 @@ def test_replay_of_a_dataset_agrees(dataset_folder):
         assert replay(episode) is None
 
 
+MILK = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
+
+
+@pytest.fixture(scope="module")
+def moved() -> Demonstration:
+    """A highlight in the prompt, and an arm that was moved off its way."""
+    return record_demonstration(get_task(MILK), SEED + 1, images=False, referent="random", perturb=True)
+
+
+def test_the_expert_finds_back_and_says_how(moved):
+    assert moved.success
+    assert moved.executed is not None
+    off = np.abs(moved.executed - moved.actions)
+    assert not off[: moved.exec_start].any(), "the prompt is as it was"
+    acting = off[moved.exec_start : -HOLD_FRAMES]
+    assert (acting[:, :6].max(axis=1) > 0).mean() > 0.9
+    assert not acting[:, 6].any(), "the gripper does as it is told"
+    assert np.abs(moved.executed).max() <= 1
+    undisturbed = record_demonstration(get_task(MILK), SEED + 1, images=False, referent="random")
+    np.testing.assert_array_equal(undisturbed.states[: moved.exec_start], moved.states[: moved.exec_start])
+    assert undisturbed.executed is None
+
+
+def test_a_third_of_the_episodes_stays_clean():
+    action = np.zeros(7, np.float32)
+    clean = [not Perturbation(np.random.default_rng(seed)).moved(action).any() for seed in range(600)]
+    assert 150 < sum(clean) < 250
+
+
+def test_replay_agrees_on_moved_arms_and_seen_objects(moved, tmp_path):
+    assert replay(moved) is None
+    folder = write_dataset([moved], tmp_path / "ds")
+    episode = read_episode(folder, 0)
+    np.testing.assert_array_equal(episode.columns["executed_action"], moved.applied)
+    np.testing.assert_array_equal(episode.columns["action"], moved.actions)
+    np.testing.assert_array_equal(episode.columns["observation.environment_state"], moved.objects)
+    lit = moved.objects.reshape(len(moved), SLOTS, -1)[..., STARTS["highlighted"]].any(axis=1)
+    assert lit[: moved.exec_start].any()
+    assert not lit[moved.exec_start :].any()
+    assert replay(episode) is None
+    seen = episode.columns["observation.environment_state"].copy()
+    seen[moved.exec_start, 3] += 0.01
+    found = replay(replace(episode, columns={**episode.columns, "observation.environment_state": seen}))
+    assert (found.column, found.frame) == ("observation.environment_state", moved.exec_start)
+
+
 def test_replay_finds_the_first_disagreement(stove, butter):
     actions = stove.actions.copy()
     actions[40, 0] = np.clip(actions[40, 0] + 0.05, -1, 1)
@@ -228,6 +276,7 @@ def test_an_episode_is_given_up_when_the_expert_is_through(monkeypatch):
 SCRIPT = """
 import sys
 from lerobot_memobench.datasets.generation import generate
+from lerobot_memobench.sim.object_slots import SLOTS, STARTS
 from lerobot_memobench.tasks import get_task
 from lerobot_memobench.tasks.catalogue import task_names
 

@@ -52,6 +52,9 @@ def generate(
     images: Annotated[bool, typer.Option(help="Record both cameras.")] = True,
     image_size: Annotated[int, typer.Option(min=16, help="Height and width of the images, pixels.")] = 256,
     prompt_video: Annotated[bool, typer.Option(help="Begin with the prompt where a task has one.")] = True,
+    perturb: Annotated[
+        bool, typer.Option("--perturb", help="Move the arm off its way at random; action is what the expert does then.")
+    ] = False,
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     repo_id: Annotated[str | None, typer.Option(help="Name of the dataset, user/name.")] = None,
     formats: Annotated[
@@ -88,6 +91,7 @@ def generate(
             images=images,
             image_size=image_size,
             prompt_video=prompt_video,
+            perturb=perturb,
             workers=workers,
             formats=tuple(format_.value for format_ in formats or [Format.LEROBOT]),
             executor=executor.value,

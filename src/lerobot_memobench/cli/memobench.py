@@ -17,6 +17,7 @@ from lerobot_memobench.cli.demo import demo
 from lerobot_memobench.cli.doctor import doctor
 from lerobot_memobench.cli.generate import generate
 from lerobot_memobench.cli.html import html
+from lerobot_memobench.cli.learn import learn
 from lerobot_memobench.cli.merge import merge, rerun
 from lerobot_memobench.cli.necessity import necessity
 from lerobot_memobench.cli.objects import objects
@@ -51,6 +52,7 @@ COMMANDS: tuple[Callable[..., int | None], ...] = (
     data.push,
     recipe,
     study,
+    learn,
     report,
     compare,
     agreement,
@@ -91,3 +93,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"memobench: {message()} (see `memobench --help`)", file=sys.stderr)
         return int(getattr(error, "exit_code", USAGE_ERROR))
     return result if isinstance(result, int) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -7,6 +7,7 @@ An episode is recorded by the scripted expert, read from HDF5 or taken from a ro
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +36,7 @@ class Demonstration:
         referent: ``"fixed"`` or ``"random"``.
         variant: which admissible referent or order was asked for; 0 is the published one.
         states: (T, D) float64, the simulator's flattened state (1 + nq + nv).
-        actions: (T, 7) float32, OSC pose deltas and gripper, as they were really applied.
+        actions: (T, 7) float32, OSC pose deltas and gripper: what is to be done at this frame.
         proprio: (T, 8) float32, end-effector position 3, axis-angle 3, gripper joints 2.
         images: ``{"image", "wrist_image"}`` to (T, H, W, 3) uint8, or None.
         exec_start: the frame at which execution starts; the frames before it are the prompt video.
@@ -45,6 +46,8 @@ class Demonstration:
         fixture_poses: fixture name to (7,) position and quaternion wxyz.
         model_xml: the scene as MJCF, or empty.
         scene_hash: hash of the initial scene, or empty.
+        objects: (T, SIZE) float32, what could be seen as objects (`sim.object_slots`), or None.
+        executed: (T, 7) float32, what was really applied where the arm was moved off its way; None: ``actions``.
 
     Raises:
         MemobenchError: arrays of different length, or of another type or width than stated above.
@@ -64,6 +67,8 @@ class Demonstration:
     fixture_poses: dict[str, NDArray[np.float64]] = field(default_factory=dict)
     model_xml: str = ""
     scene_hash: str = ""
+    objects: NDArray[np.float32] | None = None
+    executed: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         length, count = len(self.states), len(self.task.checkpoints)
@@ -71,6 +76,10 @@ class Demonstration:
         self._check("actions", self.actions, np.float32, (length, ACTION_DIM))
         self._check("proprio", self.proprio, np.float32, (length, PROPRIO_DIM))
         self._check("satisfied", self.satisfied, np.bool_, (length, count))
+        if self.objects is not None:
+            self._check("objects", self.objects, np.float32, (length, None))
+        if self.executed is not None:
+            self._check("executed", self.executed, np.float32, (length, ACTION_DIM))
         self._check_images(length)
         self._check_start(length)
 
@@ -113,6 +122,11 @@ class Demonstration:
         return len(self.states)
 
     @property
+    def applied(self) -> NDArray[np.float32]:
+        """The actions (T, 7) that moved the arm: played again, they give the states."""
+        return self.actions if self.executed is None else self.executed
+
+    @property
     def steps(self) -> int:
         """Number of execution frames, those held after success included."""
         return len(self) - self.exec_start
@@ -125,5 +139,8 @@ class Demonstration:
                 f"it must reach into the execution, frames {self.exec_start + 1} to {len(self)}"
             )
         images = None if self.images is None else {k: v[:length] for k, v in self.images.items()}
-        cut = {name: getattr(self, name)[:length] for name in ("states", "actions", "proprio", "satisfied")}
+        columns = ("states", "actions", "proprio", "satisfied", "objects", "executed")
+        cut: dict[str, Any] = {
+            name: None if (whole := getattr(self, name)) is None else whole[:length] for name in columns
+        }
         return replace(self, images=images, **cut)

@@ -52,6 +52,7 @@ def generate(
     image_size: int = 256,
     prompt_video: bool = True,
     hold_frames: int = HOLD_FRAMES,
+    perturb: bool = False,
     formats: Collection[str] = (LEROBOT,),
     workers: int = 1,
     executor: str = "processes",
@@ -62,9 +63,10 @@ def generate(
 ) -> GenerationSummary:
     """Make ``episodes`` demonstrations of each task into the folder ``out``.
 
-    ``formats`` says what becomes of them: ``lerobot`` is a LeRobotDataset in ``out``, ``hdf5`` a file per task in
-    the published layout in ``out``/hdf5. The seeds are ``seed_base`` + i. An unfinished run of the same request in
-    ``out`` is continued (``resume=False`` starts anew), a finished one is only reported. Failed episodes are in no
+    With ``perturb`` the arm is moved off its way at random (`datasets.perturbation`), and ``action`` is what the expert
+    does there. ``formats`` says what becomes of them: ``lerobot`` is a LeRobotDataset in ``out``, ``hdf5`` a file per
+    task in the published layout in ``out``/hdf5. The seeds are ``seed_base`` + i. An unfinished run of the same request
+    in ``out`` is continued (``resume=False`` starts anew), a finished one is only reported. Failed episodes are in no
     dataset, but in the summary, the manifest and the card.
 
     ``executor`` says where ``workers`` episodes at a time are made (`jobs.executors`); it changes nothing of
@@ -80,8 +82,8 @@ def generate(
             f"{len(tasks)} tasks, {episodes} episodes, {workers} workers were asked for; each must be at least 1"
         )
     check_executor(executor, executor_options)
-    settings = RecordingSettings(referent, images, image_size, prompt_video, hold_frames)
-    plan = _Plan(tuple(tasks), episodes, seed_base, settings, _checked_formats(formats, images))
+    settings = RecordingSettings(referent, images, image_size, prompt_video, hold_frames, perturb)
+    plan = _Plan(tuple(tasks), episodes, seed_base, settings, _checked_formats(formats, settings))
     if is_finished(out):
         return _finished(out, plan)
     check_destination(out)
@@ -135,7 +137,8 @@ class _Plan:
         """A sentence for the card."""
         referent, prompts = self.settings.referent, "" if self.settings.prompt_video else ", prompt videos left out"
         seeds = f"{self.episodes} seeds per task from {self.seed_base} on"
-        return f"`memobench generate`, {seeds}, referent {referent}{prompts}. {SCRIPTED}"
+        moved = ", the arm moved off its way at random in two thirds of them" if self.settings.perturb else ""
+        return f"`memobench generate`, {seeds}, referent {referent}{prompts}{moved}. {SCRIPTED}"
 
     def jobs(self, folder: Path) -> list[RecordingJob]:
         """Return one job per seed of each task, each with a folder of its own in ``folder``."""
@@ -188,7 +191,7 @@ def is_finished(out: Path) -> bool:
     return isinstance(formats, list) and LEROBOT not in formats and (out / HDF5_FOLDER).is_dir()
 
 
-def _checked_formats(formats: Collection[str], images: bool) -> tuple[str, ...]:
+def _checked_formats(formats: Collection[str], settings: RecordingSettings) -> tuple[str, ...]:
     """Return the formats in their order, each once."""
     given = [formats] if isinstance(formats, str) else list(formats)
     for name in given:
@@ -196,7 +199,12 @@ def _checked_formats(formats: Collection[str], images: bool) -> tuple[str, ...]:
             raise MemobenchError(f"found format {name!r}, {nearest(name, FORMATS)}")
     if not given:
         raise MemobenchError(f"no format was asked for; name {' or '.join(FORMATS)}, or both")
-    if HDF5 in given and not images:
+    if HDF5 in given and settings.perturb:
+        raise MemobenchError(
+            "format 'hdf5' was asked for with the arm moved off its way, but its layout has one action per frame, and "
+            "needs two: what is to be done and what was; write format lerobot alone"
+        )
+    if HDF5 in given and not settings.images:
         raise MemobenchError("format 'hdf5' was asked for without images, which its layout holds; record them as well")
     return tuple(name for name in FORMATS if name in given)
 

@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.hdf5.mjcf import model_file
+from lerobot_memobench.datasets.perturbation import Perturbation
 from lerobot_memobench.datasets.staging.episode import HDF5, LEROBOT, StagedJob
 from lerobot_memobench.datasets.staging.stage import EpisodeStage, stage_failure
-from lerobot_memobench.envs.episode import Episode
+from lerobot_memobench.envs.episode import Episode, generator
+from lerobot_memobench.envs.observations import EXECUTION
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import NO_OP
@@ -23,6 +25,9 @@ from lerobot_memobench.tasks.task import Task
 
 HOLD_FRAMES = 10
 """Frames kept after success, without motion: the last event has a frame, and a policy learns to stop."""
+
+PERTURBATION = 4
+"""Stream of the episode's random numbers that decides how the arm is moved off its way."""
 
 PATIENCE = 40
 """Steps that an episode goes on after the expert is through with its plan: what still falls, slides or has to hold for
@@ -41,6 +46,7 @@ class RecordingSettings:
     image_size: int = 256
     prompt_video: bool = True
     hold_frames: int = HOLD_FRAMES
+    perturb: bool = False
 
 
 def record_demonstration(
@@ -53,6 +59,7 @@ def record_demonstration(
     prompt_video: bool = True,
     hold_frames: int = HOLD_FRAMES,
     image_size: int = 256,
+    perturb: bool = False,
 ) -> Demonstration:
     """Let the scripted expert carry out a task from a seed.
 
@@ -63,7 +70,7 @@ def record_demonstration(
         raise MemobenchError(
             f"variant {variant} was asked for together with referent={referent!r}; choose variants with 'fixed' only"
         )
-    settings = RecordingSettings(referent, images, image_size, prompt_video, hold_frames)
+    settings = RecordingSettings(referent, images, image_size, prompt_video, hold_frames, perturb)
     return record(compiled_episode(task.variant(variant), settings), seed, settings)
 
 
@@ -93,6 +100,7 @@ def record(
     episode.reset(seed)
     fixture_poses = episode.sim.fixture_poses()
     tape = _Tape()
+    disturb = Perturbation(generator(episode.published, seed, PERTURBATION)) if settings.perturb else None
     reached = False
     held = idle = 0
     while held < settings.hold_frames:
@@ -103,8 +111,11 @@ def record(
         idle += getattr(episode, "expert_done", False)
         over = reached or episode.done or idle > PATIENCE
         held += over
-        episode.step(np.asarray(NO_OP, dtype=np.float32) if over else episode.expert_action())
-        tape.actions.append(episode.applied_action)
+        wanted = np.asarray(NO_OP, dtype=np.float32) if over else episode.expert_action()
+        acting = disturb is not None and episode.phase == EXECUTION
+        episode.step(disturb.moved(wanted) if disturb is not None and acting and not over else wanted)
+        tape.executed.append(episode.applied_action)
+        tape.actions.append(np.clip(wanted, -1.0, 1.0) if acting else episode.applied_action)
     return tape.demonstration(episode, fixture_poses, success=reached and episode.prompt_shown is not False)
 
 
@@ -114,6 +125,8 @@ class _Tape:
 
     states: list[NDArray[np.float64]] = field(default_factory=list)
     actions: list[NDArray[np.float32]] = field(default_factory=list)
+    executed: list[NDArray[np.float32]] = field(default_factory=list)
+    objects: list[NDArray[np.float32]] = field(default_factory=list)
     proprio: list[NDArray[np.float32]] = field(default_factory=list)
     satisfied: list[tuple[bool, ...]] = field(default_factory=list)
     images: dict[str, list[NDArray[np.uint8]]] = field(default_factory=dict)
@@ -122,6 +135,7 @@ class _Tape:
         """Take down what is before the next action."""
         self.states.append(episode.sim.state())
         self.proprio.append(episode.sim.proprio())
+        self.objects.append(episode.objects())
         self.satisfied.append(episode.progress.satisfied)
 
     def keep(self, images: Images) -> None:
@@ -134,13 +148,16 @@ class _Tape:
     ) -> Demonstration:
         """Return the whole, once the episode is over; the images are given away."""
         assert episode.exec_start is not None
+        actions, executed = np.array(self.actions, dtype=np.float32), np.array(self.executed, dtype=np.float32)
         return Demonstration(
             task=episode.task,
             seed=episode.seed,
             referent=episode.referent,
             variant=episode.task.variant_index,
             states=np.array(self.states, dtype=np.float64),
-            actions=np.array(self.actions, dtype=np.float32),
+            actions=actions,
+            executed=None if np.array_equal(actions, executed) else executed,
+            objects=np.array(self.objects, dtype=np.float32),
             proprio=np.array(self.proprio, dtype=np.float32),
             images={name: np.stack(self.images.pop(name)) for name in list(self.images)} if self.images else None,
             exec_start=episode.exec_start,

@@ -16,8 +16,11 @@ from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.digest import digest
 from lerobot_memobench.datasets.labels import labels
 from lerobot_memobench.datasets.language import persistent_rows
+from lerobot_memobench.datasets.lerobot_format.layout import EXECUTED_ACTION, OBJECTS
 from lerobot_memobench.datasets.lerobot_format.reading import Columns, RecordedEpisode
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.experts.prompts import highlights_at
+from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.progress import Progress
@@ -41,24 +44,27 @@ class Disagreement:
 def replay(recorded: Demonstration | RecordedEpisode, *, task: Task | None = None) -> Disagreement | None:
     """Play an episode again and return the first disagreement, or None.
 
-    Compared are states (where recorded), proprioception, every label column, language rows, success, key frames, the
-    scene's hash and the episode's: it is of the states too, and so stands for them where LeRobot's dataset tools have
-    left them behind. ``task`` replaces the catalogue's task of that name, for datasets of tasks of one's own.
+    Compared are states (where recorded), proprioception, visible objects, every label column, language rows, success,
+    key frames, the scene's hash and the episode's: it is of the states too, and so stands for them where LeRobot's
+    dataset tools have left them behind. ``task`` replaces the catalogue's task of that name, for datasets of tasks of
+    one's own.
 
     Raises:
         MemobenchError: no such task, or the actions are gone.
     """
     if isinstance(recorded, Demonstration):
-        again = resimulate(recorded.task, recorded.seed, recorded.actions, recorded.exec_start)
-        again = replace(again, referent=recorded.referent, variant=recorded.variant)
+        again = resimulate(recorded.task, recorded.seed, recorded.applied, recorded.exec_start)
+        again = _labelled(again, recorded.actions, referent=recorded.referent, variant=recorded.variant)
         return _first_difference(demonstration_columns(recorded), demonstration_columns(again)) or _whole_difference(
             _whole(recorded), _whole(again)
         )
     task = (task or get_task(recorded.task_name)).variant(recorded.variant)
     if "action" not in recorded.columns:
         raise MemobenchError("its frames have no column 'action' (a tool removed it), so nothing can be played again")
-    again = resimulate(task, recorded.seed, recorded.columns["action"], recorded.exec_start)
-    again = replace(again, referent=recorded.referent)
+    wanted = recorded.columns["action"]
+    executed = recorded.columns[EXECUTED_ACTION if EXECUTED_ACTION in recorded.columns else "action"]
+    again = resimulate(task, recorded.seed, executed, recorded.exec_start)
+    again = _labelled(again, wanted, referent=recorded.referent)
     return _first_difference(recorded.columns, demonstration_columns(again)) or _whole_difference(
         recorded.whole, _whole(again)
     )
@@ -73,13 +79,16 @@ def resimulate(task: Task, seed: int, actions: NDArray[np.float32], exec_start: 
     sim.reset(seed)
     start, scene_hash, fixture_poses = sim.snapshot(), sim.scene_hash(), sim.fixture_poses()
     progress = Progress(task)
-    states, proprio, satisfied = [], [], []
+    look = ObjectSlots(sim)
+    states, proprio, objects, satisfied = [], [], [], []
     success = False
     for frame, action in enumerate(actions):
         if frame == exec_start and frame > 0:
             sim.restore(start)
+        sim.highlights = highlights_at(task, sim, frame) if frame < exec_start else ()
         states.append(sim.state())
         proprio.append(sim.proprio())
+        objects.append(look.observe())
         satisfied.append(progress.satisfied)
         success = success or progress.success
         sim.step(action)
@@ -99,12 +108,21 @@ def resimulate(task: Task, seed: int, actions: NDArray[np.float32], exec_start: 
         success=success,
         fixture_poses=fixture_poses,
         scene_hash=scene_hash,
+        objects=np.array(objects),
     )
+
+
+def _labelled(again: Demonstration, wanted: NDArray[np.float32], **identity: Any) -> Demonstration:
+    """Say what was to be done in a demonstration that was played again, where something else was done."""
+    if np.array_equal(wanted, again.actions):
+        return replace(again, **identity)
+    return replace(again, actions=wanted, executed=again.actions, **identity)
 
 
 def demonstration_columns(demo: Demonstration) -> Columns:
     """Return states, proprioception and labels under the dataset's column names."""
-    return {"states": demo.states, "observation.state": demo.proprio, **labels(demo).columns()}
+    seen = {} if demo.objects is None else {OBJECTS: demo.objects}
+    return {"states": demo.states, "observation.state": demo.proprio, **seen, **labels(demo).columns()}
 
 
 def _whole(demo: Demonstration) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from lerobot_memobench.envs.observations import ACTION_DIM, EXECUTION, IMAGE_KEY
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.experts.prompts import PromptDemonstrator
+from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.rendering import Image, RenderSettings
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.formula import Atom, atoms
@@ -62,6 +63,7 @@ class Episode:
         self.referent, self.horizon = referent, horizon
         self.prompt_video = prompt_video and task.prompt is not None
         self.sim = Simulation(task, render)
+        self._slots: ObjectSlots | None = None
         self.task = task
         self.seed = -1
 
@@ -153,6 +155,12 @@ class Episode:
     def expert_done(self) -> bool:
         """The expert has gone through its plan; whatever does not hold by now it will not bring about."""
         return self._expert is not None and self._expert.done
+
+    def objects(self) -> NDArray[np.float32]:
+        """Return what both cameras see now as objects, (`sim.object_slots.SIZE`,)."""
+        if self._slots is None:
+            self._slots = ObjectSlots(self.sim)
+        return self._slots.observe()
 
     def images(self) -> dict[str, Image]:
         """Return what both cameras see now, (256, 256, 3) uint8 each, upright."""

@@ -89,10 +89,20 @@ class PromptDemonstrator:
         yield from hand.move(above + 0.10 * UP, rotation, CLOSED, tolerance=0.02)
 
     def _highlight(self, hand: Hand) -> Generator[NDArray[np.float32], None, None]:
-        asset = self._sim.assets[self._referent()]
-        place, _ = self._sim.body_pose(self._referent())
-        spot = (float(place[0]), float(place[1]), float(place[2] + asset.bottom + 0.002))
-        self._sim.highlights = (Highlight(spot, asset.radius + 0.035),)
+        self._sim.highlights = highlights_at(self._task, self._sim, PAUSE)
         self.shown = True
         yield from hand.wait(HIGHLIGHT_STEPS, OPEN)
         self._sim.highlights = ()
+
+
+def highlights_at(task: Task, sim: Simulation, frame: int) -> tuple[Highlight, ...]:
+    """Return what is highlighted at a frame of a task's prompt video, where things stand in ``sim``."""
+    prompt = task.prompt
+    if prompt is None or prompt.kind != "highlight" or prompt.target is None:
+        return ()
+    if not PAUSE <= frame < PAUSE + HIGHLIGHT_STEPS:
+        return ()
+    asset = sim.assets[prompt.target]
+    place, _ = sim.body_pose(prompt.target)
+    spot = (float(place[0]), float(place[1]), float(place[2] + asset.bottom + 0.002))
+    return (Highlight(spot, asset.radius + 0.035),)

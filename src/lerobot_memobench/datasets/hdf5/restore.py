@@ -1,7 +1,8 @@
 """A demonstration from a group of the published layout: where execution starts, what was satisfied when.
 
 The layout holds states, not what the arm felt or which predicates held. Proprioception is read off the states in
-the simulator. Checkpoint columns come from the key frames where all are there; where one is missing (-1) the
+the simulator, and so is what could be seen as objects; where a stranger's prompt video highlights something is not
+known. Checkpoint columns come from the key frames where all are there; where one is missing (-1) the
 predicates are evaluated on the states, with the latches and orders that a rollout has.
 """
 
@@ -19,6 +20,8 @@ from lerobot_memobench.datasets.hdf5.layout import Unusable, truth_from_interval
 from lerobot_memobench.datasets.hdf5.mjcf import Pose, read_fixture_poses
 from lerobot_memobench.datasets.hdf5.reading import PublishedDemo
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.experts.prompts import highlights_at
+from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.placement import GAP
 from lerobot_memobench.sim.scene import TABLE_TOP
 from lerobot_memobench.sim.simulation import Simulation
@@ -42,7 +45,8 @@ def restore(task: Task, demo: PublishedDemo) -> Demonstration:
     _check_clock(demo.states, exec_start)
     told = _told_truth(task, demo, exec_start)
     poses = fixture_poses(sim, task, demo)
-    found = _read_off(sim, task, demo.states, exec_start, poses, evaluate="success" not in demo.extras)
+    ours = "success" in demo.extras
+    found = _read_off(sim, task, demo.states, exec_start, poses, evaluate=not ours, prompt=exec_start if ours else 0)
     try:
         restored = Demonstration(
             task=task,
@@ -59,6 +63,7 @@ def restore(task: Task, demo: PublishedDemo) -> Demonstration:
             fixture_poses=poses,
             model_xml=demo.model_file,
             scene_hash=str(demo.extras.get("scene_hash", "")),
+            objects=found.objects,
         )
         written = demo.extras.get("digest", digest(restored))
     except MemobenchError as error:
@@ -150,6 +155,7 @@ def _middle(sim: Simulation, task: Task, name: str) -> Pose:
 @dataclass(frozen=True, eq=False)
 class _ReadOff:
     proprio: NDArray[np.float32]
+    objects: NDArray[np.float32]
     satisfied: NDArray[np.bool_]
     success: bool
 
@@ -162,19 +168,26 @@ def _read_off(
     poses: dict[str, Pose],
     *,
     evaluate: bool,
+    prompt: int,
 ) -> _ReadOff:
-    """Show the states to the simulator one after the other and note what it says."""
+    """Show the states to the simulator one after the other and note what it says; the first ``prompt`` frames are of
+    this package's prompt video.
+    """
     progress = Progress(task)
-    proprio, satisfied = [], []
+    look = ObjectSlots(sim)
+    proprio, objects, satisfied = [], [], []
     success = False
     for frame, state in enumerate(states):
         sim.set_state(state, poses)
         proprio.append(sim.proprio())
+        sim.highlights = highlights_at(task, sim, frame) if frame < prompt else ()
+        objects.append(look.observe())
         if evaluate and frame > exec_start:  # the world is evaluated after a control step, see Demonstration
             success = progress.step(sim.holds) or success
         satisfied.append(progress.satisfied)
     return _ReadOff(
         np.array(proprio, dtype=np.float32),
+        np.array(objects),
         np.array(satisfied, dtype=np.bool_).reshape(len(states), len(task.checkpoints)),
         success,
     )

@@ -113,7 +113,7 @@ def _write_lerobot(
     meta = LeRobotDatasetMetadata.create(
         repo_id=repo_id,
         fps=FPS,
-        features=dataset_features(_image_size(written[0])),
+        features=dataset_features(_image_size(written[0]), objects=all(episode.has_objects for episode in written)),
         root=part,
         robot_type=ROBOT_TYPE,
         use_videos=written[0].has_images,

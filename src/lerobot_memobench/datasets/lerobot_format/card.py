@@ -22,7 +22,7 @@ LICENSE = "apache-2.0"
 
 SCRIPTED = (
     "Scripted experts act in a MuJoCo simulation; nothing was collected from people or robots. Actions were recorded "
-    "as applied, so that replaying them from the seed gives the same states."
+    "as applied (`executed_action`), so that replaying them from the seed gives the same states."
 )
 
 COLUMNS = {
@@ -30,6 +30,8 @@ COLUMNS = {
     "observation.images.wrist_image": "wrist camera",
     "observation.state": "end-effector position 3, axis-angle 3, gripper joints 2",
     "action": "OSC pose delta 6 (±1 is ±0.05 m, ±0.5 rad), gripper (−1 opens, +1 closes)",
+    "observation.environment_state": "what the cameras see as objects, 16 slots: see `memobench objects`",
+    "executed_action": "what moved the arm: `action`, but where it was moved off its way (`generate --perturb`)",
     "phase": "0 prompt video (the policy does not act), 1 execution",
     "checkpoint.index": "number of checkpoints completed in order before this frame",
     "checkpoint.operation": "of the next one: 0 Storage, 1 Update, 2 Compression; −1 when none is left",

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.demonstration import CAMERAS, FPS
-from lerobot_memobench.datasets.lerobot_format.layout import image_key
+from lerobot_memobench.datasets.lerobot_format.layout import EXECUTED_ACTION, OBJECTS, image_key
 from lerobot_memobench.datasets.lerobot_format.record import EPISODE_INFO, EpisodeRecord
 from lerobot_memobench.datasets.lerobot_format.tables import ParquetFiles, frames_table, states_table
 from lerobot_memobench.datasets.staging.episode import StagedEpisode
@@ -88,6 +88,7 @@ class _FrameWriter:
         columns: dict[str, NDArray] = {
             "observation.state": arrays["proprio"],
             "action": arrays["actions"],
+            EXECUTED_ACTION: arrays.get("executed", arrays["actions"]),
             "timestamp": (np.arange(length) / FPS).astype(np.float32),
             "frame_index": np.arange(length),
             "episode_index": np.full(length, self._episodes),
@@ -95,6 +96,8 @@ class _FrameWriter:
             "task_index": np.full(length, task_index),
             EPISODE_INFO: info,
         }
+        if "objects" in arrays:
+            columns[OBJECTS] = arrays["objects"]
         return columns | {key: arrays[key] for key in self._meta.features if key in arrays}
 
     def _count(self, columns: dict[str, NDArray], episode: StagedEpisode) -> dict[str, Stats]:

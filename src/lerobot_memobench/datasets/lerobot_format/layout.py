@@ -18,6 +18,12 @@ MANIFEST_FILE = "manifest.json"
 PROPRIO_NAMES = ["x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z", "finger_left", "finger_right"]
 ACTION_NAMES = ["x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z", "gripper"]
 
+OBJECTS = "observation.environment_state"
+"""What could be seen as objects, under LeRobot's name for a state of the environment."""
+EXECUTED_ACTION = "executed_action"
+"""What moved the arm; `action` is what the expert would have done, which differs where the arm was moved off its way.
+LeRobot takes every column that begins with `action` for something to be learned."""
+
 TOP_LEVEL = (HDF5_FOLDER, "videos", "states", "data", "README.md", MANIFEST_FILE, "meta")
 """Moved into place in this order; with `meta` the folder becomes a dataset, without it the manifest is the last."""
 
@@ -27,8 +33,9 @@ def image_key(camera: str) -> str:
     return f"observation.images.{camera}"
 
 
-def dataset_features(image_size: tuple[int, int] | None) -> dict[str, dict[str, Any]]:
+def dataset_features(image_size: tuple[int, int] | None, *, objects: bool = False) -> dict[str, dict[str, Any]]:
     """Return LeRobot's description of the columns; ``image_size`` is (height, width), None without images."""
+    from lerobot_memobench.sim.object_slots import SIZE
 
     def feature(dtype: str, shape: tuple[int, ...] = (1,), names: list[str] | None = None) -> dict[str, Any]:
         return {"dtype": dtype, "shape": shape, "names": names}
@@ -37,10 +44,13 @@ def dataset_features(image_size: tuple[int, int] | None) -> dict[str, dict[str, 
     if image_size is not None:
         for camera in CAMERAS:
             features[image_key(camera)] = feature("video", (*image_size, 3), ["height", "width", "channels"])
+    if objects:
+        features[OBJECTS] = feature("float32", (SIZE,))
     completed = [f"checkpoint_{k}" for k in range(MAX_CHECKPOINTS)]
     return features | {
         "observation.state": feature("float32", (PROPRIO_DIM,), PROPRIO_NAMES),
         "action": feature("float32", (ACTION_DIM,), ACTION_NAMES),
+        EXECUTED_ACTION: feature("float32", (ACTION_DIM,), ACTION_NAMES),
         "phase": feature("int64"),
         "checkpoint.index": feature("int64"),
         "checkpoint.operation": feature("int64"),

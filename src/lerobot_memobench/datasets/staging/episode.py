@@ -109,6 +109,12 @@ class StagedEpisode:
         return bool(self.record["image_stats"])
 
     @property
+    def has_objects(self) -> bool:
+        """Whether what could be seen as objects was recorded."""
+        with np.load(self.folder / ARRAYS_FILE, allow_pickle=False) as data:
+            return "objects" in data
+
+    @property
     def hdf5(self) -> Path:
         """The demonstration in the published layout, alone at the root of a file of its own."""
         return self.folder / HDF5_FILE

@@ -115,6 +115,8 @@ class EpisodeStage:
         }
         if LEROBOT in self._formats:
             columns: dict[str, Any] = {"states": demo.states, "actions": demo.actions, "proprio": demo.proprio}
+            columns |= {} if demo.objects is None else {"objects": demo.objects}
+            columns |= {} if demo.executed is None else {"executed": demo.executed}
             columns |= {name: np.asarray(column) for name, column in found.columns().items()}
             np.savez_compressed(self._temporary / ARRAYS_FILE, **columns)
         if self._hdf5 is not None:

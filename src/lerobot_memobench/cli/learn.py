@@ -1,0 +1,43 @@
+"""``memobench learn``: from no data to memory policies and what they solve."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lerobot_memobench.cli.console import console
+
+
+class Name(StrEnum):
+    """The experiments (`studies.learning.experiments`)."""
+
+    BOWL = "bowl"
+    PROMPTED = "prompted"
+    JOINT = "joint"
+
+
+def learn(
+    name: Annotated[Name, typer.Argument(help="bowl: one task, in minutes; prompted: ten tasks; joint: all thirty.")],
+    out: Annotated[Path, typer.Option(help="Folder of data, policies, rollouts and tables; the same command goes on.")],
+    episodes: Annotated[int | None, typer.Option(min=1, help="Demonstrations per task.")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Updates per policy.")] = None,
+    seeds: Annotated[int | None, typer.Option(min=1, help="Training seeds.")] = None,
+    rollouts: Annotated[int | None, typer.Option(min=1, help="Rollouts per task and policy.")] = None,
+    first_seed: Annotated[
+        int | None, typer.Option(help="First seed of the rollouts; choose settings by 20000.")
+    ] = None,
+    dataset: Annotated[Path | None, typer.Option(help="Demonstrations that are there already.")] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Processes; so many policies are trained at once.")] = 1,
+) -> int:
+    """Generate demonstrations, train a policy with memory and one without, roll both out on the evaluation seeds."""
+    from lerobot_memobench.studies.learning.experiments import changed, experiment
+    from lerobot_memobench.studies.learning.study import learn as run
+
+    screen = console()
+    given = {"episodes": episodes, "steps": steps, "seeds": seeds, "rollouts": rollouts, "first_seed": first_seed}
+    chosen = changed(experiment(name.value), **given)
+    screen.print(run(chosen, out, lambda text: screen.print(text, soft_wrap=True), dataset=dataset, workers=workers))
+    return 0

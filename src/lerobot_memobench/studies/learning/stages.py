@@ -1,0 +1,79 @@
+"""The three parts of an experiment, each a command of ours: demonstrations, policies, rollouts."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+from lerobot_memobench.studies.learning.commands import Cost, run_once
+from lerobot_memobench.studies.learning.experiments import Experiment
+
+SHARED = ("policy=memobench_mem", "perception=objects", "size=small")
+"""What every policy of an experiment is told: objects instead of pixels, the small size."""
+
+
+@dataclass(frozen=True)
+class Stages:
+    """An experiment in a folder; what has been done there is not done again.
+
+    Args:
+        experiment: what is learned. out: its folder. dataset: demonstrations that are there already.
+        workers: processes that generate and roll out.
+    """
+
+    experiment: Experiment
+    out: Path
+    dataset: Path | None = None
+    workers: int = 1
+
+    @property
+    def data(self) -> Path:
+        """Where the demonstrations are."""
+        return self.dataset or self.out / "data"
+
+    def generate(self) -> Cost | None:
+        """Make the demonstrations; None where they were given."""
+        if self.dataset is not None:
+            return None
+        words = ["memobench", "generate", "--tasks", ",".join(self.experiment.tasks), "--referent", "random"]
+        words += ["--episodes", str(self.experiment.episodes), "--perturb", "--no-images", "--out", str(self.data)]
+        return run_once([*words, "--workers", str(self.workers)], self.out / "data.log", threads=1, accept=(0, 1))
+
+    def train(self, arm: str, seed: int, threads: int | None = None) -> Cost:
+        """Train an arm's policy with one seed."""
+        own = self.experiment.arms[arm]
+        words = ["lerobot", "train", *SHARED, f"dataset={self.data}", f"steps={self.experiment.steps}"]
+        words += [f"seed={seed}", f"output_dir={self.policy(arm, seed)}", *self.experiment.settings, *own]
+        folder = self.policy(arm, seed)
+        begun = folder / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
+        going_on = ["lerobot", "train", f"config_path={begun}", "resume=true"] if begun.is_file() else None
+        log = self.log("training", arm, seed)
+        if going_on is None and not log.with_suffix(".json").is_file():
+            shutil.rmtree(folder, ignore_errors=True)  # of an attempt that was killed before its first checkpoint
+        return run_once(words, log, threads=threads, going_on=going_on)
+
+    def evaluate(self, arm: str, seed: int) -> Cost:
+        """Roll a trained policy out on the experiment's evaluation seeds."""
+        words = ["lerobot", "eval", "env=memobench", f"policy={self.policy(arm, seed)}", "referent=random", "films=0"]
+        words += [f"tasks={','.join(self.experiment.tasks)}", f"episodes={self.experiment.rollouts}"]
+        words += [f"seed={self.experiment.first_seed}", f"output_dir={self.rollouts(arm, seed)}", "resume=true"]
+        words += [f"shards={self.workers}", f"workers={self.workers}"] if self.workers > 1 else []
+        return run_once(words, self.log("evaluation", arm, seed), threads=1)
+
+    def policy(self, arm: str, seed: int) -> Path:
+        """Return the folder of a training run."""
+        return self.out / "policies" / name_of(arm, seed)
+
+    def rollouts(self, arm: str, seed: int) -> Path:
+        """Return the folder of an evaluation."""
+        return self.out / "rollouts" / name_of(arm, seed)
+
+    def log(self, part: str, arm: str, seed: int) -> Path:
+        """Return the file of a command's output."""
+        return self.out / part / f"{name_of(arm, seed)}.log"
+
+
+def name_of(arm: str, seed: int) -> str:
+    """Return what files of an arm and a training seed are called."""
+    return f"{arm.replace(' ', '_')}-{seed}"

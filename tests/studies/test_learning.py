@@ -1,0 +1,110 @@
+"""From commands to tables: what is run once, gone on with and counted. What is learned, `memobench learn` shows."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lerobot_memobench.envs.episode_log import write_episodes
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.studies.learning import stages as stages_module
+from lerobot_memobench.studies.learning.commands import Cost, run_once
+from lerobot_memobench.studies.learning.experiments import BOWL, EXPERIMENTS, MEMORY, MEMORYLESS, changed
+from lerobot_memobench.studies.learning.outcomes import read_outcomes
+from lerobot_memobench.studies.learning.stages import Stages
+from lerobot_memobench.studies.learning.study import learn
+
+sys.path[:0] = [str(Path(__file__).parents[1] / "evaluation")]
+
+
+def test_a_command_that_ended_well_is_not_run_again(tmp_path: Path) -> None:
+    log = tmp_path / "logs" / "objects.log"
+    first = run_once(["memobench", "objects", "--json"], log)
+    assert json.loads(log.read_text())["slots"] == 16
+    assert first.cpu_s > 0
+    assert run_once(["memobench", "objects", "--json"], log) == first
+    with pytest.raises(MemobenchError, match="is of another command"):
+        run_once(["memobench", "objects"], log)
+
+
+def test_a_command_that_fails_is_told_and_gone_on_with(tmp_path: Path) -> None:
+    log = tmp_path / "wrong.log"
+    words = ["memobench", "describe", str(tmp_path / "nothing")]
+    with pytest.raises(MemobenchError, match=r"ended with status 2; see .*wrong\.log"):
+        run_once(words, log)
+    assert "is no dataset" in log.read_text()
+    spent = run_once(words, log, going_on=["memobench", "objects", "--json"])
+    kept = json.loads(log.with_suffix(".json").read_text())
+    assert kept["words"] == words
+    assert kept["ended"]
+    assert spent.wall_s == kept["wall_s"] > 0
+
+
+def write_rollouts(folder: Path, solved: int, wrong: int, episodes: int = 10) -> None:
+    from logs import rollout
+
+    failures = ["reference_drift"] * wrong + ["storage_failure"] * (episodes - solved - wrong)
+    records = [
+        rollout(BOWL, "object", "S", [k < solved], k < solved, k, failure=None if k < solved else failures[k - solved])
+        for k in range(episodes)
+    ]
+    write_episodes(folder, records)
+
+
+def test_outcomes_tell_wrong_referents_apart(tmp_path: Path) -> None:
+    for seed, (solved, wrong) in enumerate([(9, 1), (5, 3)]):
+        write_rollouts(tmp_path / str(seed), solved, wrong)
+    found = read_outcomes([tmp_path / "0", tmp_path / "1"])
+    assert set(found) == {"all", "object", BOWL}
+    for outcome in found.values():
+        assert outcome.success.value == pytest.approx(0.7)
+        assert outcome.of_seeds == pytest.approx((0.9, 0.5))
+        assert (outcome.wrong, outcome.others) == (4, 2)
+    assert found[BOWL].success.n == 20
+
+
+def test_an_experiment_runs_its_parts_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ran: list[list[str]] = []
+
+    def fake(words: list[str], log: Path, **options: Any) -> Cost:
+        ran.append(words)
+        if words[1] == "eval":
+            out = next(word.partition("=")[2] for word in words if word.startswith("output_dir="))
+            write_rollouts(Path(out), *((9, 1) if "no_memory" not in out else (3, 6)))
+        return Cost(60.0, 90.0)
+
+    monkeypatch.setattr(stages_module, "run_once", fake)
+    said: list[str] = []
+    experiment = changed(EXPERIMENTS["bowl"], seeds=2, steps=5, rollouts=10, first_seed=None)
+    text = learn(experiment, tmp_path / "out", said.append)
+    assert [words[1] for words in ran] == ["generate", *["train"] * 4, *["eval"] * 4]
+    assert "--perturb" in ran[0]
+    memoryless = [word for word in ran[2] if word not in ran[1]]
+    assert "policy.integration=none" in memoryless
+    assert all("seed=7" in words and "referent=random" in words for words in ran[5:])
+    assert f"| {BOWL}, {MEMORY} | 90.0 |" in text
+    assert f"| {BOWL}, {MEMORYLESS} | 30.0 |" in text
+    assert "| training | 4 | 1.0 | 6.0 |" in text
+    assert (tmp_path / "out" / "learning.md").read_text() == text
+    assert json.loads((tmp_path / "out" / "learning.json").read_text())[MEMORYLESS][BOWL]["wrong_referent"] == 12
+
+
+def test_a_killed_training_goes_on_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given: dict[str, Any] = {}
+    monkeypatch.setattr(stages_module, "run_once", lambda words, log, **options: given.update(options) or Cost(0, 0))
+    stages = Stages(replace(EXPERIMENTS["bowl"], seeds=1), tmp_path)
+    half_made = stages.policy(MEMORY, 0) / "half_made"
+    half_made.mkdir(parents=True)
+    stages.train(MEMORY, 0)
+    assert given["going_on"] is None
+    assert not half_made.exists()
+    config = stages.policy(MEMORY, 0) / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
+    config.parent.mkdir(parents=True)
+    config.touch()
+    stages.train(MEMORY, 0)
+    assert given["going_on"] == ["lerobot", "train", f"config_path={config}", "resume=true"]
