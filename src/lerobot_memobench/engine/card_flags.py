@@ -35,7 +35,14 @@ REACHING_OUT = ("push_to_hub", "private", "use_peft", "trust_remote_code", "disc
 """Truth values of a policy by which more than its numbers changes."""
 WORDS = (
     *("job_name", "env.task", "env.tasks", "env.referent", "env.prompt_in", "env.render"),
-    *("policy.size", "policy.align", "policy.subgoal_level", "policy.integration", "policy.memory_camera"),
+    *(
+        "policy.size",
+        "policy.perception",
+        "policy.align",
+        "policy.subgoal_level",
+        "policy.integration",
+        "policy.memory_camera",
+    ),
     *("policy.dtype", "policy.dialect", "policy.gripper"),
 )
 """Words, which name one of several known things."""

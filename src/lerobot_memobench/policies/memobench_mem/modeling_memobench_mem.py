@@ -6,11 +6,13 @@ import logging
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
 from safetensors.torch import load_file
 from torch import Tensor
 
+from lerobot_memobench.datasets.memory_cache import RecordedFrames
 from lerobot_memobench.policies.memobench_mem.acting import ActingPolicy
 from lerobot_memobench.policies.memobench_mem.adapters import trained_whole
 from lerobot_memobench.policies.memobench_mem.alignment.objectives import make_alignment
@@ -24,6 +26,7 @@ from lerobot_memobench.policies.memobench_mem.checkpoints import (
     save_training_weights,
 )
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.drawn_statistics import count_drawn_only
 from lerobot_memobench.policies.memobench_mem.execution_frames import Drawn, execution_starts
 from lerobot_memobench.policies.memobench_mem.learning import LearningPolicy
 from lerobot_memobench.policies.memobench_mem.memory.registry import make_mechanism
@@ -95,8 +98,10 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
         """Make ready to train on a dataset: what the preprocessor looks up, and what LeRobot draws."""
         cache = open_frames(Path(meta.root), self.config, self.perception)
         begin_training(TrainingRun(self.config, cache, meta))
-        if self.config.sees_objects:
+        if isinstance(cache, RecordedFrames):
             read_from_memory()
+            drawn = np.ones(cache.num_frames, bool) if self.config.prompt_loss else cache.phase != 0
+            count_drawn_only(meta.stats, cache, drawn)
         starts = None if self.config.prompt_loss else execution_starts(cache.episodes, cache.phase)
         self.config.drop_n_last_frames = Drawn.of(starts, self.config.moments_per_episode)
 
