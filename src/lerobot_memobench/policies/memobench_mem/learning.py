@@ -14,6 +14,7 @@ from lerobot_memobench.policies.memobench_mem.alignment.objectives import Alignm
 from lerobot_memobench.policies.memobench_mem.averaging import WeightAverage
 from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, PHASE, STEPS, TOKENS, MemoryBatch
 from lerobot_memobench.policies.memobench_mem.seeing import SeeingPolicy
+from lerobot_memobench.policies.memobench_mem.training_curve import TrainingCurve
 
 
 class LearningPolicy(SeeingPolicy):
@@ -21,9 +22,11 @@ class LearningPolicy(SeeingPolicy):
 
     Attributes:
         alignment: what ties memory to text; None without one.
+        curve: how its losses fell.
     """
 
     alignment: Alignment | None
+    curve: TrainingCurve
 
     @property
     def _averages(self) -> bool:
@@ -73,6 +76,8 @@ class LearningPolicy(SeeingPolicy):
                 weighted, numbers = alignment_loss(self.alignment, self.config.align_weight, batch, *memory, encoder)
                 per_sample, total, logged = per_sample + weighted, total + weighted, logged | numbers
         logged["loss"] = total.item()
+        if self.training:
+            self.curve.note(logged)
         return (per_sample, logged) if reduction == "none" else (total, logged)
 
     def _require_memory(self, batch: dict[str, Tensor]) -> None:

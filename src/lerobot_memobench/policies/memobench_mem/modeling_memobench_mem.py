@@ -39,6 +39,7 @@ from lerobot_memobench.policies.memobench_mem.precision import Precision
 from lerobot_memobench.policies.memobench_mem.processing.training_run import TrainingRun, begin_training
 from lerobot_memobench.policies.memobench_mem.recorded_items import read_from_memory
 from lerobot_memobench.policies.memobench_mem.saved_steps import require_agreement
+from lerobot_memobench.policies.memobench_mem.training_curve import TrainingCurve
 from lerobot_memobench.policies.memobench_mem.weights import require_statistics, weights_file
 
 # A saved pipeline is built right after its policy, by the names under which its steps register when imported.
@@ -86,6 +87,7 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
             self.model.gradient_checkpointing_enable()
         self.to(config.device)
         self.average: WeightAverage | None = None
+        self.curve = TrainingCurve()
         self.history = RolloutMemory(make_mechanism(config.memory, config.memory_frames), config.memory_stride)
         self.plans, self.noise = RowPlans(self._action_dim), EpisodeNoise()
         self.thread = OneThread()
@@ -146,11 +148,13 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
             return policy
         if policy._averages:
             policy.average = restore_average(policy._new_average(), source, revision)
+        policy.curve = TrainingCurve.read(Path(source))
         policy._begin_training(dataset_meta)
         return policy
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
-        """Save the averaged weights as the model, and the trained ones beside it for going on."""
+        """Save the averaged weights as the model, and beside it the trained ones for going on and the losses."""
+        self.curve.save(save_directory)
         if self.average is None or state_dict is not None:
             if self.average is not None:
                 logger.warning("Sharded training: the checkpoint holds the trained weights, not their average.")
