@@ -357,13 +357,17 @@ def test_an_environment_without_objects_is_told(saved: tuple[Any, Any, Any, Path
         policy.select_action(before(seen))
 
 
-def test_no_picture_is_asked_for(saved: tuple[Any, Any, Any, Path]) -> None:
-    policy, before, dataset, _ = saved
-    policy.reset()
-    for index in range(8):
-        policy.select_action(before(observed(dataset, index, **{"observation.picture_step": torch.tensor([0.0])})))
-        assert not policy.looks_next()
-    assert not policy.config.watches
+def test_objects_are_looked_at_where_they_are_remembered_or_acted_upon(root: Path) -> None:
+    """Old pictures are no matter: another policy may want them drawn rarely."""
+    for integration, wanted in (("modulation", [True] * 12), ("none", [*[False] * 8, True, False, False, True])):
+        policy, before, _, dataset = made_for_training(root, **OBJECTS | {"integration": integration})
+        assert not policy.config.watches
+        looks = []
+        for index in range(12):
+            old = {"observation.picture_step": torch.tensor([0.0])}
+            policy.select_action(before(observed(dataset, index, **old)))
+            looks.append(policy.looks_next())
+        assert looks == wanted
 
 
 def test_training_goes_on_from_a_checkpoint_with_other_settings(saved: tuple[Any, Any, Any, Path], root: Path) -> None:

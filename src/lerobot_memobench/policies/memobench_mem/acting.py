@@ -43,13 +43,11 @@ class ActingPolicy(SeeingPolicy):
         self._acting_rows: list[int] = []
 
     def looks_next(self) -> bool:
-        """Whether the pictures of the next observation are read: it is remembered, or a plan is made from it.
+        """Whether pictures or objects of the next observation are read: it is remembered, or a plan is made from it.
 
         Asked after an action. Whether the next frame is the first of an execution, where plans begin, only the
         environment knows: that one is to be shown in any case, as the first of an episode.
         """
-        if not self.perception.looks:
-            return False
         return self.history.writes_next() or bool(self.plans.wanting(self._acting_rows))
 
     def observe(self, batch: dict[str, Tensor]) -> tuple[list[int], list[bool], list[bool]]:
@@ -77,7 +75,7 @@ class ActingPolicy(SeeingPolicy):
 
     def _encode(self, batch: dict[str, Tensor], steps: list[int], rows: list[int]) -> Tensor:
         """Tokens (n, P, D) of the present frames of some rows; a frame of an earlier step is refused."""
-        if OBS_PICTURE in batch and self.perception.looks:
+        if OBS_PICTURE in batch and self.perception.pictures:
             for row in rows:
                 require_fresh(steps[row], round(float(batch[OBS_PICTURE][row])))
         return self.perception.remember(batch, rows)

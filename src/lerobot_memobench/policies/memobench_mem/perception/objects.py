@@ -91,7 +91,7 @@ class ObjectPerception(nn.Module, Perception):
     advice = "Evaluate it with --env.obs_type=environment_state_agent_pos"
     key = f"objects-{SIZE}"
     grid = 0
-    looks = False
+    pictures = False
 
     def __init__(self, trained: Sequence[str], tokens_per_frame: int, width: int) -> None:
         super().__init__()

@@ -20,14 +20,14 @@ class Perception(ABC):
         advice: what to do where it is missing, as the end of a sentence.
         dim: D, width of the tokens that the memory's encoder is given.
         grid: side of the square of a picture's tokens; 0 where tokens have no place in a picture.
-        looks: whether it looks at pictures, which an environment need not draw otherwise.
+        pictures: whether it looks at pictures, which an environment may repeat.
     """
 
     remembers: str
     advice: str
     dim: int
     grid: int
-    looks: bool
+    pictures: bool
 
     @property
     @abstractmethod

@@ -35,7 +35,7 @@ class PixelPerception(Perception):
     advice = "Map its names with --rename_map"
     tokens_per_frame = GRID**2
     grid = GRID
-    looks = True
+    pictures = True
 
     def __init__(self, tower: nn.Module, projector: nn.Module, resolution: tuple[int, int], camera: str) -> None:
         self.tower, self.projector, self.resolution = tower, projector, resolution
