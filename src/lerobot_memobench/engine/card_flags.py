@@ -35,7 +35,8 @@ REACHING_OUT = ("push_to_hub", "private", "use_peft", "trust_remote_code", "disc
 """Truth values of a policy by which more than its numbers changes."""
 WORDS = (
     *("job_name", "env.task", "env.tasks", "env.suite", "env.obs_type", "env.referent", "env.prompt_in", "env.render"),
-    *("policy.size", "policy.align", "policy.subgoal_level", "policy.integration", "policy.memory_camera"),
+    *("policy.size", "policy.perception", "policy.align", "policy.subgoal_level", "policy.integration"),
+    "policy.memory_camera",
     *("policy.dtype", "policy.dialect", "policy.gripper"),
 )
 """Words, which name one of several known things."""

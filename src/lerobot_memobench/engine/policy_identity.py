@@ -15,7 +15,10 @@ from lerobot_memobench.files.reading import Count, read_json
 if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig
 
-NOT_THE_CHECKPOINT = ("train_config.json", "README.md", "training_weights.safetensors", ".gitattributes")
+NOT_THE_CHECKPOINT = (
+    *("train_config.json", "README.md", "training_weights.safetensors", ".gitattributes"),
+    *("training_curve.png", "training_curve.json"),
+)
 """Files of a checkpoint folder on which what the policy does at evaluation does not depend."""
 
 ELSEWHERE = (

@@ -5,6 +5,7 @@ from __future__ import annotations
 EVERYWHERE: dict[str, tuple[str, ...]] = {
     "align": ("policy.align",),
     "size": ("policy.size",),
+    "perception": ("policy.perception",),
     "device": ("policy.device",),
     "replan": ("policy.n_action_steps", "env.replan_steps"),
     "tasks": ("env.tasks",),

@@ -16,6 +16,9 @@ from lerobot_memobench.settings.translation import LerobotSettings
 from lerobot_memobench.settings.words import Words
 
 INFO_FILE = Path("meta") / "info.json"
+OBJECT_BATCH = 72
+"""Frames per update of a policy that sees objects: a dozen episodes, six moments of each. They lie in main memory,
+where no loader would be quicker."""
 TRAINED = ("policy.type", "policy.path", "reward_model.type", "reward_model.path")
 """What may say what is trained."""
 
@@ -50,8 +53,11 @@ def complete_training(settings: LerobotSettings) -> LerobotSettings:
             raise MemobenchError("name a policy: policy=memobench_mem")
         settings = with_places(settings)
     check_dataset(settings)
-    check_sight(policy_config(settings), env_config(settings))
+    policy = policy_config(settings)
+    check_sight(policy, env_config(settings))
     settings = with_logging(settings)
+    if not from_file and getattr(policy, "sees_objects", False):
+        settings = settings.default("batch_size", OBJECT_BATCH).default("num_workers", 0)
     cores = os.cpu_count() or 4
     if cores < 4 and not from_file:  # LeRobot's default of 4 loaders would only wait for one another
         settings = settings.default("num_workers", cores)

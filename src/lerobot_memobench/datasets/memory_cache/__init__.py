@@ -16,19 +16,24 @@ from lerobot_memobench.datasets.memory_cache.layout import (
     find_cache,
     read_meta,
 )
+from lerobot_memobench.datasets.memory_cache.lookup import FrameLookup
 from lerobot_memobench.datasets.memory_cache.reading import MemoryCache
+from lerobot_memobench.datasets.memory_cache.recorded import RecordedFrames, read_recorded
 from lerobot_memobench.datasets.memory_cache.tables import TextEncoder
 
 __all__ = [
     "FOLDER",
     "CacheMeta",
     "FrameEncoder",
+    "FrameLookup",
     "MemoryCache",
     "Progress",
+    "RecordedFrames",
     "TextEncoder",
     "build_memory_cache",
     "dataset_fingerprint",
     "find_cache",
     "read_meta",
+    "read_recorded",
     "resolve_subgoals",
 ]

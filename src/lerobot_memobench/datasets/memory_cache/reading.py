@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_memobench.datasets.memory_cache.frame_table import LEVEL_COLUMNS, MEMORY_COLUMN, resolve_subgoals
+from lerobot_memobench.datasets.memory_cache.frame_table import resolve_subgoals
 from lerobot_memobench.datasets.memory_cache.layout import (
     FOLDER,
     FORMAT,
@@ -22,21 +22,22 @@ from lerobot_memobench.datasets.memory_cache.layout import (
     slot_starts,
     texts_file,
 )
+from lerobot_memobench.datasets.memory_cache.lookup import FrameLookup
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.files import file_name
 from lerobot_memobench.files.reading import read_json
 
 
-class MemoryCache:
+class MemoryCache(FrameLookup):
     """A complete cache, read through memory maps. Open one with :meth:`open`."""
 
     def __init__(self, folder: Path, meta: CacheMeta, texts_key: str | None = None) -> None:
-        self.folder, self.meta = folder, meta
+        self.folder, self.root, self.meta = folder, folder.parent.parent, meta
         self.episodes: np.ndarray = np.load(folder / "episodes.npy")
         self.phase: np.ndarray = np.load(folder / "phase.npy")
         self.slots = slot_starts(self.episodes, meta.stride)
         self._tokens = np.memmap(folder / TOKENS_FILE, dtype=np.uint16, mode="r", shape=meta.shape)
-        self._subgoals = {
+        self.subgoal_rows = {
             level: resolve_subgoals(
                 np.load(folder / file_name(f"subgoal-{level}.npy", "the table of a level")), self.episodes
             )
@@ -45,15 +46,15 @@ class MemoryCache:
         self.texts: list[str] = read_json(folder / TEXTS_FILE, list[str], "it is damaged")
         embeddings = folder / texts_file(meta.texts_key, texts_key or meta.texts_key)
         self.text_embeddings = torch.from_numpy(np.load(embeddings))
-        self._memory: np.ndarray | None = np.load(folder / "memory.npy") if meta.oracle else None
+        self.memory_rows = np.load(folder / "memory.npy") if meta.oracle else None
         self.memories: list[str] = read_json(folder / "memory.json", list[str], "it is damaged") if meta.oracle else []
         self._check()
 
     def _check(self) -> None:
         """Raise a ValueError unless the tables are those of one dataset."""
         frames, episodes = self.num_frames, len(self.episodes)
-        tables = [(rows, len(self.texts)) for rows in self._subgoals.values()]
-        tables += [] if self._memory is None else [(self._memory, len(self.memories))]
+        tables = [(rows, len(self.texts)) for rows in self.subgoal_rows.values()]
+        tables += [] if self.memory_rows is None else [(self.memory_rows, len(self.memories))]
         fitting = (
             episodes > 0
             and (np.diff(self.episodes) > 0).all()
@@ -115,49 +116,7 @@ class MemoryCache:
                 f"The memory cache {folder} is damaged ({told}). Delete that folder. {fix_hint(root)}"
             ) from None
 
-    @property
-    def num_frames(self) -> int:
-        """Frames of the dataset."""
-        return int(self.episodes[-1])
-
-    def locate(self, index: int) -> tuple[int, int]:
-        """Episode and frame in it, of a frame of the dataset's global index."""
-        if not 0 <= index < self.num_frames:
-            raise MemobenchError(
-                f"Frame {index} lies outside the memory cache {self.folder}, which has {self.num_frames} frames. "
-                f"{fix_hint(self.folder.parent.parent)}"
-            )
-        episode = int(np.searchsorted(self.episodes, index, "right")) - 1
-        return episode, index - int(self.episodes[episode])
-
     def tokens(self, episode: int, slots: Sequence[int]) -> Tensor:
         """Tokens (n, P, D) bfloat16 of stored frames of an episode; slot k is its frame k * stride."""
         rows = np.asarray(slots, dtype=np.int64) + self.slots[episode]
         return torch.from_numpy(self._tokens[rows]).view(torch.bfloat16)
-
-    def memory_texts(self, indices: Sequence[int]) -> list[str]:
-        """Oracle memory texts of frames of the dataset, by their global indices.
-
-        Raises:
-            MemobenchError: the dataset has no such column.
-        """
-        if self._memory is None:
-            raise MemobenchError(
-                f"The dataset of {self.folder} has no column '{MEMORY_COLUMN}', which --policy.oracle_memory=true "
-                "reads; generate it again with this version."
-            )
-        return [self.memories[row] for row in self._memory[np.asarray(indices, dtype=np.int64)].tolist()]
-
-    def text_rows(self, level: str) -> np.ndarray:
-        """(N,) int32: row of :attr:`text_embeddings` for each frame of the dataset; -1 where there is none.
-
-        Raises:
-            MemobenchError: the dataset has no texts at this level.
-        """
-        if level not in self._subgoals:
-            known = ", ".join(self._subgoals) or "none"
-            raise MemobenchError(
-                f"The dataset of {self.folder} has no subgoals at level '{level}' (column {LEVEL_COLUMNS[level]}); "
-                f"levels it has: {known}. Choose one with --policy.subgoal_level."
-            )
-        return self._subgoals[level]

@@ -38,16 +38,29 @@ def write_tables(folder: Path, table: FrameTable, texts: TextEncoder) -> None:
     write_done(folder, np.zeros(table.num_episodes, dtype=np.uint8))
     _save_array(folder / "episodes.npy", table.episodes)
     _save_array(folder / "phase.npy", table.phase)
-    unique = sorted({text for values in table.subgoals.values() for text in values if text})
-    number = {text: row for row, text in enumerate(unique)}
-    for level, values in table.subgoals.items():
-        _save_array(folder / f"subgoal-{level}.npy", np.array([number.get(text, -1) for text in values], np.int32))
+    unique, subgoals = numbered(table)
+    for level, rows in subgoals.items():
+        _save_array(folder / f"subgoal-{level}.npy", rows)
     _write_json(folder / TEXTS_FILE, unique)
     _save_embeddings(folder / texts_file(texts.key, texts.key), unique, texts)
     if table.memory is not None:
-        memories, rows = np.unique(np.array(table.memory, dtype=object), return_inverse=True)
-        _save_array(folder / "memory.npy", rows.astype(np.int32))
-        _write_json(folder / "memory.json", memories.tolist())
+        memories, rows = numbered_memory(table.memory)
+        _save_array(folder / "memory.npy", rows)
+        _write_json(folder / "memory.json", memories)
+
+
+def numbered(table: FrameTable) -> tuple[list[str], dict[str, np.ndarray]]:
+    """Return the subgoals that there are, and for each level their rows (N,) int32, -1 for none."""
+    unique = sorted({text for values in table.subgoals.values() for text in values if text})
+    number = {text: row for row, text in enumerate(unique)}
+    rows = {level: [number.get(text, -1) for text in values] for level, values in table.subgoals.items()}
+    return unique, {level: np.array(found, np.int32) for level, found in rows.items()}
+
+
+def numbered_memory(memory: Sequence[str]) -> tuple[list[str], np.ndarray]:
+    """Return the oracle memory texts that there are, and the row (N,) int32 of each frame's."""
+    memories, rows = np.unique(np.array(memory, dtype=object), return_inverse=True)
+    return memories.tolist(), rows.astype(np.int32)
 
 
 def add_embeddings(folder: Path, meta: CacheMeta, texts: TextEncoder) -> None:

@@ -11,15 +11,19 @@ from copy import deepcopy
 from typing import Any
 
 import torch
+from einops import rearrange, repeat
 from lerobot.policies.pi05.modeling_pi05 import GemmaConfig, PaliGemmaWithExpertModel, PI05Pytorch
 from lerobot.policies.pi_gemma import PaliGemmaForConditionalGenerationWithPiGemma, PiGemmaForCausalLM
 from torch import Tensor, nn
 
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.dimensions import Dimensions, Gemma
+from lerobot_memobench.policies.memobench_mem.integration.integration import Prefix
 from lerobot_memobench.policies.memobench_mem.perception.frozen import VISION_SEED, seed_parameters
+from lerobot_memobench.policies.memobench_mem.perception.objects import LOUD, ObjectPerception
 from lerobot_memobench.policies.memobench_mem.perception.perception import Perception
 from lerobot_memobench.policies.memobench_mem.perception.pixels import PixelPerception
+from lerobot_memobench.sim.object_slots import classes
 
 
 def _gemma(size: Gemma) -> GemmaConfig:
@@ -69,10 +73,18 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
         for module in (self.paligemma.model.vision_tower, self.paligemma.model.multi_modal_projector):
             seed_parameters(module, VISION_SEED)
         self._set_requires_grad()
+        self.perception = self._perception(config)
+
+    def _perception(self, config: MemobenchMemConfig) -> Perception:
+        """Build the configuration's way of seeing; one without pictures leaves no image tower."""
         seeing = self.paligemma.model
-        self.perception = PixelPerception(
-            seeing.vision_tower, seeing.multi_modal_projector, config.image_size, config.memory_camera
-        )
+        if not config.sees_objects:
+            return PixelPerception(
+                seeing.vision_tower, seeing.multi_modal_projector, config.image_size, config.memory_camera
+            )
+        seeing.vision_tower, seeing.multi_modal_projector = nn.Identity(), nn.Identity()
+        config.object_classes = config.object_classes or list(classes())
+        return ObjectPerception(config.object_classes, config.tokens_per_frame, config.dimensions.vlm.width)
 
     def _set_requires_grad(self) -> None:
         super()._set_requires_grad()
@@ -88,8 +100,20 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
         return self.perception.prefix(image)
 
 
+class StateToken(nn.Module):
+    """The robot's state, normalised, as one token (B, 1, width)."""
+
+    def __init__(self, dim: int, width: int) -> None:
+        super().__init__()
+        self.mlp = nn.Sequential(nn.Linear(dim, width), nn.GELU(), nn.Linear(width, width))
+
+    def forward(self, state: Tensor) -> Tensor:
+        """Token of a state (B, dim)."""
+        return rearrange(self.mlp(state) * LOUD, "b d -> b 1 d")
+
+
 class SizedPI05(PI05Pytorch):
-    """LeRobot's pi0.5 model at this policy's dimensions; nothing else differs."""
+    """LeRobot's pi0.5 model at this policy's dimensions, with a token of the state where the policy has one."""
 
     def __init__(self, config: MemobenchMemConfig, rtc_processor: Any = None) -> None:
         with torch.device("meta"):
@@ -100,3 +124,25 @@ class SizedPI05(PI05Pytorch):
         self.action_out_proj = nn.Linear(width, config.max_action_dim)
         self.time_mlp_in = nn.Linear(width, width)
         self.time_mlp_out = nn.Linear(width, width)
+        self.state_token = StateToken(config.max_state_dim, config.dimensions.vlm.width) if config.state_token else None
+
+    def embed_prefix(self, images: Any, img_masks: Any, tokens: Tensor, masks: Tensor) -> Prefix:
+        """LeRobot's prefix: what is seen now, then words.
+
+        With a token of the state, the last of the ``images`` is the state (B, dim), and the masks of the others may be
+        of their tokens (B, n), which LeRobot's are not.
+        """
+        if self.state_token is None:
+            prefix: Prefix = super().embed_prefix(images, img_masks, tokens, masks)
+            return prefix
+        longest = int(masks.sum(dim=1).max())  # padding would be most of so short a prefix
+        words, real, _ = super().embed_prefix([], [], tokens[:, :longest], masks[:, :longest])
+        *parts, state = images
+        seen = [*(self.paligemma_with_expert.embed_image(part) for part in parts), self.state_token(state)]
+        shown = [
+            repeat(mask, "b -> b n", n=part.shape[1]) if mask.ndim == 1 else mask
+            for mask, part in zip(img_masks, seen, strict=True)
+        ]
+        embeddings = torch.cat([*(part.to(words.dtype) for part in seen), words], dim=1)
+        real = torch.cat([*shown, real], dim=1)
+        return embeddings, real, torch.zeros_like(real)

@@ -8,8 +8,18 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
-from lerobot_memobench.datasets.memory_cache import MemoryCache, Progress, build_memory_cache, find_cache
+from lerobot_memobench.datasets.memory_cache import (
+    FrameLookup,
+    MemoryCache,
+    Progress,
+    RecordedFrames,
+    build_memory_cache,
+    find_cache,
+    read_recorded,
+)
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.backbone import SizedPaliGemmaWithExpert
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.language.text_encoders import (
@@ -18,16 +28,20 @@ from lerobot_memobench.policies.memobench_mem.language.text_encoders import (
     make_text_encoder,
 )
 from lerobot_memobench.policies.memobench_mem.perception.frozen import VISION_SEED, seed_parameters
+from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_PHASE, OBS_RAW_STATE
 from lerobot_memobench.policies.memobench_mem.perception.perception import Perception
 from lerobot_memobench.policies.memobench_mem.perception.pixels import PixelPerception
 from lerobot_memobench.policies.memobench_mem.weights import load_exactly, read_weights
 
 logger = logging.getLogger(__name__)
 
+RECORDED = (OBS_STATE, OBS_ENV_STATE, ACTION, "timestamp", "frame_index", "episode_index", "task_index", "index")
+"""Columns that a policy which sees objects learns from."""
+
 _VISION_PREFIX = "paligemma_with_expert.paligemma.model."
 
 
-def load_perception(config: MemobenchMemConfig, weights: str | Path | None = None) -> Perception:
+def load_perception(config: MemobenchMemConfig, weights: str | Path | None = None) -> PixelPerception:
     """Load the frozen image tower of ``config``'s size alone, without the rest of the model.
 
     Args:
@@ -35,8 +49,12 @@ def load_perception(config: MemobenchMemConfig, weights: str | Path | None = Non
             the fixed-seed tower when there are none.
 
     Raises:
-        MemobenchError: the weights cannot be read or do not fit.
+        MemobenchError: the weights cannot be read or do not fit, or there is no tower.
     """
+    if config.sees_objects:
+        raise MemobenchError(
+            "perception=objects needs no memory cache: training reads the dataset's columns; leave this command out."
+        )
     with torch.device("meta"):
         model = SizedPaliGemmaWithExpert(config).paligemma.model
     towers = type(model.vision_tower)(model.config.vision_config), type(model.multi_modal_projector)(model.config)
@@ -77,7 +95,31 @@ def cache_dataset(
     return _build(root, config, perception, batch_size=batch_size, workers=workers, progress=progress, tell=tell)
 
 
-def open_cache(root: Path, config: MemobenchMemConfig, perception: Perception) -> MemoryCache:
+def open_frames(root: Path, config: MemobenchMemConfig, perception: Perception) -> FrameLookup:
+    """Open what training looks up of the dataset at ``root``.
+
+    Raises:
+        MemobenchError: the dataset lacks a column, or a cache cannot be made.
+    """
+    if isinstance(perception, PixelPerception):
+        return open_cache(root, config, perception)
+    columns, table = read_recorded(root, RECORDED)
+    phase = torch.from_numpy(table.phase)
+    logger.info("%d frames of %s are read into memory", table.episodes[-1], root)
+    return RecordedFrames(
+        root,
+        columns,
+        table,
+        _text_encoder(config),
+        remember=lambda seen, frames: perception.remember(
+            {**seen, OBS_RAW_STATE: seen[OBS_STATE], OBS_PHASE: phase}, frames
+        ),
+        key=perception.key,
+        stride=config.memory_stride,
+    )
+
+
+def open_cache(root: Path, config: MemobenchMemConfig, perception: PixelPerception) -> MemoryCache:
     """Open the cache that ``config`` reads of the dataset at ``root``; make or finish it first where that is needed.
 
     Of several processes (the ranks of a training run) one makes it, and the others wait.
@@ -102,7 +144,7 @@ def open_cache(root: Path, config: MemobenchMemConfig, perception: Perception) -
     )
 
 
-def _build(root: Path, config: MemobenchMemConfig, perception: Perception, **how: Any) -> Path:
+def _build(root: Path, config: MemobenchMemConfig, perception: PixelPerception, **how: Any) -> Path:
     """Make or finish the cache of what ``perception`` remembers, beside the dataset or where ``config`` says."""
     place = None if config.memory_cache_dir is None else Path(config.memory_cache_dir).expanduser()
     seen: dict[str, Any] = {"camera": perception.remembers, "stride": config.memory_stride}

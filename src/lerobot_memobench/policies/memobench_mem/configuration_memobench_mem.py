@@ -1,24 +1,27 @@
-"""Configuration of ``memobench_mem``: pi0.5 with a visual memory (spec: policy.md; paper, Table "reproducibility")."""
+"""Configuration of ``memobench_mem``: its settings, with what size and perception decide, checked."""
 
 from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any
 
-from lerobot.configs import PreTrainedConfig
-from lerobot.policies.pi05.configuration_pi05 import PI05Config
+from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
+from lerobot.utils.constants import OBS_ENV_STATE
 
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.policies.memobench_mem.dimensions import GRID, SIZES, Dimensions
+from lerobot_memobench.policies.memobench_mem.dimensions import GRID, SIZES, Dimensions, resized
 from lerobot_memobench.policies.memobench_mem.schedule import WarmupFractionSchedulerConfig
+from lerobot_memobench.policies.memobench_mem.settings_memobench_mem import MemobenchMemSettings
 
 logger = logging.getLogger(__name__)
 
 ALIGN_WEIGHTS = {"none": 0.0, "semantic": 0.1, "contrastive": 0.1, "framewise": 0.05}
 INTEGRATIONS = ("modulation", "context", "none")
+PERCEPTIONS = ("pixels", "objects")
 SUBGOAL_LEVELS = ("coarse", "intermediate", "fine")
-TOKENS_PER_FRAME = GRID**2
+TOKENS_PER_FRAME = {"pixels": GRID**2, "objects": 2}
+MOMENTS_PER_EPISODE = {"pixels": 1, "objects": 6}
 ORACLE_TOKENS = 128
 """Room that oracle memory text needs in a prompt of the word tokenizer: six checkpoints of some ten words."""
 
@@ -33,57 +36,8 @@ def _choose(field: str, given: str, known: tuple[str, ...]) -> None:
 
 @PreTrainedConfig.register_subclass("memobench_mem")
 @dataclass
-class MemobenchMemConfig(PI05Config):
-    """pi0.5's fields plus the memory's. Fields that are ``None`` here take the size's value after construction."""
-
-    knows_phases: ClassVar[bool] = True
-
-    size: str = "tiny"
-    """``tiny`` (from scratch, trains on a CPU) or ``pi05`` (3.2 B)."""
-
-    base_weights: str | None = None
-    """Folder or repository of pi0.5 weights to start from (e.g. ``lerobot/pi05_base``); none: from scratch."""
-
-    # -- alignment
-    align: str = "none"
-    align_weight: float | None = None
-    """Weight of the alignment loss; none or 0: the paper's for this objective (``align=none`` trains without one)."""
-    subgoal_level: str = "intermediate"
-    shuffle_subgoals: bool = False
-    """Control of the paper: the subgoal texts of an episode change places among themselves."""
-    shuffle_seed: int = 7
-    """Which shuffle; the same for every epoch and on every machine."""
-    text_encoder: str | None = None
-
-    # -- memory
-    integration: str = "modulation"
-    """How actions read memory: ``modulation``, ``context`` (memory joins the prefix), or ``none``: plain pi0.5, the
-    baseline that never sees the past."""
-    oracle_memory: bool = False
-    """Control of the paper: ground-truth memory text stands in the prompt, from the dataset's column ``memory`` in
-    training and from the environment (``--env.oracle_memory=true``) at evaluation."""
-    memory_camera: str = "observation.images.image"
-    memory_frames: int = 32
-    tokens_per_frame: int = TOKENS_PER_FRAME
-    memory_stride: int = 1
-    """Every how many control steps a frame enters the history (and the cache)."""
-    memory_cache_dir: str | None = None
-    """Folder for memory caches, of several datasets perhaps; none: ``memory_cache`` in the dataset's folder."""
-
-    # -- training
-    prompt_loss: bool = False
-    """Whether prompt frames (``phase == 0``), whose actions have no effect, count in the action loss."""
-    ema_decay: float = 0.999
-    """Decay of the weights' moving average, which evaluation uses; 0 turns it off."""
-    freeze_vision_encoder: bool = True
-    warmup_fraction: float = 0.05
-
-    # -- pi0.5's fields with this recipe's values
-    image_resolution: tuple[int, int] | None = None
-    tokenizer_name: str | None = None
-    tokenizer_max_length: int | None = None
-    optimizer_lr: float | None = None
-    optimizer_weight_decay: float = 0.0
+class MemobenchMemConfig(MemobenchMemSettings):
+    """The settings, completed and checked."""
 
     def __post_init__(self) -> None:
         try:
@@ -97,17 +51,23 @@ class MemobenchMemConfig(PI05Config):
         """Fill in what the size and the objective decide, and check every field."""
         _choose("size", self.size, tuple(SIZES))
         _choose("align", self.align, tuple(ALIGN_WEIGHTS))
+        _choose("perception", self.perception, PERCEPTIONS)
         _choose("integration", self.integration, INTEGRATIONS)
         _choose("subgoal_level", self.subgoal_level, SUBGOAL_LEVELS)
+        self._check_dimensions()
         dims = self.dimensions
+        for name, value in self._defaults().items():
+            if getattr(self, name) is None:
+                setattr(self, name, value)
+        if not self.normalization_mapping:
+            mode = NormalizationMode(dims.recipe.normalization)
+            self.normalization_mapping = {"VISUAL": NormalizationMode.IDENTITY, "STATE": mode, "ACTION": mode}
         if self.image_resolution is None:
             self.image_resolution = (dims.vision.image, dims.vision.image)
         # A checkpoint without oracle memory holds the length of prompts without it, which would cut the text off.
         if self.tokenizer_max_length in (None, dims.tokenizer_max_length):
             room = ORACLE_TOKENS if self.oracle_memory and dims.tokenizer == "words" else 0
             self.tokenizer_max_length = dims.tokenizer_max_length + room
-        if self.optimizer_lr is None:
-            self.optimizer_lr = dims.learning_rate
         self.tokenizer_name = self.tokenizer_name or dims.tokenizer
         self.text_encoder = self.text_encoder or dims.text_encoder
         # A checkpoint with align=none holds a weight of 0, with which another objective would change nothing.
@@ -118,20 +78,48 @@ class MemobenchMemConfig(PI05Config):
         self._check_perception()
         self._check_alignment()
 
+    def _defaults(self) -> dict[str, Any]:
+        """Return what the size and the perception decide where nobody else does."""
+        recipe = self.dimensions.recipe
+        return {
+            "chunk_size": recipe.chunk_size,
+            "n_action_steps": min(recipe.n_action_steps, self.chunk_size or recipe.chunk_size),
+            "ema_decay": recipe.ema_decay,
+            "final_lr": recipe.final_lr,
+            "optimizer_weight_decay": recipe.weight_decay,
+            "optimizer_lr": self.dimensions.learning_rate,
+            "tokens_per_frame": TOKENS_PER_FRAME[self.perception],
+            "moments_per_episode": MOMENTS_PER_EPISODE[self.perception],
+        }
+
+    def _check_dimensions(self) -> None:
+        if self.size == "pi05" and (self.width, self.depth) != (None, None):
+            raise MemobenchError(
+                "--policy.width and --policy.depth change the sizes that are trained from scratch, and size=pi05 is "
+                "pi0.5's own; leave them out, or use --policy.size=small."
+            )
+        if self.width is not None and (self.width < 16 or self.width % 16):
+            raise MemobenchError(f"--policy.width={self.width} must be a multiple of 16, for 8 heads of even width.")
+        if self.depth is not None and self.depth < 1:
+            raise MemobenchError(f"--policy.depth={self.depth} must be at least 1.")
+
     def _check_numbers(self) -> None:
-        for field in ("memory_frames", "memory_stride", "n_action_steps"):
-            if getattr(self, field) < 1:
-                raise MemobenchError(f"--policy.{field}={getattr(self, field)} must be at least 1.")
+        counts = ("memory_frames", "memory_stride", "n_action_steps", "tokens_per_frame", "moments_per_episode")
+        for name in counts:
+            if getattr(self, name) < 1:
+                raise MemobenchError(f"--policy.{name}={getattr(self, name)} must be at least 1.")
+        if not 0.0 <= self.final_lr <= 1.0:
+            raise MemobenchError(f"--policy.final_lr={self.final_lr} must be in [0, 1]; 1 keeps the rate constant.")
         if not 0.0 <= self.ema_decay < 1.0:
             raise MemobenchError(f"--policy.ema_decay={self.ema_decay} must be in [0, 1); 0 turns it off.")
         if self.align_weight is not None and self.align_weight < 0:
             raise MemobenchError(f"--policy.align_weight={self.align_weight} must not be negative.")
 
     def _check_perception(self) -> None:
-        if self.tokens_per_frame != TOKENS_PER_FRAME:
+        if self.perception == "pixels" and self.tokens_per_frame != GRID**2:
             raise MemobenchError(
                 f"--policy.tokens_per_frame={self.tokens_per_frame} is not supported: frames are pooled to a "
-                f"4x4 grid, so leave it at {TOKENS_PER_FRAME}."
+                f"4x4 grid, so leave it at {GRID**2}."
             )
         if not self.freeze_vision_encoder:
             raise MemobenchError(
@@ -163,7 +151,20 @@ class MemobenchMemConfig(PI05Config):
     @property
     def dimensions(self) -> Dimensions:
         """Dimensions of this size."""
-        return SIZES[self.size]
+        return resized(SIZES[self.size], self.width, self.depth)
+
+    @property
+    def sees_objects(self) -> bool:
+        """Whether a moment is seen as objects, and no picture is looked at."""
+        return self.perception == "objects"
+
+    @property
+    def state_token(self) -> bool:
+        """Whether the state enters as numbers, by a token of the prefix; otherwise as words of the prompt.
+
+        Words at full size, as in pi0.5, and in tiny policies of pixels, which were so from the beginning.
+        """
+        return self.dimensions.tokenizer == "words" and (self.sees_objects or self.size != "tiny")
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -178,8 +179,8 @@ class MemobenchMemConfig(PI05Config):
 
     @property
     def watches(self) -> bool:
-        """Whether frames count that are seen between two plans."""
-        return self.memory != "none"
+        """Whether pictures count that are shown between two plans."""
+        return self.memory != "none" and not self.sees_objects
 
     @property
     def cache_name(self) -> str:
@@ -188,4 +189,20 @@ class MemobenchMemConfig(PI05Config):
 
     def get_scheduler_preset(self) -> WarmupFractionSchedulerConfig:
         """Return the schedule that lerobot-train takes."""
-        return WarmupFractionSchedulerConfig(warmup_fraction=self.warmup_fraction)
+        return WarmupFractionSchedulerConfig(warmup_fraction=self.warmup_fraction, final=self.final_lr)
+
+    def validate_features(self) -> None:
+        """Keep of the features what this perception looks at, besides the state.
+
+        Raises:
+            MemobenchError: they lack the slots of objects.
+        """
+        unseen = FeatureType.VISUAL if self.sees_objects else FeatureType.ENV
+        for key in [key for key, feature in self.input_features.items() if feature.type is unseen]:
+            del self.input_features[key]
+        if self.sees_objects and OBS_ENV_STATE not in self.input_features:
+            raise MemobenchError(
+                f"perception=objects sees by '{OBS_ENV_STATE}', which is not there; train on a dataset of this "
+                "version's `memobench generate`, and evaluate with --env.obs_type=environment_state_agent_pos."
+            )
+        super().validate_features()

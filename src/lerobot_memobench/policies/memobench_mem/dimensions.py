@@ -1,8 +1,8 @@
-"""The two sizes of the policy. Everything that differs between them is a number or a name in this file."""
+"""The sizes of the policy. Everything that differs between them is a number or a name in this file."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 GRID = 4
 """A remembered picture is pooled to GRID x GRID tokens."""
@@ -33,6 +33,24 @@ class Vision:
 
 
 @dataclass(frozen=True)
+class Recipe:
+    """What is trained how, as far as a size decides it; the first values are the paper's.
+
+    Attributes:
+        chunk_size: actions of a plan. n_action_steps: how many of them are taken before the next plan.
+        final_lr: learning rate at the end, as a fraction of the highest; below 1 it falls there as a cosine.
+        normalization: LeRobot's mode for states and actions.
+    """
+
+    chunk_size: int = 50
+    n_action_steps: int = 50
+    weight_decay: float = 0.0
+    ema_decay: float = 0.999
+    final_lr: float = 1.0
+    normalization: str = "QUANTILES"
+
+
+@dataclass(frozen=True)
 class Dimensions:
     """All dimensions and size-dependent defaults of one size."""
 
@@ -45,6 +63,7 @@ class Dimensions:
     text_encoder: str  # "words" (built here) or a folder or repository of a SigLIP model
     text_dim: int
     learning_rate: float
+    recipe: Recipe = field(default_factory=Recipe)
 
 
 # The VLM's width is also the width d_m of the memory tokens (2048 at full size).
@@ -61,6 +80,25 @@ SIZES = {
         text_dim=64,
         learning_rate=1e-3,
     ),
+    "small": Dimensions(
+        vlm=Gemma(width=128, depth=3, mlp_dim=256, num_heads=8, num_kv_heads=1, head_dim=16),
+        expert=Gemma(width=128, depth=3, mlp_dim=256, num_heads=8, num_kv_heads=1, head_dim=16),
+        vision=Vision(width=96, depth=2, mlp_dim=192, num_heads=4, patch=12, image=96),
+        vocabulary=512,
+        tokenizer="words",
+        tokenizer_max_length=48,
+        text_encoder="words",
+        text_dim=64,
+        learning_rate=1e-3,
+        recipe=Recipe(
+            chunk_size=16,
+            n_action_steps=6,
+            weight_decay=1e-4,
+            ema_decay=0.995,
+            final_lr=0.02,
+            normalization="MEAN_STD",
+        ),
+    ),
     "pi05": Dimensions(
         vlm=Gemma(width=2048, depth=18, mlp_dim=16_384, num_heads=8, num_kv_heads=1, head_dim=256),
         expert=Gemma(width=1024, depth=18, mlp_dim=4096, num_heads=8, num_kv_heads=1, head_dim=256),
@@ -73,3 +111,20 @@ SIZES = {
         learning_rate=5e-5,
     ),
 }
+
+
+def resized(dims: Dimensions, width: int | None, depth: int | None) -> Dimensions:
+    """Return dimensions with both transformers ``width`` wide and ``depth`` layers deep; None leaves them."""
+    return replace(dims, vlm=_resized(dims.vlm, width, depth), expert=_resized(dims.expert, width, depth))
+
+
+def _resized(size: Gemma, width: int | None, depth: int | None) -> Gemma:
+    wide, deep = width or size.width, depth or size.depth
+    return Gemma(
+        wide,
+        deep,
+        size.mlp_dim * wide // size.width,
+        size.num_heads,
+        size.num_kv_heads,
+        size.head_dim * wide // size.width,
+    )

@@ -2,34 +2,44 @@
 
 lerobot-train draws the frames of all episodes uniformly, each once per epoch, in an order that seed and epoch decide,
 and leaves no say in where an episode begins. What it does ask the configuration for is how many frames to drop at the
-end; our answer is 0 and carries, for its sampler, where each episode's execution begins. The sampler is LeRobot's, and
-any other answer leaves it as it was. Histories still hold the prompt, because they come from the memory cache.
+end; our answer is 0 and carries, for its sampler, where each episode's execution begins and how many of its frames
+follow one another in the order. The sampler is LeRobot's, each frame is still drawn once per epoch, and any other
+answer leaves it as it was. Histories still hold the prompt, because they come from the memory cache.
 """
 
 from __future__ import annotations
 
 import functools
 import inspect
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import torch
 from lerobot.datasets.sampler import EpisodeAwareSampler
+from torch import Tensor
 
 from lerobot_memobench.datasets.demonstration import PROMPT
 from lerobot_memobench.datasets.execution_frames import first_frames
 
 
-class FromStarts(int):
-    """How many frames to drop at the end of each episode, and from which frame on (E,) to draw."""
+class Drawn(int):
+    """How many frames to drop at the end of each episode, and how the others are drawn.
 
-    starts: np.ndarray
+    Attributes:
+        starts: from which frame on (E,) to draw; None: from the first.
+        moments: how many frames of an episode to draw in a row.
+    """
+
+    starts: np.ndarray | None
+    moments: int
 
     @classmethod
-    def of(cls, starts: np.ndarray) -> FromStarts:
-        """Return 0, with the first frames to draw; LeRobot's sampler understands it from now on."""
+    def of(cls, starts: np.ndarray | None, moments: int) -> Drawn:
+        """Return 0, which LeRobot's sampler understands from now on."""
         _teach(EpisodeAwareSampler)
         found = cls(0)
-        found.starts = starts
+        found.starts, found.moments = starts, moments
         return found
 
 
@@ -42,8 +52,24 @@ def execution_starts(episodes: np.ndarray, phase: np.ndarray) -> np.ndarray:
     return first_frames(episodes[:-1], episodes[1:], np.flatnonzero(phase != PROMPT))
 
 
+def in_groups(ends: np.ndarray, moments: int, generator: torch.Generator) -> Tensor:
+    """Return all places 0 ... N - 1 in a random order in which ``moments`` of an episode follow one another.
+
+    Args:
+        ends: (E,) end of each episode's places, counted from the first's beginning; the last is N.
+    """
+    lengths = torch.from_numpy(np.diff(ends, prepend=0))
+    episode = torch.repeat_interleave(lengths)
+    mixed = torch.randperm(len(episode), generator=generator)
+    mixed = mixed[episode[mixed].argsort(stable=True)]  # within each episode
+    rank = torch.arange(len(mixed)) - (lengths.cumsum(0) - lengths)[episode]
+    groups = (lengths + moments - 1) // moments
+    group = (groups.cumsum(0) - groups)[episode] + rank // moments
+    return mixed[torch.randperm(int(groups.sum()), generator=generator)[group].argsort(stable=True)]
+
+
 def _teach(sampler: type[Any]) -> None:
-    """Let a sampler begin its episodes where its ``drop_n_last_frames`` says, if that says so."""
+    """Let a sampler begin its episodes, and draw them, as its ``drop_n_last_frames`` says, if that says so."""
     original = sampler.__init__
     if hasattr(original, "__wrapped__"):
         return
@@ -53,8 +79,19 @@ def _teach(sampler: type[Any]) -> None:
     def init(self: Any, *args: Any, **named: Any) -> None:
         asked = signature.bind(self, *args, **named)
         dropped = asked.arguments.get("drop_n_last_frames", 0)
-        if isinstance(dropped, FromStarts):
-            asked.arguments["dataset_from_indices"] = dropped.starts
+        self.moments = 1
+        if isinstance(dropped, Drawn):
+            self.moments = dropped.moments
+            if dropped.starts is not None:
+                asked.arguments["dataset_from_indices"] = dropped.starts
         original(*asked.args, **asked.kwargs)
 
-    sampler.__init__ = init
+    one_epoch = sampler._iter_epoch
+
+    def draw(self: Any, epoch: int, start: int) -> Iterator[int]:
+        if self.moments == 1 or not self.shuffle:
+            return one_epoch(self, epoch, start)
+        order = in_groups(self._cum_lengths, self.moments, self._epoch_generator(epoch))
+        return (self._frame_index(position) for position in order[start:].tolist())
+
+    sampler.__init__, sampler._iter_epoch = init, draw

@@ -16,6 +16,10 @@ from lerobot_memobench.policies.memobench_mem.memory.registry import make_mechan
 INTEGRATIONS: dict[str, type[Integration]] = {"modulation": Modulation, "context": Context}
 
 
+OWN = ("memory.", "state_token.", "paligemma_with_expert.perception.")
+"""What the names of parameters begin with that plain pi0.5 does not have; an integration has more."""
+
+
 class MemoryPI05(SizedPI05):
     """pi0.5 with a memory: ``set_memory`` first, then LeRobot's ``forward`` or ``sample_actions``."""
 
@@ -26,32 +30,37 @@ class MemoryPI05(SizedPI05):
             return
         dims = config.dimensions
         mechanism = make_mechanism(config.memory, config.memory_frames)
-        self.memory = mechanism.encoder(image_dim=dims.vlm.width, memory_dim=dims.vlm.width)
+        seeing = self.paligemma_with_expert.perception
+        self.memory = seeing.memory(mechanism.encoder(seeing.dim, dims.vlm.width, seeing.grid))
         self.integration = INTEGRATIONS[config.integration](self, dims.vlm.width, dims.expert.width)
 
     def memory_parameters(self) -> dict[str, nn.Parameter]:
         """Every parameter that plain pi0.5 does not have, by name."""
         integration = self.integration
-        if integration is None:
-            return {}
         return {
             name: parameter
             for name, parameter in self.named_parameters()
-            if name.startswith("memory.") or integration.owns(name)
+            if name.startswith(OWN) or (integration is not None and integration.owns(name))
         }
 
     def place_of(self, name: str) -> str:
         """Return the name in this model of a parameter of plain pi0.5."""
         return name if self.integration is None else self.integration.place_of(name)
 
-    def set_memory(self, tokens: Tensor, steps: Tensor, frame_mask: Tensor) -> tuple[Tensor, Tensor]:
+    def set_memory(
+        self, tokens: Tensor, steps: Tensor, frame_mask: Tensor, numbers: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Encode tokens (B, F, P, D) seen at steps (B, F) and hand them to the integration.
+
+        Args:
+            numbers: (B, F), equal where frames are; a perception that learns to remember encodes each once.
 
         Returns:
             H (B, F*P, d_m) and its mask (B, F*P), for the alignment objectives.
         """
         assert self.integration is not None  # the policy asks no plain pi0.5
-        memory, mask = self.memory(tokens, steps, frame_mask)
+        shared = {} if numbers is None else {"numbers": numbers}
+        memory, mask = self.memory(tokens, steps, frame_mask, **shared)
         self.integration.hand_over(memory, mask)
         return memory, mask
 

@@ -21,6 +21,7 @@ from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import
 from lerobot_memobench.policies.memobench_mem.language.tokenizer import WordTokenizerProcessorStep, make_vocabulary
 from lerobot_memobench.policies.memobench_mem.processing.gather_memory import GatherMemoryProcessorStep, gathering
 from lerobot_memobench.policies.memobench_mem.processing.oracle_memory import OracleMemoryProcessorStep
+from lerobot_memobench.policies.memobench_mem.processing.raw_state import RawStateProcessorStep
 from lerobot_memobench.policies.memobench_mem.processing.training_run import prompt_texts, training_run
 
 
@@ -60,8 +61,9 @@ def make_memobench_mem_pre_post_processors(
         GatherMemoryProcessorStep(**gathering(config)),
         OracleMemoryProcessorStep(enabled=config.oracle_memory),
         relative,
-        steps.normalize,  # before the prompt, which spells the normalised state out
-        Pi05PrepareStateTokenizerProcessorStep(max_state_dim=config.max_state_dim),
+        *([RawStateProcessorStep()] if config.sees_objects else []),
+        steps.normalize,  # before the prompt, which may spell the normalised state out
+        *([] if config.state_token else [Pi05PrepareStateTokenizerProcessorStep(max_state_dim=config.max_state_dim)]),
         _tokenizer(config, meta),
         steps.to_device,
     ]

@@ -105,6 +105,7 @@ def load_exactly(module: nn.Module, weights: dict[str, Tensor], source: str | Pa
         name = (missing + wrong)[0]
         raise MemobenchError(
             f"The weights of '{source}' do not fit this policy: {len(missing)} are missing and {len(wrong)} have "
-            f"another shape, the first being '{name}'; give weights of the same size (--policy.size)."
+            f"another shape, the first being '{name}'; give weights of the same size (--policy.size) and "
+            "perception (--policy.perception)."
         )
     module.load_state_dict({name: weights[name] for name in own if name in weights}, strict=False)

@@ -11,12 +11,15 @@ from torch import Tensor
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import Frame
 
 TOKENS, STEPS, MASK = "memory.tokens", "memory.steps", "memory.mask"
+FRAMES = "memory.frames"
+"""Numbers (B, F) of remembered frames in the dataset, by which samples of one episode share what they remember; -1
+where a row has none."""
 TEXT, TEXT_MASK = "memory.text", "memory.text_mask"
 PHASE = "phase"
 
 
 class MemoryBatch(NamedTuple):
-    """Frames read for B samples: tokens (B, F, P, D) bfloat16, control steps (B, F) int64, mask (B, F) bool."""
+    """Frames read for B samples: tokens (B, F, P, D), control steps (B, F) int64, mask (B, F) bool."""
 
     tokens: Tensor
     steps: Tensor
@@ -29,8 +32,9 @@ class MemoryBatch(NamedTuple):
 
 def collate_frames(rows: Sequence[Sequence[Frame]], frames: int) -> MemoryBatch:
     """Right-pad what was read for each sample to ``frames`` frames."""
+    like = rows[0][0].tokens
     batch = MemoryBatch(
-        tokens=torch.zeros(len(rows), frames, *rows[0][0].tokens.shape, dtype=torch.bfloat16),
+        tokens=torch.zeros(len(rows), frames, *like.shape, dtype=like.dtype),
         steps=torch.zeros(len(rows), frames, dtype=torch.int64),
         mask=torch.zeros(len(rows), frames, dtype=torch.bool),
     )

@@ -47,12 +47,14 @@ class MemoryEncoder(nn.Module):
 
     A Linear of a concatenation is the sum of its parts' Linears. The 16 tokens of a frame share their time and all
     frames share their grid, so the first Linear is applied to F times and 4 + 4 places instead of F * 16 tokens.
+    Tokens without a ``grid`` are told their time alone.
     """
 
-    def __init__(self, image_dim: int, memory_dim: int) -> None:
+    def __init__(self, image_dim: int, memory_dim: int, grid: int = GRID) -> None:
         super().__init__()
-        self.position = nn.Linear(POSITION_DIM, POSITION_DIM)
-        self.project = nn.Linear(image_dim + POSITION_DIM, memory_dim)
+        self.grid = grid
+        self.position = nn.Linear(POSITION_DIM, POSITION_DIM) if grid else nn.Linear(2 * _FREQUENCIES, memory_dim)
+        self.project = nn.Linear(image_dim + self.position.out_features, memory_dim)
 
     def forward(self, tokens: Tensor, steps: Tensor, frame_mask: Tensor) -> tuple[Tensor, Tensor]:
         """Encode tokens (B, F, P, D) seen at control steps (B, F).
@@ -60,15 +62,17 @@ class MemoryEncoder(nn.Module):
         Returns:
             H (B, F*P, d_m) float32 and its mask (B, F*P) bool, from ``frame_mask`` (B, F).
         """
-        of_image, of_position = self.project.weight.split([tokens.shape[-1], POSITION_DIM], dim=1)
+        of_image, of_position = self.project.weight.split([tokens.shape[-1], self.position.out_features], dim=1)
         image = F.linear(tokens.to(of_image.dtype), of_image, self.project.bias)
         encoded = image + F.linear(F.silu(self._positions(steps)), of_position)
         mask = repeat(frame_mask.bool(), "b f -> b (f p)", p=tokens.shape[2])
         return rearrange(encoded, "b f p d -> b (f p) d"), mask
 
     def _positions(self, steps: Tensor) -> Tensor:
-        """`position` of `position_features` (B, F, 16, 768), by its parts."""
+        """`position` of `position_features` (B, F, 16, 768), by its parts; (B, F, 1, d_m) of the time alone."""
         weight = self.position.weight
+        if not self.grid:
+            return rearrange(self.position(_waves(steps, _TIME_BASE).to(weight.dtype)), "b f d -> b f 1 d")
         of_time, of_row, of_column = weight.split(2 * _FREQUENCIES, dim=1)
         grid = _grid_waves(steps.device).to(weight.dtype)
         time = F.linear(_waves(steps, _TIME_BASE).to(weight.dtype), of_time, self.position.bias)

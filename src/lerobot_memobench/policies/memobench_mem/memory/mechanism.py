@@ -13,12 +13,13 @@ from typing import ClassVar, Protocol
 
 from torch import Tensor, nn
 
+from lerobot_memobench.policies.memobench_mem.dimensions import GRID
 from lerobot_memobench.policies.memobench_mem.memory.encoder import MemoryEncoder
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One moment: its control step since the episode began, and its tokens (P, D) bfloat16 on the CPU."""
+    """One moment: its control step since the episode began, and its tokens (P, D) on the CPU."""
 
     step: int
     tokens: Tensor
@@ -66,10 +67,13 @@ class MemoryMechanism(ABC):
             self.write(kept, frame)
         return self.read(kept)
 
-    def encoder(self, image_dim: int, memory_dim: int) -> nn.Module:
+    def encoder(self, image_dim: int, memory_dim: int, grid: int = GRID) -> nn.Module:
         """Build what turns frames read into memory tokens.
 
         It is called with tokens (B, F, P, D), their control steps (B, F) and which frames are real (B, F), and returns
         tokens (B, L, d_m) and their mask (B, L). A recurrent memory goes through the frames here, in their order.
+
+        Args:
+            grid: side of the square of a picture's tokens; 0 where tokens have no place in a picture.
         """
-        return MemoryEncoder(image_dim, memory_dim)
+        return MemoryEncoder(image_dim, memory_dim, grid)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-import torch
 from torch import Tensor
 
 from lerobot_memobench.policies.memobench_mem.memory.batch import MemoryBatch, collate_frames
@@ -58,7 +57,7 @@ class RolloutMemory:
             row for row, step in enumerate(steps) if not frozen[row] and (started[row] or step % self.stride == 0)
         ]
         if wanted and self.mechanism.frames:
-            for row, tokens in zip(wanted, encode(wanted).to("cpu", torch.bfloat16), strict=True):
+            for row, tokens in zip(wanted, encode(wanted).to("cpu"), strict=True):
                 self.mechanism.write(self.rows[row].kept, Frame(steps[row], tokens))
         return started, frozen
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from lerobot_memobench.datasets.memory_cache import MemoryCache
+from lerobot_memobench.datasets.memory_cache import FrameLookup
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import Frame, MemoryMechanism
 
 
 class CachedEpisode:
     """The stored frames of one episode of a memory cache; see `EpisodeFrames`."""
 
-    def __init__(self, cache: MemoryCache, episode: int) -> None:
+    def __init__(self, cache: FrameLookup, episode: int) -> None:
         self.cache, self.episode = cache, episode
 
     def load(self, slots: Sequence[int]) -> list[Frame]:
@@ -20,6 +20,6 @@ class CachedEpisode:
         return [Frame(slot * self.cache.meta.stride, seen) for slot, seen in zip(slots, tokens, strict=True)]
 
 
-def recall_at(cache: MemoryCache, mechanism: MemoryMechanism, episode: int, frame: int) -> list[Frame]:
+def recall_at(cache: FrameLookup, mechanism: MemoryMechanism, episode: int, frame: int) -> list[Frame]:
     """Return what ``mechanism`` reads at a frame of an episode, counted from its start."""
     return mechanism.recall(CachedEpisode(cache, episode), frame // cache.meta.stride)

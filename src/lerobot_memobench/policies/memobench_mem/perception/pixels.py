@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 
 import torch
@@ -32,6 +33,8 @@ class PixelPerception(Perception):
     """
 
     tokens_per_frame = GRID**2
+    grid = GRID
+    pictures = True
 
     def __init__(self, tower: nn.Module, projector: nn.Module, resolution: tuple[int, int], camera: str) -> None:
         self.tower, self.projector, self.resolution = tower, projector, resolution
@@ -43,6 +46,10 @@ class PixelPerception(Perception):
         """Identity of the tokens this makes: weights, input size and pooling."""
         weights = fingerprint({"vision_tower": self.tower, "multi_modal_projector": self.projector})
         return f"{weights}-{self.resolution[0]}x{self.resolution[1]}-mean{self.tokens_per_frame}"
+
+    def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
+        """Return the tokens (n, 16, D) of some rows' pictures."""
+        return self(batch[self.remembers][list(rows)])
 
     @torch.no_grad()
     def __call__(self, images: Tensor) -> Tensor:

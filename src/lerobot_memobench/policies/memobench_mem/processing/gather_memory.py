@@ -18,9 +18,9 @@ from lerobot.lerobot_types import EnvTransition, TransitionKey
 from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 from torch import Tensor
 
-from lerobot_memobench.datasets.memory_cache import MemoryCache
+from lerobot_memobench.datasets.memory_cache import FrameLookup, RecordedFrames
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.memory.batch import MASK, PHASE, STEPS, TOKENS, collate_frames
+from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, PHASE, STEPS, TOKENS, collate_frames
 from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import FrameSampling
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryMechanism
 from lerobot_memobench.policies.memobench_mem.memory.none import NoMemory
@@ -46,7 +46,7 @@ def gathering(config: MemobenchMemConfig) -> dict[str, Any]:
 class GatherMemoryProcessorStep(ProcessorStep):
     """Add history, phase and subgoal embeddings to training samples; leave observations of a rollout alone.
 
-    Adds ``memory.tokens`` (B, F, P, D) bfloat16, ``memory.steps`` (B, F) int64, ``memory.mask`` (B, F) bool, ``phase``
+    Adds ``memory.tokens`` (B, F, P, D), ``memory.steps`` (B, F) int64, ``memory.mask`` (B, F) bool, ``phase``
     (B,), and with an alignment ``memory.text`` and ``memory.text_mask``: (B, d_t) and (B,) for the frame itself, or
     with ``framewise`` (B, F, d_t) and (B, F) for the frames of the history. With ``frames`` 0 (``integration=none``)
     there is no history, and only ``phase`` is added.
@@ -61,7 +61,7 @@ class GatherMemoryProcessorStep(ProcessorStep):
     shuffle_subgoals: bool = False
     shuffle_seed: int = 7
     memory: str = FrameSampling.name
-    cache: MemoryCache | None = field(default=None, repr=False)
+    cache: FrameLookup | None = field(default=None, repr=False)
     _texts: np.ndarray | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -90,7 +90,7 @@ class GatherMemoryProcessorStep(ProcessorStep):
         """How samples remember; with no frames, not at all."""
         return make_mechanism(self.memory if self.frames else NoMemory.name, self.frames)
 
-    def gather(self, cache: MemoryCache, indices: Sequence[int]) -> dict[str, Tensor]:
+    def gather(self, cache: FrameLookup, indices: Sequence[int]) -> dict[str, Tensor]:
         """Look up frames of the dataset by their global indices."""
         places = [cache.locate(index) for index in indices]  # refuses frames that the cache does not know
         phase = {PHASE: torch.from_numpy(cache.phase[np.asarray(indices)].astype(np.int64))}
@@ -99,6 +99,9 @@ class GatherMemoryProcessorStep(ProcessorStep):
             return phase
         recalled = [recall_at(cache, mechanism, episode, frame) for episode, frame in places]
         memory = dict(zip((TOKENS, STEPS, MASK), collate_frames(recalled, mechanism.frames), strict=True))
+        if isinstance(cache, RecordedFrames):  # what is encoded for every batch anew is encoded once in it
+            starts = torch.from_numpy(cache.episodes)[[episode for episode, _ in places]]
+            memory[FRAMES] = (memory[STEPS] + starts[:, None]).masked_fill(~memory[MASK], -1)
         if self.align == "none":
             return memory | phase
         rows = self._text_rows(cache)
@@ -110,7 +113,7 @@ class GatherMemoryProcessorStep(ProcessorStep):
         ]
         return memory | phase | texts_of_histories(cache, rows, histories, mechanism.frames)
 
-    def _text_rows(self, cache: MemoryCache) -> np.ndarray:
+    def _text_rows(self, cache: FrameLookup) -> np.ndarray:
         if self._texts is None:
             seed = self.shuffle_seed if self.shuffle_subgoals else None
             self._texts = text_rows(cache, self.subgoal_level, self.align, seed)

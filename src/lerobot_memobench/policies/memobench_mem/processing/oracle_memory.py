@@ -9,7 +9,7 @@ from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.lerobot_types import EnvTransition, TransitionKey
 from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 
-from lerobot_memobench.datasets.memory_cache import MemoryCache
+from lerobot_memobench.datasets.memory_cache import FrameLookup
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.processing.training_run import require_cache, training_run
 from lerobot_memobench.tasks.memory_text import MARK, with_memory
@@ -27,7 +27,7 @@ class OracleMemoryProcessorStep(ProcessorStep):
     """
 
     enabled: bool = True
-    cache: MemoryCache | None = field(default=None, repr=False)
+    cache: FrameLookup | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         self._run = None if self.cache is not None else training_run()

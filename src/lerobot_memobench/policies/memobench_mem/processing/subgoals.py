@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_memobench.datasets.memory_cache import MemoryCache
+from lerobot_memobench.datasets.memory_cache import FrameLookup
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.memory.batch import TEXT, TEXT_MASK
 
 
-def text_rows(cache: MemoryCache, level: str, align: str, shuffle_seed: int | None) -> np.ndarray:
+def text_rows(cache: FrameLookup, level: str, align: str, shuffle_seed: int | None) -> np.ndarray:
     """Return the row of the cache's embeddings for each frame of the dataset (N,), -1 where it has no subgoal.
 
     Args:
@@ -33,13 +33,13 @@ def text_rows(cache: MemoryCache, level: str, align: str, shuffle_seed: int | No
     return rows if shuffle_seed is None else shuffle_within_episodes(rows, cache.episodes, shuffle_seed)
 
 
-def texts_of_frames(cache: MemoryCache, rows: np.ndarray, frames: Sequence[int]) -> dict[str, Tensor]:
+def texts_of_frames(cache: FrameLookup, rows: np.ndarray, frames: Sequence[int]) -> dict[str, Tensor]:
     """Return the texts (B, d_t) of frames of the dataset, and which have one (B,); ``rows`` as from `text_rows`."""
     return _embed(cache, rows[np.asarray(frames)].astype(np.int64))
 
 
 def texts_of_histories(
-    cache: MemoryCache, rows: np.ndarray, histories: Sequence[np.ndarray], frames: int
+    cache: FrameLookup, rows: np.ndarray, histories: Sequence[np.ndarray], frames: int
 ) -> dict[str, Tensor]:
     """Return the texts (B, F, d_t) of remembered frames, right-padded to F, and which have one (B, F)."""
     padded = np.full((len(histories), frames), -1, dtype=np.int64)
@@ -48,7 +48,7 @@ def texts_of_histories(
     return _embed(cache, padded)
 
 
-def _embed(cache: MemoryCache, rows: np.ndarray) -> dict[str, Tensor]:
+def _embed(cache: FrameLookup, rows: np.ndarray) -> dict[str, Tensor]:
     numbers = torch.from_numpy(rows)
     return {TEXT_MASK: numbers >= 0, TEXT: cache.text_embeddings[numbers.clamp(min=0)]}
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from lerobot_memobench.datasets.memory_cache import MemoryCache
+from lerobot_memobench.datasets.memory_cache import FrameLookup
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.tasks.memory_text import with_memory
@@ -25,7 +25,7 @@ class TrainingRun:
     """
 
     config: MemobenchMemConfig
-    cache: MemoryCache
+    cache: FrameLookup
     meta: Any
 
     def prompt_texts(self) -> list[str]:
@@ -47,7 +47,7 @@ def training_run() -> TrainingRun | None:
     return _run
 
 
-def prompt_texts(config: MemobenchMemConfig, meta: Any | None, cache: MemoryCache | None) -> list[str]:
+def prompt_texts(config: MemobenchMemConfig, meta: Any | None, cache: FrameLookup | None) -> list[str]:
     """Return the dataset's tasks and, with oracle memory, every memory that is put behind them."""
     tasks = [] if meta is None or meta.tasks is None else [str(task) for task in meta.tasks.index]
     if config.oracle_memory and cache is not None:
@@ -55,7 +55,7 @@ def prompt_texts(config: MemobenchMemConfig, meta: Any | None, cache: MemoryCach
     return tasks
 
 
-def require_cache(own: MemoryCache | None, run: TrainingRun | None) -> MemoryCache:
+def require_cache(own: FrameLookup | None, run: TrainingRun | None) -> FrameLookup:
     """Return the cache a step was given, or that of the run it was made for, or that of the policy made last.
 
     Raises:

@@ -1,0 +1,141 @@
+"""The policy as it acts: histories, noise and plans of the rows of a vector environment, each by its own clock."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
+from torch import Tensor
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.freshness import PICTURE_STEP, require_fresh
+from lerobot_memobench.policies.memobench_mem.noise import EpisodeNoise
+from lerobot_memobench.policies.memobench_mem.one_thread import OneThread
+from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_PHASE
+from lerobot_memobench.policies.memobench_mem.plans import RowPlans
+from lerobot_memobench.policies.memobench_mem.seeing import SeeingPolicy
+from lerobot_memobench.policies.shown import cure
+
+OBS_STEP, OBS_PICTURE = "observation.step", f"observation.{PICTURE_STEP}"
+
+
+class ActingPolicy(SeeingPolicy):
+    """``select_action``: rows of a vector environment are independent of one another.
+
+    Attributes:
+        plans: what the rows are about to do. noise: that their plans are sampled from.
+        thread: the one that acts.
+    """
+
+    plans: RowPlans
+    noise: EpisodeNoise
+    thread: OneThread
+
+    def reset(self) -> None:
+        """Forget histories and planned actions. LeRobot calls it once per batch of episodes."""
+        super().reset()
+        for part in (self.history, self.plans, self.noise):
+            part.reset()
+        self._calls = 0
+        self.thread.begin()
+        self._acting_rows: list[int] = []
+
+    def looks_next(self) -> bool:
+        """Whether pictures or objects of the next observation are read: it is remembered, or a plan is made from it.
+
+        Asked after an action. Whether the next frame is the first of an execution, where plans begin, only the
+        environment knows: that one is to be shown in any case, as the first of an episode.
+        """
+        return self.history.writes_next() or bool(self.plans.wanting(self._acting_rows))
+
+    def observe(self, batch: dict[str, Tensor]) -> tuple[list[int], list[bool], list[bool]]:
+        """Take the current frames of all rows into their histories; return steps, new episodes and frozen rows."""
+        seen = self.perception.remembers
+        if seen not in batch:
+            raise MemobenchError(f"The observation has no '{seen}', which this policy remembers; {cure(seen, batch)}")
+        count = len(batch[seen])
+        if OBS_STEP in batch:
+            steps = [round(step) for step in batch[OBS_STEP].reshape(count, -1)[:, 0].tolist()]
+        else:
+            steps = [self._calls] * count  # an environment without a clock: one call is one step
+        self._calls += 1
+        started, frozen = self.history.observe(steps, lambda rows: self._encode(batch, steps, rows))
+        self.noise.resize(count)
+        for row in range(count):
+            if started[row]:
+                told = (key for key in (seen, OBS_STATE, OBS_LANGUAGE_TOKENS) if key in batch)
+                self.noise.begin(row, (batch[key][row] for key in told))
+        return steps, started, frozen
+
+    def _encode(self, batch: dict[str, Tensor], steps: list[int], rows: list[int]) -> Tensor:
+        """Tokens (n, P, D) of the present frames of some rows; a frame of an earlier step is refused."""
+        if OBS_PICTURE in batch and self.perception.pictures:
+            for row in rows:
+                require_fresh(steps[row], round(float(batch[OBS_PICTURE][row])))
+        return self.perception.remember(batch, rows)
+
+    def plan(self, batch: dict[str, Tensor], rows: list[int], noise: Tensor, **kwargs: Any) -> Tensor:
+        """Actions (n, chunk, A) for some rows of the batch, with their histories and sampling noise."""
+        part = {key: batch[key][rows] for key in self._seen if key in batch}
+        images, image_masks = self._preprocess_images(part)
+        words = part[OBS_LANGUAGE_TOKENS], part[OBS_LANGUAGE_ATTENTION_MASK]
+        with self._acting():
+            if self._remembers:
+                self.model.set_memory(*self.history.gather(rows).to(self._device))
+            noise = noise.to(self._device)
+            actions = self.model.sample_actions(images, image_masks, *words, noise=noise, **kwargs)
+        return actions[:, :, : self._action_dim]
+
+    @contextlib.contextmanager
+    def _acting(self) -> Iterator[None]:
+        """Act as the checkpoint of this moment would: by the average, in the precision that it is loaded in."""
+        wide = self.precision.narrowed()
+        average = contextlib.nullcontext() if self.average is None else self.average.applied(wide)
+        with average, self.precision.computing(self._device):
+            yield
+
+    def _noise(self, rows: list[int], steps: list[int]) -> Tensor:
+        return self.noise.draw(rows, steps, (self.config.chunk_size, self.config.max_action_dim))
+
+    @torch.no_grad()
+    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """Take in one observation per row and plan for all rows: (B, chunk, A), normalised.
+
+        Call it at every control step, or pass ``observation.step``, for the history to be complete. ``noise``
+        (B, chunk, max_action_dim) replaces the episodes' own; other keywords are LeRobot's real-time chunking ones.
+        """
+        self.eval()
+        steps, _, _ = self.observe(batch)
+        rows = list(range(len(steps)))
+        noise = kwargs.pop("noise", None)
+        return self.plan(batch, rows, self._noise(rows, steps) if noise is None else noise, **kwargs)
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """Next action of every row (B, A), normalised.
+
+        Every row keeps its own plan of ``n_action_steps``: it is made when the row's execution begins or its last plan
+        is used up, from that row alone, so rows of a batch are independent. In the prompt phase, where actions have no
+        effect, and for frozen rows nothing is planned.
+        """
+        self.thread.check()
+        self.eval()
+        steps, started, frozen = self.observe(batch)
+        count = len(steps)
+        self.plans.resize(count)
+        prompt = [False] * count
+        if OBS_PHASE in batch:
+            prompt = (batch[OBS_PHASE].reshape(count, -1)[:, 0] < 0.5).tolist()
+        for row in range(count):
+            if started[row] or prompt[row]:
+                self.plans.drop(row)
+        acting = self._acting_rows = [row for row in range(count) if not prompt[row] and not frozen[row]]
+        wanting = self.plans.wanting(acting)
+        if wanting:
+            plans = self.plan(batch, wanting, self._noise(wanting, steps))
+            for row, plan in zip(wanting, plans[:, : self.config.n_action_steps].float().cpu(), strict=True):
+                self.plans.queues[row].extend(plan)
+        return self.plans.step(acting).to(self._device)

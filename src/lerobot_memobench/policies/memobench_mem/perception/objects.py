@@ -1,0 +1,123 @@
+"""Objects: the slots of `sim.object_slots` instead of pictures; a remembered frame keeps them as numbers.
+
+What is stored of a frame is what was seen, and what becomes of it is learned: slots, robot state and phase, one row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from einops import rearrange
+from lerobot.utils.constants import OBS_ENV_STATE
+from torch import Tensor, nn
+
+from lerobot_memobench.policies.memobench_mem.perception.perception import Perception, Seen
+from lerobot_memobench.policies.memobench_mem.perception.slots import HAND_DIM, SlotEncoder
+from lerobot_memobench.sim.object_slots import SIZE, SLOTS, WIDTH, classes
+
+OBS_RAW_STATE, OBS_PHASE = "observation.raw_state", "observation.phase"
+LOUD = 8.0
+"""How much larger than a layer's output tokens are made; at 1 they learned slower."""
+
+
+def frame_row(slots: Tensor, state: Tensor, phase: Tensor) -> Tensor:
+    """Return what is stored of N frames, (N, 1, SIZE + 6 + 1): slots (N, SIZE), state (N, >= 6) and phase (N,)."""
+    row = torch.cat([slots, state[:, :HAND_DIM], phase.reshape(-1, 1).to(slots.dtype)], dim=1)
+    return rearrange(row, "n d -> n 1 d")
+
+
+class FramePool(nn.Module):
+    """A stored frame to a few tokens: its things, pooled by learned attention."""
+
+    def __init__(self, order: Sequence[int], kinds: int, tokens: int, width: int) -> None:
+        super().__init__()
+        self.slot = SlotEncoder(order, kinds, width, width)
+        self.score = nn.Linear(width, tokens)
+        self.phase = nn.Linear(1, width)
+        self.out = nn.Sequential(nn.GELU(), nn.Linear(width, width))
+
+    def forward(self, frames: Tensor) -> Tensor:
+        """Return tokens (N, tokens, width) of frames (N, SIZE + 6 + 1)."""
+        slots, hand, phase = frames.split([SIZE, HAND_DIM, 1], dim=1)
+        made, there = self.slot(slots.unflatten(1, (SLOTS, WIDTH)), hand)
+        score = self.score(made)
+        # A finite score keeps a frame in which nothing is seen finite: it becomes zeros.
+        scores = score.new_full((*there.shape, score.shape[-1]), -1e4).masked_scatter(there.unsqueeze(-1), score)
+        values = made.new_zeros((*there.shape, made.shape[-1])).masked_scatter(there.unsqueeze(-1), made)
+        pooled = torch.einsum("nsk,nsd->nkd", scores.softmax(dim=1), values)
+        kept: Tensor = self.out(pooled + self.phase(phase).unsqueeze(1))
+        return kept
+
+
+class ObjectMemory(nn.Module):
+    """Stored frames to memory tokens: each frame pooled, then the mechanism's encoder over the frames."""
+
+    def __init__(self, pool: FramePool, encoder: nn.Module) -> None:
+        super().__init__()
+        self.pool, self.encoder = pool, encoder
+
+    def forward(
+        self, frames: Tensor, steps: Tensor, mask: Tensor, numbers: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Encode frames (B, F, 1, D') seen at steps (B, F), of which mask (B, F) are real.
+
+        Args:
+            numbers: (B, F), equal where frames are: each is pooled once, however many rows read it.
+
+        Returns:
+            H (B, L, d_m) and its mask (B, L).
+        """
+        rows = frames.flatten(0, 2)
+        if numbers is None:
+            pooled = self.pool(rows)
+        else:
+            unique, places = numbers.flatten().unique(return_inverse=True)
+            first = places.new_zeros(len(unique)).scatter_(0, places, torch.arange(len(places), device=places.device))
+            pooled = self.pool(rows[first])[places]
+        memory, real = self.encoder(pooled.unflatten(0, mask.shape), steps, mask)
+        return memory, real
+
+
+class ObjectPerception(nn.Module, Perception):
+    """A token per thing that is seen now; what is remembered are the numbers themselves, for `ObjectMemory`.
+
+    Args:
+        trained: names of the classes that it knows, in order of their indices.
+        tokens_per_frame: memory tokens of a frame. width: of all tokens.
+    """
+
+    remembers = OBS_ENV_STATE
+    key = f"objects-{SIZE}"
+    grid = 0
+    pictures = False
+
+    def __init__(self, trained: Sequence[str], tokens_per_frame: int, width: int) -> None:
+        super().__init__()
+        self.tokens_per_frame, self.dim = tokens_per_frame, width
+        self.order = [trained.index(name) if name in trained else len(trained) for name in classes()]
+        self.kinds = len(trained) + 1
+        self.slot = SlotEncoder(self.order, self.kinds, 2 * width, width)
+
+    def present(self, batch: Mapping[str, Tensor]) -> Seen:
+        """Return what is seen now: slots and hand (B, SIZE + 6), and which slots hold something (B, SLOTS)."""
+        slots = batch[OBS_ENV_STATE].to(torch.float32)
+        seen = torch.cat([slots, batch[OBS_RAW_STATE][:, :HAND_DIM].to(slots)], dim=1)
+        return [seen], [slots.unflatten(1, (SLOTS, WIDTH))[..., 0] > 0]
+
+    def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
+        """Return the rows (n, 1, D') of frames; without a phase all is execution."""
+        chosen = list(rows)
+        slots, state = batch[OBS_ENV_STATE][chosen].to(torch.float32), batch[OBS_RAW_STATE][chosen]
+        phase = batch[OBS_PHASE].reshape(-1)[chosen] if OBS_PHASE in batch else torch.ones(len(chosen))
+        return frame_row(slots, state.to(slots), phase.to(slots))
+
+    def prefix(self, observed: Tensor) -> Tensor:
+        """Return a token (B, SLOTS, d_vlm) per slot of what `present` returns; zeros for empty ones."""
+        slots, hand = observed.split([SIZE, HAND_DIM], dim=1)
+        made, there = self.slot(slots.unflatten(1, (SLOTS, WIDTH)), hand)
+        return made.new_zeros((*there.shape, made.shape[-1])).masked_scatter(there.unsqueeze(-1), made * LOUD)
+
+    def memory(self, encoder: nn.Module) -> nn.Module:
+        """Return the encoder behind a pool of each frame."""
+        return ObjectMemory(FramePool(self.order, self.kinds, self.tokens_per_frame, self.dim), encoder)

@@ -1,0 +1,88 @@
+"""What may be set of ``memobench_mem``, with what it means (spec: policy.md; paper, Table "reproducibility")."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+from lerobot.configs import NormalizationMode
+from lerobot.policies.pi05.configuration_pi05 import PI05Config
+
+SIZES_OWN: Any = None
+"""Default of what the size or the perception decides once the rest is known; then it is a number."""
+
+
+@dataclass
+class MemobenchMemSettings(PI05Config):
+    """pi0.5's fields plus the memory's. Fields that are ``None`` here take the size's value after construction."""
+
+    knows_phases: ClassVar[bool] = True
+
+    size: str = "tiny"
+    """``small`` (from scratch, learns from objects in minutes on a CPU), ``tiny`` (from scratch, trains on a CPU) or
+    ``pi05`` (3.2 B)."""
+    width: int | None = None
+    """Width of both transformers, a multiple of 16; none: the size's. Not at ``size=pi05``."""
+    depth: int | None = None
+    """Layers of both transformers; none: the size's. Not at ``size=pi05``."""
+
+    perception: str = "pixels"
+    """How a moment is seen: ``pixels``, by the image tower, or ``objects``, by the slots of
+    ``observation.environment_state`` (`sim.object_slots`), without any picture."""
+    object_classes: list[str] | None = None
+    """Names of the classes that slots were trained with, in order of their indices; none: those of this version."""
+
+    base_weights: str | None = None
+    """Folder or repository of pi0.5 weights to start from (e.g. ``lerobot/pi05_base``); none: from scratch."""
+
+    # -- alignment
+    align: str = "none"
+    align_weight: float | None = None
+    """Weight of the alignment loss; none or 0: the paper's for this objective (``align=none`` trains without one)."""
+    subgoal_level: str = "intermediate"
+    shuffle_subgoals: bool = False
+    """Control of the paper: the subgoal texts of an episode change places among themselves."""
+    shuffle_seed: int = 7
+    """Which shuffle; the same for every epoch and on every machine."""
+    text_encoder: str | None = None
+
+    # -- memory
+    integration: str = "modulation"
+    """How actions read memory: ``modulation``, ``context`` (memory joins the prefix), or ``none``: plain pi0.5, the
+    baseline that never sees the past."""
+    oracle_memory: bool = False
+    """Control of the paper: ground-truth memory text stands in the prompt, from the dataset's column ``memory`` in
+    training and from the environment (``--env.oracle_memory=true``) at evaluation."""
+    memory_camera: str = "observation.images.image"
+    memory_frames: int = 32
+    tokens_per_frame: int = SIZES_OWN
+    """Memory tokens of a remembered frame: 16 of a picture; 2, or another number, of objects."""
+    memory_stride: int = 1
+    """Every how many control steps a frame enters the history (and the cache)."""
+    memory_cache_dir: str | None = None
+    """Folder for memory caches, of several datasets perhaps; none: ``memory_cache`` in the dataset's folder."""
+
+    # -- training
+    prompt_loss: bool = False
+    """Whether prompt frames (``phase == 0``), whose actions have no effect, count in the action loss."""
+    ema_decay: float = SIZES_OWN
+    """Decay of the weights' moving average, which evaluation uses; 0 turns it off. None: the size's, the paper's
+    0.999 or 0.995 at ``small``."""
+    moments_per_episode: int = SIZES_OWN
+    """How many frames of an episode stand side by side in a batch, which shares what they remember; none: 6 with
+    objects, and 1, LeRobot's order, with pixels. ``batch_size`` counts frames all the same."""
+    freeze_vision_encoder: bool = True
+    warmup_fraction: float = 0.05
+    final_lr: float = SIZES_OWN
+    """Learning rate at the end, as a fraction of the highest, to which it falls as a cosine; 1: it stays constant.
+    None: the size's, 0.02 at ``small`` and the paper's 1 elsewhere."""
+
+    # -- pi0.5's fields with this recipe's values, or the size's where they are None or empty
+    chunk_size: int = SIZES_OWN
+    n_action_steps: int = SIZES_OWN
+    normalization_mapping: dict[str, NormalizationMode] = field(default_factory=dict)
+    image_resolution: tuple[int, int] | None = None
+    tokenizer_name: str | None = None
+    tokenizer_max_length: int | None = None
+    optimizer_lr: float | None = None
+    optimizer_weight_decay: float = SIZES_OWN

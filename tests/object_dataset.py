@@ -1,0 +1,77 @@
+"""A small LeRobotDataset of objects seen as slots, with or without pictures, for tests of policies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lerobot_memobench.sim.object_slots import SLOTS, STARTS, WIDTH
+
+LENGTHS, PROMPTS = (40, 23, 31), (6, 8, 0)
+TASKS = ("put the butter into the bowl", "open the drawer", "put the butter into the bowl")
+
+
+def slots_at(rng: np.random.Generator, places: np.ndarray, lit: int | None = None) -> np.ndarray:
+    """Slots (SLOTS * WIDTH,) of things of classes 3, 4, ... at places (n, 3), the ``lit``-th one highlighted."""
+    found = np.zeros((SLOTS, WIDTH), np.float32)
+    for row, place in enumerate(places):
+        axes = np.linalg.qr(rng.normal(size=(3, 3)))[0][:, :2]
+        found[row] = [1, 3 + row, *place, *axes.T.ravel(), 0.1 * row, float(row == lit)]
+    return found.reshape(-1)
+
+
+def state_at(hand: np.ndarray) -> np.ndarray:
+    """State (8,) of a hand at a place (3,), looking down."""
+    return np.array([*hand, 3.1, 0.05, 0.1, 0.03, -0.03], np.float32)
+
+
+def make_object_dataset(root: Path, seed: int = 0, pictures: bool = False, repeats: int = 1) -> Path:
+    """Write episodes in which the hand moves to the one of three things that was lit in the prompt."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    number: dict[str, Any] = {"dtype": "float32", "names": None}
+    string = {"dtype": "string", "shape": (1,), "names": None}
+    camera = {"dtype": "video", "shape": (48, 48, 3), "names": ["height", "width", "channels"]}
+    dataset = LeRobotDataset.create(
+        "memobench/objects",
+        fps=20,
+        root=root,
+        use_videos=pictures,
+        features={
+            **({"observation.images.image": camera} if pictures else {}),
+            "observation.state": number | {"shape": (8,)},
+            "observation.environment_state": number | {"shape": (SLOTS * WIDTH,)},
+            "action": number | {"shape": (7,)},
+            "phase": {"dtype": "int64", "shape": (1,), "names": None},
+            **dict.fromkeys(("simple_subgoal", "grounded_subgoal", "coarse_subgoal", "memory"), string),
+        },
+    )
+    rng = np.random.default_rng(seed)
+    for length, prompt, task in [kind for kind in zip(LENGTHS, PROMPTS, TASKS, strict=True) for _ in range(repeats)]:
+        places = np.array([0.0, 0.0, 0.9]) + rng.uniform(-0.2, 0.2, (3, 3))
+        hand, lit = np.array([0.0, 0.0, 1.1]), int(rng.integers(3))
+        for t in range(length):
+            way = np.clip((places[lit] - hand) / 0.05, -1, 1) if t >= prompt else np.zeros(3)
+            frame = {
+                "observation.state": state_at(hand),
+                "observation.environment_state": slots_at(rng, places, lit if t < prompt else None),
+                "action": np.array([*way, 0, 0, 0, 1 if t % 2 else -1], np.float32) * (t >= prompt),
+                "phase": np.array([int(t >= prompt)]),
+                "simple_subgoal": f"reach thing {lit}" if t >= prompt else "",
+                "grounded_subgoal": f"reach thing {lit} at {places[lit][0]:.1f}",
+                "coarse_subgoal": "reach",
+                "memory": f"thing {lit} was lit",
+                "task": task,
+            }
+            if pictures:
+                frame["observation.images.image"] = np.full((48, 48, 3), t, np.uint8)
+            dataset.add_frame(frame)
+            hand = hand + 0.01 * way
+        dataset.save_episode()
+    dataset.finalize()
+    return root
+
+
+assert STARTS["highlighted"] == WIDTH - 1  # as slots_at writes them

@@ -1,0 +1,399 @@
+"""perception=objects through LeRobot's own doors: samples, batches, training, rollouts, checkpoints."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
+from lerobot.datasets import EpisodeAwareSampler
+from lerobot.datasets.dataset_reader import DatasetReader
+from lerobot.policies import make_pre_post_processors
+from small_policy import batch_of, made_for_training, small_config
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.execution_frames import in_groups
+from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, STEPS, TOKENS
+from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from object_dataset import LENGTHS, PROMPTS, make_object_dataset
+
+OBJECTS: dict[str, Any] = {"perception": "objects", "size": "small", "n_action_steps": 3}
+STARTS = np.cumsum([0, *LENGTHS])
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_object_dataset(tmp_path_factory.mktemp("objects") / "data")
+
+
+def observed(dataset: Any, index: int, **more: Any) -> dict[str, Any]:
+    """An observation of a rollout: frame ``index`` of the dataset, as the environment would give it."""
+    row = dataset.hf_dataset[index]
+    seen = {key: row[key][None] for key in ("observation.state", "observation.environment_state")}
+    episode = int(np.searchsorted(STARTS, index, "right")) - 1
+    step = index - STARTS[episode]
+    clock = {"observation.step": torch.tensor([float(step)]), "observation.phase": row["phase"].reshape(1).float()}
+    return {**seen, **clock, "task": ["put the butter into the bowl"], **more}
+
+
+# -- settings ------------------------------------------------------------------------------------------------------
+
+
+def test_small_brings_its_recipe_and_leaves_it_to_the_user(tmp_path: Path) -> None:
+    config = MemobenchMemConfig(device="cpu", size="small", perception="objects")
+    assert (config.chunk_size, config.n_action_steps, config.num_inference_steps) == (16, 6, 10)
+    assert (config.optimizer_lr, config.optimizer_weight_decay, config.ema_decay) == (1e-3, 1e-4, 0.995)
+    assert (config.tokens_per_frame, config.moments_per_episode, config.memory_frames) == (2, 6, 32)
+    assert config.normalization_mapping["ACTION"] is NormalizationMode.MEAN_STD
+    own = {"chunk_size": 8, "width": 192, "depth": 2, "ema_decay": 0.0, "final_lr": 1.0, "tokens_per_frame": 4}
+    other = MemobenchMemConfig(device="cpu", size="small", perception="objects", **own)
+    assert {name: getattr(other, name) for name in own} == own
+    assert other.n_action_steps == 6
+    assert (other.dimensions.vlm.width, other.dimensions.vlm.mlp_dim, other.dimensions.vlm.head_dim) == (192, 384, 24)
+    other.save_pretrained(tmp_path)
+    assert dataclasses.asdict(PreTrainedConfig.from_pretrained(tmp_path)) == dataclasses.asdict(other)
+    before = MemobenchMemConfig(device="cpu", size="tiny")
+    assert (before.chunk_size, before.ema_decay, before.final_lr, before.moments_per_episode) == (50, 0.999, 1.0, 1)
+    assert before.normalization_mapping["STATE"] is NormalizationMode.QUANTILES
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"perception": "object"}, "objects"),
+        ({"size": "pi05", "width": 256}, "size=small"),
+        ({"size": "small", "width": 100}, "multiple of 16"),
+        ({"size": "small", "depth": 0}, "depth"),
+        ({"perception": "objects", "tokens_per_frame": 0}, "tokens_per_frame"),
+        ({"moments_per_episode": 0}, "moments_per_episode"),
+        ({"final_lr": 2.0}, "final_lr"),
+    ],
+)
+def test_bad_values_are_refused(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(MemobenchError, match=message):
+        MemobenchMemConfig(device="cpu", **fields)
+
+
+def test_the_rate_falls_as_a_cosine() -> None:
+    config = MemobenchMemConfig(device="cpu", size="small", perception="objects")
+    optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
+    schedule = config.get_scheduler_preset().build(optimizer, num_training_steps=200)
+    rates = []
+    for _ in range(201):
+        rates.append(optimizer.param_groups[0]["lr"])
+        optimizer.step()
+        schedule.step()
+    assert rates[0] == pytest.approx(0.1)
+    assert rates[100] == pytest.approx(0.51, abs=1e-6)
+    assert rates[200] == pytest.approx(0.02)
+    assert rates[10:] == sorted(rates[10:], reverse=True)
+
+
+# -- samples -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("episodes", [None, [0, 2]])
+def test_samples_from_memory_are_lerobots(root: Path, episodes: list[int] | None) -> None:
+    from lerobot.datasets.factory import resolve_delta_timestamps
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    policy, _, _, whole = made_for_training(root, **OBJECTS)
+    deltas = resolve_delta_timestamps(policy.config, whole.meta)
+    dataset = LeRobotDataset("memobench/objects", root=root, delta_timestamps=deltas, episodes=episodes)
+    of_lerobot = DatasetReader.get_item.__wrapped__
+    for row in (0, 12, 38, len(dataset) - 1):
+        expected, found = of_lerobot(dataset.reader, row), dataset[row]
+        assert expected.keys() - found.keys() <= {
+            *("phase", "simple_subgoal", "grounded_subgoal", "coarse_subgoal", "memory")
+        }
+        for key, value in found.items():
+            assert value == expected[key] if key == "task" else torch.equal(value, expected[key]), key
+
+
+def test_no_video_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any, **__: Any) -> None:
+        raise AssertionError("a video was opened")
+
+    folder = make_object_dataset(tmp_path / "filmed", pictures=True)
+    monkeypatch.setattr("lerobot.datasets.dataset_reader.decode_video_frames", refuse)
+    policy, before, _, dataset = made_for_training(folder, **OBJECTS)
+    assert set(policy.config.input_features) == {"observation.state", "observation.environment_state"}
+    loss, _ = policy.forward(before(batch_of(dataset, [10, 30])))
+    assert loss.isfinite()
+    with pytest.raises(AssertionError, match="a video was opened"):  # any other policy's samples are LeRobot's
+        DatasetReader.get_item.__wrapped__(dataset.reader, 10)
+
+
+def test_a_dataset_without_objects_is_refused(dataset_root: Path) -> None:
+    with pytest.raises(MemobenchError, match=r"observation\.environment_state.*memobench generate"):
+        made_for_training(dataset_root, **OBJECTS)
+
+
+@pytest.mark.parametrize("moments", [1, 3, 6])
+def test_every_place_once_in_groups_of_an_episode(moments: int) -> None:
+    ends = np.cumsum([7, 30, 1, 12])
+    order = in_groups(ends, moments, torch.Generator().manual_seed(1))
+    assert sorted(order.tolist()) == list(range(50))
+    episodes = np.searchsorted(ends, order.numpy(), "right").tolist()
+    runs = [episodes[0:1]]
+    for episode in episodes[1:]:
+        if episode == runs[-1][-1] and len(runs[-1]) < moments:
+            runs[-1].append(episode)
+        else:
+            runs.append([episode])
+    assert len(runs) <= 2 + -(-7 // moments) + -(-30 // moments) + -(-12 // moments)
+    assert not torch.equal(order, in_groups(ends, moments, torch.Generator().manual_seed(2)))
+
+
+def test_batches_hold_moments_of_few_episodes_and_no_prompt(root: Path) -> None:
+    policy, before, _, dataset = made_for_training(root, **OBJECTS)
+    sampler = EpisodeAwareSampler(
+        dataset.meta.episodes["dataset_from_index"],
+        dataset.meta.episodes["dataset_to_index"],
+        drop_n_last_frames=policy.config.drop_n_last_frames,
+        shuffle=True,
+    )
+    loader = torch.utils.data.DataLoader(dataset, batch_size=12, sampler=sampler)
+    drawn = torch.cat([part["index"] for part in loader]).tolist()
+    execution = {
+        int(STARTS[episode]) + frame
+        for episode, (length, prompt) in enumerate(zip(LENGTHS, PROMPTS, strict=True))
+        for frame in range(prompt, length)
+    }
+    assert sorted(drawn) == sorted(execution)
+    batch = before(next(iter(loader)))
+    assert len(batch["episode_index"].unique()) <= 3
+    assert len(batch[FRAMES].unique()) < batch[MASK].sum(), "moments of an episode share frames"
+
+
+def test_statistics_are_those_of_execution_frames(root: Path) -> None:
+    _, before, _, dataset = made_for_training(root, **OBJECTS)
+    hf = dataset.hf_dataset.with_format("numpy")
+    actions = np.asarray(hf["action"])[np.asarray(hf["phase"]).reshape(-1) != 0]
+    normaliser = next(step for step in before.steps if type(step).__name__ == "NormalizerProcessorStep")
+    held = normaliser._tensor_stats["action"]
+    assert np.allclose(held["mean"], actions.mean(axis=0), atol=1e-5)
+    assert np.allclose(held["std"], actions.std(axis=0) + 0.01, atol=1e-4)
+
+
+# -- training ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"align": "semantic"},
+        {"align": "contrastive"},
+        {"align": "framewise"},
+        {"align": "framewise", "integration": "context", "tokens_per_frame": 3},
+        {"integration": "none", "oracle_memory": True},
+        {"size": "tiny", "memory_stride": 2},
+    ],
+    ids=lambda fields: "-".join(map(str, fields.values())),
+)
+def test_every_kind_trains(root: Path, fields: dict[str, Any]) -> None:
+    policy, before, _, dataset = made_for_training(root, **OBJECTS | fields)
+    batch = before(batch_of(dataset, [10, 30, 50, 80]))
+    loss, logged = policy.train().forward(batch)
+    loss.backward()
+    gradients = {name: parameter.grad for name, parameter in policy.named_parameters() if parameter.requires_grad}
+    assert loss.isfinite()
+    assert all(gradients[f"model.{name}"] is not None for name in policy.model.memory_parameters())
+    if "align" in fields:
+        assert {"align_loss", "align_grad_norm", "align_top1"} <= set(logged)
+    if "oracle_memory" in fields:
+        words = next(step for step in before.steps if type(step).__name__ == "WordTokenizerProcessorStep")
+        assert words.vocabulary.index("lit") in batch["observation.language.tokens"]
+
+
+def test_loss_falls(root: Path) -> None:
+    policy, before, _, dataset = made_for_training(root, **OBJECTS | {"chunk_size": 4})
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=3e-3)
+    batch, losses = before(batch_of(dataset, [*range(8, 38, 2)])), []
+    for _ in range(40):
+        loss, logged = policy.train().forward(batch)
+        loss.backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        losses.append(logged["action_loss"])
+    assert np.mean(losses[-5:]) < 0.5 * np.mean(losses[:5])
+
+
+# -- memory, in training and in a rollout --------------------------------------------------------------------------
+
+
+def test_a_rollout_remembers_what_training_reads(root: Path) -> None:
+    policy, before, _, dataset = made_for_training(root, **OBJECTS | {"memory_stride": 2})
+    index = int(STARTS[1]) + 18
+    gathered = before(batch_of(dataset, [index]))
+    for frame in range(int(STARTS[1]), index + 1):
+        policy.observe(before(observed(dataset, frame)))
+    held = policy.history.gather([0])
+    for key, value in zip((TOKENS, STEPS, MASK), held, strict=True):
+        assert torch.equal(value, gathered[key]), key
+    with torch.no_grad():
+        one = policy.model.set_memory(*held)[0]
+        other = policy.model.set_memory(gathered[TOKENS], gathered[STEPS], gathered[MASK], gathered[FRAMES])[0]
+    assert torch.allclose(one, other, atol=1e-6)
+
+
+def test_the_present_is_the_same_in_training_and_in_a_rollout(root: Path) -> None:
+    policy, before, _, dataset = made_for_training(root, **OBJECTS)
+    index = 20
+    trained, acted = before(batch_of(dataset, [index])), before(observed(dataset, index, task=dataset[index]["task"]))
+    words = ("observation.language.tokens", "observation.language.attention_mask")
+    prefixes = [
+        policy.model.embed_prefix(*policy._preprocess_images(batch), *(batch[key] for key in words))
+        for batch in (trained, acted)
+    ]
+    for one, other in zip(*prefixes, strict=True):
+        assert torch.equal(one, other)
+    embeddings, real, _ = prefixes[0]
+    assert real.sum() == 3 + 1 + trained[words[1]].sum(), "three things, the state and the words"
+    assert embeddings.shape[1] == 16 + 1 + trained[words[1]].sum()
+
+
+def test_no_memory_is_nothing_in_training_and_in_a_rollout(root: Path) -> None:
+    """Whatever was seen before, and whatever a batch brings along, the same comes out, and no weight makes it."""
+    policy, before, _, dataset = made_for_training(root, **OBJECTS | {"integration": "none"})
+    assert not [name for name, _ in policy.named_parameters() if "memory" in name or "modulat" in name]
+    batch = before(batch_of(dataset, [30]))
+    assert TOKENS not in batch
+    noise = torch.randn(1, policy.config.chunk_size, 32, generator=torch.Generator().manual_seed(0))
+    plans = []
+    for history in ([], [0, 1, 2, 3], [41, 42, 43]):
+        policy.reset()
+        for step, index in enumerate(history):
+            policy.observe(before(observed(dataset, index, **{"observation.step": torch.tensor([float(step)])})))
+        last = before(observed(dataset, 30, **{"observation.step": torch.tensor([30.0])}))
+        plans.append(policy.predict_action_chunk(last, noise=noise))
+    assert torch.equal(plans[0], plans[1])
+    assert torch.equal(plans[0], plans[2])
+
+
+def test_memory_that_is_masked_is_nothing(root: Path) -> None:
+    """What lies in the padding of a memory changes no loss; a real frame does."""
+    policy, before, _, dataset = made_for_training(root, **OBJECTS)
+    with torch.no_grad():
+        for name, parameter in policy.named_parameters():
+            if ".modulation." in name:
+                parameter.normal_(std=0.2)
+    batch = before(batch_of(dataset, [int(STARTS[2]) + 3]))
+    assert batch[MASK].sum() == 4 < batch[MASK].shape[1]
+
+    def loss(tokens: torch.Tensor) -> float:
+        torch.manual_seed(3)
+        return float(policy.forward(batch | {TOKENS: tokens, FRAMES: batch[STEPS] + 1000 * ~batch[MASK]})[0])
+
+    changed = batch[TOKENS].clone()
+    changed[:, 4:] = torch.randn_like(changed[:, 4:]) * 0.1
+    assert loss(changed) == pytest.approx(loss(batch[TOKENS]), abs=1e-6)
+    changed[:, 1] = changed[:, 1] * 0.9
+    assert loss(changed) != pytest.approx(loss(batch[TOKENS]), abs=1e-6)
+
+
+# -- rollouts and checkpoints --------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def saved(root: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Any, Any, Path]:
+    policy, before, after, dataset = made_for_training(root, **OBJECTS | {"align": "contrastive"})
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+    policy.train()
+    for step in range(3):
+        policy.forward(before(batch_of(dataset, [10 + step, 30, 55, 80])))[0].backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        policy.update()
+    folder = tmp_path_factory.mktemp("checkpoint") / "pretrained_model"
+    for part in (policy, before, after):
+        part.save_pretrained(folder)
+    return policy, before, dataset, folder
+
+
+def test_a_checkpoint_acts_as_the_policy_did(saved: tuple[Any, Any, Any, Path]) -> None:
+    policy, before, dataset, folder = saved
+    again = MemobenchMemPolicy.from_pretrained(folder)
+    pre, post = make_pre_post_processors(again.config, pretrained_path=str(folder))
+    assert again.config.object_classes == policy.config.object_classes
+    actions = {}
+    for name, actor, step in (("was", policy, before), ("is", again, pre)):
+        actor.reset()
+        actions[name] = [actor.select_action(step(observed(dataset, index))) for index in range(14)]
+    assert all(torch.allclose(one, other, atol=1e-6) for one, other in zip(*actions.values(), strict=True))
+    assert post(actions["is"][-1]).shape == (1, 7)
+    assert not any(action.any() for action in actions["is"][: PROMPTS[0]]), "nothing is done in the prompt"
+    assert actions["is"][-1].any()
+
+
+def test_rows_are_independent(saved: tuple[Any, Any, Any, Path]) -> None:
+    policy, before, dataset, _ = saved
+
+    def act(batches: list[list[dict[str, Any]]]) -> list[torch.Tensor]:
+        policy.reset()
+        found = []
+        for rows in batches:
+            joined = {key: torch.cat([row[key] for row in rows]) for key in rows[0] if key != "task"}
+            found.append(policy.select_action(before(joined | {"task": [row["task"][0] for row in rows]})))
+        return found
+
+    one = [observed(dataset, index) for index in range(12)]
+    other = [observed(dataset, int(STARTS[2]) + index) for index in range(12)]
+    together, alone = act([list(rows) for rows in zip(one, other, strict=True)]), act([[row] for row in one])
+    assert all(torch.allclose(both[0], single[0], atol=1e-5) for both, single in zip(together, alone, strict=True))
+
+
+def test_an_environment_without_objects_is_told(saved: tuple[Any, Any, Any, Path]) -> None:
+    policy, before, dataset, _ = saved
+    policy.reset()
+    seen = observed(dataset, 0)
+    del seen["observation.environment_state"]
+    with pytest.raises(MemobenchError, match=r"environment_state.*--env\.obs_type=environment_state_agent_pos"):
+        policy.select_action(before(seen))
+
+
+def test_objects_are_looked_at_where_they_are_remembered_or_acted_upon(root: Path) -> None:
+    """Old pictures are no matter: another policy may want them drawn rarely."""
+    for integration, wanted in (("modulation", [True] * 12), ("none", [*[False] * 8, True, False, False, True])):
+        policy, before, _, dataset = made_for_training(root, **OBJECTS | {"integration": integration})
+        assert not policy.config.watches
+        looks = []
+        for index in range(12):
+            old = {"observation.picture_step": torch.tensor([0.0])}
+            policy.select_action(before(observed(dataset, index, **old)))
+            looks.append(policy.looks_next())
+        assert looks == wanted
+
+
+def test_training_goes_on_from_a_checkpoint_with_other_settings(saved: tuple[Any, Any, Any, Path], root: Path) -> None:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from lerobot.policies import make_policy
+
+    policy, _, dataset, folder = saved
+    config = PreTrainedConfig.from_pretrained(folder, cli_overrides=["--align=framewise", "--memory_frames=5"])
+    config.pretrained_path = folder
+    again = make_policy(config, ds_meta=LeRobotDataset("memobench/objects", root=root).meta)
+    pre, _ = make_pre_post_processors(config, pretrained_path=str(folder))
+    batch = pre(batch_of(dataset, [10, 60]))
+    assert batch[TOKENS].shape[1] == 5
+    assert batch["memory.text"].shape[:2] == (2, 5)
+    again.train().forward(batch)[0].backward()
+    trained = policy.average.average["model.memory.pool.slot.mlp.0.weight"]
+    assert torch.equal(again.average.average["model.memory.pool.slot.mlp.0.weight"], trained)
+
+
+def test_another_perceptions_weights_are_refused(saved: tuple[Any, Any, Any, Path]) -> None:
+    folder = saved[3]
+    config = small_config(size="small", perception="pixels")
+    config.input_features = {
+        **saved[0].config.input_features,
+        "observation.images.image": PolicyFeature(FeatureType.VISUAL, (3, 48, 48)),
+    }
+    config.output_features = saved[0].config.output_features
+    with pytest.raises(MemobenchError, match=r"--policy\.perception"):
+        MemobenchMemPolicy.from_pretrained(folder, config=config)

@@ -1,0 +1,31 @@
+"""Losses beside a checkpoint: means of windows, a picture, and going on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from lerobot_memobench.policies.memobench_mem.training_curve import NUMBERS, PICTURE, WINDOW, TrainingCurve
+
+
+def test_points_are_means_and_go_on(tmp_path: Path) -> None:
+    curve = TrainingCurve()
+    curve.save(tmp_path)
+    assert not list(tmp_path.iterdir())
+    for update in range(2 * WINDOW + 3):
+        more = {"align_top1": 0.5, "align_loss": 1.0} if update % 2 else {}
+        curve.note({"loss": update + 1.0, "action_loss": float(update), "loss_per_dim": [1.0, 2.0], **more})
+    curve.save(tmp_path)
+    means = [(WINDOW - 1) / 2, WINDOW + (WINDOW - 1) / 2]
+    assert [point["action_loss"] for point in curve.points] == pytest.approx(means)
+    assert curve.points[0]["align_top1"] == 0.5
+    assert Image.open(tmp_path / PICTURE).width > 500
+    again = TrainingCurve.read(tmp_path)
+    assert again.points == curve.points
+    for _ in range(WINDOW):
+        again.note({"action_loss": 7.0})
+    assert [point["action_loss"] for point in again.points] == pytest.approx([*means, 7.0])
+    assert (tmp_path / NUMBERS).is_file()
+    assert TrainingCurve.read(tmp_path / "elsewhere").points == []
