@@ -12,7 +12,14 @@ from scipy.spatial.transform import Rotation
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.hand import CLOSED, COMFORTABLE, OPEN, STRETCHED, Array, Hand, downward, length
 from lerobot_memobench.experts.leaning import clear_of_objects, lean_from_fixtures, reach_lean
-from lerobot_memobench.experts.surroundings import FINGER_REACH, FULLY_OPEN, crowding, in_the_way
+from lerobot_memobench.experts.surroundings import (
+    FINGER_REACH,
+    FULLY_OPEN,
+    crowding,
+    drawer_around,
+    in_the_way,
+    outward_of,
+)
 from lerobot_memobench.experts.travel import Held, rise, travel
 from lerobot_memobench.sim.assets.asset import Grasp
 from lerobot_memobench.sim.scene import TABLE_TOP
@@ -95,7 +102,14 @@ def _lean(hand: Hand, name: str, target: Array, closing: Array, place: Array | N
 
 
 def _closing_of_fallen(hand: Hand, name: str) -> float:
-    """Return the angle, rad, of the narrower of the two level sides of a thing that lies on its side."""
+    """Return the angle, rad, of the narrower of the two level sides of a thing that lies on its side.
+
+    In a drawer it is that of the front: the other way the hand, 20 cm wide, would not fit in before the cabinet.
+    """
+    drawer = drawer_around(hand, name)
+    if drawer is not None:
+        out = outward_of(hand, hand.sim.world.articulation(drawer)[0])
+        return float(np.arctan2(out[0], -out[1]))
     _, rotation = hand.sim.body_pose(name)
     asset = hand.sim.assets[name]
     size = np.asarray(asset.high) - np.asarray(asset.low)
