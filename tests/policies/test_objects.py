@@ -353,7 +353,7 @@ def test_an_environment_without_objects_is_told(saved: tuple[Any, Any, Any, Path
     policy.reset()
     seen = observed(dataset, 0)
     del seen["observation.environment_state"]
-    with pytest.raises(MemobenchError, match="environment_state.*set env.obs_type=environment_state_agent_pos"):
+    with pytest.raises(MemobenchError, match=r"environment_state.*set env\.obs_type=environment_state_agent_pos"):
         policy.select_action(before(seen))
 
 
