@@ -31,8 +31,8 @@ def frame_row(slots: Tensor, state: Tensor, phase: Tensor) -> Tensor:
 class FramePool(nn.Module):
     """A stored frame to a few tokens of unit size: its things, pooled by learned attention.
 
-    As these layers begin, what was seen comes out several times smaller than when it was seen, which the encoder adds to
-    it. At unit size, 400 updates chose the right one of three bowls at 85 % of moments, instead of at 58 %.
+    As these layers begin, what was seen comes out several times smaller than when it was seen, which the encoder adds
+    to it. At unit size, 400 updates chose the right one of three bowls at 85 % of moments, instead of at 58 %.
     """
 
     def __init__(self, order: Sequence[int], kinds: int, tokens: int, width: int) -> None:
