@@ -156,6 +156,7 @@ def test_generate_tells_what_became_of_every_seed(
         "images": False,
         "image_size": 256,
         "prompt_video": True,
+        "perturb": False,
         "workers": 1,
         "formats": ("lerobot", "hdf5"),
         "executor": "local",

@@ -53,7 +53,8 @@ def recorded(make_demo, monkeypatch):
 
     def episode(task, settings):
         progress = SimpleNamespace(index=1, steps=1200)
-        return SimpleNamespace(task=task, prompt_shown=None, horizon=1200, progress=progress, referent="fixed")
+        told = {"prompt_shown": None, "horizon": 1200, "referent": "fixed", "lost": False}
+        return SimpleNamespace(task=task, progress=progress, **told)
 
     monkeypatch.setattr(recording, "compiled_episode", episode)
     monkeypatch.setattr(recording, "record", record)
