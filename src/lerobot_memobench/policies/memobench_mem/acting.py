@@ -12,6 +12,7 @@ from torch import Tensor
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.freshness import PICTURE_STEP, require_fresh
+from lerobot_memobench.policies.memobench_mem.action_objective import REGRESSION
 from lerobot_memobench.policies.memobench_mem.noise import EpisodeNoise
 from lerobot_memobench.policies.memobench_mem.one_thread import OneThread
 from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_PHASE
@@ -98,7 +99,10 @@ class ActingPolicy(SeeingPolicy):
             yield
 
     def _noise(self, rows: list[int], steps: list[int]) -> Tensor:
-        return self.noise.draw(rows, steps, (self.config.chunk_size, self.config.max_action_dim))
+        shape = self.config.chunk_size, self.config.max_action_dim
+        if self.config.objective == REGRESSION:
+            return torch.zeros(len(rows), *shape)
+        return self.noise.draw(rows, steps, shape)
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:

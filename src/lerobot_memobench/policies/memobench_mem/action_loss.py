@@ -1,4 +1,4 @@
-"""Which actions of a batch count in the flow-matching loss, and its mean over them."""
+"""Which actions of a batch count in the loss, and its mean over them."""
 
 from __future__ import annotations
 

@@ -10,6 +10,7 @@ from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
 from lerobot.utils.constants import OBS_ENV_STATE
 
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.policies.memobench_mem.action_objective import OBJECTIVES, REGRESSION
 from lerobot_memobench.policies.memobench_mem.dimensions import GRID, SIZES, Dimensions, resized
 from lerobot_memobench.policies.memobench_mem.schedule import WarmupFractionSchedulerConfig
 from lerobot_memobench.policies.memobench_mem.settings_memobench_mem import MemobenchMemSettings
@@ -53,6 +54,7 @@ class MemobenchMemConfig(MemobenchMemSettings):
         _choose("align", self.align, tuple(ALIGN_WEIGHTS))
         _choose("perception", self.perception, PERCEPTIONS)
         _choose("integration", self.integration, INTEGRATIONS)
+        _choose("objective", self.objective, OBJECTIVES)
         _choose("subgoal_level", self.subgoal_level, SUBGOAL_LEVELS)
         self._check_dimensions()
         dims = self.dimensions
@@ -73,6 +75,8 @@ class MemobenchMemConfig(MemobenchMemSettings):
         # A checkpoint with align=none holds a weight of 0, with which another objective would change nothing.
         if not self.align_weight:
             self.align_weight = ALIGN_WEIGHTS[self.align]
+        if self.objective == REGRESSION:
+            self.num_inference_steps = 1
         super().__post_init__()
         self._check_numbers()
         self._check_perception()
@@ -120,6 +124,11 @@ class MemobenchMemConfig(MemobenchMemSettings):
             raise MemobenchError(
                 f"--policy.tokens_per_frame={self.tokens_per_frame} is not supported: frames are pooled to a "
                 f"4x4 grid, so leave it at {GRID**2}."
+            )
+        if self.objective == REGRESSION and self.rtc_config is not None:
+            raise MemobenchError(
+                "--policy.rtc_config guides the denoising of a plan, which --policy.objective=regression does not have; "
+                "leave it out, or use --policy.objective=flow_matching."
             )
         if not self.freeze_vision_encoder:
             raise MemobenchError(

@@ -1,4 +1,4 @@
-"""The policy as it trains: flow matching, and the alignment of its memory to checkpoint text."""
+"""The policy as it trains: its actions, and the alignment of its memory to checkpoint text."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.action_loss import counted_actions, mean_losses
+from lerobot_memobench.policies.memobench_mem.action_objective import losses_of, noise_and_time
 from lerobot_memobench.policies.memobench_mem.alignment.loss import alignment_loss
 from lerobot_memobench.policies.memobench_mem.alignment.objectives import Alignment
 from lerobot_memobench.policies.memobench_mem.averaging import WeightAverage
@@ -50,7 +51,7 @@ class LearningPolicy(SeeingPolicy):
             self.average.update()
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, Any]]:
-        """Flow-matching loss plus weighted alignment on a preprocessed training batch.
+        """Loss of the actions (`action_objective`) plus weighted alignment on a preprocessed training batch.
 
         Args:
             batch: what LeRobot's pi0.5 needs, and ``memory.*`` and ``phase`` as the preprocessor adds them.
@@ -97,18 +98,13 @@ class LearningPolicy(SeeingPolicy):
         return self.model.set_memory(*memory, numbers=None if numbers is None else numbers.to(self._device))
 
     def _action_loss(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor, dict[str, Any]]:
-        """Flow-matching loss per sample (B,), its mean over the actions that count, and numbers to log."""
+        """Loss of the actions per sample (B,), its mean over the actions that count, and numbers to log."""
         images, image_masks = self._preprocess_images(batch)
         actions = self.prepare_action(batch)
-        losses = self.model.forward(
-            images,
-            image_masks,
-            batch[OBS_LANGUAGE_TOKENS],
-            batch[OBS_LANGUAGE_ATTENTION_MASK],
-            actions,
-            self.model.sample_noise(actions.shape, actions.device),
-            self.model.sample_time(actions.shape[0], actions.device),
-        )[:, :, : self._action_dim]
+        words = batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK]
+        drawn = noise_and_time(self.config.objective, self.model, actions)
+        squared = self.model.forward(images, image_masks, *words, actions, *drawn)[:, :, : self._action_dim]
+        losses = losses_of(self.config.objective, squared)
         found = mean_losses(losses, counted_actions(batch, losses, prompt_loss=self.config.prompt_loss))
         logged = {"action_loss": found.mean.item(), "loss_per_dim": found.per_dim.cpu().tolist()}
         return found.per_sample, found.mean, logged

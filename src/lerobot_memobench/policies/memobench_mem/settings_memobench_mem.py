@@ -63,6 +63,9 @@ class MemobenchMemSettings(PI05Config):
     """Folder for memory caches, of several datasets perhaps; none: ``memory_cache`` in the dataset's folder."""
 
     # -- training
+    objective: str = "flow_matching"
+    """How actions are learned: ``flow_matching``, as in pi0.5, or ``regression``, whose plan is one pass of the model
+    instead of ten (`action_objective`)."""
     prompt_loss: bool = False
     """Whether prompt frames (``phase == 0``), whose actions have no effect, count in the action loss."""
     ema_decay: float = SIZES_OWN
