@@ -127,7 +127,7 @@ class MemobenchMemConfig(MemobenchMemSettings):
             )
         if self.objective == REGRESSION and self.rtc_config is not None:
             raise MemobenchError(
-                "--policy.rtc_config guides the denoising of a plan, which --policy.objective=regression does not have; "
+                "--policy.rtc_config guides the denoising of a plan, which --policy.objective=regression lacks; "
                 "leave it out, or use --policy.objective=flow_matching."
             )
         if not self.freeze_vision_encoder:
