@@ -22,7 +22,7 @@ from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, 
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from object_dataset import LENGTHS, PROMPTS, make_object_dataset
 
-OBJECTS: dict[str, Any] = {"perception": "objects", "size": "small", "n_action_steps": 3}
+OBJECTS: dict[str, Any] = {"perception": "objects", "size": "small", "n_action_steps": 3, "memory_stride": 1}
 STARTS = np.cumsum([0, *LENGTHS])
 
 
@@ -46,7 +46,8 @@ def observed(dataset: Any, index: int, **more: Any) -> dict[str, Any]:
 
 def test_small_brings_its_recipe_and_leaves_it_to_the_user(tmp_path: Path) -> None:
     config = MemobenchMemConfig(device="cpu", size="small", perception="objects")
-    assert (config.chunk_size, config.n_action_steps, config.num_inference_steps) == (16, 6, 10)
+    assert (config.chunk_size, config.n_action_steps, config.num_inference_steps) == (16, 6, 1)
+    assert (config.objective, config.memory_stride) == ("regression", 8)
     assert (config.optimizer_lr, config.optimizer_weight_decay, config.ema_decay) == (1e-3, 1e-4, 0.995)
     assert (config.tokens_per_frame, config.moments_per_episode, config.memory_frames) == (2, 6, 32)
     assert config.normalization_mapping["ACTION"] is NormalizationMode.MEAN_STD
@@ -58,6 +59,7 @@ def test_small_brings_its_recipe_and_leaves_it_to_the_user(tmp_path: Path) -> No
     other.save_pretrained(tmp_path)
     assert dataclasses.asdict(PreTrainedConfig.from_pretrained(tmp_path)) == dataclasses.asdict(other)
     before = MemobenchMemConfig(device="cpu", size="tiny")
+    assert (before.objective, before.num_inference_steps, before.memory_stride) == ("flow_matching", 10, 1)
     assert (before.chunk_size, before.ema_decay, before.final_lr, before.moments_per_episode) == (50, 0.999, 1.0, 1)
     assert before.normalization_mapping["STATE"] is NormalizationMode.QUANTILES
 

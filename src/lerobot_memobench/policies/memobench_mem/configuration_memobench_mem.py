@@ -22,6 +22,7 @@ INTEGRATIONS = ("modulation", "context", "none")
 PERCEPTIONS = ("pixels", "objects")
 SUBGOAL_LEVELS = ("coarse", "intermediate", "fine")
 TOKENS_PER_FRAME = {"pixels": GRID**2, "objects": 2}
+MEMORY_STRIDE = {"pixels": 1, "objects": 8}
 MOMENTS_PER_EPISODE = {"pixels": 1, "objects": 6}
 ORACLE_TOKENS = 128
 """Room that oracle memory text needs in a prompt of the word tokenizer: six checkpoints of some ten words."""
@@ -54,13 +55,13 @@ class MemobenchMemConfig(MemobenchMemSettings):
         _choose("align", self.align, tuple(ALIGN_WEIGHTS))
         _choose("perception", self.perception, PERCEPTIONS)
         _choose("integration", self.integration, INTEGRATIONS)
-        _choose("objective", self.objective, OBJECTIVES)
         _choose("subgoal_level", self.subgoal_level, SUBGOAL_LEVELS)
         self._check_dimensions()
         dims = self.dimensions
         for name, value in self._defaults().items():
             if getattr(self, name) is None:
                 setattr(self, name, value)
+        _choose("objective", self.objective, OBJECTIVES)
         if not self.normalization_mapping:
             mode = NormalizationMode(dims.recipe.normalization)
             self.normalization_mapping = {"VISUAL": NormalizationMode.IDENTITY, "STATE": mode, "ACTION": mode}
@@ -90,9 +91,11 @@ class MemobenchMemConfig(MemobenchMemSettings):
             "n_action_steps": min(recipe.n_action_steps, self.chunk_size or recipe.chunk_size),
             "ema_decay": recipe.ema_decay,
             "final_lr": recipe.final_lr,
+            "objective": recipe.objective,
             "optimizer_weight_decay": recipe.weight_decay,
             "optimizer_lr": self.dimensions.learning_rate,
             "tokens_per_frame": TOKENS_PER_FRAME[self.perception],
+            "memory_stride": MEMORY_STRIDE[self.perception],
             "moments_per_episode": MOMENTS_PER_EPISODE[self.perception],
         }
 

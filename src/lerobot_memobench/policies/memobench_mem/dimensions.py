@@ -40,6 +40,7 @@ class Recipe:
         chunk_size: actions of a plan. n_action_steps: how many of them are taken before the next plan.
         final_lr: learning rate at the end, as a fraction of the highest; below 1 it falls there as a cosine.
         normalization: LeRobot's mode for states and actions.
+        objective: how actions are learned (`action_objective`).
     """
 
     chunk_size: int = 50
@@ -48,6 +49,7 @@ class Recipe:
     ema_decay: float = 0.999
     final_lr: float = 1.0
     normalization: str = "QUANTILES"
+    objective: str = "flow_matching"
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,7 @@ SIZES = {
             ema_decay=0.995,
             final_lr=0.02,
             normalization="MEAN_STD",
+            objective="regression",
         ),
     ),
     "pi05": Dimensions(

@@ -57,15 +57,15 @@ class MemobenchMemSettings(PI05Config):
     memory_frames: int = 32
     tokens_per_frame: int = SIZES_OWN
     """Memory tokens of a remembered frame: 16 of a picture; 2, or another number, of objects."""
-    memory_stride: int = 1
-    """Every how many control steps a frame enters the history (and the cache)."""
+    memory_stride: int = SIZES_OWN
+    """Every how many control steps a frame enters the history (and the cache); none: 8 with objects, 1 with pixels."""
     memory_cache_dir: str | None = None
     """Folder for memory caches, of several datasets perhaps; none: ``memory_cache`` in the dataset's folder."""
 
     # -- training
-    objective: str = "flow_matching"
+    objective: str = SIZES_OWN
     """How actions are learned: ``flow_matching``, as in pi0.5, or ``regression``, whose plan is one pass of the model
-    instead of ten (`action_objective`)."""
+    instead of ten (`action_objective`). None: the size's, ``regression`` at ``small``."""
     prompt_loss: bool = False
     """Whether prompt frames (``phase == 0``), whose actions have no effect, count in the action loss."""
     ema_decay: float = SIZES_OWN
