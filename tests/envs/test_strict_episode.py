@@ -21,7 +21,7 @@ from lerobot_memobench.experts import motions
 from lerobot_memobench.experts.hand import OPEN, Hand
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.formula import Atom
+from lerobot_memobench.tasks.formula import Atom, Never
 from lerobot_memobench.tasks.task import STRICT, Prompt, Task
 
 STOVE = "turn_the_stove_on_and_off_a_given_number_of_times"
@@ -76,7 +76,7 @@ def rounds(episode: Episode, count: int) -> Iterator[NDArray[np.floating[Any]]]:
     for _ in range(count):
         yield from motions.turn_knob(hand, "flat_stove_1", on=True)
         yield from motions.turn_knob(hand, "flat_stove_1", on=False)
-        yield from motions.go_home(hand, *home)
+        yield from motions.come_home(hand, *home)
     while True:
         yield hand.rest(OPEN)
 
@@ -95,7 +95,8 @@ def test_the_stove_as_often_as_asked_for(asked: int, done: int) -> None:
 
 def test_a_published_episode_goes_on_though_nothing_can_be_mended() -> None:
     """Its protocol is the paper's: success or the horizon."""
-    lost = dataclasses.replace(get_task("turn_on_the_stove_and_turn_it_off"), goal=get_task(STOVE).goal)
+    never = Never(Atom("turnoff", ("flat_stove_1",)))
+    lost = dataclasses.replace(get_task("turn_on_the_stove_and_turn_it_off"), goal=never)
     episode = Episode(lost, horizon=45)
     episode.reset(20_000)
     while not episode.done:
