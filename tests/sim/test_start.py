@@ -82,9 +82,10 @@ def test_who_leaves_home_in_the_very_first_step_was_there(sim: Simulation) -> No
         act(sim, 1, x=1.0)
         assert sim.holds(HOME) == expected
         states.append(sim.state())
-    for state, expected in zip(states, (False, True, False), strict=True):  # and so where states are read from a file
+    sim.set_state(states[0])
+    for state, expected in zip(states[1:], (True, False), strict=True):  # and so where states are read from a file
         sim.set_state(state)
-        assert sim.holds(HOME) == expected or state is states[0]
+        assert sim.holds(HOME) == expected
 
 
 def test_a_small_action_leaves_home(sim: Simulation) -> None:
