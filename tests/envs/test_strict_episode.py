@@ -53,7 +53,7 @@ def test_a_configuration_tells_what_is_true_of_its_suite(referent: str) -> None:
 
 def test_published_tasks_are_not_drawn() -> None:
     published = get_task(str(get_task(STOVE).twin_of))
-    with pytest.raises(MemobenchError, match="referent is 'drawn'.*fixed"):
+    with pytest.raises(MemobenchError, match=r"referent is 'drawn'.*fixed"):
         Episode(published, referent="drawn")
     with pytest.raises(MemobenchError, match=r"env\.referent is 'drawn'"):
         MemobenchEnvConfig(referent="drawn")
@@ -122,7 +122,10 @@ def rounds(episode: Episode, count: int) -> Iterator[NDArray[np.floating[Any]]]:
         yield hand.rest(OPEN)
 
 
-@pytest.mark.parametrize(("asked", "done"), [(1, 1), (1, 2), (2, 1), (2, 2)])
+@pytest.mark.parametrize(
+    ("asked", "done"),
+    [(1, 2), (2, 2), *(pytest.param(*pair, marks=pytest.mark.slow) for pair in ((1, 1), (2, 1)))],
+)
 def test_the_stove_as_often_as_asked_for(asked: int, done: int) -> None:
     episode = Episode(get_task(STOVE))
     episode.reset(seed_of(STOVE, asked - 1))

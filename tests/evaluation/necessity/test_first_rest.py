@@ -1,4 +1,4 @@
-"""Why a rest decides before the first event too: else a policy without memory could wait there for ever. No simulator."""
+"""Why a rest decides before the first event too: else a policy without memory could wait there. No simulator."""
 
 from __future__ import annotations
 
