@@ -3,17 +3,14 @@
 What may differ, stated here for all of the suite:
 
 - fixtures: 1e-6 m or rad; loose things 1e-4 m (they creep by microns while time passes, whatever is done).
-- the hand when it has come home: `AT_HOME`, after a hiding not a bit.
+- the arm when it has come home, or after a hiding: not a bit.
 - pictures with the arm where it was: 3 of 255 levels, but for `EDGES` pixels on outlines, which a micron can turn over.
-- pictures with the arm as the demonstrator brought it home: one in a hundred pixels may differ visibly, at the edges of
-  hand and arm, and the mean by one level.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-import mujoco
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -28,10 +25,7 @@ from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import Atom
 
 FIXTURES, THINGS = 1e-6, 1e-4
-AT_HOME = (0.0005, 0.002)
-"""Of the hand, m and rad; asked of `HandHome` are 0.03 and 0.2."""
 SAME_LEVEL, EDGES = 3, 4
-VISIBLE, VISIBLE_SHARE, MEAN = 32, 0.01, 1.0
 ARM = 9
 """The first positions and velocities of a scene: arm and fingers."""
 
@@ -45,31 +39,21 @@ EVENTS = {
 }
 
 
+ALIKE = {
+    "check_the_top_drawer_a_given_number_of_times",
+    "turn_the_stove_on_and_off_near_the_shelf_a_given_number_of_times",
+}
+"""Those of them that move what another one moves."""
+
+
 def pictures(sim: Simulation) -> dict[str, Image]:
     return {camera: sim.render(camera).copy() for camera in CAMERAS}
-
-
-def with_arm_of(sim: Simulation, start: NDArray[np.float64]) -> dict[str, Image]:
-    """Return the pictures of the present scene with the arm in another pose; the simulation goes on as it was."""
-    before = sim.snapshot()
-    sim.data.qpos[:ARM] = start[:ARM]
-    mujoco.mj_step1(sim.model, sim.data)
-    found = pictures(sim)
-    sim.restore(before)
-    return found
 
 
 def check_same(before: dict[str, Image], after: dict[str, Image]) -> None:
     for camera, image in before.items():
         apart = np.abs(image.astype(int) - after[camera]).max(axis=-1)
         assert (apart > SAME_LEVEL).sum() <= EDGES, camera
-
-
-def check_alike(before: dict[str, Image], after: dict[str, Image]) -> None:
-    for camera, image in before.items():
-        apart = np.abs(image.astype(int) - after[camera])
-        assert (apart.max(axis=-1) > VISIBLE).mean() <= VISIBLE_SHARE, camera
-        assert apart.mean() <= MEAN, camera
 
 
 def fixture_joints(sim: Simulation) -> dict[str, float]:
@@ -98,21 +82,20 @@ def events(sim: Simulation, name: str, seed: int) -> Iterator[int]:
 
 
 @pytest.mark.parametrize("seed", [20_000, pytest.param(20_001, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", EVENTS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name in ALIKE else name for name in EVENTS]
+)
 def test_an_event_leaves_no_trace(name: str, seed: int, gl: str) -> None:
     sim = Simulation(get_task(name))
     sim.reset(seed)
     look = ObjectSlots(sim)
-    start, seen, slots = sim.data.qpos.copy(), pictures(sim), look.observe()
+    arm, seen, slots = sim.data.qpos[:ARM].copy(), pictures(sim), look.observe()
     joints, places = fixture_joints(sim), {thing: sim.body_pose(thing)[0] for thing in sim.task.objects}
     for done in events(sim, name, seed):
         check_state(sim, joints, places)
-        position, rotation = sim.eef_pose()
-        assert np.linalg.norm(position - sim.home[0]) < AT_HOME[0]
-        assert np.arccos((np.trace(rotation.T @ sim.home[1]) - 1) / 2) < AT_HOME[1]
+        np.testing.assert_array_equal(sim.data.qpos[:ARM], arm)
         np.testing.assert_allclose(look.observe(), slots, atol=THINGS)
-        check_same(seen, with_arm_of(sim, start))
-        check_alike(seen, pictures(sim))
+        check_same(seen, pictures(sim))
         if done == 2:
             break
 

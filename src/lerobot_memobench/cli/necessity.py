@@ -57,8 +57,9 @@ def necessity(
 ) -> int:
     """Find moments that look the same and need different answers; print what a policy without memory can reach."""
     from lerobot_memobench.evaluation.necessity.pieces import PIECES, make
-    from lerobot_memobench.evaluation.necessity.question import REFERENTS, Settings
+    from lerobot_memobench.evaluation.necessity.question import Settings
     from lerobot_memobench.evaluation.necessity.report import put_into_page, read_results, terminal_table, write
+    from lerobot_memobench.tasks.task import REFERENTS
 
     published = None if beside is None else read_results(beside)  # now, not after the simulation
     settings = Settings(episodes=episodes, budget=budget, tolerance=tolerance)

@@ -33,7 +33,7 @@ class Demonstration:
     Attributes:
         task: the task as it was carried out; with ``variant`` k > 0 this is ``task.variant(k)`` already.
         seed: seed of the scene.
-        referent: ``"fixed"`` or ``"random"``.
+        referent: ``"fixed"`` or ``"random"``; of a strict task ``"drawn"``.
         variant: which admissible referent or order was asked for; 0 is the published one.
         states: (T, D) float64, the simulator's flattened state (1 + nq + nv).
         actions: (T, 7) float32, OSC pose deltas and gripper: what is to be done at this frame.

@@ -28,7 +28,7 @@ from lerobot_memobench.envs.observations import (
 from lerobot_memobench.envs.prompting import AUTO, PLACES, policy_being_run, prompt_in
 from lerobot_memobench.envs.protocol import SEED_BASE, SETTINGS, check_protocol
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.tasks.task import PUBLISHED, SUITES
+from lerobot_memobench.tasks.task import DRAWN, PUBLISHED, REFERENTS, STRICT, SUITES
 
 
 @EnvConfig.register_subclass("memobench")
@@ -44,7 +44,7 @@ class MemobenchEnvConfig(EnvConfig):
         obs_type: what is seen beside the arm's state: `pixels_agent_pos`, pictures; `environment_state_agent_pos`, what
             they would show as object slots (`observation.environment_state`), and nothing is drawn; or `both`.
         referent: `fixed`, the published goals, or `random`: by seed another admissible referent or order. Strict tasks
-            are drawn by seed whatever is said here.
+            are drawn by seed whatever is said here: `drawn`.
         prompt_video: whether object and procedural tasks begin with their prompt video.
         prompt_in: `steps`, the policy sees the prompt step by step, with `phase` 0; `reset`, it plays before the first
             observation; `auto`: in steps for a policy that knows phases, in reset for any other (`envs.prompting`).
@@ -97,7 +97,7 @@ class MemobenchEnvConfig(EnvConfig):
         for name, value, known in (
             ("obs_type", self.obs_type, OBS_TYPES),
             ("suite", self.suite, SUITES),
-            ("referent", self.referent, ("fixed", "random")),
+            ("referent", self.referent, (*REFERENTS, DRAWN) if self.suite == STRICT else REFERENTS),
             ("prompt_in", self.prompt_in, PLACES),
             ("render", self.render, ("fast", "default", "high")),
         ):
@@ -108,6 +108,8 @@ class MemobenchEnvConfig(EnvConfig):
                 raise MemobenchError(f"env.{name} is {number}; expected a whole number from 1 on")
         if self.films is not None and self.films < 0:
             raise MemobenchError(f"env.films is {self.films}; expected a whole number of episodes from 0 on")
+        if self.suite == STRICT:
+            self.referent = DRAWN
         if self.obs_type != PIXELS:
             self.features, self.features_map = policy_features(self.obs_type), policy_names(self.obs_type)
 

@@ -23,13 +23,12 @@ from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.formula import Atom, atoms
 from lerobot_memobench.tasks.progress import Progress
-from lerobot_memobench.tasks.task import STRICT, Task
+from lerobot_memobench.tasks.task import DRAWN, REFERENTS, STRICT, Task
 
 HORIZON = 1200
 """Execution steps before an episode is cut off (paper, section 5.1)."""
 PROMPT_LIMIT = 1000
 """Control steps after which a prompt video ends, whatever it still had to show."""
-REFERENTS = ("fixed", "random")
 
 
 class Episode:
@@ -38,7 +37,7 @@ class Episode:
     Args:
         task: the published task.
         referent: `fixed`, the catalogue's goal, or `random`, one of the task's variants by seed; of the strict suite
-            one of the variants always.
+            one of the variants always, which is told as `drawn`.
         prompt_video: whether tasks that have a prompt begin with it; what a prompt hides is hidden unseen without.
         horizon: execution steps before truncation.
         render: size and quality of frames.
@@ -60,10 +59,11 @@ class Episode:
         horizon: int = HORIZON,
         render: RenderSettings | None = None,
     ) -> None:
-        if referent not in REFERENTS:
-            raise MemobenchError(f"referent is {referent!r}; {nearest(referent, REFERENTS)}")
+        known = (*REFERENTS, DRAWN) if task.drawn else REFERENTS
+        if referent not in known:
+            raise MemobenchError(f"referent is {referent!r}; {nearest(referent, known)}")
         self.published = task
-        self.referent, self.horizon = referent, horizon
+        self.referent, self.horizon = DRAWN if task.drawn else referent, horizon
         self.prompt_video = prompt_video and task.prompt is not None
         self.sim = Simulation(task, render)
         self._slots: ObjectSlots | None = None
@@ -76,8 +76,7 @@ class Episode:
     def reset(self, seed: int) -> None:
         """Start the episode of a seed. Everything that follows is a function of task, settings, seed and actions."""
         self.seed = int(seed)
-        draws = self.referent == "random" or self.published.drawn
-        self.task = task = referent_of(self.published, self.seed) if draws else self.published
+        self.task = task = self.published if self.referent == "fixed" else referent_of(self.published, self.seed)
         self.sim.reset(self.seed)
         self.scene_hash = self.sim.scene_hash()
         self._start = self.sim.snapshot()

@@ -37,4 +37,4 @@ class BlindRoutine:
             expert = Expert(self._task, self._sim, self._rng)
             while not expert.done:
                 yield expert.act()
-            yield from motions.go_home(expert.hand, *self._home)
+            yield from motions.come_home(expert.hand, *self._home)

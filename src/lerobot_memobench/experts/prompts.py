@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from lerobot_memobench.experts import motions
 from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.experts.hand import CLOSED, OPEN, UP, Array, Hand
+from lerobot_memobench.experts.travel import HOME
 from lerobot_memobench.sim.rendering import Highlight
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.formula import Atom
@@ -24,7 +25,6 @@ PAUSE = 8
 HIGHLIGHT_STEPS = 50
 BRISK = 1.25
 """How much faster than at work the hand hides things: two of them fit into a prompt video."""
-HOME = Atom("handhome", ())
 
 
 class PromptDemonstrator:

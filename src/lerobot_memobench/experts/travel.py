@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from lerobot_memobench.experts.hand import OPEN, UP, Array, Hand, length
 from lerobot_memobench.experts.surroundings import FINGER_REACH, clear_height, corners
 from lerobot_memobench.sim.scene import TABLE_TOP
+from lerobot_memobench.tasks.formula import Atom
 
 Steps = Generator[NDArray[np.float32], None, None]
 """A part of a motion: yields actions (7,)."""
@@ -18,10 +19,9 @@ Doing = Generator[NDArray[np.float32], None, bool]
 """A motion: yields actions (7,), returns whether it did what it is for."""
 LOST = 0.05
 """Distance between hand and thing, beyond that at the grasp, at which it counts as dropped, m."""
-EXACT_DISTANCE, EXACT_ANGLE = 0.0002, 0.0005
-"""How near to its pose a hand that has come home stands, m and rad."""
+HOME = Atom("handhome", ())
 SETTLING = 18
-"""Control steps within which it gets there, once it is near."""
+"""Control steps within which a hand comes to rest at home, once it is near."""
 HAND_BESIDE = 0.05
 """How far the hand reaches sideways on its way, m."""
 
@@ -117,19 +117,14 @@ def go_home(hand: Hand, position: Array, rotation: Array) -> Steps:
 
 
 def come_home(hand: Hand, position: Array, rotation: Array) -> Steps:
-    """Go back to a pose so exactly that a picture does not tell where the hand has been; nothing when it is there.
+    """Go back to where the hand was at first and come to rest; nothing when it stands there.
 
     Short of `Hold`-long rests: it ends after `SETTLING` steps, however near it is.
     """
-    if _exact(hand, position, rotation):
+    if hand.sim.holds(HOME):
         return
     yield from go_home(hand, position, rotation)
     for _ in range(SETTLING):
-        if _exact(hand, position, rotation):
+        if hand.sim.holds(HOME):
             break
         yield hand.toward(position, rotation, OPEN)
-
-
-def _exact(hand: Hand, position: Array, rotation: Array) -> bool:
-    distance, angle = hand.error(position, rotation)
-    return distance < EXACT_DISTANCE and angle < EXACT_ANGLE

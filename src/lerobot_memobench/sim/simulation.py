@@ -65,6 +65,7 @@ class Simulation:
         self.assets = scene.assets
         self.world = World(task, self.model, self.data, scene.assets)
         self._start = Start(self.model, self.data, tuple(task.objects))
+        self._at_home: Snapshot | None = None
         self.highlights: tuple[Highlight, ...] = ()
         self._controller = make_controller(self.model)
         self._placer = Placer(task, self.model, self.data, scene.assets)
@@ -96,6 +97,7 @@ class Simulation:
 
     def _rewind(self) -> None:
         """Put the arm at its start; things are placed next."""
+        self._at_home = None
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[self._arm_qpos] = robot.ARM_START
         self.data.qpos[self._finger_qpos] = robot.GRIPPER_OPEN if self._strict else robot.GRIPPER_START
@@ -109,6 +111,7 @@ class Simulation:
         for _ in range(STABILISATION_STEPS):
             self.step(NO_OP)
         self._start.mark_hand()
+        self._at_home = self.snapshot() if self._strict else None
         self.begin_execution()
 
     def begin_execution(self) -> None:
@@ -128,8 +131,17 @@ class Simulation:
             raise MemobenchError(
                 f"an action holds a value that is not finite: {action.tolist()}; check the policy's output"
             )
+        self._start.mark_step()
         self._controller.set_goal(self.data, action.astype(np.float64, copy=False))
         self._controller.advance(self.data, float(action[6]), SUBSTEPS)
+        if self._at_home is not None and action[6] <= 0.0 and self._start.in_detent():
+            self._stand_at_home(self._at_home)  # unless it is told to close: it must be able to
+
+    def _stand_at_home(self, home: Snapshot) -> None:
+        """Let a strict scene's arm stand as when the scene had settled: where it has been is not in it any more."""
+        time = self.data.time
+        self.restore_arm(home)
+        self.data.time = time
 
     # --- state ----------------------------------------------------------------------------------------------
 
@@ -145,6 +157,8 @@ class Simulation:
     def set_state(self, state: Array, fixture_poses: dict[str, Array] | None = None) -> None:
         """Show a recorded state: what is asked and rendered afterwards belongs to it.
 
+        The state shown before it counts as the one before (`Start.mark_step`).
+
         Args:
             state: (state_dim,) as `state()` returns it.
             fixture_poses: where the fixtures stood, as `fixture_poses()` returns it; as they are when left out.
@@ -154,6 +168,7 @@ class Simulation:
             raise MemobenchError(
                 f"a state of task {self.task.name} has shape {state.shape}; expected ({self.state_dim},)"
             )
+        self._start.mark_step()
         for name, pose in (fixture_poses or {}).items():
             body = self.model.body(name).id
             self.model.body_pos[body], self.model.body_quat[body] = pose[:3], pose[3:]
@@ -185,6 +200,7 @@ class Simulation:
         self._controller.goal_position = snapshot.goal_position.copy()
         self._controller.goal_rotation = snapshot.goal_rotation.copy()
         self._controller.gripper = snapshot.gripper.copy()
+        self._start.mark_step(goes_on=False)
         mujoco.mj_step1(self.model, self.data)
 
     def end_prompt(self, start: Snapshot) -> None:

@@ -25,6 +25,9 @@ MEMORY_TYPES: tuple[MemoryType, ...] = get_args(MemoryType)
 OPERATIONS: tuple[Operation, ...] = get_args(Operation)
 SUITES: tuple[Suite, ...] = get_args(Suite)
 PUBLISHED, STRICT = SUITES
+REFERENTS = ("fixed", "random")
+#: The referent of strict episodes, whatever is asked for (`Task.drawn`).
+DRAWN = "drawn"
 #: Classes of failure that only strict tasks have (`Task.spoilt_as`): the event was done too seldom or too often; the
 #: thing was looked for where it is not.
 STRICT_FAILURES = ("miscount", "wrong_place")

@@ -52,7 +52,7 @@ EPISODE_COLUMNS = {
     "family": "group of similar tasks",
     "operations": "labels of the checkpoints in order, e.g. SUC",
     "seed": "seed of the scene",
-    "referent": "fixed, or random: the prompt video decides what the goal is",
+    "referent": "fixed; random: the prompt video decides what the goal is; drawn: so is every strict task, by seed",
     "variant": "which admissible referent or order; 0 is the published one",
     "success": "the goal was reached",
     "exec_start_index": "frame at which execution starts",

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.necessity.question import DRAWN
 from lerobot_memobench.evaluation.necessity.study import Result, pictures_path
 from lerobot_memobench.tasks.catalogue import get_task
+from lerobot_memobench.tasks.task import DRAWN
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -8,13 +8,10 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 from lerobot_memobench.evaluation.necessity.demonstrations import HORIZON
-from lerobot_memobench.tasks.task import Task
+from lerobot_memobench.tasks.task import DRAWN, REFERENTS, Task
 
 VERSION = 1
 """Raised when results change, so that old ones are made again."""
-REFERENTS = ("fixed", "random")
-DRAWN = "drawn"
-"""The referent of tasks whose every episode draws its goal."""
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from lerobot_memobench.evaluation.documents.tables import NOT_APPLICABLE, figure
-from lerobot_memobench.evaluation.necessity.question import DRAWN, REFERENTS
 from lerobot_memobench.evaluation.necessity.study import Result
 from lerobot_memobench.evaluation.necessity.verdicts import verdict
 from lerobot_memobench.tasks.catalogue import get_task
+from lerobot_memobench.tasks.task import DRAWN, REFERENTS
 
 HEADINGS = (
     *("published task", "best map", "memory needed"),
