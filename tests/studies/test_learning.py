@@ -8,13 +8,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image, ImageColor
 
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.studies.learning import stages as stages_module
 from lerobot_memobench.studies.learning.commands import Cost, run_once
 from lerobot_memobench.studies.learning.experiments import BOWL, EXPERIMENTS, MEMORY, MEMORYLESS, changed
+from lerobot_memobench.studies.learning.figure import COLOURS
 from lerobot_memobench.studies.learning.outcomes import read_outcomes
 from lerobot_memobench.studies.learning.stages import Stages
 from lerobot_memobench.studies.learning.study import learn
@@ -92,6 +95,10 @@ def test_an_experiment_runs_its_parts_in_order(tmp_path: Path, monkeypatch: pyte
     assert "| training | 4 | 1.0 | 6.0 |" in text
     assert (tmp_path / "out" / "learning.md").read_text() == text
     assert json.loads((tmp_path / "out" / "learning.json").read_text())[MEMORYLESS][BOWL]["wrong_referent"] == 12
+    with Image.open(tmp_path / "out" / "learning.png") as picture:
+        pixels = np.asarray(picture.convert("RGB")).reshape(-1, 3)
+    memory, memoryless = ((pixels == ImageColor.getrgb(colour)).all(axis=1).sum() for colour in COLOURS[:2])
+    assert memory / memoryless == pytest.approx(3, rel=0.15), "bars are as long as their rates"
 
 
 def test_a_killed_training_goes_on_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from lerobot_memobench.files import write_file
 from lerobot_memobench.studies.learning.commands import Cost
 from lerobot_memobench.studies.learning.experiments import Experiment
+from lerobot_memobench.studies.learning.figure import draw
 from lerobot_memobench.studies.learning.outcomes import Outcome, as_json, read_outcomes
 from lerobot_memobench.studies.learning.stages import Stages, name_of
 
@@ -21,7 +22,7 @@ PARTS = ("data", "training", "evaluation")
 
 
 def learn(experiment: Experiment, out: Path, say: Say, *, dataset: Path | None = None, workers: int = 1) -> str:
-    """Do, or finish, an experiment in ``out``; return its tables, written there as well.
+    """Do, or finish, an experiment in ``out``; return its tables, written there as well, with a picture (`figure`).
 
     Args:
         say: told what begins and what it took.
@@ -46,6 +47,7 @@ def learn(experiment: Experiment, out: Path, say: Say, *, dataset: Path | None =
     seeds = range(experiment.seeds)
     found = {arm: read_outcomes([stages.rollouts(arm, seed) for seed in seeds]) for arm in experiment.arms}
     write_file(out / "learning.json", json.dumps(as_json(found), indent=1))
+    draw(found, out / "learning.png")
     text = f"{outcomes_table(found)}\n\n{costs_table(costs)}\n"
     write_file(out / "learning.md", text)
     return text
