@@ -92,6 +92,7 @@ def test_an_experiment_runs_its_parts_in_order(tmp_path: Path, monkeypatch: pyte
     assert all("seed=7" in words and "referent=random" in words for words in ran[5:])
     assert f"| {BOWL}, {MEMORY} | 90.0 |" in text
     assert f"| {BOWL}, {MEMORYLESS} | 30.0 |" in text
+    assert f"| {MEMORYLESS} less {MEMORY} | -60.0 | " in text
     assert "| training | 4 | 1.0 | 6.0 |" in text
     assert (tmp_path / "out" / "learning.md").read_text() == text
     assert json.loads((tmp_path / "out" / "learning.json").read_text())[MEMORYLESS][BOWL]["wrong_referent"] == 12
@@ -115,3 +116,14 @@ def test_a_killed_training_goes_on_from_its_checkpoint(tmp_path: Path, monkeypat
     config.touch()
     stages.train(MEMORY, 0)
     assert given["going_on"] == ["lerobot", "train", f"config_path={config}", "resume=true"]
+
+
+def test_what_is_told_in_training_is_told_in_rollouts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ran: dict[str, list[str]] = {}
+    monkeypatch.setattr(stages_module, "run_once", lambda words, log, **options: ran.update({log.stem: words}))
+    stages = Stages(EXPERIMENTS["alignment"], tmp_path)
+    for arm in stages.experiment.arms:
+        stages.evaluate(arm, 0)
+    told = [name for name, words in ran.items() if "env.oracle_memory=true" in words]
+    assert told == ["oracle_text-0"]
+    assert len(ran) == 6

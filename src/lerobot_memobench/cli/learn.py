@@ -10,6 +10,10 @@ import typer
 
 from lerobot_memobench.cli.console import console
 
+EXPERIMENTS = (
+    "bowl: one task, in minutes; prompted: ten tasks; joint: all thirty; alignment: whether it helps, on the ten."
+)
+
 
 class Name(StrEnum):
     """The experiments (`studies.learning.experiments`)."""
@@ -17,10 +21,11 @@ class Name(StrEnum):
     BOWL = "bowl"
     PROMPTED = "prompted"
     JOINT = "joint"
+    ALIGNMENT = "alignment"
 
 
 def learn(
-    name: Annotated[Name, typer.Argument(help="bowl: one task, in minutes; prompted: ten tasks; joint: all thirty.")],
+    name: Annotated[Name, typer.Argument(help=EXPERIMENTS)],
     out: Annotated[Path, typer.Option(help="Folder of data, policies, rollouts and tables; the same command goes on.")],
     episodes: Annotated[int | None, typer.Option(min=1, help="Demonstrations per task.")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Updates per policy.")] = None,
@@ -32,7 +37,7 @@ def learn(
     dataset: Annotated[Path | None, typer.Option(help="Demonstrations that are there already.")] = None,
     workers: Annotated[int, typer.Option(min=1, help="Processes; so many policies are trained at once.")] = 1,
 ) -> int:
-    """Generate demonstrations, train a policy with memory and one without, roll both out on the evaluation seeds."""
+    """Generate demonstrations, train policies with a memory and without, roll them out on the evaluation seeds."""
     from lerobot_memobench.studies.learning.experiments import changed, experiment
     from lerobot_memobench.studies.learning.study import learn as run
 

@@ -13,6 +13,14 @@ MEMORY, MEMORYLESS = "memory", "no memory"
 ARMS: dict[str, tuple[str, ...]] = {MEMORY: (), MEMORYLESS: ("policy.integration=none",)}
 """Who is compared -> what is said of it to `lerobot train` beside what all share."""
 
+ALIGNMENTS: dict[str, tuple[str, ...]] = {
+    MEMORY: (),
+    **{name: (f"align={name}",) for name in ("semantic", "contrastive", "framewise")},
+    "oracle text": ("policy.integration=none", "policy.oracle_memory=true"),
+    MEMORYLESS: ("policy.integration=none",),
+}
+"""The paper's objectives, and its two ends: what was seen told in words, and nothing of it."""
+
 EVALUATION_SEEDS = 7
 TUNING_SEEDS = 20_000
 """First seeds: of the evaluation that is reported, and of one that settings may be chosen by."""
@@ -51,11 +59,13 @@ def experiment(name: str) -> Experiment:
 
 
 EXPERIMENTS: dict[str, Experiment] = {
-    "bowl": Experiment((BOWL,), episodes=120, steps=1500, seeds=3),
-    "prompted": Experiment(prompted(), episodes=100, steps=12_000),
-    "joint": Experiment(tuple(task_names()), episodes=80, steps=30_000),
+    "bowl": Experiment((BOWL,), episodes=120, steps=1000, seeds=3),
+    "prompted": Experiment(prompted(), episodes=40, steps=8_000),
+    "joint": Experiment(tuple(task_names()), episodes=20, steps=10_000),
+    "alignment": Experiment(prompted(), episodes=40, steps=4_000, arms=ALIGNMENTS, seeds=3),
 }
-"""Butter into the prompted bowl, in minutes; the ten prompted tasks, by one policy; all thirty, by one policy."""
+"""Butter into the prompted bowl, in minutes; the ten prompted tasks, by one policy; all thirty, by one policy; and
+whether alignment helps."""
 
 
 def changed(which: Experiment, **given: object) -> Experiment:

@@ -58,6 +58,7 @@ class Stages:
         words = ["lerobot", "eval", "env=memobench", f"policy={self.policy(arm, seed)}", "referent=random", "films=0"]
         words += [f"tasks={','.join(self.experiment.tasks)}", f"episodes={self.experiment.rollouts}"]
         words += [f"seed={self.experiment.first_seed}", f"output_dir={self.rollouts(arm, seed)}", "resume=true"]
+        words += ["env.oracle_memory=true"] if "policy.oracle_memory=true" in self.experiment.arms[arm] else []
         words += [f"shards={self.workers}", f"workers={self.workers}"] if self.workers > 1 else []
         return run_once(words, self.log("evaluation", arm, seed), threads=1)
 

@@ -8,9 +8,11 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import product
 from pathlib import Path
 
+from lerobot_memobench.evaluation.records.runs import read_rollouts
 from lerobot_memobench.files import write_file
 from lerobot_memobench.studies.learning.commands import Cost
-from lerobot_memobench.studies.learning.experiments import Experiment
+from lerobot_memobench.studies.learning.contrasts import Contrast, contrasts
+from lerobot_memobench.studies.learning.experiments import MEMORY, Experiment
 from lerobot_memobench.studies.learning.figure import draw
 from lerobot_memobench.studies.learning.outcomes import Outcome, as_json, read_outcomes
 from lerobot_memobench.studies.learning.stages import Stages, name_of
@@ -48,7 +50,9 @@ def learn(experiment: Experiment, out: Path, say: Say, *, dataset: Path | None =
     found = {arm: read_outcomes([stages.rollouts(arm, seed) for seed in seeds]) for arm in experiment.arms}
     write_file(out / "learning.json", json.dumps(as_json(found), indent=1))
     draw(found, out / "learning.png")
-    text = f"{outcomes_table(found)}\n\n{costs_table(costs)}\n"
+    rollouts = {arm: [read_rollouts(stages.rollouts(arm, seed))[0] for seed in seeds] for arm in experiment.arms}
+    against = contrasts_table(contrasts(rollouts, MEMORY), experiment.seeds)
+    text = f"{outcomes_table(found)}\n\n{against}\n\n{costs_table(costs)}\n"
     write_file(out / "learning.md", text)
     return text
 
@@ -68,6 +72,20 @@ def _cells(outcome: Outcome) -> list[str]:
     value = outcome.success.value or 0.0
     seeds = ", ".join(f"{100 * each:.0f}" for each in outcome.of_seeds)
     return [f"{100 * value:.1f}", f"{100 * low:.1f}–{100 * high:.1f}", seeds, str(outcome.wrong), str(outcome.others)]
+
+
+def contrasts_table(found: dict[str, Contrast], seeds: int) -> str:
+    """Return a table of arms against the one with a memory that is aligned with nothing."""
+    rows = [
+        [
+            f"{name} less {MEMORY}",
+            *(f"{100 * one.value:+.1f}", f"{100 * one.low:+.1f} to {100 * one.high:+.1f}", f"{one.p:.3f}"),
+            "–" if one.detectable is None else f"{100 * one.detectable:.1f}",
+        ]
+        for name, one in found.items()
+    ]
+    trained = f"95 % interval, {seeds} training seed{'s' if seeds > 1 else ''}"
+    return _table(("", "difference, points", trained, "p (Holm)", "detectable"), rows)
 
 
 def costs_table(costs: dict[str, list[Cost | None]]) -> str:
