@@ -174,11 +174,10 @@ class Rasterizer:
 
         One sample per pixel, in its middle, whatever the quality of pictures.
         """
-        GL, call = self._gl, self._call
         self._enter()
         if self._geom_program is None:
             self._geom_target = self._plain_target()
-            self._geom_program = self._resources.program(geom_program(GL))
+            self._geom_program = self._resources.program(geom_program(self._gl))
         self._send_view(model, data, camera)
         if self._send_geoms(model, data, ()):
             self._sent = None  # the shadows are still of another state
