@@ -35,15 +35,16 @@ def test_nothing_stands_in_anything(simulate: Simulate) -> None:
     places, free = [], 0
     for _ in range(30):
         sim.set_state(state, fixed)
-        free += scatter.stir(reach=True)
+        if not scatter.stir(reach=True):
+            continue
+        free += 1
         places.append([sim.body_pose(name)[0] for name in objects])
-        near = sim.data.contact.geom[sim.data.contact.dist < -PENETRATION]
-        roots = {sim.model.body(sim.model.body_rootid[sim.model.geom_bodyid[geom]]).name for geom in near.ravel()}
-        # What is held may touch the fingers; of two others none is left.
-        assert len(roots & set(objects)) <= 1
-    assert free > 15
-    seen = np.array(places)
-    assert (np.std(seen[seen[..., 2] > 0], axis=0)[:2] > 0.05).all()
+        for pair in sim.data.contact.geom[sim.data.contact.dist < -PENETRATION]:
+            roots = {sim.model.body(sim.model.body_rootid[sim.model.geom_bodyid[geom]]).name for geom in pair}
+            assert roots - set(objects) == {"robot0_base"}  # only what is held is touched, by the fingers
+    assert free > 10
+    seen = np.array(places).reshape(-1, 3)
+    assert (np.std(seen[seen[:, 2] < 2], axis=0)[:2] > 0.05).all()
 
 
 def test_the_arm_reaches_a_pose(simulate: Simulate) -> None:

@@ -154,7 +154,7 @@ class Pictures:
 def _read(file: Path) -> Rows:
     try:
         rows = np.load(file, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, EOFError) as error:
         raise MemobenchError(f"{file} cannot be read as pictures ({error}); remove it and make it anew") from None
     if rows.dtype != PICTURE:
         raise MemobenchError(f"{file} holds no pictures of this version; remove it and make it anew")

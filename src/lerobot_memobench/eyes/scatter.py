@@ -31,8 +31,10 @@ SLIDE, TURN = 0.03, 0.1
 """How far a fixture is moved at most along x and y, m, and turned, rad."""
 ROUNDS = 6
 """How often what overlaps is put elsewhere before it is taken away."""
-AWAY = -3.0
+AWAY = 8.0
 """Height of things that are taken away, m."""
+ARM = "robot0_base"
+"""Root of the arm's tree of bodies."""
 
 
 class Scatter:
@@ -66,11 +68,10 @@ class Scatter:
         if held is not None:
             self._hold(held)
         settle(self._sim)
-        overlapping = self._overlapping() - {held}
-        for name in overlapping & set(self._objects):
-            self._write(name, np.array([0, 0, AWAY, 1.0, 0, 0, 0]))
+        for name in self._overlapping(held) & set(self._objects):
+            self._take_away(name)
         settle(self._sim)
-        return not overlapping - set(self._objects)
+        return not self._overlapping(held)
 
     def _move_fixtures(self) -> None:
         """Fixtures a little, their moving parts anywhere between their ends, half of them to one of those."""
@@ -91,7 +92,7 @@ class Scatter:
         """Put an object on the table, on or into something, or away."""
         rng, asset = self._rng, self._objects[name]
         if rng.random() < ABSENT:
-            self._write(name, np.array([0, 0, AWAY, 1.0, 0, 0, 0]))
+            self._take_away(name)
             return
         lying = rng.random() < LYING
         turn = Rotation.random(random_state=rng) if lying else Rotation.from_rotvec([0, 0, rng.uniform(-np.pi, np.pi)])
@@ -146,18 +147,23 @@ class Scatter:
         for joint, sign in zip(FINGER_JOINTS, (1.0, -1.0), strict=True):
             self._sim.data.joint(joint).qpos[0] = sign * half
 
+    def _take_away(self, name: str) -> None:
+        """Put an object high above the scene, where no camera looks, beside what is there already."""
+        self._write(name, np.array([0, list(self._objects).index(name), AWAY, 1.0, 0, 0, 0]))
+
     def _write(self, name: str, pose: Array) -> None:
         self._sim.data.joint(f"{name}_joint0").qpos[:] = pose
 
-    def _overlapping(self) -> set[str]:
-        """Return the names of bodies, at the roots of their trees, that stand in one another."""
+    def _overlapping(self, held: str | None = None) -> set[str]:
+        """Return the names of bodies, at the roots of their trees, that stand in one another; a held one may."""
         model, data = self._sim.model, self._sim.data
         contact = data.contact
-        deep = contact.geom[contact.dist < -PENETRATION].ravel() if data.ncon else np.zeros(0, np.int64)
-        return {self._root(int(body)) for body in set(model.geom_bodyid[deep])} - {"world"}
+        deep = contact.geom[contact.dist < -PENETRATION] if data.ncon else np.zeros((0, 2), np.int64)
+        pairs = [{self._root(int(model.geom_bodyid[geom])) for geom in pair} for pair in deep]
+        return {name for pair in pairs if pair != {held, ARM} for name in pair} - {"world", held}
 
     def _root(self, body: int) -> str:
-        """The instance that a body belongs to, else the root of its tree."""
+        """The name of the root of a body's tree: an instance, or the arm."""
         model = self._sim.model
         return str(model.body(model.body_rootid[body]).name)
 

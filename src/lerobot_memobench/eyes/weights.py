@@ -63,4 +63,4 @@ def load_eyes(path: Path) -> Eyes:
     except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
         reason = str(error).splitlines()[0]
         raise MemobenchError(f"{path} holds no eyes ({reason}); name a file of `memobench eyes train`") from None
-    return eyes.eval()
+    return eyes.eval().to(memory_format=torch.channels_last)
