@@ -97,7 +97,7 @@ class ObjectSlots:
         """All that may be seen: each object and fixture, followed by its moving parts."""
         return tuple(self._things)
 
-    def owners(self, geoms: NDArray[np.int64]) -> NDArray[np.int64]:
+    def owners(self, geoms: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return the index in `things` that each geom belongs to, for ids of any shape; -1 for none and for id -1."""
         return np.where(geoms >= 0, self._owner[self._sim.model.geom_bodyid[geoms]], -1)
 
