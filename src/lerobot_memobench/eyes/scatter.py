@@ -31,8 +31,8 @@ SLIDE, TURN = 0.03, 0.1
 """How far a fixture is moved at most along x and y, m, and turned, rad."""
 ROUNDS = 6
 """How often what overlaps is put elsewhere before it is taken away."""
-AWAY = 8.0
-"""Height of things that are taken away, m."""
+AWAY = (30.0, 0.0, 5.0)
+"""Where things are taken away to, m: no camera looks there, and no shadow of theirs falls on the table."""
 ARM = "robot0_base"
 """Root of the arm's tree of bodies."""
 
@@ -148,8 +148,9 @@ class Scatter:
             self._sim.data.joint(joint).qpos[0] = sign * half
 
     def _take_away(self, name: str) -> None:
-        """Put an object high above the scene, where no camera looks, beside what is there already."""
-        self._write(name, np.array([0, list(self._objects).index(name), AWAY, 1.0, 0, 0, 0]))
+        """Put an object where no camera looks, each at a place of its own."""
+        place = np.array(AWAY) + [0.0, list(self._objects).index(name), 0.0]
+        self._write(name, poses.pose(place, Rotation.identity()))
 
     def _write(self, name: str, pose: Array) -> None:
         self._sim.data.joint(f"{name}_joint0").qpos[:] = pose
