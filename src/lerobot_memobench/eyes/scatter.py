@@ -149,7 +149,7 @@ class Scatter:
 
     def _take_away(self, name: str) -> None:
         """Put an object where no camera looks, each at a place of its own."""
-        place = np.array(AWAY) + [0.0, list(self._objects).index(name), 0.0]
+        place = np.add(AWAY, [0.0, list(self._objects).index(name), 0.0])
         self._write(name, poses.pose(place, Rotation.identity()))
 
     def _write(self, name: str, pose: Array) -> None:
