@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 
 import typer
 
-from lerobot_memobench.cli import controls, data, figures
+from lerobot_memobench.cli import controls, data, eyes, figures
 from lerobot_memobench.cli.cache import cache
 from lerobot_memobench.cli.demo import demo
 from lerobot_memobench.cli.doctor import doctor
@@ -71,6 +71,7 @@ for command in COMMANDS:
     app.command()(command)
 app.add_typer(figures.app, name="figures")
 app.add_typer(controls.app, name="controls")
+app.add_typer(eyes.app, name="eyes")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -92,6 +92,15 @@ class ObjectSlots:
         self._group = np.zeros(6, np.uint8)
         self._group[VISUAL_GROUP] = 1
 
+    @property
+    def things(self) -> tuple[Thing, ...]:
+        """All that may be seen: each object and fixture, followed by its moving parts."""
+        return tuple(self._things)
+
+    def owners(self, geoms: NDArray[np.integer]) -> NDArray[np.int64]:
+        """Return the index in `things` that each geom belongs to, for ids of any shape; -1 for none and for id -1."""
+        return np.where(geoms >= 0, self._owner[self._sim.model.geom_bodyid[geoms]], -1)
+
     def observe(self) -> NDArray[np.float32]:
         """Return the slots (SIZE,) of what is visible in the present state."""
         seen = self._visible()
@@ -152,7 +161,7 @@ class ObjectSlots:
                 model, data, origin, rays[inside].ravel(), self._group, True, -1, geoms, distances, None, count,
                 mujoco.mjMAXVAL,
             )  # fmt: skip
-            owners = np.where(geoms >= 0, self._owner[model.geom_bodyid[geoms]], -1)
+            owners = self.owners(geoms)
             mine = self._of_point[inside]
             hits += np.bincount(mine[owners == mine], minlength=len(hits))
         return hits >= SEEN_POINTS

@@ -145,11 +145,18 @@ class Renderer:
         highlights: tuple[Highlight, ...] = (),
     ) -> Image:
         """Return the frame of a named camera, (height, width, 3) uint8, upright."""
+        discs = [(np.array(h.position), h.radius, _DISC_HALF_HEIGHT, h.rgba) for h in highlights]
+        return self._ready().draw(model, data, model.camera(camera).id, discs)
+
+    def geoms(self, model: mujoco.MjModel, data: mujoco.MjData, camera: str) -> NDArray[np.int64]:
+        """Return the id of the geom that each pixel of such a frame shows, (height, width), -1 for none."""
+        return self._ready().draw_geoms(model, data, model.camera(camera).id)
+
+    def _ready(self) -> Rasterizer:
         if self._rasterizer is None:
             raise MemobenchError("this renderer was closed; make another one")
         self._context.make_current()
-        discs = [(np.array(h.position), h.radius, _DISC_HALF_HEIGHT, h.rgba) for h in highlights]
-        return self._rasterizer.draw(model, data, model.camera(camera).id, discs)
+        return self._rasterizer
 
     def close(self) -> None:
         """Free what this holds on the GPU; safe to call twice."""

@@ -15,7 +15,7 @@ from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.compiled_controller import make_controller
 from lerobot_memobench.sim.placement import Placement, Placer
-from lerobot_memobench.sim.rendering import Highlight, Image, RenderSettings, get_renderer
+from lerobot_memobench.sim.rendering import Highlight, Image, Renderer, RenderSettings, get_renderer
 from lerobot_memobench.sim.scene import AGENTVIEW, SUBSTEPS, get_scene, state_size
 from lerobot_memobench.sim.start import Start
 from lerobot_memobench.sim.world import World
@@ -234,13 +234,19 @@ class Simulation:
 
     def render(self, camera: str = "agentview") -> Image:
         """Return what a camera (`agentview` or `wrist`) sees, (height, width, 3) uint8, upright."""
-        if camera not in CAMERAS:
-            raise MemobenchError(f"there is no camera {camera!r}; {nearest(camera, CAMERAS)}")
         for asset, geom in self._glow:
             lit = self.holds(Atom("turnon", (asset.name,)))
             self.model.geom_rgba[geom] = asset.glow_on if lit else asset.glow_off
-        renderer = get_renderer(self._scene.key, self._scene.model, self.render_settings)
-        return renderer.render(self.model, self.data, CAMERAS[camera], self.highlights)
+        return self._renderer(camera).render(self.model, self.data, CAMERAS[camera], self.highlights)
+
+    def geoms(self, camera: str = "agentview") -> NDArray[np.int64]:
+        """Return the id of the geom that each pixel of a camera's picture shows, (height, width), -1 for none."""
+        return self._renderer(camera).geoms(self.model, self.data, CAMERAS[camera])
+
+    def _renderer(self, camera: str) -> Renderer:
+        if camera not in CAMERAS:
+            raise MemobenchError(f"there is no camera {camera!r}; {nearest(camera, CAMERAS)}")
+        return get_renderer(self._scene.key, self._scene.model, self.render_settings)
 
     def proprio(self) -> NDArray[np.float32]:
         """Return the 8-D proprioception: end-effector position (3), axis-angle (3), finger positions (2)."""

@@ -17,7 +17,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.drawing.calls import frame_calls
 from lerobot_memobench.sim.drawing.drawlist import LAYER_SIZE, ROWS, VERTEX, DrawList
 from lerobot_memobench.sim.drawing.resources import Resources
-from lerobot_memobench.sim.drawing.shaders import ATTRIBUTES, TEXTURE_UNITS, scene_program
+from lerobot_memobench.sim.drawing.shaders import ATTRIBUTES, TEXTURE_UNITS, geom_program, scene_program
 from lerobot_memobench.sim.drawing.shadows import ShadowMap
 from lerobot_memobench.sim.drawing.shapes import disc
 from lerobot_memobench.sim.drawing.views import View
@@ -70,6 +70,7 @@ class Rasterizer:
         # The headlight goes before the other lights.
         shadowed = None if caster is None else 1 + lights.index(caster)
         self._program = self._resources.program(scene_program(GL, 1 + len(lights), shadowed))
+        self._geom_program: int | None = None
 
     # --- set up ---------------------------------------------------------------------------------------------
 
@@ -127,16 +128,22 @@ class Rasterizer:
         """Make what is drawn into, and what is read from where that has several samples per pixel."""
         GL, make = self._gl, self._resources
         samples = min(samples, int(GL.glGetIntegerv(GL.GL_MAX_SAMPLES)))
-        self._target = make.framebuffer()
+        self._target = self._plain_target(samples)
         size = (self._width, self._height)
-        make.renderbuffer(GL.GL_RGBA8, GL.GL_COLOR_ATTACHMENT0, samples, size)
-        make.renderbuffer(GL.GL_DEPTH_COMPONENT24, GL.GL_DEPTH_ATTACHMENT, samples, size)
-        make.check_framebuffer()
         self._result = self._target
         if samples:
             self._result = make.framebuffer()
             make.renderbuffer(GL.GL_RGBA8, GL.GL_COLOR_ATTACHMENT0, 0, size)
             make.check_framebuffer()
+
+    def _plain_target(self, samples: int = 0) -> int:
+        """Make a framebuffer of colours and depths."""
+        GL, make, size = self._gl, self._resources, (self._width, self._height)
+        target = make.framebuffer()
+        make.renderbuffer(GL.GL_RGBA8, GL.GL_COLOR_ATTACHMENT0, samples, size)
+        make.renderbuffer(GL.GL_DEPTH_COMPONENT24, GL.GL_DEPTH_ATTACHMENT, samples, size)
+        make.check_framebuffer()
+        return target
 
     # --- draw -----------------------------------------------------------------------------------------------
 
@@ -155,10 +162,29 @@ class Rasterizer:
         self._send_view(model, data, camera)
         if self._send_geoms(model, data, discs) and self._shadows is not None:
             self._shadows.draw(self._table, self._view.block["light"])
-        self._draw_scene()
+        self._draw_scene(self._target, self._program)
         if discs:
             self._draw_discs(len(discs))
-        return self._read()
+        if self._result != self._target:
+            self._resolve()
+        return self._read(self._result)
+
+    def draw_geoms(self, model: mujoco.MjModel, data: mujoco.MjData, camera: int) -> NDArray[np.int64]:
+        """Return the id of the geom that each pixel of `draw` shows, (height, width), -1 for none; discs are no geoms.
+
+        One sample per pixel, in its middle, whatever the quality of pictures.
+        """
+        self._enter()
+        if self._geom_program is None:
+            self._geom_target = self._plain_target()
+            self._geom_program = self._resources.program(geom_program(self._gl))
+        self._send_view(model, data, camera)
+        if self._send_geoms(model, data, ()):
+            self._sent = None  # the shadows are still of another state
+        self._draw_scene(self._geom_target, self._geom_program)
+        codes = self._read(self._geom_target).astype(np.int64)
+        rows = codes[..., 0] + 256 * codes[..., 1] - 1
+        return np.where(rows >= 0, self._list.geoms[rows], -1)
 
     def _enter(self) -> None:
         """Set the context's state, which other renderers share."""
@@ -194,13 +220,13 @@ class Rasterizer:
         call.glBufferData(GL.GL_TEXTURE_BUFFER, self._table.nbytes, self._table.ctypes.data, GL.GL_STREAM_DRAW)
         return True
 
-    def _draw_scene(self) -> None:
+    def _draw_scene(self, target: int, program: int) -> None:
         GL, call = self._gl, self._call
-        call.glBindFramebuffer(GL.GL_FRAMEBUFFER, self._target)
+        call.glBindFramebuffer(GL.GL_FRAMEBUFFER, target)
         call.glViewport(0, 0, self._width, self._height)
         call.glClearColor(0.0, 0.0, 0.0, 1.0)
         call.glClear(GL.GL_COLOR_BUFFER_BIT | GL.GL_DEPTH_BUFFER_BIT)
-        call.glUseProgram(self._program)
+        call.glUseProgram(program)
         call.glFrontFace(GL.GL_CW)  # frames are drawn upside down
         call.glDrawElements(GL.GL_TRIANGLES, self._list.indices.size, GL.GL_UNSIGNED_INT, 0)
 
@@ -213,14 +239,17 @@ class Rasterizer:
         call.glDepthMask(GL.GL_TRUE)
         call.glDisable(GL.GL_BLEND)
 
-    def _read(self) -> Image:
+    def _resolve(self) -> None:
+        """Make one sample of a pixel's several."""
+        GL, call, size = self._gl, self._call, (self._width, self._height)
+        call.glBindFramebuffer(GL.GL_READ_FRAMEBUFFER, self._target)
+        call.glBindFramebuffer(GL.GL_DRAW_FRAMEBUFFER, self._result)
+        call.glBlitFramebuffer(0, 0, *size, 0, 0, *size, GL.GL_COLOR_BUFFER_BIT, GL.GL_NEAREST)
+
+    def _read(self, source: int) -> Image:
         GL, call = self._gl, self._call
         size = (self._width, self._height)
-        if self._result != self._target:
-            call.glBindFramebuffer(GL.GL_READ_FRAMEBUFFER, self._target)
-            call.glBindFramebuffer(GL.GL_DRAW_FRAMEBUFFER, self._result)
-            call.glBlitFramebuffer(0, 0, *size, 0, 0, *size, GL.GL_COLOR_BUFFER_BIT, GL.GL_NEAREST)
-        call.glBindFramebuffer(GL.GL_FRAMEBUFFER, self._result)
+        call.glBindFramebuffer(GL.GL_FRAMEBUFFER, source)
         call.glPixelStorei(GL.GL_PACK_ALIGNMENT, 1)
         image = np.empty((self._height, self._width, 3), dtype=np.uint8)
         call.glReadPixels(0, 0, *size, GL.GL_RGB, GL.GL_UNSIGNED_BYTE, image.ctypes.data)

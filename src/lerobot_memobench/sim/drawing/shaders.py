@@ -1,4 +1,4 @@
-"""The GLSL programs: a scene in MuJoCo's light, and the shadow map of one light."""
+"""The GLSL programs: a scene in MuJoCo's light, the shadow map of one light, and which geom a pixel shows."""
 
 from __future__ import annotations
 
@@ -87,6 +87,33 @@ _SHADOW_FRAGMENT_SHADER = """#version 140
 void main() {}
 """
 
+_GEOM_VERTEX_SHADER = """#version 140
+uniform samplerBuffer geoms;
+layout(std140) uniform Frame { mat4 light; mat4 projection; };
+in vec3 position;
+in float geom;
+out float code;
+void main() {
+    int row = 5 * int(geom + 0.5);
+    vec4 local = vec4(position, 1.0);
+    vec3 world = vec3(
+        dot(texelFetch(geoms, row), local),
+        dot(texelFetch(geoms, row + 1), local),
+        dot(texelFetch(geoms, row + 2), local));
+    code = geom + 1.0;
+    gl_Position = projection * vec4(world, 1.0);
+}
+"""
+
+_GEOM_FRAGMENT_SHADER = """#version 140
+in float code;
+out vec4 pixel;
+void main() {
+    float whole = floor(code + 0.5);
+    pixel = vec4(mod(whole, 256.0), floor(whole / 256.0), 0.0, 255.0) / 255.0;
+}
+"""
+
 ATTRIBUTES = ("position", "normal", "uv", "geom")
 """What a vertex has, by location."""
 
@@ -131,6 +158,11 @@ def scene_program(GL: Any, lights: int, caster: int | None) -> int:
 def shadow_program(GL: Any) -> int:
     """Compile the program that draws depths as a light sees them, and leave it in use."""
     return _program(GL, _SHADOW_VERTEX_SHADER, _SHADOW_FRAGMENT_SHADER)
+
+
+def geom_program(GL: Any) -> int:
+    """Compile the program that draws each geom in the colour of its row + 1, low byte red, high byte green."""
+    return _program(GL, _GEOM_VERTEX_SHADER, _GEOM_FRAGMENT_SHADER)
 
 
 def _program(GL: Any, vertex: str, fragment: str) -> int:

@@ -1,0 +1,64 @@
+"""What heads say, read off: the things of each picture, where they are, and how sure that is."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from lerobot_memobench.eyes.heads import GEOMETRY, Said
+
+FOUND = np.dtype(
+    [
+        ("kind", "u1"),
+        ("score", "<f4"),
+        ("place", "<f4", 2),
+        ("depth", "<f4"),
+        ("height", "<f4"),
+        ("joint", "<f4"),
+        ("turn", "<f4", 2),
+    ]
+)
+"""A thing that was found. ``score``: probability. ``place``: of its origin in the picture, a fraction of its side from
+the upper left corner. The others as `heads.GEOMETRY` has them."""
+SURE = 0.3
+"""Probability from which on a thing counts as found."""
+MOST = 32
+"""Things that are looked for in a picture."""
+
+
+def found(said: Said) -> list[NDArray[np.void]]:
+    """Return the things (n,) of dtype `FOUND` that each picture shows, the surest first."""
+    heat = torch.sigmoid(said.heat)
+    peaks = torch.where(heat == max_pool2d(heat, 3, 1, 1), heat, torch.zeros(()))
+    side = heat.shape[-1]
+    scores, places = peaks.flatten(1).topk(MOST, dim=1)
+    picture, rank = torch.nonzero(scores > SURE, as_tuple=True)
+    place = places[picture, rank]
+    kind, row, column = place // side**2, place // side % side, place % side
+    geometry = _between(said.geometry, picture, kind, (row + 0.5) / side, (column + 0.5) / side)
+    things = np.zeros(len(picture), FOUND)
+    things["kind"], things["score"] = kind.numpy(), scores[picture, rank].detach().numpy()
+    things["place"] = geometry[:, :2]
+    for name in ("depth", "height", "joint"):
+        things[name] = geometry[:, GEOMETRY.index(name)]
+    things["turn"] = geometry[:, -2:]
+    owner = picture.numpy()
+    return [things[owner == number] for number in range(len(heat))]
+
+
+def _between(geometry: Tensor, picture: Tensor, kind: Tensor, down: Tensor, across: Tensor) -> NDArray[np.float32]:
+    """Return what the four cells around places say, (n, len(GEOMETRY)), the nearer the more; offsets made places."""
+    side = geometry.shape[-1]
+    y, x = down * side - 0.5, across * side - 0.5
+    whole, total = torch.zeros(len(y), len(GEOMETRY)), torch.zeros(len(y), 1)
+    for row, column in ((y.floor() + a, x.floor() + b) for a in (0, 1) for b in (0, 1)):
+        inside = (row >= 0) & (row < side) & (column >= 0) & (column < side)
+        weight = (inside * (1 - (y - row).abs()) * (1 - (x - column).abs()))[:, None]
+        at = (picture, kind, slice(None), row.long().clamp(0, side - 1), column.long().clamp(0, side - 1))
+        said = geometry[at].detach().clone()
+        said[:, :2] = (said[:, :2] + torch.stack([column, row], dim=1) + 0.5) / side
+        whole, total = whole + weight * said, total + weight
+    return np.asarray((whole / total).numpy())

@@ -1,0 +1,67 @@
+"""Heads: what a token says of its part of the picture, read off by linear maps alone.
+
+What policies are given are the tokens; that linear maps can read all of this from them is what makes them good.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from einops import rearrange
+from torch import Tensor, nn
+
+FINE, COARSE = 4, 2
+"""Cells along a token's side: of heat and mask, and of geometry."""
+GEOMETRY = ("across", "down", "depth", "height", "joint", "turn cosine", "turn sine")
+"""What is said of a thing of each kind in each coarse cell. ``across``, ``down``: from the cell's middle to its origin,
+in cells. ``depth``: of its origin along the camera's view, m. ``height``: of its origin over the table, m. ``joint``:
+of a moving part, m or rad. ``turn``: of twice the angle at which its x axis lies in the picture, see `labels.THING`."""
+RARE = 0.01
+"""Probability of a thing in a cell that an untrained head says."""
+
+
+@dataclass(frozen=True)
+class Said:
+    """What heads say of pictures.
+
+    Attributes:
+        heat: (N, kinds, 4 grid, 4 grid), logit that a thing's visible middle is there.
+        geometry: (N, kinds, len(GEOMETRY), 2 grid, 2 grid).
+        mask: (N, kinds + 1, 4 grid, 4 grid), logits of what is shown, first of nothing.
+    """
+
+    heat: Tensor
+    geometry: Tensor
+    mask: Tensor
+
+
+class Heads(nn.Module):
+    """Linear maps from tokens to what they show.
+
+    Args:
+        width: of a token. kinds: how many kinds of things there are. grid: side of the square of tokens.
+    """
+
+    def __init__(self, width: int, kinds: int, grid: int) -> None:
+        super().__init__()
+        self.grid = grid
+        self.heat = nn.Linear(width, kinds * FINE**2)
+        self.geometry = nn.Linear(width, kinds * len(GEOMETRY) * COARSE**2)
+        self.mask = nn.Linear(width, (kinds + 1) * FINE**2)
+        nn.init.constant_(self.heat.bias, float(torch.logit(torch.tensor(RARE))))
+
+    def forward(self, tokens: Tensor) -> Said:
+        """Say what tokens (N, grid * grid, width) show."""
+        geometry = self._spread(self.geometry(tokens), COARSE)
+        return Said(
+            self._spread(self.heat(tokens), FINE),
+            rearrange(geometry, "n (k v) y x -> n k v y x", v=len(GEOMETRY)),
+            self._spread(self.mask(tokens), FINE),
+        )
+
+    def _spread(self, values: Tensor, cells: int) -> Tensor:
+        """Lay what each token says of its cells out as a picture, (N, values, grid * cells, grid * cells), float32."""
+        return rearrange(
+            values.float(), "n (gy gx) (v y x) -> n v (gy y) (gx x)", gy=self.grid, gx=self.grid, y=cells, x=cells
+        )

@@ -1,0 +1,156 @@
+"""What a test of eyes found, as one table, as numbers, and as pictures with the found things drawn into them."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from lerobot_memobench.datasets.lerobot_format.card_tables import markdown as table
+from lerobot_memobench.eyes.kinds import DRAWERS, PARTS
+from lerobot_memobench.eyes.labels import SIDE, Rows, projected
+from lerobot_memobench.eyes.testing import SHOWN, Things
+from lerobot_memobench.files import draft_of, write_file
+from lerobot_memobench.sim.simulation import CAMERAS
+
+VIEWS = ("third person", "wrist", "wrist, hand within 15 cm")
+TABLE, NUMBERS, PICTURE = "eyes_test.md", "eyes_test.json", "eyes_test.png"
+SCALE, COLUMNS = 2, 6
+"""How much larger pictures are drawn, and how many stand in a row."""
+
+
+@dataclass(frozen=True)
+class Tested:
+    """A test of eyes.
+
+    Attributes:
+        kinds: names. told: outcomes by all tokens, (n,) of dtype `testing.OUTCOME`; pooled: by the pooled ones.
+        false: false finds per picture. pictures: how many were looked at. milliseconds: of one core for a picture.
+    """
+
+    kinds: Sequence[str]
+    told: Things
+    pooled: Things
+    false: float
+    pictures: int
+    milliseconds: float
+
+
+def in_view(told: Things, view: int) -> Things:
+    """Return the outcomes of one of `VIEWS`."""
+    third = told["camera"] == list(CAMERAS).index("agentview")
+    return told[(third, ~third, ~third & told["near"])[view]]
+
+
+def figures(told: Things) -> dict[str, float | int | None]:
+    """Return how many things were shown, the share found, and errors; what is not found is infinitely far off."""
+    return {
+        "shown": len(told),
+        "found": float(np.isfinite(told["error"]).mean()) if len(told) else None,
+        "median_cm": _rank(told["error"], 50),
+        "p90_cm": _rank(told["error"], 90),
+        "space_median_cm": _rank(told["space"], 50),
+        "turn_median_deg": _rank(told["turn"][~np.isnan(told["turn"])], 50),
+    }
+
+
+def _rank(values: NDArray[Any], percent: int) -> float | None:
+    """A percentile, None where it is infinite or of nothing."""
+    found = float(np.percentile(values, percent, method="higher")) if len(values) else math.inf
+    return round(found, 4) if math.isfinite(found) else None
+
+
+def numbers(tested: Tested) -> dict[str, Any]:
+    """Return the whole test as JSON has it; errors that are infinite are null."""
+    groups = [("all", tested.told), ("all, pooled tokens", tested.pooled)]
+    groups += [(name, tested.told[tested.told["kind"] == kind]) for kind, name in enumerate(tested.kinds)]
+    rows = [
+        {"kind": name, "view": VIEWS[view], **figures(in_view(told, view))}
+        for name, told in groups
+        for view in range(len(VIEWS))
+        if len(in_view(told, view))
+    ]
+    return {
+        "pictures": tested.pictures,
+        "least_pixels": SHOWN,
+        "ms_per_picture": round(tested.milliseconds, 2),
+        "false_finds_per_picture": round(tested.false, 3),
+        "rows": rows,
+        "joints": [row for kind, name in enumerate(PARTS) for row in _joint_rows(tested.told, kind, name)],
+    }
+
+
+def _joint_rows(told: Things, kind: int, name: str) -> list[dict[str, Any]]:
+    found = told[(told["kind"] == kind) & ~np.isnan(told["joint"])]
+    return [
+        {
+            "part": name,
+            "view": VIEWS[view],
+            "unit": "cm" if kind < len(DRAWERS) else "rad",
+            "found": len(in_view(found, view)),
+            "median": _rank(in_view(found, view)["joint"], 50),
+            "p90": _rank(in_view(found, view)["joint"], 90),
+        }
+        for view in range(len(VIEWS))
+        if len(in_view(found, view))
+    ]
+
+
+def markdown(test: dict[str, Any]) -> str:
+    """Return the table of a test's numbers: error in cm, median / 90th percentile (share found), by kind and view."""
+    cells: dict[str, dict[str, str]] = {}
+    for row in test["rows"]:
+        text = f"{_text(row['median_cm'])} / {_text(row['p90_cm'])} ({row['found']:.3f} of {row['shown']})"
+        cells.setdefault(row["kind"], {})[row["view"]] = text
+    for row in test["joints"]:
+        text = f"{_text(row['median'], 3)} / {_text(row['p90'], 3)} {row['unit']}"
+        cells.setdefault(f"{row['part']}: joint", {})[row["view"]] = text
+    rows = [[name, *(found.get(view, "") for view in VIEWS)] for name, found in cells.items()]
+    said = (
+        f"Median / 90th percentile (share found of how many shown by {test['least_pixels']} pixels or more), in "
+        f"{test['pictures']} pictures; – is infinite: not found. {test['false_finds_per_picture']} false finds per "
+        f"picture, {test['ms_per_picture']} ms per picture on one core."
+    )
+    return f"{said}\n\n{table(['error, cm', *VIEWS], rows)}\n"
+
+
+def _text(value: float | None, digits: int = 2) -> str:
+    return "–" if value is None else f"{value:.{digits}f}"
+
+
+def drawn(rows: Rows, finds: Sequence[Things], kinds: Sequence[str]) -> Image.Image:
+    """Return pictures beside one another: found things as green rings with their names, the true places as crosses."""
+    side = SCALE * SIDE
+    sheet = Image.new("RGB", (COLUMNS * side, -(-len(rows) // COLUMNS) * side))
+    for index, (row, things) in enumerate(zip(rows, finds, strict=True)):
+        picture = Image.fromarray(row["pixels"].transpose(1, 2, 0)).resize((side, side))
+        pen = ImageDraw.Draw(picture)
+        shown = row["things"][: row["count"]]
+        for x, y in side * projected(shown["position"][shown["pixels"] >= SHOWN].astype(np.float64), row)[0]:
+            pen.line((x - 3, y, x + 3, y), "white")
+            pen.line((x, y - 3, x, y + 3), "white")
+        for thing in things:
+            x, y = side * thing["place"].astype(float)
+            pen.ellipse((x - 5, y - 5, x + 5, y + 5), outline="lime")
+            pen.text((x + 7, y - 6), kinds[thing["kind"]].replace("_", " "), "yellow")
+        sheet.paste(picture, (index % COLUMNS * side, index // COLUMNS * side))
+    return sheet
+
+
+def write_report(tested: Tested, sheet: Image.Image, folder: Path) -> str:
+    """Write table, numbers and picture to a folder; return the table."""
+    folder.mkdir(parents=True, exist_ok=True)
+    found = numbers(tested)
+    write_file(folder / NUMBERS, json.dumps(found, indent=1, allow_nan=False))
+    with draft_of(folder / PICTURE) as draft:
+        sheet.save(draft, "png")
+    text = markdown(found)
+    write_file(folder / TABLE, text)
+    return text

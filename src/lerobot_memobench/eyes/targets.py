@@ -1,0 +1,120 @@
+"""What heads should say of labelled pictures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import cross_entropy, logsigmoid
+
+from lerobot_memobench.eyes.heads import COARSE, FINE, GEOMETRY, Said
+from lerobot_memobench.eyes.labels import MASK, Rows, projected
+from lerobot_memobench.sim.scene import TABLE_TOP
+
+LEAST = 15
+"""Pixels of the rendered picture that must show a thing for it to be taught."""
+SIGMA, SPREAD = 0.8, 2
+"""How far a thing's heat reaches: standard deviation and half side, in cells."""
+SCALES = (1.0, 1.0, 5.0, 5.0, 10.0, 0.3, 0.3)
+"""What an error of one is worth, for each of `GEOMETRY`: cells, metres (radians), and parts of a circle."""
+REACH = 4.0
+"""Cells from which on a place is no farther: of a large thing of which a corner shows."""
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Targets:
+    """What heads of a grid should say of a batch of pictures.
+
+    Attributes:
+        heat: (N, kinds, 4 grid, 4 grid), 1 at a thing's visible middle, falling off around it.
+        cells: (n, 4) of things near coarse cells: picture, kind, row, column.
+        geometry: (n, len(GEOMETRY)) of those, NaN where nothing is asked. weights: (n,).
+        mask: (N, 4 grid, 4 grid), kind + 1 of what is shown, 0 for nothing.
+    """
+
+    heat: Tensor
+    cells: Tensor
+    geometry: Tensor
+    weights: Tensor
+    mask: Tensor
+
+
+def targets(rows: Rows, kinds: int, grid: int) -> Targets:
+    """Return what heads of a grid should say of pictures (N,)."""
+    pictures, places = np.nonzero(
+        (np.arange(rows["things"].shape[1]) < rows["count"][:, None]) & (rows["things"]["pixels"] >= LEAST)
+    )
+    things = rows["things"][pictures, places]
+    cells, geometry, weights = _geometry(rows, things, pictures, COARSE * grid)
+    step = MASK // (FINE * grid)
+    mask = rows["mask"][:, step // 2 :: step, step // 2 :: step].astype(np.int64)
+    return Targets(
+        torch.from_numpy(_heat(things, pictures, (len(rows), kinds, FINE * grid, FINE * grid))),
+        torch.from_numpy(cells),
+        torch.from_numpy(geometry.astype(np.float32)),
+        torch.from_numpy(weights.astype(np.float32)),
+        torch.from_numpy(mask),
+    )
+
+
+def _heat(things: Rows, pictures: NDArray[np.int64], shape: tuple[int, int, int, int]) -> NDArray[np.float32]:
+    heat, side = np.zeros(shape, np.float32), shape[-1]
+    cell = np.clip((things["anchor"] * side).astype(np.int64), 0, side - 1)
+    for down in range(-SPREAD, SPREAD + 1):
+        for across in range(-SPREAD, SPREAD + 1):
+            x, y = cell[:, 0] + across, cell[:, 1] + down
+            inside = (x >= 0) & (x < side) & (y >= 0) & (y < side)
+            where = (pictures[inside], things["kind"][inside].astype(np.int64), y[inside], x[inside])
+            np.maximum.at(heat, where, np.float32(np.exp(-(across**2 + down**2) / (2 * SIGMA**2))))
+    return heat
+
+
+def _geometry(
+    rows: Rows, things: Rows, pictures: NDArray[np.int64], side: int
+) -> tuple[NDArray[np.int64], Array, Array]:
+    """Return the four cells around each visible middle, (n, 4), what is asked there and how much that counts."""
+    place, depth = projected(things["position"].astype(np.float64), rows[pictures])
+    facts = np.column_stack([depth, things["position"][:, 2] - TABLE_TOP, things["joint"], things["turn"]])
+    corner = np.floor(things["anchor"] * side - 0.5).astype(np.int64)
+    found: list[tuple[NDArray[np.int64], Array, Array]] = []
+    for offset in np.ndindex(2, 2):
+        cell = corner + np.array(offset)
+        far = np.abs(things["anchor"] * side - 0.5 - cell)
+        from_middle = np.clip(place * side - 0.5 - cell, -REACH, REACH)
+        index = np.column_stack([pictures, things["kind"], cell[:, 1], cell[:, 0]]).astype(np.int64)
+        found.append((index, np.column_stack([from_middle, facts]), np.prod(1 - far, axis=1)))
+    cells, geometry, weights = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    inside = ((cells[:, 2:] >= 0) & (cells[:, 2:] < side)).all(axis=1)
+    order = np.argsort(-weights[inside], kind="stable")  # of two of a kind in a cell the nearer is asked for
+    cells, geometry, weights = cells[inside][order], geometry[inside][order], weights[inside][order]
+    _, first = np.unique(cells, axis=0, return_index=True)
+    return cells[first], geometry[first], weights[first]
+
+
+def loss(said: Said, wanted: Targets) -> dict[str, Tensor]:
+    """Return the losses (scalars) of what heads said: ``heat``, ``place``, ``rest`` and ``mask``."""
+    picture, kind, row, column = wanted.cells.T
+    asked = said.geometry[picture, kind, :, row, column]
+    error = (asked - wanted.geometry).abs() * torch.tensor(SCALES)
+    error = torch.where(wanted.geometry.isnan(), torch.zeros(()), error) * wanted.weights[:, None]
+    each = error.sum(dim=0) / wanted.weights.sum().clamp(min=1.0)
+    known = GEOMETRY.index("depth")
+    return {
+        "heat": _heat_loss(said.heat, wanted.heat),
+        "place": each[:known].sum(),
+        "rest": each[known:].sum(),
+        "mask": cross_entropy(said.mask, wanted.mask),
+    }
+
+
+def _heat_loss(logits: Tensor, heat: Tensor) -> Tensor:
+    """CenterNet's focal loss: near a middle less is asked of a cell than far from it."""
+    there = heat == 1
+    likely = torch.sigmoid(logits.detach())
+    weight = torch.where(there, (1 - likely) ** 2, (1 - heat) ** 4 * likely**2)
+    return -(weight * logsigmoid(torch.where(there, logits, -logits))).sum() / there.sum().clamp(min=1)

@@ -1,0 +1,146 @@
+"""How well eyes see pictures they have never seen: every shown thing, whether it was found, and how far off."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from lerobot_memobench.eyes.finding import found
+from lerobot_memobench.eyes.kinds import DRAWERS
+from lerobot_memobench.eyes.labels import Rows, projected, rays
+from lerobot_memobench.eyes.pictures import Pictures
+from lerobot_memobench.eyes.tower import Tower, shrunk
+from lerobot_memobench.eyes.walk import NEAR
+from lerobot_memobench.eyes.weights import Eyes
+from lerobot_memobench.sim.scene import TABLE_TOP
+from lerobot_memobench.sim.simulation import CAMERAS
+
+SHOWN = 30
+"""Pixels of the rendered picture (256 x 256) from which on a thing should be found."""
+FAR = 5.0
+"""Error from which on something else was found, cm."""
+BATCH = 32
+
+OUTCOME = np.dtype(
+    [
+        ("kind", "u1"),
+        ("camera", "u1"),
+        ("scene", "u1"),
+        ("near", "?"),
+        ("error", "<f4"),
+        ("space", "<f4"),
+        ("joint", "<f4"),
+        ("turn", "<f4"),
+    ]
+)
+"""What became of a thing that a picture shows. ``near``: the hand is within `NEAR`. ``error``, cm, infinite where it
+was not found: for the third-person camera on the level plane of its origin, for the wrist's across the line of sight.
+``space``: of its place in the world by the found depth (wrist) or height (third person), cm. ``joint``: cm or rad;
+``turn``: degrees. Both NaN where there is nothing to say."""
+
+Things = NDArray[np.void]
+See = Callable[[Rows], list[Things]]
+"""From pictures to what was found in each, of dtype `finding.FOUND`."""
+Array = NDArray[np.float64]
+
+
+def seeing(eyes: Eyes, *, pooled: bool = False) -> See:
+    """Return how eyes see pictures, by all tokens or by the pooled ones."""
+
+    @torch.inference_mode()
+    def see(rows: Rows) -> list[Things]:
+        images = torch.from_numpy(rows["pixels"]).float() / 255
+        return found(eyes(images)[int(pooled)])
+
+    return see
+
+
+def outcomes(see: See, pictures: Pictures) -> tuple[Things, float]:
+    """Return what became of every shown thing, (n,) of dtype `OUTCOME`, and false finds per picture."""
+    told, false = [np.zeros(0, OUTCOME)], 0
+    for start in range(0, len(pictures), BATCH):
+        rows = pictures.rows(np.arange(start, min(start + BATCH, len(pictures))))
+        for row, finds in zip(rows, see(rows), strict=True):
+            things = row["things"][: row["count"]]
+            matched = _matched(row, things, finds)
+            false += len(finds) - int((matched >= 0).sum())
+            told.append(_told(row, things, finds, matched)[things["pixels"] >= SHOWN])
+    return np.concatenate(told), false / max(1, len(pictures))
+
+
+def _matched(row: Rows, things: Things, finds: Things) -> NDArray[np.int64]:
+    """Return for each thing which find is of it, -1 for none: of its kind, each at most once, the nearest in all."""
+    matched = np.full(len(things), -1)
+    for kind in np.intersect1d(things["kind"], finds["kind"]):
+        mine, theirs = np.flatnonzero(things["kind"] == kind), np.flatnonzero(finds["kind"] == kind)
+        far = np.minimum(_errors(row, things[mine][:, None], finds[theirs][None]), FAR)
+        for thing, find in zip(*linear_sum_assignment(far), strict=True):
+            if far[thing, find] < FAR:
+                matched[mine[thing]] = theirs[find]
+    return matched
+
+
+def _errors(row: Rows, things: Things, finds: Things) -> Array:
+    """Return how far off finds (broadcast with things) are, cm: see `OUTCOME`."""
+    sight = rays(finds["place"].astype(np.float64), row)
+    position = things["position"].astype(np.float64)
+    if row["camera"] == list(CAMERAS).index("wrist"):
+        at = row["eye"] + sight * projected(position, row)[1][..., None]
+    else:
+        at = _on_plane(row, sight, position[..., 2])
+    return np.asarray(100 * np.linalg.norm(at - position, axis=-1))
+
+
+def _on_plane(row: Rows, sight: Array, height: Array) -> Array:
+    """Return where lines of sight (..., 3) meet level planes; far away where they look up."""
+    down = np.minimum(sight[..., 2], -1e-3)
+    return np.asarray(row["eye"] + sight * ((height - row["eye"][2]) / down)[..., None])
+
+
+def _told(row: Rows, things: Things, finds: Things, matched: NDArray[np.int64]) -> Things:
+    """Return the outcome of each thing of a picture."""
+    told = np.zeros(len(things), OUTCOME)
+    told["kind"], told["camera"], told["scene"] = things["kind"], row["camera"], row["scene"]
+    told["near"] = np.linalg.norm(things["position"] - row["hand"], axis=1) <= NEAR
+    told["error"] = told["space"] = np.inf
+    told["joint"] = told["turn"] = np.nan
+    there = matched >= 0
+    mine, theirs = things[there], finds[matched[there]]
+    told["error"][there] = _errors(row, mine, theirs)
+    told["space"][there] = 100 * np.linalg.norm(_in_space(row, theirs) - mine["position"], axis=1)
+    unit = np.where(mine["kind"] < len(DRAWERS), 100.0, 1.0)
+    told["joint"][there] = unit * np.abs(theirs["joint"] - mine["joint"])
+    angles = [np.arctan2(turn[:, 1], turn[:, 0]) for turn in (theirs["turn"], mine["turn"])]
+    told["turn"][there] = np.degrees(np.abs(np.angle(np.exp(1j * (angles[0] - angles[1]))))) / 2
+    return told
+
+
+def _in_space(row: Rows, finds: Things) -> Array:
+    sight = rays(finds["place"].astype(np.float64), row)
+    if row["camera"] == list(CAMERAS).index("wrist"):
+        return np.asarray(row["eye"] + sight * finds["depth"][:, None])
+    return _on_plane(row, sight, TABLE_TOP + finds["height"])
+
+
+def milliseconds(tower: Tower, rounds: int = 30) -> float:
+    """Return how long the tower takes for a picture of 256 x 256 on one core: the median, both cameras' at once."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with torch.inference_mode():
+            pictures = torch.randint(0, 256, (len(CAMERAS), 3, 256, 256), dtype=torch.uint8)
+            tower(shrunk(pictures) / 255)
+            return float(np.median([_once(tower, pictures) for _ in range(rounds)]))
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _once(tower: Tower, pictures: torch.Tensor) -> float:
+    began = time.process_time()
+    tower(shrunk(pictures) / 255)
+    return 1000 * (time.process_time() - began) / len(pictures)

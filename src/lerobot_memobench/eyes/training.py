@@ -1,0 +1,183 @@
+"""Eyes learn from labelled pictures; a run that was stopped goes on where it was."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.eyes.curve import draw_curve
+from lerobot_memobench.eyes.labels import Rows
+from lerobot_memobench.eyes.pictures import Pictures
+from lerobot_memobench.eyes.targets import loss, targets
+from lerobot_memobench.eyes.tower import GRID, POOLED, Tower
+from lerobot_memobench.eyes.weights import Eyes, save_eyes
+from lerobot_memobench.files import draft_of
+
+CHECKPOINT, WEIGHTS, CURVE = "training.pt", "eyes.safetensors", "training_curve.png"
+SHARES = {"heat": 1.0, "place": 2.0, "rest": 1.0, "mask": 0.5}
+"""What each loss counts."""
+OF_POOLED = 0.5
+"""What the losses of the pooled tokens count beside the others."""
+GAIN, SHIFT, NOISE = 0.12, 0.06, 0.02
+"""Changes of pictures: largest gain of each colour and shift of all, and the noise's standard deviation at most, as
+shares of white. Videos change colours and edges about as much."""
+WINDOW = 10
+"""Updates that one point of the curve is the mean of."""
+CLIP = 5.0
+"""Norm that a gradient is cut to."""
+
+Progress = Callable[[int, int, str], None]
+"""Told of updates done, of how many, and of the newest losses."""
+
+
+@dataclass(frozen=True)
+class Training:
+    """What a training depends on besides its pictures.
+
+    Attributes:
+        updates: how many. batch: pictures of each. rate: highest learning rate; it rises for a twentieth of the updates
+            and falls as a cosine. decay: of the weights. seed: of weights, order and changes of pictures.
+    """
+
+    updates: int = 2500
+    batch: int = 64
+    rate: float = 2e-3
+    decay: float = 0.02
+    seed: int = 0
+
+
+def train(
+    pictures: Pictures,
+    kinds: tuple[str, ...],
+    folder: Path,
+    settings: Training,
+    *,
+    tower: Callable[[], Tower] = Tower,
+    save_every: int = 50,
+    progress: Progress | None = None,
+) -> Path:
+    """Train eyes, or go on with the training that a folder holds; return the file of their weights.
+
+    Args:
+        pictures: with labels. kinds: names of the things in them. folder: gets checkpoint, curve and weights.
+        tower: makes the one to train. save_every: updates between two checkpoints.
+
+    Raises:
+        MemobenchError: the folder's training has other settings.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    torch.manual_seed(settings.seed)
+    learner = _Learner(Eyes(tower(), kinds), settings, len(pictures))
+    learner.restore(folder / CHECKPOINT)
+    while learner.update < settings.updates:
+        learner.learn(pictures.rows(learner.order()))
+        if learner.update % save_every == 0 or learner.update == settings.updates:
+            learner.save(folder)
+        if progress is not None and learner.update % WINDOW == 0:
+            newest = ", ".join(f"{name} {value:.3f}" for name, value in learner.points[-1].items())
+            progress(learner.update, settings.updates, newest)
+    save_eyes(learner.eyes, folder / WEIGHTS)
+    return folder / WEIGHTS
+
+
+class _Learner:
+    """Eyes and all that decides how they go on."""
+
+    def __init__(self, eyes: Eyes, settings: Training, pictures: int) -> None:
+        self.eyes, self._settings, self._pictures = eyes, settings, pictures
+        eyes.to(memory_format=torch.channels_last)
+        self._optimizer = torch.optim.AdamW(eyes.parameters(), settings.rate, weight_decay=settings.decay)
+        self._schedule = torch.optim.lr_scheduler.OneCycleLR(
+            self._optimizer, settings.rate, settings.updates, pct_start=0.05, cycle_momentum=False
+        )
+        self.update = 0
+        self.points: list[dict[str, float]] = []
+        self._window: list[Mapping[str, Tensor]] = []
+
+    def order(self) -> NDArray[np.int64]:
+        """Return the numbers of the pictures of the next update: all of them once, then all in another order."""
+        size = min(self._settings.batch, self._pictures)
+        epoch, place = divmod(self.update, self._pictures // size)
+        return _permutation(self._settings.seed, epoch, self._pictures)[place * size : (place + 1) * size]
+
+    def learn(self, rows: Rows) -> None:
+        """Make one update."""
+        self.eyes.train()
+        losses = self._losses(rows)
+        total = torch.stack([SHARES[name.removeprefix("pooled ")] * value for name, value in losses.items()])
+        weights = torch.tensor([OF_POOLED if name.startswith("pooled ") else 1.0 for name in losses])
+        self._optimizer.zero_grad()
+        (total * weights).sum().backward()
+        torch.nn.utils.clip_grad_norm_(self.eyes.parameters(), CLIP)
+        self._optimizer.step()
+        self._schedule.step()
+        self.update += 1
+        self._window.append({name: value.detach() for name, value in losses.items()})
+        if len(self._window) == WINDOW:
+            names = self._window[0]
+            self.points.append({name: float(np.mean([float(one[name]) for one in self._window])) for name in names})
+            self._window = []
+
+    def _losses(self, rows: Rows) -> dict[str, Tensor]:
+        chance = torch.Generator().manual_seed(self._settings.seed * 2**32 + self.update)
+        images = changed(torch.from_numpy(rows["pixels"]).float() / 255, chance)
+        with torch.autocast("cpu", torch.bfloat16):
+            said, said_pooled = self.eyes(images)
+        kinds = len(self.eyes.kinds)
+        pooled = loss(said_pooled, targets(rows, kinds, POOLED))
+        return {**loss(said, targets(rows, kinds, GRID)), **{f"pooled {name}": one for name, one in pooled.items()}}
+
+    def save(self, folder: Path) -> None:
+        """Write checkpoint and curve."""
+        state = {
+            "settings": asdict(self._settings),
+            "pictures": self._pictures,
+            "eyes": self.eyes.state_dict(),
+            "optimizer": self._optimizer.state_dict(),
+            "schedule": self._schedule.state_dict(),
+            "update": self.update,
+            "points": self.points,
+            "window": self._window,
+        }
+        with draft_of(folder / CHECKPOINT) as draft:
+            torch.save(state, draft)
+        draw_curve(self.points, WINDOW, folder / CURVE)
+
+    def restore(self, path: Path) -> None:
+        """Go on from a checkpoint, if there is one."""
+        if not path.is_file():
+            return
+        state: dict[str, Any] = torch.load(path, weights_only=True)
+        if (state["settings"], state["pictures"]) != (asdict(self._settings), self._pictures):
+            raise MemobenchError(
+                f"{path} is of a training with {state['settings']} and {state['pictures']} pictures, and now "
+                f"{asdict(self._settings)} and {self._pictures} are asked for; ask for the same, or take another folder"
+            )
+        self.eyes.load_state_dict(state["eyes"])
+        self._optimizer.load_state_dict(state["optimizer"])
+        self._schedule.load_state_dict(state["schedule"])
+        self.update, self.points, self._window = state["update"], state["points"], state["window"]
+
+
+@lru_cache(maxsize=1)
+def _permutation(seed: int, epoch: int, count: int) -> NDArray[np.int64]:
+    return np.random.default_rng([seed, epoch]).permutation(count)
+
+
+def changed(images: Tensor, chance: torch.Generator) -> Tensor:
+    """Return pictures (N, 3, H, W) in [0, 1] in another light and with noise, each by itself."""
+
+    def draw(channels: int) -> Tensor:
+        return 2 * torch.rand(len(images), channels, 1, 1, generator=chance) - 1
+
+    images = images * (1 + GAIN * draw(3)) + SHIFT * draw(1)
+    return (images + NOISE * draw(1).abs() * torch.randn(images.shape, generator=chance)).clamp(0, 1)

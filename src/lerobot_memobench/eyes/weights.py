@@ -1,0 +1,66 @@
+"""Eyes as a file: tower and heads in bfloat16, with the names of the kinds that the heads tell apart."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor, nn
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.eyes.heads import Heads, Said
+from lerobot_memobench.eyes.tower import GRID, POOLED, Tower
+from lerobot_memobench.files import write_file
+
+
+class Eyes(nn.Module):
+    """Tower and heads.
+
+    Args:
+        tower: makes the tokens. kinds: names of the kinds of things that the heads tell apart.
+
+    Attributes:
+        heads, pooled_heads: of the 64 tokens, and of the 16 pooled ones.
+    """
+
+    def __init__(self, tower: Tower, kinds: tuple[str, ...]) -> None:
+        super().__init__()
+        self.tower, self.kinds = tower, kinds
+        self.heads = Heads(tower.width, len(kinds), GRID)
+        self.pooled_heads = Heads(tower.width, len(kinds), POOLED)
+
+    def forward(self, images: Tensor) -> tuple[Said, Said]:
+        """Say what pictures (N, 3, SIDE, SIDE) in [0, 1] show, by all tokens and by the pooled ones."""
+        tokens = self.tower(images)
+        return self.heads(tokens), self.pooled_heads(self.tower.pooled(tokens))
+
+
+def save_eyes(eyes: Eyes, path: Path) -> None:
+    """Write eyes to a file, batch normalisation folded into the convolutions: they learn no more."""
+    eyes.tower.fold()
+    tensors = {name: value.detach().to(torch.bfloat16).contiguous() for name, value in eyes.state_dict().items()}
+    shape = {"widths": eyes.tower.widths, "blocks": eyes.tower.blocks, "kinds": eyes.kinds}
+    write_file(path, save(tensors, {"eyes": json.dumps(shape)}))
+
+
+def load_eyes(path: Path) -> Eyes:
+    """Return the eyes of a file, in float32, in evaluation.
+
+    Raises:
+        MemobenchError: the file is not there, or was not written by `save_eyes`.
+    """
+    if not path.is_file():
+        raise MemobenchError(f"there is no file {path}; name one that `memobench eyes train` has written")
+    try:
+        with safe_open(path, framework="pt") as file:
+            shape = json.loads(file.metadata()["eyes"])
+            tensors = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118 (not a dict)
+        eyes = Eyes(Tower(tuple(shape["widths"]), tuple(shape["blocks"]), folded=True), tuple(shape["kinds"]))
+        eyes.load_state_dict(tensors)
+    except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        reason = str(error).splitlines()[0]
+        raise MemobenchError(f"{path} holds no eyes ({reason}); name a file of `memobench eyes train`") from None
+    return eyes.eval().to(memory_format=torch.channels_last)

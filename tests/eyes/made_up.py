@@ -1,0 +1,40 @@
+"""Labelled pictures without a simulator: bright squares on a dark ground, seen straight from above."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lerobot_memobench.eyes.labels import MASK, PICTURE, Rows, rays
+from lerobot_memobench.eyes.tower import SIDE
+from lerobot_memobench.sim.scene import TABLE_TOP
+from lerobot_memobench.sim.simulation import CAMERAS
+
+HEIGHT, SLOPE, HALF = 0.8, 0.4, 6
+"""Of the camera over the table, m; tangent of half its field of view; half a square's side, pixels."""
+
+
+def made_up(count: int, kinds: int = 3, *, camera: str = "agentview", seed: int = 0) -> Rows:
+    """Return pictures (count,) that show one square of each kind, in a colour and a third of the picture of its own."""
+    rng = np.random.default_rng(seed)
+    rows = np.zeros(count, PICTURE)
+    rows["pixels"] = rng.integers(0, 40, rows["pixels"].shape)
+    rows["camera"], rows["count"] = list(CAMERAS).index(camera), kinds
+    rows["eye"], rows["turned"], rows["slope"] = (0.0, 0.0, TABLE_TOP + HEIGHT), np.eye(3), SLOPE
+    for row in rows:
+        for kind in range(kinds):
+            _show(row, kind, kinds, rng)
+    return rows
+
+
+def _show(row: Rows, kind: int, kinds: int, rng: np.random.Generator) -> None:
+    third = SIDE / kinds
+    x, y = rng.uniform(kind * third + HALF, (kind + 1) * third - HALF), rng.uniform(HALF, SIDE - HALF)
+    place, angle = np.array([x, y]) / SIDE, rng.uniform(-np.pi, np.pi)
+    box = (slice(int(y) - HALF + 1, int(y) + HALF), slice(int(x) - HALF + 1, int(x) + HALF))
+    row["pixels"][:, *box] = 60
+    row["pixels"][kind, *box] = 250
+    step = SIDE // MASK
+    row["mask"][box[0].start // step : box[0].stop // step, box[1].start // step : box[1].stop // step] = kind + 1
+    position = row["eye"] + rays(place, row) * HEIGHT
+    turn = (np.cos(angle), np.sin(angle))
+    row["things"][kind] = (kind, 400, place, position, 0.1 * kind if kind < 2 else np.nan, turn)

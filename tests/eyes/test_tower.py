@@ -1,0 +1,86 @@
+"""The tower: its sizes, what folding and the file leave as it was, and that pooled tokens know their place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.eyes.kinds import kinds
+from lerobot_memobench.eyes.tower import GRID, POOLED, SIDE, WIDTH, Tower, shrunk
+from lerobot_memobench.eyes.weights import Eyes, load_eyes, save_eyes
+
+LARGEST, MOST = 6_000_000, 3_000_000
+"""Bytes of the file, and weights of the tower."""
+
+
+def trained_a_little(tower: Tower) -> Tower:
+    """Give batch normalisation something to remember."""
+    tower.train()
+    for _ in range(3):
+        tower(torch.rand(4, 3, SIDE, SIDE))
+    return tower.eval()
+
+
+def test_sizes(tmp_path: Path) -> None:
+    eyes = Eyes(Tower(), kinds())
+    assert sum(weights.numel() for weights in eyes.tower.parameters()) <= MOST
+    tokens = eyes.tower.eval()(torch.rand(2, 3, SIDE, SIDE))
+    assert tokens.shape == (2, GRID**2, WIDTH)
+    assert eyes.tower.pooled(tokens).shape == (2, POOLED**2, WIDTH)
+    save_eyes(eyes, tmp_path / "eyes.safetensors")
+    assert (tmp_path / "eyes.safetensors").stat().st_size <= LARGEST
+
+
+@torch.no_grad()
+def test_folding_leaves_tokens_as_they_were(small_tower: Callable[[], Tower]) -> None:
+    tower, images = trained_a_little(small_tower()), torch.rand(2, 3, SIDE, SIDE)
+    before = tower(images)
+    tower.fold()
+    assert torch.allclose(tower(images), before, atol=1e-5)
+    assert not any("norm" in name for name in tower.state_dict())
+
+
+@torch.no_grad()
+def test_eyes_come_back_from_their_file(small_tower: Callable[[], Tower], tmp_path: Path) -> None:
+    eyes, images = Eyes(trained_a_little(small_tower()), ("cork", "cap")), torch.rand(2, 3, SIDE, SIDE)
+    before = eyes.eval()(images)
+    save_eyes(eyes, tmp_path / "eyes.safetensors")
+    back = load_eyes(tmp_path / "eyes.safetensors")
+    assert back.kinds == ("cork", "cap")
+    for said, was in zip(back(images), before, strict=True):
+        assert torch.allclose(said.heat, was.heat, atol=0.05)
+        assert torch.allclose(said.geometry, was.geometry, atol=0.05)
+
+
+def test_other_files_are_no_eyes(tmp_path: Path) -> None:
+    with pytest.raises(MemobenchError, match="there is no file"):
+        load_eyes(tmp_path / "none.safetensors")
+    (tmp_path / "text.safetensors").write_text("eyes")
+    with pytest.raises(MemobenchError, match="holds no eyes"):
+        load_eyes(tmp_path / "text.safetensors")
+    save_file({"weight": torch.zeros(2)}, tmp_path / "other.safetensors")
+    with pytest.raises(MemobenchError, match="holds no eyes"):
+        load_eyes(tmp_path / "other.safetensors")
+
+
+def test_pictures_of_any_size_are_averaged_over_areas() -> None:
+    images = torch.randint(0, 256, (1, 3, 2 * SIDE, 2 * SIDE), dtype=torch.uint8)
+    by_hand = images.float().reshape(1, 3, SIDE, 2, SIDE, 2).mean(dim=(3, 5))
+    assert torch.allclose(shrunk(images), by_hand)
+    assert shrunk(by_hand) is by_hand
+
+
+def test_a_pooled_token_is_of_its_own_four(small_tower: Callable[[], Tower]) -> None:
+    tower = small_tower()
+    tokens = torch.rand(1, GRID**2, tower.width, requires_grad=True)
+    tower.pooled(tokens)[0, POOLED + 2].sum().backward()  # second row, third column
+    assert tokens.grad is not None
+    used = tokens.grad[0].abs().sum(dim=1).reshape(GRID, GRID) > 0
+    assert used.nonzero().tolist() == [[2, 4], [2, 5], [3, 4], [3, 5]]
+    parts = tower.pool.weight.reshape(tower.width, 4, tower.width)
+    assert not torch.allclose(parts[:, 0], parts[:, 1])  # what is where in it is kept
