@@ -17,7 +17,7 @@ from small_policy import batch_of, made_for_training, small_config
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.execution_frames import in_groups
+from lerobot_memobench.policies.memobench_mem.execution_frames import in_groups, in_turns
 from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, STEPS, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from object_dataset import LENGTHS, PROMPTS, make_object_dataset
@@ -152,8 +152,22 @@ def test_every_place_once_in_groups_of_an_episode(moments: int) -> None:
     assert not torch.equal(order, in_groups(ends, moments, torch.Generator().manual_seed(2)))
 
 
-def test_batches_hold_moments_of_few_episodes_and_no_prompt(root: Path) -> None:
-    policy, before, _, dataset = made_for_training(root, **OBJECTS)
+def test_tasks_are_drawn_alike_however_long_their_episodes_are() -> None:
+    ends, tasks = np.cumsum([600, 30, 1, 1200, 20]), np.array([2, 0, 1, 2, 0])
+    order = in_turns(ends, tasks, 6, torch.Generator().manual_seed(1)).numpy()
+    assert len(order) == ends[-1]
+    episodes = np.searchsorted(ends, order, "right")
+    groups = episodes[: len(order) // 6 * 6].reshape(-1, 6)
+    assert (groups == groups[:, :1]).all(), "six moments of an episode follow one another"
+    shares = np.bincount(episodes, minlength=5) / len(order)
+    assert shares == pytest.approx([1 / 6, 1 / 6, 1 / 3, 1 / 6, 1 / 6], abs=0.06)
+    assert len(set(order[episodes == 0].tolist())) > 150, "frames of an episode are drawn at random"
+    assert torch.equal(torch.from_numpy(order), in_turns(ends, tasks, 6, torch.Generator().manual_seed(1)))
+
+
+@pytest.mark.parametrize("balance", [True, False])
+def test_batches_hold_moments_of_few_episodes_and_no_prompt(root: Path, balance: bool) -> None:
+    policy, before, _, dataset = made_for_training(root, **OBJECTS, balance_tasks=balance)
     sampler = EpisodeAwareSampler(
         dataset.meta.episodes["dataset_from_index"],
         dataset.meta.episodes["dataset_to_index"],
@@ -167,7 +181,8 @@ def test_batches_hold_moments_of_few_episodes_and_no_prompt(root: Path) -> None:
         for episode, (length, prompt) in enumerate(zip(LENGTHS, PROMPTS, strict=True))
         for frame in range(prompt, length)
     }
-    assert sorted(drawn) == sorted(execution)
+    assert len(drawn) == len(execution)
+    assert set(drawn) <= execution if balance else set(drawn) == execution
     batch = before(next(iter(loader)))
     assert len(batch["episode_index"].unique()) <= 3
     assert len(batch[FRAMES].unique()) < batch[MASK].sum(), "moments of an episode share frames"

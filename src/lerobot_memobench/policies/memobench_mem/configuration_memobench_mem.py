@@ -96,6 +96,7 @@ class MemobenchMemConfig(MemobenchMemSettings):
             "optimizer_lr": self.dimensions.learning_rate,
             "tokens_per_frame": TOKENS_PER_FRAME[self.perception],
             "memory_stride": MEMORY_STRIDE[self.perception],
+            "balance_tasks": self.sees_objects,
             "moments_per_episode": MOMENTS_PER_EPISODE[self.perception],
         }
 

@@ -3,8 +3,11 @@
 lerobot-train draws the frames of all episodes uniformly, each once per epoch, in an order that seed and epoch decide,
 and leaves no say in where an episode begins. What it does ask the configuration for is how many frames to drop at the
 end; our answer is 0 and carries, for its sampler, where each episode's execution begins and how many of its frames
-follow one another in the order. The sampler is LeRobot's, each frame is still drawn once per epoch, and any other
+follow one another in the order. The sampler is LeRobot's, and any other
 answer leaves it as it was. Histories still hold the prompt, because they come from the memory cache.
+
+Where tasks are to be drawn alike, an epoch has as many frames as otherwise, but not each of them once: tasks whose
+episodes are short would else be a small part of every batch, and they learned several times slower than the others.
 """
 
 from __future__ import annotations
@@ -29,17 +32,19 @@ class Drawn(int):
     Attributes:
         starts: from which frame on (E,) to draw; None: from the first.
         moments: how many frames of an episode to draw in a row.
+        tasks: (N,) number of each frame's task, each of which is drawn equally often; None: frames are.
     """
 
     starts: np.ndarray | None
     moments: int
+    tasks: np.ndarray | None
 
     @classmethod
-    def of(cls, starts: np.ndarray | None, moments: int) -> Drawn:
+    def of(cls, starts: np.ndarray | None, moments: int, tasks: np.ndarray | None = None) -> Drawn:
         """Return 0, which LeRobot's sampler understands from now on."""
         _teach(EpisodeAwareSampler)
         found = cls(0)
-        found.starts, found.moments = starts, moments
+        found.starts, found.moments, found.tasks = starts, moments, tasks
         return found
 
 
@@ -50,6 +55,17 @@ def execution_starts(episodes: np.ndarray, phase: np.ndarray) -> np.ndarray:
         episodes: (E + 1,) first frame of each episode, and the number of frames N. phase: (N,) 0 in the prompt.
     """
     return first_frames(episodes[:-1], episodes[1:], np.flatnonzero(phase != PROMPT))
+
+
+def task_of_frames(meta: Any, episodes: np.ndarray) -> np.ndarray:
+    """Return the number (N,) of each frame's task, by the instructions that LeRobot's metadata has of its episode.
+
+    Args:
+        episodes: (E + 1,) first frame of each episode, and N.
+    """
+    said = [" / ".join(tasks) for tasks in meta.episodes["tasks"]]
+    numbers = np.unique(said, return_inverse=True)[1]
+    return np.repeat(numbers, np.diff(episodes))
 
 
 def in_groups(ends: np.ndarray, moments: int, generator: torch.Generator) -> Tensor:
@@ -68,6 +84,25 @@ def in_groups(ends: np.ndarray, moments: int, generator: torch.Generator) -> Ten
     return mixed[torch.randperm(int(groups.sum()), generator=generator)[group].argsort(stable=True)]
 
 
+def in_turns(ends: np.ndarray, tasks: np.ndarray, moments: int, generator: torch.Generator) -> Tensor:
+    """Return N places at random, ``moments`` of an episode in a row: each task equally often, and in it each episode.
+
+    Args:
+        ends: (E,) as for `in_groups`. tasks: (E,) number of each episode's task.
+    """
+    first, count = torch.from_numpy(np.r_[0, ends[:-1]]), int(ends[-1])
+    order = torch.from_numpy(np.argsort(tasks, kind="stable"))
+    _, episodes = np.unique(tasks, return_counts=True)
+    of_task = torch.from_numpy(episodes)
+    groups = -(-count // moments)
+    task = torch.randint(len(of_task), (groups,), generator=generator)
+    rank = (torch.rand(groups, generator=generator) * of_task[task]).long()
+    episode = order[(of_task.cumsum(0) - of_task)[task] + rank].repeat_interleave(moments)
+    lengths = torch.from_numpy(ends) - first
+    offset = (torch.rand(len(episode), generator=generator, dtype=torch.float64) * lengths[episode]).long()
+    return (first[episode] + offset)[:count]
+
+
 def _teach(sampler: type[Any]) -> None:
     """Let a sampler begin its episodes, and draw them, as its ``drop_n_last_frames`` says, if that says so."""
     original = sampler.__init__
@@ -79,19 +114,24 @@ def _teach(sampler: type[Any]) -> None:
     def init(self: Any, *args: Any, **named: Any) -> None:
         asked = signature.bind(self, *args, **named)
         dropped = asked.arguments.get("drop_n_last_frames", 0)
-        self.moments = 1
+        self.moments, tasks = 1, None
         if isinstance(dropped, Drawn):
-            self.moments = dropped.moments
+            self.moments, tasks = dropped.moments, dropped.tasks
             if dropped.starts is not None:
                 asked.arguments["dataset_from_indices"] = dropped.starts
         original(*asked.args, **asked.kwargs)
+        self.tasks = None if tasks is None else tasks[self._starts]
 
     one_epoch = sampler._iter_epoch
 
     def draw(self: Any, epoch: int, start: int) -> Iterator[int]:
-        if self.moments == 1 or not self.shuffle:
+        if (self.moments == 1 and self.tasks is None) or not self.shuffle:
             return one_epoch(self, epoch, start)
-        order = in_groups(self._cum_lengths, self.moments, self._epoch_generator(epoch))
+        chance = self._epoch_generator(epoch)
+        if self.tasks is None:
+            order = in_groups(self._cum_lengths, self.moments, chance)
+        else:
+            order = in_turns(self._cum_lengths, self.tasks, self.moments, chance)
         return (self._frame_index(position) for position in order[start:].tolist())
 
     sampler.__init__, sampler._iter_epoch = init, draw

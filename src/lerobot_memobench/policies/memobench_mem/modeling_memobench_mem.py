@@ -27,7 +27,11 @@ from lerobot_memobench.policies.memobench_mem.checkpoints import (
 )
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.drawn_statistics import count_drawn_only
-from lerobot_memobench.policies.memobench_mem.execution_frames import Drawn, execution_starts
+from lerobot_memobench.policies.memobench_mem.execution_frames import (
+    Drawn,
+    execution_starts,
+    task_of_frames,
+)
 from lerobot_memobench.policies.memobench_mem.freed_memory import keep_freed_memory
 from lerobot_memobench.policies.memobench_mem.learning import LearningPolicy
 from lerobot_memobench.policies.memobench_mem.memory.registry import make_mechanism
@@ -108,7 +112,8 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
         if self._device.type == "cpu":
             keep_freed_memory()
         starts = None if self.config.prompt_loss else execution_starts(cache.episodes, cache.phase)
-        self.config.drop_n_last_frames = Drawn.of(starts, self.config.moments_per_episode)
+        tasks = task_of_frames(meta, cache.episodes) if self.config.balance_tasks else None
+        self.config.drop_n_last_frames = Drawn.of(starts, self.config.moments_per_episode, tasks)
 
     # -- checkpoints -----------------------------------------------------------------------------------------------
 

@@ -74,6 +74,9 @@ class MemobenchMemSettings(PI05Config):
     moments_per_episode: int = SIZES_OWN
     """How many frames of an episode stand side by side in a batch, which shares what they remember; none: 6 with
     objects, and 1, LeRobot's order, with pixels. ``batch_size`` counts frames all the same."""
+    balance_tasks: bool = SIZES_OWN
+    """Whether each task is drawn equally often, however long its episodes are; none: with objects. Otherwise each frame
+    is drawn once per epoch."""
     freeze_vision_encoder: bool = True
     warmup_fraction: float = 0.05
     final_lr: float = SIZES_OWN
