@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from lerobot_memobench.engine import contact_sheet as sheets
-from lerobot_memobench.engine import demo
+from lerobot_memobench.engine import demo, memory_demo
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.html import write_html
@@ -39,6 +39,12 @@ def fake_evaluation(output: Path) -> int:
     return 0
 
 
+def fake_comparison(work: Path, made: Path) -> None:
+    made.mkdir(parents=True)
+    for name in (memory_demo.MEMORY_FILM, memory_demo.MEMORY_STRIP, memory_demo.MEMORY_TABLE):
+        (made / name).write_text(name)
+
+
 def test_one_task_of_each_memory_type() -> None:
     assert [get_task(name).memory_type for name in demo.TASKS] == ["temporal", "spatial", "object", "procedural"]
 
@@ -48,7 +54,7 @@ def test_the_demo_folder(tmp_path: Path) -> None:
     (out / "videos").mkdir(parents=True)
     (out / "videos" / "old.mp4").write_text("")
     (out / "notes.txt").write_text("the user's own")
-    assert demo.make_demo(out, fake_evaluation) == 0
+    assert demo.make_demo(out, fake_evaluation, fake_comparison) == 0
     assert {path.name for path in out.iterdir()} == {*demo.PRODUCTS, "notes.txt"}
     assert {path.name for path in (out / "videos").iterdir()} == {f"{name}.0.mp4" for name in demo.TASKS}
     with Image.open(out / "contact_sheet.png") as sheet:
@@ -64,7 +70,7 @@ def test_the_html_report_finds_the_demos_films(tmp_path: Path) -> None:
         write_episodes(output, [rollout(name, "temporal", "", [], True, 0) for name in demo.TASKS])
         return 0
 
-    demo.make_demo(tmp_path / "demo", evaluate)
+    demo.make_demo(tmp_path / "demo", evaluate, fake_comparison)
     (tmp_path / "demo" / "card.json").unlink()  # of a fake evaluation, no card
     written = write_html([tmp_path / "demo"], tmp_path / "html")
     assert written.videos == len(demo.TASKS)
@@ -73,8 +79,53 @@ def test_the_html_report_finds_the_demos_films(tmp_path: Path) -> None:
 
 def test_a_failed_evaluation_leaves_the_earlier_demo(tmp_path: Path) -> None:
     (tmp_path / "report.json").write_text("earlier")
-    assert demo.make_demo(tmp_path, lambda output: 3) == 3
+    assert demo.make_demo(tmp_path, lambda output: 3, fake_comparison) == 3
     assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
+
+
+def test_a_failed_comparison_leaves_the_earlier_demo(tmp_path: Path) -> None:
+    (tmp_path / "report.json").write_text("earlier")
+    with pytest.raises(MemobenchError, match="the evaluation expert has failed"):
+        demo.make_demo(tmp_path, fake_evaluation, lambda *where: memory_demo.compare_memories(*where, lambda *_: 2))
+    assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
+
+
+def test_the_memories_are_compared_on_the_same_episodes(tmp_path: Path) -> None:
+    wrong, other = "reference_drift", "storage_failure"
+    failed = {"expert": {}, "with memory": {3: wrong}, "without memory": {0: wrong, 2: wrong, 3: other}}
+
+    def evaluate(name: str, folder: Path) -> int:
+        ends = [failed[name].get(k) for k in range(5)]
+        task = memory_demo.TASK
+        write_episodes(
+            folder, [rollout(task, "object", "S", [not end], not end, k, failure=end) for k, end in enumerate(ends)]
+        )
+        write_video(folder / "videos" / f"{task}.0.mp4")
+        return 0
+
+    told = memory_demo.compare_memories(tmp_path / "work", tmp_path / "made", evaluate)
+    assert [(one.solved, one.episodes, one.first) for one in told.values()] == [
+        (5, 5, True),
+        (4, 5, True),
+        (2, 5, False),
+    ]
+    assert "| without memory | 2/5 | 2 |" in (tmp_path / "made" / memory_demo.MEMORY_TABLE).read_text()
+    frames = sheets.read_video(tmp_path / "made" / memory_demo.MEMORY_FILM)
+    assert frames[0].shape[1] == 3 * 128, "three films side by side"
+
+
+def test_what_is_compared_differs_in_the_policy_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory_demo, "plan_line", lambda words: words)
+    told = [memory_demo.memory_plan(name, tmp_path) for name in memory_demo.WHO]
+    others = [[word for word in words if not word.startswith("policy=")] for words in told]
+    assert others[0] == others[1] == others[2]
+    assert [len(words) - len(rest) for words, rest in zip(told, others, strict=True)] == [0, 1, 1]
+
+
+def test_without_trained_policies_the_demo_is_the_experts(tmp_path: Path) -> None:
+    (tmp_path / memory_demo.MEMORY_TABLE).write_text("of an earlier demo")
+    assert demo.make_demo(tmp_path, fake_evaluation, None) == 0
+    assert not {path.name for path in tmp_path.iterdir()} & {memory_demo.MEMORY_FILM, memory_demo.MEMORY_TABLE}
 
 
 def test_a_missing_video_is_named(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""``memobench demo``: the scripted expert in videos, a contact sheet and a report."""
+"""``memobench demo``: the scripted expert in videos, a contact sheet and a report; and what a memory is good for."""
 
 from __future__ import annotations
 
@@ -15,17 +15,40 @@ def demo(
         "outputs/demo"
     ),
 ) -> int:
-    """Evaluate the scripted expert on four tasks, one of each memory type, and show it in videos."""
-    from lerobot_memobench.cli.evaluate import evaluate_here
+    """Evaluate the scripted expert on a task of each memory type; on one of them, trained policies as well, with a
+    memory and without.
+    """
+    from rich.markdown import Markdown
+
+    from lerobot_memobench.cli.evaluate import evaluate_here, tell
     from lerobot_memobench.engine.demo import CONTACT_SHEET, demo_plan, make_demo
     from lerobot_memobench.engine.folder import VIDEOS
+    from lerobot_memobench.engine.memory_demo import (
+        MEMORY_FILM,
+        MEMORY_TABLE,
+        compare_memories,
+        has_policies,
+        memory_plan,
+    )
+    from lerobot_memobench.engine.run import run_evaluation
     from lerobot_memobench.evaluation.documents.report import REPORT_MARKDOWN
 
-    status = make_demo(out, lambda folder: evaluate_here(demo_plan(folder), say_where=False))
+    def one_of_three(name: str, folder: Path) -> int:
+        return run_evaluation(memory_plan(name, folder), tell).status
+
+    status = make_demo(
+        out,
+        lambda folder: evaluate_here(demo_plan(folder), say_where=False),
+        (lambda work, made: compare_memories(work, made, one_of_three)) if has_policies() else None,
+    )
     if status:
         return status
     screen = console()
+    if (out / MEMORY_TABLE).is_file():
+        screen.print(Markdown((out / MEMORY_TABLE).read_text()))
     screen.print(f"report:  {out / REPORT_MARKDOWN}", soft_wrap=True)
     screen.print(f"videos:  {out / VIDEOS}", soft_wrap=True)
     screen.print(f"picture: {out / CONTACT_SHEET}", soft_wrap=True)
+    if (out / MEMORY_FILM).is_file():
+        screen.print(f"memory:  {out / MEMORY_FILM}", soft_wrap=True)
     return 0

@@ -1,4 +1,7 @@
-"""The demo: the scripted expert on one task of each memory type, in videos, a contact sheet and a report."""
+"""The demo: the scripted expert on one task of each memory type, and beside it policies that have learned one.
+
+In videos, a contact sheet and a report; one film shows expert, memory and no memory side by side (`memory_demo`).
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ from pathlib import Path
 from lerobot_memobench.engine.card import CARD_MARKDOWN
 from lerobot_memobench.engine.contact_sheet import contact_sheet
 from lerobot_memobench.engine.folder import VIDEOS
+from lerobot_memobench.engine.memory_demo import MEMORY_FILM, MEMORY_STRIP, MEMORY_TABLE
 from lerobot_memobench.engine.plan import EvaluationPlan
 from lerobot_memobench.engine.planning import plan_line
 from lerobot_memobench.envs.episode_log import MERGED_FILE
@@ -31,7 +35,7 @@ CONTACT_SHEET = "contact_sheet.png"
 RESULTS = (MERGED_FILE, REPORT_JSON, REPORT_MARKDOWN, PROTOCOL_FILE, CARD_FILE, CARD_MARKDOWN)
 
 #: All that a demo writes, and so all that a new one removes.
-PRODUCTS = (*RESULTS, VIDEOS, CONTACT_SHEET)
+PRODUCTS = (*RESULTS, VIDEOS, CONTACT_SHEET, MEMORY_FILM, MEMORY_STRIP, MEMORY_TABLE)
 
 
 def demo_plan(folder: Path) -> EvaluationPlan:
@@ -40,13 +44,15 @@ def demo_plan(folder: Path) -> EvaluationPlan:
     return plan_line([*words, f"output_dir={folder}"])
 
 
-def make_demo(out: Path, evaluate: Callable[[Path], int]) -> int:
-    """Evaluate, then put the results into ``out``; return the exit status.
+def make_demo(out: Path, evaluate: Callable[[Path], int], compare: Callable[[Path, Path], object] | None) -> int:
+    """Evaluate and compare, then put the results into ``out``; return the exit status.
 
     The evaluation works in a folder of its own, so a demo that fails leaves an earlier one as it was.
 
     Args:
         evaluate: runs the demo's evaluation in a folder and returns its exit status.
+        compare: works in one folder and writes into another what `memory_demo.compare_memories` does; None where the
+            package brings no trained policies.
     """
     if out.exists() and not out.is_dir():
         raise MemobenchError(f"{out} is a file; name a folder")
@@ -56,14 +62,17 @@ def make_demo(out: Path, evaluate: Callable[[Path], int]) -> int:
         status = evaluate(work)
         if status:
             return status
-        videos = collect_videos(work, Path(scratch) / VIDEOS)
-        contact_sheet(videos).save(Path(scratch) / CONTACT_SHEET, optimize=True)
+        made = Path(scratch) / "made"
+        if compare is not None:
+            compare(Path(scratch) / "memory", made)
+        videos = collect_videos(work, made / VIDEOS)
+        contact_sheet(videos).save(made / CONTACT_SHEET, optimize=True)
+        for name in RESULTS:
+            shutil.move(work / name, made / name)
         for name in PRODUCTS:
             _remove(out / name)
-        for name in RESULTS:
-            shutil.move(work / name, out / name)
-        for name in (VIDEOS, CONTACT_SHEET):
-            shutil.move(Path(scratch) / name, out / name)
+            if (made / name).exists():
+                shutil.move(made / name, out / name)
     return 0
 
 

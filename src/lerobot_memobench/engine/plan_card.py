@@ -15,7 +15,7 @@ from lerobot_memobench.engine.policy_identity import (
     training_facts,
     tree_hash,
 )
-from lerobot_memobench.policies.checkpoint import ADAPTER_FILE, WEIGHTS_FILE, local_folder
+from lerobot_memobench.policies.checkpoint import ADAPTER_FILE, WEIGHTS_FILE, local_folder, portable_path
 
 
 def card_of(plan: EvaluationPlan) -> dict[str, Any]:
@@ -27,11 +27,19 @@ def card_of(plan: EvaluationPlan) -> dict[str, Any]:
         checkpoint=None,
         trained_on=None,
         task_files=_task_files(plan),
-        flags=plan.portable_flags,
+        flags=_flags(plan),
         runs=[run_facts(plan.command, plan.batch, gl_facts() if plan.draws else {})],
         shard=None if shard is None else str(shard),
     )
     return with_checkpoint(card, plan.policy_path)
+
+
+def _flags(plan: EvaluationPlan) -> list[str]:
+    """Return the plan's flags as another machine may use them: a policy of this package goes by its name."""
+    key = "--policy.path="
+    return [
+        key + portable_path(flag.removeprefix(key)) if flag.startswith(key) else flag for flag in plan.portable_flags
+    ]
 
 
 def _protocol(plan: EvaluationPlan) -> dict[str, Any]:
@@ -58,7 +66,7 @@ def with_checkpoint(card: dict[str, Any], path: str | None) -> dict[str, Any]:
     return {
         **card,
         "policy": {**card["policy"], "sha256": tree_hash(files)},
-        "checkpoint": {"path": path, "revision": _revision(folder), "files": files},
+        "checkpoint": {"path": portable_path(str(path)), "revision": _revision(folder), "files": files},
         "trained_on": training_facts(folder),
     }
 

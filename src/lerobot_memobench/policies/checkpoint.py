@@ -16,6 +16,8 @@ ADAPTER_FILE = "adapter_model.safetensors"
 PREPROCESSOR_FILE = "policy_preprocessor.json"
 POSTPROCESSOR_FILE = "policy_postprocessor.json"
 ADVICE = "copy or train the checkpoint again"
+SHIPPED = Path(__file__).parent / "shipped"
+"""Folder of the trained policies that come with the package, each in a folder of its name."""
 
 
 class Feature(TypedDict, total=False):
@@ -50,15 +52,26 @@ def looks_local(text: str) -> bool:
     return text.startswith((".", "/", "~")) or text.count("/") > 1 or text.endswith("/")
 
 
+def shipped_policies() -> dict[str, Path]:
+    """Return name -> checkpoint folder of the trained policies that come with the package."""
+    return {file.parent.name: file.parent for file in sorted(SHIPPED.glob(f"*/{CONFIG_FILE}"))}
+
+
 def checkpoint_folder(text: str) -> Path | None:
-    """Return the checkpoint that a path means: itself, or the last one of a training run; None when there is
-    none.
+    """Return the checkpoint that a path means: itself, or the last one of a training run; or that of a policy that
+    comes with the package, by its name; None when there is none.
     """
     base = Path(text).expanduser()
     for folder in (base, base / "pretrained_model", base / "checkpoints" / "last" / "pretrained_model"):
         if (folder / CONFIG_FILE).is_file():
             return folder
-    return None
+    return shipped_policies().get(text)
+
+
+def portable_path(path: str) -> str:
+    """Return how another machine knows a checkpoint: by its name if it comes with the package, else by its path."""
+    names = {str(folder): name for name, folder in shipped_policies().items()}
+    return names.get(path, path)
 
 
 def local_folder(path: str) -> Path | None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.policies.checkpoint import checkpoint_folder, checkpoint_type, looks_local
+from lerobot_memobench.policies.checkpoint import checkpoint_folder, checkpoint_type, looks_local, shipped_policies
 from lerobot_memobench.settings import fields
 from lerobot_memobench.settings.flags import flag_value
 
@@ -27,7 +27,8 @@ def choice_flags(config: type, key: str, value: str) -> list[str]:
     if path is not None:
         return [f"--policy.path={path}"]
     if value not in known:
-        raise MemobenchError(f"there is no {key} {value!r}, {nearest(value, known)}")
+        others = shipped_policies() if key == "policy" else {}
+        raise MemobenchError(f"there is no {key} {value!r}, {nearest(value, [*known, *others])}")
     return [f"--{key}.type={value}"]
 
 

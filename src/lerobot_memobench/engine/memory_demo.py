@@ -1,0 +1,96 @@
+"""The demo's second part: a task that begins with a prompt, under the expert, a policy with a memory and one without.
+
+The policies are those that come with the package. All three see the same episodes, of the first evaluation seeds; the
+film and the strip are of the first of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from lerobot_memobench.engine.folder import VIDEOS
+from lerobot_memobench.engine.plan import EvaluationPlan
+from lerobot_memobench.engine.planning import plan_line
+from lerobot_memobench.engine.side_by_side import side_by_side, strip
+from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files import write_file
+from lerobot_memobench.policies.checkpoint import shipped_policies
+
+TASK = "put_the_butter_into_the_bowl_from_the_prompt_video"
+WHO: dict[str, tuple[str, ...]] = {
+    "expert": (),
+    "with memory": ("policy=memobench_small",),
+    "without memory": ("policy=memobench_small_memoryless",),
+}
+"""Who acts -> what is said of it to `lerobot eval`."""
+EPISODES, HORIZON = 3, 400
+"""Of each; and how many steps one may take. The expert takes about 150."""
+MEMORY_FILM, MEMORY_STRIP, MEMORY_TABLE = "memory.mp4", "memory.png", "memory.md"
+WRONG = "reference_drift"
+
+
+@dataclass(frozen=True)
+class Told:
+    """How somebody's episodes ended: how many there were, were solved, and failed at a wrong referent; whether the
+    first one, which is filmed, was solved.
+    """
+
+    episodes: int
+    solved: int
+    wrong: int
+    first: bool
+
+
+def has_policies() -> bool:
+    """Return whether the package brings the trained policies that are compared."""
+    return {word.partition("=")[2] for words in WHO.values() for word in words} <= set(shipped_policies())
+
+
+def memory_plan(name: str, folder: Path) -> EvaluationPlan:
+    """Return the plan of one's evaluation."""
+    words = ["env=memobench", *WHO[name], f"tasks={TASK}", "referent=random", f"horizon={HORIZON}"]
+    return plan_line([*words, f"episodes={EPISODES}", "films=1", f"output_dir={folder}"])
+
+
+def compare_memories(work: Path, out: Path, evaluate: Callable[[str, Path], int]) -> dict[str, Told]:
+    """Evaluate all, each in a folder of its own in ``work``; write film, strip and table into ``out``.
+
+    Args:
+        evaluate: runs one's evaluation in a folder and returns its exit status.
+
+    Raises:
+        MemobenchError: an evaluation failed.
+    """
+    told: dict[str, Told] = {}
+    films: dict[str, tuple[Path, bool]] = {}
+    for name in WHO:
+        folder = work / name.replace(" ", "_")
+        film = folder / VIDEOS / f"{TASK}.0.mp4"
+        if evaluate(name, folder) or not film.is_file():
+            raise MemobenchError(f"the evaluation {name} has failed; see its messages above")
+        told[name] = _told(folder)
+        films[name] = film, told[name].first
+    out.mkdir(parents=True, exist_ok=True)
+    side_by_side(films, out / MEMORY_FILM)
+    strip(films).save(out / MEMORY_STRIP, optimize=True)
+    write_file(out / MEMORY_TABLE, table(told))
+    return told
+
+
+def _told(folder: Path) -> Told:
+    records = read_episodes(folder)
+    return Told(
+        episodes=len(records),
+        solved=sum(bool(record["success"]) for record in records),
+        wrong=sum(not record["success"] and record.get("failure") == WRONG for record in records),
+        first=bool(records[0]["success"]),
+    )
+
+
+def table(told: dict[str, Told]) -> str:
+    """Return who solved how many of the episodes, and how many failed at a wrong bowl, as Markdown."""
+    rows = [f"| {name} | {one.solved}/{one.episodes} | {one.wrong} |" for name, one in told.items()]
+    return "\n".join(["| butter into the prompted bowl | solved | wrong bowl |", "|---|---|---|", *rows]) + "\n"
