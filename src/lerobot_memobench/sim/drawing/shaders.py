@@ -67,42 +67,40 @@ void main() {
 }
 """
 
-_SHADOW_VERTEX_SHADER = """#version 140
+_PLACE = """\
 uniform samplerBuffer geoms;
-layout(std140) uniform Frame { mat4 light; };
 in vec3 position;
 in float geom;
-void main() {
+vec3 place() {
     int row = 5 * int(geom + 0.5);
     vec4 local = vec4(position, 1.0);
-    vec3 world = vec3(
+    return vec3(
         dot(texelFetch(geoms, row), local),
         dot(texelFetch(geoms, row + 1), local),
         dot(texelFetch(geoms, row + 2), local));
-    gl_Position = light * vec4(world, 1.0);
-}
+}"""
+"""Where in the world a vertex is, by its geom's row of the table."""
+
+_SHADOW_VERTEX_SHADER = f"""#version 140
+{_PLACE}
+layout(std140) uniform Frame {{ mat4 light; }};
+void main() {{
+    gl_Position = light * vec4(place(), 1.0);
+}}
 """
 
 _SHADOW_FRAGMENT_SHADER = """#version 140
 void main() {}
 """
 
-_GEOM_VERTEX_SHADER = """#version 140
-uniform samplerBuffer geoms;
-layout(std140) uniform Frame { mat4 light; mat4 projection; };
-in vec3 position;
-in float geom;
+_GEOM_VERTEX_SHADER = f"""#version 140
+{_PLACE}
+layout(std140) uniform Frame {{ mat4 light; mat4 projection; }};
 out float code;
-void main() {
-    int row = 5 * int(geom + 0.5);
-    vec4 local = vec4(position, 1.0);
-    vec3 world = vec3(
-        dot(texelFetch(geoms, row), local),
-        dot(texelFetch(geoms, row + 1), local),
-        dot(texelFetch(geoms, row + 2), local));
+void main() {{
     code = geom + 1.0;
-    gl_Position = projection * vec4(world, 1.0);
-}
+    gl_Position = projection * vec4(place(), 1.0);
+}}
 """
 
 _GEOM_FRAGMENT_SHADER = """#version 140
