@@ -31,5 +31,18 @@ def made_for_training(root: Path, **fields: Any):  # type: ignore[no-untyped-def
     return policy, before, after, dataset
 
 
+def losses_in_training(policy: Any, batch: dict[str, Any], updates: int = 40) -> list[float]:
+    """Train a policy on one batch; return the action loss before each update."""
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=3e-3)
+    losses = []
+    for _ in range(updates):
+        loss, logged = policy.train().forward(batch)
+        loss.backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        losses.append(logged["action_loss"])
+    return losses
+
+
 def batch_of(dataset: LeRobotDataset, indices: list[int]) -> dict[str, Any]:
     return torch.utils.data.default_collate([dataset[index] for index in indices])

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from small_policy import batch_of, made_for_training
+from small_policy import batch_of, losses_in_training, made_for_training
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
@@ -21,14 +21,8 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, dict[str, An
     """A policy after some updates on one batch, that batch, and how the loss fell."""
     root = make_object_dataset(tmp_path_factory.mktemp("objects") / "data")
     policy, before, _, dataset = made_for_training(root, **REGRESSION, ema_decay=0.0)
-    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=3e-3)
-    batch, losses = before(batch_of(dataset, INDICES)), []
-    for _ in range(40):
-        loss, logged = policy.train().forward(batch)
-        loss.backward()
-        optimizer.step()
-        optimizer.zero_grad()
-        losses.append(logged["action_loss"])
+    batch = before(batch_of(dataset, INDICES))
+    losses = losses_in_training(policy, batch)
     return policy.eval(), batch, losses
 
 

@@ -13,7 +13,7 @@ from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTr
 from lerobot.datasets import EpisodeAwareSampler
 from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.policies import make_pre_post_processors
-from small_policy import batch_of, made_for_training, small_config
+from small_policy import batch_of, losses_in_training, made_for_training, small_config
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
@@ -230,14 +230,7 @@ def test_every_kind_trains(root: Path, fields: dict[str, Any]) -> None:
 
 def test_loss_falls(root: Path) -> None:
     policy, before, _, dataset = made_for_training(root, **OBJECTS | {"chunk_size": 4})
-    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=3e-3)
-    batch, losses = before(batch_of(dataset, [*range(8, 38, 2)])), []
-    for _ in range(40):
-        loss, logged = policy.train().forward(batch)
-        loss.backward()
-        optimizer.step()
-        optimizer.zero_grad()
-        losses.append(logged["action_loss"])
+    losses = losses_in_training(policy, before(batch_of(dataset, [*range(8, 38, 2)])))
     assert np.mean(losses[-5:]) < 0.5 * np.mean(losses[:5])
 
 
