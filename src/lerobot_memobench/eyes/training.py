@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.eyes.curve import draw_curve
 from lerobot_memobench.eyes.labels import Rows
 from lerobot_memobench.eyes.pictures import Pictures
 from lerobot_memobench.eyes.targets import loss, targets
 from lerobot_memobench.eyes.tower import GRID, POOLED, Tower
 from lerobot_memobench.eyes.weights import Eyes, save_eyes
 from lerobot_memobench.files import draft_of
+from lerobot_memobench.files.curve import draw_curve, mean_of
 
 CHECKPOINT, WEIGHTS, CURVE = "training.pt", "eyes.safetensors", "training_curve.png"
 SHARES = {"heat": 1.0, "place": 2.0, "rest": 1.0, "mask": 0.5}
@@ -123,8 +123,7 @@ class _Learner:
         self.update += 1
         self._window.append({name: value.detach() for name, value in losses.items()})
         if len(self._window) == WINDOW:
-            names = self._window[0]
-            self.points.append({name: float(np.mean([float(one[name]) for one in self._window])) for name in names})
+            self.points.append(mean_of(self._window))
             self._window = []
 
     def _losses(self, rows: Rows) -> dict[str, Tensor]:

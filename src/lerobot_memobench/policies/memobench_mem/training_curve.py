@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.files import draft_of, write_file
+from lerobot_memobench.files import write_file
+from lerobot_memobench.files.curve import draw_curve, mean_of
 from lerobot_memobench.files.reading import read_json
 
 PICTURE, NUMBERS = "training_curve.png", "training_curve.json"
@@ -15,6 +16,8 @@ WINDOW = 10
 """Updates that one point is the mean of."""
 SHARES = ("align_top1",)
 """What is no loss, and runs from 0 to 1."""
+HIDDEN = ("loss", "align_grad_norm", "align_temperature")
+"""What is kept as numbers, and not drawn."""
 
 
 class TrainingCurve:
@@ -32,7 +35,7 @@ class TrainingCurve:
         """Take in what one update logged; lists are left out."""
         self._window.append({name: float(value) for name, value in logged.items() if isinstance(value, int | float)})
         if len(self._window) == WINDOW:
-            self.points.append(_mean(self._window))
+            self.points.append(dict(sorted(mean_of(self._window).items())))
             self._window = []
 
     def save(self, folder: Path) -> None:
@@ -40,8 +43,7 @@ class TrainingCurve:
         if not self.points:
             return
         write_file(folder / NUMBERS, json.dumps({"updates_per_point": WINDOW, "points": self.points}))
-        with draft_of(folder / PICTURE) as draft:
-            _draw(self.points, draft)
+        draw_curve(self.points, WINDOW, folder / PICTURE, hidden=HIDDEN, shares=SHARES, columns=3)
 
     @classmethod
     def read(cls, folder: Path) -> TrainingCurve:
@@ -52,31 +54,3 @@ class TrainingCurve:
                 "points"
             ]
         return found
-
-
-def _mean(window: list[dict[str, float]]) -> dict[str, float]:
-    names = sorted(set().union(*window))
-    values = {name: [numbers[name] for numbers in window if name in numbers] for name in names}
-    return {name: sum(found) / len(found) for name, found in values.items()}
-
-
-def _draw(points: list[dict[str, float]], path: Path) -> None:
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
-
-    names = sorted(set().union(*points) - {"loss", "align_grad_norm", "align_temperature"})
-    figure, axis = plt.subplots(figsize=(6, 3.4), constrained_layout=True)
-    shares = axis.twinx() if set(names) & set(SHARES) else None
-    updates = [WINDOW * (place + 1) for place in range(len(points))]
-    for colour, name in enumerate(names):
-        where = shares if shares is not None and name in SHARES else axis
-        where.plot(updates, [point.get(name) for point in points], color=f"C{colour}", lw=1.2, label=name)
-    axis.set(xlabel="updates", ylabel="loss", yscale="log")
-    if shares is not None:
-        shares.set(ylabel="share", ylim=(0, 1))
-    axis.grid(alpha=0.3, which="both", lw=0.5)
-    figure.legend(loc="outside upper center", ncols=3, fontsize=8, frameon=False)
-    figure.savefig(path, dpi=130, format="png")
-    plt.close(figure)

@@ -1,0 +1,70 @@
+"""How the losses of a training fell: means over windows of updates, and their picture."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+from lerobot_memobench.files import draft_of
+
+DASHED = "pooled "
+"""What the name of a loss begins with that is drawn dashed, in the colour of the loss whose name follows."""
+
+
+def mean_of(window: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Return the mean of each number over the updates that tell it, in the order in which they first appear."""
+    values = {name: [float(one[name]) for one in window if name in one] for name in dict.fromkeys(chain(*window))}
+    return {name: sum(found) / len(found) for name, found in values.items()}
+
+
+def draw_curve(
+    points: Sequence[Mapping[str, float]],
+    window: int,
+    path: Path,
+    *,
+    hidden: Collection[str] = (),
+    shares: Collection[str] = (),
+    columns: int = 4,
+) -> None:
+    """Draw means over windows of so many updates to a PNG; nothing before the first.
+
+    Args:
+        hidden: names of what is left out. shares: names of what is no loss, and runs from 0 to 1.
+        columns: of the legend.
+    """
+    import matplotlib as mpl
+
+    if not points:
+        return
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axis = plt.subplots(figsize=(6, 3.4), constrained_layout=True)
+    looks = _looks(name for name in dict.fromkeys(chain(*points)) if name not in hidden)
+    right = axis.twinx() if set(looks) & set(shares) else None
+    updates = [window * (place + 1) for place in range(len(points))]
+    for name, look in looks.items():
+        own = right if right is not None and name in shares else axis
+        own.plot(updates, [point.get(name) for point in points], **look, lw=1.2, label=name)
+    axis.set(xlabel="updates", ylabel="loss", yscale="log")
+    if right is not None:
+        right.set(ylabel="share", ylim=(0, 1))
+    axis.grid(alpha=0.3, which="both", lw=0.5)
+    figure.legend(loc="outside upper center", ncols=columns, fontsize=8, frameon=False)
+    with draft_of(path) as draft:
+        figure.savefig(draft, dpi=130, format="png")
+    plt.close(figure)
+
+
+def _looks(names: Iterable[str]) -> dict[str, dict[str, str]]:
+    """Return name -> style and colour of its line."""
+    colours: dict[str, str] = {}
+    return {
+        name: {
+            "linestyle": "--" if name.startswith(DASHED) else "-",
+            "color": colours.setdefault(name.removeprefix(DASHED), f"C{len(colours)}"),
+        }
+        for name in names
+    }
