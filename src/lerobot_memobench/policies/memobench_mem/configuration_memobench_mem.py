@@ -81,6 +81,7 @@ class MemobenchMemConfig(MemobenchMemSettings):
         super().__post_init__()
         self._check_numbers()
         self._check_perception()
+        self._check_objective()
         self._check_alignment()
 
     def _defaults(self) -> dict[str, Any]:
@@ -129,11 +130,6 @@ class MemobenchMemConfig(MemobenchMemSettings):
                 f"--policy.tokens_per_frame={self.tokens_per_frame} is not supported: frames are pooled to a "
                 f"4x4 grid, so leave it at {GRID**2}."
             )
-        if self.objective == REGRESSION and self.rtc_config is not None:
-            raise MemobenchError(
-                "--policy.rtc_config guides the denoising of a plan, which --policy.objective=regression lacks; "
-                "leave it out, or use --policy.objective=flow_matching."
-            )
         if not self.freeze_vision_encoder:
             raise MemobenchError(
                 "--policy.freeze_vision_encoder=false cannot be used: memory tokens are cached from the frozen "
@@ -144,6 +140,13 @@ class MemobenchMemConfig(MemobenchMemSettings):
             raise MemobenchError(
                 f"--policy.image_resolution={self.image_resolution} must be a multiple of {GRID * patch} pixels at "
                 f"size {self.size}, so that its patches pool to a 4x4 grid."
+            )
+
+    def _check_objective(self) -> None:
+        if self.objective == REGRESSION and self.rtc_config is not None:
+            raise MemobenchError(
+                "--policy.rtc_config guides the denoising of a plan, which --policy.objective=regression lacks; "
+                "leave it out, or use --policy.objective=flow_matching."
             )
 
     def _check_alignment(self) -> None:

@@ -3,8 +3,8 @@
 lerobot-train draws the frames of all episodes uniformly, each once per epoch, in an order that seed and epoch decide,
 and leaves no say in where an episode begins. What it does ask the configuration for is how many frames to drop at the
 end; our answer is 0 and carries, for its sampler, where each episode's execution begins and how many of its frames
-follow one another in the order. The sampler is LeRobot's, and any other
-answer leaves it as it was. Histories still hold the prompt, because they come from the memory cache.
+follow one another in the order. The sampler is LeRobot's, and any other answer leaves it as it was. Histories still
+hold the prompt, because they come from the memory cache.
 
 Where tasks are to be drawn alike, an epoch has as many frames as otherwise, but not each of them once: tasks whose
 episodes are short would else be a small part of every batch, and they learned several times slower than the others.
