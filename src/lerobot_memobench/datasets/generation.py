@@ -35,7 +35,7 @@ from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.jobs.executors import check_executor
 from lerobot_memobench.jobs.job import ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
-from lerobot_memobench.tasks.task import DRAWN, Task
+from lerobot_memobench.tasks.task import Task, referent_told
 
 FIRST_SEED = 10_000
 """Demonstrations use the seeds 10,000 + i; evaluation uses 7 + i (paper, section 5.1)."""
@@ -83,7 +83,7 @@ def generate(
         )
     check_executor(executor, executor_options)
     _check_prompts(tasks, prompt_video)
-    referent = DRAWN if all(task.drawn for task in tasks) else referent
+    referent = referent_told(referent, drawn=all(task.drawn for task in tasks))
     settings = RecordingSettings(referent, images, image_size, prompt_video, hold_frames, perturb)
     plan = _Plan(tuple(tasks), episodes, seed_base, settings, _checked_formats(formats, settings))
     if is_finished(out):

@@ -28,7 +28,7 @@ from lerobot_memobench.envs.observations import (
 from lerobot_memobench.envs.prompting import AUTO, PLACES, policy_being_run, prompt_in
 from lerobot_memobench.envs.protocol import SEED_BASE, SETTINGS, check_protocol
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.tasks.task import DRAWN, PUBLISHED, REFERENTS, STRICT, SUITES
+from lerobot_memobench.tasks.task import DRAWN, PUBLISHED, REFERENTS, STRICT, SUITES, referent_told
 
 
 @EnvConfig.register_subclass("memobench")
@@ -108,8 +108,7 @@ class MemobenchEnvConfig(EnvConfig):
                 raise MemobenchError(f"env.{name} is {number}; expected a whole number from 1 on")
         if self.films is not None and self.films < 0:
             raise MemobenchError(f"env.films is {self.films}; expected a whole number of episodes from 0 on")
-        if self.suite == STRICT:
-            self.referent = DRAWN
+        self.referent = referent_told(self.referent, drawn=self.suite == STRICT)
         if self.obs_type != PIXELS:
             self.features, self.features_map = policy_features(self.obs_type), policy_names(self.obs_type)
 

@@ -23,7 +23,7 @@ from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.formula import Atom, atoms
 from lerobot_memobench.tasks.progress import Progress
-from lerobot_memobench.tasks.task import DRAWN, REFERENTS, STRICT, Task
+from lerobot_memobench.tasks.task import DRAWN, REFERENTS, STRICT, Task, referent_told
 
 HORIZON = 1200
 """Execution steps before an episode is cut off (paper, section 5.1)."""
@@ -63,7 +63,7 @@ class Episode:
         if referent not in known:
             raise MemobenchError(f"referent is {referent!r}; {nearest(referent, known)}")
         self.published = task
-        self.referent, self.horizon = DRAWN if task.drawn else referent, horizon
+        self.referent, self.horizon = referent_told(referent, task.drawn), horizon
         self.prompt_video = prompt_video and task.prompt is not None
         self.sim = Simulation(task, render)
         self._slots: ObjectSlots | None = None

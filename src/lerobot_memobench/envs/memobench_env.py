@@ -30,7 +30,7 @@ from lerobot_memobench.files import file_name
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.tasks.loading import load_task
 from lerobot_memobench.tasks.memory_text import memory_text, with_memory
-from lerobot_memobench.tasks.task import DRAWN, PUBLISHED
+from lerobot_memobench.tasks.task import PUBLISHED, referent_told
 
 
 class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
@@ -87,7 +87,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             "suite": suite,
             "seed_base": seed_base,
             "obs_type": obs_type,
-            "referent": DRAWN if self._task.drawn else referent,
+            "referent": referent_told(referent, self._task.drawn),
             "prompt_video": prompt_video,
             "prompt_in": prompt_in,
             "horizon": horizon,
