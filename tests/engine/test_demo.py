@@ -14,7 +14,7 @@ from lerobot_memobench.engine import demo, memory_demo
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.html import write_html
-from lerobot_memobench.tasks.catalogue import get_task
+from lerobot_memobench.tasks.catalogue import BOWL, get_task
 
 from ..evaluation.logs import rollout
 
@@ -96,11 +96,10 @@ def test_the_memories_are_compared_on_the_same_episodes(tmp_path: Path) -> None:
 
     def evaluate(name: str, folder: Path) -> int:
         ends = [failed[name].get(k) for k in range(5)]
-        task = memory_demo.TASK
         write_episodes(
-            folder, [rollout(task, "object", "S", [not end], not end, k, failure=end) for k, end in enumerate(ends)]
+            folder, [rollout(BOWL, "object", "S", [not end], not end, k, failure=end) for k, end in enumerate(ends)]
         )
-        write_video(folder / "videos" / f"{task}.0.mp4")
+        write_video(folder / "videos" / f"{BOWL}.0.mp4")
         return 0
 
     told = memory_demo.compare_memories(tmp_path / "work", tmp_path / "made", evaluate)

@@ -14,13 +14,15 @@ from PIL import Image, ImageColor
 
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.records.runs import read_rollouts
 from lerobot_memobench.studies.learning import stages as stages_module
 from lerobot_memobench.studies.learning.commands import Cost, run_once
-from lerobot_memobench.studies.learning.experiments import BOWL, EXPERIMENTS, MEMORY, MEMORYLESS, changed
+from lerobot_memobench.studies.learning.experiments import EXPERIMENTS, MEMORY, MEMORYLESS, changed
 from lerobot_memobench.studies.learning.figure import COLOURS
-from lerobot_memobench.studies.learning.outcomes import read_outcomes
+from lerobot_memobench.studies.learning.outcomes import outcomes_of
 from lerobot_memobench.studies.learning.stages import Stages
 from lerobot_memobench.studies.learning.study import learn
+from lerobot_memobench.tasks.catalogue import BOWL
 
 sys.path[:0] = [str(Path(__file__).parents[1] / "evaluation")]
 
@@ -62,7 +64,7 @@ def write_rollouts(folder: Path, solved: int, wrong: int, episodes: int = 10) ->
 def test_outcomes_tell_wrong_referents_apart(tmp_path: Path) -> None:
     for seed, (solved, wrong) in enumerate([(9, 1), (5, 3)]):
         write_rollouts(tmp_path / str(seed), solved, wrong)
-    found = read_outcomes([tmp_path / "0", tmp_path / "1"])
+    found = outcomes_of([read_rollouts(tmp_path / "0")[0], read_rollouts(tmp_path / "1")[0]])
     assert set(found) == {"all", "object", BOWL}
     for outcome in found.values():
         assert outcome.success.value == pytest.approx(0.7)

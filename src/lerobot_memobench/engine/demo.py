@@ -21,12 +21,13 @@ from lerobot_memobench.envs.protocol import PROTOCOL_FILE
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.report import REPORT_JSON, REPORT_MARKDOWN
 from lerobot_memobench.evaluation.records.protocol import CARD_FILE
+from lerobot_memobench.tasks.catalogue import BOWL
 
 #: One task of each memory type.
 TASKS = (
     "turn_on_the_stove_and_turn_it_off",
     "put_the_tomato_into_the_top_drawer_of_the_cabinet",
-    "put_the_butter_into_the_bowl_from_the_prompt_video",
+    BOWL,
     "execute_the_assembly_procedure_demonstrated_in_the_prompt_video",
 )
 CONTACT_SHEET = "contact_sheet.png"

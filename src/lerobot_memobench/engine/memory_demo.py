@@ -18,8 +18,9 @@ from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.files import write_file
 from lerobot_memobench.policies.checkpoint import shipped_policies
+from lerobot_memobench.tasks.catalogue import BOWL
+from lerobot_memobench.tasks.failures import REFERENCE_DRIFT
 
-TASK = "put_the_butter_into_the_bowl_from_the_prompt_video"
 WHO: dict[str, tuple[str, ...]] = {
     "expert": (),
     "with memory": ("policy=memobench_small",),
@@ -29,7 +30,6 @@ WHO: dict[str, tuple[str, ...]] = {
 EPISODES, HORIZON = 3, 400
 """Of each; and how many steps one may take. The expert takes about 150."""
 MEMORY_FILM, MEMORY_STRIP, MEMORY_TABLE = "memory.mp4", "memory.png", "memory.md"
-WRONG = "reference_drift"
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def has_policies() -> bool:
 
 def memory_plan(name: str, folder: Path) -> EvaluationPlan:
     """Return the plan of one's evaluation."""
-    words = ["env=memobench", *WHO[name], f"tasks={TASK}", "referent=random", f"horizon={HORIZON}"]
+    words = ["env=memobench", *WHO[name], f"tasks={BOWL}", "referent=random", f"horizon={HORIZON}"]
     return plan_line([*words, f"episodes={EPISODES}", "films=1", f"output_dir={folder}"])
 
 
@@ -68,7 +68,7 @@ def compare_memories(work: Path, out: Path, evaluate: Callable[[str, Path], int]
     films: dict[str, tuple[Path, bool]] = {}
     for name in WHO:
         folder = work / name.replace(" ", "_")
-        film = folder / VIDEOS / f"{TASK}.0.mp4"
+        film = folder / VIDEOS / f"{BOWL}.0.mp4"
         if evaluate(name, folder) or not film.is_file():
             raise MemobenchError(f"the evaluation {name} has failed; see its messages above")
         told[name] = _told(folder)
@@ -85,7 +85,7 @@ def _told(folder: Path) -> Told:
     return Told(
         episodes=len(records),
         solved=sum(bool(record["success"]) for record in records),
-        wrong=sum(not record["success"] and record.get("failure") == WRONG for record in records),
+        wrong=sum(not record["success"] and record.get("failure") == REFERENCE_DRIFT for record in records),
         first=bool(records[0]["success"]),
     )
 

@@ -15,6 +15,9 @@ from lerobot_memobench.tasks.task import BDDL_FILE, MEMORY_TYPES, PUBLISHED, SUI
 #: <suite>/<memory type>/<task name>/{task_config.bddl, task_config.meta.json}; names are unique over both suites.
 CATALOGUE_DIR = Path(__file__).parent / "catalogue"
 
+BOWL = "put_the_butter_into_the_bowl_from_the_prompt_video"
+"""The task that shows in little time what a memory is for: which of three bowls it is, the prompt alone tells."""
+
 
 @lru_cache(maxsize=1)
 def _folders() -> dict[str, Path]:

@@ -6,12 +6,15 @@ from collections.abc import Sequence
 
 from lerobot_memobench.tasks.task import Task
 
+REFERENCE_DRIFT = "reference_drift"
+"""The class of a failure at a wrong referent."""
+
 #: Failure classes of the published tasks, in the order of the report.
 FAILURES = (
     "storage_failure",
     "stale_memory",
     "compression_collapse",
-    "reference_drift",
+    REFERENCE_DRIFT,
     "execution_failure",
 )
 
@@ -46,5 +49,5 @@ def classify(
         return None
     for operation, first_step in zip(operations, first_steps, strict=True):
         if first_step is None:
-            return "reference_drift" if drift else _BY_OPERATION[operation]
+            return REFERENCE_DRIFT if drift else _BY_OPERATION[operation]
     return "execution_failure"

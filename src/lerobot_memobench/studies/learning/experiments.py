@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from lerobot_memobench.tasks.catalogue import get_task, task_names
-
-BOWL = "put_the_butter_into_the_bowl_from_the_prompt_video"
+from lerobot_memobench.tasks.catalogue import BOWL, get_task, task_names
 
 MEMORY, MEMORYLESS = "memory", "no memory"
 ARMS: dict[str, tuple[str, ...]] = {MEMORY: (), MEMORYLESS: ("policy.integration=none",)}

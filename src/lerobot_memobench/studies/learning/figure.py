@@ -20,7 +20,7 @@ def draw(arms: Mapping[str, Mapping[str, Outcome]], path: Path) -> Path:
     """Draw the means over memory types, or the one task there is, to ``path``; return it.
 
     Args:
-        arms: arm -> scope -> outcome, as `outcomes.read_outcomes` finds them.
+        arms: arm -> scope -> outcome, as `outcomes.outcomes_of` finds them.
     """
     import matplotlib
 

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.evaluation.metrics.rates import Rate, mean_rate, success_rate
 from lerobot_memobench.evaluation.metrics.rollouts import Record, by_task
-from lerobot_memobench.evaluation.records.runs import read_rollouts
+from lerobot_memobench.studies.learning.contrasts import Runs
+from lerobot_memobench.tasks.failures import REFERENCE_DRIFT
 from lerobot_memobench.tasks.task import MEMORY_TYPES
-
-WRONG_REFERENT = "reference_drift"
 
 
 @dataclass(frozen=True)
@@ -31,12 +29,12 @@ class Outcome:
     others: int
 
 
-def read_outcomes(folders: Sequence[Path]) -> dict[str, Outcome]:
-    """Return "all", memory type and task -> outcome, of an arm's evaluations, one folder per training seed.
+def outcomes_of(rollouts: Runs) -> dict[str, Outcome]:
+    """Return "all", memory type and task -> outcome, of an arm's rollouts.
 
     "all" is the mean over memory types of the mean over tasks, as in the paper.
     """
-    runs = [by_task(read_rollouts(folder)[0]) for folder in folders]
+    runs = [by_task(records) for records in rollouts]
     tasks = list(runs[0])
     found = {task: _outcome([[run[task]] for run in runs]) for task in tasks}
     type_of = {task: str(runs[0][task][0]["memory_type"]) for task in tasks}
@@ -51,7 +49,7 @@ def _outcome(runs: Sequence[Sequence[Sequence[Record]]]) -> Outcome:
     """Put together the rollouts of one or several tasks, (training seed, task, rollout)."""
     tasks = [[record for run in runs for record in run[k]] for k in range(len(runs[0]))]
     failures = [record.get("failure") for group in tasks for record in group if not record["success"]]
-    wrong = failures.count(WRONG_REFERENT)
+    wrong = failures.count(REFERENCE_DRIFT)
     return Outcome(
         success=mean_rate([success_rate(group) for group in tasks]),
         of_seeds=tuple(_value(mean_rate([success_rate(group) for group in run])) for run in runs),

@@ -14,7 +14,7 @@ from lerobot_memobench.studies.learning.commands import Cost
 from lerobot_memobench.studies.learning.contrasts import Contrast, contrasts
 from lerobot_memobench.studies.learning.experiments import MEMORY, Experiment
 from lerobot_memobench.studies.learning.figure import draw
-from lerobot_memobench.studies.learning.outcomes import Outcome, as_json, read_outcomes
+from lerobot_memobench.studies.learning.outcomes import Outcome, as_json, outcomes_of
 from lerobot_memobench.studies.learning.stages import Stages, name_of
 
 Say = Callable[[str], None]
@@ -47,10 +47,10 @@ def learn(experiment: Experiment, out: Path, say: Say, *, dataset: Path | None =
         say(f"evaluation: {name_of(arm, seed)}; see {stages.log('evaluation', arm, seed)}")
         costs.setdefault("evaluation", []).append(stages.evaluate(arm, seed))
     seeds = range(experiment.seeds)
-    found = {arm: read_outcomes([stages.rollouts(arm, seed) for seed in seeds]) for arm in experiment.arms}
+    rollouts = {arm: [read_rollouts(stages.rollouts(arm, seed))[0] for seed in seeds] for arm in experiment.arms}
+    found = {arm: outcomes_of(runs) for arm, runs in rollouts.items()}
     write_file(out / "learning.json", json.dumps(as_json(found), indent=1))
     draw(found, out / "learning.png")
-    rollouts = {arm: [read_rollouts(stages.rollouts(arm, seed))[0] for seed in seeds] for arm in experiment.arms}
     against = contrasts_table(contrasts(rollouts, MEMORY), experiment.seeds)
     text = f"{outcomes_table(found)}\n\n{against}\n\n{costs_table(costs)}\n"
     write_file(out / "learning.md", text)
