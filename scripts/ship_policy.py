@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import shutil
 from pathlib import Path
 from typing import Any
@@ -17,14 +18,20 @@ from typing import Any
 import torch
 from safetensors.torch import load_file, save_file
 
-from lerobot_memobench.engine.policy_identity import training_facts
+from lerobot_memobench.datasets.manifest import read_manifest
+from lerobot_memobench.engine.policy_identity import ELSEWHERE, encoded, training_facts
 from lerobot_memobench.envs.episode_log import MERGED_FILE
 from lerobot_memobench.evaluation.documents.report import REPORT_JSON
 from lerobot_memobench.files import file_hash, write_file
 from lerobot_memobench.policies.checkpoint import SHIPPED, WEIGHTS_FILE, checkpoint_folder
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.tasks.catalogue import get_task, task_names
+from lerobot_memobench.tasks.task import DRAWN
 
 LARGEST = 4_000_000
 """Bytes that one policy may take."""
+OF_THE_DATA = ("input_features", "output_features", "action_feature_names", "object_classes")
+"""Settings of a policy that its dataset decides."""
 HEAD = """---
 license: apache-2.0
 library_name: lerobot
@@ -60,26 +67,70 @@ def ship(run: Path, name: str, rollouts: Path | None) -> Path:
 def card(name: str, source: Path, weights: dict[str, torch.Tensor], rollouts: Path | None) -> str:
     """Return the Markdown that goes with a policy."""
     told = json.loads((source / "train_config.json").read_text())
-    facts: dict[str, Any] = {**(training_facts(source) or {})}
     policy = told["policy"]
-    words = [f"policy.{key}={policy[key]}" for key in ("integration", "objective", "memory_stride", "align")]
     count = sum(value.numel() for value in weights.values()) / 1e6
+    words = [*settings(policy), *(f"{key}={told[key]}" for key in ("batch_size", "steps", "seed"))]
     lines = [
         f"# {name}",
         "",
-        f"`memobench_mem`, {count:.1f} million parameters, bfloat16; sees objects, not pixels. Trained on the scripted",
-        "expert's demonstrations of all thirty published tasks with random referents, seeds from 10,000 on:",
+        f"`memobench_mem`, {count:.1f} million parameters, bfloat16; sees {policy['perception']}.",
+        *demonstrations(training_facts(source) or {}),
         "",
         "```bash",
-        "memobench generate --tasks all --referent random --episodes 20 --perturb --no-images --out outputs/data",
-        "lerobot train policy=memobench_mem perception=objects size=small dataset=outputs/data \\",
-        f"    {' '.join(words)} batch_size={told['batch_size']} steps={told['steps']} seed={told['seed']}",
+        f"lerobot train policy=memobench_mem perception={policy['perception']} size={policy['size']} \\",
+        f"    dataset=outputs/data {shlex.join(words)}",
         "```",
-        "",
-        f"sha256 of the dataset's meta files and manifest: `{facts.get('sha256')}`.",
         *([] if rollouts is None else results(name, rollouts)),
     ]
     return HEAD + "\n".join(lines) + "\n"
+
+
+def settings(policy: dict[str, Any]) -> list[str]:
+    """Return what was said of a policy in training: where it is not as its size and perception decide."""
+    usual = encoded(MemobenchMemConfig(device="cpu", size=policy["size"], perception=policy["perception"]))
+    said = {key: policy[key] for key in sorted({*usual} & {*policy} - {*ELSEWHERE, *OF_THE_DATA})}
+    return [
+        f"policy.{key}={value if isinstance(value, str) else json.dumps(value)}"
+        for key, value in said.items()
+        if value != usual[key]
+    ]
+
+
+def demonstrations(trained_on: dict[str, Any]) -> list[str]:
+    """Return what a policy was trained on and the command that made it, by the manifest in the dataset's folder."""
+    try:
+        manifest = read_manifest(Path(trained_on["root"]))
+        made = sum(episode["failure"] is None for episode in manifest["episodes"])
+        count, words, digest = len(manifest["request"]["tasks"]), generation(manifest["request"]), trained_on["sha256"]
+    except (FileNotFoundError, KeyError, TypeError):  # it is gone, has no folder, or was not generated
+        return ["Trained on a dataset that was not at hand when this card was written."]
+    return [
+        f"Trained on {made} demonstrations by the scripted expert, of {count} task{'s' if count > 1 else ''}; sha256",
+        f"of the dataset's meta files and manifest: `{digest}`.",
+        "",
+        "```bash",
+        f"memobench generate {shlex.join(words)} \\",
+        "    --out outputs/data",
+        "```",
+    ]
+
+
+def generation(request: dict[str, Any]) -> list[str]:
+    """Return the words of `memobench generate` that ask for what a manifest says was asked for."""
+    suite = get_task(request["tasks"][0]).suite
+    every = sorted(request["tasks"]) == sorted(task_names(suite=suite))
+    options = {
+        "--tasks": "all" if every else ",".join(request["tasks"]),
+        "--suite": suite,
+        "--episodes": request["episodes"],
+        "--seed-base": request["seed_base"],
+        "--referent": None if request["referent"] == DRAWN else request["referent"],
+        "--image-size": request["image_size"] if request["images"] else None,
+    }
+    flags = {"--perturb": request["perturb"], "--no-images": not request["images"]}
+    flags["--no-prompt-video"] = not request["prompt_video"]
+    given = [str(word) for option in options.items() if option[1] is not None for word in option]
+    return given + [flag for flag, meant in flags.items() if meant]
 
 
 def results(name: str, rollouts: Path) -> list[str]:

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 from pathlib import Path
+from types import ModuleType
 
 import pytest
+import torch
 
 from lerobot_memobench.engine import memory_demo
+from lerobot_memobench.engine.policy_identity import encoded
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies import checkpoint
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.settings.choices import checkpoint_of
+from lerobot_memobench.tasks.catalogue import BOWL, task_names
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
@@ -53,3 +61,55 @@ def test_a_name_that_is_nearly_one_is_told(shipped: Path) -> None:
 
     with pytest.raises(MemobenchError, match="did you mean 'memobench_small'"):
         choice_flags(EvalPipelineConfig, "policy", "memobench_smal")
+
+
+# -- the script that ships them ------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def script() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("ship_policy", ROOT / "scripts" / "ship_policy.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_card_tells_every_setting_that_is_not_the_sizes(script: ModuleType) -> None:
+    import draccus
+
+    given = {"balance_tasks": False, "chunk_size": 8, "final_lr": 0.1, "integration": "context", "width": 192}
+    usual = {"device": "cpu", "size": "small", "perception": "objects"}
+    policy = encoded(MemobenchMemConfig(**usual, **given))
+    words = script.settings(policy)
+    assert {word.partition("=")[0] for word in words} == {f"policy.{name}" for name in given}
+    shared = [f"--{name}={value}" for name, value in usual.items()]
+    again = draccus.parse(MemobenchMemConfig, args=[*shared, *("--" + word.removeprefix("policy.") for word in words)])
+    assert encoded(again) == policy
+
+
+def test_a_card_tells_how_the_demonstrations_were_made(script: ModuleType, tmp_path: Path) -> None:
+    source = tmp_path / "pretrained_model"
+    source.mkdir()
+    policy = encoded(MemobenchMemConfig(device="cpu", size="small", perception="objects", memory_stride=4))
+    told = {"policy": policy, "dataset": {"root": str(tmp_path / "data")}, "batch_size": 6, "steps": 5, "seed": 1}
+    (source / "train_config.json").write_text(json.dumps(told))
+
+    def card() -> str:
+        return str(script.card("mine", source, {"a": torch.zeros(3)}, None))
+
+    assert "not at hand" in card()
+    (tmp_path / "data" / "meta").mkdir(parents=True)
+    request = {"tasks": [BOWL], "episodes": 3, "seed_base": 10_000, "referent": "random", "perturb": True}
+    request |= {"images": False, "image_size": 256, "prompt_video": True}
+    made = [{"task_name": BOWL, "seed": seed, "failure": None, "frames": 9} for seed in (10_000, 10_001)]
+    manifest = {"request": request, "episodes": [*made, {"task_name": BOWL, "seed": 10_002, "failure": "it fell"}]}
+    (tmp_path / "data" / "manifest.json").write_text(json.dumps(manifest))
+    assert "Trained on 2 demonstrations by the scripted expert, of 1 task;" in card()
+    options = "--episodes 3 --seed-base 10000 --referent random --perturb --no-images"
+    assert f"memobench generate --tasks {BOWL} --suite published {options} " in card()
+    assert "policy.memory_stride=4 batch_size=6 steps=5 seed=1\n" in card()
+    strict = {**request, "tasks": task_names(suite="strict"), "referent": "drawn"}
+    assert script.generation(strict)[:6] == ["--tasks", "all", "--suite", "strict", "--episodes", "3"]
+    assert "--referent" not in script.generation(strict)
