@@ -10,6 +10,8 @@ from lerobot.policies.pi05.modeling_pi05 import PI05Pytorch
 from lerobot_memobench.policies.memobench_mem.backbone import SizedPI05
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory_pi05 import MemoryPI05
+from lerobot_memobench.policies.memobench_mem.perception.slots import HAND_DIM
+from lerobot_memobench.sim.object_slots import SIZE, SLOTS
 
 CHUNK, BATCH, FRAMES = 6, 2, 5
 
@@ -134,6 +136,25 @@ def test_context_memory_joins_the_prefix_and_padding_says_nothing() -> None:
     torch.testing.assert_close(_actions(ours, inputs), actions)
     ours.set_memory(-tokens, steps, mask)
     assert not torch.allclose(_actions(ours, inputs), actions)
+
+
+def test_the_instruction_conditions_the_experts_norms_and_its_padding_does_not() -> None:
+    config = _config(size="small", perception="objects")
+    torch.manual_seed(0)
+    model = SizedPI05(config)
+    tokens = torch.randint(0, 200, (2, 12))
+    short = torch.arange(12) < torch.tensor([[12], [7]])
+    seen = [torch.zeros(2, SIZE + HAND_DIM), torch.zeros(2, config.max_state_dim)]
+    shown = [torch.zeros(2, SLOTS, dtype=torch.bool), torch.ones(2, dtype=torch.bool)]
+
+    def condition(words: torch.Tensor) -> torch.Tensor:
+        model.embed_prefix(seen, shown, words, short)
+        return model.embed_suffix(torch.zeros(2, CHUNK, 32), torch.ones(2))[3]
+
+    told = condition(tokens)
+    assert torch.equal(told, condition(torch.where(short, tokens, 3)))
+    other = condition(torch.where(torch.arange(12) == 4, tokens + 1, tokens))
+    assert (other != told).any(dim=1).all()
 
 
 def test_gradients_reach_memory_expert_and_vlm_but_not_the_tower() -> None:

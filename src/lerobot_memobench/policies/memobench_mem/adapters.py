@@ -8,7 +8,7 @@ from torch import nn
 
 _OWN = (
     *("model.memory", "model.memory_to_expert", "modulator", "alignment"),
-    *("model.state_token", "paligemma_with_expert.perception"),
+    *("model.state_token", "model.instruction", "paligemma_with_expert.perception"),
 )
 """Ends of the names of modules that a checkpoint of pi0.5 knows nothing of; they are small beside it."""
 

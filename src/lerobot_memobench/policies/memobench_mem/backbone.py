@@ -112,8 +112,35 @@ class StateToken(nn.Module):
         return rearrange(self.mlp(state) * LOUD, "b d -> b 1 d")
 
 
+class InstructionCondition(nn.Module):
+    """The instruction's mean word, for the adaptive norms of the action expert, which are told the time by it.
+
+    Attention alone has to find the one word that tells two tasks apart. On six tasks of one cabinet, one microwave and
+    one stove, 2,000 updates, the loss was 2 % lower with it and 28 of 30 rollouts were solved, not 24 (one training
+    seed, and seeds that settings may be chosen by).
+    """
+
+    def __init__(self, words_dim: int, width: int) -> None:
+        super().__init__()
+        self.mlp = nn.Sequential(nn.Linear(words_dim, width), nn.SiLU(), nn.Linear(width, width))
+        self.said: Tensor | None = None
+
+    def read(self, words: Tensor, real: Tensor) -> None:
+        """Begin a pass with these words (B, n, D), of which ``real`` (B, n) are no padding."""
+        weights = real.unsqueeze(-1).to(words.dtype)
+        self.said = (words * weights).sum(dim=1) / weights.sum(dim=1).clamp(min=1)
+
+    def forward(self) -> Tensor:
+        """Return what is added to the condition (B, width)."""
+        added: Tensor = self.mlp(self.said)
+        return added
+
+
 class SizedPI05(PI05Pytorch):
-    """LeRobot's pi0.5 model at this policy's dimensions, with a token of the state where the policy has one."""
+    """LeRobot's pi0.5 model at this policy's dimensions.
+
+    A policy that has a token of the state also tells the action expert's norms what the instruction is.
+    """
 
     def __init__(self, config: MemobenchMemConfig, rtc_processor: Any = None) -> None:
         with torch.device("meta"):
@@ -124,7 +151,14 @@ class SizedPI05(PI05Pytorch):
         self.action_out_proj = nn.Linear(width, config.max_action_dim)
         self.time_mlp_in = nn.Linear(width, width)
         self.time_mlp_out = nn.Linear(width, width)
-        self.state_token = StateToken(config.max_state_dim, config.dimensions.vlm.width) if config.state_token else None
+        seen = config.dimensions.vlm.width
+        self.state_token = StateToken(config.max_state_dim, seen) if config.state_token else None
+        self.instruction = InstructionCondition(seen, width) if config.state_token else None
+
+    def embed_suffix(self, noisy_actions: Tensor, timestep: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """LeRobot's action tokens, their masks, and the condition of the expert's norms."""
+        *tokens, condition = super().embed_suffix(noisy_actions, timestep)
+        return *tokens, condition if self.instruction is None else condition + self.instruction()
 
     def embed_prefix(self, images: Any, img_masks: Any, tokens: Tensor, masks: Tensor) -> Prefix:
         """LeRobot's prefix: what is seen now, then words.
@@ -132,11 +166,12 @@ class SizedPI05(PI05Pytorch):
         With a token of the state, the last of the ``images`` is the state (B, dim), and the masks of the others may be
         of their tokens (B, n), which LeRobot's are not.
         """
-        if self.state_token is None:
+        if self.state_token is None or self.instruction is None:
             prefix: Prefix = super().embed_prefix(images, img_masks, tokens, masks)
             return prefix
         longest = int(masks.sum(dim=1).max())  # padding would be most of so short a prefix
         words, real, _ = super().embed_prefix([], [], tokens[:, :longest], masks[:, :longest])
+        self.instruction.read(words, real)
         *parts, state = images
         seen = [*(self.paligemma_with_expert.embed_image(part) for part in parts), self.state_token(state)]
         shown = [

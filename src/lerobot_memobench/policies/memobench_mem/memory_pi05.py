@@ -16,7 +16,7 @@ from lerobot_memobench.policies.memobench_mem.memory.registry import make_mechan
 INTEGRATIONS: dict[str, type[Integration]] = {"modulation": Modulation, "context": Context}
 
 
-OWN = ("memory.", "state_token.", "paligemma_with_expert.perception.")
+OWN = ("memory.", "state_token.", "instruction.", "paligemma_with_expert.perception.")
 """What the names of parameters begin with that plain pi0.5 does not have; an integration has more."""
 
 

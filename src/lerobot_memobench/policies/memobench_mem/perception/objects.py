@@ -28,6 +28,13 @@ def frame_row(slots: Tensor, state: Tensor, phase: Tensor) -> Tensor:
     return rearrange(row, "n d -> n 1 d")
 
 
+def in_slots(made: Tensor, there: Tensor, empty: float = 0.0) -> Tensor:
+    """Return the vectors of things (M, D) in their slots (N, SLOTS, D), of which ``there`` (N, SLOTS) hold one."""
+    slots = made.new_full((*there.shape, made.shape[-1]), empty)
+    slots[there] = made  # masked_scatter takes three times as long
+    return slots
+
+
 class FramePool(nn.Module):
     """A stored frame to a few tokens of unit size: its things, pooled by learned attention.
 
@@ -48,8 +55,7 @@ class FramePool(nn.Module):
         made, there = self.slot(slots.unflatten(1, (SLOTS, WIDTH)), hand)
         score = self.score(made)
         # A finite score keeps a frame in which nothing is seen finite: it becomes zeros.
-        scores = score.new_full((*there.shape, score.shape[-1]), -1e4).masked_scatter(there.unsqueeze(-1), score)
-        values = made.new_zeros((*there.shape, made.shape[-1])).masked_scatter(there.unsqueeze(-1), made)
+        scores, values = in_slots(score, there, -1e4), in_slots(made, there)
         pooled = torch.einsum("nsk,nsd->nkd", scores.softmax(dim=1), values)
         kept: Tensor = self.out(pooled + self.phase(phase).unsqueeze(1))
         return rms_norm(kept, kept.shape[-1:], eps=1e-6)
@@ -121,7 +127,7 @@ class ObjectPerception(nn.Module, Perception):
         """Return a token (B, SLOTS, d_vlm) per slot of what `present` returns; zeros for empty ones."""
         slots, hand = observed.split([SIZE, HAND_DIM], dim=1)
         made, there = self.slot(slots.unflatten(1, (SLOTS, WIDTH)), hand)
-        return made.new_zeros((*there.shape, made.shape[-1])).masked_scatter(there.unsqueeze(-1), made * LOUD)
+        return in_slots(made * LOUD, there)
 
     def memory(self, encoder: nn.Module) -> nn.Module:
         """Return the encoder behind a pool of each frame."""
