@@ -59,7 +59,7 @@ def experiment(name: str) -> Experiment:
 EXPERIMENTS: dict[str, Experiment] = {
     "bowl": Experiment((BOWL,), episodes=120, steps=1000, seeds=3),
     "prompted": Experiment(prompted(), episodes=40, steps=8_000),
-    "joint": Experiment(tuple(task_names()), episodes=20, steps=10_000),
+    "joint": Experiment(tuple(task_names()), episodes=40, steps=20_000),
     "alignment": Experiment(prompted(), episodes=40, steps=4_000, arms=ALIGNMENTS, seeds=3),
 }
 """Butter into the prompted bowl, in minutes; the ten prompted tasks, by one policy; all thirty, by one policy; and
