@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,7 @@ import pytest
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode import PROMPT_LIMIT
 from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.envs.film import Film
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.envs.observations import EXECUTION, PROMPT
 from lerobot_memobench.errors import MemobenchError
@@ -274,6 +277,30 @@ def test_the_first_episodes_are_filmed_or_all(tmp_path: Path) -> None:
             env.step(np.zeros(7, np.float32))
         env.close()
         assert {film.name for film in folder.rglob("*.mp4")} == {f"{STOVE}.{number}.mp4" for number in filmed}
+
+
+def test_a_film_that_cannot_be_written_leaves_the_log_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was run before is there with its films; the episode at hand is not in the log, so that it is run again."""
+    env = make(STOVE, log_dir=str(tmp_path), videos=True, horizon=3, render="fast")
+
+    def run(seed: int) -> None:
+        env.reset(seed=seed)
+        for action in actions(seed, 3):
+            env.step(action)
+
+    def no_room(film: Film, picture: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    run(20_007)
+    with monkeypatch.context() as patch:
+        patch.setattr(Film, "_encode", no_room)
+        with pytest.raises(MemobenchError, match=r"cannot be written \(No space left on device\)"):
+            run(20_008)
+    assert [record["seed"] for record in read_episodes(tmp_path)] == [20_007]
+    run(20_009)
+    env.close()
+    assert [record["seed"] for record in read_episodes(tmp_path)] == [20_007, 20_009]
+    assert len(list((tmp_path / "videos").iterdir())) == 2
 
 
 def test_log_holds_the_finished_episodes(tmp_path: Path) -> None:
