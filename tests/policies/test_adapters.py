@@ -34,7 +34,6 @@ def test_what_is_asked_for_is_trained_whole_too(dataset_root: Path) -> None:
 
 
 def test_adapters_are_made_beside_memory_and_heads(dataset_root: Path, tmp_path: Path) -> None:
-    pytest.importorskip("peft")
     policy, before, _, dataset = made_for_training(dataset_root, align="contrastive")
     policy.save_pretrained(tmp_path)
     policy.config.pretrained_path = str(tmp_path)
