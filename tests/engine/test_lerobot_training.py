@@ -8,11 +8,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
 from lerobot.datasets import factory as dataset_factory
+from lerobot.datasets.streaming_dataset import StreamingLeRobotDataset
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 from lerobot.scripts import lerobot_train
@@ -45,6 +47,8 @@ CALLS = {
     (lerobot_train.train, f"{lerobot_training.MAKE}(cfg)"): "opens the datasets by it, looked up in its module",
     (lerobot_train.train, 'dataset.meta.episodes["dataset_from_index"]'): "draws within these bounds",
     (lerobot_train.train, "episode_indices_to_use=dataset.episodes"): "draws from the episodes that are opened",
+    (StreamingLeRobotDataset.__iter__, "safe_shard(self.hf_dataset, idx"): "streams the frames that are found there",
+    (StreamingLeRobotDataset._get_delta_frames, "dataset_iterator.peek_back"): "looks back in that stream alone",
     (lerobot_train.train, 'eval_dataset.hf_dataset.data.column("task_index")'): "looks there for held-out tasks",
     (dataset_factory.make_train_eval_datasets, "return full_dataset, None"): "returns two datasets, or one and None",
 }
@@ -144,13 +148,34 @@ def test_what_is_no_dataset_of_ours_stays_as_it_is(root: Path, monkeypatch: pyte
     assert drawn(opened(root, act())[0]) == set(range(sum(LENGTHS)))
 
 
-def test_a_streamed_dataset_is_refused_in_one_sentence(root: Path) -> None:
-    with pytest.raises(MemobenchError, match=r"prompt_frames=true to train on them"):
-        opened(root, act(), streaming=True)
-    opened(root, act(), prompt_frames=True, streaming=True)
+def test_of_a_streamed_dataset_prompts_are_passed_over(root: Path) -> None:
+    """Nor does a history reach into them; each frame is that of the dataset on disk."""
+    acting = set(range(sum(LENGTHS))) - PROMPT_FRAMES
+    train, held_out = opened(root, act(), streaming=True)
+    assert held_out is None
+    streamed = {int(frame["index"]): frame for frame in train}
+    assert set(streamed) == acting
+    train.delta_indices = {"observation.state": [-2, -1, 0]}
+    train.delta_timestamps = {"observation.state": [-0.1, -0.05, 0.0]}
+    (first,) = (frame for frame in train if frame["index"] == START)
+    assert first["observation.state_is_pad"].tolist() == [True, True, False]
+    assert (first["observation.state"] == streamed[START]["observation.state"]).all()
+    on_disk, _ = opened(root, act())
+    for key in ("observation.state", "action", "action_is_pad", "phase"):
+        assert np.asarray(streamed[START][key]).tolist() == np.asarray(on_disk[START][key]).tolist()
+    assert {int(frame["index"]) for frame in opened(root, act(), True, streaming=True)[0]} == acting | PROMPT_FRAMES
+
+
+def test_what_cannot_be_streamed_without_prompts_is_refused_in_one_sentence(root: Path) -> None:
+    looks_back = DiffusionConfig(device="cpu", push_to_hub=False, n_obs_steps=2)
+    with pytest.raises(MemobenchError, match=r"image is asked for earlier frames.*prompt_frames=true to train"):
+        opened(root, looks_back, streaming=True)
+    opened(root, looks_back, prompt_frames=True, streaming=True)
     ours = MemobenchMemConfig(device="cpu", push_to_hub=False)
     with pytest.raises(MemobenchError, match=r"memobench_mem draws execution frames alone.*policy.prompt_loss=true"):
         opened(root, ours, streaming=True)
+    train, _ = opened(root, ours, prompt_frames=False, streaming=True)
+    assert {int(frame["phase"]) for frame in train} == {1}
     ours.prompt_loss = True
     opened(root, ours, streaming=True)
 
@@ -195,16 +220,20 @@ def test_an_unclear_choice_is_refused(capsys: pytest.CaptureFixture[str]) -> Non
 
 
 @pytest.mark.slow
-def test_plain_lerobot_train_by_its_own_flag(root: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("streaming", "told"), [((), "8 frames"), (("--dataset.streaming=true", "--num_workers=1"), "the frames")]
+)
+def test_plain_lerobot_train_by_its_own_flag(root: Path, tmp_path: Path, streaming: tuple[str, ...], told: str) -> None:
     flags = [f"--{word}" for word in WORDS]
     run = subprocess.run(
         [
             *(sys.executable, "-c", "from lerobot.scripts.lerobot_train import main; main()", *flags),
             *("--dataset.repo_id=memobench/synthetic", f"--dataset.root={root}", f"--output_dir={tmp_path / 'run'}"),
             "--dataset.discover_packages_path=lerobot_memobench.engine.without_prompts",
+            *streaming,
         ],
         capture_output=True,
         text=True,
     )
     assert run.returncode == 0, run.stderr
-    assert "8 frames of prompts are left out of the 94 to train on" in run.stderr
+    assert f"{told} of prompts are left out of the 94 to train on" in run.stderr

@@ -64,14 +64,16 @@ def _steered(make: Callable[..., Any], prompt_frames: bool | None, obs_type: str
 
     @functools.wraps(make)
     def run(config: Any) -> Any:
-        _check_streaming(config)
+        if prompt_frames is not False:
+            _check_streaming(config)
         train, held_out = make(config)
         _choose_inputs(config.policy, train.meta.features, obs_type)
         wanted = config.policy is None or knows_phases(config.policy) if prompt_frames is None else prompt_frames
         if wanted:
             return train, held_out
         count = leave_out_prompts(train)
-        logger.info("%d frames of prompts are left out of the %d to train on", count, train.num_frames)
+        told = "the frames" if count is None else f"{count} frames"
+        logger.info("%s of prompts are left out of the %d to train on", told, train.num_frames)
         if held_out is not None and leave_out_prompts(held_out):
             held_out = ExecutionFrames(held_out)
         return train, held_out
@@ -84,7 +86,8 @@ def _check_streaming(config: Any) -> None:
     if config.dataset.streaming and getattr(config.policy, "prompt_loss", True) is False:
         raise MemobenchError(
             f"policy={config.policy.type} draws execution frames alone, and dataset.streaming=true leaves no choice of "
-            "frames; use dataset.streaming=false, or policy.prompt_loss=true to train on prompts as well"
+            "frames; use dataset.streaming=false, prompt_frames=false to take execution frames as they come, or "
+            "policy.prompt_loss=true to train on prompts as well"
         )
 
 
