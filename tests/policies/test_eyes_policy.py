@@ -30,6 +30,8 @@ from synthetic_dataset import LENGTHS
 CAMERAS = ("observation.images.image", "observation.images.wrist_image")
 STARTS = np.cumsum([0, *LENGTHS])
 FRAME_BYTES = 2 * GRID**2 * WIDTH
+ROUNDED = 2**-7
+"""What bfloat16 may round off, as a share of a number."""
 
 
 def made_eyes(path: Path, seed: int) -> Path:
@@ -72,6 +74,11 @@ def looked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return seen
 
 
+def apart(one: torch.Tensor, other: torch.Tensor) -> float:
+    """How far numbers are apart at most, as a share of the largest."""
+    return float((one.float() - other.float()).abs().max() / other.float().abs().max())
+
+
 def observed(root: Path, dataset: Any, index: int) -> dict[str, Any]:
     """An observation of a rollout: frame ``index`` as the dataset's videos show it."""
     episode = int(np.searchsorted(STARTS, index, "right")) - 1
@@ -94,10 +101,8 @@ def test_eyes_are_the_default_of_small_pixels_once_they_are_shipped(
 ) -> None:
     monkeypatch.setattr(weights, "SHIPPED", tmp_path / "absent.safetensors")
     before = MemobenchMemConfig(device="cpu", size="small")
-    assert (before.eyes, before.memory_stride, before.moments_per_episode, before.balance_tasks) == (
-        *("random", 1, 1),
-        False,
-    )
+    assert (before.eyes, before.memory_stride, before.moments_per_episode) == ("random", 1, 1)
+    assert not before.balance_tasks
     monkeypatch.setattr(weights, "SHIPPED", eyes)
     config = MemobenchMemConfig(device="cpu", size="small")
     assert (config.eyes, config.image_size, config.tokens_per_frame) == ("package", (SIDE, SIDE), POOLED**2)
@@ -178,16 +183,18 @@ def test_a_cache_that_was_killed_is_finished(
         patched.setattr(Tower, "forward", kill)
         with pytest.raises(KeyboardInterrupt):
             cache_dataset(killed, small_config(**seeing), batch_size=40)
-    folders = [cache_dataset(where, small_config(**seeing), batch_size=40) for where in (killed, root)]
-    for one, other in zip(*(sorted(folder.parent.glob("*/tokens.bin")) for folder in folders), strict=True):
-        assert one.read_bytes() == other.read_bytes()
+    for where in (killed, root):
+        cache_dataset(where, small_config(**seeing), batch_size=40)
+    made = [path.relative_to(killed) for path in killed.glob(f"{FOLDER}/*/tokens.bin")]
+    assert len(made) == 3
+    assert all((killed / path).read_bytes() == (root / path).read_bytes() for path in made)
 
 
 def test_a_disk_without_room_for_all_is_told_before_any_is_made(
     dataset_root: Path, tmp_path: Path, seeing: dict[str, Any], looked: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root, usage = copy(dataset_root, tmp_path / "data"), shutil.disk_usage(tmp_path)
-    room = 2 * sum(LENGTHS) * FRAME_BYTES  # for one camera, and some
+    room = 2 * sum(LENGTHS) * FRAME_BYTES  # for the present pictures, and not for the memory
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=room))
     with pytest.raises(MemobenchError, match=r"4\.7 MiB are needed there and 4\.4 MiB are free.*memory_cache_dir"):
         cache_dataset(root, small_config(**seeing))
@@ -252,20 +259,18 @@ def test_a_rollout_sees_and_remembers_what_training_reads(root: Path, seeing: di
     tokens, steps, mask = policy.history.gather([0])
     assert torch.equal(steps, trained[STEPS])
     assert torch.equal(mask, trained[MASK])
-    near = {"rtol": 2**-7, "atol": 1e-6}  # what bfloat16 rounds off
-    torch.testing.assert_close(tokens, trained[TOKENS], **near)
     (of_cache, _), (of_pictures, _) = (policy.perception.present(batch) for batch in (trained, acted))
-    for one, other in zip(of_cache, of_pictures, strict=True):
-        torch.testing.assert_close(one, other, **near)
-    assert not torch.allclose(of_cache[0].float(), of_cache[1].float(), **near), "cameras see differently"
-    assert not torch.allclose(tokens[0, 0].float(), tokens[0, 7].float(), **near), "so do moments"
+    for one, other in ((trained[TOKENS], tokens), *zip(of_cache, of_pictures, strict=True)):
+        assert apart(one, other) <= ROUNDED
+    assert apart(of_cache[0], of_cache[1]) > 4 * ROUNDED, "cameras see differently"
+    assert apart(tokens[0, 0], tokens[0, 7]) > 4 * ROUNDED, "so do moments"
     words = ("observation.language.tokens", "observation.language.attention_mask")
     prefixes = [
         policy.model.embed_prefix(*policy._preprocess_images(batch), *(batch[key] for key in words))
         for batch in (trained, acted)
     ]
     assert prefixes[0][0].shape[1] == 2 * GRID**2 + 1 + trained[words[1]].sum(), "both pictures, the state, the words"
-    torch.testing.assert_close(prefixes[0][0], prefixes[1][0], rtol=1e-2, atol=1e-3)
+    assert apart(prefixes[0][0], prefixes[1][0]) <= ROUNDED
 
 
 @pytest.mark.parametrize(
@@ -352,7 +357,7 @@ def test_training_goes_on_through_the_tower_of_the_checkpoint(
 
 def test_other_eyes_than_a_checkpoint_was_trained_through_are_refused(saved: tuple[Any, ...], eyes: Path) -> None:
     folder = saved[3]
-    for other in (str(eyes), "random", "package"):
+    for other in (str(eyes), "package"):
         config = PreTrainedConfig.from_pretrained(folder, cli_overrides=[f"--eyes={other}"])
         with pytest.raises(MemobenchError, match=r"was trained through.*holds it; leave eyes out"):
             MemobenchMemPolicy.from_pretrained(folder, config=config)

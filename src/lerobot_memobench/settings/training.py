@@ -17,8 +17,8 @@ from lerobot_memobench.settings.words import Words
 
 INFO_FILE = Path("meta") / "info.json"
 OBJECT_BATCH = 72
-"""Frames per update of a policy that sees objects: a dozen episodes, six moments of each. They lie in main memory,
-where no loader would be quicker."""
+"""Frames per update of a policy that sees objects, or through eyes: a dozen episodes, six moments of each. They lie in
+main memory, where no loader would be quicker."""
 TRAINED = ("policy.type", "policy.path", "reward_model.type", "reward_model.path")
 """What may say what is trained."""
 
