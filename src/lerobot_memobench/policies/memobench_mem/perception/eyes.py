@@ -22,10 +22,13 @@ from lerobot_memobench.policies.memobench_mem.perception.perception import Perce
 from lerobot_memobench.policies.memobench_mem.perception.pooled_memory import PooledMemory
 from lerobot_memobench.policies.shown import cure
 
+SEEN = "observation.seen."
+"""What the names of pictures' tokens in training samples begin with."""
+
 
 def seen_key(camera: str) -> str:
     """Return the name in a training sample of the tokens (B, 64, WIDTH) of a camera's picture."""
-    return f"observation.seen.{camera.removeprefix(f'{OBS_IMAGES}.')}"
+    return SEEN + camera.removeprefix(f"{OBS_IMAGES}.")
 
 
 class PicturePool(nn.Module):
