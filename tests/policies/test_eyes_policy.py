@@ -250,7 +250,7 @@ def test_pictures_in_a_batch_are_refused(root: Path, seeing: dict[str, Any]) -> 
     """As LeRobot's loader processes make them, which know nothing of what was seen."""
     policy, before, _, dataset = made_for_training(root, **seeing)
     batch = before(torch.utils.data.default_collate([DatasetReader.get_item.__wrapped__(dataset.reader, 45)]))
-    with pytest.raises(MemobenchError, match=r"has pictures and not what eyes saw.*--num_workers=0"):
+    with pytest.raises(MemobenchError, match=r"has pictures, and not what eyes saw.*--num_workers=0"):
         policy.train().forward(batch)
 
 

@@ -91,8 +91,8 @@ class LearningPolicy(SeeingPolicy):
             )
         if self.config.has_eyes and not any(key.startswith(SEEN) for key in batch):
             raise MemobenchError(
-                "The training batch has pictures and not what eyes saw in them, because a stream or loader processes of "
-                "LeRobot's made it: pass --num_workers=0, which is quicker too, and leave dataset.streaming out."
+                "The training batch has pictures, and not what eyes saw in them, because a stream or loader processes "
+                "made it: pass --num_workers=0, which is quicker too, and leave dataset.streaming out."
             )
 
     def _read_memory(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor] | None:
