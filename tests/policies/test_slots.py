@@ -10,10 +10,10 @@ from lerobot_memobench.policies.memobench_mem.memory.encoder import MemoryEncode
 from lerobot_memobench.policies.memobench_mem.perception.objects import (
     OBS_RAW_STATE,
     FramePool,
-    ObjectMemory,
     ObjectPerception,
     frame_row,
 )
+from lerobot_memobench.policies.memobench_mem.perception.pooled_memory import PooledMemory
 from lerobot_memobench.policies.memobench_mem.perception.slots import FEATURES, SlotEncoder, rotation, slot_features
 from lerobot_memobench.sim.object_slots import SIZE, SLOTS, WIDTH, classes
 from object_dataset import slots_at, state_at
@@ -59,7 +59,7 @@ def test_a_millimetre_beside_the_hand_is_seen() -> None:
     """Through the whole of memory, where bfloat16 would hold places to 4 mm."""
     perception = ObjectPerception(classes(), 2, 32)
     memory = perception.memory(torch.nn.Identity())
-    assert isinstance(memory, ObjectMemory)
+    assert isinstance(memory, PooledMemory)
     moved = PLACES + np.array([0.001, 0, 0])
     rows = [
         perception.remember({"observation.environment_state": one[None], OBS_RAW_STATE: hand()[None]}, [0])
@@ -113,7 +113,7 @@ def test_a_frame_that_many_read_is_encoded_once() -> None:
         def forward(self, tokens: torch.Tensor, steps: torch.Tensor, mask: torch.Tensor) -> tuple[torch.Tensor, ...]:
             return tokens, mask
 
-    memory = ObjectMemory(Counting(range(KINDS), KINDS + 1, 2, 16), Pass())
+    memory = PooledMemory(Counting(range(KINDS), KINDS + 1, 2, 16), Pass())
     stored = torch.cat([frame_row(seen(seed=n)[None], hand()[None], torch.ones(1)) for n in range(5)])
     numbers = torch.tensor([[0, 1, 2, 3], [0, 2, 4, -1]])
     frames = stored[numbers] * (numbers >= 0)[..., None, None]
@@ -140,7 +140,7 @@ def test_which_thing_was_lit_can_be_learned() -> None:
     """A scene in which nothing is lit now, remembered after frames in which one thing was: where is that one?"""
     torch.manual_seed(0)
     rng = np.random.default_rng(0)
-    memory = ObjectMemory(FramePool(range(KINDS), KINDS + 1, 2, 32), MemoryEncoder(32, 32, grid=0))
+    memory = PooledMemory(FramePool(range(KINDS), KINDS + 1, 2, 32), MemoryEncoder(32, 32, grid=0))
     head = torch.nn.Linear(32, 2)
     optimizer = torch.optim.Adam([*memory.parameters(), *head.parameters()], lr=3e-3)
     steps, real, losses = torch.arange(2).expand(32, 2), torch.ones(32, 2, dtype=torch.bool), []

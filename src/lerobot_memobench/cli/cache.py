@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -12,8 +12,13 @@ from lerobot_memobench.cli.console import console, counting
 
 def cache(
     dataset: Annotated[Path, typer.Argument(help="Folder of a LeRobotDataset with the benchmark's columns.")],
-    size: Annotated[str, typer.Option(help="Size of the policy that reads it: tiny or pi05.")] = "tiny",
-    stride: Annotated[int, typer.Option(min=1, help="Keep every how many frames (policy.memory_stride).")] = 1,
+    size: Annotated[str, typer.Option(help="Size of the policy that reads it: tiny, small or pi05.")] = "tiny",
+    stride: Annotated[
+        int | None, typer.Option(min=1, help="Keep every how many frames (policy.memory_stride); 8 with eyes, else 1.")
+    ] = None,
+    eyes: Annotated[
+        str | None, typer.Option(help="Eyes of size small (policy.eyes): a file; those of the package by default.")
+    ] = None,
     weights: Annotated[
         str | None, typer.Option(help="Folder or repository whose image tower is used (size pi05).")
     ] = None,
@@ -36,7 +41,8 @@ def cache(
 
     with quiet():
         place = None if out is None else str(out)
-        config = MemobenchMemConfig(size=size, memory_stride=stride, memory_cache_dir=place, device=device)
+        given: dict[str, Any] = {} if stride is None else {"memory_stride": stride}
+        config = MemobenchMemConfig(size=size, eyes=eyes, memory_cache_dir=place, device=device, **given)
     screen = console()
     with counting(screen, "episodes") as count:
         folder = cache_dataset(

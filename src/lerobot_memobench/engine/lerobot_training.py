@@ -64,8 +64,11 @@ def _steered(make: Callable[..., Any], prompt_frames: bool | None, obs_type: str
 
     @functools.wraps(make)
     def run(config: Any) -> Any:
+        from lerobot_memobench.policies.memobench_mem.recorded_items import check_transforms
+
         if prompt_frames is not False:
             _check_streaming(config)
+        check_transforms(config.policy, config.dataset.image_transforms.enable)
         train, held_out = make(config)
         _choose_inputs(config.policy, train.meta.features, obs_type)
         wanted = config.policy is None or knows_phases(config.policy) if prompt_frames is None else prompt_frames

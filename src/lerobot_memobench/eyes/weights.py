@@ -12,8 +12,18 @@ from torch import Tensor, nn
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.eyes.heads import Heads, Said
-from lerobot_memobench.eyes.tower import GRID, POOLED, Tower
+from lerobot_memobench.eyes.tower import BLOCKS, GRID, POOLED, WIDTHS, Tower
 from lerobot_memobench.files import write_file
+
+SHIPPED = Path(__file__).parent / "eyes.safetensors"
+"""The eyes that come with the package, in a version that has some."""
+PACKAGE, RANDOM = "package", "random"
+"""Names of eyes that are no file's: those of the package, and none, where a policy's tower has random weights."""
+
+
+def default_eyes() -> str:
+    """Return the name of the eyes that a policy has which names none: the package's, if it has some."""
+    return PACKAGE if SHIPPED.is_file() else RANDOM
 
 
 class Eyes(nn.Module):
@@ -44,6 +54,22 @@ def save_eyes(eyes: Eyes, path: Path) -> None:
     tensors = {name: value.detach().to(torch.bfloat16).contiguous() for name, value in eyes.state_dict().items()}
     shape = {"widths": eyes.tower.widths, "blocks": eyes.tower.blocks, "kinds": eyes.kinds}
     write_file(path, save(tensors, {"eyes": json.dumps(shape)}))
+
+
+def load_tower(name: str) -> Tower:
+    """Return the tower of the eyes of that name, `PACKAGE` or a file, as policies look through it.
+
+    Raises:
+        MemobenchError: there are no such eyes, or their tower has other sizes than this version's.
+    """
+    path = SHIPPED if name == PACKAGE else Path(name).expanduser()
+    tower = load_eyes(path).tower
+    if (tower.widths, tower.blocks) != (WIDTHS, BLOCKS):
+        raise MemobenchError(
+            f"the tower of {path} has stages of widths {tower.widths} and blocks {tower.blocks}, and policies look "
+            f"through {WIDTHS} and {BLOCKS}; name eyes of this version's `memobench eyes train`"
+        )
+    return tower
 
 
 def load_eyes(path: Path) -> Eyes:

@@ -17,8 +17,8 @@ from lerobot_memobench.settings.words import Words
 
 INFO_FILE = Path("meta") / "info.json"
 OBJECT_BATCH = 72
-"""Frames per update of a policy that sees objects: a dozen episodes, six moments of each. They lie in main memory,
-where no loader would be quicker."""
+"""Frames per update of a policy that sees objects, or through eyes: a dozen episodes, six moments of each. They lie in
+main memory, where no loader would be quicker."""
 TRAINED = ("policy.type", "policy.path", "reward_model.type", "reward_model.path")
 """What may say what is trained."""
 
@@ -56,7 +56,7 @@ def complete_training(settings: LerobotSettings) -> LerobotSettings:
     policy = policy_config(settings)
     check_sight(policy, env_config(settings))
     settings = with_logging(settings)
-    if not from_file and getattr(policy, "sees_objects", False):
+    if not from_file and getattr(policy, "decodes_nothing", False):
         settings = settings.default("batch_size", OBJECT_BATCH).default("num_workers", 0)
     cores = os.cpu_count() or 4
     if cores < 4 and not from_file:  # LeRobot's default of 4 loaders would only wait for one another

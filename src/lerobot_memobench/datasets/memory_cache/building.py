@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from lerobot_memobench.datasets.memory_cache.decoding import frame_reader
+from lerobot_memobench.datasets.memory_cache.decoding import FrameReader, frame_reader
 from lerobot_memobench.datasets.memory_cache.encoding import Encoding, FrameEncoder, Progress
 from lerobot_memobench.datasets.memory_cache.frame_table import FrameTable, read_frame_table
 from lerobot_memobench.datasets.memory_cache.layout import (
@@ -44,6 +44,7 @@ def build_memory_cache(
     workers: int | None = None,
     progress: Progress | None = None,
     place: Path | None = None,
+    read: FrameReader | None = None,
     tell: Callable[[str], None] = logger.info,
 ) -> Path:
     """Build, or finish building, the cache ``<root>/memory_cache/<name>``; a fitting complete one is left alone.
@@ -60,6 +61,7 @@ def build_memory_cache(
         workers: threads that decode videos ahead of the tower; as many as there are cores, up to 8, by default.
         progress: called with (episodes done, episodes in all), first with what is done already.
         place: folder in which the cache's is made, where it is not to lie beside the dataset.
+        read: from where frames come; from the camera's videos by default.
         tell: told what is made, and how large it will be, before it is made.
 
     Returns:
@@ -77,7 +79,7 @@ def build_memory_cache(
     if work.is_done:  # read without a lock: it may lie where nobody may write
         progress(table.num_episodes, table.num_episodes)
         return work.folder
-    read = frame_reader(root, camera)
+    read = read or frame_reader(root, camera)
     with telling_of_the_disk(work.folder):
         work.folder.parent.mkdir(parents=True, exist_ok=True)
         with taking_turns(work.folder.parent / f"{name}.lock", work.wait):

@@ -19,7 +19,7 @@ TOLERANCE = 1e-4
 """Seconds by which a decoded frame may miss its time."""
 
 FrameReader = Callable[[int, list[int]], Tensor]
-"""From (episode, frame numbers) to images (n, 3, H, W) float32 in [0, 1]."""
+"""From (episode, frame numbers) to images (n, 3, H, W) float32 in [0, 1], or to what an encoder is given for them."""
 
 
 def frame_reader(root: Path, camera: str) -> FrameReader:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -115,6 +116,11 @@ class MemoryCache(FrameLookup):
             raise MemobenchError(
                 f"The memory cache {folder} is damaged ({told}). Delete that folder. {fix_hint(root)}"
             ) from None
+
+    def all_tokens(self) -> Tensor:
+        """Tokens (slots, P, D) bfloat16 of all stored frames, mapped: read where they are looked at."""
+        path, shape = self.folder / TOKENS_FILE, self.meta.shape
+        return torch.from_file(str(path), size=math.prod(shape), dtype=torch.bfloat16).view(shape)
 
     def tokens(self, episode: int, slots: Sequence[int]) -> Tensor:
         """Tokens (n, P, D) bfloat16 of stored frames of an episode; slot k is its frame k * stride."""

@@ -6,9 +6,10 @@ import contextlib
 import errno
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+from lerobot_memobench.datasets.memory_cache.layout import TOKENS_FILE
 from lerobot_memobench.errors import MemobenchError
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -52,6 +53,18 @@ def reserve(path: Path, size: int) -> None:
             os.posix_fallocate(file.fileno(), 0, size)
         else:  # macOS
             file.truncate(size)
+
+
+def require_room(place: Path, folders: Mapping[Path, int]) -> None:
+    """Refuse caches in ``place``, folder -> bytes of its tokens, if the disk lacks room for all that are not begun.
+
+    Raises:
+        MemobenchError: it does. Nothing is changed then.
+    """
+    missing = sum(size for folder, size in folders.items() if not (folder / TOKENS_FILE).is_file())
+    free = free_bytes(place)
+    if free < missing:
+        raise no_room(place, f"{in_words(missing)} are needed there and {in_words(free)} are free")
 
 
 def no_room(folder: Path, found: str) -> MemobenchError:

@@ -16,9 +16,11 @@ from lerobot.policies.pi05.modeling_pi05 import GemmaConfig, PaliGemmaWithExpert
 from lerobot.policies.pi_gemma import PaliGemmaForConditionalGenerationWithPiGemma, PiGemmaForCausalLM
 from torch import Tensor, nn
 
+from lerobot_memobench.eyes.tower import Tower
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.dimensions import Dimensions, Gemma
 from lerobot_memobench.policies.memobench_mem.integration.integration import Prefix
+from lerobot_memobench.policies.memobench_mem.perception.eyes import EyePerception
 from lerobot_memobench.policies.memobench_mem.perception.frozen import VISION_SEED, seed_parameters
 from lerobot_memobench.policies.memobench_mem.perception.objects import LOUD, ObjectPerception
 from lerobot_memobench.policies.memobench_mem.perception.perception import Perception
@@ -78,6 +80,11 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
     def _perception(self, config: MemobenchMemConfig) -> Perception:
         """Build the configuration's way of seeing; one without pictures leaves no image tower."""
         seeing = self.paligemma.model
+        if config.has_eyes:
+            # Where the frozen image tower lies in pi0.5; its weights are loaded by the policy.
+            tower = seeing.vision_tower = Tower(folded=True).eval().requires_grad_(False)
+            seeing.multi_modal_projector = nn.Identity()
+            return EyePerception(tower, [*config.image_features], config.memory_camera, config.dimensions.vlm.width)
         if not config.sees_objects:
             return PixelPerception(
                 seeing.vision_tower, seeing.multi_modal_projector, config.image_size, config.memory_camera

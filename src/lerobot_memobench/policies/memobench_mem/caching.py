@@ -20,6 +20,8 @@ from lerobot_memobench.datasets.memory_cache import (
     read_recorded,
 )
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.eyes.tower import Tower
+from lerobot_memobench.eyes.weights import load_tower
 from lerobot_memobench.policies.memobench_mem.backbone import SizedPaliGemmaWithExpert
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.language.text_encoders import (
@@ -27,10 +29,12 @@ from lerobot_memobench.policies.memobench_mem.language.text_encoders import (
     WordTextEncoder,
     make_text_encoder,
 )
+from lerobot_memobench.policies.memobench_mem.perception.eyes import EyePerception
 from lerobot_memobench.policies.memobench_mem.perception.frozen import VISION_SEED, seed_parameters
 from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_PHASE, OBS_RAW_STATE
 from lerobot_memobench.policies.memobench_mem.perception.perception import Perception
 from lerobot_memobench.policies.memobench_mem.perception.pixels import PixelPerception
+from lerobot_memobench.policies.memobench_mem.seen_pictures import make_caches, open_pictures
 from lerobot_memobench.policies.memobench_mem.weights import load_exactly, read_weights
 
 logger = logging.getLogger(__name__)
@@ -39,6 +43,19 @@ RECORDED = (OBS_STATE, OBS_ENV_STATE, ACTION, "timestamp", "frame_index", "episo
 """Columns that a policy which sees objects learns from."""
 
 _VISION_PREFIX = "paligemma_with_expert.paligemma.model."
+
+
+def load_eyes(config: MemobenchMemConfig, weights: str | Path | None = None) -> EyePerception:
+    """Load the tower of ``config``'s eyes alone; arguments and errors as of `load_perception`."""
+    source = weights or config.base_weights
+    if source is None:
+        assert config.eyes is not None  # asked of a configuration that has some
+        tower = load_tower(config.eyes)
+    else:
+        tower = Tower(folded=True).eval()
+        load_exactly(tower, read_weights(source, _VISION_PREFIX + "vision_tower."), source, optional=set())
+    width = config.dimensions.vlm.width
+    return EyePerception(tower.to(config.device), [*config.image_features], config.memory_camera, width)
 
 
 def load_perception(config: MemobenchMemConfig, weights: str | Path | None = None) -> PixelPerception:
@@ -89,8 +106,12 @@ def cache_dataset(
         tell: told where it lies and how large it will be, before it is made.
 
     Returns:
-        The cache's folder, ``<root>/memory_cache/<size>-stride<n>-<hash>``, or below ``config.memory_cache_dir``.
+        The cache's folder, ``<root>/memory_cache/<size>-stride<n>-<hash>``, or below ``config.memory_cache_dir``; with
+        eyes that of the memory's, beside which those of the present lie.
     """
+    if config.has_eyes:
+        how: dict[str, Any] = {"batch_size": batch_size, "workers": workers, "progress": progress, "tell": tell}
+        return make_caches(root, config, load_eyes(config, weights), _text_encoder(config), **how)[0].folder
     perception = load_perception(config, weights)
     return _build(root, config, perception, batch_size=batch_size, workers=workers, progress=progress, tell=tell)
 
@@ -103,6 +124,9 @@ def open_frames(root: Path, config: MemobenchMemConfig, perception: Perception) 
     """
     if isinstance(perception, PixelPerception):
         return open_cache(root, config, perception)
+    if isinstance(perception, EyePerception):
+        names = [name for name in RECORDED if name != OBS_ENV_STATE]
+        return open_pictures(root, config, perception, _text_encoder(config), names)
     columns, table = read_recorded(root, RECORDED)
     phase = torch.from_numpy(table.phase)
     logger.info("%d frames of %s are read into memory", table.episodes[-1], root)

@@ -11,6 +11,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.checkpoint import CONFIG_FILE, read_json
 from lerobot_memobench.policies.memobench_mem.averaging import WeightAverage
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory_pi05 import MemoryPI05
@@ -27,13 +28,20 @@ def read_config(source: str | Path, config: PreTrainedConfig | None, revision: s
     """Return the configuration that a checkpoint is loaded with: ``config``, or its own.
 
     Raises:
-        MemobenchError: it is another policy's.
+        MemobenchError: it is another policy's, or was trained through other eyes.
     """
     found = PreTrainedConfig.from_pretrained(source, revision=revision) if config is None else config
     if not isinstance(found, MemobenchMemConfig):
         raise MemobenchError(
             f"'{source}' is a '{found.type}' checkpoint and not memobench_mem; to start from pi0.5's weights "
             "pass --policy.type=memobench_mem --policy.base_weights=<checkpoint>."
+        )
+    path = checkpoint_file(source, CONFIG_FILE, revision)
+    held = None if path is None else read_json(path).get("eyes")
+    if held and found.eyes and found.eyes != held:
+        raise MemobenchError(
+            f"--policy.eyes={found.eyes} cannot be followed: '{source}' was trained through the tower of '{held}' and "
+            "holds it; leave eyes out, or train anew."
         )
     return found
 

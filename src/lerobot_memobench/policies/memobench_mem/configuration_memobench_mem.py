@@ -10,6 +10,8 @@ from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
 from lerobot.utils.constants import OBS_ENV_STATE
 
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.eyes.tower import SIDE
+from lerobot_memobench.eyes.weights import RANDOM, default_eyes
 from lerobot_memobench.policies.memobench_mem.action_objective import OBJECTIVES, REGRESSION
 from lerobot_memobench.policies.memobench_mem.dimensions import GRID, SIZES, Dimensions, resized
 from lerobot_memobench.policies.memobench_mem.schedule import WarmupFractionSchedulerConfig
@@ -22,8 +24,8 @@ INTEGRATIONS = ("modulation", "context", "none")
 PERCEPTIONS = ("pixels", "objects")
 SUBGOAL_LEVELS = ("coarse", "intermediate", "fine")
 TOKENS_PER_FRAME = {"pixels": GRID**2, "objects": 2}
-MEMORY_STRIDE = {"pixels": 1, "objects": 8}
-MOMENTS_PER_EPISODE = {"pixels": 1, "objects": 6}
+MEMORY_STRIDE, MOMENTS_PER_EPISODE = 8, 6
+"""Where samples are made of what was read before training; 1 elsewhere."""
 ORACLE_TOKENS = 128
 """Room that oracle memory text needs in a prompt of the word tokenizer: six checkpoints of some ten words."""
 
@@ -57,6 +59,7 @@ class MemobenchMemConfig(MemobenchMemSettings):
         _choose("integration", self.integration, INTEGRATIONS)
         _choose("subgoal_level", self.subgoal_level, SUBGOAL_LEVELS)
         self._check_dimensions()
+        self._choose_eyes()
         dims = self.dimensions
         for name, value in self._defaults().items():
             if getattr(self, name) is None:
@@ -66,7 +69,8 @@ class MemobenchMemConfig(MemobenchMemSettings):
             mode = NormalizationMode(dims.recipe.normalization)
             self.normalization_mapping = {"VISUAL": NormalizationMode.IDENTITY, "STATE": mode, "ACTION": mode}
         if self.image_resolution is None:
-            self.image_resolution = (dims.vision.image, dims.vision.image)
+            side = SIDE if self.has_eyes else dims.vision.image
+            self.image_resolution = (side, side)
         # A checkpoint without oracle memory holds the length of prompts without it, which would cut the text off.
         if self.tokenizer_max_length in (None, dims.tokenizer_max_length):
             room = ORACLE_TOKENS if self.oracle_memory and dims.tokenizer == "words" else 0
@@ -96,10 +100,20 @@ class MemobenchMemConfig(MemobenchMemSettings):
             "optimizer_weight_decay": recipe.weight_decay,
             "optimizer_lr": self.dimensions.learning_rate,
             "tokens_per_frame": TOKENS_PER_FRAME[self.perception],
-            "memory_stride": MEMORY_STRIDE[self.perception],
-            "balance_tasks": self.sees_objects,
-            "moments_per_episode": MOMENTS_PER_EPISODE[self.perception],
+            "memory_stride": MEMORY_STRIDE if self.decodes_nothing else 1,
+            "balance_tasks": self.decodes_nothing,
+            "moments_per_episode": MOMENTS_PER_EPISODE if self.decodes_nothing else 1,
         }
+
+    def _choose_eyes(self) -> None:
+        possible = self.size == "small" and not self.sees_objects
+        if possible and self.eyes is None:
+            self.eyes = default_eyes()
+        elif self.eyes is not None and not possible:
+            raise MemobenchError(
+                f"--policy.eyes={self.eyes} is for --policy.size=small --policy.perception=pixels, and not for size="
+                f"{self.size} perception={self.perception}; leave it out."
+            )
 
     def _check_dimensions(self) -> None:
         if self.size == "pi05" and (self.width, self.depth) != (None, None):
@@ -135,6 +149,13 @@ class MemobenchMemConfig(MemobenchMemSettings):
                 "--policy.freeze_vision_encoder=false cannot be used: memory tokens are cached from the frozen "
                 "vision tower, and would no longer match a tower that learns."
             )
+        if self.has_eyes:
+            if self.image_size != (SIDE, SIDE):
+                raise MemobenchError(
+                    f"--policy.image_resolution={self.image_resolution} cannot be used: eyes look at {SIDE} x {SIDE} "
+                    "pixels; leave it out, or use --policy.eyes=random."
+                )
+            return
         patch = self.dimensions.vision.patch
         if any(side % patch or (side // patch) % GRID for side in self.image_size):
             raise MemobenchError(
@@ -173,6 +194,16 @@ class MemobenchMemConfig(MemobenchMemSettings):
     def sees_objects(self) -> bool:
         """Whether a moment is seen as objects, and no picture is looked at."""
         return self.perception == "objects"
+
+    @property
+    def has_eyes(self) -> bool:
+        """Whether pictures are seen through the tower of `lerobot_memobench.eyes`."""
+        return self.eyes not in (None, RANDOM)
+
+    @property
+    def decodes_nothing(self) -> bool:
+        """Whether training samples are made of what was read, or seen, before; no video is decoded for them."""
+        return self.sees_objects or self.has_eyes
 
     @property
     def state_token(self) -> bool:

@@ -14,6 +14,7 @@ from lerobot_memobench.policies.memobench_mem.alignment.loss import alignment_lo
 from lerobot_memobench.policies.memobench_mem.alignment.objectives import Alignment
 from lerobot_memobench.policies.memobench_mem.averaging import WeightAverage
 from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, PHASE, STEPS, TOKENS, MemoryBatch
+from lerobot_memobench.policies.memobench_mem.perception.eyes import SEEN
 from lerobot_memobench.policies.memobench_mem.seeing import SeeingPolicy
 from lerobot_memobench.policies.memobench_mem.training_curve import TrainingCurve
 
@@ -63,7 +64,7 @@ class LearningPolicy(SeeingPolicy):
             of memory vectors whose nearest text in the batch is theirs).
 
         Raises:
-            MemobenchError: the batch has no memory.
+            MemobenchError: the batch has no memory, or pictures in the place of what eyes saw in them.
         """
         self._require_memory(batch)
         if self._averages and self.average is None and self.training:
@@ -87,6 +88,11 @@ class LearningPolicy(SeeingPolicy):
             raise MemobenchError(
                 f"The training batch has no '{needed}': the preprocessor lacks the step memobench_gather_memory; to "
                 "start from pi0.5's weights pass --policy.base_weights instead of --policy.pretrained_path."
+            )
+        if self.config.has_eyes and not any(key.startswith(SEEN) for key in batch):
+            raise MemobenchError(
+                "The training batch has pictures, and not what eyes saw in them, because a stream or loader processes "
+                "made it: pass --num_workers=0, which is quicker too, and leave dataset.streaming out."
             )
 
     def _read_memory(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor] | None:

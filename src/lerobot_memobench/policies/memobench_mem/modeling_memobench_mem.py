@@ -13,6 +13,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from lerobot_memobench.datasets.memory_cache import RecordedFrames
+from lerobot_memobench.eyes.weights import load_tower
 from lerobot_memobench.policies.memobench_mem.acting import ActingPolicy
 from lerobot_memobench.policies.memobench_mem.adapters import trained_whole
 from lerobot_memobench.policies.memobench_mem.alignment.objectives import make_alignment
@@ -39,6 +40,7 @@ from lerobot_memobench.policies.memobench_mem.memory.rollout import RolloutMemor
 from lerobot_memobench.policies.memobench_mem.memory_pi05 import MemoryPI05
 from lerobot_memobench.policies.memobench_mem.noise import EpisodeNoise
 from lerobot_memobench.policies.memobench_mem.one_thread import OneThread
+from lerobot_memobench.policies.memobench_mem.perception.eyes import EyePerception
 from lerobot_memobench.policies.memobench_mem.plans import RowPlans
 from lerobot_memobench.policies.memobench_mem.precision import Precision
 from lerobot_memobench.policies.memobench_mem.processing.training_run import TrainingRun, begin_training
@@ -88,6 +90,9 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
             self.precision.settle()  # before weights are loaded, which may be finer than bfloat16
         if config.base_weights and load_base:
             self._load_base_weights(config.base_weights)
+        elif isinstance(self.perception, EyePerception) and load_base:
+            assert config.eyes is not None
+            self.perception.tower.load_state_dict(load_tower(config.eyes).state_dict())
         if config.gradient_checkpointing:
             self.model.gradient_checkpointing_enable()
         self.to(config.device)

@@ -2,7 +2,7 @@
 
 LeRobot's reader decodes the videos of every sample, wanted or not, and takes a millisecond per row for the rest. Where
 the policy that is about to be trained sees objects, its frames are in memory already, and samples are made of these;
-every other reader stays as it was.
+where it has eyes, what they saw stands in the place of pictures. Every other reader stays as it was.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from lerobot.datasets.dataset_reader import DatasetReader
 from torch import Tensor
 
 from lerobot_memobench.datasets.memory_cache import RecordedFrames
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.processing.training_run import training_run
 
 
@@ -30,9 +31,24 @@ def read_from_memory() -> None:
         run = training_run()
         if run is None or not isinstance(run.cache, RecordedFrames) or Path(self.root) != Path(run.meta.root):
             return original(self, idx)
+        check_transforms(run.config, self._image_transforms is not None)
         return item(run.cache, run.meta, self.delta_indices or {}, _number(self, idx))
 
     DatasetReader.get_item = get_item
+
+
+def check_transforms(policy: Any, transformed: bool) -> None:
+    """Refuse changed pictures for a policy whose samples are made of what was seen in them before.
+
+    Raises:
+        MemobenchError: they are ``transformed``, and it has eyes.
+    """
+    if transformed and getattr(policy, "has_eyes", False):
+        raise MemobenchError(
+            "dataset.image_transforms.enable=true would change nothing: a policy with eyes learns from what was once "
+            "seen in the dataset's pictures; leave it out (eyes are trained on changed pictures), or use "
+            "policy.eyes=random, which looks at the pictures of each sample."
+        )
 
 
 def item(frames: RecordedFrames, meta: Any, deltas: dict[str, list[int]], number: int) -> dict[str, Any]:

@@ -29,6 +29,10 @@ class MemobenchMemSettings(PI05Config):
     perception: str = "pixels"
     """How a moment is seen: ``pixels``, by the image tower, or ``objects``, by the slots of
     ``observation.environment_state`` (`sim.object_slots`), without any picture."""
+    eyes: str | None = None
+    """Whose tower pictures are seen through at ``size=small``: a file of `memobench eyes train`, ``package``: the one
+    that comes with the package, or ``random``: pi0.5's image tower with random weights. None: ``package`` where it has
+    one, else ``random``. A checkpoint holds its tower; there this only says where it was from."""
     object_classes: list[str] | None = None
     """Names of the classes that slots were trained with, in order of their indices; none: those of this version."""
 
@@ -58,7 +62,8 @@ class MemobenchMemSettings(PI05Config):
     tokens_per_frame: int = SIZES_OWN
     """Memory tokens of a remembered frame: 16 of a picture; 2, or another number, of objects."""
     memory_stride: int = SIZES_OWN
-    """Every how many control steps a frame enters the history (and the cache); none: 8 with objects, 1 with pixels."""
+    """Every how many control steps a frame enters the history (and the cache); none: 8 with objects and
+    with eyes, 1 with other pixels."""
     memory_cache_dir: str | None = None
     """Folder for memory caches, of several datasets perhaps; none: ``memory_cache`` in the dataset's folder."""
 
@@ -73,10 +78,10 @@ class MemobenchMemSettings(PI05Config):
     0.999 or 0.995 at ``small``."""
     moments_per_episode: int = SIZES_OWN
     """How many frames of an episode stand side by side in a batch, which shares what they remember; none: 6 with
-    objects, and 1, LeRobot's order, with pixels. ``batch_size`` counts frames all the same."""
+    objects and with eyes, and 1, LeRobot's order, with other pixels. ``batch_size`` counts frames all the same."""
     balance_tasks: bool = SIZES_OWN
-    """Whether each task is drawn equally often, however long its episodes are; none: with objects. Otherwise each frame
-    is drawn once per epoch."""
+    """Whether each task is drawn equally often, however long its episodes are; none: with objects and
+    with eyes. Otherwise each frame is drawn once per epoch."""
     freeze_vision_encoder: bool = True
     warmup_fraction: float = 0.05
     final_lr: float = SIZES_OWN

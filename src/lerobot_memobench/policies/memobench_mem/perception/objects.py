@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn.functional import rms_norm
 
 from lerobot_memobench.policies.memobench_mem.perception.perception import Perception, Seen
+from lerobot_memobench.policies.memobench_mem.perception.pooled_memory import PooledMemory
 from lerobot_memobench.policies.memobench_mem.perception.slots import HAND_DIM, SlotEncoder
 from lerobot_memobench.sim.object_slots import SIZE, SLOTS, WIDTH, classes
 
@@ -50,8 +51,8 @@ class FramePool(nn.Module):
         self.out = nn.Sequential(nn.GELU(), nn.Linear(width, width))
 
     def forward(self, frames: Tensor) -> Tensor:
-        """Return tokens (N, tokens, width) of frames (N, SIZE + 6 + 1)."""
-        slots, hand, phase = frames.split([SIZE, HAND_DIM, 1], dim=1)
+        """Return tokens (N, tokens, width) of frames (N, 1, SIZE + 6 + 1)."""
+        slots, hand, phase = frames.flatten(1).split([SIZE, HAND_DIM, 1], dim=1)
         made, there = self.slot(slots.unflatten(1, (SLOTS, WIDTH)), hand)
         score = self.score(made)
         # A finite score keeps a frame in which nothing is seen finite: it becomes zeros.
@@ -61,37 +62,8 @@ class FramePool(nn.Module):
         return rms_norm(kept, kept.shape[-1:], eps=1e-6)
 
 
-class ObjectMemory(nn.Module):
-    """Stored frames to memory tokens: each frame pooled, then the mechanism's encoder over the frames."""
-
-    def __init__(self, pool: FramePool, encoder: nn.Module) -> None:
-        super().__init__()
-        self.pool, self.encoder = pool, encoder
-
-    def forward(
-        self, frames: Tensor, steps: Tensor, mask: Tensor, numbers: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Encode frames (B, F, 1, D') seen at steps (B, F), of which mask (B, F) are real.
-
-        Args:
-            numbers: (B, F), equal where frames are: each is pooled once, however many rows read it.
-
-        Returns:
-            H (B, L, d_m) and its mask (B, L).
-        """
-        rows = frames.flatten(0, 2)
-        if numbers is None:
-            pooled = self.pool(rows)
-        else:
-            unique, places = numbers.flatten().unique(return_inverse=True)
-            first = places.new_zeros(len(unique)).scatter_(0, places, torch.arange(len(places), device=places.device))
-            pooled = self.pool(rows[first])[places]
-        memory, real = self.encoder(pooled.unflatten(0, mask.shape), steps, mask)
-        return memory, real
-
-
 class ObjectPerception(nn.Module, Perception):
-    """A token per thing that is seen now; what is remembered are the numbers themselves, for `ObjectMemory`.
+    """A token per thing that is seen now; what is remembered are the numbers themselves, for `FramePool`.
 
     Args:
         trained: names of the classes that it knows, in order of their indices.
@@ -131,4 +103,4 @@ class ObjectPerception(nn.Module, Perception):
 
     def memory(self, encoder: nn.Module) -> nn.Module:
         """Return the encoder behind a pool of each frame."""
-        return ObjectMemory(FramePool(self.order, self.kinds, self.tokens_per_frame, self.dim), encoder)
+        return PooledMemory(FramePool(self.order, self.kinds, self.tokens_per_frame, self.dim), encoder)

@@ -1,0 +1,149 @@
+"""What eyes see in a dataset, made once: all tokens of every picture, and pooled ones of what is remembered.
+
+Both are memory caches (`datasets.memory_cache`), so they are found, finished, waited for and refused alike: one of each
+camera's present pictures, at every frame, and the memory's. The memory's is pooled from its camera's, so no video is
+decoded twice. Training samples are then made of the dataset's columns in main memory and of tokens that are read where
+they lie (`recorded_items`).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from lerobot_memobench.datasets.lerobot_format.info import read_info
+from lerobot_memobench.datasets.memory_cache import (
+    FrameEncoder,
+    MemoryCache,
+    RecordedFrames,
+    TextEncoder,
+    build_memory_cache,
+    find_cache,
+    read_recorded,
+)
+from lerobot_memobench.datasets.memory_cache.room import in_words, require_room
+from lerobot_memobench.eyes.tower import GRID, POOLED, WIDTH
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.perception.eyes import EyePerception, seen_key
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass
+class Tokens:
+    """What makes the tokens of a cache; a `FrameEncoder`."""
+
+    key: str
+    tokens_per_frame: int
+    make: Callable[[Tensor], Tensor]
+    dim: int = WIDTH
+
+    def __call__(self, images: Tensor) -> Tensor:
+        """Make them."""
+        return self.make(images)
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """A cache that is wanted: of which camera, at every how many frames, made how, and where."""
+
+    camera: str
+    stride: int
+    tokens: FrameEncoder
+    folder: Path
+
+    def open(self, root: Path) -> MemoryCache:
+        """Open it, which is there."""
+        how: dict[str, Any] = {"camera": self.camera, "stride": self.stride, "place": self.folder.parent}
+        return MemoryCache.open(root, self.folder.name, frames_key=self.tokens.key, **how)
+
+
+def make_caches(
+    root: Path,
+    config: MemobenchMemConfig,
+    eyes: EyePerception,
+    texts: TextEncoder,
+    *,
+    tell: Callable[[str], None] = logger.info,
+    **how: Any,
+) -> tuple[MemoryCache, dict[str, MemoryCache]]:
+    """Make or finish what ``eyes`` see of the dataset at ``root``; how large it will be is told before.
+
+    Args:
+        how: of `build_memory_cache`.
+
+    Returns:
+        The memory's cache, and those of the present pictures by their cameras.
+
+    Raises:
+        MemobenchError: the dataset lacks a camera, or the disk has no room for all of them.
+    """
+    info = read_info(root)
+    frames = int(info.get("total_frames", 0))
+    cameras = [name for name, feature in info["features"].items() if feature.get("dtype") in ("video", "image")]
+    *present, memory = wanted = _wanted(root, config, eyes, cameras)
+    sizes = {cache.folder: _bytes(cache, frames) for cache in wanted}
+    tell(
+        f"What is seen in the {frames:,} frames of {root} takes {in_words(sum(sizes.values()))}: "
+        f"{in_words(2 * GRID**2 * WIDTH)} of each of {len(present)} pictures of a frame, and "
+        f"{in_words(2 * POOLED**2 * WIDTH)} of every frame that is remembered; what is not there yet is made now."
+    )
+    require_room(memory.folder.parent, sizes)
+    opened = {}
+    for cache in present:
+        _make(root, cache, texts, tell=tell, **how)
+        opened[cache.camera] = cache.open(root)
+    _make(root, memory, texts, read=opened[memory.camera].tokens, tell=tell, **how)
+    return memory.open(root), opened
+
+
+def _make(root: Path, cache: Wanted, texts: TextEncoder, **how: Any) -> None:
+    named: dict[str, Any] = {"camera": cache.camera, "stride": cache.stride, "place": cache.folder.parent}
+    build_memory_cache(root, cache.folder.name, cache.tokens, texts, **named, **how)
+
+
+def _wanted(root: Path, config: MemobenchMemConfig, eyes: EyePerception, cameras: Sequence[str]) -> list[Wanted]:
+    """Return the caches: of the present of each camera, and last the memory's."""
+    place = None if config.memory_cache_dir is None else Path(config.memory_cache_dir).expanduser()
+
+    def wanted(camera: str, stride: int, name: str, tokens: Tokens) -> Wanted:
+        where: dict[str, Any] = {"camera": camera, "stride": stride, "place": place}
+        return Wanted(camera, stride, tokens, find_cache(root, name, frames_key=tokens.key, **where))
+
+    whole = Tokens(eyes.present_key, GRID**2, eyes.look)
+    pooled = Tokens(eyes.key, eyes.tokens_per_frame, eyes.pooled)
+    seen = dict.fromkeys([*(eyes.cameras or cameras), eyes.remembers])
+    present = [wanted(camera, 1, f"{config.size}-present", whole) for camera in seen]
+    return [*present, wanted(eyes.remembers, config.memory_stride, config.cache_name, pooled)]
+
+
+def _bytes(cache: Wanted, frames: int) -> int:
+    """Return about how large a cache is; each episode may remember one frame more."""
+    return -(-frames // cache.stride) * cache.tokens.tokens_per_frame * cache.tokens.dim * 2
+
+
+def open_pictures(
+    root: Path, config: MemobenchMemConfig, eyes: EyePerception, texts: TextEncoder, names: Sequence[str]
+) -> RecordedFrames:
+    """Open what training looks up of the dataset at ``root``: its columns ``names``, and what ``eyes`` see.
+
+    Raises:
+        MemobenchError: the dataset lacks a column, or a cache cannot be made.
+    """
+    memory, present = make_caches(
+        root, config, eyes, texts, progress=lambda done, count: logger.info("seen: %d of %d episodes", done, count)
+    )
+    columns, table = read_recorded(root, names)
+
+    def remember(_: Any, frames: Sequence[int]) -> Tensor:
+        """Return what is remembered of frames of one episode, by their global numbers."""
+        episode, first = memory.locate(frames[0])
+        return memory.tokens(episode, [(first + frame - frames[0]) // memory.meta.stride for frame in frames])
+
+    columns |= {seen_key(camera): cache.all_tokens() for camera, cache in present.items()}
+    return RecordedFrames(root, columns, table, texts, remember=remember, key=eyes.key, stride=config.memory_stride)

@@ -1,0 +1,371 @@
+"""Seeing through eyes, by LeRobot's own doors: settings, caches, samples, training, rollouts, checkpoints."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.datasets.dataset_reader import DatasetReader
+from lerobot.policies import make_policy, make_pre_post_processors
+from small_policy import batch_of, losses_in_training, made_for_training, small_config
+
+from lerobot_memobench.datasets.memory_cache import FOLDER
+from lerobot_memobench.datasets.memory_cache.decoding import frame_reader
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.eyes import weights
+from lerobot_memobench.eyes.tower import GRID, POOLED, SIDE, WIDTH, Tower
+from lerobot_memobench.eyes.weights import Eyes, save_eyes
+from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, STEPS, TOKENS
+from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from lerobot_memobench.policies.memobench_mem.perception.eyes import seen_key
+from synthetic_dataset import LENGTHS
+
+CAMERAS = ("observation.images.image", "observation.images.wrist_image")
+STARTS = np.cumsum([0, *LENGTHS])
+FRAME_BYTES = 2 * GRID**2 * WIDTH
+ROUNDED = 2**-7
+"""What bfloat16 may round off, as a share of a number."""
+
+
+def made_eyes(path: Path, seed: int) -> Path:
+    torch.manual_seed(seed)
+    save_eyes(Eyes(Tower().eval(), ("cork",)), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def eyes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made_eyes(tmp_path_factory.mktemp("eyes") / "eyes.safetensors", 1)
+
+
+@pytest.fixture(scope="module")
+def seeing(eyes: Path) -> dict[str, Any]:
+    return {"size": "small", "eyes": str(eyes), "n_action_steps": 3, "memory_stride": 2}
+
+
+@pytest.fixture(scope="module")
+def root(dataset_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The dataset; its caches are made once for all tests that do not change them."""
+    return copy(dataset_root, tmp_path_factory.mktemp("seen") / "data")
+
+
+def copy(dataset_root: Path, to: Path) -> Path:
+    return shutil.copytree(dataset_root, to, ignore=shutil.ignore_patterns(FOLDER))
+
+
+@pytest.fixture
+def looked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many pictures each pass of a tower saw."""
+    seen: list[int] = []
+    original = Tower.forward
+
+    def counting(tower: Tower, images: torch.Tensor) -> torch.Tensor:
+        seen.append(len(images))
+        return original(tower, images)
+
+    monkeypatch.setattr(Tower, "forward", counting)
+    return seen
+
+
+def apart(one: torch.Tensor, other: torch.Tensor) -> float:
+    """How far numbers are apart at most, as a share of the largest."""
+    return float((one.float() - other.float()).abs().max() / other.float().abs().max())
+
+
+def observed(root: Path, dataset: Any, index: int) -> dict[str, Any]:
+    """An observation of a rollout: frame ``index`` as the dataset's videos show it."""
+    episode = int(np.searchsorted(STARTS, index, "right")) - 1
+    step = int(index - STARTS[episode])
+    row = dataset.hf_dataset[index]
+    return {
+        **{camera: frame_reader(root, camera)(episode, [step]) for camera in CAMERAS},
+        "observation.state": row["observation.state"][None],
+        "observation.step": torch.tensor([float(step)]),
+        "observation.phase": torch.ones(1),
+        "task": [dataset[index]["task"]],
+    }
+
+
+# -- settings ------------------------------------------------------------------------------------------------------
+
+
+def test_eyes_are_the_default_of_small_pixels_once_they_are_shipped(
+    eyes: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(weights, "SHIPPED", tmp_path / "absent.safetensors")
+    before = MemobenchMemConfig(device="cpu", size="small")
+    assert (before.eyes, before.memory_stride, before.moments_per_episode) == ("random", 1, 1)
+    assert not before.balance_tasks
+    monkeypatch.setattr(weights, "SHIPPED", eyes)
+    config = MemobenchMemConfig(device="cpu", size="small")
+    assert (config.eyes, config.image_size, config.tokens_per_frame) == ("package", (SIDE, SIDE), POOLED**2)
+    assert (config.memory_stride, config.moments_per_episode, config.balance_tasks) == (8, 6, True)
+    assert (config.objective, config.state_token, config.watches) == ("regression", True, True)
+    assert not MemobenchMemConfig(device="cpu", size="small", eyes="random").has_eyes
+    for other in ({"size": "tiny"}, {"size": "pi05"}, {"size": "small", "perception": "objects"}):
+        assert MemobenchMemConfig(device="cpu", **other).eyes is None
+    config.save_pretrained(tmp_path)
+    monkeypatch.setattr(weights, "SHIPPED", tmp_path / "absent.safetensors")
+    assert PreTrainedConfig.from_pretrained(tmp_path).eyes == "package"
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"size": "tiny", "eyes": "package"}, r"size=small --policy\.perception=pixels.*leave it out"),
+        ({"size": "small", "perception": "objects", "eyes": "package"}, "leave it out"),
+        ({"size": "small", "eyes": "package", "image_resolution": (96, 96)}, "128 x 128.*eyes=random"),
+        ({"size": "small", "eyes": "package", "tokens_per_frame": 4}, "tokens_per_frame"),
+    ],
+)
+def test_bad_settings_are_refused(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(MemobenchError, match=message):
+        MemobenchMemConfig(device="cpu", **fields)
+
+
+def test_eyes_that_are_none_are_refused(root: Path, tmp_path: Path) -> None:
+    with pytest.raises(MemobenchError, match=r"there is no file.*memobench eyes train"):
+        cache_dataset(root, small_config(size="small", eyes=str(tmp_path / "absent")))
+    save_eyes(Eyes(Tower((4, 8, 8, 16), (0, 0, 1, 0)), ("cork",)), tmp_path / "narrow.safetensors")
+    with pytest.raises(MemobenchError, match=r"widths \(4, 8, 8, 16\).*memobench eyes train"):
+        cache_dataset(root, small_config(size="small", eyes=str(tmp_path / "narrow.safetensors")))
+
+
+# -- caches --------------------------------------------------------------------------------------------------------
+
+
+def test_both_are_made_once_and_their_size_is_told_before(
+    dataset_root: Path, tmp_path: Path, seeing: dict[str, Any], looked: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, told = copy(dataset_root, tmp_path / "data"), []
+    folder = cache_dataset(root, small_config(**seeing), tell=lambda said: told.append((said, len(looked))))
+    made = {path.name.rsplit("-", 1)[0]: (path / "tokens.bin").stat().st_size for path in (root / FOLDER).glob("*/")}
+    assert folder.name.rsplit("-", 1)[0] == "small-stride2"
+    slots = sum(-(-length // 2) for length in LENGTHS)
+    assert made == {"small-present": sum(LENGTHS) * FRAME_BYTES, "small-stride2": slots * 2 * POOLED**2 * WIDTH}
+    assert len(list((root / FOLDER).glob("small-present-*/"))) == len(CAMERAS)
+    assert told[0][1] == 0
+    assert "94 frames" in told[0][0]
+    assert "24.0 KiB of each of 2 pictures of a frame, and 6.0 KiB of every frame that is remembered" in told[0][0]
+    assert sum(looked) == sum(LENGTHS) * len(CAMERAS), "the memory is made of what was seen, and not looked at again"
+
+    def refuse(*_: Any, **__: Any) -> None:
+        raise AssertionError("a video was opened")
+
+    monkeypatch.setattr("lerobot.datasets.dataset_reader.decode_video_frames", refuse)
+    monkeypatch.setattr("lerobot_memobench.datasets.memory_cache.building.frame_reader", refuse)
+    looked.clear()
+    policy, before, _, dataset = made_for_training(root, **seeing)
+    assert policy.forward(before(batch_of(dataset, [10, 30])))[0].isfinite()
+    assert looked == []
+
+
+def test_a_cache_that_was_killed_is_finished(
+    dataset_root: Path, tmp_path: Path, seeing: dict[str, Any], root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    killed = copy(dataset_root, tmp_path / "data")
+    passes = iter(range(4))
+    original = Tower.forward
+
+    def kill(tower: Tower, images: torch.Tensor) -> torch.Tensor:
+        if next(passes) == 3:
+            raise KeyboardInterrupt
+        return original(tower, images)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Tower, "forward", kill)
+        with pytest.raises(KeyboardInterrupt):
+            cache_dataset(killed, small_config(**seeing), batch_size=40)
+    for where in (killed, root):
+        cache_dataset(where, small_config(**seeing), batch_size=40)
+    made = [path.relative_to(killed) for path in killed.glob(f"{FOLDER}/*/tokens.bin")]
+    assert len(made) == 3
+    assert all((killed / path).read_bytes() == (root / path).read_bytes() for path in made)
+
+
+def test_a_disk_without_room_for_all_is_told_before_any_is_made(
+    dataset_root: Path, tmp_path: Path, seeing: dict[str, Any], looked: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, usage = copy(dataset_root, tmp_path / "data"), shutil.disk_usage(tmp_path)
+    room = 2 * sum(LENGTHS) * FRAME_BYTES  # for the present pictures, and not for the memory
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=room))
+    with pytest.raises(MemobenchError, match=r"4\.7 MiB are needed there and 4\.4 MiB are free.*memory_cache_dir"):
+        cache_dataset(root, small_config(**seeing))
+    assert looked == []
+    assert not (root / FOLDER).exists()
+
+
+def test_caches_of_other_eyes_lie_beside_and_elsewhere(
+    dataset_root: Path, tmp_path: Path, seeing: dict[str, Any]
+) -> None:
+    root, place = copy(dataset_root, tmp_path / "data"), tmp_path / "caches"
+    others = made_eyes(tmp_path / "others.safetensors", 2)
+    for file in (seeing["eyes"], str(others)):
+        cache_dataset(root, small_config(**seeing | {"eyes": file, "memory_cache_dir": str(place)}))
+    assert len([path for path in place.iterdir() if path.is_dir()]) == 6
+    assert not (root / FOLDER).exists()
+
+
+# -- samples -------------------------------------------------------------------------------------------------------
+
+
+def test_a_sample_has_tokens_in_the_place_of_pictures(root: Path, seeing: dict[str, Any]) -> None:
+    policy, before, _, dataset = made_for_training(root, **seeing)
+    sample, lerobots = dataset[45], DatasetReader.get_item.__wrapped__(dataset.reader, 45)
+    assert not set(CAMERAS) & sample.keys()
+    assert set(policy.config.image_features) == set(CAMERAS)
+    for key in sample.keys() & lerobots.keys():
+        assert sample[key] == lerobots[key] if key == "task" else torch.equal(sample[key], lerobots[key]), key
+    batch = before(batch_of(dataset, [45, 50]))
+    assert all(batch[seen_key(camera)].shape == (2, GRID**2, WIDTH) for camera in CAMERAS)
+    assert batch[TOKENS].shape[2:] == (POOLED**2, WIDTH)
+    assert len(batch[FRAMES].unique()) < batch[MASK].sum(), "moments of an episode share frames"
+
+
+def test_pictures_that_are_changed_are_refused(root: Path, seeing: dict[str, Any]) -> None:
+    from lerobot_memobench.engine.lerobot_training import trained_on
+
+    policy, _, _, dataset = made_for_training(root, **seeing)
+    dataset.set_image_transforms(lambda picture: 1 - picture)
+    with pytest.raises(MemobenchError, match=r"image_transforms.*leave it out.*policy\.eyes=random"):
+        dataset[0]
+
+    from lerobot.configs.train import DatasetConfig, TrainPipelineConfig
+    from lerobot.scripts import lerobot_train
+
+    data = DatasetConfig("memobench/synthetic", root=str(root))
+    data.image_transforms.enable = True
+    with trained_on(None), pytest.raises(MemobenchError, match="image_transforms"):
+        lerobot_train.make_train_eval_datasets(TrainPipelineConfig(dataset=data, policy=policy.config))
+
+
+def test_pictures_in_a_batch_are_refused(root: Path, seeing: dict[str, Any]) -> None:
+    """As LeRobot's loader processes make them, which know nothing of what was seen."""
+    policy, before, _, dataset = made_for_training(root, **seeing)
+    batch = before(torch.utils.data.default_collate([DatasetReader.get_item.__wrapped__(dataset.reader, 45)]))
+    with pytest.raises(MemobenchError, match=r"has pictures, and not what eyes saw.*--num_workers=0"):
+        policy.train().forward(batch)
+
+
+# -- training and rollouts see alike -------------------------------------------------------------------------------
+
+
+def test_a_rollout_sees_and_remembers_what_training_reads(root: Path, seeing: dict[str, Any]) -> None:
+    policy, before, _, dataset = made_for_training(root, **seeing)
+    index = int(STARTS[1]) + 14
+    trained = before(batch_of(dataset, [index]))
+    for frame in range(int(STARTS[1]), index + 1):
+        acted = before(observed(root, dataset, frame))
+        policy.observe(acted)
+    tokens, steps, mask = policy.history.gather([0])
+    assert torch.equal(steps, trained[STEPS])
+    assert torch.equal(mask, trained[MASK])
+    (of_cache, _), (of_pictures, _) = (policy.perception.present(batch) for batch in (trained, acted))
+    for one, other in ((trained[TOKENS], tokens), *zip(of_cache, of_pictures, strict=True)):
+        assert apart(one, other) <= ROUNDED
+    assert apart(of_cache[0], of_cache[1]) > 4 * ROUNDED, "cameras see differently"
+    assert apart(tokens[0, 0], tokens[0, 7]) > 4 * ROUNDED, "so do moments"
+    words = ("observation.language.tokens", "observation.language.attention_mask")
+    prefixes = [
+        policy.model.embed_prefix(*policy._preprocess_images(batch), *(batch[key] for key in words))
+        for batch in (trained, acted)
+    ]
+    assert prefixes[0][0].shape[1] == 2 * GRID**2 + 1 + trained[words[1]].sum(), "both pictures, the state, the words"
+    assert apart(prefixes[0][0], prefixes[1][0]) <= ROUNDED
+
+
+@pytest.mark.parametrize(
+    "fields", [{"align": "framewise"}, {"integration": "context"}, {"integration": "none"}], ids=str
+)
+def test_every_kind_trains_and_the_tower_does_not(root: Path, seeing: dict[str, Any], fields: dict[str, Any]) -> None:
+    policy, before, _, dataset = made_for_training(root, **seeing | fields)
+    policy.train().forward(before(batch_of(dataset, [10, 30, 50, 80])))[0].backward()
+    learning = {id(parameter) for parameter in policy.get_optim_params()}
+    assert not any(id(parameter) in learning for parameter in policy.perception.tower.parameters())
+    assert all(parameter.grad is not None for parameter in policy.model.memory_parameters().values())
+    assert policy.perception.project.weight.grad.any()
+    assert not policy.perception.tower.training
+
+
+def test_loss_falls(root: Path, seeing: dict[str, Any]) -> None:
+    policy, before, _, dataset = made_for_training(root, **seeing | {"chunk_size": 4, "memory_frames": 4})
+    losses = losses_in_training(policy, before(batch_of(dataset, [*range(8, 38, 4)])), updates=30)
+    assert np.mean(losses[-5:]) < 0.5 * np.mean(losses[:5])
+
+
+def test_pictures_are_looked_at_where_they_are_remembered_or_acted_upon(
+    root: Path, seeing: dict[str, Any], looked: list[int]
+) -> None:
+    policy, before, _, dataset = made_for_training(root, **seeing | {"memory_stride": 4})
+    looked.clear()
+    counts = []
+    for index in range(8):
+        policy.select_action(before(observed(root, dataset, index)))
+        counts.append(sum(looked))
+        looked.clear()
+    assert counts == [3, 0, 0, 2, 1, 0, 2, 0], "two for each plan of three actions, one for every fourth frame"
+
+
+def test_an_observation_without_a_camera_is_told(root: Path, seeing: dict[str, Any]) -> None:
+    policy, before, _, dataset = made_for_training(root, **seeing)
+    seen = observed(root, dataset, 0)
+    del seen[CAMERAS[1]]
+    with pytest.raises(MemobenchError, match=r"no 'observation\.images\.wrist_image'.*rename_map"):
+        policy.select_action(before(seen))
+
+
+# -- checkpoints ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def saved(root: Path, seeing: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Any, Any, Path]:
+    """A policy whose eyes are gone since, as they are where a checkpoint is taken to."""
+    folder = tmp_path_factory.mktemp("checkpoint")
+    file = shutil.copy(seeing["eyes"], folder / "eyes.safetensors")
+    policy, before, after, dataset = made_for_training(root, **seeing | {"eyes": str(file)})
+    policy.train().forward(before(batch_of(dataset, [10, 30])))
+    policy.update()
+    for part in (policy, before, after):
+        part.save_pretrained(folder / "pretrained_model")
+    Path(file).unlink()
+    return policy, before, dataset, folder / "pretrained_model"
+
+
+def test_a_checkpoint_holds_its_tower_and_acts_as_the_policy_did(saved: tuple[Any, ...], root: Path) -> None:
+    policy, before, dataset, folder = saved
+    again = MemobenchMemPolicy.from_pretrained(folder)
+    pre, _ = make_pre_post_processors(again.config, pretrained_path=str(folder))
+    assert again.perception.key == policy.perception.key
+    actions: list[list[torch.Tensor]] = []
+    for actor, step in ((policy, before), (again, pre)):
+        actor.reset()
+        actions.append([actor.select_action(step(observed(root, dataset, index))) for index in range(4)])
+    assert all(torch.allclose(one, other, atol=1e-6) for one, other in zip(*actions, strict=True))
+    assert actions[0][-1].any()
+
+
+def test_training_goes_on_through_the_tower_of_the_checkpoint(
+    saved: tuple[Any, ...], root: Path, looked: list[int]
+) -> None:
+    _, _, dataset, folder = saved
+    config = PreTrainedConfig.from_pretrained(folder)
+    config.pretrained_path = folder
+    again = make_policy(config, ds_meta=dataset.meta)
+    pre, _ = make_pre_post_processors(config, pretrained_path=str(folder))
+    again.train().forward(pre(batch_of(dataset, [10, 60])))[0].backward()
+    assert looked == [], "its caches are found by its tower"
+
+
+def test_other_eyes_than_a_checkpoint_was_trained_through_are_refused(saved: tuple[Any, ...], eyes: Path) -> None:
+    folder = saved[3]
+    for other in (str(eyes), "package"):
+        config = PreTrainedConfig.from_pretrained(folder, cli_overrides=[f"--eyes={other}"])
+        with pytest.raises(MemobenchError, match=r"was trained through.*holds it; leave eyes out"):
+            MemobenchMemPolicy.from_pretrained(folder, config=config)
