@@ -17,11 +17,14 @@ from PIL import Image, ImageColor
 from safetensors.torch import load_file
 
 from lerobot_memobench.cli.study import study
+from lerobot_memobench.datasets.lerobot_format.reading import EpisodePlace
+from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.studies.alignment.measures import Measures
 from lerobot_memobench.studies.alignment.settings import ALIGNMENTS, StudySettings
+from lerobot_memobench.studies.alignment.split import split_episodes
 from lerobot_memobench.studies.alignment.study import Study, run_study
 from lerobot_memobench.studies.learning import stages as stages_module
 from lerobot_memobench.studies.learning.commands import Cost
@@ -33,6 +36,7 @@ sys.path[:0] = [str(Path(__file__).parents[1] / "evaluation")]
 
 SETTINGS = StudySettings(steps=2, seeds=1, held_out=1, rollouts=10, frames_per_episode=6)
 BOWL, MILK = NAMES[:2]
+TWIN = "open_and_close_the_microwave_a_given_number_of_times"
 
 
 @pytest.fixture(scope="module")
@@ -56,8 +60,7 @@ def fake_training(work: Study, words: Sequence[str]) -> None:
 
 
 def weights_of(work: Study, arm: str) -> dict[str, torch.Tensor]:
-    folder = work.stages.policy(arm, 0) / "checkpoints" / "last" / "pretrained_model"
-    return load_file(folder / "model.safetensors")
+    return load_file(work.stages.checkpoint(arm, 0) / "model.safetensors")
 
 
 def fake_evaluation(words: Sequence[str]) -> None:
@@ -169,6 +172,23 @@ def test_a_dataset_of_nobody_knows_what_is_refused(twice_root: Path, tmp_path: P
     with pytest.raises(MemobenchError, match=r"of the episode 0 of .*, it tells neither task nor seed"):
         Study(make_object_dataset(tmp_path / "strange"), tmp_path / "out", SETTINGS)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("name", "referent"), [(BOWL, "fixed"), (TWIN, "random")])
+def test_demonstrations_of_two_kinds_are_refused(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str, referent: str
+) -> None:
+    kinds = [(BOWL, "random"), (name, referent)] * 3
+    records = [
+        EpisodeRecord(task_name=n, memory_type="", seed=k, referent=r, variant=0, exec_start_index=0, key_frames=[])
+        for k, (n, r) in enumerate(kinds)
+    ]
+    places = [EpisodePlace(k, 10 * k, 10, record) for k, record in enumerate(records)]
+    monkeypatch.setattr("lerobot_memobench.studies.alignment.split.list_episodes", lambda _: places)
+    with pytest.raises(MemobenchError, match="demonstrations of 2 kinds"):
+        split_episodes(tmp_path, 1)
+    places[1::2] = []
+    assert split_episodes(tmp_path, 1).trained == [0, 1]
 
 
 @pytest.mark.slow

@@ -28,7 +28,7 @@ from lerobot_memobench.studies.alignment.kept import KeptBaselines, KeptRun, kep
 from lerobot_memobench.studies.alignment.measures import Measures
 from lerobot_memobench.studies.alignment.questions import guesses, make_questions
 from lerobot_memobench.studies.alignment.settings import ALIGNMENTS, StudySettings, claim_folder
-from lerobot_memobench.studies.alignment.split import split_episodes
+from lerobot_memobench.studies.alignment.split import Split, split_episodes
 from lerobot_memobench.studies.alignment.summary import measures_table, summarise
 from lerobot_memobench.studies.learning.commands import Cost
 from lerobot_memobench.studies.learning.contrasts import contrasts
@@ -50,18 +50,7 @@ class Study:
     def __init__(self, root: Path, out: Path, settings: StudySettings, workers: int = 1) -> None:
         self.out, self.settings = out, settings
         self.split = split_episodes(root, settings.held_out)
-        experiment = Experiment(
-            self.split.tasks,
-            episodes=0,
-            steps=settings.steps,
-            settings=(f"policy.subgoal_level={settings.level}", f"dataset.episodes={self.split.trained}"),
-            arms=ALIGNMENTS,
-            seeds=settings.seeds,
-            rollouts=settings.rollouts,
-            first_seed=settings.first_seed,
-            referent=self.split.referent,
-        )
-        self.stages = Stages(experiment, out, root, workers)
+        self.stages = Stages(experiment_of(self.split, settings), out, root, workers)
         meta = LeRobotDatasetMetadata(DEFAULT_REPO_ID, root=root)
         config = MemobenchMemConfig(size="small", perception="objects", device="cpu", push_to_hub=False)
         torch.manual_seed(0)
@@ -90,9 +79,24 @@ class Study:
 
     def _measured(self, arm: str, seed: int) -> dict[str, Any]:
         wall, cpu = time.monotonic(), time.process_time()
-        found = self.measures.of_checkpoint(self.stages.policy(arm, seed) / "checkpoints" / "last" / "pretrained_model")
+        found = self.measures.of_checkpoint(self.stages.checkpoint(arm, seed))
         took = {"wall_s": round(time.monotonic() - wall, 1), "cpu_s": round(time.process_time() - cpu, 1)}
         return {"arm": arm, "seed": seed, **found, **took}
+
+
+def experiment_of(split: Split, settings: StudySettings) -> Experiment:
+    """Return what is trained and rolled out: every arm on the episodes that are not held out."""
+    return Experiment(
+        split.tasks,
+        episodes=0,
+        steps=settings.steps,
+        settings=(f"policy.subgoal_level={settings.level}", f"dataset.episodes={split.trained}"),
+        arms=ALIGNMENTS,
+        seeds=settings.seeds,
+        rollouts=settings.rollouts,
+        first_seed=settings.first_seed,
+        referent=split.referent,
+    )
 
 
 def run_study(root: Path, out: Path, settings: StudySettings, say: Say, workers: int = 1) -> tuple[str, Path]:

@@ -49,7 +49,7 @@ class Stages:
         words = ["lerobot", "train", *SHARED, f"dataset={self.data}", f"steps={self.experiment.steps}"]
         words += [f"seed={seed}", f"output_dir={self.policy(arm, seed)}", *self.experiment.settings, *own]
         folder = self.policy(arm, seed)
-        begun = folder / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
+        begun = self.checkpoint(arm, seed) / "train_config.json"
         going_on = ["lerobot", "train", f"config_path={begun}", "resume=true"] if begun.is_file() else None
         log = self.log("training", arm, seed)
         if going_on is None and not log.with_suffix(".json").is_file():
@@ -70,6 +70,10 @@ class Stages:
     def policy(self, arm: str, seed: int) -> Path:
         """Return the folder of a training run."""
         return self.out / "policies" / name_of(arm, seed)
+
+    def checkpoint(self, arm: str, seed: int) -> Path:
+        """Return the folder of a training run's last checkpoint."""
+        return self.policy(arm, seed) / "checkpoints" / "last" / "pretrained_model"
 
     def rollouts(self, arm: str, seed: int) -> Path:
         """Return the folder of an evaluation."""
