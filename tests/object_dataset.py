@@ -7,10 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_memobench.datasets.lerobot_format.record import EPISODE_INFO, EpisodeRecord
 from lerobot_memobench.sim.object_slots import SLOTS, STARTS, WIDTH
+from lerobot_memobench.tasks.catalogue import BOWL
 
 LENGTHS, PROMPTS = (40, 23, 31), (6, 8, 0)
 TASKS = ("put the butter into the bowl", "open the drawer", "put the butter into the bowl")
+NAMES = (BOWL, "put_the_milk_picked_up_in_the_prompt_video_on_the_plate", BOWL)
 
 
 def slots_at(rng: np.random.Generator, places: np.ndarray, lit: int | None = None) -> np.ndarray:
@@ -27,8 +30,20 @@ def state_at(hand: np.ndarray) -> np.ndarray:
     return np.array([*hand, 3.1, 0.05, 0.1, 0.03, -0.03], np.float32)
 
 
-def make_object_dataset(root: Path, seed: int = 0, pictures: bool = False, repeats: int = 1) -> Path:
-    """Write episodes in which the hand moves to the one of three things that was lit in the prompt."""
+def record_of(name: str, seed: int, prompt: int) -> str:
+    """What `memobench generate` says of an episode."""
+    told = {"memory_type": "object", "referent": "random", "variant": 0, "key_frames": [-1]}
+    return EpisodeRecord(task_name=name, seed=seed, exec_start_index=prompt, **told).in_frames()
+
+
+def make_object_dataset(
+    root: Path, seed: int = 0, pictures: bool = False, repeats: int = 1, records: bool = False
+) -> Path:
+    """Write episodes in which the hand moves to the one of three things that was lit in the prompt.
+
+    With ``repeats`` each of the three kinds of episodes has that many; with ``records`` each says which of two tasks it
+    is of.
+    """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     number: dict[str, Any] = {"dtype": "float32", "names": None}
@@ -46,10 +61,12 @@ def make_object_dataset(root: Path, seed: int = 0, pictures: bool = False, repea
             "action": number | {"shape": (7,)},
             "phase": {"dtype": "int64", "shape": (1,), "names": None},
             **dict.fromkeys(("simple_subgoal", "grounded_subgoal", "coarse_subgoal", "memory"), string),
+            **({EPISODE_INFO: string} if records else {}),
         },
     )
     rng = np.random.default_rng(seed)
-    for length, prompt, task in [kind for kind in zip(LENGTHS, PROMPTS, TASKS, strict=True) for _ in range(repeats)]:
+    kinds = [kind for kind in zip(LENGTHS, PROMPTS, TASKS, NAMES, strict=True) for _ in range(repeats)]
+    for number, (length, prompt, task, name) in enumerate(kinds):
         places = np.array([0.0, 0.0, 0.9]) + rng.uniform(-0.2, 0.2, (3, 3))
         hand, lit = np.array([0.0, 0.0, 1.1]), int(rng.integers(3))
         for t in range(length):
@@ -65,6 +82,8 @@ def make_object_dataset(root: Path, seed: int = 0, pictures: bool = False, repea
                 "memory": f"thing {lit} was lit",
                 "task": task,
             }
+            if records:
+                frame[EPISODE_INFO] = "" if t else record_of(name, 10_000 + number, prompt)
             if pictures:
                 frame["observation.images.image"] = np.full((48, 48, 3), t, np.uint8)
             dataset.add_frame(frame)

@@ -16,7 +16,9 @@ from lerobot_memobench.evaluation.necessity.question import Settings
 from lerobot_memobench.evaluation.necessity.report import write
 from lerobot_memobench.evaluation.necessity.study import Study
 from lerobot_memobench.studies.alignment.kept import KeptBaselines, KeptRun, kept_or_made
-from lerobot_memobench.studies.alignment.summary import summarise
+from lerobot_memobench.studies.alignment.summary import measures_table, summarise
+from lerobot_memobench.studies.learning.commands import Cost
+from lerobot_memobench.studies.learning.tables import costs_table
 from lerobot_memobench.tasks.catalogue import get_task
 
 from .. import mutations
@@ -43,7 +45,15 @@ SEARCH = {
     "policy": [{"when": ["a"], "do": "b"}],
 }
 SCORES = {"all": 0.5, "own_task": 0.5}
-RUN = {"align": "none", "seed": 0, "memory": SCORES, "last_frame": SCORES, "action_loss": 0.1, "curve": []}
+RUN = {
+    "arm": "memory",
+    "seed": 0,
+    "memory": SCORES,
+    "last_frame": SCORES,
+    "action_loss": 0.1,
+    "wall_s": 1.5,
+    "cpu_s": 1.5,
+}
 BASELINES = dict.fromkeys(KeptBaselines.__annotations__, SCORES)
 
 
@@ -106,12 +116,13 @@ def test_what_a_necessity_study_keeps_is_used_or_made_again(tmp_path: Path, monk
 
 def test_what_an_alignment_study_keeps_is_used_or_refused(tmp_path: Path) -> None:
     def prepare(folder: Path) -> None:
-        (folder / "none-0.json").write_text(json.dumps(RUN))
+        (folder / "memory-0.json").write_text(json.dumps(RUN))
         (folder / "baselines.json").write_text(json.dumps(BASELINES))
 
     def use(folder: Path) -> None:
-        run = kept_or_made(folder / "none-0.json", KeptRun, lambda: RUN)
-        summarise([run])
-        kept_or_made(folder / "baselines.json", KeptBaselines, lambda: BASELINES)
+        run = kept_or_made(folder / "memory-0.json", KeptRun, lambda: RUN)
+        baselines = kept_or_made(folder / "baselines.json", KeptBaselines, lambda: BASELINES)
+        measures_table({"memory": summarise([run])}, baselines)
+        costs_table({"questions": [Cost(run["wall_s"], run["cpu_s"])]})
 
     assert check(tmp_path, prepare, use, mutations.mutated_json, 200) > 50

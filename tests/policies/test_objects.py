@@ -188,6 +188,30 @@ def test_batches_hold_moments_of_few_episodes_and_no_prompt(root: Path, balance:
     assert len(batch[FRAMES].unique()) < batch[MASK].sum(), "moments of an episode share frames"
 
 
+@pytest.mark.parametrize("balance", [True, False])
+def test_of_some_episodes_no_other_frame_is_drawn(root: Path, balance: bool) -> None:
+    """`dataset.episodes` holds some out; rows of what is opened are not frames of the dataset then."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    policy, before, _, _ = made_for_training(root, **OBJECTS, balance_tasks=balance)
+    dataset = LeRobotDataset("memobench/objects", root=root, episodes=[1, 2])
+    sampler = EpisodeAwareSampler(
+        dataset.meta.episodes["dataset_from_index"],
+        dataset.meta.episodes["dataset_to_index"],
+        episode_indices_to_use=dataset.episodes,
+        drop_n_last_frames=policy.config.drop_n_last_frames,
+        shuffle=True,
+        absolute_to_relative_idx=dataset.absolute_to_relative_idx,
+    )
+    drawn = [int(dataset[row]["index"]) for _ in range(20) for row in sampler]
+    execution = {int(STARTS[k]) + frame for k in (1, 2) for frame in range(PROMPTS[k], LENGTHS[k])}
+    assert set(drawn) == execution
+    share = np.mean([frame < STARTS[2] for frame in drawn])
+    alike, by_frames = 1 / 2, (LENGTHS[1] - PROMPTS[1]) / len(execution)
+    assert share == pytest.approx(alike if balance else by_frames, abs=0.06)
+    assert before(batch_of(dataset, list(range(4))))[MASK].any()
+
+
 def test_statistics_are_those_of_execution_frames(root: Path) -> None:
     _, before, _, dataset = made_for_training(root, **OBJECTS)
     hf = dataset.hf_dataset.with_format("numpy")

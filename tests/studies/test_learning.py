@@ -15,6 +15,7 @@ from PIL import Image, ImageColor
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records.runs import read_rollouts
+from lerobot_memobench.studies.alignment.settings import ALIGNMENTS
 from lerobot_memobench.studies.learning import stages as stages_module
 from lerobot_memobench.studies.learning.commands import Cost, run_once
 from lerobot_memobench.studies.learning.experiments import EXPERIMENTS, MEMORY, MEMORYLESS, changed
@@ -25,6 +26,7 @@ from lerobot_memobench.studies.learning.study import learn
 from lerobot_memobench.tasks.catalogue import BOWL
 
 sys.path[:0] = [str(Path(__file__).parents[1] / "evaluation")]
+TWIN = "open_and_close_the_microwave_a_given_number_of_times"
 
 
 def test_a_command_that_ended_well_is_not_run_again(tmp_path: Path) -> None:
@@ -123,9 +125,20 @@ def test_a_killed_training_goes_on_from_its_checkpoint(tmp_path: Path, monkeypat
 def test_what_is_told_in_training_is_told_in_rollouts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ran: dict[str, list[str]] = {}
     monkeypatch.setattr(stages_module, "run_once", lambda words, log, **options: ran.update({log.stem: words}))
-    stages = Stages(EXPERIMENTS["alignment"], tmp_path)
+    stages = Stages(replace(EXPERIMENTS["bowl"], arms=ALIGNMENTS), tmp_path)
     for arm in stages.experiment.arms:
         stages.evaluate(arm, 0)
     told = [name for name, words in ran.items() if "env.oracle_memory=true" in words]
     assert told == ["oracle_text-0"]
     assert len(ran) == 6
+
+
+@pytest.mark.parametrize(("task", "referent", "strict"), [(BOWL, "random", False), (TWIN, "drawn", True)])
+def test_rollouts_are_of_the_demonstrations_kind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, task: str, referent: str, strict: bool
+) -> None:
+    ran: list[str] = []
+    monkeypatch.setattr(stages_module, "run_once", lambda words, log, **options: ran.extend(words))
+    Stages(replace(EXPERIMENTS["bowl"], tasks=(task,), referent=referent), tmp_path).evaluate(MEMORY, 0)
+    assert f"referent={referent}" in ran
+    assert ("suite=strict" in ran) == strict

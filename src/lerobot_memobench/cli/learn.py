@@ -10,9 +10,7 @@ import typer
 
 from lerobot_memobench.cli.console import console
 
-EXPERIMENTS = (
-    "bowl: one task, in minutes; prompted: ten tasks; joint: all thirty; alignment: whether it helps, on the ten."
-)
+EXPERIMENTS = "bowl: one task, in minutes; prompted: ten tasks; joint: all thirty."
 
 
 class Name(StrEnum):
@@ -21,7 +19,6 @@ class Name(StrEnum):
     BOWL = "bowl"
     PROMPTED = "prompted"
     JOINT = "joint"
-    ALIGNMENT = "alignment"
 
 
 def learn(

@@ -1,4 +1,4 @@
-"""``memobench study``: train the small policy with every alignment and show what its memory then knows."""
+"""``memobench study``: train the small policy with every alignment and show what it solves and its memory knows."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ from lerobot_memobench.cli.console import console
 
 
 def study(
-    dataset: Annotated[Path, typer.Argument(help="Folder of a generated dataset of eight tasks or more.")],
-    out: Annotated[Path, typer.Option(help="Folder of runs, table and figure; the same command goes on there.")],
-    steps: Annotated[int, typer.Option(min=1, help="Updates per run.")] = 300,
-    batch_size: Annotated[int, typer.Option(min=2, help="Samples per update.")] = 16,
-    seeds: Annotated[int, typer.Option(min=1, help="Runs per alignment.")] = 3,
-    held_out: Annotated[int, typer.Option(min=1, help="Episodes per task that are never trained on.")] = 2,
+    dataset: Annotated[Path, typer.Argument(help="Folder of a generated dataset; images are not needed.")],
+    out: Annotated[Path, typer.Option(help="Folder of policies, rollouts and tables; the same command goes on there.")],
+    steps: Annotated[int, typer.Option(min=1, help="Updates per policy.")] = 3000,
+    seeds: Annotated[int, typer.Option(min=1, help="Training seeds.")] = 3,
+    held_out: Annotated[int, typer.Option(min=1, help="Episodes per task that are never trained on.")] = 4,
+    rollouts: Annotated[int, typer.Option(min=1, help="Rollouts per task and policy.")] = 20,
     level: Annotated[str, typer.Option(help="Subgoal level: coarse, intermediate or fine.")] = "intermediate",
-    size: Annotated[str, typer.Option(help="Size of the policy.")] = "tiny",
+    first_seed: Annotated[int, typer.Option(help="First seed of the rollouts; choose settings by 20000.")] = 7,
+    workers: Annotated[int, typer.Option(min=1, help="Processes; so many policies are trained at once.")] = 1,
 ) -> int:
-    """Train with none, semantic, contrastive and framewise alignment from the same seeds, and compare what a memory
-    tells about the active subgoal on held-out episodes: one table and one figure. A killed run is continued.
+    """Does alignment help? Train with no, semantic, contrastive and framewise alignment, with oracle text and without
+    a memory, and compare success, what memories tell of the active subgoal, and action loss.
     """
     from lerobot_memobench.studies.alignment.settings import StudySettings
     from lerobot_memobench.studies.alignment.study import run_study
@@ -31,8 +32,10 @@ def study(
     def say(text: str) -> None:
         screen.print(text, markup=False, soft_wrap=True)
 
-    settings = StudySettings(steps=steps, batch_size=batch_size, seeds=seeds, held_out=held_out, level=level, size=size)
-    table, figure = run_study(dataset, out, settings, say)
-    say(table)
+    settings = StudySettings(
+        steps=steps, seeds=seeds, held_out=held_out, rollouts=rollouts, first_seed=first_seed, level=level
+    )
+    tables, figure = run_study(dataset, out, settings, say, workers)
+    say(tables)
     say(f"figure: {figure}")
     return 0

@@ -1,4 +1,4 @@
-"""The study's figure: retrieval from memory, from the last frame and by the own head, and the action loss."""
+"""The study's figure: what was solved, what memories tell of the active subgoal, and the action loss."""
 
 from __future__ import annotations
 
@@ -6,38 +6,36 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.files import draft_of
-
-COLOURS = {"none": "#7f7f7f", "semantic": "#56b4e9", "contrastive": "#e69f00", "framewise": "#009e73"}
-"""Okabe and Ito's palette, apart for the colour-blind too."""
+from lerobot_memobench.studies.learning.figure import COLOURS, WRONG
 
 PANELS = {
-    "memory": "From memory (readout)",
-    "last frame": "From the last frame (readout)",
-    "own head": "By the policy's own head",
+    "memory": "Subgoal from memory (readout)",
+    "last frame": "Subgoal from the last frame (readout)",
+    "own head": "Subgoal by the policy's own head",
     "memory, own task": "From memory, own task's subgoals",
-    "action loss": "Action loss",
+    "action loss": "Action loss, held-out episodes",
 }
-"""Measure of each panel, and its title."""
+"""Measure of each panel after the first, and its title."""
 
 
 def draw(summary: dict[str, Any], path: Path) -> Path:
-    """Draw every panel with every seed to ``path``; return it."""
+    """Draw every panel with every training seed to ``path``; return it."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(1, len(PANELS), figsize=(3.1 * len(PANELS), 3.3), constrained_layout=True)
-    for axis, (name, title) in zip(axes, PANELS.items(), strict=True):
-        _draw_alignments(axis, name, summary["alignments"])
+    figure, axes = plt.subplots(2, 3, figsize=(11.0, 6.6), constrained_layout=True)
+    _draw_solved(axes.flat[0], {arm: found["all"] for arm, found in summary["outcomes"].items()})
+    for axis, (name, title) in zip(axes.flat[1:], PANELS.items(), strict=True):
+        _draw_measure(axis, name, {arm: found.get(name) for arm, found in summary["measures"].items()})
         axis.set_title(title, fontsize=10)
-        if name == "action loss":
-            axis.set_ylabel("flow-matching loss")
-        else:
+        if name != "action loss":
             axis.set_ylim(0, 100)
             axis.set_ylabel("held-out top-1, %")
             _draw_baselines(axis, name, summary["baselines"])
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8, frameon=False)
+    handles = [label for axis in axes.flat[:2] for label in zip(*axis.get_legend_handles_labels(), strict=True)]
+    figure.legend(*zip(*handles, strict=True), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     figure.suptitle(_headline(summary), fontsize=10)
     with draft_of(path) as draft:
         figure.savefig(draft, dpi=130)
@@ -45,18 +43,38 @@ def draw(summary: dict[str, Any], path: Path) -> Path:
     return path
 
 
-def _draw_alignments(axis: Any, name: str, alignments: dict[str, Any]) -> None:
-    """A bar for the mean of each alignment, a dot for each seed."""
+def _draw_solved(axis: Any, arms: dict[str, Any]) -> None:
+    """Success with its interval, wrong referents above it."""
+    for place, found in enumerate(arms.values()):
+        solved, (low, high) = 100 * found["success"], found["interval"]
+        label = "failed at a wrong referent" if place == 0 else None
+        _draw_bar(axis, place, solved, [100 * value for value in found["of_seeds"]])
+        axis.bar(place, 100 * found["wrong_share"], 0.7, bottom=solved, color=WRONG, alpha=0.35, label=label)
+        axis.plot([place + 0.25] * 2, [100 * low, 100 * high], color="black", linewidth=1.2)
+    axis.set_ylim(0, 100)
+    axis.set_ylabel("rollouts solved, %")
+    axis.set_title("Success (line: 95 % interval of rollouts)", fontsize=10)
+    _name_arms(axis, arms)
+
+
+def _draw_measure(axis: Any, name: str, arms: dict[str, Any]) -> None:
     factor = 1.0 if name == "action loss" else 100.0
-    for place, (align, measures) in enumerate(alignments.items()):
-        measure = measures.get(name)
+    for place, measure in enumerate(arms.values()):
         if measure is None:
-            axis.text(place, 7.0, "no head", ha="center", va="bottom", fontsize=8, color="#555555")
-            continue
-        axis.bar(place, factor * measure["mean"], 0.7, color=COLOURS.get(align, "#444444"), alpha=0.85)
-        values = [factor * value for value in measure["values"]]
-        axis.plot([place] * len(values), values, "o", color="black", markersize=3)
-    axis.set_xticks(range(len(alignments)), alignments, rotation=25, fontsize=9)
+            axis.text(place, 3.0, "none", ha="center", va="bottom", fontsize=8, color="#555555")
+        else:
+            _draw_bar(axis, place, factor * measure["mean"], [factor * value for value in measure["values"]])
+    _name_arms(axis, arms)
+
+
+def _draw_bar(axis: Any, place: int, mean: float, values: list[float]) -> None:
+    """A bar for the mean of an arm, a dot for each training seed."""
+    axis.bar(place, mean, 0.7, color=COLOURS[place % len(COLOURS)])
+    axis.plot([place] * len(values), values, "o", color="black", markersize=3)
+
+
+def _name_arms(axis: Any, arms: dict[str, Any]) -> None:
+    axis.set_xticks(range(len(arms)), arms, rotation=25, fontsize=9)
     axis.spines[["top", "right"]].set_visible(False)
 
 
@@ -72,6 +90,7 @@ def _draw_baselines(axis: Any, name: str, baselines: dict[str, Any]) -> None:
 def _headline(summary: dict[str, Any]) -> str:
     settings = summary["settings"]
     return (
-        f"{summary['tasks']} tasks, {summary['candidates']} subgoals, {summary['frames']['test']} held-out frames; "
-        f"{settings['size']}, {settings['steps']} updates of {settings['batch_size']}; bars: mean, dots: seeds"
+        f"{len(summary['tasks'])} tasks, {settings['steps']} updates, {settings['rollouts']} rollouts of each task and "
+        f"policy; {summary['candidates']} subgoals, {summary['frames']['test']} held-out frames; bars: mean, dots: "
+        "training seeds"
     )

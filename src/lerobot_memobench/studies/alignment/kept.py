@@ -19,14 +19,16 @@ class Scores(TypedDict):
 
 
 class KeptRun(TypedDict):
-    """A policy that was trained and measured."""
+    """What was measured on a trained policy: its actions, and its memory if it has one; seconds that this took."""
 
-    align: str
+    arm: str
     seed: Count
-    memory: Scores
-    last_frame: Scores
+    memory: NotRequired[Scores]
+    last_frame: NotRequired[Scores]
     head: NotRequired[Scores]
     action_loss: float
+    wall_s: Number
+    cpu_s: Number
 
 
 class KeptBaselines(TypedDict):
@@ -34,8 +36,6 @@ class KeptBaselines(TypedDict):
 
     chance: Scores
     commonest: Scores
-    tower_history: Scores
-    tower_last_frame: Scores
     untrained_memory: Scores
     untrained_last_frame: Scores
 

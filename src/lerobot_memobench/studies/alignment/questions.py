@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_memobench.datasets.memory_cache import MemoryCache
+from lerobot_memobench.datasets.demonstration import PROMPT
+from lerobot_memobench.datasets.memory_cache import FrameLookup
 from lerobot_memobench.studies.alignment.split import Split
 
 
@@ -19,7 +21,7 @@ class Asked:
     Attributes:
         indices: (N,) frames of the dataset.
         labels: (N,) candidate that is right.
-        episodes: (N,). tasks: (N,).
+        episodes: (N,). tasks: (N,) numbers, as the split has them.
         allowed: (N, C) candidates of the frame's own task.
     """
 
@@ -45,28 +47,43 @@ class Questions:
     test: Asked
 
 
-def make_questions(cache: MemoryCache, level: str, split: Split, tasks: np.ndarray) -> Questions:
-    """Ask for the subgoal of ``level`` at the split's frames; ``tasks`` (N,) is the task of each frame."""
-    rows = cache.text_rows(level)
-    used, numbers = np.unique(rows[np.concatenate([split.fit, split.test])], return_inverse=True)
-    fit, test = np.split(numbers, [len(split.fit)])
-    by_task = np.zeros((int(tasks.max()) + 1, len(used)), dtype=bool)
-    for frames, labels in ((split.fit, fit), (split.test, test)):
-        by_task[tasks[frames], labels] = True
-
-    def asked(frames: np.ndarray, labels: np.ndarray) -> Asked:
-        """Ask about these frames."""
-        return Asked(
-            indices=frames,
+def make_questions(frames: FrameLookup, level: str, split: Split, per_episode: int) -> Questions:
+    """Ask for the subgoal of ``level`` at execution frames, at most ``per_episode`` of each episode."""
+    rows, episodes = frames.text_rows(level), frames.episodes
+    askable = (frames.phase != PROMPT) & (rows >= 0)
+    parts = [split.frames(askable, episodes, per_episode, held=held) for held in (False, True)]
+    used, numbers = np.unique(rows[np.concatenate(parts)], return_inverse=True)
+    episode_of = np.repeat(np.arange(len(split.task)), np.diff(episodes))
+    task_of = split.task[episode_of]
+    by_task = np.zeros((len(split.tasks), len(used)), dtype=bool)
+    by_task[task_of[np.concatenate(parts)], numbers] = True
+    fit, test = (
+        Asked(
+            indices=indices,
             labels=torch.from_numpy(labels),
-            episodes=torch.from_numpy(split.episode[frames]),
-            tasks=tasks[frames],
-            allowed=torch.from_numpy(by_task[tasks[frames]]),
+            episodes=torch.from_numpy(episode_of[indices]),
+            tasks=task_of[indices],
+            allowed=torch.from_numpy(by_task[task_of[indices]]),
         )
-
-    return Questions(
-        candidates=cache.text_embeddings[torch.from_numpy(used.astype(np.int64))],
-        texts=[cache.texts[row] for row in used],
-        fit=asked(split.fit, fit),
-        test=asked(split.test, test),
+        for indices, labels in zip(parts, np.split(numbers, [len(parts[0])]), strict=True)
     )
+    return Questions(
+        candidates=frames.text_embeddings[torch.from_numpy(used.astype(np.int64))],
+        texts=[frames.texts[row] for row in used],
+        fit=fit,
+        test=test,
+    )
+
+
+def guesses(questions: Questions) -> dict[str, Any]:
+    """Return what is right without looking: at random, and by the commonest subgoal of the training episodes."""
+    test, count = questions.test, len(questions.candidates)
+    common = torch.bincount(questions.fit.labels, minlength=count)
+    in_task = torch.where(test.allowed, common, -1)
+    return {
+        "chance": {"all": 1.0 / count, "own_task": float((1.0 / test.allowed.sum(dim=1)).mean())},
+        "commonest": {
+            "all": float((test.labels == common.argmax()).double().mean()),
+            "own_task": float((test.labels == in_task.argmax(dim=1)).double().mean()),
+        },
+    }

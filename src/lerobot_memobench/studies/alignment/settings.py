@@ -7,52 +7,42 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from lerobot.configs import PolicyFeature
-
 from lerobot_memobench.datasets.memory_cache import dataset_fingerprint
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.files import write_file
 from lerobot_memobench.files.reading import read_json
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.studies.learning.experiments import EVALUATION_SEEDS, MEMORY, MEMORYLESS
 
-ALIGNMENTS = ("none", "semantic", "contrastive", "framewise")
-PROMPT_LENGTH = 48
-"""Tokens of a prompt: the catalogue's longest instruction and eight state values take 45 words."""
+ALIGNMENTS: dict[str, tuple[str, ...]] = {
+    MEMORY: (),
+    **{name: (f"align={name}",) for name in ("semantic", "contrastive", "framewise")},
+    "oracle text": ("policy.integration=none", "policy.oracle_memory=true"),
+    MEMORYLESS: ("policy.integration=none",),
+}
+"""The paper's objectives beside a memory that is aligned with nothing, and the two ends: what was seen told in words,
+and nothing of it. Name -> words for `lerobot train`."""
 
 
 @dataclass(frozen=True)
 class StudySettings:
-    """What a study does; two studies with equal settings and dataset give equal numbers."""
+    """What a study does.
 
-    steps: int = 300
-    batch_size: int = 16
+    Attributes:
+        steps: updates of each policy. seeds: of training; the first ``seeds`` numbers.
+        held_out: episodes of each task, its last ones, that are never trained on.
+        rollouts: of each task and policy. first_seed: of the rollouts.
+        level: of the subgoals that memories are aligned with and asked for.
+        frames_per_episode: execution frames, evenly spaced, that are asked about.
+    """
+
+    steps: int = 3000
     seeds: int = 3
-    held_out: int = 2
-    """Episodes of each task, its last ones, that are never trained on."""
+    held_out: int = 4
+    rollouts: int = 20
+    first_seed: int = EVALUATION_SEEDS
     level: str = "intermediate"
-    size: str = "tiny"
-    chunk: int = 20
-    """Actions per prediction; the full recipe's 50 would take half as long again on a CPU."""
     frames_per_episode: int = 24
-    """Execution frames, evenly spaced, on which readouts are fitted and tested."""
-    action_batches: int = 8
-    """Batches of held-out frames on which the action loss is measured, each with fixed noise."""
-
-    def config(self, align: str, features: dict[str, PolicyFeature] | None = None) -> MemobenchMemConfig:
-        """The policy that is trained; of the dataset's ``features`` it sees the state and the remembered camera."""
-        camera = MemobenchMemConfig.memory_camera
-        seen = {key: feature for key, feature in (features or {}).items() if key in (camera, "observation.state")}
-        return MemobenchMemConfig(
-            input_features=seen,
-            size=self.size,
-            align=align,
-            subgoal_level=self.level,
-            device="cpu",
-            push_to_hub=False,
-            chunk_size=self.chunk,
-            n_action_steps=self.chunk,
-            tokenizer_max_length=PROMPT_LENGTH,
-        )
 
 
 def claim_folder(out: Path, root: Path, settings: StudySettings) -> None:

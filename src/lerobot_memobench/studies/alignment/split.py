@@ -1,60 +1,77 @@
-"""Which episodes are held out, and on which frames is a memory asked?"""
+"""Of which tasks are a dataset's episodes, which of them are held out, and on which frames is a memory asked?"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, list_episodes
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.studies.alignment.frames import Frames
-from lerobot_memobench.studies.alignment.settings import StudySettings
+from lerobot_memobench.tasks.catalogue import suite_of
 
 
 @dataclass(frozen=True)
 class Split:
-    """Frames of the dataset by their use, as global indices.
+    """A dataset's episodes.
 
     Attributes:
-        train: every frame of the training episodes.
-        fit, test: execution frames of training and of held-out episodes, evenly spaced.
-        episode: (N,) episode of every frame.
+        tasks: names of its tasks, in order. referent: of all its episodes.
+        task: (E,) number of each episode's task. held: (E,) whether it is held out.
     """
 
-    train: np.ndarray
-    fit: np.ndarray
-    test: np.ndarray
-    episode: np.ndarray
+    tasks: tuple[str, ...]
+    referent: str
+    task: np.ndarray
+    held: np.ndarray
+
+    @property
+    def trained(self) -> list[int]:
+        """Numbers of the episodes to train on."""
+        return [int(number) for number in np.flatnonzero(~self.held)]
+
+    def frames(self, askable: np.ndarray, episodes: np.ndarray, count: int, *, held: bool) -> np.ndarray:
+        """Return frames of the episodes that are held out, or of the others, at most ``count`` of each, evenly spaced.
+
+        Args:
+            askable: (N,) which frames may be taken. episodes: (E + 1,) first frame of each episode.
+        """
+        chosen = np.flatnonzero(self.held == held)
+        own = (episodes[k] + np.flatnonzero(askable[episodes[k] : episodes[k + 1]]) for k in chosen)
+        return np.concatenate([_spaced(frames, count) for frames in own])
 
 
-def split_frames(frames: Frames, phase: np.ndarray, settings: StudySettings) -> Split:
-    """Hold out the last episodes of every task; ``phase`` (N,) is 1 for the execution's frames.
+def split_episodes(root: Path, held_out: int) -> Split:
+    """Hold out the last ``held_out`` episodes of every task of a dataset.
 
     Raises:
-        MemobenchError: a task has too few episodes.
+        MemobenchError: it is none of this package, of several suites or referents, or a task has too few episodes.
     """
-    held = _held_out(frames, settings.held_out)
-    episode = np.repeat(np.arange(len(held)), np.diff(frames.episodes))
+    records = [place.record for place in list_episodes(root)]
+    known = [record for record in records if record is not None]
+    if len(known) < len(records):
+        raise MemobenchError(f"of the episode {records.index(None)} of {root}, {STRANGER}")
+    kinds = {(suite_of(record.task_name), record.referent) for record in known}
+    if len(kinds) != 1:
+        raise MemobenchError(
+            f"{root} holds demonstrations of {len(kinds)} kinds, told apart by suite and referent; a study rolls out "
+            "by one of each, so give a dataset of one `memobench generate`"
+        )
+    ((_, referent),) = kinds
+    tasks, task = np.unique([record.task_name for record in known], return_inverse=True)
+    return Split(tuple(map(str, tasks)), referent, task, _last(task, tasks, held_out))
 
-    def asked(held_out: bool) -> np.ndarray:
-        """Execution frames, evenly spaced, of episodes that are held out or not."""
-        chosen = np.flatnonzero(held == held_out)
-        acting = (np.flatnonzero((episode == number) & (phase == 1)) for number in chosen)
-        return np.concatenate([_spaced(own, settings.frames_per_episode) for own in acting])
 
-    return Split(train=np.flatnonzero(~held[episode]), fit=asked(False), test=asked(True), episode=episode)
-
-
-def _held_out(frames: Frames, count: int) -> np.ndarray:
-    """(E,) bool: the last ``count`` episodes of every task."""
-    task_of = np.array([frames.tasks[first] for first in frames.episodes[:-1]])
-    held = np.zeros(len(task_of), dtype=bool)
-    for task in np.unique(task_of):
-        own = np.flatnonzero(task_of == task)
+def _last(task: np.ndarray, names: np.ndarray, count: int) -> np.ndarray:
+    """Return which episodes (E,) are among the last ``count`` of their task (E,)."""
+    held = np.zeros(len(task), dtype=bool)
+    for number, name in enumerate(names):
+        own = np.flatnonzero(task == number)
         if len(own) <= count:
             raise MemobenchError(
-                f"the task '{frames.task_texts[int(task)]}' has {len(own)} episodes and {count} are to be "
-                "held out; generate more, or lower --held-out"
+                f"the task '{name}' has {len(own)} episodes and {count} are to be held out; generate more, or lower "
+                "--held-out"
             )
         held[own[-count:]] = True
     return held

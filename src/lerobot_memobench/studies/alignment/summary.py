@@ -1,11 +1,12 @@
-"""A study's runs in one table: mean and spread over seeds, beside the baselines."""
+"""What the policies of a study know, in one table: mean and spread over training seeds, beside the baselines."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lerobot_memobench.studies.alignment.readouts import mean_and_deviation
+from lerobot_memobench.studies.learning.tables import markdown
 
 MEASURES = {
     "memory": ("memory", "all"),
@@ -20,7 +21,6 @@ MEASURES = {
 
 BASELINES = {
     "untrained weights": ("untrained_memory", "untrained_last_frame"),
-    "tower's tokens, no clock": ("tower_history", "tower_last_frame"),
     "commonest subgoal": ("commonest",),
     "chance": ("chance",),
 }
@@ -46,16 +46,13 @@ def _value(run: dict[str, Any], path: Sequence[str]) -> float | None:
     return None if value is None else float(value)
 
 
-def markdown_table(summary: dict[str, Any]) -> str:
-    """Return the study's table: a row per alignment and per baseline."""
-    lines = [["", *MEASURES], ["---", *["---:"] * len(MEASURES)]]
-    for align, found in summary["alignments"].items():
-        lines.append([f"align={align}", *(_cell(name, found.get(name)) for name in MEASURES)])
-    base = summary["baselines"]
+def measures_table(arms: Mapping[str, dict[str, Any]], baselines: Mapping[str, Any]) -> str:
+    """Return a row per arm, as `summarise` tells it, and per baseline."""
+    rows = [[arm, *(_cell(name, found.get(name)) for name in MEASURES)] for arm, found in arms.items()]
     for label, names in BASELINES.items():
-        cells = [f"{100 * base[name][key]:.1f}" for name in names for key in ("all", "own_task")]
-        lines.append([label, *cells, *["–"] * (len(MEASURES) - len(cells))])
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
+        cells = [f"{100 * baselines[name][key]:.1f}" for name in names for key in ("all", "own_task")]
+        rows.append([label, *cells, *["–"] * (len(MEASURES) - len(cells))])
+    return markdown(["active subgoal, top-1 in %", *MEASURES], rows)
 
 
 def _cell(name: str, measure: dict[str, Any] | None) -> str:

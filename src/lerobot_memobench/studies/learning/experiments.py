@@ -11,14 +11,6 @@ MEMORY, MEMORYLESS = "memory", "no memory"
 ARMS: dict[str, tuple[str, ...]] = {MEMORY: (), MEMORYLESS: ("policy.integration=none",)}
 """Who is compared -> what is said of it to `lerobot train` beside what all share."""
 
-ALIGNMENTS: dict[str, tuple[str, ...]] = {
-    MEMORY: (),
-    **{name: (f"align={name}",) for name in ("semantic", "contrastive", "framewise")},
-    "oracle text": ("policy.integration=none", "policy.oracle_memory=true"),
-    MEMORYLESS: ("policy.integration=none",),
-}
-"""The paper's objectives, and its two ends: what was seen told in words, and nothing of it."""
-
 EVALUATION_SEEDS = 7
 TUNING_SEEDS = 20_000
 """First seeds: of the evaluation that is reported, and of one that settings may be chosen by."""
@@ -29,11 +21,12 @@ class Experiment:
     """Policies of equal data and updates, which differ in what their arm says.
 
     Attributes:
-        tasks: task names. episodes: demonstrations of each, two thirds of them with the arm moved off its way.
+        tasks: task names, of one suite. episodes: demonstrations of each, two thirds of them with the arm moved off
+            its way; 0 where they are given.
         steps: updates. settings: more words for `lerobot train`, of all arms.
         arms: name -> words for `lerobot train`.
         seeds: of training; the first ``seeds`` numbers.
-        rollouts: of each task and policy. first_seed: of the rollouts.
+        rollouts: of each task and policy. first_seed: of the rollouts. referent: of demonstrations and rollouts.
     """
 
     tasks: tuple[str, ...]
@@ -44,6 +37,7 @@ class Experiment:
     seeds: int = 1
     rollouts: int = 50
     first_seed: int = EVALUATION_SEEDS
+    referent: str = "random"
 
 
 def prompted() -> tuple[str, ...]:
@@ -60,10 +54,8 @@ EXPERIMENTS: dict[str, Experiment] = {
     "bowl": Experiment((BOWL,), episodes=120, steps=1000, seeds=3),
     "prompted": Experiment(prompted(), episodes=40, steps=8_000),
     "joint": Experiment(tuple(task_names()), episodes=40, steps=20_000),
-    "alignment": Experiment(prompted(), episodes=40, steps=4_000, arms=ALIGNMENTS, seeds=3),
 }
-"""Butter into the prompted bowl, in minutes; the ten prompted tasks, by one policy; all thirty, by one policy; and
-whether alignment helps."""
+"""Butter into the prompted bowl, in minutes; the ten prompted tasks, by one policy; all thirty, by one policy."""
 
 
 def changed(which: Experiment, **given: object) -> Experiment:

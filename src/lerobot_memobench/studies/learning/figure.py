@@ -58,9 +58,7 @@ def _draw_bar(axis: Any, at: float, height: float, outcome: Outcome, place: int)
     """Draw one arm: solved, wrong referents behind it, and the interval of the first."""
     solved = 100 * (outcome.success.value or 0.0)
     low, high = (100 * bound for bound in outcome.success.interval or (0.0, 0.0))
-    count = outcome.wrong + outcome.others
-    wrong = (100 - solved) * outcome.wrong / count if count else 0.0
     axis.barh(at, solved, height, color=COLOURS[place % len(COLOURS)])
-    axis.barh(at, wrong, height, left=solved, color=WRONG, alpha=0.35)
+    axis.barh(at, 100 * outcome.wrong_share, height, left=solved, color=WRONG, alpha=0.35)
     axis.plot([low, high], [at, at], color="black", linewidth=1.2)
     axis.text(1, at, f"{solved:.0f}", va="center", fontsize=8, color="white" if solved > 6 else "black")

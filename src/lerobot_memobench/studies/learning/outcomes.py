@@ -28,6 +28,12 @@ class Outcome:
     wrong: int
     others: int
 
+    @property
+    def wrong_share(self) -> float:
+        """What share of rollouts failed with a wrong referent, tasks averaged as in ``success``, about."""
+        failures = self.wrong + self.others
+        return (1 - _value(self.success)) * self.wrong / failures if failures else 0.0
+
 
 def outcomes_of(rollouts: Runs) -> dict[str, Outcome]:
     """Return "all", memory type and task -> outcome, of an arm's rollouts.
@@ -87,5 +93,6 @@ def _figures(outcome: Outcome) -> dict[str, Any]:
         "rollouts": outcome.success.n,
         "of_seeds": list(outcome.of_seeds),
         "wrong_referent": outcome.wrong,
+        "wrong_share": outcome.wrong_share,
         "other_failures": outcome.others,
     }

@@ -8,6 +8,8 @@ from pathlib import Path
 
 from lerobot_memobench.studies.learning.commands import Cost, run_once
 from lerobot_memobench.studies.learning.experiments import Experiment
+from lerobot_memobench.tasks.catalogue import suite_of
+from lerobot_memobench.tasks.task import STRICT
 
 SHARED = ("policy=memobench_mem", "perception=objects", "size=small")
 """What every policy of an experiment is told: objects instead of pixels, the small size."""
@@ -36,8 +38,9 @@ class Stages:
         """Make the demonstrations; None where they were given."""
         if self.dataset is not None:
             return None
-        words = ["memobench", "generate", "--tasks", ",".join(self.experiment.tasks), "--referent", "random"]
-        words += ["--episodes", str(self.experiment.episodes), "--perturb", "--no-images", "--out", str(self.data)]
+        words = ["memobench", "generate", "--tasks", ",".join(self.experiment.tasks)]
+        words += ["--referent", self.experiment.referent, "--episodes", str(self.experiment.episodes)]
+        words += ["--perturb", "--no-images", "--out", str(self.data)]
         return run_once([*words, "--workers", str(self.workers)], self.out / "data.log", threads=1, accept=(0, 1))
 
     def train(self, arm: str, seed: int, threads: int | None = None) -> Cost:
@@ -46,7 +49,7 @@ class Stages:
         words = ["lerobot", "train", *SHARED, f"dataset={self.data}", f"steps={self.experiment.steps}"]
         words += [f"seed={seed}", f"output_dir={self.policy(arm, seed)}", *self.experiment.settings, *own]
         folder = self.policy(arm, seed)
-        begun = folder / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
+        begun = self.checkpoint(arm, seed) / "train_config.json"
         going_on = ["lerobot", "train", f"config_path={begun}", "resume=true"] if begun.is_file() else None
         log = self.log("training", arm, seed)
         if going_on is None and not log.with_suffix(".json").is_file():
@@ -55,9 +58,11 @@ class Stages:
 
     def evaluate(self, arm: str, seed: int) -> Cost:
         """Roll a trained policy out on the experiment's evaluation seeds."""
-        words = ["lerobot", "eval", "env=memobench", f"policy={self.policy(arm, seed)}", "referent=random", "films=0"]
-        words += [f"tasks={','.join(self.experiment.tasks)}", f"episodes={self.experiment.rollouts}"]
-        words += [f"seed={self.experiment.first_seed}", f"output_dir={self.rollouts(arm, seed)}", "resume=true"]
+        words = ["lerobot", "eval", "env=memobench", f"policy={self.policy(arm, seed)}"]
+        words += [f"referent={self.experiment.referent}", "films=0", f"tasks={','.join(self.experiment.tasks)}"]
+        words += [f"episodes={self.experiment.rollouts}", f"seed={self.experiment.first_seed}"]
+        words += [f"output_dir={self.rollouts(arm, seed)}", "resume=true"]
+        words += ["suite=strict"] if suite_of(self.experiment.tasks[0]) == STRICT else []
         words += ["env.oracle_memory=true"] if "policy.oracle_memory=true" in self.experiment.arms[arm] else []
         words += [f"shards={self.workers}", f"workers={self.workers}"] if self.workers > 1 else []
         return run_once(words, self.log("evaluation", arm, seed), threads=1)
@@ -65,6 +70,10 @@ class Stages:
     def policy(self, arm: str, seed: int) -> Path:
         """Return the folder of a training run."""
         return self.out / "policies" / name_of(arm, seed)
+
+    def checkpoint(self, arm: str, seed: int) -> Path:
+        """Return the folder of a training run's last checkpoint."""
+        return self.policy(arm, seed) / "checkpoints" / "last" / "pretrained_model"
 
     def rollouts(self, arm: str, seed: int) -> Path:
         """Return the folder of an evaluation."""
