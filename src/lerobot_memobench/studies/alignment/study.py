@@ -90,7 +90,7 @@ def experiment_of(split: Split, settings: StudySettings) -> Experiment:
         split.tasks,
         episodes=0,
         steps=settings.steps,
-        settings=(f"policy.subgoal_level={settings.level}", f"dataset.episodes={split.trained}"),
+        settings=(f"policy.subgoal_level={settings.level}", f"dataset.episodes={split.trained}", "save_freq=1000"),
         arms=ALIGNMENTS,
         seeds=settings.seeds,
         rollouts=settings.rollouts,
