@@ -3,23 +3,15 @@
 from __future__ import annotations
 
 import ast
-import importlib.util
 import re
 import statistics
-import sys
 from collections.abc import Collection, Iterator
-from pathlib import Path
 
 import numpy as np
 
-SCRIPT = Path(__file__).parents[1] / "scripts" / "house.py"
-spec = importlib.util.spec_from_file_location("house", SCRIPT)
-assert spec is not None
-assert spec.loader is not None
-house = importlib.util.module_from_spec(spec)
-sys.modules["house"] = house
-spec.loader.exec_module(house)
+from .scripts import load_script
 
+house = load_script("house")
 PACKAGE = house.PACKAGE
 IMPORTS = house.read_imports()
 TREES = {name: ast.parse(path.read_text()) for name, path in house.modules().items()}

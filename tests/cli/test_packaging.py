@@ -10,11 +10,12 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 from packaging.markers import default_environment
 from packaging.requirements import Requirement
+
+from ..scripts import load_script
 
 ROOT = Path(__file__).parents[2]
 LOCKS = ["requirements.lock", "scripts/uv-requirements.txt"]
@@ -72,22 +73,13 @@ def test_scripts_are_sound_and_executable(script: str) -> None:
     subprocess.run(["bash", "-n", path], check=True)
 
 
-def load_compile_imports() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("compile_imports", ROOT / "scripts" / "compile_imports.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_late_imports_are_compiled_although_bytecode_is_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source, library = tmp_path / "src", tmp_path / "library"
     for folder in (source / "deep", library):
         folder.mkdir(parents=True)
     (source / "deep" / "a.py").write_text("def f():\n    import not_installed_here\n    from found_late import x\n")
     (library / "found_late.py").write_text("x = 1\n")
-    script = load_compile_imports()
+    script = load_script("compile_imports")
     assert script.imported(source) == {"not_installed_here", "found_late"}
     monkeypatch.setattr(script, "COMMANDS", ())
     monkeypatch.setattr(sys, "dont_write_bytecode", True)

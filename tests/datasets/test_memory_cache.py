@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import logging
 import shutil
@@ -26,19 +25,10 @@ from lerobot_memobench.datasets.memory_cache import (
 )
 from lerobot_memobench.errors import MemobenchError
 
+from .. import synthetic_dataset
+
 CAMERA = "observation.images.image"
 SUBGOALS_1 = "open the top drawer; put the bowl in the drawer"
-
-
-def _synthetic():  # type: ignore[no-untyped-def]
-    """The writer of a small dataset that policies and studies are tested with too."""
-    path = Path(__file__).parents[1] / "synthetic_dataset.py"
-    spec = importlib.util.spec_from_file_location("synthetic_dataset", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 class _Frames:
@@ -90,7 +80,7 @@ class _Texts:
 
 @pytest.fixture(scope="module")
 def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return _synthetic().make_dataset(tmp_path_factory.mktemp("cache") / "data")
+    return synthetic_dataset.make_dataset(tmp_path_factory.mktemp("cache") / "data")
 
 
 @pytest.fixture
@@ -112,7 +102,6 @@ def _frame(root: Path, episode: int, frame: int) -> torch.Tensor:
 
 
 def test_contents(root: Path) -> None:
-    synthetic = _synthetic()
     calls: list[tuple[int, int]] = []
     folder = build_memory_cache(
         root, "test", _Frames(), _Texts(), batch_size=7, progress=lambda *done: calls.append(done)
@@ -120,8 +109,8 @@ def test_contents(root: Path) -> None:
     assert folder == root / FOLDER / "test"
     assert calls == [(0, 3), (1, 3), (2, 3), (3, 3)]
     cache = _open(root)
-    assert cache.num_frames == sum(synthetic.LENGTHS)
-    assert np.diff(cache.episodes).tolist() == list(synthetic.LENGTHS)
+    assert cache.num_frames == sum(synthetic_dataset.LENGTHS)
+    assert np.diff(cache.episodes).tolist() == list(synthetic_dataset.LENGTHS)
     assert cache.locate(0) == (0, 0)
     assert cache.locate(40) == (1, 0)
     assert cache.locate(93) == (2, 30)

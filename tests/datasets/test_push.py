@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import subprocess
@@ -15,17 +14,9 @@ from lerobot_memobench.datasets.lerobot_format import write_dataset
 from lerobot_memobench.datasets.push import push
 from lerobot_memobench.errors import MemobenchError
 
+from . import hub_server
+
 REPO = "somebody/memobench"
-
-
-def _hub_server():
-    spec = importlib.util.spec_from_file_location("hub_server", Path(__file__).with_name("hub_server.py"))
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-hub_server = _hub_server()
 
 
 @pytest.fixture

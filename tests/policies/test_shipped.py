@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from pathlib import Path
 from types import ModuleType
@@ -18,7 +17,7 @@ from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import
 from lerobot_memobench.settings.choices import checkpoint_of
 from lerobot_memobench.tasks.catalogue import BOWL, task_names
 
-ROOT = Path(__file__).parents[2]
+from ..scripts import load_script
 
 
 @pytest.fixture
@@ -66,14 +65,9 @@ def test_a_name_that_is_nearly_one_is_told(shipped: Path) -> None:
 # -- the script that ships them ------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("ship_policy", ROOT / "scripts" / "ship_policy.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_script("ship_policy")
 
 
 def test_a_card_tells_every_setting_that_is_not_the_sizes(script: ModuleType) -> None:

@@ -6,11 +6,9 @@ browser really shows.
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -22,6 +20,8 @@ from lerobot_memobench.envs.film import Film
 from lerobot_memobench.evaluation.documents.html import write_html
 from lerobot_memobench.tasks.catalogue import get_task
 
+from . import browser as chromium
+
 STOVE = "turn_on_the_stove_and_turn_it_off"
 DRAWER = "check_the_top_drawer_of_the_cabinet"
 BUTTER = "put_the_butter_picked_up_in_the_prompt_video_on_the_plate"
@@ -29,16 +29,6 @@ NASTY = "</script><img src=x onerror=alert(1)><b>"
 FPS = 20
 
 
-def _browser_module() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("browser", Path(__file__).with_name("browser.py"))
-    assert spec
-    assert spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-chromium = _browser_module()
 pytestmark = pytest.mark.skipif(
     chromium.find_chromium() is None,
     reason="no Chromium is here; `make test` installs it where it may, else ask for: apt-get install chromium",

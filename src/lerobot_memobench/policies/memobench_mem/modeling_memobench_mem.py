@@ -28,11 +28,7 @@ from lerobot_memobench.policies.memobench_mem.checkpoints import (
 )
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.drawn_statistics import count_drawn_only
-from lerobot_memobench.policies.memobench_mem.execution_frames import (
-    Drawn,
-    execution_starts,
-    task_of_frames,
-)
+from lerobot_memobench.policies.memobench_mem.execution_frames import Drawn, execution_starts, task_of_frames
 from lerobot_memobench.policies.memobench_mem.freed_memory import keep_freed_memory
 from lerobot_memobench.policies.memobench_mem.learning import LearningPolicy
 from lerobot_memobench.policies.memobench_mem.memory.registry import make_mechanism

@@ -12,8 +12,7 @@ from lerobot_memobench.policies.memobench_mem.averaging import WeightAverage
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.rollout import RolloutMemory
 from lerobot_memobench.policies.memobench_mem.memory_pi05 import MemoryPI05
-from lerobot_memobench.policies.memobench_mem.perception.eyes import EyePerception
-from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_RAW_STATE, ObjectPerception
+from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_RAW_STATE
 from lerobot_memobench.policies.memobench_mem.perception.perception import Perception, Seen
 from lerobot_memobench.policies.memobench_mem.precision import Precision
 
@@ -60,10 +59,7 @@ class SeeingPolicy(PI05Policy):
 
     def _preprocess_images(self, batch: dict[str, Tensor]) -> Seen:
         """What the model is given in the place of images: what is seen, and the state where it has a token."""
-        if isinstance(self.perception, ObjectPerception | EyePerception):
-            parts, masks = self.perception.present(batch)
-        else:
-            parts, masks = super()._preprocess_images(batch)
+        parts, masks = self.perception.present(batch) or super()._preprocess_images(batch)
         if self.config.state_token:
             state = pad_vector(batch[OBS_STATE], self.config.max_state_dim)
             parts, masks = [*parts, state], [*masks, torch.ones(len(state), dtype=torch.bool)]

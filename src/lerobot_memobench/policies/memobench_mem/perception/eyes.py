@@ -70,12 +70,15 @@ class EyePerception(nn.Module, Perception):
     @cached_property
     def key(self) -> str:
         """Identity of the tokens this makes: weights, and size of the pictures."""
-        return f"{fingerprint({'eyes': self.tower})}-{SIDE}x{SIDE}-eyes{self.tokens_per_frame}"
+        return self._key(self.tokens_per_frame)
 
-    @property
+    @cached_property
     def present_key(self) -> str:
         """Identity of the tokens of present pictures."""
-        return self.key.replace(f"eyes{self.tokens_per_frame}", f"eyes{GRID**2}")
+        return self._key(GRID**2)
+
+    def _key(self, tokens: int) -> str:
+        return f"{fingerprint({'eyes': self.tower})}-{SIDE}x{SIDE}-eyes{tokens}"
 
     @torch.no_grad()
     def look(self, pictures: Tensor) -> Tensor:

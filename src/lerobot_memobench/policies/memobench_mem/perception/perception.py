@@ -36,6 +36,10 @@ class Perception(ABC):
     def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
         """Return what is remembered of some rows of an observation, (n, P, D'); nothing in it learns."""
 
+    def present(self, batch: Mapping[str, Tensor]) -> Seen | None:
+        """Return what is seen now of a batch of observations; None where it is LeRobot's images."""
+        return None
+
     @abstractmethod
     def prefix(self, observed: Tensor) -> Tensor:
         """Return the prefix tokens (B, n, d_vlm) of one part of the present (B, ...)."""
