@@ -12,6 +12,7 @@ import argparse
 import json
 import shlex
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,7 @@ tags: [lerobot, memobench, memory]
 """
 
 
-def ship(run: Path, name: str, rollouts: Path | None) -> Path:
+def ship(run: Path, name: str, rollouts: Path | None, merged: Sequence[Path] = ()) -> Path:
     """Write the last checkpoint of a training run as the package's policy ``name``; return its folder."""
     source, folder = checkpoint_folder(str(run)), SHIPPED / name
     if source is None:
@@ -57,15 +58,17 @@ def ship(run: Path, name: str, rollouts: Path | None) -> Path:
     write_file(
         folder / "config.json", json.dumps({**config, "device": "cpu", "pretrained_path": None}, indent=4) + "\n"
     )
-    write_file(folder / "README.md", card(name, source, weights, rollouts))
+    write_file(folder / "README.md", card(name, source, weights, rollouts, merged))
     size = sum(path.stat().st_size for path in folder.iterdir())
     if size > LARGEST:
         raise SystemExit(f"{folder} takes {size:,} bytes; expected at most {LARGEST:,}")
     return folder
 
 
-def card(name: str, source: Path, weights: dict[str, torch.Tensor], rollouts: Path | None) -> str:
-    """Return the Markdown that goes with a policy."""
+def card(
+    name: str, source: Path, weights: dict[str, torch.Tensor], rollouts: Path | None, merged: Sequence[Path] = ()
+) -> str:
+    """Return the Markdown that goes with a policy; ``merged`` are the datasets that LeRobot made one of for it."""
     told = json.loads((source / "train_config.json").read_text())
     policy = told["policy"]
     count = sum(value.numel() for value in weights.values()) / 1e6
@@ -74,7 +77,7 @@ def card(name: str, source: Path, weights: dict[str, torch.Tensor], rollouts: Pa
         f"# {name}",
         "",
         f"`memobench_mem`, {count:.1f} million parameters, bfloat16; sees {policy['perception']}.",
-        *demonstrations(training_facts(source) or {}),
+        *demonstrations(training_facts(source) or {}, merged),
         "",
         "```bash",
         f"lerobot train policy=memobench_mem perception={policy['perception']} size={policy['size']} \\",
@@ -96,12 +99,19 @@ def settings(policy: dict[str, Any]) -> list[str]:
     ]
 
 
-def demonstrations(trained_on: dict[str, Any]) -> list[str]:
-    """Return what a policy was trained on and the command that made it, by the manifest in the dataset's folder."""
+def demonstrations(trained_on: dict[str, Any], merged: Sequence[Path]) -> list[str]:
+    """Return what a policy was trained on and the commands that made it, by the manifests in the datasets' folders."""
     try:
-        manifest = read_manifest(Path(trained_on["root"]))
-        made = sum(episode["failure"] is None for episode in manifest["episodes"])
-        count, words, digest = len(manifest["request"]["tasks"]), generation(manifest["request"]), trained_on["sha256"]
+        manifests = [read_manifest(part) for part in merged or [Path(trained_on["root"])]]
+        made = sum(episode["failure"] is None for manifest in manifests for episode in manifest["episodes"])
+        requests, digest = [manifest["request"] for manifest in manifests], trained_on["sha256"]
+        count = len({task for request in requests for task in request["tasks"]})
+        names = [f"outputs/part{number}" for number in range(1, len(merged) + 1)]
+        commands = [
+            line
+            for request, out in zip(requests, names or ["outputs/data"], strict=True)
+            for line in (f"memobench generate {shlex.join(generation(request))} \\", f"    --out {out}")
+        ]
     except (FileNotFoundError, KeyError, TypeError):  # it is gone, has no folder, or was not generated
         return ["Trained on a dataset that was not at hand when this card was written."]
     return [
@@ -109,9 +119,18 @@ def demonstrations(trained_on: dict[str, Any]) -> list[str]:
         f"of the dataset's meta files and manifest: `{digest}`.",
         "",
         "```bash",
-        f"memobench generate {shlex.join(words)} \\",
-        "    --out outputs/data",
+        *commands,
+        *(merging(names) if merged else []),
         "```",
+    ]
+
+
+def merging(names: Sequence[str]) -> list[str]:
+    """Return LeRobot's command that makes one dataset of several."""
+    return [
+        "lerobot-edit-dataset --operation.type=merge --new_repo_id=local/data --new_root=outputs/data \\",
+        f"    --operation.repo_ids='[{', '.join(f'local/{Path(name).name}' for name in names)}]' \\",
+        f"    --operation.roots='[{', '.join(names)}]'",
     ]
 
 
@@ -155,5 +174,6 @@ if __name__ == "__main__":
     parser.add_argument("run", type=Path, help="output_dir of a training run")
     parser.add_argument("name", help="by which policy= finds it")
     parser.add_argument("--rollouts", type=Path, help="output_dir of its evaluation")
+    parser.add_argument("--merged", type=Path, nargs="+", default=[], help="datasets that the training's is made of")
     given = parser.parse_args()
-    print(ship(given.run, given.name, given.rollouts))
+    print(ship(given.run, given.name, given.rollouts, given.merged))

@@ -90,8 +90,8 @@ def test_a_card_tells_how_the_demonstrations_were_made(script: ModuleType, tmp_p
     told = {"policy": policy, "dataset": {"root": str(tmp_path / "data")}, "batch_size": 6, "steps": 5, "seed": 1}
     (source / "train_config.json").write_text(json.dumps(told))
 
-    def card() -> str:
-        return str(script.card("mine", source, {"a": torch.zeros(3)}, None))
+    def card(*merged: Path) -> str:
+        return str(script.card("mine", source, {"a": torch.zeros(3)}, None, merged))
 
     assert "not at hand" in card()
     (tmp_path / "data" / "meta").mkdir(parents=True)
@@ -104,6 +104,13 @@ def test_a_card_tells_how_the_demonstrations_were_made(script: ModuleType, tmp_p
     options = "--episodes 3 --seed-base 10000 --referent random --perturb --no-images"
     assert f"memobench generate --tasks {BOWL} --suite published {options} " in card()
     assert "policy.memory_stride=4 batch_size=6 steps=5 seed=1\n" in card()
+    (tmp_path / "more").mkdir()
+    more = {"request": request | {"seed_base": 10_003}, "episodes": [{**made[0], "seed": 10_003}]}
+    (tmp_path / "more" / "manifest.json").write_text(json.dumps(more))
+    both = card(tmp_path / "data", tmp_path / "more")
+    assert "Trained on 3 demonstrations by the scripted expert, of 1 task;" in both
+    assert both.count("memobench generate") == 2
+    assert "--operation.roots='[outputs/part1, outputs/part2]'" in both
     strict = {**request, "tasks": task_names(suite="strict"), "referent": "drawn"}
     assert script.generation(strict)[:6] == ["--tasks", "all", "--suite", "strict", "--episodes", "3"]
     assert "--referent" not in script.generation(strict)
