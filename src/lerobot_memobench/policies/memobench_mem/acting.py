@@ -126,7 +126,8 @@ class ActingPolicy(SeeingPolicy):
         effect, and for frozen rows nothing is planned.
         """
         self.thread.check()
-        self.eval()
+        if self.training:  # a millisecond, if it were said at every step
+            self.eval()
         steps, started, frozen = self.observe(batch)
         count = len(steps)
         self.plans.resize(count)
