@@ -11,13 +11,15 @@ import pytest
 import torch
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.datasets import EpisodeAwareSampler
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.policies import make_pre_post_processors
 from small_policy import batch_of, losses_in_training, made_for_training, small_config
 
+import object_dataset
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.execution_frames import in_groups, in_turns
+from lerobot_memobench.policies.memobench_mem.execution_frames import in_groups, in_turns, task_of_frames
 from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, STEPS, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from object_dataset import LENGTHS, PROMPTS, make_object_dataset
@@ -163,6 +165,16 @@ def test_tasks_are_drawn_alike_however_long_their_episodes_are() -> None:
     assert shares == pytest.approx([1 / 6, 1 / 6, 1 / 3, 1 / 6, 1 / 6], abs=0.06)
     assert len(set(order[episodes == 0].tolist())) > 150, "frames of an episode are drawn at random"
     assert torch.equal(torch.from_numpy(order), in_turns(ends, tasks, 6, torch.Generator().manual_seed(1)))
+
+
+@pytest.mark.parametrize("records", [True, False])
+def test_a_task_of_several_instructions_is_one_task(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, records: bool
+) -> None:
+    monkeypatch.setattr(object_dataset, "TASKS", ("butter twice", "open the drawer", "butter once"))
+    meta = LeRobotDatasetMetadata("here/data", root=make_object_dataset(tmp_path / "data", records=records))
+    tasks = task_of_frames(meta, np.cumsum([0, *LENGTHS]))
+    assert tasks.tolist() == np.repeat([0, 1, 0] if records else [1, 2, 0], LENGTHS).tolist()
 
 
 @pytest.mark.parametrize("balance", [True, False])

@@ -15,6 +15,7 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from torch import Tensor
 
 from lerobot_memobench.datasets.demonstration import PROMPT
 from lerobot_memobench.datasets.execution_frames import first_frames
+from lerobot_memobench.datasets.lerobot_format.reading import list_episodes
 
 
 class Drawn(int):
@@ -58,13 +60,20 @@ def execution_starts(episodes: np.ndarray, phase: np.ndarray) -> np.ndarray:
 
 
 def task_of_frames(meta: Any, episodes: np.ndarray) -> np.ndarray:
-    """Return the number (N,) of each frame's task, by the instructions that LeRobot's metadata has of its episode.
+    """Return the number (N,) of each frame's task: of our records' task, else of the episode's instruction.
+
+    A task may have several instructions ("twice", "three times"); it goes by the first of them in the alphabet.
 
     Args:
         episodes: (E + 1,) first frame of each episode, and N.
     """
     said = [" / ".join(tasks) for tasks in meta.episodes["tasks"]]
-    numbers = np.unique(said, return_inverse=True)[1]
+    records = (place.record for place in list_episodes(Path(meta.root)))
+    names = [words if record is None else record.task_name for record, words in zip(records, said, strict=True)]
+    first: dict[str, str] = {}
+    for name, words in zip(names, said, strict=True):
+        first[name] = min(words, first.get(name, words))
+    numbers = np.unique([first[name] for name in names], return_inverse=True)[1]
     return np.repeat(numbers, np.diff(episodes))
 
 
