@@ -45,6 +45,17 @@ def test_a_plan_says_everything() -> None:
 
 
 @pytest.mark.parametrize(
+    ("words", "base"), [([], 7), (["seed=20000"], 20_000), (["seed=20000", "env.seed_base=19990"], 19_990)]
+)
+def test_episodes_are_counted_from_the_first_seed(words: list[str], base: int) -> None:
+    plan = plan_line([*LINE, *words])
+    assert plan.environment is not None
+    assert plan.grid is not None
+    assert plan.environment.seed_base == base
+    assert plan.grid.first == plan.seed - base
+
+
+@pytest.mark.parametrize(
     ("words", "found"),
     [
         (["policy=act"], "reset"),

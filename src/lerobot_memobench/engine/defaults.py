@@ -9,6 +9,7 @@ from pathlib import Path
 from lerobot_memobench.engine.orders import Orders
 from lerobot_memobench.engine.resume import earlier_batch_size
 from lerobot_memobench.envs.obs_types import OBJECTS
+from lerobot_memobench.settings.flags import whole_number
 from lerobot_memobench.settings.translation import LerobotSettings
 
 ENVIRONMENT = "memobench"
@@ -72,6 +73,8 @@ def with_protocol(settings: LerobotSettings, n_action_steps: int | None) -> Lero
     import torch
 
     settings = settings.default("seed", FIRST_SEED).default("eval.n_episodes", EPISODES)
+    if whole_number(settings.get("seed")) is not None:
+        settings = settings.default("env.seed_base", settings.get("seed"))  # episodes are counted from the first
     settings = with_largest_batch(settings, LARGEST_BATCH)
     if not torch.cuda.is_available() and not torch.backends.mps.is_available():
         settings = settings.default("policy.device", "cpu")
