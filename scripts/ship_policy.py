@@ -12,8 +12,9 @@ import argparse
 import json
 import shlex
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -33,6 +34,7 @@ LARGEST = 4_000_000
 """Bytes that one policy may take."""
 OF_THE_DATA = ("input_features", "output_features", "action_feature_names", "object_classes")
 """Settings of a policy that its dataset decides."""
+EMPTY: Mapping[Path, Sequence[Path]] = MappingProxyType({})
 HEAD = """---
 license: apache-2.0
 library_name: lerobot
@@ -43,7 +45,7 @@ tags: [lerobot, memobench, memory]
 """
 
 
-def ship(run: Path, name: str, rollouts: Path | None, merged: Sequence[Path] = ()) -> Path:
+def ship(run: Path, name: str, rollouts: Path | None, merged: Mapping[Path, Sequence[Path]] = EMPTY) -> Path:
     """Write the last checkpoint of a training run as the package's policy ``name``; return its folder."""
     source, folder = checkpoint_folder(str(run)), SHIPPED / name
     if source is None:
@@ -66,26 +68,57 @@ def ship(run: Path, name: str, rollouts: Path | None, merged: Sequence[Path] = (
 
 
 def card(
-    name: str, source: Path, weights: dict[str, torch.Tensor], rollouts: Path | None, merged: Sequence[Path] = ()
+    name: str,
+    source: Path,
+    weights: dict[str, torch.Tensor],
+    rollouts: Path | None,
+    merged: Mapping[Path, Sequence[Path]] = EMPTY,
 ) -> str:
-    """Return the Markdown that goes with a policy; ``merged`` are the datasets that LeRobot made one of for it."""
-    told = json.loads((source / "train_config.json").read_text())
-    policy = told["policy"]
+    """Return the Markdown that goes with a policy; ``merged``: datasets, and those that LeRobot made each of."""
+    runs = trainings(source)
+    policy = runs[-1]["policy"]
     count = sum(value.numel() for value in weights.values()) / 1e6
-    words = [*settings(policy), *(f"{key}={told[key]}" for key in ("batch_size", "steps", "seed"))]
     lines = [
         f"# {name}",
         "",
         f"`memobench_mem`, {count:.1f} million parameters, bfloat16; sees {policy['perception']}.",
-        *demonstrations(training_facts(source) or {}, merged),
+        *demonstrations(runs, training_facts(source) or {}, merged),
         "",
         "```bash",
-        f"lerobot train policy=memobench_mem perception={policy['perception']} size={policy['size']} \\",
-        f"    dataset=outputs/data {shlex.join(words)}",
+        *(line for number in range(len(runs)) for line in training(runs, number)),
         "```",
         *([] if rollouts is None else results(name, rollouts)),
     ]
     return HEAD + "\n".join(lines) + "\n"
+
+
+def trainings(source: Path) -> list[dict[str, Any]]:
+    """Return the settings of the trainings that led to a checkpoint, one from the weights of the other."""
+    told: dict[str, Any] = json.loads((source / "train_config.json").read_text())
+    begun = told["policy"].get("pretrained_path")  # of a training that went on after an interruption: its own
+    another = begun is not None and not Path(begun).is_relative_to(told["output_dir"])
+    return [*(trainings(Path(begun)) if another else []), told]
+
+
+def training(runs: Sequence[dict[str, Any]], number: int) -> list[str]:
+    """Return the command of one of several trainings."""
+    told, policy = runs[number], runs[number]["policy"]
+    kind = f"policy=memobench_mem perception={policy['perception']} size={policy['size']}"
+    words = [f"dataset={place(told['dataset']['root'])}"]
+    if number:
+        kind = f"policy={place(runs[number - 1]['output_dir'])}"
+        before = settings(runs[number - 1]["policy"])
+        words += [word for word in settings(policy) if word not in before]
+    else:
+        words += settings(policy)
+    words += [f"{key}={told[key]}" for key in ("batch_size", "steps", "seed")]
+    words += [f"output_dir={place(told['output_dir'])}"] if len(runs) > 1 else []
+    return [f"lerobot train {kind} \\", f"    {shlex.join(words)}"]
+
+
+def place(folder: str | Path) -> str:
+    """Return where a command of a card has what was in a folder here."""
+    return f"outputs/{Path(folder).name}"
 
 
 def settings(policy: dict[str, Any]) -> list[str]:
@@ -99,18 +132,23 @@ def settings(policy: dict[str, Any]) -> list[str]:
     ]
 
 
-def demonstrations(trained_on: dict[str, Any], merged: Sequence[Path]) -> list[str]:
+def demonstrations(
+    runs: Sequence[dict[str, Any]], trained_on: dict[str, Any], merged: Mapping[Path, Sequence[Path]]
+) -> list[str]:
     """Return what a policy was trained on and the commands that made it, by the manifests in the datasets' folders."""
+    roots = [Path(told["dataset"]["root"]) for told in runs]
     try:
-        manifests = [read_manifest(part) for part in merged or [Path(trained_on["root"])]]
-        made = sum(episode["failure"] is None for manifest in manifests for episode in manifest["episodes"])
-        requests, digest = [manifest["request"] for manifest in manifests], trained_on["sha256"]
-        count = len({task for request in requests for task in request["tasks"]})
-        names = [f"outputs/part{number}" for number in range(1, len(merged) + 1)]
+        parts = dict.fromkeys(part for root in roots for part in generated(root, merged))
+        manifests = {part: read_manifest(part) for part in parts}
+        made = sum(episode["failure"] is None for manifest in manifests.values() for episode in manifest["episodes"])
+        count, digest = len({e["task_name"] for m in manifests.values() for e in m["episodes"]}), trained_on["sha256"]
         commands = [
             line
-            for request, out in zip(requests, names or ["outputs/data"], strict=True)
-            for line in (f"memobench generate {shlex.join(generation(request))} \\", f"    --out {out}")
+            for part in parts
+            for line in (
+                f"memobench generate {shlex.join(generation(manifests[part]['request']))} \\",
+                f"    --out {place(part)}",
+            )
         ]
     except (FileNotFoundError, KeyError, TypeError):  # it is gone, has no folder, or was not generated
         return ["Trained on a dataset that was not at hand when this card was written."]
@@ -120,16 +158,22 @@ def demonstrations(trained_on: dict[str, Any], merged: Sequence[Path]) -> list[s
         "",
         "```bash",
         *commands,
-        *(merging(names) if merged else []),
+        *(line for root, own in merged.items() if root in roots for line in merging(root, own)),
         "```",
     ]
 
 
-def merging(names: Sequence[str]) -> list[str]:
+def generated(root: Path, merged: Mapping[Path, Sequence[Path]]) -> list[Path]:
+    """Return the datasets that were generated, of which ``root`` was merged; itself if it was not."""
+    return [part for own in merged[root] for part in generated(own, merged)] if root in merged else [root]
+
+
+def merging(root: Path, parts: Sequence[Path]) -> list[str]:
     """Return LeRobot's command that makes one dataset of several."""
+    names = [place(part) for part in parts]
     return [
-        "lerobot-edit-dataset --operation.type=merge --new_repo_id=local/data --new_root=outputs/data \\",
-        f"    --operation.repo_ids='[{', '.join(f'local/{Path(name).name}' for name in names)}]' \\",
+        f"lerobot-edit-dataset --operation.type=merge --new_repo_id=local/{root.name} --new_root={place(root)} \\",
+        f"    --operation.repo_ids='[{', '.join(f'local/{part.name}' for part in parts)}]' \\",
         f"    --operation.roots='[{', '.join(names)}]'",
     ]
 
@@ -174,6 +218,14 @@ if __name__ == "__main__":
     parser.add_argument("run", type=Path, help="output_dir of a training run")
     parser.add_argument("name", help="by which policy= finds it")
     parser.add_argument("--rollouts", type=Path, help="output_dir of its evaluation")
-    parser.add_argument("--merged", type=Path, nargs="+", default=[], help="datasets that the training's is made of")
+    parser.add_argument(
+        "--merged",
+        type=Path,
+        nargs="+",
+        action="append",
+        default=[],
+        metavar=("DATASET", "PART"),
+        help="a dataset that was trained on, and those that lerobot-edit-dataset made it of; may be said again",
+    )
     given = parser.parse_args()
-    print(ship(given.run, given.name, given.rollouts, given.merged))
+    print(ship(given.run, given.name, given.rollouts, {whole: parts for whole, *parts in given.merged}))

@@ -88,10 +88,12 @@ def test_a_card_tells_how_the_demonstrations_were_made(script: ModuleType, tmp_p
     source.mkdir()
     policy = encoded(MemobenchMemConfig(device="cpu", size="small", perception="objects", memory_stride=4))
     told = {"policy": policy, "dataset": {"root": str(tmp_path / "data")}, "batch_size": 6, "steps": 5, "seed": 1}
+    told["output_dir"] = str(tmp_path / "run")
     (source / "train_config.json").write_text(json.dumps(told))
 
     def card(*merged: Path) -> str:
-        return str(script.card("mine", source, {"a": torch.zeros(3)}, None, merged))
+        parts = {tmp_path / "data": merged} if merged else {}
+        return str(script.card("mine", source, {"a": torch.zeros(3)}, None, parts))
 
     assert "not at hand" in card()
     (tmp_path / "data" / "meta").mkdir(parents=True)
@@ -104,13 +106,26 @@ def test_a_card_tells_how_the_demonstrations_were_made(script: ModuleType, tmp_p
     options = "--episodes 3 --seed-base 10000 --referent random --perturb --no-images"
     assert f"memobench generate --tasks {BOWL} --suite published {options} " in card()
     assert "policy.memory_stride=4 batch_size=6 steps=5 seed=1\n" in card()
-    (tmp_path / "more").mkdir()
+    for name in ("few", "more"):
+        (tmp_path / name / "meta").mkdir(parents=True)
     more = {"request": request | {"seed_base": 10_003}, "episodes": [{**made[0], "seed": 10_003}]}
     (tmp_path / "more" / "manifest.json").write_text(json.dumps(more))
-    both = card(tmp_path / "data", tmp_path / "more")
+    (tmp_path / "data" / "manifest.json").rename(tmp_path / "few" / "manifest.json")
+    both = card(tmp_path / "few", tmp_path / "more")
     assert "Trained on 3 demonstrations by the scripted expert, of 1 task;" in both
     assert both.count("memobench generate") == 2
-    assert "--operation.roots='[outputs/part1, outputs/part2]'" in both
+    assert "--new_root=outputs/data " in both
+    assert "--operation.roots='[outputs/few, outputs/more]'" in both
+    later = tmp_path / "later"
+    later.mkdir()
+    policy |= {"pretrained_path": str(source), "optimizer_lr": 1e-4}
+    again = {**told, "policy": policy, "dataset": {"root": str(tmp_path / "more")}, "output_dir": str(later)}
+    (later / "train_config.json").write_text(json.dumps(again))
+    source = later
+    text = card(tmp_path / "few", tmp_path / "more")
+    assert "perception=objects size=small \\\n    dataset=outputs/data policy.memory_stride=4 batch_size=6 " in text
+    assert "train policy=outputs/run \\\n    dataset=outputs/more policy.optimizer_lr=0.0001 batch_size=6 " in text
+    assert text.count("memobench generate") == 2, "what both were trained on is made once"
     strict = {**request, "tasks": task_names(suite="strict"), "referent": "drawn"}
     assert script.generation(strict)[:6] == ["--tasks", "all", "--suite", "strict", "--episodes", "3"]
     assert "--referent" not in script.generation(strict)
