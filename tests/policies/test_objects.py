@@ -167,6 +167,16 @@ def test_tasks_are_drawn_alike_however_long_their_episodes_are() -> None:
     assert torch.equal(torch.from_numpy(order), in_turns(ends, tasks, 6, torch.Generator().manual_seed(1)))
 
 
+@pytest.mark.parametrize("balance", [0.0, 0.5])
+def test_tasks_are_drawn_by_a_power_of_their_frames(balance: float) -> None:
+    lengths, tasks = np.array([9000, 900, 3600, 4500]), np.array([7, 3, 5, 7])
+    order = in_turns(np.cumsum(lengths), tasks, 2, torch.Generator().manual_seed(1), balance).numpy()
+    shares = np.bincount(np.searchsorted(np.cumsum(lengths), order, "right"), minlength=4) / len(order)
+    power = np.array([13_500, 900, 3600]) ** (1 - balance)
+    long, short, middle = power / power.sum()
+    assert shares == pytest.approx([long / 2, short, middle, long / 2], abs=0.02)
+
+
 @pytest.mark.parametrize("records", [True, False])
 def test_a_task_of_several_instructions_is_one_task(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, records: bool

@@ -101,7 +101,7 @@ class MemobenchMemConfig(MemobenchMemSettings):
             "optimizer_lr": self.dimensions.learning_rate,
             "tokens_per_frame": TOKENS_PER_FRAME[self.perception],
             "memory_stride": MEMORY_STRIDE if self.decodes_nothing else 1,
-            "balance_tasks": self.decodes_nothing,
+            "balance_tasks": float(self.decodes_nothing),
             "moments_per_episode": MOMENTS_PER_EPISODE if self.decodes_nothing else 1,
         }
 
@@ -133,6 +133,8 @@ class MemobenchMemConfig(MemobenchMemSettings):
                 raise MemobenchError(f"--policy.{name}={getattr(self, name)} must be at least 1.")
         if not 0.0 <= self.final_lr <= 1.0:
             raise MemobenchError(f"--policy.final_lr={self.final_lr} must be in [0, 1]; 1 keeps the rate constant.")
+        if not 0.0 <= self.balance_tasks <= 1.0:
+            raise MemobenchError(f"--policy.balance_tasks={self.balance_tasks} must be in [0, 1]; 1 draws them alike.")
         if not 0.0 <= self.ema_decay < 1.0:
             raise MemobenchError(f"--policy.ema_decay={self.ema_decay} must be in [0, 1); 0 turns it off.")
         if self.align_weight is not None and self.align_weight < 0:

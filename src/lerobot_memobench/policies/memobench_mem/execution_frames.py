@@ -6,8 +6,8 @@ end; our answer is 0 and carries, for its sampler, where each episode's executio
 follow one another in the order. The sampler is LeRobot's, and any other answer leaves it as it was. Histories still
 hold the prompt, because they come from the memory cache.
 
-Where tasks are to be drawn alike, an epoch has as many frames as otherwise, but not each of them once: tasks whose
-episodes are short would else be a small part of every batch, and they learned several times slower than the others.
+Where tasks are balanced, an epoch has as many frames as otherwise, but not each of them once: tasks whose episodes are
+short would else be a small part of every batch, and they learned several times slower than the others.
 """
 
 from __future__ import annotations
@@ -34,19 +34,20 @@ class Drawn(int):
     Attributes:
         starts: from which frame on (E,) to draw; None: from the first.
         moments: how many frames of an episode to draw in a row.
-        tasks: (N,) number of each frame's task, each of which is drawn equally often; None: frames are.
+        tasks: (N,) number of each frame's task. balance: see `in_turns`; 0: each frame is drawn once.
     """
 
     starts: np.ndarray | None
     moments: int
-    tasks: np.ndarray | None
+    tasks: np.ndarray
+    balance: float
 
     @classmethod
-    def of(cls, starts: np.ndarray | None, moments: int, tasks: np.ndarray | None = None) -> Drawn:
+    def of(cls, starts: np.ndarray | None, moments: int, tasks: np.ndarray, balance: float) -> Drawn:
         """Return 0, which LeRobot's sampler understands from now on."""
         _teach(EpisodeAwareSampler)
         found = cls(0)
-        found.starts, found.moments, found.tasks = starts, moments, tasks
+        found.starts, found.moments, found.tasks, found.balance = starts, moments, tasks, balance
         return found
 
 
@@ -93,18 +94,23 @@ def in_groups(ends: np.ndarray, moments: int, generator: torch.Generator) -> Ten
     return mixed[torch.randperm(int(groups.sum()), generator=generator)[group].argsort(stable=True)]
 
 
-def in_turns(ends: np.ndarray, tasks: np.ndarray, moments: int, generator: torch.Generator) -> Tensor:
-    """Return N places at random, ``moments`` of an episode in a row: each task equally often, and in it each episode.
+def in_turns(
+    ends: np.ndarray, tasks: np.ndarray, moments: int, generator: torch.Generator, balance: float = 1.0
+) -> Tensor:
+    """Return N places at random, ``moments`` of an episode in a row: a task by ``balance``, in it each episode alike.
 
     Args:
         ends: (E,) as for `in_groups`. tasks: (E,) number of each episode's task.
+        balance: 1: each task equally often; 0: in proportion to its frames; between: to a power of them, 1 - balance,
+            as languages are drawn in multilingual models (Conneau et al. 2020, arXiv 1911.02116, section 3.1).
     """
     first, count = torch.from_numpy(np.r_[0, ends[:-1]]), int(ends[-1])
     order = torch.from_numpy(np.argsort(tasks, kind="stable"))
-    _, episodes = np.unique(tasks, return_counts=True)
+    _, number, episodes = np.unique(tasks, return_inverse=True, return_counts=True)
     of_task = torch.from_numpy(episodes)
     groups = -(-count // moments)
-    task = torch.randint(len(of_task), (groups,), generator=generator)
+    weights = torch.from_numpy(np.bincount(number, np.diff(ends, prepend=0)) ** (1 - balance))
+    task = torch.multinomial(weights, groups, replacement=True, generator=generator)
     rank = (torch.rand(groups, generator=generator) * of_task[task]).long()
     episode = order[(of_task.cumsum(0) - of_task)[task] + rank].repeat_interleave(moments)
     lengths = torch.from_numpy(ends) - first
@@ -123,24 +129,24 @@ def _teach(sampler: type[Any]) -> None:
     def init(self: Any, *args: Any, **named: Any) -> None:
         asked = signature.bind(self, *args, **named)
         dropped = asked.arguments.get("drop_n_last_frames", 0)
-        self.moments, tasks = 1, None
+        self.moments, self.balance = 1, 0.0
         if isinstance(dropped, Drawn):
-            self.moments, tasks = dropped.moments, dropped.tasks
+            self.moments, self.balance = dropped.moments, dropped.balance
             if dropped.starts is not None:
                 asked.arguments["dataset_from_indices"] = dropped.starts
         original(*asked.args, **asked.kwargs)
-        self.tasks = None if tasks is None else tasks[self._starts]
+        self.tasks = dropped.tasks[self._starts] if isinstance(dropped, Drawn) else None
 
     one_epoch = sampler._iter_epoch
 
     def draw(self: Any, epoch: int, start: int) -> Iterator[int]:
-        if (self.moments == 1 and self.tasks is None) or not self.shuffle:
+        if (self.moments == 1 and not self.balance) or not self.shuffle:
             return one_epoch(self, epoch, start)
         chance = self._epoch_generator(epoch)
-        if self.tasks is None:
-            order = in_groups(self._cum_lengths, self.moments, chance)
+        if self.balance:
+            order = in_turns(self._cum_lengths, self.tasks, self.moments, chance, self.balance)
         else:
-            order = in_turns(self._cum_lengths, self.tasks, self.moments, chance)
+            order = in_groups(self._cum_lengths, self.moments, chance)
         return (self._frame_index(position) for position in order[start:].tolist())
 
     sampler.__init__, sampler._iter_epoch = init, draw

@@ -79,9 +79,9 @@ class MemobenchMemSettings(PI05Config):
     moments_per_episode: int = SIZES_OWN
     """How many frames of an episode stand side by side in a batch, which shares what they remember; none: 6 with
     objects and with eyes, and 1, LeRobot's order, with other pixels. ``batch_size`` counts frames all the same."""
-    balance_tasks: bool = SIZES_OWN
-    """Whether each task is drawn equally often, however long its episodes are; none: with objects and
-    with eyes. Otherwise each frame is drawn once per epoch."""
+    balance_tasks: float = SIZES_OWN
+    """1: each task is drawn equally often, however long its episodes are; 0: each frame once per epoch; between: in
+    proportion to its frames to the power 1 - balance_tasks. None: 1 with objects and with eyes, else 0."""
     freeze_vision_encoder: bool = True
     warmup_fraction: float = 0.05
     final_lr: float = SIZES_OWN
