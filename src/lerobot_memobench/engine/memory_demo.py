@@ -1,13 +1,14 @@
 """The demo's second part: a task that begins with a prompt, under the expert, a policy with a memory and one without.
 
-The policies are those that come with the package. All three see the same episodes, of the first evaluation seeds; the
-film and the strip are of the first of them.
+The policies are those that come with the package. All three see the same episodes, of the first evaluation seeds, and
+the table counts them all; film and strip are of the first that did not end alike for all, or else of the first.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 
 from lerobot_memobench.engine.folder import VIDEOS
@@ -34,14 +35,10 @@ MEMORY_FILM, MEMORY_STRIP, MEMORY_TABLE = "memory.mp4", "memory.png", "memory.md
 
 @dataclass(frozen=True)
 class Told:
-    """How somebody's episodes ended: how many there were, were solved, and failed at a wrong referent; whether the
-    first one, which is filmed, was solved.
-    """
+    """How somebody's episodes ended: whether each was solved, and how many failed at a wrong referent."""
 
-    episodes: int
-    solved: int
+    solved: tuple[bool, ...]
     wrong: int
-    first: bool
 
 
 def has_policies() -> bool:
@@ -52,7 +49,7 @@ def has_policies() -> bool:
 def memory_plan(name: str, folder: Path) -> EvaluationPlan:
     """Return the plan of one's evaluation."""
     words = ["env=memobench", *WHO[name], f"tasks={BOWL}", "referent=random", f"horizon={HORIZON}"]
-    return plan_line([*words, f"episodes={EPISODES}", "films=1", f"output_dir={folder}"])
+    return plan_line([*words, f"episodes={EPISODES}", f"films={EPISODES}", f"output_dir={folder}"])
 
 
 def compare_memories(work: Path, out: Path, evaluate: Callable[[str, Path], int]) -> dict[str, Told]:
@@ -65,14 +62,16 @@ def compare_memories(work: Path, out: Path, evaluate: Callable[[str, Path], int]
         MemobenchError: an evaluation failed.
     """
     told: dict[str, Told] = {}
-    films: dict[str, tuple[Path, bool]] = {}
-    for name in WHO:
-        folder = work / name.replace(" ", "_")
-        film = folder / VIDEOS / f"{BOWL}.0.mp4"
-        if evaluate(name, folder) or not film.is_file():
+    folders = {name: work / name.replace(" ", "_") for name in WHO}
+    for name, folder in folders.items():
+        if evaluate(name, folder):
             raise MemobenchError(f"the evaluation {name} has failed; see its messages above")
         told[name] = _told(folder)
-        films[name] = film, told[name].first
+    ends = enumerate(zip(*(one.solved for one in told.values()), strict=True))
+    shown = next((episode for episode, solved in ends if len({*solved}) > 1), 0)
+    films = {
+        name: (folder / VIDEOS / f"{BOWL}.{shown}.mp4", told[name].solved[shown]) for name, folder in folders.items()
+    }
     out.mkdir(parents=True, exist_ok=True)
     side_by_side(films, out / MEMORY_FILM)
     strip(films).save(out / MEMORY_STRIP, optimize=True)
@@ -83,14 +82,12 @@ def compare_memories(work: Path, out: Path, evaluate: Callable[[str, Path], int]
 def _told(folder: Path) -> Told:
     records = read_episodes(folder)
     return Told(
-        episodes=len(records),
-        solved=sum(bool(record["success"]) for record in records),
+        solved=tuple(bool(record["success"]) for record in sorted(records, key=itemgetter("episode"))),
         wrong=sum(not record["success"] and record.get("failure") == REFERENCE_DRIFT for record in records),
-        first=bool(records[0]["success"]),
     )
 
 
 def table(told: dict[str, Told]) -> str:
     """Return who solved how many of the episodes, and how many failed at a wrong bowl, as Markdown."""
-    rows = [f"| {name} | {one.solved}/{one.episodes} | {one.wrong} |" for name, one in told.items()]
+    rows = [f"| {name} | {sum(one.solved)}/{len(one.solved)} | {one.wrong} |" for name, one in told.items()]
     return "\n".join(["| butter into the prompted bowl | solved | wrong bowl |", "|---|---|---|", *rows]) + "\n"
