@@ -78,7 +78,7 @@ def test_a_card_is_repeated(fake_lerobot: Any, capsys: pytest.CaptureFixture[str
     fake_lerobot.changed = {"steps": 5}
     assert memobench(["rerun", "out", "--out", "changed"]) == 1
     out = capsys.readouterr().out.replace("\n", " ")
-    assert f"not repeated: {DRAWER}, episode 2: steps is 109 on the card and 5 here" in out
+    assert f"not repeated: {DRAWER}, episode 0: steps is 109 on the card and 5 here" in out
 
 
 def test_without_pictures_nothing_to_draw_with_is_needed(fake_lerobot: Any, monkeypatch: pytest.MonkeyPatch) -> None:
