@@ -14,7 +14,6 @@ import shlex
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -34,7 +33,6 @@ LARGEST = 4_000_000
 """Bytes that one policy may take."""
 OF_THE_DATA = ("input_features", "output_features", "action_feature_names", "object_classes")
 """Settings of a policy that its dataset decides."""
-EMPTY: Mapping[Path, Sequence[Path]] = MappingProxyType({})
 HEAD = """---
 license: apache-2.0
 library_name: lerobot
@@ -45,7 +43,7 @@ tags: [lerobot, memobench, memory]
 """
 
 
-def ship(run: Path, name: str, rollouts: Path | None, merged: Mapping[Path, Sequence[Path]] = EMPTY) -> Path:
+def ship(run: Path, name: str, rollouts: Path | None, merged: Mapping[Path, Sequence[Path]]) -> Path:
     """Write the last checkpoint of a training run as the package's policy ``name``; return its folder."""
     source, folder = checkpoint_folder(str(run)), SHIPPED / name
     if source is None:
@@ -72,7 +70,7 @@ def card(
     source: Path,
     weights: dict[str, torch.Tensor],
     rollouts: Path | None,
-    merged: Mapping[Path, Sequence[Path]] = EMPTY,
+    merged: Mapping[Path, Sequence[Path]],
 ) -> str:
     """Return the Markdown that goes with a policy; ``merged``: datasets, and those that LeRobot made each of."""
     runs = trainings(source)
@@ -85,7 +83,11 @@ def card(
         *demonstrations(runs, training_facts(source) or {}, merged),
         "",
         "```bash",
-        *(line for number in range(len(runs)) for line in training(runs, number)),
+        *(
+            line
+            for told, before in zip(runs, [None, *runs], strict=False)
+            for line in training(told, before, len(runs) > 1)
+        ),
         "```",
         *([] if rollouts is None else results(name, rollouts)),
     ]
@@ -100,19 +102,20 @@ def trainings(source: Path) -> list[dict[str, Any]]:
     return [*(trainings(Path(begun)) if another else []), told]
 
 
-def training(runs: Sequence[dict[str, Any]], number: int) -> list[str]:
-    """Return the command of one of several trainings."""
-    told, policy = runs[number], runs[number]["policy"]
-    kind = f"policy=memobench_mem perception={policy['perception']} size={policy['size']}"
-    words = [f"dataset={place(told['dataset']['root'])}"]
-    if number:
-        kind = f"policy={place(runs[number - 1]['output_dir'])}"
-        before = settings(runs[number - 1]["policy"])
-        words += [word for word in settings(policy) if word not in before]
+def training(told: dict[str, Any], before: dict[str, Any] | None, named: bool) -> list[str]:
+    """Return the command of a training, from the weights of the one ``before`` if there is one.
+
+    Args:
+        named: whether it says its folder, because there are several.
+    """
+    policy = told["policy"]
+    if before is None:
+        kind, known = f"policy=memobench_mem perception={policy['perception']} size={policy['size']}", []
     else:
-        words += settings(policy)
+        kind, known = f"policy={place(before['output_dir'])}", settings(before["policy"])
+    words = [f"dataset={place(told['dataset']['root'])}", *(word for word in settings(policy) if word not in known)]
     words += [f"{key}={told[key]}" for key in ("batch_size", "steps", "seed")]
-    words += [f"output_dir={place(told['output_dir'])}"] if len(runs) > 1 else []
+    words += [f"output_dir={place(told['output_dir'])}"] if named else []
     return [f"lerobot train {kind} \\", f"    {shlex.join(words)}"]
 
 
@@ -158,7 +161,7 @@ def demonstrations(
         "",
         "```bash",
         *commands,
-        *(line for root, own in merged.items() if root in roots for line in merging(root, own)),
+        *(line for root, own in merged.items() for line in merging(root, own)),
         "```",
     ]
 
@@ -225,7 +228,7 @@ if __name__ == "__main__":
         action="append",
         default=[],
         metavar=("DATASET", "PART"),
-        help="a dataset that was trained on, and those that lerobot-edit-dataset made it of; may be said again",
+        help="a dataset trained on, and those that lerobot-edit-dataset made it of; may be said again, in order",
     )
     given = parser.parse_args()
     print(ship(given.run, given.name, given.rollouts, {whole: parts for whole, *parts in given.merged}))

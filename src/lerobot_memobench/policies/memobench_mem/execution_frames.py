@@ -34,16 +34,18 @@ class Drawn(int):
     Attributes:
         starts: from which frame on (E,) to draw; None: from the first.
         moments: how many frames of an episode to draw in a row.
-        tasks: (N,) number of each frame's task. balance: see `in_turns`; 0: each frame is drawn once.
+        tasks: (N,) number of each frame's task; None: each frame is drawn once. balance: of tasks, see `in_turns`.
     """
 
     starts: np.ndarray | None
     moments: int
-    tasks: np.ndarray
+    tasks: np.ndarray | None
     balance: float
 
     @classmethod
-    def of(cls, starts: np.ndarray | None, moments: int, tasks: np.ndarray, balance: float) -> Drawn:
+    def of(
+        cls, starts: np.ndarray | None, moments: int, tasks: np.ndarray | None = None, balance: float = 1.0
+    ) -> Drawn:
         """Return 0, which LeRobot's sampler understands from now on."""
         _teach(EpisodeAwareSampler)
         found = cls(0)
@@ -63,7 +65,7 @@ def execution_starts(episodes: np.ndarray, phase: np.ndarray) -> np.ndarray:
 def task_of_frames(meta: Any, episodes: np.ndarray) -> np.ndarray:
     """Return the number (N,) of each frame's task: of our records' task, else of the episode's instruction.
 
-    A task may have several instructions ("twice", "three times"); it goes by the first of them in the alphabet.
+    A task may have several instructions ("twice", "three times").
 
     Args:
         episodes: (E + 1,) first frame of each episode, and N.
@@ -71,10 +73,7 @@ def task_of_frames(meta: Any, episodes: np.ndarray) -> np.ndarray:
     said = [" / ".join(tasks) for tasks in meta.episodes["tasks"]]
     records = (place.record for place in list_episodes(Path(meta.root)))
     names = [words if record is None else record.task_name for record, words in zip(records, said, strict=True)]
-    first: dict[str, str] = {}
-    for name, words in zip(names, said, strict=True):
-        first[name] = min(words, first.get(name, words))
-    numbers = np.unique([first[name] for name in names], return_inverse=True)[1]
+    numbers = np.unique(names, return_inverse=True)[1]
     return np.repeat(numbers, np.diff(episodes))
 
 
@@ -129,24 +128,24 @@ def _teach(sampler: type[Any]) -> None:
     def init(self: Any, *args: Any, **named: Any) -> None:
         asked = signature.bind(self, *args, **named)
         dropped = asked.arguments.get("drop_n_last_frames", 0)
-        self.moments, self.balance = 1, 0.0
+        self.moments, tasks = 1, None
         if isinstance(dropped, Drawn):
-            self.moments, self.balance = dropped.moments, dropped.balance
+            self.moments, tasks, self.balance = dropped.moments, dropped.tasks, dropped.balance
             if dropped.starts is not None:
                 asked.arguments["dataset_from_indices"] = dropped.starts
         original(*asked.args, **asked.kwargs)
-        self.tasks = dropped.tasks[self._starts] if isinstance(dropped, Drawn) else None
+        self.tasks = None if tasks is None else tasks[self._starts]
 
     one_epoch = sampler._iter_epoch
 
     def draw(self: Any, epoch: int, start: int) -> Iterator[int]:
-        if (self.moments == 1 and not self.balance) or not self.shuffle:
+        if (self.moments == 1 and self.tasks is None) or not self.shuffle:
             return one_epoch(self, epoch, start)
         chance = self._epoch_generator(epoch)
-        if self.balance:
-            order = in_turns(self._cum_lengths, self.tasks, self.moments, chance, self.balance)
-        else:
+        if self.tasks is None:
             order = in_groups(self._cum_lengths, self.moments, chance)
+        else:
+            order = in_turns(self._cum_lengths, self.tasks, self.moments, chance, self.balance)
         return (self._frame_index(position) for position in order[start:].tolist())
 
     sampler.__init__, sampler._iter_epoch = init, draw

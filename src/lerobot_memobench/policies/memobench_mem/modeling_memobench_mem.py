@@ -113,9 +113,9 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
         if self._device.type == "cpu":
             keep_freed_memory()
         starts = None if self.config.prompt_loss else execution_starts(cache.episodes, cache.phase)
-        tasks = task_of_frames(meta, cache.episodes)
-        drawn = Drawn.of(starts, self.config.moments_per_episode, tasks, self.config.balance_tasks)
-        self.config.drop_n_last_frames = drawn
+        balance = self.config.balance_tasks
+        tasks = task_of_frames(meta, cache.episodes) if balance else None
+        self.config.drop_n_last_frames = Drawn.of(starts, self.config.moments_per_episode, tasks, balance)
 
     # -- checkpoints -----------------------------------------------------------------------------------------------
 

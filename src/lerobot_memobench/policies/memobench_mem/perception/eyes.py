@@ -68,17 +68,18 @@ class EyePerception(nn.Module, Perception):
         return self._tower[0]
 
     @cached_property
+    def _sight(self) -> str:
+        return f"{fingerprint({'eyes': self.tower})}-{SIDE}x{SIDE}"
+
+    @property
     def key(self) -> str:
         """Identity of the tokens this makes: weights, and size of the pictures."""
-        return self._key(self.tokens_per_frame)
+        return f"{self._sight}-eyes{self.tokens_per_frame}"
 
-    @cached_property
+    @property
     def present_key(self) -> str:
         """Identity of the tokens of present pictures."""
-        return self._key(GRID**2)
-
-    def _key(self, tokens: int) -> str:
-        return f"{fingerprint({'eyes': self.tower})}-{SIDE}x{SIDE}-eyes{tokens}"
+        return f"{self._sight}-eyes{GRID**2}"
 
     @torch.no_grad()
     def look(self, pictures: Tensor) -> Tensor:
