@@ -25,6 +25,8 @@ from lerobot_memobench.studies.learning.stages import Stages
 from lerobot_memobench.studies.learning.study import learn
 from lerobot_memobench.tasks.catalogue import BOWL
 
+from ..scripts import load_script
+
 sys.path[:0] = [str(Path(__file__).parents[1] / "evaluation")]
 TWIN = "open_and_close_the_microwave_a_given_number_of_times"
 
@@ -73,6 +75,21 @@ def test_outcomes_tell_wrong_referents_apart(tmp_path: Path) -> None:
         assert outcome.of_seeds == pytest.approx((0.9, 0.5))
         assert (outcome.wrong, outcome.others) == (4, 2)
     assert found[BOWL].success.n == 20
+
+
+def test_the_figure_of_two_evaluations_tells_differences_on_what_both_have(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_rollouts(tmp_path / "with", solved=15, wrong=5, episodes=20)
+    write_rollouts(tmp_path / "without", solved=4, wrong=6, episodes=10)
+    arms = [f"{name}={tmp_path / name}" for name in ("with", "without")]
+    monkeypatch.setattr(sys, "argv", ["learned_figure.py", *arms, "--out", str(tmp_path / "figure.png")])
+    load_script("learned_figure").main()
+    told = capsys.readouterr().out
+    assert "| object, with | 75.0 |" in told
+    assert "prompted tasks, 10 shared episodes" in told
+    assert "| without less with | -60.0 |" in told
+    assert (tmp_path / "figure.png").is_file()
 
 
 def test_an_experiment_runs_its_parts_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,6 +148,19 @@ def test_what_is_told_in_training_is_told_in_rollouts(tmp_path: Path, monkeypatc
     told = [name for name, words in ran.items() if "env.oracle_memory=true" in words]
     assert told == ["oracle_text-0"]
     assert len(ran) == 6
+
+
+@pytest.mark.parametrize("perception", ["objects", "pixels"])
+def test_pictures_are_made_for_policies_that_see_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, perception: str
+) -> None:
+    ran: list[list[str]] = []
+    monkeypatch.setattr(stages_module, "run_once", lambda words, log, **options: ran.append(words))
+    stages = Stages(replace(EXPERIMENTS["bowl"], perception=perception, settings=("batch_size=32",)), tmp_path)
+    stages.generate()
+    stages.train(MEMORY, 0)
+    assert ("--no-images" in ran[0]) == (perception == "objects")
+    assert {f"perception={perception}", "batch_size=32"} <= set(ran[1])
 
 
 @pytest.mark.parametrize(("task", "referent", "strict"), [(BOWL, "random", False), (TWIN, "drawn", True)])

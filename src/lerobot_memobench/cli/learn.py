@@ -21,6 +21,13 @@ class Name(StrEnum):
     JOINT = "joint"
 
 
+class Sight(StrEnum):
+    """What policies see by."""
+
+    OBJECTS = "objects"
+    PIXELS = "pixels"
+
+
 def learn(
     name: Annotated[Name, typer.Argument(help=EXPERIMENTS)],
     out: Annotated[Path, typer.Option(help="Folder of data, policies, rollouts and tables; the same command goes on.")],
@@ -31,6 +38,12 @@ def learn(
     first_seed: Annotated[
         int | None, typer.Option(help="First seed of the rollouts; choose settings by 20000.")
     ] = None,
+    perception: Annotated[
+        Sight, typer.Option(help="objects: no pictures are made; pixels: pictures, through the package's eyes.")
+    ] = Sight.OBJECTS,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="One more word for `lerobot train` of all policies; repeatable.")
+    ] = None,
     dataset: Annotated[Path | None, typer.Option(help="Demonstrations that are there already.")] = None,
     workers: Annotated[int, typer.Option(min=1, help="Processes; so many policies are trained at once.")] = 1,
 ) -> int:
@@ -39,7 +52,8 @@ def learn(
     from lerobot_memobench.studies.learning.study import learn as run
 
     screen = console()
-    given = {"episodes": episodes, "steps": steps, "seeds": seeds, "rollouts": rollouts, "first_seed": first_seed}
+    given: dict[str, object] = {"episodes": episodes, "steps": steps, "seeds": seeds, "rollouts": rollouts}
+    given |= {"first_seed": first_seed, "perception": perception.value, "settings": tuple(settings or ())}
     chosen = changed(experiment(name.value), **given)
     screen.print(run(chosen, out, lambda text: screen.print(text, soft_wrap=True), dataset=dataset, workers=workers))
     return 0

@@ -11,6 +11,8 @@ MEMORY, MEMORYLESS = "memory", "no memory"
 ARMS: dict[str, tuple[str, ...]] = {MEMORY: (), MEMORYLESS: ("policy.integration=none",)}
 """Who is compared -> what is said of it to `lerobot train` beside what all share."""
 
+OBJECTS, PIXELS = "objects", "pixels"
+
 EVALUATION_SEEDS = 7
 TUNING_SEEDS = 20_000
 """First seeds: of the evaluation that is reported, and of one that settings may be chosen by."""
@@ -25,6 +27,7 @@ class Experiment:
             its way; 0 where they are given.
         steps: updates. settings: more words for `lerobot train`, of all arms.
         arms: name -> words for `lerobot train`.
+        perception: `objects`, or `pixels`: then demonstrations have pictures.
         seeds: of training; the first ``seeds`` numbers.
         rollouts: of each task and policy. first_seed: of the rollouts. referent: of demonstrations and rollouts.
     """
@@ -34,6 +37,7 @@ class Experiment:
     steps: int
     settings: tuple[str, ...] = ()
     arms: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: ARMS)
+    perception: str = OBJECTS
     seeds: int = 1
     rollouts: int = 50
     first_seed: int = EVALUATION_SEEDS

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_memobench.studies.learning.commands import Cost, run_once
-from lerobot_memobench.studies.learning.experiments import Experiment
+from lerobot_memobench.studies.learning.experiments import OBJECTS, Experiment
 from lerobot_memobench.tasks.catalogue import suite_of
 from lerobot_memobench.tasks.task import STRICT
 
-SHARED = ("policy=memobench_mem", "perception=objects", "size=small")
-"""What every policy of an experiment is told: objects instead of pixels, the small size."""
+SHARED = ("policy=memobench_mem", "size=small")
+"""What every policy of an experiment is told."""
 
 
 @dataclass(frozen=True)
@@ -40,13 +40,15 @@ class Stages:
             return None
         words = ["memobench", "generate", "--tasks", ",".join(self.experiment.tasks)]
         words += ["--referent", self.experiment.referent, "--episodes", str(self.experiment.episodes)]
-        words += ["--perturb", "--no-images", "--out", str(self.data)]
+        words += ["--perturb", "--out", str(self.data)]
+        words += ["--no-images"] if self.experiment.perception == OBJECTS else []
         return run_once([*words, "--workers", str(self.workers)], self.out / "data.log", threads=1, accept=(0, 1))
 
     def train(self, arm: str, seed: int, threads: int | None = None) -> Cost:
         """Train an arm's policy with one seed."""
         own = self.experiment.arms[arm]
-        words = ["lerobot", "train", *SHARED, f"dataset={self.data}", f"steps={self.experiment.steps}"]
+        words = ["lerobot", "train", *SHARED, f"perception={self.experiment.perception}"]
+        words += [f"dataset={self.data}", f"steps={self.experiment.steps}"]
         words += [f"seed={seed}", f"output_dir={self.policy(arm, seed)}", *self.experiment.settings, *own]
         folder = self.policy(arm, seed)
         begun = self.checkpoint(arm, seed) / "train_config.json"

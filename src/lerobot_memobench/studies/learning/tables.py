@@ -29,11 +29,11 @@ def _cells(outcome: Outcome) -> list[str]:
     return [f"{100 * value:.1f}", f"{100 * low:.1f}–{100 * high:.1f}", seeds, str(outcome.wrong), str(outcome.others)]
 
 
-def contrasts_table(found: Mapping[str, Contrast], seeds: int) -> str:
-    """Return a table of arms against the one with a memory that is aligned with nothing."""
+def contrasts_table(found: Mapping[str, Contrast], seeds: int, reference: str = MEMORY) -> str:
+    """Return a table of arms against the reference."""
     rows = [
         [
-            f"{name} less {MEMORY}",
+            f"{name} less {reference}",
             *(f"{100 * one.value:+.1f}", f"{100 * one.low:+.1f} to {100 * one.high:+.1f}", f"{one.p:.3f}"),
             "–" if one.detectable is None else f"{100 * one.detectable:.1f}",
         ]

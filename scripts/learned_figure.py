@@ -1,0 +1,56 @@
+"""The README's figure and the differences told with it, of evaluations that need not be of the same size.
+
+    python scripts/learned_figure.py "with memory=outputs/eval/small" "without memory=outputs/eval/memoryless" \
+        --out docs/figures/learned.png
+
+Bars are of all rollouts of an arm; differences from the first arm are of the episodes that all arms have.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from lerobot_memobench.evaluation.metrics.rollouts import Record
+from lerobot_memobench.evaluation.records.runs import read_rollouts
+from lerobot_memobench.studies.learning.contrasts import contrasts
+from lerobot_memobench.studies.learning.experiments import prompted
+from lerobot_memobench.studies.learning.figure import SCOPES, draw
+from lerobot_memobench.studies.learning.outcomes import outcomes_of
+from lerobot_memobench.studies.learning.tables import contrasts_table, outcomes_table
+
+
+def shared(arms: dict[str, list[Record]]) -> dict[str, list[Record]]:
+    """Return the rollouts of the episodes that all arms have."""
+    keys = {name: {(one["task"], one["seed"]) for one in records} for name, records in arms.items()}
+    common = set.intersection(*keys.values())
+    return {name: [one for one in records if (one["task"], one["seed"]) in common] for name, records in arms.items()}
+
+
+def differences(arms: dict[str, list[Record]]) -> str:
+    """Return a table of all arms against the first, on shared episodes of all tasks and of the prompted ones."""
+    reference, parts = next(iter(arms)), []
+    for title, tasks in (("all tasks", None), ("prompted tasks", set(prompted()))):
+        chosen = shared({k: [one for one in own if not tasks or one["task"] in tasks] for k, own in arms.items()})
+        count = len(chosen[reference])
+        if count:
+            table = contrasts_table(contrasts({k: [own] for k, own in chosen.items()}, reference), 1, reference)
+            parts.append(f"{title}, {count} shared episodes\n\n{table}")
+    return "\n\n".join(parts)
+
+
+def main() -> None:
+    """Draw and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("arms", nargs="+", help="NAME=FOLDER of an evaluation")
+    parser.add_argument("--out", type=Path, required=True, help="the picture")
+    given = parser.parse_args()
+    arms = {name: read_rollouts(Path(folder))[0] for name, _, folder in (one.partition("=") for one in given.arms)}
+    found = {name: outcomes_of([records]) for name, records in arms.items()}
+    draw(found, given.out)
+    means = {name: {scope: one[scope] for scope in one if scope in SCOPES} for name, one in found.items()}
+    print(outcomes_table(means), differences(arms), sep="\n\n")
+
+
+if __name__ == "__main__":
+    main()
