@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from lerobot_memobench.envs.episode import Episode, generator
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.eyes.crowd import crowded, widened
 from lerobot_memobench.eyes.kinds import kinds
 from lerobot_memobench.eyes.labels import PICTURE, Labeller, Rows
 from lerobot_memobench.eyes.scatter import Scatter
@@ -25,7 +25,8 @@ from lerobot_memobench.sim.simulation import CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_index
 
 SCENES = ("as it was", "things elsewhere", "things elsewhere, arm above one")
-"""How moments come about: the expert's own; the same with all things put elsewhere; and with the arm too."""
+"""How moments come about: the expert's own; the same with all things put elsewhere and more of other classes beside
+them; and with the arm too."""
 PER_MOMENT = len(SCENES) * len(CAMERAS)
 """Pictures of one moment."""
 TRIES = 4
@@ -65,8 +66,8 @@ class Shard:
         episode = _episode(self.name)
         rng = generator(episode.published, self.seed, STREAM)
         moments = walk(episode, self.seed, self.moments)
-        fixed, labeller = episode.sim.fixture_poses(), Labeller(episode.sim)
-        rows = [row for moment in moments for row in _rows(episode.sim, labeller, moment, fixed, rng)]
+        stage = _Stage(episode.sim, rng)
+        rows = [row for moment in moments for row in stage.rows(moment)]
         with draft_of(self.folder) as draft:
             np.save(draft, np.array(rows, PICTURE))
 
@@ -76,19 +77,27 @@ def _episode(name: str) -> Episode:
     return Episode(get_task(name), referent="random")
 
 
-def _rows(
-    sim: Simulation, labeller: Labeller, moment: Moment, fixed: dict[str, Any], rng: np.random.Generator
-) -> Iterable[Rows]:
-    """Yield the pictures of one moment, of both cameras."""
-    scatter = Scatter(sim, rng)
-    for scene in range(len(SCENES)):
-        for _ in range(TRIES):
-            sim.set_state(moment.state, fixed)
-            sim.highlights = moment.highlights if scene == 0 else ()
-            if scene == 0 or scatter.stir(reach=scene == len(SCENES) - 1):
-                yield from (labeller.look(camera, scene) for camera in CAMERAS)
-                break
-    sim.set_state(moment.state, fixed)
+class _Stage:
+    """One episode's scene, as it is and with more things in it."""
+
+    def __init__(self, sim: Simulation, rng: np.random.Generator) -> None:
+        self._sim, self._crowd = sim, crowded(sim, rng)
+        self._fixed = sim.fixture_poses()
+        self._plain, self._full = Labeller(sim), Labeller(self._crowd)
+        self._scatter = Scatter(self._crowd, rng)
+
+    def rows(self, moment: Moment) -> Iterable[Rows]:
+        """Yield the pictures of one moment, of both cameras."""
+        sim, crowd = self._sim, self._crowd
+        sim.set_state(moment.state, self._fixed)
+        sim.highlights = moment.highlights
+        yield from (self._plain.look(camera) for camera in CAMERAS)
+        for scene in range(1, len(SCENES)):
+            for _ in range(TRIES):
+                crowd.set_state(widened(moment.state, sim, crowd), self._fixed)
+                if self._scatter.stir(reach=scene == len(SCENES) - 1):
+                    yield from (self._full.look(camera, scene) for camera in CAMERAS)
+                    break
 
 
 def make_pictures(

@@ -16,6 +16,8 @@ from lerobot_memobench.sim.simulation import Simulation
 
 Array = NDArray[np.float64]
 
+AWAY = (30.0, 0.0, 5.0)
+"""Where things are taken away to, m: no camera looks there, and no shadow of theirs falls on the table."""
 ITERATIONS, STRIDE, DAMPING = 40, 0.25, 0.02
 """Of `reach`: how often it steps, by how much of a joint at most, rad, and what keeps it calm near straight poses."""
 REACHED = 0.005
@@ -25,6 +27,11 @@ REACHED = 0.005
 def pose(position: Array, turn: Rotation) -> Array:
     """Return position and quaternion wxyz as one vector (7,)."""
     return np.concatenate([position, turn.as_quat(scalar_first=True)])
+
+
+def away(index: int) -> Array:
+    """Return a pose (7,) of its own for each thing that is taken away."""
+    return pose(np.add(AWAY, [0.0, index, 0.0]), Rotation.identity())
 
 
 def standing(asset: Asset, x: float, y: float, z: float, turn: Rotation) -> Array:

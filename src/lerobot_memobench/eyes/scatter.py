@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from lerobot_memobench.experts.hand import downward
 from lerobot_memobench.eyes import poses
+from lerobot_memobench.eyes.crowd import MORE
 from lerobot_memobench.eyes.labels import settle
 from lerobot_memobench.eyes.walk import NEAR
 from lerobot_memobench.sim.assets.asset import Asset
@@ -31,8 +32,6 @@ SLIDE, TURN = 0.03, 0.1
 """How far a fixture is moved at most along x and y, m, and turned, rad."""
 ROUNDS = 6
 """How often what overlaps is put elsewhere before it is taken away."""
-AWAY = (30.0, 0.0, 5.0)
-"""Where things are taken away to, m: no camera looks there, and no shadow of theirs falls on the table."""
 ARM = "robot0_base"
 """Root of the arm's tree of bodies."""
 
@@ -52,7 +51,9 @@ class Scatter:
     def stir(self, *, reach: bool) -> bool:
         """Put things elsewhere, and with ``reach`` the arm near one of them; return whether the arm is free."""
         self._move_fixtures()
-        moved = [name for name in self._objects if self._rng.random() < MOVED]
+        share = self._rng.random()  # of a crowd: pictures with few things and with many
+        chances = {name: share if name.startswith(MORE) else MOVED for name in self._objects}
+        moved = [name for name, chance in chances.items() if self._rng.random() < chance]
         held = str(self._rng.choice(list(self._objects))) if self._objects and self._rng.random() < HELD else None
         for name in moved:
             self._put(name)
@@ -121,7 +122,7 @@ class Scatter:
         rng, sim = self._rng, self._sim
         goals = [(*sim.body_pose(name), asset.grasps[0]) for name, asset in self._objects.items() if asset.grasps]
         places = [(place + turned @ np.array(grasp.position), grasp.yaw) for place, turned, grasp in goals]
-        places = [(place, yaw) for place, yaw in places if place[2] > 0]
+        places = [(place, yaw) for place, yaw in places if place[0] < poses.AWAY[0] / 2]
         places += [(sim.site_pose(part.handle_site)[0], 0.0) for part in self._parts]
         place, yaw = places[int(rng.integers(len(places)))]
         height = NEAR * rng.random() ** 1.5
@@ -149,8 +150,7 @@ class Scatter:
 
     def _take_away(self, name: str) -> None:
         """Put an object where no camera looks, each at a place of its own."""
-        place = np.add(AWAY, [0.0, list(self._objects).index(name), 0.0])
-        self._write(name, poses.pose(place, Rotation.identity()))
+        self._write(name, poses.away(list(self._objects).index(name)))
 
     def _write(self, name: str, pose: Array) -> None:
         self._sim.data.joint(f"{name}_joint0").qpos[:] = pose
