@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+import pytest
 
 from lerobot_memobench.experts.hand import downward
+from lerobot_memobench.eyes import scatter as scatter_module
 from lerobot_memobench.eyes.poses import held, reach
 from lerobot_memobench.eyes.scatter import Scatter
 from lerobot_memobench.sim.placement import PENETRATION
@@ -45,6 +47,12 @@ def test_nothing_stands_in_anything(simulate: Simulate) -> None:
     assert free > 10
     seen = np.array(places).reshape(-1, 3)
     assert (np.std(seen[seen[:, 2] < 2], axis=0)[:2] > 0.05).all()
+
+
+def test_an_empty_table_has_nothing_to_reach_for(simulate: Simulate, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("MOVED", "ABSENT"):
+        monkeypatch.setattr(scatter_module, name, 1.0)
+    assert not Scatter(simulate(BOWLS), np.random.default_rng(0)).stir(reach=True)
 
 
 def test_the_arm_reaches_a_pose(simulate: Simulate) -> None:

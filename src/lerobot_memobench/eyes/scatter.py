@@ -124,6 +124,8 @@ class Scatter:
         places = [(place + turned @ np.array(grasp.position), grasp.yaw) for place, turned, grasp in goals]
         places = [(place, yaw) for place, yaw in places if place[0] < poses.AWAY[0] / 2]
         places += [(sim.site_pose(part.handle_site)[0], 0.0) for part in self._parts]
+        if not places:
+            return False
         place, yaw = places[int(rng.integers(len(places)))]
         height = NEAR * rng.random() ** 1.5
         place = place + np.array([*(rng.normal(size=2) * (0.004 + 0.2 * height)), height + 0.005])

@@ -12,6 +12,7 @@ from lerobot_memobench.sim.assets.asset import Asset
 from lerobot_memobench.sim.assets.kitchen import build_kitchen
 from lerobot_memobench.sim.assets.registry import build_asset
 from lerobot_memobench.sim.catches import add_catches
+from lerobot_memobench.sim.rolling import stop_rolling
 from lerobot_memobench.tasks.task import STRICT, Task
 
 TABLE = "kitchen_table"
@@ -82,6 +83,7 @@ def scene_spec(task: Task) -> tuple[mujoco.MjSpec, dict[str, Asset]]:
         spec.body(name).add_freejoint(name=f"{name}_joint0")
     if task.suite == STRICT:
         add_catches(spec, assets)
+        stop_rolling(spec, task.objects)
     return spec, assets
 
 
