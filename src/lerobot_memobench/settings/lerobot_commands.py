@@ -8,6 +8,7 @@ import sys
 import typing
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from importlib import metadata
 from typing import Any
 
@@ -38,8 +39,9 @@ def load_command(name: str) -> Callable[[], Any]:
     return entry
 
 
+@cache
 def register_plugins() -> None:
-    """Let LeRobot find its plugins as its own commands do, without the log lines about it."""
+    """Let LeRobot find its plugins as its own commands do, once per process, without the log lines about it."""
     from lerobot.utils.import_utils import register_third_party_plugins
 
     with quiet():
