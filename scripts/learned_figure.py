@@ -12,7 +12,7 @@ import argparse
 from pathlib import Path
 
 from lerobot_memobench.evaluation.metrics.rollouts import Record
-from lerobot_memobench.evaluation.records.runs import read_rollouts
+from lerobot_memobench.evaluation.records.runs import read_runs
 from lerobot_memobench.studies.learning.contrasts import contrasts
 from lerobot_memobench.studies.learning.experiments import prompted
 from lerobot_memobench.studies.learning.figure import SCOPES, draw
@@ -45,7 +45,7 @@ def main() -> None:
     parser.add_argument("arms", nargs="+", help="NAME=FOLDER of an evaluation")
     parser.add_argument("--out", type=Path, required=True, help="the picture")
     given = parser.parse_args()
-    arms = {name: read_rollouts(Path(folder))[0] for name, _, folder in (one.partition("=") for one in given.arms)}
+    arms = {run.name: list(run.records) for run in read_runs(given.arms)}
     found = {name: outcomes_of([records]) for name, records in arms.items()}
     draw(found, given.out)
     means = {name: {scope: one[scope] for scope in one if scope in SCOPES} for name, one in found.items()}

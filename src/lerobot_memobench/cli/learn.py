@@ -53,7 +53,8 @@ def learn(
 
     screen = console()
     given: dict[str, object] = {"episodes": episodes, "steps": steps, "seeds": seeds, "rollouts": rollouts}
-    given |= {"first_seed": first_seed, "perception": perception.value, "settings": tuple(settings or ())}
-    chosen = changed(experiment(name.value), **given)
+    given |= {"first_seed": first_seed, "perception": perception.value}
+    chosen = experiment(name.value)
+    chosen = changed(chosen, **given, settings=(*chosen.settings, *(settings or ())))
     screen.print(run(chosen, out, lambda text: screen.print(text, soft_wrap=True), dataset=dataset, workers=workers))
     return 0

@@ -11,7 +11,7 @@ MEMORY, MEMORYLESS = "memory", "no memory"
 ARMS: dict[str, tuple[str, ...]] = {MEMORY: (), MEMORYLESS: ("policy.integration=none",)}
 """Who is compared -> what is said of it to `lerobot train` beside what all share."""
 
-OBJECTS, PIXELS = "objects", "pixels"
+OBJECTS = "objects"
 
 EVALUATION_SEEDS = 7
 TUNING_SEEDS = 20_000
