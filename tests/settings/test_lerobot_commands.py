@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
+
 import lerobot.scripts.lerobot_eval
 import lerobot.scripts.lerobot_train
+import pytest
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.configs.train import TrainPipelineConfig
 
-from lerobot_memobench.settings.lerobot_commands import config_class, lerobot_commands
+from lerobot_memobench.settings.lerobot_commands import config_class, lerobot_commands, load_command
 
 
 def test_every_command_of_lerobot_is_there() -> None:
@@ -17,3 +20,15 @@ def test_every_command_of_lerobot_is_there() -> None:
 def test_their_configurations_are_found() -> None:
     assert config_class(lerobot.scripts.lerobot_eval.main) is EvalPipelineConfig
     assert config_class(lerobot.scripts.lerobot_train.main) is TrainPipelineConfig
+
+
+@pytest.mark.parametrize("chosen", [None, "OMP_WAIT_POLICY", "GOMP_SPINCOUNT"])
+def test_torch_waits_briefly_in_evaluations_unless_told_otherwise(
+    chosen: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = {"HOME": "/nowhere"} | ({chosen: "ACTIVE"} if chosen else {})
+    monkeypatch.setattr(os, "environ", dict(before))
+    load_command("train")
+    assert os.environ == before
+    load_command("eval")
+    assert os.environ == before | ({} if chosen else {"GOMP_SPINCOUNT": "2000"})
