@@ -13,6 +13,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.eyes.kinds import kinds
 from lerobot_memobench.eyes.tower import GRID, POOLED, SIDE, WIDTH, Tower, shrunk
 from lerobot_memobench.eyes.weights import Eyes, load_eyes, save_eyes
+from lerobot_memobench.eyes.whitening import whiten
 
 LARGEST, MOST = 6_000_000, 3_000_000
 """Bytes of the file, and weights of the tower."""
@@ -55,6 +56,26 @@ def test_eyes_come_back_from_their_file(small_tower: Callable[[], Tower], tmp_pa
     for said, was in zip(back(images), before, strict=True):
         assert torch.allclose(said.heat, was.heat, atol=0.05)
         assert torch.allclose(said.geometry, was.geometry, atol=0.05)
+
+
+@torch.no_grad()
+def test_white_tokens_say_what_the_others_said(small_tower: Callable[[], Tower], tmp_path: Path) -> None:
+    eyes, images = Eyes(trained_a_little(small_tower()), ("cork", "cap")).eval(), torch.rand(24, 3, SIDE, SIDE)
+    eyes.tower.fold()
+    before = eyes(images)
+    whiten(eyes, images.split(10))
+    for said, was in zip(eyes(images), before, strict=True):
+        assert torch.allclose(said.heat, was.heat, atol=1e-3)
+        assert torch.allclose(said.geometry, was.geometry, atol=1e-3)
+        assert torch.allclose(said.mask, was.mask, atol=1e-3)
+    save_eyes(eyes, tmp_path / "eyes.safetensors")
+    for tower in (eyes.tower, load_eyes(tmp_path / "eyes.safetensors").tower):
+        for tokens in (tower(images), tower.pooled(tower(images))):
+            rows = tokens.flatten(0, 1)
+            variances = torch.linalg.eigvalsh(torch.cov(rows.T))
+            assert rows.mean(dim=0).abs().max() < 0.05
+            assert variances.max() < 1.2
+            assert variances[-3:].min() > 0.8
 
 
 def test_other_files_are_no_eyes(tmp_path: Path) -> None:

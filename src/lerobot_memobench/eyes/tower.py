@@ -73,6 +73,7 @@ class Tower(nn.Module):
             stages += [Convolution(here, there, stride=2), nn.ReLU(), *(Block(there) for _ in range(count))]
         self.stages = nn.Sequential(*stages)
         self.place = nn.Parameter(torch.zeros(widths[-1], GRID, GRID))
+        self.even: nn.Module = nn.Identity()
         self.pool = nn.Linear(widths[-1] * (GRID // POOLED) ** 2, widths[-1])
         if folded:
             self.fold()
@@ -85,7 +86,8 @@ class Tower(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         """Return the tokens (N, 64, width) of pictures (N, 3, SIDE, SIDE) in [0, 1], row by row."""
         x = (images * 2 - 1).contiguous(memory_format=torch.channels_last)
-        return rearrange(self.stages(x) + self.place, "n d y x -> n (y x) d")
+        tokens: Tensor = self.even(rearrange(self.stages(x) + self.place, "n d y x -> n (y x) d"))
+        return tokens
 
     def pooled(self, tokens: Tensor) -> Tensor:
         """Return 16 tokens (N, 16, width) of 64: each of a square of four, which keeps what is where in it."""
@@ -93,7 +95,11 @@ class Tower(nn.Module):
         return self.pool(near)
 
     def fold(self) -> None:
-        """Make batch normalisation part of the convolutions: for looking, no more for training."""
+        """Make batch normalisation part of the convolutions, and room for `whitening`: no more for training."""
         for module in self.modules():
             if isinstance(module, Convolution):
                 module.fold()
+        if isinstance(self.even, nn.Identity):
+            self.even = nn.Linear(self.width, self.width)
+            nn.init.eye_(self.even.weight)
+            nn.init.zeros_(self.even.bias)

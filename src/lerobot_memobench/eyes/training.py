@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -19,6 +19,7 @@ from lerobot_memobench.eyes.pictures import Pictures
 from lerobot_memobench.eyes.targets import loss, targets
 from lerobot_memobench.eyes.tower import GRID, POOLED, Tower
 from lerobot_memobench.eyes.weights import Eyes, save_eyes
+from lerobot_memobench.eyes.whitening import whiten
 from lerobot_memobench.files import draft_of
 from lerobot_memobench.files.curve import draw_curve, mean_of
 
@@ -32,6 +33,8 @@ GAIN, SHIFT, NOISE = 0.12, 0.06, 0.02
 shares of white. Videos change colours and edges about as much."""
 WINDOW = 10
 """Updates that one point of the curve is the mean of."""
+WHITENED = 2048
+"""Pictures over which tokens are made white in the end."""
 CLIP = 5.0
 """Norm that a gradient is cut to."""
 
@@ -85,8 +88,17 @@ def train(
         if progress is not None and learner.update % WINDOW == 0:
             newest = ", ".join(f"{name} {value:.3f}" for name, value in learner.points[-1].items())
             progress(learner.update, settings.updates, newest)
+    learner.eyes.eval().tower.fold()
+    whiten(learner.eyes, _some(pictures))
     save_eyes(learner.eyes, folder / WEIGHTS)
     return folder / WEIGHTS
+
+
+def _some(pictures: Pictures) -> Iterator[Tensor]:
+    """Yield batches of pictures from all over."""
+    chosen = np.linspace(0, len(pictures) - 1, min(len(pictures), WHITENED)).astype(np.int64)
+    for numbers in np.array_split(chosen, -(-len(chosen) // 64)):
+        yield torch.from_numpy(pictures.rows(numbers)["pixels"]).float() / 255
 
 
 class _Learner:

@@ -49,7 +49,7 @@ class Eyes(nn.Module):
 
 
 def save_eyes(eyes: Eyes, path: Path) -> None:
-    """Write eyes to a file, batch normalisation folded into the convolutions: they learn no more."""
+    """Write eyes to a file, their towers folded: they learn no more."""
     eyes.tower.fold()
     tensors = {name: value.detach().to(torch.bfloat16).contiguous() for name, value in eyes.state_dict().items()}
     shape = {"widths": eyes.tower.widths, "blocks": eyes.tower.blocks, "kinds": eyes.kinds}
