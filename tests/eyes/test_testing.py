@@ -102,7 +102,8 @@ def test_what_is_missed_is_infinitely_far_and_what_is_not_there_is_false(shown: 
     table = numbers(Tested(KINDS, told, told, false, 10, 1.0))["rows"]
     red = next(row for row in table if row["kind"] == "red")
     assert (red["found"], red["median_cm"], red["shown"]) == (0.0, None, 10)
-    everything = next(row for row in table if row["kind"] == "all")
+    everything, scene = (next(row for row in table if row["kind"] == kind) for kind in ("all", "all, as it was"))
+    assert scene | {"kind": "all"} == everything
     assert everything["found"] == pytest.approx(2 / 3)
     assert everything["median_cm"] is not None
     assert everything["p90_cm"] is None

@@ -17,7 +17,6 @@ from small_policy import batch_of, losses_in_training, made_for_training, small_
 from lerobot_memobench.datasets.memory_cache import FOLDER
 from lerobot_memobench.datasets.memory_cache.decoding import frame_reader
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.eyes import weights
 from lerobot_memobench.eyes.tower import GRID, POOLED, SIDE, WIDTH, Tower
 from lerobot_memobench.eyes.weights import Eyes, save_eyes
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
@@ -96,23 +95,17 @@ def observed(root: Path, dataset: Any, index: int) -> dict[str, Any]:
 # -- settings ------------------------------------------------------------------------------------------------------
 
 
-def test_eyes_are_the_default_of_small_pixels_once_they_are_shipped(
-    eyes: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(weights, "SHIPPED", tmp_path / "absent.safetensors")
-    before = MemobenchMemConfig(device="cpu", size="small")
-    assert (before.eyes, before.memory_stride, before.moments_per_episode) == ("random", 1, 1)
-    assert not before.balance_tasks
-    monkeypatch.setattr(weights, "SHIPPED", eyes)
+def test_the_packages_eyes_are_the_default_of_small_pixels(tmp_path: Path) -> None:
+    random = MemobenchMemConfig(device="cpu", size="small", eyes="random")
+    assert (random.memory_stride, random.moments_per_episode, random.balance_tasks) == (1, 1, False)
     config = MemobenchMemConfig(device="cpu", size="small")
     assert (config.eyes, config.image_size, config.tokens_per_frame) == ("package", (SIDE, SIDE), POOLED**2)
     assert (config.memory_stride, config.moments_per_episode, config.balance_tasks) == (8, 6, True)
     assert (config.objective, config.state_token, config.watches) == ("regression", True, True)
-    assert not MemobenchMemConfig(device="cpu", size="small", eyes="random").has_eyes
+    assert not random.has_eyes
     for other in ({"size": "tiny"}, {"size": "pi05"}, {"size": "small", "perception": "objects"}):
         assert MemobenchMemConfig(device="cpu", **other).eyes is None
     config.save_pretrained(tmp_path)
-    monkeypatch.setattr(weights, "SHIPPED", tmp_path / "absent.safetensors")
     assert PreTrainedConfig.from_pretrained(tmp_path).eyes == "package"
 
 

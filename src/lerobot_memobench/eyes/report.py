@@ -16,6 +16,7 @@ from PIL import Image, ImageDraw
 from lerobot_memobench.datasets.lerobot_format.card_tables import markdown as table
 from lerobot_memobench.eyes.kinds import DRAWERS, PARTS
 from lerobot_memobench.eyes.labels import SIDE, Rows, projected
+from lerobot_memobench.eyes.pictures import SCENES
 from lerobot_memobench.eyes.testing import SHOWN, Things
 from lerobot_memobench.files import draft_of, write_file
 from lerobot_memobench.sim.simulation import CAMERAS
@@ -70,6 +71,7 @@ def _rank(values: NDArray[Any], percent: int) -> float | None:
 def numbers(tested: Tested) -> dict[str, Any]:
     """Return the whole test as JSON has it; errors that are infinite are null."""
     groups = [("all", tested.told), ("all, pooled tokens", tested.pooled)]
+    groups += [(f"all, {name}", tested.told[tested.told["scene"] == scene]) for scene, name in enumerate(SCENES)]
     groups += [(name, tested.told[tested.told["kind"] == kind]) for kind, name in enumerate(tested.kinds)]
     rows = [
         {"kind": name, "view": VIEWS[view], **figures(in_view(told, view))}

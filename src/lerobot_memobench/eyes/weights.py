@@ -16,14 +16,9 @@ from lerobot_memobench.eyes.tower import BLOCKS, GRID, POOLED, WIDTHS, Tower
 from lerobot_memobench.files import write_file
 
 SHIPPED = Path(__file__).parent / "eyes.safetensors"
-"""The eyes that come with the package, in a version that has some."""
+"""The eyes that come with the package: docs/eyes.md."""
 PACKAGE, RANDOM = "package", "random"
 """Names of eyes that are no file's: those of the package, and none, where a policy's tower has random weights."""
-
-
-def default_eyes() -> str:
-    """Return the name of the eyes that a policy has which names none: the package's, if it has some."""
-    return PACKAGE if SHIPPED.is_file() else RANDOM
 
 
 class Eyes(nn.Module):

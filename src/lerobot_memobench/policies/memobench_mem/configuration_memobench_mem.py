@@ -11,7 +11,7 @@ from lerobot.utils.constants import OBS_ENV_STATE
 
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.eyes.tower import SIDE
-from lerobot_memobench.eyes.weights import RANDOM, default_eyes
+from lerobot_memobench.eyes.weights import PACKAGE, RANDOM
 from lerobot_memobench.policies.memobench_mem.action_objective import OBJECTIVES, REGRESSION
 from lerobot_memobench.policies.memobench_mem.dimensions import GRID, SIZES, Dimensions, resized
 from lerobot_memobench.policies.memobench_mem.schedule import WarmupFractionSchedulerConfig
@@ -108,7 +108,7 @@ class MemobenchMemConfig(MemobenchMemSettings):
     def _choose_eyes(self) -> None:
         possible = self.size == "small" and not self.sees_objects
         if possible and self.eyes is None:
-            self.eyes = default_eyes()
+            self.eyes = PACKAGE
         elif self.eyes is not None and not possible:
             raise MemobenchError(
                 f"--policy.eyes={self.eyes} is for --policy.size=small --policy.perception=pixels, and not for size="

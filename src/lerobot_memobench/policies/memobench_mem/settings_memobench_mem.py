@@ -31,8 +31,8 @@ class MemobenchMemSettings(PI05Config):
     ``observation.environment_state`` (`sim.object_slots`), without any picture."""
     eyes: str | None = None
     """Whose tower pictures are seen through at ``size=small``: a file of `memobench eyes train`, ``package``: the one
-    that comes with the package, or ``random``: pi0.5's image tower with random weights. None: ``package`` where it has
-    one, else ``random``. A checkpoint holds its tower; there this only says where it was from."""
+    that comes with the package, or ``random``: pi0.5's image tower with random weights. None: ``package``.
+    A checkpoint holds its tower; there this only says where it was from."""
     object_classes: list[str] | None = None
     """Names of the classes that slots were trained with, in order of their indices; none: those of this version."""
 
