@@ -189,7 +189,7 @@ def ends_well(
         except Exception as error:
             raise AssertionError(f"seed {seed}: {type(error).__name__}: {error}") from error
         found["refused" if said else "result"] += 1
-        assert len(said) < LONGEST_SENTENCE, f"seed {seed}: a message of {len(said)} characters"
+        assert len(said) < LONGEST_SENTENCE, f"seed {seed}: a message of {len(said)} characters: {said[:300]}"
         strangers = {path.name for path in whole.iterdir()} - set(inside)
         assert not strangers, f"seed {seed}: {strangers} were written elsewhere"
     return found

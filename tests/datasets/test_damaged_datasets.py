@@ -208,6 +208,11 @@ def test_damaged_arrays_of_a_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert min(check(tmp_path, "arrays", 300, monkeypatch, mutations.mutated_bytes)) > 3
 
 
+def test_what_a_cache_says_of_itself_is_told_in_one_sentence() -> None:
+    meta = CacheMeta(FORMAT, "print", "tower", "words", 5000 * "a", 1, 2, 4, 6, ["coarse"], True, True)
+    assert len(meta.mismatch({"camera": "observation.images.image"}) or "") < mutations.LONGEST_SENTENCE
+
+
 # --- attributes ---
 
 ATTRIBUTES: dict[str, Any] = {

@@ -124,6 +124,11 @@ def test_the_dataset_that_a_policy_was_trained_on(tmp_path: Path) -> None:
     changed = training_facts(tmp_path)
     assert changed is not None
     assert changed["sha256"] != facts["sha256"]
+    told["dataset"]["root"] = 5000 * "a"
+    (tmp_path / "train_config.json").write_text(json.dumps(told))
+    elsewhere = training_facts(tmp_path)
+    assert elsewhere is not None
+    assert "sha256" not in elsewhere, "a name that no file system takes is one of a dataset that is not here"
     (tmp_path / "train_config.json").write_text("{}")
     assert training_facts(tmp_path) is None
 

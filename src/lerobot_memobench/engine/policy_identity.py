@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NotRequired, TypedDict
@@ -78,8 +79,8 @@ def training_facts(folder: Path) -> dict[str, Any] | None:
     dataset = told["dataset"]
     found = {key: dataset.get(key) for key in ("repo_id", "revision", "root", "episodes")}
     found["steps"] = told.get("steps")
-    root = Path(str(found["root"])) if found["root"] else None
-    if root is not None and (root / "meta").is_dir():
+    root = Path(str(found["root"] or ""))
+    if found["root"] and os.path.isdir(root / "meta"):  # pathlib's raises at names that are too long
         files = sorted(path for path in [*(root / "meta").rglob("*"), root / "manifest.json"] if path.is_file())
         found["sha256"] = tree_hash({str(path.relative_to(root)): file_hash(path) for path in files})
     return found

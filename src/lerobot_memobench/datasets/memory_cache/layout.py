@@ -25,7 +25,7 @@ from typing import Any, TypedDict, get_type_hints
 import numpy as np
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files.reading import read_json
+from lerobot_memobench.files.reading import read_json, short
 
 FOLDER = "memory_cache"
 FORMAT = 2
@@ -68,11 +68,12 @@ class CacheMeta:
 
     def mismatch(self, wanted: dict[str, Any]) -> str | None:
         """Why the cache does not fit, as the end of a sentence; None when it does."""
+        theirs, ours = short(self.camera), short(wanted.get("camera"))
         reasons = {
             "format": "has an older format",
             "dataset": "is stale: the dataset's frames changed after it was made",
             "frames_key": "is foreign: another vision tower (other weights or input size) made it",
-            "camera": f"is foreign: it shows camera '{self.camera}', and '{wanted.get('camera')}' is asked for",
+            "camera": f"is foreign: it shows camera {theirs}, and {ours} is asked for",
             "stride": f"is foreign: it was made with stride {self.stride}, and stride {wanted.get('stride')} is asked "
             "for",
         }
