@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from lerobot_memobench.eyes.kinds import kinds
+from lerobot_memobench.eyes.labels import images_of
 from lerobot_memobench.eyes.pictures import make_pictures
 from lerobot_memobench.eyes.testing import outcomes, seeing
 from lerobot_memobench.eyes.weights import SHIPPED, load_eyes
@@ -25,8 +26,7 @@ def test_they_see_and_their_tokens_are_white(gl: str, tmp_path: Path) -> None:
     assert len(errors) > 40
     assert np.isfinite(errors).mean() > 0.8
     assert np.median(errors) < 0.6
-    images = torch.from_numpy(pictures.rows(np.arange(len(pictures)))["pixels"]).float() / 255
     with torch.inference_mode():
-        tokens = eyes.tower(images).flatten(0, 1)
+        tokens = eyes.tower(images_of(pictures.rows(np.arange(len(pictures))))).flatten(0, 1)
     assert tokens.mean(dim=0).abs().mean() < 0.3
     assert 0.5 < tokens.var(dim=0).mean() < 2

@@ -61,7 +61,6 @@ def test_eyes_come_back_from_their_file(small_tower: Callable[[], Tower], tmp_pa
 @torch.no_grad()
 def test_white_tokens_say_what_the_others_said(small_tower: Callable[[], Tower], tmp_path: Path) -> None:
     eyes, images = Eyes(trained_a_little(small_tower()), ("cork", "cap")).eval(), torch.rand(24, 3, SIDE, SIDE)
-    eyes.tower.fold()
     before = eyes(images)
     whiten(eyes, images.split(10))
     for said, was in zip(eyes(images), before, strict=True):

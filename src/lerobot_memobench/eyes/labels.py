@@ -60,6 +60,11 @@ Rows = NDArray[np.void]
 Array = NDArray[np.float64]
 
 
+def images_of(rows: Rows) -> torch.Tensor:
+    """Return the pictures of rows (N,) as the tower takes them, float (N, 3, SIDE, SIDE) in [0, 1]."""
+    return torch.from_numpy(rows["pixels"]).float() / 255
+
+
 class Labeller:
     """Take labelled pictures of one simulation."""
 

@@ -12,7 +12,7 @@ from scipy.optimize import linear_sum_assignment
 
 from lerobot_memobench.eyes.finding import found
 from lerobot_memobench.eyes.kinds import DRAWERS
-from lerobot_memobench.eyes.labels import Rows, projected, rays
+from lerobot_memobench.eyes.labels import Rows, images_of, projected, rays
 from lerobot_memobench.eyes.pictures import Pictures
 from lerobot_memobench.eyes.tower import Tower, shrunk
 from lerobot_memobench.eyes.walk import NEAR
@@ -54,8 +54,7 @@ def seeing(eyes: Eyes, *, pooled: bool = False) -> See:
 
     @torch.inference_mode()
     def see(rows: Rows) -> list[Things]:
-        images = torch.from_numpy(rows["pixels"]).float() / 255
-        return found(eyes(images)[int(pooled)])
+        return found(eyes(images_of(rows))[int(pooled)])
 
     return see
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.eyes.labels import Rows
+from lerobot_memobench.eyes.labels import Rows, images_of
 from lerobot_memobench.eyes.pictures import Pictures
 from lerobot_memobench.eyes.targets import loss, targets
 from lerobot_memobench.eyes.tower import GRID, POOLED, Tower
@@ -35,6 +35,8 @@ WINDOW = 10
 """Updates that one point of the curve is the mean of."""
 WHITENED = 2048
 """Pictures over which tokens are made white in the end."""
+BATCH = 64
+"""Pictures that are looked at together then."""
 CLIP = 5.0
 """Norm that a gradient is cut to."""
 
@@ -88,7 +90,6 @@ def train(
         if progress is not None and learner.update % WINDOW == 0:
             newest = ", ".join(f"{name} {value:.3f}" for name, value in learner.points[-1].items())
             progress(learner.update, settings.updates, newest)
-    learner.eyes.eval().tower.fold()
     whiten(learner.eyes, _some(pictures))
     save_eyes(learner.eyes, folder / WEIGHTS)
     return folder / WEIGHTS
@@ -97,8 +98,8 @@ def train(
 def _some(pictures: Pictures) -> Iterator[Tensor]:
     """Yield batches of pictures from all over."""
     chosen = np.linspace(0, len(pictures) - 1, min(len(pictures), WHITENED)).astype(np.int64)
-    for numbers in np.array_split(chosen, -(-len(chosen) // 64)):
-        yield torch.from_numpy(pictures.rows(numbers)["pixels"]).float() / 255
+    for numbers in np.array_split(chosen, -(-len(chosen) // BATCH)):
+        yield images_of(pictures.rows(numbers))
 
 
 class _Learner:
@@ -140,7 +141,7 @@ class _Learner:
 
     def _losses(self, rows: Rows) -> dict[str, Tensor]:
         chance = torch.Generator().manual_seed(self._settings.seed * 2**32 + self.update)
-        images = changed(torch.from_numpy(rows["pixels"]).float() / 255, chance)
+        images = changed(images_of(rows), chance)
         with torch.autocast("cpu", torch.bfloat16):
             said, said_pooled = self.eyes(images)
         kinds = len(self.eyes.kinds)

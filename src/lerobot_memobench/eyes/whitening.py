@@ -43,11 +43,12 @@ class _Moments:
 
 @torch.no_grad()
 def whiten(eyes: Eyes, batches: Iterable[Tensor]) -> None:
-    """Make the tokens of folded eyes white over pictures, batches of (N, 3, SIDE, SIDE) in [0, 1], and the pooled ones.
+    """Fold eyes and make their tokens, and pooled ones, white over pictures, batches of (N, 3, SIDE, SIDE) in [0, 1].
 
     What the heads say stays as it was.
     """
-    tower = eyes.tower
+    tower = eyes.eval().tower
+    tower.fold()
     ours, pooled = _Moments(tower.width), _Moments(tower.width)
     for images in batches:
         tokens = tower(images)
