@@ -13,12 +13,15 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.policies import make_policy, make_pre_post_processors
 from small_policy import batch_of, losses_in_training, made_for_training, small_config
+from torch.nn.functional import scaled_dot_product_attention
+from transformers.models.gemma import modeling_gemma
 
 from lerobot_memobench.datasets.memory_cache import FOLDER
 from lerobot_memobench.datasets.memory_cache.decoding import frame_reader
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.eyes.tower import GRID, POOLED, SIDE, WIDTH, Tower
 from lerobot_memobench.eyes.weights import Eyes, save_eyes
+from lerobot_memobench.policies.memobench_mem import fused_attention
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, STEPS, TOKENS
@@ -285,6 +288,38 @@ def test_every_kind_trains_and_the_tower_does_not(root: Path, seeing: dict[str, 
     assert all(parameter.grad is not None for parameter in policy.model.memory_parameters().values())
     assert policy.perception.project.weight.grad.any()
     assert not policy.perception.tower.training
+
+
+def test_attention_in_one_kernel_learns_the_same_and_acts_by_lerobots(
+    root: Path, seeing: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fused: list[bool] = []
+
+    def counting(*tensors: torch.Tensor, **named: Any) -> torch.Tensor:
+        fused.append(torch.is_grad_enabled())
+        return scaled_dot_product_attention(*tensors, **named)
+
+    monkeypatch.setattr(fused_attention, "scaled_dot_product_attention", counting)
+    policy, before, _, dataset = made_for_training(root, **seeing)
+    batch = before(batch_of(dataset, [10, 30, 50]))
+    layers = [module for module in policy.modules() if isinstance(module, modeling_gemma.GemmaAttention)]
+    found = []
+    for count in (policy.config.dimensions.vlm.depth, 0):
+        fused.clear()
+        policy.zero_grad()
+        loss, _ = policy.train().forward(batch)
+        loss.backward()
+        assert len(fused) == count
+        found.append([loss, *(weight.grad for weight in policy.get_optim_params())])
+        for layer in layers:
+            vars(layer).pop(fused_attention.MARK, None)
+    for ours, lerobots in zip(*found, strict=True):
+        torch.testing.assert_close(ours, lerobots, rtol=1e-3, atol=1e-5)
+    fused_attention.attend_fused(policy)
+    policy.eval().select_action(before(observed(root, dataset, 0)))
+    with torch.no_grad():
+        policy.forward(batch)
+    assert not fused
 
 
 def test_loss_falls(root: Path, seeing: dict[str, Any]) -> None:

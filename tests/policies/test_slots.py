@@ -121,9 +121,31 @@ def test_a_frame_that_many_read_is_encoded_once() -> None:
     alone, _ = memory(frames, numbers, mask)
     assert Counting.count == 8
     Counting.count = 0
-    shared, _ = memory(frames, numbers, mask, numbers=numbers)
+    shared = memory.shared(frames, numbers, mask, numbers)
     assert Counting.count == 6  # five frames, and the one that is none
-    assert torch.allclose(alone, shared, atol=1e-6)
+    assert torch.allclose(alone, shared.rows(), atol=1e-6)
+
+
+def test_a_frame_that_many_read_has_its_time_and_is_told_it_once() -> None:
+    class Counting(MemoryEncoder):
+        count = 0
+
+        def forward(self, tokens: torch.Tensor, *rest: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            Counting.count += tokens.shape[0] * tokens.shape[1]
+            return super().forward(tokens, *rest)
+
+    memory = PooledMemory(FramePool(range(KINDS), KINDS + 1, 2, 16), Counting(16, 24, grid=0))
+    stored = torch.cat([frame_row(seen(seed=n)[None], hand()[None], torch.ones(1)) for n in range(5)])
+    numbers = torch.tensor([[10, 11, 13, 14], [10, 12, -1, -1]])
+    mask, steps = numbers >= 0, (numbers - 10).clamp(min=0) * 8
+    frames = stored[(numbers - 10).clamp(min=0)] * mask[..., None, None]
+    alone, real = memory(frames, steps, mask)
+    assert Counting.count == 8
+    Counting.count = 0
+    shared = memory.shared(frames, steps, mask, numbers)
+    assert Counting.count == 6
+    assert torch.equal(real, shared.mask)
+    assert torch.allclose(alone, shared.rows(), atol=1e-6)
 
 
 def test_classes_keep_their_meaning_when_others_come() -> None:

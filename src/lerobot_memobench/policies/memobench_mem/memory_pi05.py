@@ -12,6 +12,7 @@ from lerobot_memobench.policies.memobench_mem.integration.context import Context
 from lerobot_memobench.policies.memobench_mem.integration.integration import Integration, Prefix
 from lerobot_memobench.policies.memobench_mem.integration.modulation import Modulation
 from lerobot_memobench.policies.memobench_mem.memory.registry import make_mechanism
+from lerobot_memobench.policies.memobench_mem.memory.tokens import MemoryTokens
 
 INTEGRATIONS: dict[str, type[Integration]] = {"modulation": Modulation, "context": Context}
 
@@ -53,16 +54,19 @@ class MemoryPI05(SizedPI05):
         """Encode tokens (B, F, P, D) seen at steps (B, F) and hand them to the integration.
 
         Args:
-            numbers: (B, F), equal where frames are; a perception that learns to remember encodes each once.
+            numbers: (B, F), equal where frames are; only of a perception that learns to remember, which encodes each
+                once.
 
         Returns:
             H (B, F*P, d_m) and its mask (B, F*P), for the alignment objectives.
         """
         assert self.integration is not None  # the policy asks no plain pi0.5
-        shared = {} if numbers is None else {"numbers": numbers}
-        memory, mask = self.memory(tokens, steps, frame_mask, **shared)
-        self.integration.hand_over(memory, mask)
-        return memory, mask
+        if numbers is None:
+            memory = MemoryTokens(*self.memory(tokens, steps, frame_mask))
+        else:
+            memory = self.memory.shared(tokens, steps, frame_mask, numbers)
+        self.integration.hand_over(memory)
+        return memory.rows(), memory.mask
 
     def embed_prefix(self, images: Any, img_masks: Any, tokens: Any, masks: Any) -> Prefix:
         """LeRobot's prefix (what is seen now, language), as the integration changes it."""

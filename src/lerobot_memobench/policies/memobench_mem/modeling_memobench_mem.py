@@ -30,6 +30,7 @@ from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import
 from lerobot_memobench.policies.memobench_mem.drawn_statistics import count_drawn_only
 from lerobot_memobench.policies.memobench_mem.execution_frames import Drawn, execution_starts, task_of_frames
 from lerobot_memobench.policies.memobench_mem.freed_memory import keep_freed_memory
+from lerobot_memobench.policies.memobench_mem.fused_attention import attend_fused
 from lerobot_memobench.policies.memobench_mem.learning import LearningPolicy
 from lerobot_memobench.policies.memobench_mem.memory.registry import make_mechanism
 from lerobot_memobench.policies.memobench_mem.memory.rollout import RolloutMemory
@@ -110,6 +111,8 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
             read_from_memory()
             drawn = np.ones(cache.num_frames, bool) if self.config.prompt_loss else cache.phase != 0
             count_drawn_only(meta.stats, cache, drawn)
+        if self.config.has_eyes:
+            attend_fused(self.model)
         if self._device.type == "cpu":
             keep_freed_memory()
         starts = None if self.config.prompt_loss else execution_starts(cache.episodes, cache.phase)

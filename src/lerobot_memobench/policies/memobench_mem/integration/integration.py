@@ -6,6 +6,8 @@ from abc import ABC, abstractmethod
 
 from torch import Tensor, nn
 
+from lerobot_memobench.policies.memobench_mem.memory.tokens import MemoryTokens
+
 Prefix = tuple[Tensor, Tensor, Tensor]
 """LeRobot's prefix: embeddings (B, N, D), which of them are real (B, N), and where attention blocks begin (B, N)."""
 
@@ -18,8 +20,8 @@ class Integration(ABC):
         """Make ``model`` ready: memory tokens are ``memory_dim`` wide, the action expert ``expert_dim``."""
 
     @abstractmethod
-    def hand_over(self, memory: Tensor, mask: Tensor) -> None:
-        """Take the memory (B, L, d_m), of which ``mask`` (B, L) is real, that the next passes read."""
+    def hand_over(self, memory: MemoryTokens) -> None:
+        """Take the memory, of width d_m, that the next passes read."""
 
     def prefix(self, prefix: Prefix) -> Prefix:
         """Return the prefix that the model sees, given LeRobot's."""

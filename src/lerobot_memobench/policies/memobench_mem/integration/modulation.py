@@ -14,6 +14,7 @@ from einops import rearrange, repeat
 from torch import Tensor, nn
 
 from lerobot_memobench.policies.memobench_mem.integration.integration import Integration
+from lerobot_memobench.policies.memobench_mem.memory.tokens import MemoryTokens
 
 _ROPE_BASE = 10_000.0
 
@@ -62,21 +63,22 @@ class MemoryModulator(nn.Module):
         nn.init.zeros_(self.modulation.weight)
         nn.init.zeros_(self.modulation.bias)
 
-    def keys(self, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Rotated keys and values, both (B, 1, L, head_dim), of memory (B, L, W)."""
-        normed = self.memory_norm(memory)
-        key, value = (rearrange(linear(normed), "b l d -> b 1 l d") for linear in (self.key, self.value))
-        return _rotate(key, torch.arange(memory.shape[1], device=memory.device)), value
+    def keys(self, memory: MemoryTokens) -> tuple[Tensor, Tensor]:
+        """Rotated keys and values, both (B, 1, L, head_dim), of memory of width W."""
+        normed = memory.through(self.memory_norm)
+        key, value = (rearrange(normed.through(linear).rows(), "b l d -> b 1 l d") for linear in (self.key, self.value))
+        return _rotate(key, torch.arange(key.shape[2], device=key.device)), value
 
     def forward(
-        self, actions: Tensor, memory: Tensor, mask: Tensor, keys: tuple[Tensor, Tensor] | None = None
+        self, actions: Tensor, memory: MemoryTokens, keys: tuple[Tensor, Tensor] | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Scale and shift, both (B, T, W), for actions (B, T, W) from memory (B, L, W) with mask (B, L).
+        """Scale and shift, both (B, T, W), for actions (B, T, W) from memory of width W.
 
         ``keys`` are those of the same memory, if they have been computed before. A row whose memory is all masked
         reads zeros.
         """
-        count, length = actions.shape[1], memory.shape[1]
+        mask = memory.mask
+        count, length = actions.shape[1], mask.shape[1]
         key, value = self.keys(memory) if keys is None else keys
         query = rearrange(self.query(self.action_norm(actions)), "b t (h d) -> b h t d", h=self.heads)
         query = _rotate(query, torch.arange(length, length + count, device=actions.device))
@@ -96,19 +98,18 @@ class MemoryModulator(nn.Module):
 
 @dataclass
 class SharedMemory:
-    """What every modulated layer reads during one forward pass: memory at the expert's width, and its mask.
+    """What every modulated layer reads during one forward pass: memory at the expert's width.
 
     It is kept until the next pass replaces it, because gradient checkpointing runs layers again in ``backward``. In a
     rollout the layers' keys of this memory are kept as well: all denoising steps of a plan read the same memory.
     """
 
-    memory: Tensor | None = None  # (B, L, W)
-    mask: Tensor | None = None  # (B, L) bool
+    memory: MemoryTokens | None = None
     keys: dict[nn.Module, tuple[Tensor, Tensor]] = field(default_factory=dict)
 
-    def set(self, memory: Tensor, mask: Tensor) -> None:
+    def set(self, memory: MemoryTokens) -> None:
         """Begin a pass over another memory."""
-        self.memory, self.mask = memory, mask
+        self.memory = memory
         self.keys.clear()
 
     def keys_of(self, modulator: MemoryModulator) -> tuple[Tensor, Tensor]:
@@ -137,10 +138,10 @@ class ModulatedNorm(nn.Module):
     def forward(self, x: Tensor, cond: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
         """Normalised and modulated x (B, T, W), and LeRobot's gate."""
         normed, gate = self.norm(x, cond=cond)
-        if self.state.memory is None or self.state.mask is None:
+        if self.state.memory is None:
             return normed, gate
         keys = self.state.keys_of(self.modulator)
-        scale, shift = self.modulator(x, self.state.memory, self.state.mask, keys)
+        scale, shift = self.modulator(x, self.state.memory, keys)
         return (normed * (1.0 + scale) + shift).to(normed.dtype), gate
 
 
@@ -158,9 +159,9 @@ class Modulation(Integration):
                 layer.post_attention_layernorm, MemoryModulator(expert_dim), self.shared
             )
 
-    def hand_over(self, memory: Tensor, mask: Tensor) -> None:
+    def hand_over(self, memory: MemoryTokens) -> None:
         """Begin a pass over this memory in every layer."""
-        self.shared.set(self.model.memory_to_expert(memory), mask)
+        self.shared.set(memory.through(self.model.memory_to_expert))
 
     def owns(self, name: str) -> bool:
         """Say whether a parameter is the projection's or a modulator's."""

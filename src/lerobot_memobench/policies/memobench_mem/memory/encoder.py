@@ -50,6 +50,8 @@ class MemoryEncoder(nn.Module):
     Tokens without a ``grid`` are told their time alone.
     """
 
+    framewise = True
+
     def __init__(self, image_dim: int, memory_dim: int, grid: int = GRID) -> None:
         super().__init__()
         self.grid = grid

@@ -71,7 +71,8 @@ class MemoryMechanism(ABC):
         """Build what turns frames read into memory tokens.
 
         It is called with tokens (B, F, P, D), their control steps (B, F) and which frames are real (B, F), and returns
-        tokens (B, L, d_m) and their mask (B, L). A recurrent memory goes through the frames here, in their order.
+        tokens (B, L, d_m) and their mask (B, L). A recurrent memory goes through the frames here, in their order; one
+        that looks at each frame alone says so (``framewise = True``) and is given a frame that many rows read once.
 
         Args:
             grid: side of the square of a picture's tokens; 0 where tokens have no place in a picture.
