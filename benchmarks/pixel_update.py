@@ -1,0 +1,100 @@
+"""A pixel policy's update as it is made beside one without what makes it quick, with a memory and without.
+
+    python benchmarks/pixel_update.py [--moments 6] [--episodes 12] [--repeats 5]
+
+The batch has several moments of each episode, which remember many of the same frames. The other side attends by
+LeRobot's eager attention and encodes each moment's memory by itself. Without a memory only the attention differs. An
+update is forward, backward, clipping, AdamW and the weight average, on one thread; seconds are of the CPU. Prints one
+JSON line: ratio (other side / as it is made) and seconds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from collections.abc import Callable
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import torch
+from turns import medians
+
+from lerobot_memobench.eyes.tower import GRID, POOLED, WIDTH
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.freed_memory import keep_freed_memory
+from lerobot_memobench.policies.memobench_mem.fused_attention import attend_fused
+from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, STEPS, TOKENS
+from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import sample_frames
+from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from lerobot_memobench.policies.memobench_mem.perception.eyes import seen_key
+from policies import config, training_batch
+
+SLOTS = 50
+"""Remembered frames of an episode: its prompt, and an execution of 250 steps."""
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--moments", type=int, default=6)
+    parser.add_argument("--episodes", type=int, default=12)
+    parser.add_argument("--repeats", type=int, default=5)
+    asked = parser.parse_args()
+    torch.set_num_threads(1)
+    keep_freed_memory()  # as training does, on both sides
+    result: dict[str, object] = {"benchmark": "pixel_update", "samples": asked.moments * asked.episodes}
+    for name, integration in {"memory": "modulation", "no_memory": "none"}.items():
+        settings = config("small", device="cpu", integration=integration)
+        batch = pixel_batch(settings, asked.episodes, asked.moments)
+        sides = {"made": updater(settings, batch, quick=True), "plain": updater(settings, batch, quick=False)}
+        seconds = medians(sides, asked.repeats, warm_up=2)
+        result[name] = {"ratio": round(seconds["plain"] / seconds["made"], 3)} | {
+            f"{side}_s": round(value, 4) for side, value in seconds.items()
+        }
+    print(json.dumps(result))
+
+
+def pixel_batch(settings: MemobenchMemConfig, episodes: int, moments: int) -> dict[str, torch.Tensor]:
+    """Return a preprocessed training batch of some moments of each of some episodes."""
+    torch.manual_seed(0)
+    rows, frames = episodes * moments, settings.memory_frames
+    numbers = torch.full((rows, frames), -1)
+    for row in range(rows):
+        read = torch.tensor(sample_frames(int(torch.randint(SLOTS // 3, SLOTS, ())), frames))
+        numbers[row, : len(read)] = row // moments * SLOTS + read
+    mask = numbers >= 0
+    stored = torch.randn(episodes * SLOTS, POOLED**2, WIDTH).to(torch.bfloat16)
+    batch = {key: value for key, value in training_batch(settings, rows).items() if "images" not in key}
+    for camera in settings.image_features:
+        batch[seen_key(camera)] = torch.randn(rows, GRID**2, WIDTH).to(torch.bfloat16)
+    return batch | {
+        TOKENS: stored[numbers.clamp(min=0)] * mask[..., None, None],
+        STEPS: numbers.clamp(min=0) % SLOTS * settings.memory_stride,
+        MASK: mask,
+        FRAMES: numbers,
+    }
+
+
+def updater(settings: MemobenchMemConfig, batch: dict[str, torch.Tensor], quick: bool) -> Callable[[], None]:
+    """Return a function that makes one update."""
+    torch.manual_seed(0)
+    policy = MemobenchMemPolicy(settings).train()
+    optimizer = settings.get_optimizer_preset().build(policy.get_optim_params())
+    seen = batch if quick else {key: value for key, value in batch.items() if key != FRAMES}
+    if quick:
+        attend_fused(policy)
+
+    def update() -> None:
+        loss, _ = policy.forward(seen)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
+        optimizer.step()
+        optimizer.zero_grad()
+        policy.update()
+
+    return update
+
+
+if __name__ == "__main__":
+    main()
