@@ -18,7 +18,7 @@ from lerobot_memobench.evaluation.records.runs import read_rollouts
 from lerobot_memobench.studies.alignment.settings import ALIGNMENTS
 from lerobot_memobench.studies.learning import stages as stages_module
 from lerobot_memobench.studies.learning.commands import Cost, run_once
-from lerobot_memobench.studies.learning.experiments import EXPERIMENTS, MEMORY, MEMORYLESS, changed
+from lerobot_memobench.studies.learning.experiments import MEMORY, MEMORYLESS, changed, experiment
 from lerobot_memobench.studies.learning.figure import COLOURS
 from lerobot_memobench.studies.learning.outcomes import outcomes_of
 from lerobot_memobench.studies.learning.stages import Stages
@@ -104,8 +104,8 @@ def test_an_experiment_runs_its_parts_in_order(tmp_path: Path, monkeypatch: pyte
 
     monkeypatch.setattr(stages_module, "run_once", fake)
     said: list[str] = []
-    experiment = changed(EXPERIMENTS["bowl"], seeds=2, steps=5, rollouts=10, first_seed=None)
-    text = learn(experiment, tmp_path / "out", said.append)
+    few = changed(experiment("bowl"), seeds=2, steps=5, rollouts=10, first_seed=None)
+    text = learn(few, tmp_path / "out", said.append)
     assert [words[1] for words in ran] == ["generate", *["train"] * 4, *["eval"] * 4]
     assert "--perturb" in ran[0]
     memoryless = [word for word in ran[2] if word not in ran[1]]
@@ -126,7 +126,7 @@ def test_an_experiment_runs_its_parts_in_order(tmp_path: Path, monkeypatch: pyte
 def test_a_killed_training_goes_on_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     given: dict[str, Any] = {}
     monkeypatch.setattr(stages_module, "run_once", lambda words, log, **options: given.update(options) or Cost(0, 0))
-    stages = Stages(replace(EXPERIMENTS["bowl"], seeds=1), tmp_path)
+    stages = Stages(replace(experiment("bowl"), seeds=1), tmp_path)
     half_made = stages.policy(MEMORY, 0) / "half_made"
     half_made.mkdir(parents=True)
     stages.train(MEMORY, 0)
@@ -142,7 +142,7 @@ def test_a_killed_training_goes_on_from_its_checkpoint(tmp_path: Path, monkeypat
 def test_what_is_told_in_training_is_told_in_rollouts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ran: dict[str, list[str]] = {}
     monkeypatch.setattr(stages_module, "run_once", lambda words, log, **options: ran.update({log.stem: words}))
-    stages = Stages(replace(EXPERIMENTS["bowl"], arms=ALIGNMENTS), tmp_path)
+    stages = Stages(replace(experiment("bowl"), arms=ALIGNMENTS), tmp_path)
     for arm in stages.experiment.arms:
         stages.evaluate(arm, 0)
     told = [name for name, words in ran.items() if "env.oracle_memory=true" in words]
@@ -150,17 +150,17 @@ def test_what_is_told_in_training_is_told_in_rollouts(tmp_path: Path, monkeypatc
     assert len(ran) == 6
 
 
-@pytest.mark.parametrize("perception", ["objects", "pixels"])
+@pytest.mark.parametrize(("perception", "steps"), [("objects", 1000), ("pixels", 2000)])
 def test_pictures_are_made_for_policies_that_see_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, perception: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, perception: str, steps: int
 ) -> None:
     ran: list[list[str]] = []
     monkeypatch.setattr(stages_module, "run_once", lambda words, log, **options: ran.append(words))
-    stages = Stages(replace(EXPERIMENTS["bowl"], perception=perception, settings=("batch_size=32",)), tmp_path)
+    stages = Stages(changed(experiment("bowl", perception), settings=("batch_size=32",)), tmp_path)
     stages.generate()
     stages.train(MEMORY, 0)
     assert ("--no-images" in ran[0]) == (perception == "objects")
-    assert {f"perception={perception}", "batch_size=32"} <= set(ran[1])
+    assert {f"perception={perception}", f"steps={steps}", "batch_size=32"} <= set(ran[1])
 
 
 @pytest.mark.parametrize(("task", "referent", "strict"), [(BOWL, "random", False), (TWIN, "drawn", True)])
@@ -169,6 +169,6 @@ def test_rollouts_are_of_the_demonstrations_kind(
 ) -> None:
     ran: list[str] = []
     monkeypatch.setattr(stages_module, "run_once", lambda words, log, **options: ran.extend(words))
-    Stages(replace(EXPERIMENTS["bowl"], tasks=(task,), referent=referent), tmp_path).evaluate(MEMORY, 0)
+    Stages(replace(experiment("bowl"), tasks=(task,), referent=referent), tmp_path).evaluate(MEMORY, 0)
     assert f"referent={referent}" in ran
     assert ("suite=strict" in ran) == strict

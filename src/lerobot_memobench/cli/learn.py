@@ -53,8 +53,8 @@ def learn(
 
     screen = console()
     given: dict[str, object] = {"episodes": episodes, "steps": steps, "seeds": seeds, "rollouts": rollouts}
-    given |= {"first_seed": first_seed, "perception": perception.value}
-    chosen = experiment(name.value)
+    given |= {"first_seed": first_seed}
+    chosen = experiment(name.value, perception.value)
     chosen = changed(chosen, **given, settings=(*chosen.settings, *(settings or ())))
     screen.print(run(chosen, out, lambda text: screen.print(text, soft_wrap=True), dataset=dataset, workers=workers))
     return 0

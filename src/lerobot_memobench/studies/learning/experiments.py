@@ -25,7 +25,8 @@ class Experiment:
     Attributes:
         tasks: task names, of one suite. episodes: demonstrations of each, two thirds of them with the arm moved off
             its way; 0 where they are given.
-        steps: updates. settings: more words for `lerobot train`, of all arms.
+        steps: updates. pixel_steps: updates from pixels, where these are others.
+        settings: more words for `lerobot train`, of all arms.
         arms: name -> words for `lerobot train`.
         perception: `objects`, or `pixels`: then demonstrations have pictures.
         seeds: of training; the first ``seeds`` numbers.
@@ -38,6 +39,7 @@ class Experiment:
     settings: tuple[str, ...] = ()
     arms: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: ARMS)
     perception: str = OBJECTS
+    pixel_steps: int | None = None
     seeds: int = 1
     rollouts: int = 50
     first_seed: int = EVALUATION_SEEDS
@@ -49,13 +51,15 @@ def prompted() -> tuple[str, ...]:
     return tuple(name for name in task_names() if get_task(name).prompt is not None)
 
 
-def experiment(name: str) -> Experiment:
-    """Return the experiment of a name in `EXPERIMENTS`."""
-    return EXPERIMENTS[name]
+def experiment(name: str, perception: str = OBJECTS) -> Experiment:
+    """Return the experiment of a name in `EXPERIMENTS`, by policies that see in this way."""
+    named = EXPERIMENTS[name]
+    steps = named.steps if perception == OBJECTS else named.pixel_steps or named.steps
+    return replace(named, perception=perception, steps=steps)
 
 
 EXPERIMENTS: dict[str, Experiment] = {
-    "bowl": Experiment((BOWL,), episodes=120, steps=1000, seeds=3),
+    "bowl": Experiment((BOWL,), episodes=120, steps=1000, pixel_steps=2000, seeds=3),
     "prompted": Experiment(prompted(), episodes=40, steps=8_000),
     "joint": Experiment(tuple(task_names()), episodes=40, steps=20_000),
 }
