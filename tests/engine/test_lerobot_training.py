@@ -143,6 +143,16 @@ def test_the_held_out_part_has_no_prompt_either(tmp_path: Path) -> None:
     assert tasks.tolist() == [held_out.dataset.hf_dataset[k]["task_index"].item() for k in held_out.indices]
 
 
+@pytest.mark.parametrize("prompt_loss", [False, True])
+def test_a_policy_with_phases_is_tested_on_what_it_learns(tmp_path: Path, prompt_loss: bool) -> None:
+    from synthetic_dataset import make_dataset
+
+    policy = MemobenchMemConfig(device="cpu", push_to_hub=False, prompt_loss=prompt_loss)
+    train, held_out = opened(make_dataset(tmp_path / "two", repeats=2), policy, eval_split=0.5)
+    assert len(drawn(train)) == sum(LENGTHS)
+    assert len(held_out) == sum(LENGTHS) - (0 if prompt_loss else PROMPTS[1])
+
+
 def test_what_is_no_dataset_of_ours_stays_as_it_is(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(execution_frames, "COLUMNS", {"phase", "nothing_of_ours"})
     assert drawn(opened(root, act())[0]) == set(range(sum(LENGTHS)))

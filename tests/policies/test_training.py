@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import re
 import sys
@@ -14,7 +15,10 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.scripts.lerobot_train import train
 from safetensors import safe_open
 
+from lerobot_memobench.engine.lerobot_training import trained_on
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.training_curve import NUMBERS
+from synthetic_dataset import make_dataset
 
 
 def _config(root: Path, output: Path, steps: int, save_freq: int, **fields: Any) -> TrainPipelineConfig:
@@ -62,6 +66,19 @@ def test_training_saves_and_goes_on(
     monkeypatch.setattr(sys, "argv", ["lerobot-train", f"--config_path={config_path}", "--resume=true", "--steps=3"])
     train()  # type: ignore[call-arg]
     assert _updates(checkpoints / "000003") == 3
+
+
+def test_the_loss_of_held_out_episodes_lies_beside_the_checkpoint(
+    tmp_path: Path, logs: pytest.LogCaptureFixture
+) -> None:
+    config = _config(make_dataset(tmp_path / "two", repeats=2), tmp_path / "run", 10, 10, chunk_size=8)
+    config.dataset.eval_split, config.eval_steps = 0.5, 5
+    with trained_on(None):
+        train(config)
+    numbers = json.loads((tmp_path / "run/checkpoints/000010/pretrained_model" / NUMBERS).read_text())
+    lerobots = [float(loss) for loss in re.findall(r"eval_loss=([\d.]+)", logs.text)]
+    assert [look["updates"] for look in numbers["held_out"]] == [5, 10]
+    assert [look["action_loss"] for look in numbers["held_out"]] == pytest.approx(lerobots, abs=1e-4)
 
 
 @pytest.mark.slow

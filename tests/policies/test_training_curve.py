@@ -29,3 +29,18 @@ def test_points_are_means_and_go_on(tmp_path: Path) -> None:
     assert [point["action_loss"] for point in again.points] == pytest.approx([*means, 7.0])
     assert (tmp_path / NUMBERS).is_file()
     assert TrainingCurve.read(tmp_path / "elsewhere").points == []
+
+
+def test_looks_at_held_out_episodes_lie_between_updates(tmp_path: Path) -> None:
+    curve = TrainingCurve()
+    for loss in (1.0, 3.0):
+        curve.note_held_out({"action_loss": loss, "loss": 9.0})
+    for _ in range(WINDOW + 4):
+        curve.note({"action_loss": 0.5})
+    curve.note_held_out({"action_loss": 0.25})
+    curve.save(tmp_path)
+    assert curve.held_out == [
+        {"updates": 0, "action_loss": 2.0},
+        {"updates": WINDOW + 4, "action_loss": 0.25},
+    ]
+    assert TrainingCurve.read(tmp_path).held_out == curve.held_out

@@ -73,6 +73,8 @@ def _steered(make: Callable[..., Any], prompt_frames: bool | None, obs_type: str
         _choose_inputs(config.policy, train.meta.features, obs_type)
         wanted = config.policy is None or knows_phases(config.policy) if prompt_frames is None else prompt_frames
         if wanted:
+            if held_out is not None and getattr(config.policy, "prompt_loss", True) is False:
+                held_out = ExecutionFrames(held_out)  # such a policy sees to what it trains on, and not to this
             return train, held_out
         count = leave_out_prompts(train)
         told = "the frames" if count is None else f"{count} frames"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from lerobot_memobench.files import draft_of
@@ -24,6 +25,7 @@ def draw_curve(
     window: int,
     path: Path,
     *,
+    marked: Mapping[str, Sequence[tuple[float, float]]] = MappingProxyType({}),
     hidden: Collection[str] = (),
     shares: Collection[str] = (),
     columns: int = 4,
@@ -31,6 +33,7 @@ def draw_curve(
     """Draw means over windows of so many updates to a PNG; nothing before the first.
 
     Args:
+        marked: name -> losses beside these, each after so many updates.
         hidden: names of what is left out. shares: names of what is no loss, and runs from 0 to 1.
         columns: of the legend.
     """
@@ -48,6 +51,9 @@ def draw_curve(
     for name, look in looks.items():
         own = right if right is not None and name in shares else axis
         own.plot(updates, [point.get(name) for point in points], **look, lw=1.2, label=name)
+    for name, places in marked.items():
+        if places:
+            axis.plot(*zip(*places, strict=True), "o--", color="black", ms=3, lw=0.8, label=name)
     axis.set(xlabel="updates", ylabel="loss", yscale="log")
     if right is not None:
         right.set(ylabel="share", ylim=(0, 1))

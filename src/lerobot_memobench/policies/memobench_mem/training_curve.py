@@ -14,6 +14,7 @@ from lerobot_memobench.files.reading import read_json
 PICTURE, NUMBERS = "training_curve.png", "training_curve.json"
 WINDOW = 10
 """Updates that one point is the mean of."""
+LOSS = "action_loss"
 SHARES = ("align_top1",)
 """What is no loss, and runs from 0 to 1."""
 HIDDEN = ("loss", "align_grad_norm", "align_temperature")
@@ -25,32 +26,48 @@ class TrainingCurve:
 
     Attributes:
         points: one per whole window, name -> mean.
+        held_out: one per look at episodes that are not trained on: after how many updates, and the actions' mean loss.
     """
 
     def __init__(self) -> None:
         self.points: list[dict[str, float]] = []
+        self.held_out: list[dict[str, float]] = []
         self._window: list[dict[str, float]] = []
+        self._unseen: list[float] = []
 
     def note(self, logged: Mapping[str, Any]) -> None:
         """Take in what one update logged; lists are left out."""
+        self._end_look()
         self._window.append({name: float(value) for name, value in logged.items() if isinstance(value, int | float)})
         if len(self._window) == WINDOW:
             self.points.append(dict(sorted(mean_of(self._window).items())))
             self._window = []
 
+    def note_held_out(self, logged: Mapping[str, Any]) -> None:
+        """Take in what one batch of held-out episodes logged; those between two updates make one look."""
+        self._unseen.append(logged[LOSS])
+
+    def _end_look(self) -> None:
+        if self._unseen:
+            updates = WINDOW * len(self.points) + len(self._window)
+            self.held_out.append({"updates": updates, LOSS: sum(self._unseen) / len(self._unseen)})
+            self._unseen = []
+
     def save(self, folder: Path) -> None:
         """Write numbers and picture to a checkpoint's folder; nothing before the first whole window."""
+        self._end_look()
         if not self.points:
             return
-        write_file(folder / NUMBERS, json.dumps({"updates_per_point": WINDOW, "points": self.points}))
-        draw_curve(self.points, WINDOW, folder / PICTURE, hidden=HIDDEN, shares=SHARES, columns=3)
+        numbers = {"updates_per_point": WINDOW, "points": self.points, "held_out": self.held_out}
+        write_file(folder / NUMBERS, json.dumps(numbers))
+        looks = {f"{LOSS}, held out": [(look["updates"], look[LOSS]) for look in self.held_out]}
+        draw_curve(self.points, WINDOW, folder / PICTURE, marked=looks, hidden=HIDDEN, shares=SHARES, columns=3)
 
     @classmethod
     def read(cls, folder: Path) -> TrainingCurve:
         """Return the curve of a checkpoint's folder, to go on with; an empty one where there is none."""
         found = cls()
         if (folder / NUMBERS).is_file():
-            found.points = read_json(folder / NUMBERS, dict[str, Any], "remove it; the curve then begins anew")[
-                "points"
-            ]
+            told = read_json(folder / NUMBERS, dict[str, Any], "remove it; the curve then begins anew")
+            found.points, found.held_out = told["points"], told.get("held_out", [])
         return found
