@@ -6,13 +6,17 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import mujoco
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.observations import EXECUTION
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.expert import Expert, steps_of
+from lerobot_memobench.experts.hand import Hand
+from lerobot_memobench.experts.surroundings import stands_out
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import Atom, atoms
@@ -161,6 +165,34 @@ def test_what_was_dropped_is_picked_up_again() -> None:
 
     assert not play(get_task(BOWL), 10_000, disturb=let_go).faults
     assert left == 0
+
+
+def test_what_leans_in_a_drawer_is_laid_down_again() -> None:
+    """A bowl that stands out of its drawer, as one came to do in a thousand episodes, keeps it from being shut."""
+    task = get_task("check_the_middle_drawer_and_put_the_black_bowl_in_the_top_drawer_and_close_it")
+    bowl, drawer = "akita_black_bowl_1", "wooden_cabinet_1_top_region"
+    place = np.array([-0.0681, -0.0323, -0.0159])
+    turn = np.array([[-0.9705, 0.0509, 0.2356], [0.0136, -0.9644, 0.2641], [0.2406, 0.2595, 0.9353]])
+    leans = 0
+
+    def lean(episode: Episode, action: np.ndarray) -> np.ndarray:
+        nonlocal leans
+        sim = episode.sim
+        (x, y, z), _ = sim.body_pose(bowl)
+        released = sim.holds(Atom("in", (bowl, drawer))) and np.linalg.norm(sim.eef_pose()[0] - (x, y, z)) > 0.1
+        if released and not leans:
+            leans += 1
+            centre, rotation = sim.site_pose(drawer)
+            quaternion = Rotation.from_matrix(rotation @ turn).as_quat(scalar_first=True)
+            joint = sim.data.joint(sim.model.body(bowl).jntadr[0])
+            joint.qpos = np.concatenate([centre + rotation @ place, quaternion])
+            joint.qvel = 0.0
+            mujoco.mj_forward(sim.model, sim.data)
+            assert stands_out(Hand(sim, np.random.default_rng(0)), bowl, drawer)
+        return action
+
+    assert not play(task, 10_000, disturb=lean).faults
+    assert leans == 1
 
 
 def test_a_handle_that_slipped_is_taken_again() -> None:

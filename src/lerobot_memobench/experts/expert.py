@@ -11,7 +11,7 @@ from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.experts import motions
 from lerobot_memobench.experts.hand import OPEN, UP, Hand
 from lerobot_memobench.experts.plans import Step, counts, plan_of
-from lerobot_memobench.experts.surroundings import drawer_around
+from lerobot_memobench.experts.surroundings import drawer_around, stands_out
 from lerobot_memobench.sim.scene import TABLE, TABLE_TOP
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.evaluator import Evaluator
@@ -156,10 +156,10 @@ class Expert:
                 raise MemobenchError(f"the expert has no motion for {atom}")
 
     def _bring(self, atom: Atom, once: Callable[[], Doing]) -> Doing:
-        """Pick and place until it holds: a thing may slip on the way."""
+        """Pick and place until it holds: a thing may slip on the way, or come to lean on a drawer's wall."""
         for _ in range(TRIES):
             yield from once()
-            if self._holds(atom):
+            if self._holds(atom) and not (atom.predicate == "in" and stands_out(self.hand, *atom.args)):
                 return
 
     def _put_on(self, name: str, support: str) -> Doing:

@@ -21,6 +21,8 @@ HAND_POINTS = np.array(
     + [(x, y, -z) for x in (-0.05, 0.0, 0.05) for y in (-0.05, 0.0, 0.05) for z in (0.14, 0.18)]
 )
 """Places on palm and wrist in the grip site's frame (N, 3), m."""
+MOST_OVER = 0.022
+"""By how much a thing may be higher than a drawer's room and still go in with it, m."""
 CLEAR = 0.025
 """Height left over what stands on the way, m."""
 
@@ -44,6 +46,14 @@ def drawer_around(hand: Hand, name: str) -> str | None:
             if articulation.kind == "drawer" and hand.sim.holds(Atom("in", (name, asset.regions[region]))):
                 return asset.regions[region]
     return None
+
+
+def stands_out(hand: Hand, name: str, region: str) -> bool:
+    """Say whether a thing in a drawer is so far above it that the drawer cannot be shut: a bowl that leans, say."""
+    position, rotation = hand.sim.body_pose(name)
+    highest = position[2] + (rotation @ corners(hand.sim.assets[name]))[2].max()
+    over: float = highest - hand.sim.site_pose(region)[0][2] - hand.sim.site_half_size(region)[2]
+    return over > MOST_OVER
 
 
 def tall_boxes(hand: Hand, name: str) -> list[tuple[Array, Array, Array]]:
