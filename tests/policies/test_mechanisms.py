@@ -95,3 +95,16 @@ def test_frame_sampling_loads_no_more_than_it_reads() -> None:
 def test_what_the_configuration_names_is_there() -> None:
     assert {MemobenchMemConfig(device="cpu", integration=name).memory for name in INTEGRATIONS} <= set(MECHANISMS)
     assert {*INTEGRATION_CLASSES, "none"} == set(INTEGRATIONS)
+
+
+@pytest.mark.parametrize("name", MECHANISMS)
+def test_an_encoder_that_looks_at_each_frame_alone_does(name: str) -> None:
+    encoder = make_mechanism(name, 4).encoder(D, 6, grid=0)
+    if not getattr(encoder, "framewise", False):
+        return
+    tokens, steps = torch.randn(2, 4, P, D), torch.randint(0, 90, (2, 4))
+    mask = torch.tensor([[True, True, True, True], [True, True, False, False]])
+    together, real = encoder(tokens, steps, mask)
+    alone, real_alone = encoder(tokens.flatten(0, 1)[:, None], steps.flatten()[:, None], mask.flatten()[:, None])
+    assert torch.equal(real, real_alone.reshape(real.shape))
+    torch.testing.assert_close(together, alone.reshape(together.shape))
