@@ -6,7 +6,9 @@ Each ends in a result or in a sentence, whether a value, a text, a column or a b
 from __future__ import annotations
 
 import contextlib
+import json
 import random
+import shutil
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,6 +28,7 @@ from lerobot_memobench.datasets.hdf5.writing import write_task_file
 from lerobot_memobench.datasets.lerobot_format import write_dataset
 from lerobot_memobench.datasets.replay import resimulate
 from lerobot_memobench.datasets.staging.stage import stage_demonstration
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks import get_task
 
 from .. import mutations
@@ -207,3 +210,14 @@ def test_what_is_whole_gives_a_result(source: Path, tmp_path: Path) -> None:
 def test_much_damaged_data(source: Path, tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     found = check(source, tmp_path, kind, True, monkeypatch)
     print(f"{kind}: {found['result']} results, {found['refused']} refused")
+
+
+def test_a_feature_larger_than_memory_is_told_before_it_is_taken(source: Path, tmp_path: Path) -> None:
+    """LeRobot would take memory for all that it tells of: 23 GB of six frames, and the kernel ended the process."""
+    folder = shutil.copytree(source / DATASET, tmp_path / "dataset")
+    info = json.loads((folder / "meta" / "info.json").read_text())
+    info["features"]["observation.environment_state"]["shape"][0] *= 10**6
+    (folder / "meta" / "info.json").write_text(json.dumps(info))
+    with pytest.raises(MemobenchError, match=r"more than 50,000,000 numbers of observation\.environment_state"):
+        commands.describe(folder, tmp_path / "out")
+    assert not (tmp_path / "out").exists()

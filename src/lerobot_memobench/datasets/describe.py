@@ -16,7 +16,7 @@ import numpy as np
 from lerobot_memobench.datasets.demonstration import CAMERAS
 from lerobot_memobench.datasets.lerobot_format.card import statistics_section
 from lerobot_memobench.datasets.lerobot_format.card_tables import ordered_types, storage_by_frames
-from lerobot_memobench.datasets.lerobot_format.info import undamaged
+from lerobot_memobench.datasets.lerobot_format.info import read_info, undamaged
 from lerobot_memobench.datasets.lerobot_format.layout import MANIFEST_FILE, image_key
 from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, list_episodes
 from lerobot_memobench.datasets.manifest import read_manifest
@@ -58,6 +58,7 @@ def describe(folder: Path, out: Path, say: Say = lambda _: None) -> list[Path]:
         MemobenchError: the folder is no dataset, or none of its episodes is one of this benchmark.
     """
     rows, hashes = _known(folder, say), folder / MANIFEST_FILE
+    read_info(folder)
     with undamaged(folder):
         card = _card_tables(folder)
         tables = card or _tables_of(folder, rows)

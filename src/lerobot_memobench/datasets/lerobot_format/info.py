@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated, Any, NotRequired, TypedDict
@@ -13,6 +14,10 @@ from lerobot_memobench.files.reading import Count, read_json, refusing
 
 INFO_FILE = Path("meta") / "info.json"
 ADVICE = "the dataset is damaged; generate it or take it from its source again"
+
+
+MOST_NUMBERS = 50_000_000
+"""Of a feature in one frame: a picture of 4096 x 4096. LeRobot takes memory for as many as a dataset tells."""
 
 
 class Info(TypedDict):
@@ -29,12 +34,19 @@ def read_info(folder: Path) -> dict[str, Any]:
     """Return ``meta/info.json`` of the dataset in ``folder``.
 
     Raises:
-        MemobenchError: there is none, or it is none of LeRobot's.
+        MemobenchError: there is none, it is none of LeRobot's, or a feature is larger than main memory.
     """
     try:
         found: dict[str, Any] = read_json(folder / INFO_FILE, Info, ADVICE)
     except FileNotFoundError:
         raise MemobenchError(f"{folder} is no dataset (there is no {INFO_FILE}); name one that was generated") from None
+    for name, feature in found["features"].items():
+        shape = feature.get("shape")
+        sizes = [size for size in shape if isinstance(size, int)] if isinstance(shape, list) else []
+        if math.prod(min(abs(size), MOST_NUMBERS + 1) for size in sizes) > MOST_NUMBERS:
+            raise MemobenchError(
+                f"{folder / INFO_FILE} tells of more than {MOST_NUMBERS:,} numbers of {name[:80]} a frame; {ADVICE}"
+            )
     return found
 
 
