@@ -28,7 +28,7 @@ from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, 
 from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import sample_frames
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.perception.eyes import seen_key
-from policies import config, training_batch
+from policies import config, training_batch, updates
 
 SLOTS = 50
 """Remembered frames of an episode: its prompt, and an execution of 250 steps."""
@@ -79,21 +79,11 @@ def pixel_batch(settings: MemobenchMemConfig, episodes: int, moments: int) -> di
 def updater(settings: MemobenchMemConfig, batch: dict[str, torch.Tensor], quick: bool) -> Callable[[], None]:
     """Return a function that makes one update."""
     torch.manual_seed(0)
-    policy = MemobenchMemPolicy(settings).train()
-    optimizer = settings.get_optimizer_preset().build(policy.get_optim_params())
-    seen = batch if quick else {key: value for key, value in batch.items() if key != FRAMES}
-    if quick:
-        attend_fused(policy)
-
-    def update() -> None:
-        loss, _ = policy.forward(seen)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
-        optimizer.step()
-        optimizer.zero_grad()
-        policy.update()
-
-    return update
+    policy = MemobenchMemPolicy(settings)
+    if not quick:
+        return updates(policy, {key: value for key, value in batch.items() if key != FRAMES})
+    attend_fused(policy)
+    return updates(policy, batch)
 
 
 if __name__ == "__main__":

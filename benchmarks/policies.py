@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +12,7 @@ from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TO
 
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.dimensions import SIZES, Gemma, Vision
+from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 
 # A size between tiny and pi05 that a CPU can train, with the full size's proportions: 256 patches per image, a VLM
 # that is wider than its expert, a chunk of 50, memory of 512 tokens.
@@ -41,6 +43,25 @@ def config(size: str, **fields: Any) -> MemobenchMemConfig:
         output_features={"action": PolicyFeature(type=FeatureType.ACTION, shape=(7,))},
         **fields,
     )
+
+
+def updates(policy: MemobenchMemPolicy, batch: Mapping[str, torch.Tensor]) -> Callable[[], None]:
+    """Return a function that makes one update of a policy on a batch, as training does, and waits for its end."""
+    policy.train()
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+    there = {key: value.to(policy.config.device) for key, value in batch.items()}
+
+    def update() -> None:
+        loss, _ = policy.forward(there)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
+        optimizer.step()
+        optimizer.zero_grad()
+        policy.update()
+        if policy.config.device != "cpu":
+            torch.cuda.synchronize()
+
+    return update
 
 
 def observation(settings: MemobenchMemConfig, rows: int) -> dict[str, torch.Tensor]:

@@ -23,7 +23,7 @@ import torch
 from turns import medians
 
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from policies import config, training_batch
+from policies import config, training_batch, updates
 
 SIDES = {"memory": {"integration": "modulation"}, "plain": {"integration": "none"}}
 
@@ -68,21 +68,7 @@ def stepper(size: str, rows: int, device: str, fields: dict[str, Any]) -> Callab
     """Return a function that takes one training step."""
     torch.manual_seed(0)
     settings = config(size, device=device, **fields)
-    policy = MemobenchMemPolicy(settings).train()
-    optimizer = settings.get_optimizer_preset().build(policy.get_optim_params())
-    batch = {key: value.to(device) for key, value in training_batch(settings, rows).items()}
-
-    def step() -> None:
-        loss, _ = policy.forward(batch)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
-        optimizer.step()
-        optimizer.zero_grad()
-        policy.update()
-        if device != "cpu":
-            torch.cuda.synchronize()
-
-    return step
+    return updates(MemobenchMemPolicy(settings), training_batch(settings, rows))
 
 
 def count_operations(fields: dict[str, Any]) -> int:

@@ -52,8 +52,7 @@ def learn(
     from lerobot_memobench.studies.learning.study import learn as run
 
     screen = console()
-    given: dict[str, object] = {"episodes": episodes, "steps": steps, "seeds": seeds, "rollouts": rollouts}
-    given |= {"first_seed": first_seed}
+    given = {"episodes": episodes, "steps": steps, "seeds": seeds, "rollouts": rollouts, "first_seed": first_seed}
     chosen = experiment(name.value, perception.value)
     chosen = changed(chosen, **given, settings=(*chosen.settings, *(settings or ())))
     screen.print(run(chosen, out, lambda text: screen.print(text, soft_wrap=True), dataset=dataset, workers=workers))

@@ -72,14 +72,13 @@ def _steered(make: Callable[..., Any], prompt_frames: bool | None, obs_type: str
         train, held_out = make(config)
         _choose_inputs(config.policy, train.meta.features, obs_type)
         wanted = config.policy is None or knows_phases(config.policy) if prompt_frames is None else prompt_frames
-        if wanted:
-            if held_out is not None and getattr(config.policy, "prompt_loss", True) is False:
-                held_out = ExecutionFrames(held_out)  # such a policy sees to what it trains on, and not to this
-            return train, held_out
-        count = leave_out_prompts(train)
-        told = "the frames" if count is None else f"{count} frames"
-        logger.info("%s of prompts are left out of the %d to train on", told, train.num_frames)
-        if held_out is not None and leave_out_prompts(held_out):
+        if not wanted:
+            count = leave_out_prompts(train)
+            told = "the frames" if count is None else f"{count} frames"
+            logger.info("%s of prompts are left out of the %d to train on", told, train.num_frames)
+        # A policy that draws execution frames alone sees to what it trains on, and not to what it is tested on.
+        tested = wanted and getattr(config.policy, "prompt_loss", True)
+        if held_out is not None and not tested and leave_out_prompts(held_out):
             held_out = ExecutionFrames(held_out)
         return train, held_out
 

@@ -14,8 +14,6 @@ from lerobot_memobench.files.reading import Count, read_json, refusing
 
 INFO_FILE = Path("meta") / "info.json"
 ADVICE = "the dataset is damaged; generate it or take it from its source again"
-
-
 MOST_NUMBERS = 50_000_000
 """Of a feature in one frame: a picture of 4096 x 4096. LeRobot takes memory for as many as a dataset tells."""
 
@@ -34,7 +32,7 @@ def read_info(folder: Path) -> dict[str, Any]:
     """Return ``meta/info.json`` of the dataset in ``folder``.
 
     Raises:
-        MemobenchError: there is none, it is none of LeRobot's, or a feature is larger than main memory.
+        MemobenchError: there is none, it is none of LeRobot's, or a feature is too large.
     """
     try:
         found: dict[str, Any] = read_json(folder / INFO_FILE, Info, ADVICE)
@@ -43,7 +41,7 @@ def read_info(folder: Path) -> dict[str, Any]:
     for name, feature in found["features"].items():
         shape = feature.get("shape")
         sizes = [size for size in shape if isinstance(size, int)] if isinstance(shape, list) else []
-        if math.prod(min(abs(size), MOST_NUMBERS + 1) for size in sizes) > MOST_NUMBERS:
+        if abs(math.prod(sizes)) > MOST_NUMBERS:
             raise MemobenchError(
                 f"{folder / INFO_FILE} tells of more than {MOST_NUMBERS:,} numbers of {name[:80]} a frame; {ADVICE}"
             )

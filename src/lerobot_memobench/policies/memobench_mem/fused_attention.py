@@ -35,7 +35,7 @@ def attend_fused(model: nn.Module) -> None:
         if not (hasattr(module, MARK) and torch.is_grad_enabled()):
             weighed: tuple[Tensor, Tensor] = original(module, query, key, value, mask, scaling, **more)
             return weighed
-        key, value = (kept.repeat_interleave(query.shape[1] // kept.shape[1], dim=1) for kept in (key, value))
+        key, value = (modeling_gemma.repeat_kv(kept, module.num_key_value_groups) for kept in (key, value))
         read = scaled_dot_product_attention(query, key, value, attn_mask=mask, scale=scaling)
         return read.transpose(1, 2).contiguous(), None
 

@@ -78,7 +78,10 @@ class LearningPolicy(SeeingPolicy):
                 weighted, numbers = alignment_loss(self.alignment, self.config.align_weight, batch, *memory, encoder)
                 per_sample, total, logged = per_sample + weighted, total + weighted, logged | numbers
         logged["loss"] = total.item()
-        (self.curve.note if self.training else self.curve.note_held_out)(logged)
+        if self.training:
+            self.curve.note(logged)
+        else:
+            self.curve.note_held_out(logged)
         return (per_sample, logged) if reduction == "none" else (total, logged)
 
     def _require_memory(self, batch: dict[str, Tensor]) -> None:

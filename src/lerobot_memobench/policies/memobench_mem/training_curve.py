@@ -33,7 +33,7 @@ class TrainingCurve:
         self.points: list[dict[str, float]] = []
         self.held_out: list[dict[str, float]] = []
         self._window: list[dict[str, float]] = []
-        self._unseen: list[float] = []
+        self._unseen: list[dict[str, float]] = []
 
     def note(self, logged: Mapping[str, Any]) -> None:
         """Take in what one update logged; lists are left out."""
@@ -45,12 +45,12 @@ class TrainingCurve:
 
     def note_held_out(self, logged: Mapping[str, Any]) -> None:
         """Take in what one batch of held-out episodes logged; those between two updates make one look."""
-        self._unseen.append(logged[LOSS])
+        self._unseen.append({LOSS: logged[LOSS]})
 
     def _end_look(self) -> None:
         if self._unseen:
             updates = WINDOW * len(self.points) + len(self._window)
-            self.held_out.append({"updates": updates, LOSS: sum(self._unseen) / len(self._unseen)})
+            self.held_out.append({"updates": updates, **mean_of(self._unseen)})
             self._unseen = []
 
     def save(self, folder: Path) -> None:
