@@ -15,6 +15,10 @@ BAND = 64
 """Height of the text over the pictures, pixels."""
 CLOCK = 96
 """Width that is left to the clock, pixels."""
+CLOCK_BOTTOM = 24
+"""Height from the upper edge to under the clock, pixels."""
+MARGIN = 8
+"""Left free on both sides, pixels."""
 _BACKGROUND, _TEXT, _FAINT = (24, 26, 30), (240, 240, 240), (150, 155, 165)
 OPERATION_COLOURS = {"S": (86, 180, 233), "U": (230, 159, 0), "C": (0, 158, 115)}
 """Storage, Update, Compression: Okabe and Ito's palette, apart for the colour-blind too."""
@@ -41,7 +45,7 @@ def _fit(draw: ImageDraw.ImageDraw, text: str, size: int, width: int) -> tuple[s
 def annotate(images: dict[str, NDArray[np.uint8]], episode: Episode) -> NDArray[np.uint8]:
     """Return a frame (BAND + height, 2 · width, 3) uint8 of the present step.
 
-    What does not change is not drawn again: the band is until a checkpoint is done, a clock once per number.
+    What does not change is not drawn again: the band until a checkpoint is done, the clock's word and digits never.
     """
     pictures = list(images.values())
     height, width = pictures[0].shape[0], sum(picture.shape[1] for picture in pictures)
@@ -50,8 +54,8 @@ def annotate(images: dict[str, NDArray[np.uint8]], episode: Episode) -> NDArray[
     operations = tuple(checkpoint.operation for checkpoint in episode.task.checkpoints)
     done = 0 if prompt else episode.progress.index
     frame[:BAND] = _band(width, episode.task.language, operations, done, _now(episode), prompt)
-    clock = _clock(f"prompt {episode.step_index}" if prompt else f"step {episode.exec_steps}", prompt)
-    frame[: len(clock), width - clock.shape[1] :] = clock
+    clock = _clock("prompt", episode.step_index, prompt) if prompt else _clock("step", episode.exec_steps, prompt)
+    frame[:CLOCK_BOTTOM, width - MARGIN - clock.shape[1] : width - MARGIN] = clock
     np.concatenate(pictures, axis=1, out=frame[BAND:])
     return frame
 
@@ -64,8 +68,8 @@ def _band(
     band = Image.new("RGB", (width, BAND), _BACKGROUND)
     draw = ImageDraw.Draw(band)
     text, font = _fit(draw, language, 14, width - CLOCK)
-    draw.text((8, 5), text, fill=_TEXT, font=font)
-    x = 8
+    draw.text((MARGIN, 5), text, fill=_TEXT, font=font)
+    x = MARGIN
     for index, operation in enumerate(operations):
         _draw_checkpoint(draw, x, operation, done=index < done)
         x += 26
@@ -74,14 +78,17 @@ def _band(
     return np.asarray(band)
 
 
-@lru_cache(maxsize=4096)
-def _clock(clock: str, prompt: bool) -> NDArray[np.uint8]:
+def _clock(word: str, number: int, prompt: bool) -> NDArray[np.uint8]:
     """The upper right corner, (height, width, 3): only as wide as the clock is, so that it covers nothing."""
-    corner = Image.new("RGB", (CLOCK, BAND // 2), _BACKGROUND)
-    draw = ImageDraw.Draw(corner)
-    draw.text((CLOCK - 8, 5), clock, fill=_PROMPT_COLOUR if prompt else _FAINT, font=_font(13), anchor="ra")
-    left, _, _, bottom = draw.textbbox((CLOCK - 8, 5), clock, font=_font(13), anchor="ra")
-    return np.asarray(corner)[: int(bottom), int(left) :].copy()
+    return np.concatenate([_piece(piece, prompt) for piece in (f"{word} ", *str(number))], axis=1)
+
+
+@lru_cache(maxsize=64)
+def _piece(text: str, prompt: bool) -> NDArray[np.uint8]:
+    """The clock's word or a digit, (height, width, 3)."""
+    piece = Image.new("RGB", (round(_font(13).getlength(text)), CLOCK_BOTTOM), _BACKGROUND)
+    ImageDraw.Draw(piece).text((0, 5), text, fill=_PROMPT_COLOUR if prompt else _FAINT, font=_font(13))
+    return np.asarray(piece)
 
 
 def _draw_checkpoint(draw: ImageDraw.ImageDraw, x: int, operation: str, *, done: bool) -> None:
