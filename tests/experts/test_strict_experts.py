@@ -20,6 +20,8 @@ DRAWERS = "check_all_three_drawers_once_each_in_the_given_order"
 STOVE = "turn_the_stove_on_and_off_once_then_put_the_frying_pan_on_it"
 CHARGER = "find_the_charger_hidden_in_one_of_the_drawers"
 PAIR = "find_the_charger_or_the_cap_hidden_in_two_of_the_drawers"
+MILK = "put_only_the_milk_pointed_out_in_the_prompt_video_on_the_plate"
+WASTE = "discard_and_plate_strictly_as_demonstrated_in_the_prompt_video"
 SMOOTH = 0.25
 """Largest change of an action's component from one step to the next."""
 
@@ -112,6 +114,16 @@ def play(task: Task, seed: int) -> Episode:
 @pytest.mark.parametrize(("name", "variant"), [(MICROWAVE, 2), (DRAWERS, 5), (STOVE, 0), (CHARGER, 2)])
 def test_solves_a_twin_of_each_family(name: str, variant: int) -> None:
     play(get_task(name).variant(variant), 20_000)
+
+
+def test_leans_over_what_keeps_it_from_reaching() -> None:
+    """The carton stands behind a bottle as tall: it had been reached for in vain, upright, until the end."""
+    assert play(get_task(MILK), 20_034).exec_steps < 500
+
+
+def test_a_prompt_goes_on_until_what_it_shows_has_held() -> None:
+    """The plan had ended at the ninth of the ten steps for which the goal has to hold."""
+    assert play(get_task(WASTE), 20_043).prompt_shown
 
 
 def test_comes_home_between_events_and_does_not_rest_there() -> None:

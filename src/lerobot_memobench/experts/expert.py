@@ -28,6 +28,7 @@ from lerobot_memobench.tasks.formula import (
     Round,
     Then,
     When,
+    children,
 )
 from lerobot_memobench.tasks.task import STRICT, Task
 
@@ -58,6 +59,12 @@ def steps_of(formula: Formula) -> list[Atom]:
         case Not() | Never():
             return []
     raise TypeError(f"not a formula: {formula!r}")
+
+
+def rest_of(formula: Formula) -> int:
+    """Return for how many steps a goal has to hold once it does."""
+    own = formula.number if isinstance(formula, Hold) else 0
+    return max([own, *(rest_of(child) for child in children(formula))])
 
 
 class Expert:
@@ -117,6 +124,8 @@ class Expert:
                 break
             for atom in missing:
                 yield from self.achieve(atom)
+        for _ in range(rest_of(self.task.goal)):
+            yield self.hand.rest(OPEN)
 
     def _take(self, step: Step) -> Doing:
         """Bring an atom about, or rest at home."""

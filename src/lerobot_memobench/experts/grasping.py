@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +21,15 @@ from lerobot_memobench.experts.surroundings import (
     outward_of,
 )
 from lerobot_memobench.experts.travel import Held, rise, travel
-from lerobot_memobench.sim.assets.asset import Grasp
+from lerobot_memobench.sim.assets.asset import Asset, Grasp
 from lerobot_memobench.sim.scene import TABLE_TOP
 
 ATTEMPTS = 4
 """How often a thing is reached for, a handle, door or knob moved, before it is given up."""
+LOW_ATTEMPTS = 2
+"""How many of them are made before a tall thing is held higher."""
+HIGHER, BELOW_TOP = 0.02, 0.019
+"""By how much, and how much of it then still stands over the middle of the fingers, m."""
 LYING = 0.7
 """Cosine of the tilt from which a thing lies on its side."""
 MUCH_WORSE = 1.5
@@ -57,13 +61,20 @@ def _is_rim(hand: Hand, name: str, grasp: Grasp) -> bool:
 
 
 def grasp_pose(
-    hand: Hand, name: str, grasp: Grasp, spin: float, opening: float | None = None, place: Array | None = None
+    hand: Hand,
+    name: str,
+    grasp: Grasp,
+    spin: float,
+    opening: float | None = None,
+    place: Array | None = None,
+    reaching: bool = False,
 ) -> tuple[Array, Array]:
     """Return where the grip site goes to take ``name``, and how the hand is turned there.
 
     A rim is taken with the inner finger close to the wall, however wide the fingers stand: the hand comes in from
     outside and follows the outer finger as it closes. What lies in the bowl is not touched. The hand leans away from
     what stands beside the object, and towards the arm where the object or ``place``, where it will be brought, is far.
+    Where one forbids the other it keeps clear, unless it is to be ``reaching``.
     """
     opening = hand.sim.gripper_opening() if opening is None else opening
     position, rotation = hand.sim.body_pose(name)
@@ -81,7 +92,7 @@ def grasp_pose(
     target[2] = max(target[2], TABLE_TOP + FINGER_REACH)
     turn = downward(closing)
     away = _lean(hand, name, target, turn[:, 0], place, outward if rim else None)
-    return target, clear_of_objects(hand, name, target, turn[:, 0], away)
+    return target, clear_of_objects(hand, name, target, turn[:, 0], away, reaching)
 
 
 def _lean(hand: Hand, name: str, target: Array, closing: Array, place: Array | None, outward: Array | None) -> Array:
@@ -125,10 +136,16 @@ def _choose_grasp(hand: Hand, name: str, attempt: int, avoid: Array | None, plac
         raise MemobenchError(
             f"the expert does not know how to hold {name!r}: class {asset.class_name} declares no grasp"
         )
+    grasps, reaching = asset.grasps, attempt >= LOW_ATTEMPTS
+    if reaching and (higher := _higher(asset)):
+        # What stands beside had kept the hand from leaning to where the arm can reach; over it there is room.
+        grasps, attempt = higher, attempt - LOW_ATTEMPTS
     options: list[tuple[float, Grasp, float]] = []
-    for grasp in asset.grasps:
+    for grasp in grasps:
         spins = np.arange(0.0, 2 * np.pi, np.pi / 12) if grasp.symmetric else [0.0]
-        options += [(_cost(hand, name, grasp, float(spin), avoid, place), grasp, float(spin)) for spin in spins]
+        options += [
+            (_cost(hand, name, grasp, float(spin), avoid, place, reaching), grasp, float(spin)) for spin in spins
+        ]
     options.sort(key=lambda option: option[0])
     options = [option for option in options if option[0] < options[0][0] + MUCH_WORSE]
     # A later attempt tries the next different way; each varies a little between episodes.
@@ -139,17 +156,28 @@ def _choose_grasp(hand: Hand, name: str, attempt: int, avoid: Array | None, plac
     return grasp, spin
 
 
-def _cost(hand: Hand, name: str, grasp: Grasp, spin: float, avoid: Array | None, place: Array | None) -> float:
+def _higher(asset: Asset) -> tuple[Grasp, ...]:
+    """Return the grasps that can be had nearer to the top of a tall thing."""
+    return tuple(
+        replace(grasp, position=(*grasp.position[:2], grasp.position[2] + HIGHER))
+        for grasp in asset.grasps
+        if asset.top - grasp.position[2] >= HIGHER + BELOW_TOP
+    )
+
+
+def _cost(
+    hand: Hand, name: str, grasp: Grasp, spin: float, avoid: Array | None, place: Array | None, reaching: bool
+) -> float:
     """Return how bad it is to hold an object so: far for wrist and arm, among neighbours, at a reach."""
     here, start = hand.sim.eef_pose()
-    target, turn = grasp_pose(hand, name, grasp, spin, FULLY_OPEN, place)
+    target, turn = grasp_pose(hand, name, grasp, spin, FULLY_OPEN, place, reaching)
     wrist = length(Rotation.from_matrix(turn @ start.T).as_rotvec())
     cost = 0.3 * wrist + length(target - here) + crowding(hand, name, target, turn)
     if avoid is not None:
         cost += 2.0 * abs(float(turn[:, 0] @ avoid))
     cost += 3.0 * abs(float(turn[:, 0] @ lean_from_fixtures(hand, name, target)))
     blocked = in_the_way(hand, name, target, turn)
-    cost += 2.0 + 20.0 * blocked if blocked > 0.0 else 0.0
+    cost += (0.0 if reaching else 2.0) + 20.0 * blocked if blocked > 0.0 else 0.0
     cost += 0.3 if grasp.width > WIDE else 0.0
     ends = [target] if place is None else [target, place + target - hand.sim.body_pose(name)[0]]
     cost += 20.0 * max(0.0, max(hand.stretch(end, turn) for end in ends) - COMFORTABLE)
@@ -165,9 +193,10 @@ class _Approach:
     grasp: Grasp
     spin: float
     place: Array | None
+    reaching: bool
 
     def pose(self, opening: float | None = None) -> tuple[Array, Array]:
-        return grasp_pose(self.hand, self.name, self.grasp, self.spin, opening, self.place)
+        return grasp_pose(self.hand, self.name, self.grasp, self.spin, opening, self.place, self.reaching)
 
     def above(self) -> Array:
         """Over the grasp along the fingers, so that a leaning hand comes in as it will leave."""
@@ -205,7 +234,7 @@ def pick(
     """
     for attempt in range(ATTEMPTS):
         grasp, spin = _choose_grasp(hand, name, attempt, avoid, place)
-        way = _Approach(hand, name, grasp, spin, place)
+        way = _Approach(hand, name, grasp, spin, place, attempt >= LOW_ATTEMPTS)
         yield from rise(hand, OPEN)
         yield from travel(hand, way.above, way.turned, OPEN, target=name)
         yield from hand.move(way.above, way.turned, OPEN, tolerance=0.012, turn_tolerance=0.08)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lerobot_memobench.experts.hand import COMFORTABLE, DOWN, UP, Array, Hand, cross, frame, length, unit
+from lerobot_memobench.experts.hand import COMFORTABLE, DOWN, STRETCHED, UP, Array, Hand, cross, frame, length, unit
 from lerobot_memobench.experts.surroundings import drawer_around, in_the_way, outward_of, tall_boxes
 from lerobot_memobench.sim.robot import BASE_POSITION
 
@@ -26,17 +26,24 @@ def leaning(closing: Array, away: Array) -> Array:
     return frame(DOWN - np.tan(min(size, UNDER_LEAN)) * unit(away), closing)
 
 
-def clear_of_objects(hand: Hand, name: str, target: Array, closing: Array, away: Array) -> Array:
-    """Return the hand's rotation (3, 3), leaning by ``away`` or by what else keeps it off tall things beside."""
+def clear_of_objects(
+    hand: Hand, name: str, target: Array, closing: Array, away: Array, reaching: bool = False
+) -> Array:
+    """Return the hand's rotation (3, 3), leaning by ``away`` or by what else keeps it off tall things beside.
+
+    Where it is ``reaching``, a lean that stretches the arm too far is as bad as one that stands in them as deep.
+    """
     side = cross(UP, closing)
     best, least = leaning(closing, away), np.inf
     for more in MORE_LEAN:
         if abs(float(away @ side) + more) > MOST_LEAN and more != 0.0:
             continue
         turn = leaning(closing, away + more * side)
-        inside = in_the_way(hand, name, target, turn)
-        if inside < least - 0.002:
-            best, least = turn, inside
+        bad = in_the_way(hand, name, target, turn)
+        if reaching:
+            bad += max(0.0, hand.stretch(target, turn) - STRETCHED)
+        if bad < least - 0.002:
+            best, least = turn, bad
         if least <= 0.0:
             break
     return best
