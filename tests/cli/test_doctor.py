@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 
-from rich.console import Console
-
+from lerobot_memobench.cli.console import console
 from lerobot_memobench.cli.doctor import finding_table
 from lerobot_memobench.doctor.findings import Finding, exit_status
 
@@ -14,9 +13,9 @@ def test_the_exit_status_and_the_table() -> None:
     findings = [Finding("a", "ok", "x"), Finding("b", "warning", "[y]", "do z")]
     assert exit_status(findings) == 0
     assert exit_status([*findings, Finding("c", "failed", "w", "v")]) == 1
-    console = Console(width=80, record=True, quiet=False)
-    with console.capture() as capture:
-        console.print(finding_table(findings))
-    assert "[y]" in capture.get()
-    assert "do z" in capture.get()
+    screen = console()
+    with screen.capture() as capture:
+        screen.print(finding_table(findings))
+    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in capture.get().splitlines() if "│" in line]
+    assert rows == [["a", "ok", "x"], ["b", "warning", "[y]"], ["", "", "fix: do z"]]
     assert json.dumps([finding.as_dict() for finding in findings])

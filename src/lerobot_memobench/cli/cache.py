@@ -52,6 +52,6 @@ def cache(
             batch_size=batch_size,
             workers=workers,
             progress=count,
-            tell=lambda said: screen.print(said, soft_wrap=True, markup=False),
+            tell=lambda said: screen.print(said, soft_wrap=True),
         )
     screen.print(f"memory cache: {folder}", soft_wrap=True)

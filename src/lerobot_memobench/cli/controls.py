@@ -98,7 +98,7 @@ def _show(report: Report, notes: Sequence[str], name: str, out: Path | None) -> 
     screen = console()
     screen.print(terminal(report))
     for note in notes:
-        screen.print(f"note: {note}", markup=False)
+        screen.print(f"note: {note}")
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         data = {"title": report.title, "notes": list(notes), **report.data}

@@ -44,7 +44,7 @@ def convert(
             **({} if repo_id is None else {"repo_id": repo_id}),
         )
     for problem in summary.problems:
-        screen.print(f"left out: {problem}", soft_wrap=True, markup=False)
+        screen.print(f"left out: {problem}", soft_wrap=True)
     if summary.folder is None:
         screen.print("no dataset was written: nothing could be used")
     else:
@@ -104,6 +104,6 @@ def describe(
     if suite is not None:
         check_suite_of(folder, suite)
     screen = console()
-    for file in run(folder, out or folder / "description", say=lambda text: screen.print(text, markup=False)):
+    for file in run(folder, out or folder / "description", say=lambda text: screen.print(text)):
         screen.print(str(file), soft_wrap=True)
     return 0

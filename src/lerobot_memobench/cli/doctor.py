@@ -8,17 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.table import Table
+from rich.text import Text
 
 from lerobot_memobench.cli.console import console
 
 if TYPE_CHECKING:
     from lerobot_memobench.doctor.findings import Finding, Status
 
-MARKS: dict[Status, str] = {
-    "ok": "[green]ok[/green]",
-    "warning": "[yellow]warning[/yellow]",
-    "failed": "[red]failed[/red]",
-}
+COLOURS: dict[Status, str] = {"ok": "green", "warning": "yellow", "failed": "red"}
 
 
 def doctor(
@@ -42,11 +39,8 @@ def finding_table(findings: Sequence[Finding]) -> Table:
     for name in ("checked", "", "found"):
         table.add_column(name, overflow="fold")
     for finding in findings:
-        fix = f"\n[bold]fix:[/bold] {_plain(finding.fix)}" if finding.fix else ""
-        table.add_row(finding.what, MARKS[finding.status], _plain(finding.detail) + fix)
+        found = Text(finding.detail)
+        if finding.fix:
+            found.append("\nfix: ", "bold").append(finding.fix)
+        table.add_row(finding.what, Text(finding.status, COLOURS[finding.status]), found)
     return table
-
-
-def _plain(text: str) -> str:
-    """Keep rich from reading brackets in other programs' messages as markup."""
-    return text.replace("[", "\\[")

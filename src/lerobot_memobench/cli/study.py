@@ -30,7 +30,7 @@ def study(
     screen = console()
 
     def say(text: str) -> None:
-        screen.print(text, markup=False, soft_wrap=True)
+        screen.print(text, soft_wrap=True)
 
     settings = StudySettings(
         steps=steps, seeds=seeds, held_out=held_out, rollouts=rollouts, first_seed=first_seed, level=level
