@@ -44,7 +44,9 @@ def test_a_command_that_ended_well_is_not_run_again(tmp_path: Path) -> None:
 def test_a_command_that_fails_is_told_and_gone_on_with(tmp_path: Path) -> None:
     log = tmp_path / "wrong.log"
     words = ["memobench", "describe", str(tmp_path / "nothing")]
-    with pytest.raises(MemobenchError, match=r"ended with status 2; see .*wrong\.log"):
+    with pytest.raises(
+        MemobenchError, match=r"ended with status 2 \(memobench: .* is no dataset .*\); see .*wrong\.log"
+    ):
         run_once(words, log)
     assert "is no dataset" in log.read_text()
     spent = run_once(words, log, going_on=["memobench", "objects", "--json"])
@@ -121,6 +123,13 @@ def test_an_experiment_runs_its_parts_in_order(tmp_path: Path, monkeypatch: pyte
         pixels = np.asarray(picture.convert("RGB")).reshape(-1, 3)
     memory, memoryless = ((pixels == ImageColor.getrgb(colour)).all(axis=1).sum() for colour in COLOURS[:2])
     assert memory / memoryless == pytest.approx(3, rel=0.15), "bars are as long as their rates"
+
+
+@pytest.mark.parametrize("word", ["policy.nothing=1", "policy.width=broad"])
+def test_what_training_would_refuse_is_told_before_anything_is_made(tmp_path: Path, word: str) -> None:
+    with pytest.raises(MemobenchError, match=word.partition("=")[0]):
+        learn(changed(experiment("bowl"), settings=(word,)), tmp_path / "out", print)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_killed_training_goes_on_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

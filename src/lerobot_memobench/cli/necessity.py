@@ -58,10 +58,19 @@ def necessity(
     """Find moments that look the same and need different answers; print what a policy without memory can reach."""
     from lerobot_memobench.evaluation.necessity.pieces import PIECES, make
     from lerobot_memobench.evaluation.necessity.question import Settings
-    from lerobot_memobench.evaluation.necessity.report import put_into_page, read_results, terminal_table, write
+    from lerobot_memobench.evaluation.necessity.report import (
+        around_table,
+        put_into_page,
+        read_results,
+        terminal_table,
+        write,
+    )
     from lerobot_memobench.tasks.task import REFERENTS
 
-    published = None if beside is None else read_results(beside)  # now, not after the simulation
+    # Now, not after the simulation.
+    published = None if beside is None else read_results(beside)
+    if page is not None:
+        around_table(page)
     settings = Settings(episodes=episodes, budget=budget, tolerance=tolerance)
     referents = REFERENTS if referent is WhichReferent.BOTH else (referent.value,)
     studies = _studies([get_task(name) for name in resolve_tasks(tasks, suite)], referents, settings, out)

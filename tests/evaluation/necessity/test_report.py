@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from lerobot_memobench.cli.necessity import necessity
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.necessity.report import PAGE_BEGIN, PAGE_END, put_into_page
 
@@ -22,3 +23,13 @@ def test_a_page_gets_the_table_between_its_marks(tmp_path: Path) -> None:
     with pytest.raises(MemobenchError, match="put them where the table goes"):
         put_into_page(page, [])
     assert page.read_text() == "no marks"
+
+
+@pytest.mark.parametrize("content", [None, b"no marks", b"\xff"])
+def test_a_page_without_a_place_is_told_before_anything_is_simulated(tmp_path: Path, content: bytes | None) -> None:
+    page = tmp_path / "page.md"
+    if content is not None:
+        page.write_bytes(content)
+    with pytest.raises(MemobenchError, match=r"the page .*page\.md"):
+        necessity(page=page, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()

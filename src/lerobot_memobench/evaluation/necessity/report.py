@@ -151,6 +151,26 @@ def read_results(path: Path) -> list[Result]:
     return found
 
 
+def around_table(page: Path) -> tuple[str, str]:
+    """Return what stands before and after the table of a Markdown page, its marks included.
+
+    Raises:
+        MemobenchError: there is no such page, or it lacks the marks.
+    """
+    try:
+        text = page.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise MemobenchError(f"the page {page} cannot be read ({reason}); name a Markdown file") from None
+    before, begin, rest = text.partition(PAGE_BEGIN)
+    _, end, after = rest.partition(PAGE_END)
+    if not begin or not end:
+        raise MemobenchError(
+            f"the page {page} lacks the lines {PAGE_BEGIN!r} and {PAGE_END!r}; put them where the table goes"
+        )
+    return before + begin, end + after
+
+
 def put_into_page(page: Path, results: Sequence[Result], beside: Sequence[Result] | None = None) -> Path:
     """Put the table into a Markdown page, between its two marks; return the page.
 
@@ -158,22 +178,11 @@ def put_into_page(page: Path, results: Sequence[Result], beside: Sequence[Result
         beside: results of the published tasks; then the table shows those and their twins, which ``results`` are of.
 
     Raises:
-        MemobenchError: there is no such page, or it lacks the marks.
+        MemobenchError: see `around_table`.
     """
-    try:
-        text = page.read_text(encoding="utf-8")
-    except OSError as error:
-        raise MemobenchError(
-            f"the page {page} cannot be read ({error.strerror or error}); name a Markdown file"
-        ) from None
-    before, begin, rest = text.partition(PAGE_BEGIN)
-    _, end, after = rest.partition(PAGE_END)
-    if not begin or not end:
-        raise MemobenchError(
-            f"the page {page} lacks the lines {PAGE_BEGIN!r} and {PAGE_END!r}; put them where the table goes"
-        )
+    before, after = around_table(page)
     table = markdown(results) if beside is None else side_by_side(beside, results)
-    return write_file(page, f"{before}{begin}\n\n{table}\n{end}{after}")
+    return write_file(page, f"{before}\n\n{table}\n{after}")
 
 
 def write(out: Path, results: Sequence[Result]) -> list[Path]:

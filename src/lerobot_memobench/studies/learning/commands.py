@@ -65,7 +65,8 @@ def run_once(
     spent, ended = spent + took, status in accept
     write_file(kept, json.dumps({"words": list(words), "ended": ended, **asdict(spent)}, indent=1))
     if not ended:
-        raise MemobenchError(f"`{' '.join(words)}` ended with status {status}; see {log}")
+        *_, last = log.read_text(errors="replace").rstrip().splitlines() or [""]
+        raise MemobenchError(f"`{' '.join(words)}` ended with status {status} ({last[:400]}); see {log}")
     return spent
 
 

@@ -6,6 +6,7 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
+from lerobot_memobench.settings.words import split_words
 from lerobot_memobench.studies.learning.commands import Cost, run_once
 from lerobot_memobench.studies.learning.experiments import OBJECTS, Experiment
 from lerobot_memobench.tasks.catalogue import suite_of
@@ -44,19 +45,38 @@ class Stages:
         words += ["--no-images"] if self.experiment.perception == OBJECTS else []
         return run_once([*words, "--workers", str(self.workers)], self.out / "data.log", threads=1, accept=(0, 1))
 
-    def train(self, arm: str, seed: int, threads: int | None = None) -> Cost:
-        """Train an arm's policy with one seed."""
-        own = self.experiment.arms[arm]
+    def check_settings(self) -> None:
+        """Refuse what training would, before anything is made; LeRobot's import is left out where nothing was added.
+
+        Raises:
+            MemobenchError: an unknown setting or value, named with the nearest known one.
+        """
+        from lerobot_memobench.settings.reading import read_settings
+        from lerobot_memobench.settings.training import take_training_words
+
+        for arm in self.experiment.arms if self.experiment.settings else ():
+            told = [
+                word for word in self.training_words(arm, 0)[2:] if not word.startswith("dataset=")
+            ]  # not there yet
+            *_, words = take_training_words(split_words(told))
+            read_settings("train", words)
+
+    def training_words(self, arm: str, seed: int) -> list[str]:
+        """Return the command that trains an arm's policy with one seed."""
         words = ["lerobot", "train", *SHARED, f"perception={self.experiment.perception}"]
         words += [f"dataset={self.data}", f"steps={self.experiment.steps}"]
-        words += [f"seed={seed}", f"output_dir={self.policy(arm, seed)}", *self.experiment.settings, *own]
+        words += [f"seed={seed}", f"output_dir={self.policy(arm, seed)}"]
+        return [*words, *self.experiment.settings, *self.experiment.arms[arm]]
+
+    def train(self, arm: str, seed: int, threads: int | None = None) -> Cost:
+        """Train an arm's policy with one seed."""
         folder = self.policy(arm, seed)
         begun = self.checkpoint(arm, seed) / "train_config.json"
         going_on = ["lerobot", "train", f"config_path={begun}", "resume=true"] if begun.is_file() else None
         log = self.log("training", arm, seed)
         if going_on is None and not log.with_suffix(".json").is_file():
             shutil.rmtree(folder, ignore_errors=True)  # of an attempt that was killed before its first checkpoint
-        return run_once(words, log, threads=threads, going_on=going_on)
+        return run_once(self.training_words(arm, seed), log, threads=threads, going_on=going_on)
 
     def evaluate(self, arm: str, seed: int) -> Cost:
         """Roll a trained policy out on the experiment's evaluation seeds."""

@@ -24,6 +24,7 @@ def learn(experiment: Experiment, out: Path, say: Say, *, dataset: Path | None =
         workers: processes; with more than one, as many policies are trained at once, on one core each.
     """
     stages = Stages(experiment, out, dataset, workers)
+    stages.check_settings()
     say(f"demonstrations: {experiment.episodes} of each of {len(experiment.tasks)} tasks, to {stages.data}")
     costs: Costs = {"data": [stages.generate()]}
     rolled = train_and_roll_out(stages, say)
