@@ -104,6 +104,6 @@ def describe(
     if suite is not None:
         check_suite_of(folder, suite)
     screen = console()
-    for file in run(folder, out or folder / "description", say=lambda text: screen.print(text)):
+    for file in run(folder, out or folder / "description", say=screen.print):
         screen.print(str(file), soft_wrap=True)
     return 0

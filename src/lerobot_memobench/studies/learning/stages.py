@@ -55,9 +55,8 @@ class Stages:
         from lerobot_memobench.settings.training import take_training_words
 
         for arm in self.experiment.arms if self.experiment.settings else ():
-            told = [
-                word for word in self.training_words(arm, 0)[2:] if not word.startswith("dataset=")
-            ]  # not there yet
+            # All but the dataset, which is not there yet.
+            told = [word for word in self.training_words(arm, 0)[2:] if not word.startswith("dataset=")]
             *_, words = take_training_words(split_words(told))
             read_settings("train", words)
 
