@@ -129,61 +129,6 @@ def _closing_of_fallen(hand: Hand, name: str) -> float:
     return float(np.arctan2(rotation[1, side], rotation[0, side]))
 
 
-def _choose_grasp(hand: Hand, name: str, attempt: int, avoid: Array | None, place: Array | None) -> tuple[Grasp, float]:
-    """Pick one of an object's grasps, turned where that is free: easy for the wrist, clear of its neighbours."""
-    asset = hand.sim.assets[name]
-    if not asset.grasps:
-        raise MemobenchError(
-            f"the expert does not know how to hold {name!r}: class {asset.class_name} declares no grasp"
-        )
-    grasps, reaching = asset.grasps, attempt >= LOW_ATTEMPTS
-    if reaching and (higher := _higher(asset)):
-        # What stands beside had kept the hand from leaning to where the arm can reach; over it there is room.
-        grasps, attempt = higher, attempt - LOW_ATTEMPTS
-    options: list[tuple[float, Grasp, float]] = []
-    for grasp in grasps:
-        spins = np.arange(0.0, 2 * np.pi, np.pi / 12) if grasp.symmetric else [0.0]
-        options += [
-            (_cost(hand, name, grasp, float(spin), avoid, place, reaching), grasp, float(spin)) for spin in spins
-        ]
-    options.sort(key=lambda option: option[0])
-    options = [option for option in options if option[0] < options[0][0] + MUCH_WORSE]
-    # A later attempt tries the next different way; each varies a little between episodes.
-    rank = min(attempt * max(1, len(options) // 6), len(options) - 1)
-    _, grasp, spin = options[rank]
-    if grasp.symmetric:
-        spin += float(hand.rng.uniform(-0.1, 0.1))
-    return grasp, spin
-
-
-def _higher(asset: Asset) -> tuple[Grasp, ...]:
-    """Return the grasps that can be had nearer to the top of a tall thing."""
-    return tuple(
-        replace(grasp, position=(*grasp.position[:2], grasp.position[2] + HIGHER))
-        for grasp in asset.grasps
-        if asset.top - grasp.position[2] >= HIGHER + BELOW_TOP
-    )
-
-
-def _cost(
-    hand: Hand, name: str, grasp: Grasp, spin: float, avoid: Array | None, place: Array | None, reaching: bool
-) -> float:
-    """Return how bad it is to hold an object so: far for wrist and arm, among neighbours, at a reach."""
-    here, start = hand.sim.eef_pose()
-    target, turn = grasp_pose(hand, name, grasp, spin, FULLY_OPEN, place, reaching)
-    wrist = length(Rotation.from_matrix(turn @ start.T).as_rotvec())
-    cost = 0.3 * wrist + length(target - here) + crowding(hand, name, target, turn)
-    if avoid is not None:
-        cost += 2.0 * abs(float(turn[:, 0] @ avoid))
-    cost += 3.0 * abs(float(turn[:, 0] @ lean_from_fixtures(hand, name, target)))
-    blocked = in_the_way(hand, name, target, turn)
-    cost += (0.0 if reaching else 2.0) + 20.0 * blocked if blocked > 0.0 else 0.0
-    cost += 0.3 if grasp.width > WIDE else 0.0
-    ends = [target] if place is None else [target, place + target - hand.sim.body_pose(name)[0]]
-    cost += 20.0 * max(0.0, max(hand.stretch(end, turn) for end in ends) - COMFORTABLE)
-    return cost
-
-
 @dataclass(frozen=True)
 class _Approach:
     """The way to one grasp of an object, asked anew at every step: the object may move."""
@@ -218,6 +163,57 @@ class _Approach:
         return self.pose(max(self.hand.sim.gripper_opening() - CLOSING_LEAD, self.grasp.width))[0]
 
 
+def _choose_grasp(hand: Hand, name: str, attempt: int, avoid: Array | None, place: Array | None) -> _Approach:
+    """Pick one of an object's grasps, turned where that is free: easy for the wrist, clear of its neighbours."""
+    asset = hand.sim.assets[name]
+    if not asset.grasps:
+        raise MemobenchError(
+            f"the expert does not know how to hold {name!r}: class {asset.class_name} declares no grasp"
+        )
+    grasps, reaching = asset.grasps, attempt >= LOW_ATTEMPTS
+    if reaching and (higher := _higher(asset)):
+        # What stands beside had kept the hand from leaning to where the arm can reach; over it there is room.
+        grasps, attempt = higher, attempt - LOW_ATTEMPTS
+    options: list[tuple[float, _Approach]] = []
+    for grasp in grasps:
+        for spin in np.arange(0.0, 2 * np.pi, np.pi / 12) if grasp.symmetric else [0.0]:
+            way = _Approach(hand, name, grasp, float(spin), place, reaching)
+            options.append((_cost(way, avoid), way))
+    options.sort(key=lambda option: option[0])
+    options = [option for option in options if option[0] < options[0][0] + MUCH_WORSE]
+    # A later attempt tries the next different way; each varies a little between episodes.
+    rank = min(attempt * max(1, len(options) // 6), len(options) - 1)
+    _, way = options[rank]
+    return replace(way, spin=way.spin + float(hand.rng.uniform(-0.1, 0.1))) if way.grasp.symmetric else way
+
+
+def _higher(asset: Asset) -> tuple[Grasp, ...]:
+    """Return the grasps that can be had nearer to the top of a tall thing."""
+    return tuple(
+        replace(grasp, position=(*grasp.position[:2], grasp.position[2] + HIGHER))
+        for grasp in asset.grasps
+        if asset.top - grasp.position[2] >= HIGHER + BELOW_TOP
+    )
+
+
+def _cost(way: _Approach, avoid: Array | None) -> float:
+    """Return how bad it is to hold an object so: far for wrist and arm, among neighbours, at a reach."""
+    hand, name = way.hand, way.name
+    here, start = hand.sim.eef_pose()
+    target, turn = way.pose(FULLY_OPEN)
+    wrist = length(Rotation.from_matrix(turn @ start.T).as_rotvec())
+    cost = 0.3 * wrist + length(target - here) + crowding(hand, name, target, turn)
+    if avoid is not None:
+        cost += 2.0 * abs(float(turn[:, 0] @ avoid))
+    cost += 3.0 * abs(float(turn[:, 0] @ lean_from_fixtures(hand, name, target)))
+    blocked = in_the_way(hand, name, target, turn)
+    cost += (0.0 if way.reaching else 2.0) + 20.0 * blocked if blocked > 0.0 else 0.0
+    cost += 0.3 if way.grasp.width > WIDE else 0.0
+    ends = [target] if way.place is None else [target, way.place + target - hand.sim.body_pose(name)[0]]
+    cost += 20.0 * max(0.0, max(hand.stretch(end, turn) for end in ends) - COMFORTABLE)
+    return cost
+
+
 def pick(
     hand: Hand, name: str, avoid: Array | None = None, place: Array | None = None
 ) -> Generator[NDArray[np.float32], None, Held | None]:
@@ -233,8 +229,7 @@ def pick(
         How it is held, or None when every attempt missed.
     """
     for attempt in range(ATTEMPTS):
-        grasp, spin = _choose_grasp(hand, name, attempt, avoid, place)
-        way = _Approach(hand, name, grasp, spin, place, attempt >= LOW_ATTEMPTS)
+        way = _choose_grasp(hand, name, attempt, avoid, place)
         yield from rise(hand, OPEN)
         yield from travel(hand, way.above, way.turned, OPEN, target=name)
         yield from hand.move(way.above, way.turned, OPEN, tolerance=0.012, turn_tolerance=0.08)
