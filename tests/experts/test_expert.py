@@ -27,6 +27,8 @@ STOVE = "turn_on_the_stove_and_turn_it_off"
 DRAWER = "put_the_tomato_into_the_top_drawer_of_the_cabinet"
 BOWL = "put_the_butter_into_the_bowl_from_the_prompt_video"
 ASSEMBLY = "execute_the_assembly_procedure_demonstrated_in_the_prompt_video"
+SWAP = "swap_the_objects_strictly_following_the_3-step_buffered_sequence_shown_in_the_prompt"
+MILK = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
 MICROWAVE = "open_and_close_the_microwave"
 SMOOTH = 0.25
 """Largest change of an action's component from one step to the next."""
@@ -208,6 +210,24 @@ def test_a_handle_that_slipped_is_taken_again() -> None:
 
     assert not play(get_task("check_the_top_drawer_of_the_cabinet"), 10_000, disturb=slip).faults
     assert left == 0
+
+
+@pytest.mark.parametrize("name", [SWAP, MILK])
+def test_fingers_that_are_stopped_close(name: str) -> None:
+    """On a carton's top, or a plate's rim: a policy without a memory of it could not learn how long to wait there."""
+    still, waits = 0, [0]
+    last = np.full(8, np.inf)
+
+    def look(episode: Episode, action: np.ndarray) -> np.ndarray:
+        nonlocal still, last
+        now = episode.sim.proprio()
+        still = still + 1 if action[6] < 0 and np.abs(now - last)[:3].max() < 8e-4 else 0
+        waits.append(still)
+        last = now
+        return action
+
+    assert not play(get_task(name), 20_000, referent="random", disturb=look).faults
+    assert max(waits) <= 10
 
 
 def test_seeds_differ_and_repeat() -> None:

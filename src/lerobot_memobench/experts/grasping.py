@@ -15,6 +15,7 @@ from lerobot_memobench.experts.leaning import clear_of_objects, lean_from_fixtur
 from lerobot_memobench.experts.surroundings import (
     FINGER_REACH,
     FULLY_OPEN,
+    corners,
     crowding,
     drawer_around,
     in_the_way,
@@ -28,7 +29,7 @@ ATTEMPTS = 4
 """How often a thing is reached for, a handle, door or knob moved, before it is given up."""
 LOW_ATTEMPTS = 2
 """How many of them are made before a tall thing is held higher."""
-HIGHER, BELOW_TOP = 0.02, 0.019
+HIGHER, BELOW_TOP = 0.02, 0.0122
 """By how much, and how much of it then still stands over the middle of the fingers, m."""
 LYING = 0.7
 """Cosine of the tilt from which a thing lies on its side."""
@@ -36,6 +37,9 @@ MUCH_WORSE = 1.5
 """Cost by which a hold is behind the best one and not tried."""
 FUNNEL, FUNNEL_MOUTH = 4.0, 0.006
 """Height kept per distance from the line over the target, and the distance from which on, m."""
+STOPPED = 6
+"""Steps without getting nearer after which the fingers close where they are, on a plate's rim or beside a neighbour: how
+long something waits that looks the same all the while is hard to learn."""
 LIFT = 0.10
 """How high a thing is lifted before it is carried, m."""
 HOVER = 0.09
@@ -44,6 +48,8 @@ RIM_GAP = 0.004
 """Room left between a rim and the inner finger while the hand comes down, m."""
 CLOSING_LEAD = 0.03
 """How much narrower than they are the fingers are taken to be while they close: the arm is slower than they, m."""
+SUNK = 0.002
+"""How deep a thing may lie in what it rests on, m."""
 EMPTY = 0.003
 """Opening under which the fingers hold nothing, m."""
 WIDE = 0.068
@@ -89,10 +95,17 @@ def grasp_pose(
     if rotation[2, 2] < LYING:
         target, rim = position.copy(), False
         closing = _closing_of_fallen(hand, name)
-    target[2] = max(target[2], TABLE_TOP + FINGER_REACH)
+    target[2] = max(target[2], _ground(hand, name) + FINGER_REACH)
     turn = downward(closing)
     away = _lean(hand, name, target, turn[:, 0], place, outward if rim else None)
     return target, clear_of_objects(hand, name, target, turn[:, 0], away, reaching)
+
+
+def _ground(hand: Hand, name: str) -> float:
+    """Return the height, m, of what a thing rests on, which the fingers should not press: the table, a plate."""
+    position, rotation = hand.sim.body_pose(name)
+    lowest = position[2] + (rotation @ corners(hand.sim.assets[name]))[2].min()
+    return max(TABLE_TOP, float(lowest) - SUNK)
 
 
 def _lean(hand: Hand, name: str, target: Array, closing: Array, place: Array | None, outward: Array | None) -> Array:
@@ -233,7 +246,7 @@ def pick(
         yield from rise(hand, OPEN)
         yield from travel(hand, way.above, way.turned, OPEN, target=name)
         yield from hand.move(way.above, way.turned, OPEN, tolerance=0.012, turn_tolerance=0.08)
-        yield from hand.move(way.at, way.turned, OPEN, tolerance=0.005, speed=0.6, timeout=60)
+        yield from hand.move(way.at, way.turned, OPEN, tolerance=0.005, speed=0.6, timeout=60, patience=STOPPED)
         yield from hand.close(way.closing, hand.rotation)
         held = yield from _lift(hand, name)
         if held is not None:

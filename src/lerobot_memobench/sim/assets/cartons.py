@@ -54,7 +54,7 @@ def _carton(
     base = z - shoulder
     b.collision("box", (x, y, (base + z) / 2), 0.9 * mass, (0, 0, (base - z) / 2), friction=GRIP_FRICTION)
     b.collision("box", (0.35 * x, y, shoulder / 2), 0.1 * mass, (0, 0, z - shoulder / 2), friction=GRIP_FRICTION)
-    at = base - 0.007
+    at = z - 0.0325  # the palm all but touches the fin
     b.grasp((0, 0, at), ALONG_X, 2 * x, depth=0.03)
     b.grasp((0, 0, at), ALONG_Y, 2 * y, depth=0.03)
     return b.object((-x, -y, -z), half)
