@@ -38,8 +38,8 @@ MUCH_WORSE = 1.5
 FUNNEL, FUNNEL_MOUTH = 4.0, 0.006
 """Height kept per distance from the line over the target, and the distance from which on, m."""
 STOPPED = 6
-"""Steps without getting nearer after which the fingers close where they are, on a plate's rim or beside a neighbour: how
-long something waits that looks the same all the while is hard to learn."""
+"""Steps without getting nearer after which the fingers close where they are, on a plate's rim or beside a neighbour. A
+longer wait, in which nothing changes, is hard to learn."""
 LIFT = 0.10
 """How high a thing is lifted before it is carried, m."""
 HOVER = 0.09
