@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,9 +37,9 @@ MUCH_WORSE = 1.5
 """Cost by which a hold is behind the best one and not tried."""
 FUNNEL, FUNNEL_MOUTH = 4.0, 0.006
 """Height kept per distance from the line over the target, and the distance from which on, m."""
-STOPPED = 6
-"""Steps without getting nearer after which the fingers close where they are, on a plate's rim or beside a neighbour. A
-longer wait, in which nothing changes, is hard to learn."""
+STOPPED, NEAR = 6, 0.015
+"""Steps without getting nearer after which the fingers close where they are, once they are so near, m: on a plate's rim,
+say. A longer wait, in which nothing changes, is hard to learn."""
 LIFT = 0.10
 """How high a thing is lifted before it is carried, m."""
 HOVER = 0.09
@@ -171,6 +171,16 @@ class _Approach:
     def turned(self) -> Array:
         return self.pose()[1]
 
+    def stopped(self) -> Callable[[], bool]:
+        """Return what tells, asked at every step, that the hand is about there and gets no nearer."""
+        way: list[float] = []
+
+        def asked() -> bool:
+            way.append(self.hand.error(*self.pose())[0])
+            return way[-1] < NEAR and len(way) > STOPPED and way[-1 - STOPPED] - way[-1] < 0.002
+
+        return asked
+
     def closing(self) -> Array:
         """Where the hand goes while the fingers close."""
         return self.pose(max(self.hand.sim.gripper_opening() - CLOSING_LEAD, self.grasp.width))[0]
@@ -246,7 +256,7 @@ def pick(
         yield from rise(hand, OPEN)
         yield from travel(hand, way.above, way.turned, OPEN, target=name)
         yield from hand.move(way.above, way.turned, OPEN, tolerance=0.012, turn_tolerance=0.08)
-        yield from hand.move(way.at, way.turned, OPEN, tolerance=0.005, speed=0.6, timeout=60, patience=STOPPED)
+        yield from hand.move(way.at, way.turned, OPEN, tolerance=0.005, speed=0.6, timeout=60, give_up=way.stopped())
         yield from hand.close(way.closing, hand.rotation)
         held = yield from _lift(hand, name)
         if held is not None:

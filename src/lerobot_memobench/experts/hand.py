@@ -170,12 +170,11 @@ class Hand:
         turn_tolerance: float = 0.05,
         speed: float = 1.0,
         timeout: int = 160,
-        patience: int = PATIENCE,
         give_up: Callable[[], bool] | None = None,
     ) -> Motion:
         """Go to a pose, following it where it moves.
 
-        Stop after ``timeout`` steps, when ``give_up`` says so, or when for ``patience`` steps it got no nearer.
+        Stop after ``timeout`` steps, when ``give_up`` says so, or when for `PATIENCE` steps it got no nearer.
         """
         best, since = np.inf, 0
         for _ in range(timeout):
@@ -192,7 +191,7 @@ class Hand:
                 return
             left = distance + 0.1 * angle
             best, since = (left, 0) if left < best - 0.002 else (best, since + 1)
-            if since > patience:
+            if since > PATIENCE:
                 return
             yield self.toward(goal, turn, gripper, speed)
 
