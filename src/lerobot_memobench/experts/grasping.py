@@ -38,8 +38,8 @@ MUCH_WORSE = 1.5
 FUNNEL, FUNNEL_MOUTH = 4.0, 0.006
 """Height kept per distance from the line over the target, and the distance from which on, m."""
 STOPPED, NEAR = 6, 0.015
-"""Steps without getting nearer after which the fingers close where they are, once they are so near, m: on a plate's rim,
-say. A longer wait, in which nothing changes, is hard to learn."""
+"""Steps without getting nearer after which the fingers close where they are, once they are so near, m: on a plate's
+rim, say. A longer wait, in which nothing changes, is hard to learn."""
 LIFT = 0.10
 """How high a thing is lifted before it is carried, m."""
 HOVER = 0.09
