@@ -157,6 +157,7 @@ def test_generate_tells_what_became_of_every_seed(
         "image_size": 256,
         "prompt_video": True,
         "perturb": False,
+        "policy": None,
         "workers": 1,
         "formats": ("lerobot", "hdf5"),
         "executor": "local",

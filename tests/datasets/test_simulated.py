@@ -13,14 +13,17 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from lerobot_memobench.datasets import driving
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.digest import digest
+from lerobot_memobench.datasets.driving import SPELL, load_driver
 from lerobot_memobench.datasets.generation import generate
 from lerobot_memobench.datasets.labels import labels
 from lerobot_memobench.datasets.lerobot_format import is_dataset, write_dataset
@@ -30,6 +33,7 @@ from lerobot_memobench.datasets.recording import HOLD_FRAMES, PATIENCE, record_d
 from lerobot_memobench.datasets.replay import replay
 from lerobot_memobench.datasets.validate import Verdict, exit_status, validate
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.checkpoint import checkpoint_folder
 from lerobot_memobench.sim.object_slots import SLOTS, STARTS
 from lerobot_memobench.tasks import get_task
 from lerobot_memobench.tasks.catalogue import task_names
@@ -165,6 +169,42 @@ def test_the_expert_finds_back_and_says_how(moved):
     undisturbed = record_demonstration(get_task(MILK), SEED + 1, images=False, referent="random")
     np.testing.assert_array_equal(undisturbed.states[: moved.exec_start], moved.states[: moved.exec_start])
     assert undisturbed.executed is None
+
+
+def test_a_policy_drives_for_some_steps_at_a_time(butter):
+    small = str(checkpoint_folder("memobench_small"))
+    driven = record_demonstration(get_task(BUTTER), SEED, images=False, policy=small)
+    assert driven.success
+    off = np.abs(driven.applied - driven.actions)
+    np.testing.assert_array_equal(butter.states[: driven.exec_start], driven.states[: driven.exec_start])
+    assert not off[:, 6].any(), "the fingers do as the expert says"
+    driving = off[driven.exec_start : -HOLD_FRAMES, :6].max(axis=1) > 0
+    assert 0.2 < driving.mean() < 0.9
+    changes = int(np.abs(np.diff(driving.astype(int))).sum())
+    assert 2 <= changes <= len(driving) // SPELL[0] + 1, "in spells"
+    assert replay(driven) is None
+
+
+def test_a_driver_that_needs_more_than_is_recorded_is_refused(tmp_path, monkeypatch):
+    folder = shutil.copytree(checkpoint_folder("memobench_small"), tmp_path / "told")
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps({**config, "oracle_memory": True}))
+    with pytest.raises(MemobenchError, match="reads in its instruction what has been done"):
+        load_driver(str(folder))
+    sees = SimpleNamespace(
+        config=SimpleNamespace(input_features={"observation.images.image": None}), reset=lambda: None
+    )
+    monkeypatch.setattr(driving, "load_driver", lambda checkpoint: driving.Loaded(sees, None, None))
+    with pytest.raises(MemobenchError, match=r"looks at observation\.images\.image, which is not recorded; leave out"):
+        record_demonstration(get_task(STOVE), SEED, images=False, policy="pictures")
+
+
+def test_who_moves_the_arm_is_one(tmp_path):
+    with pytest.raises(MemobenchError, match="leave out --perturb or --policy"):
+        generate([get_task(STOVE)], 1, tmp_path / "ds", images=False, perturb=True, policy="memobench_small")
+    with pytest.raises(MemobenchError, match=r"holds no model\.safetensors; name the folder"):
+        generate([get_task(STOVE)], 1, tmp_path / "ds", images=False, policy=str(tmp_path))
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_third_of_the_episodes_stays_clean():

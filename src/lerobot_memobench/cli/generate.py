@@ -11,6 +11,7 @@ from rich.table import Table
 
 from lerobot_memobench.cli.console import console, counting
 from lerobot_memobench.cli.suite import Suite, WhichSuite
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.settings.words import executor_options
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 
@@ -57,6 +58,10 @@ def generate(
     perturb: Annotated[
         bool, typer.Option("--perturb", help="Move the arm off its way at random; action is what the expert does then.")
     ] = False,
+    policy: Annotated[
+        str | None,
+        typer.Option(help="A checkpoint, or a policy of the package, that moves the arm now and then; as --perturb."),
+    ] = None,
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     repo_id: Annotated[str | None, typer.Option(help="Name of the dataset, user/name.")] = None,
     formats: Annotated[
@@ -94,6 +99,7 @@ def generate(
             image_size=image_size,
             prompt_video=prompt_video,
             perturb=perturb,
+            policy=_folder_of(policy),
             workers=workers,
             formats=tuple(format_.value for format_ in formats or [Format.LEROBOT]),
             executor=executor.value,
@@ -103,6 +109,19 @@ def generate(
         )
     _print_summary(summary, out)
     return summary.exit_status
+
+
+def _folder_of(policy: str | None) -> str | None:
+    """Return the folder of the policy that moves the arm."""
+    if policy is None:
+        return None
+    from lerobot_memobench.policies.checkpoint import check_checkpoint, local_folder
+
+    folder = local_folder(policy)
+    if folder is None:
+        raise MemobenchError(f"there is no checkpoint in {policy}; name a training run's folder, or memobench_small")
+    check_checkpoint(str(folder))
+    return str(folder.absolute())
 
 
 def _print_summary(summary: GenerationSummary, out: Path) -> None:

@@ -32,11 +32,13 @@ from lerobot_memobench.datasets.staging.episode import FORMATS, HDF5, LEROBOT, s
 from lerobot_memobench.datasets.staging.folders import STAGING
 from lerobot_memobench.datasets.staging.request import compare_requests, episodes_folder
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.files import file_hash
 from lerobot_memobench.jobs.executors import check_executor
 from lerobot_memobench.jobs.job import ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.tasks.task import Task, referent_told
 
+WEIGHTS = "model.safetensors"
 FIRST_SEED = 10_000
 """Demonstrations use the seeds 10,000 + i; evaluation uses 7 + i (paper, section 5.1)."""
 
@@ -53,6 +55,7 @@ def generate(
     prompt_video: bool = True,
     hold_frames: int = HOLD_FRAMES,
     perturb: bool = False,
+    policy: str | None = None,
     formats: Collection[str] = (LEROBOT,),
     workers: int = 1,
     executor: str = "processes",
@@ -63,11 +66,12 @@ def generate(
 ) -> GenerationSummary:
     """Make ``episodes`` demonstrations of each task into the folder ``out``.
 
-    With ``perturb`` the arm is moved off its way at random (`datasets.perturbation`), and ``action`` is what the expert
-    does there. ``formats`` says what becomes of them: ``lerobot`` is a LeRobotDataset in ``out``, ``hdf5`` a file per
-    task in the published layout in ``out``/hdf5. The seeds are ``seed_base`` + i. An unfinished run of the same request
-    in ``out`` is continued (``resume=False`` starts anew), a finished one is only reported. Failed episodes are in no
-    dataset, but in the summary, the manifest and the card.
+    With ``perturb`` the arm is moved off its way at random (`datasets.perturbation`), with ``policy``, the folder of a
+    checkpoint, by that policy (`datasets.driving`), and ``action`` is what the expert does there. ``formats`` says what
+    becomes of them: ``lerobot`` is a LeRobotDataset in ``out``, ``hdf5`` a file per task in the published layout in
+    ``out``/hdf5. The seeds are ``seed_base`` + i. An unfinished run of the same request in ``out`` is continued
+    (``resume=False`` starts anew), a finished one is only reported. Failed episodes are in no dataset, but in the
+    summary, the manifest and the card.
 
     ``executor`` says where ``workers`` episodes at a time are made (`jobs.executors`); it changes nothing of
     the result. On Slurm the call returns when the jobs are submitted, the last of which writes the dataset.
@@ -84,7 +88,9 @@ def generate(
     check_executor(executor, executor_options)
     _check_prompts(tasks, prompt_video)
     referent = referent_told(referent, drawn=all(task.drawn for task in tasks))
-    settings = RecordingSettings(referent, images, image_size, prompt_video, hold_frames, perturb)
+    if perturb and policy is not None:
+        raise MemobenchError("the arm is to be moved both at random and by a policy; leave out --perturb or --policy")
+    settings = RecordingSettings(referent, images, image_size, prompt_video, hold_frames, perturb, policy)
     plan = _Plan(tuple(tasks), episodes, seed_base, settings, _checked_formats(formats, settings))
     if is_finished(out):
         return _finished(out, plan)
@@ -139,6 +145,7 @@ class _Plan:
             "episodes": self.episodes,
             "seed_base": self.seed_base,
             **asdict(self.settings),
+            "policy": self.settings.policy and policy_told(self.settings.policy),
             "task_files": [task_hash(task) for task in self.tasks],
             "versions": _versions(),
         }
@@ -149,6 +156,8 @@ class _Plan:
         referent, prompts = self.settings.referent, "" if self.settings.prompt_video else ", prompt videos left out"
         seeds = f"{self.episodes} seeds per task from {self.seed_base} on"
         moved = ", the arm moved off its way at random in two thirds of them" if self.settings.perturb else ""
+        if self.settings.policy is not None:
+            moved = f", the arm moved by the policy {policy_told(self.settings.policy)} for some steps at a time"
         return f"`memobench generate`, {seeds}, referent {referent}{prompts}{moved}. {SCRIPTED}"
 
     def jobs(self, folder: Path) -> list[RecordingJob]:
@@ -210,7 +219,7 @@ def _checked_formats(formats: Collection[str], settings: RecordingSettings) -> t
             raise MemobenchError(f"found format {name!r}, {nearest(name, FORMATS)}")
     if not given:
         raise MemobenchError(f"no format was asked for; name {' or '.join(FORMATS)}, or both")
-    if HDF5 in given and settings.perturb:
+    if HDF5 in given and (settings.perturb or settings.policy is not None):
         raise MemobenchError(
             "format 'hdf5' was asked for with the arm moved off its way, but its layout has one action per frame, and "
             "needs two: what is to be done and what was; write format lerobot alone"
@@ -234,6 +243,14 @@ def _finished(out: Path, plan: _Plan) -> GenerationSummary:
     compare_requests(earlier, request, f"{out} already holds a finished dataset", "name another folder")
     shutil.rmtree(out / STAGING, ignore_errors=True)
     return summarise(manifest["episodes"], plan.tasks, out)
+
+
+def policy_told(checkpoint: str) -> str:
+    """Return the name of a checkpoint's folder and the hash of its weights: another one is another run."""
+    weights = Path(checkpoint) / WEIGHTS
+    if not weights.is_file():
+        raise MemobenchError(f"{checkpoint} holds no {WEIGHTS}; name the folder of a policy's checkpoint")
+    return f"{Path(checkpoint).name} {file_hash(weights)[:16]}"
 
 
 def task_hash(task: Task) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.driving import Driver
 from lerobot_memobench.datasets.hdf5.mjcf import model_file
 from lerobot_memobench.datasets.perturbation import Perturbation
 from lerobot_memobench.datasets.staging.episode import HDF5, LEROBOT, StagedJob
@@ -47,6 +48,7 @@ class RecordingSettings:
     prompt_video: bool = True
     hold_frames: int = HOLD_FRAMES
     perturb: bool = False
+    policy: str | None = None
 
 
 def record_demonstration(
@@ -60,6 +62,7 @@ def record_demonstration(
     hold_frames: int = HOLD_FRAMES,
     image_size: int = 256,
     perturb: bool = False,
+    policy: str | None = None,
 ) -> Demonstration:
     """Let the scripted expert carry out a task from a seed.
 
@@ -70,7 +73,7 @@ def record_demonstration(
         raise MemobenchError(
             f"variant {variant} was asked for together with referent={referent!r}; choose variants with 'fixed' only"
         )
-    settings = RecordingSettings(referent, images, image_size, prompt_video, hold_frames, perturb)
+    settings = RecordingSettings(referent, images, image_size, prompt_video, hold_frames, perturb, policy)
     return record(compiled_episode(task.variant(variant), settings), seed, settings)
 
 
@@ -100,13 +103,16 @@ def record(
     episode.reset(seed)
     fixture_poses = episode.sim.fixture_poses()
     tape = _Tape()
-    disturb = Perturbation(generator(episode.published, seed, PERTURBATION)) if settings.perturb else None
+    disturb = _disturbance(episode, seed, settings)
     reached = False
     held = idle = 0
     while held < settings.hold_frames:
         tape.look(episode)
-        if settings.images:
-            (show or tape.keep)(episode.images())
+        pictures = episode.images() if settings.images else None
+        if isinstance(disturb, Driver):
+            disturb.look(episode, tape.objects[-1], pictures)
+        if pictures is not None:
+            (show or tape.keep)(pictures)
         reached = reached or episode.success
         idle += getattr(episode, "expert_done", False)
         over = reached or episode.done or idle > PATIENCE
@@ -117,6 +123,14 @@ def record(
         tape.executed.append(episode.applied_action)
         tape.actions.append(np.clip(wanted, -1.0, 1.0) if acting else episode.applied_action)
     return tape.demonstration(episode, fixture_poses, success=reached and episode.prompt_shown is not False)
+
+
+def _disturbance(episode: Episode, seed: int, settings: RecordingSettings) -> Perturbation | Driver | None:
+    """Return what moves the arm off the expert's way, if anything does."""
+    rng = generator(episode.published, seed, PERTURBATION)
+    if settings.policy is not None:
+        return Driver(settings.policy, rng)
+    return Perturbation(rng) if settings.perturb else None
 
 
 @dataclass
