@@ -12,6 +12,7 @@ import argparse
 import json
 import shlex
 import shutil
+import subprocess
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,8 @@ from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import DRAWN
 
+ROOT = Path(__file__).resolve().parents[1]
+TRAINED = "train_config.json"
 LARGEST = 4_000_000
 """Bytes that one policy may take."""
 OF_THE_DATA = ("input_features", "output_features", "action_feature_names", "object_classes")
@@ -43,7 +46,9 @@ tags: [lerobot, memobench, memory]
 """
 
 
-def ship(run: Path, name: str, rollouts: Path | None, merged: Mapping[Path, Sequence[Path]]) -> Path:
+def ship(
+    run: Path, name: str, rollouts: Path | None, merged: Mapping[Path, Sequence[Path]], commit: str | None
+) -> Path:
     """Write the last checkpoint of a training run as the package's policy ``name``; return its folder."""
     source, folder = checkpoint_folder(str(run)), SHIPPED / name
     if source is None:
@@ -58,7 +63,7 @@ def ship(run: Path, name: str, rollouts: Path | None, merged: Mapping[Path, Sequ
     write_file(
         folder / "config.json", json.dumps({**config, "device": "cpu", "pretrained_path": None}, indent=4) + "\n"
     )
-    write_file(folder / "README.md", card(name, source, weights, rollouts, merged))
+    write_file(folder / "README.md", card(name, source, weights, rollouts, merged, commit))
     size = sum(path.stat().st_size for path in folder.iterdir())
     if size > LARGEST:
         raise SystemExit(f"{folder} takes {size:,} bytes; expected at most {LARGEST:,}")
@@ -71,8 +76,13 @@ def card(
     weights: dict[str, torch.Tensor],
     rollouts: Path | None,
     merged: Mapping[Path, Sequence[Path]],
+    commit: str | None = None,
 ) -> str:
-    """Return the Markdown that goes with a policy; ``merged``: datasets, and those that LeRobot made each of."""
+    """Return the Markdown that goes with a policy.
+
+    Args:
+        merged: datasets, and those that LeRobot made each of. commit: by which the demonstrations were made.
+    """
     runs = trainings(source)
     policy = runs[-1]["policy"]
     count = sum(value.numel() for value in weights.values()) / 1e6
@@ -80,12 +90,15 @@ def card(
         f"# {name}",
         "",
         f"`memobench_mem`, {count:.1f} million parameters, bfloat16; sees {policy['perception']}.",
+        *began_with(runs[0]),
         *demonstrations(runs, training_facts(source) or {}, merged),
+        *([f"The expert that made them is that of commit `{commit}`."] if commit else []),
         "",
         "```bash",
         *(
             line
             for told, before in zip(runs, [None, *runs], strict=False)
+            if "shipped" not in told
             for line in training(told, before, len(runs) > 1)
         ),
         "```",
@@ -94,9 +107,24 @@ def card(
     return HEAD + "\n".join(lines) + "\n"
 
 
+def began_with(run: Mapping[str, Any]) -> list[str]:
+    """Return with which policy of the package the first training began, if with one."""
+    if "shipped" not in run:
+        return []
+    place = (SHIPPED / run["shipped"]).relative_to(ROOT)
+    words = ["git", "log", "-1", "--format=%h", "--", str(place)]
+    of = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
+    return [f"It went on from `{run['shipped']}` as of commit `{of}`, whose card says how that was made."]
+
+
 def trainings(source: Path) -> list[dict[str, Any]]:
-    """Return the settings of the trainings that led to a checkpoint, one from the weights of the other."""
-    told: dict[str, Any] = json.loads((source / "train_config.json").read_text())
+    """Return the settings of the trainings that led to a checkpoint, one from the weights of the other.
+
+    A policy of the package knows of none; it stands for its own by its name.
+    """
+    if not (source / TRAINED).is_file():
+        return [{"shipped": source.name, "policy": json.loads((source / "config.json").read_text())}]
+    told: dict[str, Any] = json.loads((source / TRAINED).read_text())
     begun = told["policy"].get("pretrained_path")  # of a training that went on after an interruption: its own
     another = begun is not None and not Path(begun).is_relative_to(told["output_dir"])
     return [*(trainings(Path(begun)) if another else []), told]
@@ -112,7 +140,8 @@ def training(told: dict[str, Any], before: dict[str, Any] | None, named: bool) -
     if before is None:
         kind, known = f"policy=memobench_mem perception={policy['perception']} size={policy['size']}", []
     else:
-        kind, known = f"policy={place(before['output_dir'])}", settings(before["policy"])
+        begun = before.get("shipped") or place(before["output_dir"])
+        kind, known = f"policy={begun}", settings(before["policy"])
     words = [f"dataset={place(told['dataset']['root'])}", *(word for word in settings(policy) if word not in known)]
     words += [f"{key}={told[key]}" for key in ("batch_size", "steps", "seed")]
     words += [f"output_dir={place(told['output_dir'])}"] if named else []
@@ -139,7 +168,7 @@ def demonstrations(
     runs: Sequence[dict[str, Any]], trained_on: dict[str, Any], merged: Mapping[Path, Sequence[Path]]
 ) -> list[str]:
     """Return what a policy was trained on and the commands that made it, by the manifests in the datasets' folders."""
-    roots = [Path(told["dataset"]["root"]) for told in runs]
+    roots = [Path(told["dataset"]["root"]) for told in runs if "shipped" not in told]
     try:
         parts = dict.fromkeys(part for root in roots for part in generated(root, merged))
         manifests = {part: read_manifest(part) for part in parts}
@@ -230,5 +259,7 @@ if __name__ == "__main__":
         metavar=("DATASET", "PART"),
         help="a dataset trained on, and those that lerobot-edit-dataset made it of; may be said again, in order",
     )
+    parser.add_argument("--commit", help="that made the demonstrations, where the expert has changed since")
     given = parser.parse_args()
-    print(ship(given.run, given.name, given.rollouts, {whole: parts for whole, *parts in given.merged}))
+    parts = {whole: parts for whole, *parts in given.merged}
+    print(ship(given.run, given.name, given.rollouts, parts, given.commit))

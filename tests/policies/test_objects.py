@@ -19,7 +19,12 @@ from small_policy import batch_of, losses_in_training, made_for_training, small_
 import object_dataset
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.execution_frames import in_groups, in_turns, task_of_frames
+from lerobot_memobench.policies.memobench_mem.execution_frames import (
+    in_groups,
+    in_turns,
+    prompted_factors,
+    task_of_frames,
+)
 from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, STEPS, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from object_dataset import LENGTHS, PROMPTS, make_object_dataset
@@ -76,6 +81,8 @@ def test_small_brings_its_recipe_and_leaves_it_to_the_user(tmp_path: Path) -> No
         ({"perception": "objects", "tokens_per_frame": 0}, "tokens_per_frame"),
         ({"moments_per_episode": 0}, "moments_per_episode"),
         ({"final_lr": 2.0}, "final_lr"),
+        ({"size": "small", "perception": "objects", "prompted_weight": 0.0}, "prompted_weight=0.0 must be above 0"),
+        ({"prompted_weight": 3.0}, r"balance_tasks=0.0\)"),
     ],
 )
 def test_bad_values_are_refused(fields: dict[str, Any], message: str) -> None:
@@ -177,6 +184,19 @@ def test_tasks_are_drawn_by_a_power_of_their_frames(balance: float) -> None:
     assert shares == pytest.approx([long / 2, short, middle, long / 2], abs=0.02)
 
 
+def test_tasks_with_a_prompt_are_drawn_more_often() -> None:
+    lengths, tasks = np.array([500, 300, 40, 600]), np.array([0, 1, 2, 0])
+    phase = np.ones(lengths.sum(), int)
+    phase[600:640] = 0  # of the second episode
+    factors = prompted_factors(np.repeat(tasks, lengths), phase, 3.0)
+    ends = np.cumsum(lengths)
+    assert factors[ends - 1].tolist() == [1, 3, 1, 1]
+    chance = torch.Generator().manual_seed(1)
+    order = torch.cat([in_turns(ends, tasks, 6, chance, 1.0, factors[ends - 1]) for _ in range(5)]).numpy()
+    shares = np.bincount(np.searchsorted(ends, order, "right"), minlength=4) / len(order)
+    assert shares == pytest.approx([1 / 10, 3 / 5, 1 / 5, 1 / 10], abs=0.04)
+
+
 @pytest.mark.parametrize("records", [True, False])
 def test_a_task_of_several_instructions_is_one_task(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, records: bool
@@ -232,6 +252,20 @@ def test_of_some_episodes_no_other_frame_is_drawn(root: Path, balance: bool) -> 
     alike, by_frames = 1 / 2, (LENGTHS[1] - PROMPTS[1]) / len(execution)
     assert share == pytest.approx(alike if balance else by_frames, abs=0.06)
     assert before(batch_of(dataset, list(range(4))))[MASK].any()
+
+
+def test_the_sampler_draws_prompted_tasks_more_often(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(object_dataset, "PROMPTS", (0, 8, 0))
+    root = make_object_dataset(tmp_path / "data")
+    policy, _, _, dataset = made_for_training(root, **OBJECTS, prompted_weight=3.0)
+    sampler = EpisodeAwareSampler(
+        dataset.meta.episodes["dataset_from_index"],
+        dataset.meta.episodes["dataset_to_index"],
+        drop_n_last_frames=policy.config.drop_n_last_frames,
+        shuffle=True,
+    )
+    drawn = np.array([frame for _ in range(20) for frame in sampler])
+    assert np.mean((drawn >= STARTS[1]) & (drawn < STARTS[2])) == pytest.approx(3 / 4, abs=0.06)
 
 
 def test_statistics_are_those_of_execution_frames(root: Path) -> None:

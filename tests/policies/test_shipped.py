@@ -13,6 +13,7 @@ from lerobot_memobench.engine import memory_demo
 from lerobot_memobench.engine.policy_identity import encoded
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies import checkpoint
+from lerobot_memobench.policies.checkpoint import SHIPPED
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.settings.choices import checkpoint_of
 from lerobot_memobench.tasks.catalogue import BOWL, task_names
@@ -126,6 +127,13 @@ def test_a_card_tells_how_the_demonstrations_were_made(script: ModuleType, tmp_p
     assert "perception=objects size=small \\\n    dataset=outputs/data policy.memory_stride=4 batch_size=6 " in text
     assert "train policy=outputs/run \\\n    dataset=outputs/more policy.optimizer_lr=0.0001 batch_size=6 " in text
     assert text.count("memobench generate") == 2, "what both were trained on is made once"
+    again["policy"]["pretrained_path"] = str(SHIPPED / "memobench_small")
+    (later / "train_config.json").write_text(json.dumps(again))
+    text = str(script.card("mine", source, {"a": torch.zeros(3)}, None, {}, commit="0123abc"))
+    assert "It went on from `memobench_small` as of commit `" in text
+    assert "is that of commit `0123abc`" in text
+    assert "lerobot train policy=memobench_small \\\n    dataset=outputs/more " in text
+    assert text.count("lerobot train") == 1
     strict = {**request, "tasks": task_names(suite="strict"), "referent": "drawn"}
     assert script.generation(strict)[:6] == ["--tasks", "all", "--suite", "strict", "--episodes", "3"]
     assert "--referent" not in script.generation(strict)

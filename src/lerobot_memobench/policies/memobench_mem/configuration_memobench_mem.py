@@ -135,6 +135,11 @@ class MemobenchMemConfig(MemobenchMemSettings):
             raise MemobenchError(f"--policy.final_lr={self.final_lr} must be in [0, 1]; 1 keeps the rate constant.")
         if not 0.0 <= self.balance_tasks <= 1.0:
             raise MemobenchError(f"--policy.balance_tasks={self.balance_tasks} must be in [0, 1]; 1 draws them alike.")
+        if self.prompted_weight <= 0.0 or (self.prompted_weight != 1.0 and not self.balance_tasks):
+            raise MemobenchError(
+                f"--policy.prompted_weight={self.prompted_weight} must be above 0, and 1 where tasks are not balanced "
+                f"(--policy.balance_tasks={self.balance_tasks})."
+            )
         if not 0.0 <= self.ema_decay < 1.0:
             raise MemobenchError(f"--policy.ema_decay={self.ema_decay} must be in [0, 1); 0 turns it off.")
         if self.align_weight is not None and self.align_weight < 0:

@@ -34,22 +34,35 @@ class Drawn(int):
     Attributes:
         starts: from which frame on (E,) to draw; None: from the first.
         moments: how many frames of an episode to draw in a row.
-        tasks: (N,) number of each frame's task; None: each frame is drawn once. balance: of tasks, see `in_turns`.
+        tasks: (N,) number of each frame's task; None: each frame is drawn once. balance, factors: see `in_turns`;
+            factors (N,) of frames.
     """
 
     starts: np.ndarray | None
     moments: int
     tasks: np.ndarray | None
     balance: float
+    factors: np.ndarray | None
 
     @classmethod
     def of(
-        cls, starts: np.ndarray | None, moments: int, tasks: np.ndarray | None = None, balance: float = 1.0
+        cls,
+        starts: np.ndarray | None,
+        moments: int,
+        tasks: np.ndarray | None = None,
+        balance: float = 1.0,
+        factors: np.ndarray | None = None,
     ) -> Drawn:
         """Return 0, which LeRobot's sampler understands from now on."""
         _teach(EpisodeAwareSampler)
         found = cls(0)
-        found.starts, found.moments, found.tasks, found.balance = starts, moments, tasks, balance
+        found.starts, found.moments, found.tasks, found.balance, found.factors = (
+            starts,
+            moments,
+            tasks,
+            balance,
+            factors,
+        )
         return found
 
 
@@ -77,6 +90,15 @@ def task_of_frames(meta: Any, episodes: np.ndarray) -> np.ndarray:
     return np.repeat(numbers, np.diff(episodes))
 
 
+def prompted_factors(tasks: np.ndarray, phase: np.ndarray, weight: float) -> np.ndarray:
+    """Return (N,) ``weight`` for frames of tasks that have a prompt, else 1.
+
+    Args:
+        tasks: (N,) number of each frame's task. phase: (N,) 0 in the prompt.
+    """
+    return np.where(np.isin(tasks, np.unique(tasks[phase == PROMPT])), weight, 1.0)
+
+
 def in_groups(ends: np.ndarray, moments: int, generator: torch.Generator) -> Tensor:
     """Return all places 0 ... N - 1 in a random order in which ``moments`` of an episode follow one another.
 
@@ -94,7 +116,12 @@ def in_groups(ends: np.ndarray, moments: int, generator: torch.Generator) -> Ten
 
 
 def in_turns(
-    ends: np.ndarray, tasks: np.ndarray, moments: int, generator: torch.Generator, balance: float = 1.0
+    ends: np.ndarray,
+    tasks: np.ndarray,
+    moments: int,
+    generator: torch.Generator,
+    balance: float = 1.0,
+    factors: np.ndarray | None = None,
 ) -> Tensor:
     """Return N places at random, ``moments`` of an episode in a row: a task by ``balance``, in it each episode alike.
 
@@ -102,14 +129,15 @@ def in_turns(
         ends: (E,) as for `in_groups`. tasks: (E,) number of each episode's task.
         balance: 1: each task equally often; 0: in proportion to its frames; between: to a power of them, 1 - balance,
             as languages are drawn in multilingual models (Conneau et al. 2020, arXiv 1911.02116, section 3.1).
+        factors: (E,) how many times as often each episode's task is drawn, equal within a task; None: 1.
     """
     first, count = torch.from_numpy(np.r_[0, ends[:-1]]), int(ends[-1])
     order = torch.from_numpy(np.argsort(tasks, kind="stable"))
-    _, number, episodes = np.unique(tasks, return_inverse=True, return_counts=True)
+    _, one, number, episodes = np.unique(tasks, return_index=True, return_inverse=True, return_counts=True)
     of_task = torch.from_numpy(episodes)
     groups = -(-count // moments)
-    weights = torch.from_numpy(np.bincount(number, np.diff(ends, prepend=0)) ** (1 - balance))
-    task = torch.multinomial(weights, groups, replacement=True, generator=generator)
+    weights = np.bincount(number, np.diff(ends, prepend=0)) ** (1 - balance) * (1 if factors is None else factors[one])
+    task = torch.multinomial(torch.from_numpy(weights), groups, replacement=True, generator=generator)
     rank = (torch.rand(groups, generator=generator) * of_task[task]).long()
     episode = order[(of_task.cumsum(0) - of_task)[task] + rank].repeat_interleave(moments)
     lengths = torch.from_numpy(ends) - first
@@ -128,13 +156,18 @@ def _teach(sampler: type[Any]) -> None:
     def init(self: Any, *args: Any, **named: Any) -> None:
         asked = signature.bind(self, *args, **named)
         dropped = asked.arguments.get("drop_n_last_frames", 0)
-        self.moments, tasks = 1, None
+        self.moments, tasks, factors = 1, None, None
         if isinstance(dropped, Drawn):
-            self.moments, tasks, self.balance = dropped.moments, dropped.tasks, dropped.balance
+            self.moments, self.balance, tasks, factors = (
+                dropped.moments,
+                dropped.balance,
+                dropped.tasks,
+                dropped.factors,
+            )
             if dropped.starts is not None:
                 asked.arguments["dataset_from_indices"] = dropped.starts
         original(*asked.args, **asked.kwargs)
-        self.tasks = None if tasks is None else tasks[self._starts]
+        self.tasks, self.factors = (None if of is None else of[self._starts] for of in (tasks, factors))
 
     one_epoch = sampler._iter_epoch
 
@@ -145,7 +178,7 @@ def _teach(sampler: type[Any]) -> None:
         if self.tasks is None:
             order = in_groups(self._cum_lengths, self.moments, chance)
         else:
-            order = in_turns(self._cum_lengths, self.tasks, self.moments, chance, self.balance)
+            order = in_turns(self._cum_lengths, self.tasks, self.moments, chance, self.balance, self.factors)
         return (self._frame_index(position) for position in order[start:].tolist())
 
     sampler.__init__, sampler._iter_epoch = init, draw

@@ -28,7 +28,12 @@ from lerobot_memobench.policies.memobench_mem.checkpoints import (
 )
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.drawn_statistics import count_drawn_only
-from lerobot_memobench.policies.memobench_mem.execution_frames import Drawn, execution_starts, task_of_frames
+from lerobot_memobench.policies.memobench_mem.execution_frames import (
+    Drawn,
+    execution_starts,
+    prompted_factors,
+    task_of_frames,
+)
 from lerobot_memobench.policies.memobench_mem.freed_memory import keep_freed_memory
 from lerobot_memobench.policies.memobench_mem.fused_attention import attend_fused
 from lerobot_memobench.policies.memobench_mem.learning import LearningPolicy
@@ -118,7 +123,9 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
         starts = None if self.config.prompt_loss else execution_starts(cache.episodes, cache.phase)
         balance = self.config.balance_tasks
         tasks = task_of_frames(meta, cache.episodes) if balance else None
-        self.config.drop_n_last_frames = Drawn.of(starts, self.config.moments_per_episode, tasks, balance)
+        weight = self.config.prompted_weight
+        factors = None if tasks is None or weight == 1 else prompted_factors(tasks, cache.phase, weight)
+        self.config.drop_n_last_frames = Drawn.of(starts, self.config.moments_per_episode, tasks, balance, factors)
 
     # -- checkpoints -----------------------------------------------------------------------------------------------
 

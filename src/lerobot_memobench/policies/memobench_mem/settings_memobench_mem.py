@@ -82,6 +82,9 @@ class MemobenchMemSettings(PI05Config):
     balance_tasks: float = SIZES_OWN
     """1: each task is drawn equally often, however long its episodes are; 0: each frame once per epoch; between: in
     proportion to its frames to the power 1 - balance_tasks. None: 1 with objects and with eyes, else 0."""
+    prompted_weight: float = 1.0
+    """How many times as often as another a task that begins with a prompt is drawn, where tasks are balanced: to read a
+    prompt takes more updates than to act."""
     freeze_vision_encoder: bool = True
     warmup_fraction: float = 0.05
     final_lr: float = SIZES_OWN
