@@ -61,7 +61,7 @@ def experiment(name: str, perception: str = OBJECTS) -> Experiment:
 EXPERIMENTS: dict[str, Experiment] = {
     "bowl": Experiment((BOWL,), episodes=120, steps=1000, pixel_steps=2000, seeds=3),
     "prompted": Experiment(prompted(), episodes=40, steps=8_000),
-    "joint": Experiment(tuple(task_names()), episodes=80, steps=16_000),
+    "joint": Experiment(tuple(task_names()), episodes=40, steps=20_000),
 }
 """Butter into the prompted bowl, in minutes; the ten prompted tasks, by one policy; all thirty, by one policy."""
 
