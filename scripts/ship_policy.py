@@ -12,7 +12,6 @@ import argparse
 import json
 import shlex
 import shutil
-import subprocess
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from lerobot_memobench.datasets.manifest import read_manifest
+from lerobot_memobench.engine.machine import git
 from lerobot_memobench.engine.policy_identity import ELSEWHERE, encoded, training_facts
 from lerobot_memobench.envs.episode_log import MERGED_FILE
 from lerobot_memobench.evaluation.documents.report import REPORT_JSON
@@ -84,22 +84,22 @@ def card(
         merged: datasets, and those that LeRobot made each of. commit: by which the demonstrations were made.
     """
     runs = trainings(source)
+    begun = runs.pop(0) if "shipped" in runs[0] else None
     policy = runs[-1]["policy"]
     count = sum(value.numel() for value in weights.values()) / 1e6
     lines = [
         f"# {name}",
         "",
         f"`memobench_mem`, {count:.1f} million parameters, bfloat16; sees {policy['perception']}.",
-        *began_with(runs[0]),
+        *([] if begun is None else [began_with(begun["shipped"])]),
         *demonstrations(runs, training_facts(source) or {}, merged),
         *([f"The expert that made them is that of commit `{commit}`."] if commit else []),
         "",
         "```bash",
         *(
             line
-            for told, before in zip(runs, [None, *runs], strict=False)
-            if "shipped" not in told
-            for line in training(told, before, len(runs) > 1)
+            for told, before in zip(runs, [begun, *runs], strict=False)
+            for line in training(told, before, begun is not None or len(runs) > 1)
         ),
         "```",
         *([] if rollouts is None else results(name, rollouts)),
@@ -107,14 +107,10 @@ def card(
     return HEAD + "\n".join(lines) + "\n"
 
 
-def began_with(run: Mapping[str, Any]) -> list[str]:
-    """Return with which policy of the package the first training began, if with one."""
-    if "shipped" not in run:
-        return []
-    place = (SHIPPED / run["shipped"]).relative_to(ROOT)
-    words = ["git", "log", "-1", "--format=%h", "--", str(place)]
-    of = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
-    return [f"It went on from `{run['shipped']}` as of commit `{of}`, whose card says how that was made."]
+def began_with(shipped: str) -> str:
+    """Return that the first training began with a policy of the package, and of which commit that is."""
+    of = git(ROOT, "log", "-1", "--format=%h", "--", str(SHIPPED / shipped))
+    return f"It went on from `{shipped}` as of commit `{of}`, whose card says how that was made."
 
 
 def trainings(source: Path) -> list[dict[str, Any]]:
@@ -168,7 +164,7 @@ def demonstrations(
     runs: Sequence[dict[str, Any]], trained_on: dict[str, Any], merged: Mapping[Path, Sequence[Path]]
 ) -> list[str]:
     """Return what a policy was trained on and the commands that made it, by the manifests in the datasets' folders."""
-    roots = [Path(told["dataset"]["root"]) for told in runs if "shipped" not in told]
+    roots = [Path(told["dataset"]["root"]) for told in runs]
     try:
         parts = dict.fromkeys(part for root in roots for part in generated(root, merged))
         manifests = {part: read_manifest(part) for part in parts}

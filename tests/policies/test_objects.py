@@ -190,9 +190,9 @@ def test_tasks_with_a_prompt_are_drawn_more_often() -> None:
     phase[600:640] = 0  # of the second episode
     factors = prompted_factors(np.repeat(tasks, lengths), phase, 3.0)
     ends = np.cumsum(lengths)
-    assert factors[ends - 1].tolist() == [1, 3, 1, 1]
+    assert factors[tasks].tolist() == [1, 3, 1, 1]
     chance = torch.Generator().manual_seed(1)
-    order = torch.cat([in_turns(ends, tasks, 6, chance, 1.0, factors[ends - 1]) for _ in range(5)]).numpy()
+    order = torch.cat([in_turns(ends, tasks, 6, chance, 1.0, factors) for _ in range(5)]).numpy()
     shares = np.bincount(np.searchsorted(ends, order, "right"), minlength=4) / len(order)
     assert shares == pytest.approx([1 / 10, 3 / 5, 1 / 5, 1 / 10], abs=0.04)
 

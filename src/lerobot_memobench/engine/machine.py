@@ -45,13 +45,14 @@ def git_commit() -> str | None:
     package = Path(__file__).resolve().parents[1]
     if not (package.parents[1] / ".git").exists():
         return None
-    commit = _git(package, "rev-parse", "HEAD")
+    commit = git(package, "rev-parse", "HEAD")
     if not commit:
         return None
-    return commit + ("+changes" if _git(package, "status", "--porcelain", "--", str(package)) else "")
+    return commit + ("+changes" if git(package, "status", "--porcelain", "--", str(package)) else "")
 
 
-def _git(folder: Path, *words: str) -> str | None:
+def git(folder: Path, *words: str) -> str | None:
+    """Return what ``git`` says of a folder, None where it cannot."""
     try:
         done = subprocess.run(
             ["git", "-C", str(folder), *words], capture_output=True, text=True, timeout=20, check=False

@@ -34,8 +34,7 @@ class Drawn(int):
     Attributes:
         starts: from which frame on (E,) to draw; None: from the first.
         moments: how many frames of an episode to draw in a row.
-        tasks: (N,) number of each frame's task; None: each frame is drawn once. balance, factors: see `in_turns`;
-            factors (N,) of frames.
+        tasks: (N,) number of each frame's task; None: each frame is drawn once. balance, factors: see `in_turns`.
     """
 
     starts: np.ndarray | None
@@ -56,13 +55,8 @@ class Drawn(int):
         """Return 0, which LeRobot's sampler understands from now on."""
         _teach(EpisodeAwareSampler)
         found = cls(0)
-        found.starts, found.moments, found.tasks, found.balance, found.factors = (
-            starts,
-            moments,
-            tasks,
-            balance,
-            factors,
-        )
+        found.starts, found.moments = starts, moments
+        found.tasks, found.balance, found.factors = tasks, balance, factors
         return found
 
 
@@ -91,12 +85,12 @@ def task_of_frames(meta: Any, episodes: np.ndarray) -> np.ndarray:
 
 
 def prompted_factors(tasks: np.ndarray, phase: np.ndarray, weight: float) -> np.ndarray:
-    """Return (N,) ``weight`` for frames of tasks that have a prompt, else 1.
+    """Return (T,) ``weight`` for each task that has a prompt, else 1.
 
     Args:
-        tasks: (N,) number of each frame's task. phase: (N,) 0 in the prompt.
+        tasks: (N,) number of each frame's task, 0 ... T - 1. phase: (N,) 0 in the prompt.
     """
-    return np.where(np.isin(tasks, np.unique(tasks[phase == PROMPT])), weight, 1.0)
+    return np.where(np.bincount(tasks, phase == PROMPT) > 0, weight, 1.0)
 
 
 def in_groups(ends: np.ndarray, moments: int, generator: torch.Generator) -> Tensor:
@@ -129,14 +123,16 @@ def in_turns(
         ends: (E,) as for `in_groups`. tasks: (E,) number of each episode's task.
         balance: 1: each task equally often; 0: in proportion to its frames; between: to a power of them, 1 - balance,
             as languages are drawn in multilingual models (Conneau et al. 2020, arXiv 1911.02116, section 3.1).
-        factors: (E,) how many times as often each episode's task is drawn, equal within a task; None: 1.
+        factors: (T,) how many times as often each task is drawn; None: 1.
     """
     first, count = torch.from_numpy(np.r_[0, ends[:-1]]), int(ends[-1])
     order = torch.from_numpy(np.argsort(tasks, kind="stable"))
-    _, one, number, episodes = np.unique(tasks, return_index=True, return_inverse=True, return_counts=True)
+    present, number, episodes = np.unique(tasks, return_inverse=True, return_counts=True)
     of_task = torch.from_numpy(episodes)
     groups = -(-count // moments)
-    weights = np.bincount(number, np.diff(ends, prepend=0)) ** (1 - balance) * (1 if factors is None else factors[one])
+    weights = np.bincount(number, np.diff(ends, prepend=0)) ** (1 - balance)
+    if factors is not None:
+        weights *= factors[present]
     task = torch.multinomial(torch.from_numpy(weights), groups, replacement=True, generator=generator)
     rank = (torch.rand(groups, generator=generator) * of_task[task]).long()
     episode = order[(of_task.cumsum(0) - of_task)[task] + rank].repeat_interleave(moments)
@@ -156,29 +152,23 @@ def _teach(sampler: type[Any]) -> None:
     def init(self: Any, *args: Any, **named: Any) -> None:
         asked = signature.bind(self, *args, **named)
         dropped = asked.arguments.get("drop_n_last_frames", 0)
-        self.moments, tasks, factors = 1, None, None
-        if isinstance(dropped, Drawn):
-            self.moments, self.balance, tasks, factors = (
-                dropped.moments,
-                dropped.balance,
-                dropped.tasks,
-                dropped.factors,
-            )
-            if dropped.starts is not None:
-                asked.arguments["dataset_from_indices"] = dropped.starts
+        self.drawn = dropped if isinstance(dropped, Drawn) else None
+        if self.drawn is not None and self.drawn.starts is not None:
+            asked.arguments["dataset_from_indices"] = self.drawn.starts
         original(*asked.args, **asked.kwargs)
-        self.tasks, self.factors = (None if of is None else of[self._starts] for of in (tasks, factors))
 
     one_epoch = sampler._iter_epoch
 
     def draw(self: Any, epoch: int, start: int) -> Iterator[int]:
-        if (self.moments == 1 and self.tasks is None) or not self.shuffle:
+        drawn: Drawn | None = self.drawn
+        if drawn is None or not self.shuffle or (drawn.moments == 1 and drawn.tasks is None):
             return one_epoch(self, epoch, start)
         chance = self._epoch_generator(epoch)
-        if self.tasks is None:
-            order = in_groups(self._cum_lengths, self.moments, chance)
+        if drawn.tasks is None:
+            order = in_groups(self._cum_lengths, drawn.moments, chance)
         else:
-            order = in_turns(self._cum_lengths, self.tasks, self.moments, chance, self.balance, self.factors)
+            tasks = drawn.tasks[self._starts]
+            order = in_turns(self._cum_lengths, tasks, drawn.moments, chance, drawn.balance, drawn.factors)
         return (self._frame_index(position) for position in order[start:].tolist())
 
     sampler.__init__, sampler._iter_epoch = init, draw

@@ -123,8 +123,7 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
         starts = None if self.config.prompt_loss else execution_starts(cache.episodes, cache.phase)
         balance = self.config.balance_tasks
         tasks = task_of_frames(meta, cache.episodes) if balance else None
-        weight = self.config.prompted_weight
-        factors = None if tasks is None or weight == 1 else prompted_factors(tasks, cache.phase, weight)
+        factors = None if tasks is None else prompted_factors(tasks, cache.phase, self.config.prompted_weight)
         self.config.drop_n_last_frames = Drawn.of(starts, self.config.moments_per_episode, tasks, balance, factors)
 
     # -- checkpoints -----------------------------------------------------------------------------------------------
