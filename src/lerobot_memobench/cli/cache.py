@@ -16,8 +16,11 @@ def cache(
     stride: Annotated[
         int | None, typer.Option(min=1, help="Keep every how many frames (policy.memory_stride); 8 with eyes, else 1.")
     ] = None,
+    perception: Annotated[
+        str, typer.Option(help="pixels; or objects, which eyes find in the pictures (policy.perception).")
+    ] = "pixels",
     eyes: Annotated[
-        str | None, typer.Option(help="Eyes of size small (policy.eyes): a file; those of the package by default.")
+        str | None, typer.Option(help="Eyes (policy.eyes): package or a file; at size small the package's by default.")
     ] = None,
     weights: Annotated[
         str | None, typer.Option(help="Folder or repository whose image tower is used (size pi05).")
@@ -42,7 +45,9 @@ def cache(
     with quiet():
         place = None if out is None else str(out)
         given: dict[str, Any] = {} if stride is None else {"memory_stride": stride}
-        config = MemobenchMemConfig(size=size, eyes=eyes, memory_cache_dir=place, device=device, **given)
+        config = MemobenchMemConfig(
+            size=size, perception=perception, eyes=eyes, memory_cache_dir=place, device=device, **given
+        )
     screen = console()
     with counting(screen, "episodes") as count:
         folder = cache_dataset(

@@ -20,9 +20,10 @@ READ_OBJECTS = ("act", "diffusion", "tdmpc")
 def obs_type_of(policy: Any) -> str | None:
     """Return what a policy must be shown by its configuration; None where that is not known, or nothing is needed.
 
-    A policy that says by ``perception`` what it sees (`pixels`, `objects` or `any`) is taken at its word.
+    A policy that says by ``perception`` what it sees (`pixels`, `objects` or `any`) is taken at its word; one that
+    ``finds_objects`` does so in pictures.
     """
-    perception = getattr(policy, "perception", None)
+    perception = "pixels" if getattr(policy, "finds_objects", False) else getattr(policy, "perception", None)
     if policy is None or perception is not None:
         return {"objects": OBJECTS, "pixels": PIXELS}.get(str(perception))
     objects = policy.type in READ_OBJECTS and policy.env_state_feature is not None

@@ -29,13 +29,13 @@ MOST = 32
 """Things that are looked for in a picture."""
 
 
-def found(said: Said) -> list[NDArray[np.void]]:
-    """Return the things (n,) of dtype `FOUND` that each picture shows, the surest first."""
+def found(said: Said, sure: float = SURE) -> list[NDArray[np.void]]:
+    """Return the things (n,) of dtype `FOUND` that each picture shows, more probable than ``sure``, by probability."""
     heat = torch.sigmoid(said.heat)
     peaks = torch.where(heat == max_pool2d(heat, 3, 1, 1), heat, torch.zeros(()))
     side = heat.shape[-1]
     scores, places = peaks.flatten(1).topk(MOST, dim=1)
-    picture, rank = torch.nonzero(scores > SURE, as_tuple=True)
+    picture, rank = torch.nonzero(scores > sure, as_tuple=True)
     place = places[picture, rank]
     kind, row, column = place // side**2, place // side % side, place % side
     geometry = _between(said.geometry, picture, kind, (row + 0.5) / side, (column + 0.5) / side)

@@ -57,14 +57,18 @@ def load_tower(name: str) -> Tower:
     Raises:
         MemobenchError: there are no such eyes, or their tower has other sizes than this version's.
     """
-    path = SHIPPED if name == PACKAGE else Path(name).expanduser()
-    tower = load_eyes(path).tower
+    tower = eyes_named(name).tower
     if (tower.widths, tower.blocks) != (WIDTHS, BLOCKS):
         raise MemobenchError(
-            f"the tower of {path} has stages of widths {tower.widths} and blocks {tower.blocks}, and policies look "
+            f"the tower of {name} has stages of widths {tower.widths} and blocks {tower.blocks}, and policies look "
             f"through {WIDTHS} and {BLOCKS}; name eyes of this version's `memobench eyes train`"
         )
     return tower
+
+
+def eyes_named(name: str) -> Eyes:
+    """Return the eyes of that name, `PACKAGE` or a file; errors as of `load_eyes`."""
+    return load_eyes(SHIPPED if name == PACKAGE else Path(name).expanduser())
 
 
 def load_eyes(path: Path) -> Eyes:

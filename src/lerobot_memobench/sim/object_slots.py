@@ -23,7 +23,7 @@ from lerobot_memobench.sim.assets.registry import known_classes, split_class
 from lerobot_memobench.sim.object_layout import FIELDS, SIZE, SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.simulation import CAMERAS, Simulation
 
-__all__ = ["FIELDS", "SIZE", "SLOTS", "STARTS", "WIDTH", "ObjectSlots", "Thing", "classes", "layout"]
+__all__ = ["FIELDS", "SIZE", "SLOTS", "STARTS", "WIDTH", "ObjectSlots", "Thing", "classes", "in_slots", "layout"]
 
 POINTS = 24
 """Points of a thing to which rays run."""
@@ -105,13 +105,7 @@ class ObjectSlots:
         """Return the slots (SIZE,) of what is visible in the present state."""
         seen = self._visible()
         rows = [self._row(thing) for thing, visible in zip(self._things, seen, strict=True) if visible]
-        found = np.zeros((SLOTS, WIDTH), np.float32)
-        if rows:
-            stacked = np.array(rows)
-            place = stacked[:, STARTS["position"] : STARTS["position"] + 3]
-            order = np.lexsort((place[:, 2], place[:, 1], place[:, 0], stacked[:, STARTS["class"]]))
-            found[: len(rows)] = stacked[order]
-        return found.reshape(-1)
+        return in_slots(np.array(rows).reshape(-1, WIDTH))
 
     def _add(self, name: str, asset: Asset) -> None:
         """Note an instance, and each of its moving parts."""
@@ -175,6 +169,14 @@ class ObjectSlots:
             np.hypot(*(position[:2] - np.array(mark.position[:2]))) < mark.radius for mark in self._sim.highlights
         )
         return np.array([1.0, thing.kind, *position, *turned[:, 0], *turned[:, 1], joint, float(lit)])
+
+
+def in_slots(things: Array) -> NDArray[np.float32]:
+    """Return things (n, WIDTH) as an observation (SIZE,): in the order of class and place, before empty slots."""
+    slots = np.zeros((SLOTS, WIDTH), np.float32)
+    x, y, z = things[:, STARTS["position"] : STARTS["position"] + 3].T
+    slots[: len(things)] = things[np.lexsort((z, y, x, things[:, STARTS["class"]]))]
+    return slots.reshape(-1)
 
 
 def rotation(quaternion: Array) -> Array:

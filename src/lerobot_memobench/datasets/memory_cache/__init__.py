@@ -7,6 +7,7 @@ so far"). For a policy with eyes all tokens of every picture of a camera are a c
 """
 
 from lerobot_memobench.datasets.memory_cache.building import build_memory_cache
+from lerobot_memobench.datasets.memory_cache.decoding import FrameReader, frame_reader
 from lerobot_memobench.datasets.memory_cache.encoding import FrameEncoder, Progress
 from lerobot_memobench.datasets.memory_cache.frame_table import resolve_subgoals
 from lerobot_memobench.datasets.memory_cache.layout import (
@@ -26,6 +27,7 @@ __all__ = [
     "CacheMeta",
     "FrameEncoder",
     "FrameLookup",
+    "FrameReader",
     "MemoryCache",
     "Progress",
     "RecordedFrames",
@@ -33,6 +35,7 @@ __all__ = [
     "build_memory_cache",
     "dataset_fingerprint",
     "find_cache",
+    "frame_reader",
     "read_meta",
     "read_recorded",
     "resolve_subgoals",

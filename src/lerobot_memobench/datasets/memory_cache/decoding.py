@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 TOLERANCE = 1e-4
 """Seconds by which a decoded frame may miss its time."""
 
-FrameReader = Callable[[int, list[int]], Tensor]
+FrameReader = Callable[[int, list[int]], Any]
 """From (episode, frame numbers) to images (n, 3, H, W) float32 in [0, 1], or to what an encoder is given for them."""
 
 

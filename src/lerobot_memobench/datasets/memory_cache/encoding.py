@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -24,7 +24,7 @@ Progress = Callable[[int, int], None]
 
 
 class FrameEncoder(Protocol):
-    """The frozen vision tower: images (N, 3, H, W) in [0, 1] -> tokens (N, P, D) bfloat16."""
+    """The frozen vision tower: images (N, 3, H, W) in [0, 1], or what else is read -> tokens (N, P, D) bfloat16."""
 
     tokens_per_frame: int
     dim: int
@@ -33,7 +33,7 @@ class FrameEncoder(Protocol):
     def key(self) -> str:
         """Identity of the tower: weights and input size."""
 
-    def __call__(self, images: Tensor) -> Tensor:
+    def __call__(self, images: Any, /) -> Tensor:
         """Encode."""
 
 

@@ -17,10 +17,12 @@ from lerobot.policies.pi_gemma import PaliGemmaForConditionalGenerationWithPiGem
 from torch import Tensor, nn
 
 from lerobot_memobench.eyes.tower import Tower
+from lerobot_memobench.eyes.weights import eyes_named
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.dimensions import Dimensions, Gemma
 from lerobot_memobench.policies.memobench_mem.integration.integration import Prefix
 from lerobot_memobench.policies.memobench_mem.perception.eyes import EyePerception
+from lerobot_memobench.policies.memobench_mem.perception.found import FoundObjects, ObjectsInPictures
 from lerobot_memobench.policies.memobench_mem.perception.frozen import VISION_SEED, seed_parameters
 from lerobot_memobench.policies.memobench_mem.perception.objects import LOUD, ObjectPerception
 from lerobot_memobench.policies.memobench_mem.perception.perception import Perception
@@ -80,7 +82,7 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
     def _perception(self, config: MemobenchMemConfig) -> Perception:
         """Build the configuration's way of seeing; one without pictures leaves no image tower."""
         seeing = self.paligemma.model
-        if config.has_eyes:
+        if config.sees_tokens:
             # Where the frozen image tower lies in pi0.5; its weights are loaded by the policy.
             tower = seeing.vision_tower = Tower(folded=True).eval().requires_grad_(False)
             seeing.multi_modal_projector = nn.Identity()
@@ -91,7 +93,10 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
             )
         seeing.vision_tower, seeing.multi_modal_projector = nn.Identity(), nn.Identity()
         config.object_classes = config.object_classes or list(classes())
-        return ObjectPerception(config.object_classes, config.tokens_per_frame, config.dimensions.vlm.width)
+        shape = config.object_classes, config.tokens_per_frame, config.dimensions.vlm.width
+        if config.eyes is None:
+            return ObjectPerception(*shape)
+        return FoundObjects(ObjectsInPictures(eyes_named(config.eyes)), *shape)
 
     def _set_requires_grad(self) -> None:
         super()._set_requires_grad()

@@ -21,15 +21,17 @@ from lerobot_memobench.datasets.memory_cache import (
 )
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.eyes.tower import Tower
-from lerobot_memobench.eyes.weights import load_tower
+from lerobot_memobench.eyes.weights import eyes_named, load_tower
 from lerobot_memobench.policies.memobench_mem.backbone import SizedPaliGemmaWithExpert
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.found_in_pictures import make_found, open_found
 from lerobot_memobench.policies.memobench_mem.language.text_encoders import (
     SiglipTextEncoder,
     WordTextEncoder,
     make_text_encoder,
 )
 from lerobot_memobench.policies.memobench_mem.perception.eyes import EyePerception
+from lerobot_memobench.policies.memobench_mem.perception.found import FoundObjects, ObjectsInPictures
 from lerobot_memobench.policies.memobench_mem.perception.frozen import VISION_SEED, seed_parameters
 from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_PHASE, OBS_RAW_STATE
 from lerobot_memobench.policies.memobench_mem.perception.perception import Perception
@@ -70,7 +72,8 @@ def load_perception(config: MemobenchMemConfig, weights: str | Path | None = Non
     """
     if config.sees_objects:
         raise MemobenchError(
-            "perception=objects needs no memory cache: training reads the dataset's columns; leave this command out."
+            "perception=objects needs no memory cache where the environment tells the objects: training reads the "
+            "dataset's columns; leave this command out, or name eyes that find them."
         )
     with torch.device("meta"):
         model = SizedPaliGemmaWithExpert(config).paligemma.model
@@ -109,11 +112,14 @@ def cache_dataset(
         The cache's folder, ``<root>/memory_cache/<size>-stride<n>-<hash>``, or below ``config.memory_cache_dir``; with
         eyes that of the memory's, beside which those of the present lie.
     """
+    how: dict[str, Any] = {"batch_size": batch_size, "workers": workers, "progress": progress, "tell": tell}
+    if config.finds_objects:
+        assert config.eyes is not None
+        return make_found(root, config, ObjectsInPictures(eyes_named(config.eyes)), _text_encoder(config), **how).folder
     if config.has_eyes:
-        how: dict[str, Any] = {"batch_size": batch_size, "workers": workers, "progress": progress, "tell": tell}
         return make_caches(root, config, load_eyes(config, weights), _text_encoder(config), **how)[0].folder
     perception = load_perception(config, weights)
-    return _build(root, config, perception, batch_size=batch_size, workers=workers, progress=progress, tell=tell)
+    return _build(root, config, perception, **how)
 
 
 def open_frames(root: Path, config: MemobenchMemConfig, perception: Perception) -> FrameLookup:
@@ -124,9 +130,10 @@ def open_frames(root: Path, config: MemobenchMemConfig, perception: Perception) 
     """
     if isinstance(perception, PixelPerception):
         return open_cache(root, config, perception)
-    if isinstance(perception, EyePerception):
+    if isinstance(perception, EyePerception | FoundObjects):
         names = [name for name in RECORDED if name != OBS_ENV_STATE]
-        return open_pictures(root, config, perception, _text_encoder(config), names)
+        open_seen = open_pictures if isinstance(perception, EyePerception) else open_found
+        return open_seen(root, config, perception, _text_encoder(config), names)
     columns, table = read_recorded(root, RECORDED)
     phase = torch.from_numpy(table.phase)
     logger.info("%d frames of %s are read into memory", table.episodes[-1], root)

@@ -38,7 +38,7 @@ def read_config(source: str | Path, config: PreTrainedConfig | None, revision: s
         )
     path = checkpoint_file(source, CONFIG_FILE, revision)
     held = None if path is None else read_json(path).get("eyes")
-    if held and found.eyes and found.eyes != held:
+    if held and found.eyes and found.eyes != held and not found.sees_objects:
         raise MemobenchError(
             f"--policy.eyes={found.eyes} cannot be followed: '{source}' was trained through the tower of '{held}' and "
             "holds it; leave eyes out, or train anew."

@@ -6,9 +6,10 @@ import logging
 from dataclasses import dataclass
 from typing import Any
 
-from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
-from lerobot.utils.constants import OBS_ENV_STATE
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
 
+from lerobot_memobench.envs.observations import IMAGE_KEYS, IMAGE_SIZE
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.eyes.tower import SIDE
 from lerobot_memobench.eyes.weights import PACKAGE, RANDOM
@@ -69,7 +70,7 @@ class MemobenchMemConfig(MemobenchMemSettings):
             mode = NormalizationMode(dims.recipe.normalization)
             self.normalization_mapping = {"VISUAL": NormalizationMode.IDENTITY, "STATE": mode, "ACTION": mode}
         if self.image_resolution is None:
-            side = SIDE if self.has_eyes else dims.vision.image
+            side = SIDE if self.sees_tokens else dims.vision.image
             self.image_resolution = (side, side)
         # A checkpoint without oracle memory holds the length of prompts without it, which would cut the text off.
         if self.tokenizer_max_length in (None, dims.tokenizer_max_length):
@@ -106,13 +107,17 @@ class MemobenchMemConfig(MemobenchMemSettings):
         }
 
     def _choose_eyes(self) -> None:
-        possible = self.size == "small" and not self.sees_objects
-        if possible and self.eyes is None:
-            self.eyes = PACKAGE
-        elif self.eyes is not None and not possible:
+        if self.size == "small" and not self.sees_objects:
+            self.eyes = self.eyes or PACKAGE
+        elif self.eyes is not None and not self.sees_objects:
             raise MemobenchError(
-                f"--policy.eyes={self.eyes} is for --policy.size=small --policy.perception=pixels, and not for size="
-                f"{self.size} perception={self.perception}; leave it out."
+                f"--policy.eyes={self.eyes} is for --policy.size=small, or --policy.perception=objects, and not for "
+                f"size={self.size} perception={self.perception}; leave it out."
+            )
+        elif self.eyes == RANDOM:
+            raise MemobenchError(
+                f"--policy.eyes={RANDOM} finds no objects; name {PACKAGE} or a file of `memobench eyes train`, or "
+                "leave it out: then objects are told by the environment."
             )
 
     def _check_dimensions(self) -> None:
@@ -156,7 +161,7 @@ class MemobenchMemConfig(MemobenchMemSettings):
                 "--policy.freeze_vision_encoder=false cannot be used: memory tokens are cached from the frozen "
                 "vision tower, and would no longer match a tower that learns."
             )
-        if self.has_eyes:
+        if self.sees_tokens:
             if self.image_size != (SIDE, SIDE):
                 raise MemobenchError(
                     f"--policy.image_resolution={self.image_resolution} cannot be used: eyes look at {SIDE} x {SIDE} "
@@ -199,13 +204,28 @@ class MemobenchMemConfig(MemobenchMemSettings):
 
     @property
     def sees_objects(self) -> bool:
-        """Whether a moment is seen as objects, and no picture is looked at."""
+        """Whether a moment is seen as objects."""
         return self.perception == "objects"
 
     @property
     def has_eyes(self) -> bool:
-        """Whether pictures are seen through the tower of `lerobot_memobench.eyes`."""
+        """Whether pictures are seen through `lerobot_memobench.eyes`."""
         return self.eyes not in (None, RANDOM)
+
+    @property
+    def sees_tokens(self) -> bool:
+        """Whether what is seen of pictures are the tokens of eyes."""
+        return self.has_eyes and not self.sees_objects
+
+    @property
+    def finds_objects(self) -> bool:
+        """Whether the objects that are seen are those that eyes find in pictures."""
+        return self.sees_objects and self.has_eyes
+
+    @property
+    def sees_pictures(self) -> bool:
+        """Whether pictures are looked at."""
+        return self.has_eyes or not self.sees_objects
 
     @property
     def decodes_nothing(self) -> bool:
@@ -234,7 +254,7 @@ class MemobenchMemConfig(MemobenchMemSettings):
     @property
     def watches(self) -> bool:
         """Whether pictures count that are shown between two plans."""
-        return self.memory != "none" and not self.sees_objects
+        return self.memory != "none" and self.sees_pictures
 
     @property
     def cache_name(self) -> str:
@@ -248,13 +268,20 @@ class MemobenchMemConfig(MemobenchMemSettings):
     def validate_features(self) -> None:
         """Keep of the features what this perception looks at, besides the state.
 
+        A checkpoint that was trained on the environment's objects has no pictures among them; eyes look at all cameras.
+
         Raises:
             MemobenchError: they lack the slots of objects.
         """
-        unseen = FeatureType.VISUAL if self.sees_objects else FeatureType.ENV
+        unseen = FeatureType.ENV if self.sees_pictures else FeatureType.VISUAL
         for key in [key for key, feature in self.input_features.items() if feature.type is unseen]:
             del self.input_features[key]
-        if self.sees_objects and OBS_ENV_STATE not in self.input_features:
+        if self.finds_objects and not self.image_features:
+            shape = (3, IMAGE_SIZE, IMAGE_SIZE)
+            self.input_features |= {
+                f"{OBS_IMAGES}.{name}": PolicyFeature(FeatureType.VISUAL, shape) for name in IMAGE_KEYS
+            }
+        if self.sees_objects and not self.has_eyes and OBS_ENV_STATE not in self.input_features:
             raise MemobenchError(
                 f"perception=objects sees by '{OBS_ENV_STATE}', which is not there; train on a dataset of this "
                 "version's `memobench generate`, and evaluate with --env.obs_type=environment_state_agent_pos."

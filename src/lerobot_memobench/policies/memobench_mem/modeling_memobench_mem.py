@@ -116,7 +116,7 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
             read_from_memory()
             drawn = np.ones(cache.num_frames, bool) if self.config.prompt_loss else cache.phase != 0
             count_drawn_only(meta.stats, cache, drawn)
-        if self.config.has_eyes:
+        if self.config.sees_tokens:
             attend_fused(self.model)
         if self._device.type == "cpu":
             keep_freed_memory()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from lerobot.policies.common.vla_utils import pad_vector
 from lerobot.policies.pi05.modeling_pi05 import PI05Policy
-from lerobot.utils.constants import ACTION, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
 from torch import Tensor
 
 from lerobot_memobench.policies.memobench_mem.averaging import WeightAverage
@@ -53,8 +53,8 @@ class SeeingPolicy(PI05Policy):
     @property
     def _seen(self) -> list[str]:
         """Observations of the present that the model is given, if they are there."""
-        seen = [] if self.config.sees_objects else [*self.config.image_features]
-        own = [self.perception.remembers, OBS_RAW_STATE] if self.config.sees_objects else []
+        seen = [*self.config.image_features] if self.config.sees_pictures else []
+        own = [OBS_ENV_STATE, OBS_RAW_STATE] if self.config.sees_objects else []
         return [*seen, *own, OBS_STATE, OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK]
 
     def _preprocess_images(self, batch: dict[str, Tensor]) -> Seen:

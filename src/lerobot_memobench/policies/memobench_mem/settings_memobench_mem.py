@@ -28,11 +28,12 @@ class MemobenchMemSettings(PI05Config):
 
     perception: str = "pixels"
     """How a moment is seen: ``pixels``, by the image tower, or ``objects``, by the slots of
-    ``observation.environment_state`` (`sim.object_slots`), without any picture."""
+    ``observation.environment_state`` (`sim.object_slots`), without any picture, or as ``eyes`` find them."""
     eyes: str | None = None
-    """Whose tower pictures are seen through at ``size=small``: a file of `memobench eyes train`, ``package``: the one
-    that comes with the package, or ``random``: pi0.5's image tower with random weights. None: ``package``.
-    A checkpoint holds its tower; there this only says where it was from."""
+    """What pictures are seen through: a file of `memobench eyes train`, ``package``: the eyes that come with the
+    package, or ``random``: pi0.5's image tower with random weights. With ``perception=objects``, the eyes that find
+    them in pictures; none: the environment tells them. With pixels at ``size=small``, whose tower's tokens are seen;
+    none: ``package``. A checkpoint of pixels holds its tower; there this only says where it was from."""
     object_classes: list[str] | None = None
     """Names of the classes that slots were trained with, in order of their indices; none: those of this version."""
 

@@ -71,7 +71,7 @@ class ObjectPerception(nn.Module, Perception):
     """
 
     remembers = OBS_ENV_STATE
-    key = f"objects-{SIZE}"
+    key: str = f"objects-{SIZE}"
     grid = 0
     pictures = False
 

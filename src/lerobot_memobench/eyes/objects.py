@@ -1,0 +1,158 @@
+"""Objects that eyes find in both cameras' pictures, as slots: what `sim.object_slots` says, without a simulator.
+
+Nothing is known but the present pictures and where the hand is. What stands in slots is what was found, right or
+wrong. How things are tilted is not looked for, nor where they have their front, which is taken to be where tasks have
+it; and no highlight is seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lerobot_memobench.eyes.finding import found
+from lerobot_memobench.eyes.kinds import DRAWERS, PARTS
+from lerobot_memobench.eyes.labels import rays
+from lerobot_memobench.eyes.tower import shrunk
+from lerobot_memobench.eyes.views import View, view_of
+from lerobot_memobench.eyes.weights import Eyes
+from lerobot_memobench.sim.object_slots import SLOTS, WIDTH, classes, in_slots
+from lerobot_memobench.sim.scene import TABLE_TOP
+from lerobot_memobench.sim.simulation import CAMERAS
+
+Array = NDArray[np.float64]
+Things = NDArray[np.void]
+
+ONE = frozenset({*PARTS, "flat_stove", "kitchen_table", "microwave", "wooden_cabinet", "wooden_two_layer_shelf"})
+"""Kinds of which a scene has one."""
+TURNED = ONE - {"flat_stove", "kitchen_table", "knob"}
+"""Kinds whose x axis points to the robot; that of others points away from it, as near as half a turn allows."""
+# fmt: off
+ROUND = frozenset({
+    "akita_black_bowl", "artichoke", "beefsteak_tomato", "biscuit", "bottle_of_coffee",
+    "bottle_of_olive_oil", "bottle_of_protein_powder", "broccoli", "brussels_sprouts", "cap",
+    "cork", "plate", "white_bowl",
+})
+# fmt: on
+"""Kinds that are alike from all sides: their x axis is taken to be the world's, as tasks place them."""
+SURE, ALONE = 0.2, {"agentview": 0.3, "wrist": 0.4}
+"""Probability from which on what both cameras find is there, and what one of them finds alone."""
+APART, SAME = 0.03, 0.05
+"""How near to one another two things of a kind can stand, and how far apart two cameras may see one thing, m."""
+NEAR = 0.3
+"""Depth up to which the wrist's camera may see better than the other where things are, m."""
+
+
+@dataclass
+class Sighting:
+    """A thing that was found.
+
+    Attributes:
+        cameras: that found it. depth: from the one by which it was placed, m.
+        place: of its origin in the world, m. axis: (3,) its x axis, level, of length 1. joint: m or rad.
+    """
+
+    kind: int
+    score: float
+    cameras: tuple[str, ...]
+    depth: float
+    place: Array
+    axis: Array
+    joint: float
+
+    def seen_too(self, other: Sighting, one: bool) -> None:
+        """Take in how another camera, less sure of it, sees this thing, which is the only one of its kind if ``one``.
+
+        The surer one places it, unless it is the wrist's and far; fixtures and their parts are placed from outside.
+        """
+        self.cameras += other.cameras
+        if self.cameras[0] == "wrist" and (one or self.depth > NEAR):
+            self.depth, self.place, self.axis, self.joint = other.depth, other.place, other.axis, other.joint
+
+
+class ObjectFinder:
+    """Look for objects through eyes; kinds that this version does not know are passed over."""
+
+    def __init__(self, eyes: Eyes) -> None:
+        self.eyes = eyes
+        names = ["drawer" if kind in DRAWERS else kind for kind in eyes.kinds]
+        self._one = [kind in ONE for kind in eyes.kinds]
+        self._class = [classes().index(name) if name in classes() else None for name in names]
+
+    @torch.inference_mode()
+    def __call__(self, pictures: Mapping[str, Tensor], states: Tensor) -> Tensor:
+        """Return the slots (N, `object_slots.SIZE`) float32 of N moments.
+
+        Args:
+            pictures: of each camera, `agentview` and `wrist`, (N, 3, H, H) in [0, 1].
+            states: (N, >= 6) the hand's place, m, and its turn as axis times angle, rad.
+        """
+        said = {camera: self.eyes.heads(self.eyes.tower(shrunk(pictures[camera]))) for camera in CAMERAS}
+        finds = {camera: found(heads, SURE) for camera, heads in said.items()}
+        hands = states.cpu().numpy().astype(np.float64)
+        slots = [
+            self.slots({camera: finds[camera][row] for camera in CAMERAS}, hands[row]) for row in range(len(hands))
+        ]
+        return torch.from_numpy(np.array(slots))
+
+    def slots(self, finds: Mapping[str, Things], state: Array) -> NDArray[np.float32]:
+        """Return the slots (SIZE,) of what each camera found at one moment, of dtype `finding.FOUND`."""
+        rows = []
+        for thing in self.merged(finds, state)[:SLOTS]:
+            side = np.cross([0.0, 0.0, 1.0], thing.axis)
+            joint = thing.joint if self.eyes.kinds[thing.kind] in PARTS else 0.0
+            rows.append([1.0, self._class[thing.kind], *thing.place, *thing.axis, *side, joint, 0.0])
+        return in_slots(np.array(rows).reshape(-1, WIDTH))
+
+    def merged(self, finds: Mapping[str, Things], state: Array) -> list[Sighting]:
+        """Return the things that there are by what each camera found, the surest first."""
+        single = [self._sighting(camera, view_of(camera, state), find) for camera in finds for find in finds[camera]]
+        things: list[Sighting] = []
+        for seen in sorted(single, key=lambda thing: -thing.score):
+            if self._class[seen.kind] is None:
+                continue
+            known = next((thing for thing in things if self._is(thing, seen)), None)
+            if known is None:
+                things.append(seen)
+            elif seen.cameras[0] not in known.cameras:
+                known.seen_too(seen, self._one[seen.kind])
+        return [thing for thing in things if len(thing.cameras) > 1 or thing.score > ALONE[thing.cameras[0]]]
+
+    def _is(self, thing: Sighting, seen: Sighting) -> bool:
+        """Whether two finds are of one thing."""
+        if thing.kind != seen.kind or self._one[seen.kind]:
+            return thing.kind == seen.kind
+        apart = APART if seen.cameras[0] in thing.cameras else SAME
+        return float(np.linalg.norm(thing.place - seen.place)) < apart
+
+    def _sighting(self, camera: str, view: View, find: np.void) -> Sighting:
+        """Return where in the world a find of a camera is."""
+        sight, turned = rays(find["place"].astype(np.float64), view), np.asarray(view["turned"])
+        angle = np.arctan2(find["turn"][1], find["turn"][0]) / 2
+        axis = np.cos(angle) * turned[:, 0] + np.sin(angle) * turned[:, 1]
+        if camera == "wrist":
+            depth = float(find["depth"])
+        else:
+            depth = float((TABLE_TOP + find["height"] - view["eye"][2]) / min(sight[2], -1e-3))
+            axis = axis - turned[:, 2] * (axis[2] / turned[2, 2])  # it is level, where the picture is not
+        level = np.array([axis[0], axis[1], 0.0])
+        level /= max(float(np.linalg.norm(level)), 1e-9)
+        kind = self.eyes.kinds[find["kind"]]
+        if kind in ROUND:
+            level = np.array([1.0, 0.0, 0.0])
+        elif (level[0] < 0) != (kind in TURNED):
+            level = -level
+        return Sighting(
+            int(find["kind"]),
+            float(find["score"]),
+            (camera,),
+            depth,
+            view["eye"] + sight * depth,
+            level,
+            float(find["joint"]),
+        )

@@ -1,0 +1,112 @@
+"""What eyes find in a dataset's pictures, made once for every frame: a memory cache of slots instead of tokens.
+
+A cache holds bfloat16 numbers, which know places to 4 mm. So a slot's number is kept as two: what it is rounded to, and
+what that leaves of it.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from lerobot.utils.constants import OBS_STATE
+from torch import Tensor
+
+from lerobot_memobench.datasets.memory_cache import (
+    MemoryCache,
+    RecordedFrames,
+    TextEncoder,
+    build_memory_cache,
+    find_cache,
+    frame_reader,
+    read_recorded,
+)
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.perception.found import FOUND, VIEWS, FoundObjects, ObjectsInPictures
+from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_PHASE, OBS_RAW_STATE
+from lerobot_memobench.sim.object_slots import SIZE
+
+logger = logging.getLogger(__name__)
+
+Look = tuple[dict[str, Tensor], Tensor]
+"""Pictures of some frames by their names, and the robot's states."""
+
+
+@dataclass
+class SlotEncoder:
+    """What makes a cache's numbers; a `FrameEncoder`."""
+
+    look: ObjectsInPictures
+    tokens_per_frame: int = 2
+    dim: int = SIZE
+
+    @property
+    def key(self) -> str:
+        """Identity of what is found."""
+        return self.look.key
+
+    def __call__(self, seen: Look) -> Tensor:
+        """Return the slots of frames in two parts, (N, 2, SIZE) bfloat16."""
+        slots = self.look(*seen)
+        rounded = slots.to(torch.bfloat16)
+        return torch.stack([rounded, (slots - rounded.float()).to(torch.bfloat16)], dim=1)
+
+
+def make_found(
+    root: Path, config: MemobenchMemConfig, look: ObjectsInPictures, texts: TextEncoder, **how: Any
+) -> MemoryCache:
+    """Make or finish the cache of what is found in the pictures of the dataset at ``root``.
+
+    Args:
+        how: of `build_memory_cache`.
+
+    Raises:
+        MemobenchError: the dataset lacks a camera, or the disk has no room.
+    """
+    place = None if config.memory_cache_dir is None else Path(config.memory_cache_dir).expanduser()
+    where: dict[str, Any] = {"camera": next(iter(VIEWS)), "stride": 1}
+    folder = find_cache(root, "objects", frames_key=look.key, place=place, **where)
+    where["place"] = folder.parent
+    build_memory_cache(root, folder.name, SlotEncoder(look), texts, read=_reader(root), **where, **how)
+    return MemoryCache.open(root, folder.name, frames_key=look.key, **where)
+
+
+def _reader(root: Path) -> Callable[[int, list[int]], Look]:
+    """Return what reads frames of all cameras, and the states at them."""
+    readers = {name: frame_reader(root, name) for name in VIEWS}
+    columns, table = read_recorded(root, [OBS_STATE])
+
+    def read(episode: int, numbers: list[int]) -> Look:
+        states = columns[OBS_STATE][[int(table.episodes[episode]) + number for number in numbers]]
+        return {name: one(episode, numbers) for name, one in readers.items()}, states
+
+    return read
+
+
+def open_found(
+    root: Path, config: MemobenchMemConfig, eyes: FoundObjects, texts: TextEncoder, names: Sequence[str]
+) -> RecordedFrames:
+    """Open what training looks up of the dataset at ``root``: its columns ``names``, and what ``eyes`` find.
+
+    Raises:
+        MemobenchError: the dataset lacks a column or a camera, or the cache cannot be made.
+    """
+    cache = make_found(
+        root,
+        config,
+        eyes.look,
+        texts,
+        progress=lambda done, count: logger.info("objects found in %d of %d episodes", done, count),
+    )
+    columns, table = read_recorded(root, names)
+    columns[FOUND] = cache.all_tokens().sum(dim=1, dtype=torch.float32)
+    phase = torch.from_numpy(table.phase)
+
+    def remember(seen: Any, frames: Sequence[int]) -> Tensor:
+        return eyes.remember({FOUND: seen[FOUND], OBS_RAW_STATE: seen[OBS_STATE], OBS_PHASE: phase}, frames)
+
+    return RecordedFrames(root, columns, table, texts, remember=remember, key=eyes.key, stride=config.memory_stride)

@@ -1,0 +1,224 @@
+"""Objects that eyes find in pictures: settings, caches, samples, rollouts, and policies that never saw a picture."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.datasets.dataset_reader import DatasetReader
+from lerobot.policies import make_pre_post_processors
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
+from small_policy import batch_of, losses_in_training, made_for_training, small_config
+
+from lerobot_memobench.datasets.memory_cache import FOLDER
+from lerobot_memobench.datasets.memory_cache.decoding import frame_reader
+from lerobot_memobench.envs.obs_types import PIXELS, obs_type_of
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.eyes.kinds import kinds
+from lerobot_memobench.eyes.tower import Tower
+from lerobot_memobench.eyes.weights import Eyes, save_eyes
+from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, STEPS, TOKENS
+from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from lerobot_memobench.policies.memobench_mem.perception.found import FOUND, VIEWS
+from lerobot_memobench.sim.object_slots import SIZE
+from object_dataset import make_object_dataset
+from synthetic_dataset import LENGTHS
+
+STARTS = np.cumsum([0, *LENGTHS])
+ROUNDED = 2**-15
+"""What two bfloat16 numbers leave of one, as a share of it."""
+
+
+def made_eyes(path: Path, seed: int) -> Path:
+    """Write eyes that find something everywhere."""
+    torch.manual_seed(seed)
+    eyes = Eyes(Tower().eval(), kinds())
+    torch.nn.init.zeros_(eyes.heads.heat.bias)
+    save_eyes(eyes, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def eyes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made_eyes(tmp_path_factory.mktemp("eyes") / "eyes.safetensors", 1)
+
+
+@pytest.fixture(scope="module")
+def finding(eyes: Path) -> dict[str, Any]:
+    return {"perception": "objects", "size": "small", "eyes": str(eyes), "n_action_steps": 3, "memory_stride": 2}
+
+
+@pytest.fixture(scope="module")
+def root(dataset_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The dataset, in which nothing says what objects there are."""
+    to = tmp_path_factory.mktemp("seen") / "data"
+    return shutil.copytree(dataset_root, to, ignore=shutil.ignore_patterns(FOLDER))
+
+
+def pictures_of(root: Path, index: int) -> dict[str, torch.Tensor]:
+    episode = int(np.searchsorted(STARTS, index, "right")) - 1
+    return {name: frame_reader(root, name)(episode, [int(index - STARTS[episode])]) for name in VIEWS}
+
+
+def observed(root: Path, dataset: Any, index: int) -> dict[str, Any]:
+    """An observation of a rollout: frame ``index`` as the dataset's videos show it."""
+    step = float(index - STARTS[int(np.searchsorted(STARTS, index, "right")) - 1])
+    clock = {"observation.step": torch.tensor([step]), "observation.phase": torch.ones(1)}
+    state = {OBS_STATE: dataset.hf_dataset[index][OBS_STATE][None]}
+    return {**pictures_of(root, index), **state, **clock, "task": [dataset[index]["task"]]}
+
+
+# -- settings ------------------------------------------------------------------------------------------------------
+
+
+def test_objects_are_found_where_eyes_are_named(tmp_path: Path) -> None:
+    told = MemobenchMemConfig(device="cpu", size="small", perception="objects")
+    found = MemobenchMemConfig(device="cpu", size="small", perception="objects", eyes="package")
+    for config, finds in ((told, False), (found, True)):
+        assert (config.finds_objects, config.sees_pictures, config.watches) == (finds,) * 3
+        assert not config.sees_tokens
+        assert (config.memory_stride, config.moments_per_episode, config.tokens_per_frame) == (8, 6, 2)
+    assert obs_type_of(found) == PIXELS
+    assert obs_type_of(told) != PIXELS
+    found.save_pretrained(tmp_path)
+    assert PreTrainedConfig.from_pretrained(tmp_path).finds_objects
+    with pytest.raises(MemobenchError, match="eyes=random finds no objects; name package or a file"):
+        MemobenchMemConfig(device="cpu", size="small", perception="objects", eyes="random")
+
+
+def test_eyes_that_are_none_are_refused(root: Path, finding: dict[str, Any], tmp_path: Path) -> None:
+    with pytest.raises(MemobenchError, match=r"there is no file.*memobench eyes train"):
+        made_for_training(root, **finding | {"eyes": str(tmp_path / "absent")})
+    with pytest.raises(MemobenchError, match="or name eyes that find them"):
+        cache_dataset(root, small_config(size="small", perception="objects"))
+
+
+# -- caches and samples --------------------------------------------------------------------------------------------
+
+
+def test_what_is_found_is_kept_for_every_frame(
+    root: Path, finding: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = cache_dataset(root, small_config(**finding))
+    assert (folder / "tokens.bin").stat().st_size == sum(LENGTHS) * 2 * SIZE * 2
+
+    def refuse(*_: Any, **__: Any) -> None:
+        raise AssertionError("a video was opened")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("lerobot.datasets.dataset_reader.decode_video_frames", refuse)
+        policy, before, _, dataset = made_for_training(root, **finding)
+        assert set(policy.config.input_features) == {OBS_STATE, *VIEWS}
+        batch = before(batch_of(dataset, [45, 50]))
+    seen = [policy.perception.look(pictures_of(root, index), batch["observation.raw_state"][row : row + 1])
+            for row, index in enumerate((45, 50))]  # fmt: skip
+    truth = torch.cat(seen)
+    assert truth.any()
+    assert torch.allclose(batch[FOUND], truth, rtol=ROUNDED, atol=1e-7)
+    assert not torch.equal(seen[0], seen[1])
+    assert len(batch[FRAMES].unique()) < batch[MASK].sum(), "moments of an episode share frames"
+
+
+def test_a_dataset_with_one_camera_is_refused(finding: dict[str, Any], tmp_path: Path) -> None:
+    with pytest.raises(MemobenchError, match=r"no camera 'observation\.images\.wrist_image'"):
+        made_for_training(make_object_dataset(tmp_path / "filmed", pictures=True), **finding)
+
+
+def test_pictures_in_a_batch_are_refused(root: Path, finding: dict[str, Any]) -> None:
+    policy, before, _, dataset = made_for_training(root, **finding)
+    batch = before(torch.utils.data.default_collate([DatasetReader.get_item.__wrapped__(dataset.reader, 45)]))
+    with pytest.raises(MemobenchError, match=r"has pictures, and not what eyes saw.*--num_workers=0"):
+        policy.train().forward(batch)
+
+
+def test_a_rollout_sees_and_remembers_what_training_reads(root: Path, finding: dict[str, Any]) -> None:
+    policy, before, _, dataset = made_for_training(root, **finding)
+    index = int(STARTS[1]) + 14
+    trained = before(batch_of(dataset, [index]))
+    for frame in range(int(STARTS[1]), index + 1):
+        acted = before(observed(root, dataset, frame))
+        policy.observe(acted)
+    tokens, steps, mask = policy.history.gather([0])
+    assert torch.equal(steps, trained[STEPS])
+    assert torch.equal(mask, trained[MASK])
+    assert torch.allclose(tokens[..., :SIZE], trained[TOKENS][..., :SIZE], rtol=ROUNDED, atol=1e-6)
+    (of_cache, real), (of_pictures, shown) = (policy.perception.present(batch) for batch in (trained, acted))
+    assert torch.equal(real[0], shown[0])
+    assert real[0].any()
+    assert torch.allclose(of_cache[0], of_pictures[0], rtol=ROUNDED, atol=1e-6)
+
+
+def test_it_learns(root: Path, finding: dict[str, Any]) -> None:
+    policy, before, _, dataset = made_for_training(root, **finding | {"chunk_size": 4, "memory_frames": 4})
+    losses = losses_in_training(policy, before(batch_of(dataset, [*range(8, 38, 4)])), updates=30)
+    assert np.mean(losses[-5:]) < 0.5 * np.mean(losses[:5])
+
+
+# -- policies that were trained on what the environment tells ------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def blind(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A checkpoint that has never seen a picture."""
+    folder = tmp_path_factory.mktemp("blind")
+    data = make_object_dataset(folder / "data")
+    fields = {"perception": "objects", "size": "small", "n_action_steps": 3, "memory_stride": 2}
+    policy, before, after, _ = made_for_training(data, **fields)
+    for part in (policy, before, after):
+        part.save_pretrained(folder / "checkpoint")
+    return folder / "checkpoint"
+
+
+def loaded(checkpoint: Path, *overrides: str) -> tuple[MemobenchMemPolicy, Any]:
+    config = PreTrainedConfig.from_pretrained(checkpoint, cli_overrides=list(overrides))
+    policy = MemobenchMemPolicy.from_pretrained(checkpoint, config=config)
+    before, _ = make_pre_post_processors(policy.config, str(checkpoint))
+    return policy, before
+
+
+def test_they_act_from_pictures_as_from_what_is_found_in_them(
+    blind: Path, eyes: Path, root: Path, finding: dict[str, Any]
+) -> None:
+    _, _, _, dataset = made_for_training(root, **finding)
+    given, told = loaded(blind)
+    finds, seeing = loaded(blind, f"--eyes={eyes}")
+    assert set(finds.config.image_features) == {*VIEWS}
+    for frame in range(8):
+        batch = observed(root, dataset, frame)
+        slots = finds.perception.look(batch, batch[OBS_STATE])
+        objects = {key: value for key, value in batch.items() if key not in VIEWS} | {OBS_ENV_STATE: slots}
+        assert torch.equal(given.select_action(told(objects)), finds.select_action(seeing(batch)))
+    with pytest.raises(MemobenchError, match=r"no 'observation\.images\.wrist_image', which eyes look at"):
+        finds.perception.look({next(iter(VIEWS)): torch.zeros(1, 3, 48, 48)}, torch.zeros(1, 8))
+
+
+def test_what_the_environment_tells_is_not_looked_at(blind: Path, eyes: Path, root: Path) -> None:
+    finds, before = loaded(blind, f"--eyes={eyes}")
+    batch = {**pictures_of(root, 3), OBS_STATE: torch.zeros(1, 8), "task": ["put"], "observation.step": torch.zeros(1)}
+    batch["observation.phase"] = torch.ones(1)
+    found = []
+    for slots in (torch.zeros(1, SIZE), torch.ones(1, SIZE)):
+        finds.reset()
+        found.append(finds.select_action(before(batch | {OBS_ENV_STATE: slots})))
+    assert torch.equal(*found)
+
+
+def test_a_checkpoint_names_its_eyes_and_takes_others(
+    root: Path, finding: dict[str, Any], eyes: Path, tmp_path: Path
+) -> None:
+    policy, before, after, _ = made_for_training(root, **finding)
+    for part in (policy, before, after):
+        part.save_pretrained(tmp_path / "checkpoint")
+    told, _ = loaded(tmp_path / "checkpoint")
+    assert told.config.eyes == str(eyes)
+    assert told.state_dict().keys() == policy.state_dict().keys()
+    assert not any("tower" in name for name in told.state_dict())
+    others, _ = loaded(tmp_path / "checkpoint", f"--eyes={made_eyes(tmp_path / 'others.safetensors', 2)}")
+    assert others.perception.key != told.perception.key
