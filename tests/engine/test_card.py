@@ -110,6 +110,18 @@ def test_where_a_policy_runs_is_no_part_of_it() -> None:
     assert facts == {"type": "act", "seed": 7, "settings": {"chunk_size": 50}}
 
 
+def test_eyes_that_find_objects_are_part_of_a_policy(tmp_path: Path) -> None:
+    file = tmp_path / "eyes.safetensors"
+    file.write_bytes(b"one")
+    settings = {"type": "memobench_mem", "perception": "objects", "eyes": str(file)}
+    assert policy_facts(settings, 7)["eyes_sha256"] == hashlib.sha256(b"one").hexdigest()
+    assert "eyes_sha256" not in policy_facts({**settings, "eyes": None}, 7)
+    assert "eyes_sha256" not in policy_facts({**settings, "perception": "pixels"}, 7), "a checkpoint holds its tower"
+    file.unlink()
+    with pytest.raises(MemobenchError, match="there is no file"):
+        policy_facts(settings, 7)
+
+
 def test_the_dataset_that_a_policy_was_trained_on(tmp_path: Path) -> None:
     assert training_facts(tmp_path) is None
     data = tmp_path / "data"

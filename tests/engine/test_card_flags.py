@@ -19,9 +19,12 @@ from lerobot_memobench.engine.card import new_card, with_episodes, write_card
 from lerobot_memobench.engine.card_flags import allowed_flags
 from lerobot_memobench.engine.machine import run_facts
 from lerobot_memobench.engine.planning import plan_line
+from lerobot_memobench.engine.policy_identity import checkpoint_files, tree_hash
 from lerobot_memobench.engine.rerun import check_policy, plan_of_card, repeatable_card
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.eyes.weights import SHIPPED
+from lerobot_memobench.files import file_hash
 
 STOVE, DRAWER = "turn_on_the_stove_and_turn_it_off", "check_the_top_drawer_of_the_cabinet"
 RECORD = {"task": STOVE, "memory_type": "temporal", "episode": 0, "seed": 7, "success": True, "checkpoints": []}
@@ -141,6 +144,18 @@ def test_a_checkpoint_that_the_card_does_not_identify_is_refused() -> None:
     Path("card.json").write_text(json.dumps(card([*BENCHMARK[:2], "--policy.path=checkpoint"], checkpoint=None)))
     with pytest.raises(MemobenchError, match="is not the one that was evaluated"):
         check_policy(repeatable_card(Path("card.json")))
+
+
+def test_other_eyes_than_those_on_the_card_are_refused() -> None:
+    eyes = "--policy.eyes=package"
+    assert eyes in allowed_flags([*BENCHMARK[:2], "--policy.type=memobench_mem", eyes])
+    told = card([*BENCHMARK[:2], "--policy.path=checkpoint"])
+    settings = {"perception": "objects", "eyes": "package"}
+    told["policy"] |= {"sha256": tree_hash(checkpoint_files(Path("checkpoint"))), "settings": settings}
+    check_policy(told | {"policy": told["policy"] | {"eyes_sha256": file_hash(SHIPPED)}})
+    for sha256 in ({"eyes_sha256": "0" * 64}, {}):
+        with pytest.raises(MemobenchError, match="eyes package are not those that were looked through"):
+            check_policy(told | {"policy": told["policy"] | sha256})
 
 
 def test_a_repository_is_its_copy_in_the_cache(monkeypatch: pytest.MonkeyPatch) -> None:

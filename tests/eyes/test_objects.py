@@ -16,7 +16,7 @@ from lerobot_memobench.eyes.objects import ALONE, APART, ONE, ROUND, SAME, SURE,
 from lerobot_memobench.eyes.poses import reach
 from lerobot_memobench.eyes.tower import Tower
 from lerobot_memobench.eyes.views import view_of
-from lerobot_memobench.eyes.weights import PACKAGE, Eyes, eyes_named
+from lerobot_memobench.eyes.weights import PACKAGE, Eyes, load_eyes
 from lerobot_memobench.sim.assets.registry import split_class
 from lerobot_memobench.sim.object_slots import SIZE, SLOTS, WIDTH, ObjectSlots, classes
 from lerobot_memobench.sim.scene import TABLE_TOP
@@ -150,7 +150,7 @@ def test_a_kind_that_this_version_does_not_know_is_passed_over(simulate: Simulat
 def test_the_packages_eyes_find_what_stands_on_a_table(gl: str, simulate: Simulate) -> None:
     sim = simulate(BOWLS)
     pictures = {name: torch.from_numpy(sim.render(name)).permute(2, 0, 1)[None] / 255 for name in CAMERAS}
-    found = ObjectFinder(eyes_named(PACKAGE))(pictures, torch.from_numpy(sim.proprio())[None])
+    found = ObjectFinder(load_eyes(PACKAGE))(pictures, torch.from_numpy(sim.proprio())[None])
     assert found.shape == (1, SIZE)
     assert found.dtype == torch.float32
     for thing in told(ObjectSlots(sim).observe()):

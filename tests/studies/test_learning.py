@@ -159,9 +159,16 @@ def test_what_is_told_in_training_is_told_in_rollouts(tmp_path: Path, monkeypatc
     assert len(ran) == 6
 
 
-@pytest.mark.parametrize(("perception", "steps"), [("objects", 1000), ("pixels", 2000)])
+@pytest.mark.parametrize(
+    ("perception", "words"),
+    [
+        ("objects", {"perception=objects", "steps=1000"}),
+        ("found", {"perception=objects", "policy.eyes=package", "steps=1000"}),
+        ("pixels", {"perception=pixels", "steps=2000"}),
+    ],
+)
 def test_pictures_are_made_for_policies_that_see_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, perception: str, steps: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, perception: str, words: set[str]
 ) -> None:
     ran: list[list[str]] = []
     monkeypatch.setattr(stages_module, "run_once", lambda words, log, **options: ran.append(words))
@@ -169,7 +176,8 @@ def test_pictures_are_made_for_policies_that_see_them(
     stages.generate()
     stages.train(MEMORY, 0)
     assert ("--no-images" in ran[0]) == (perception == "objects")
-    assert {f"perception={perception}", f"steps={steps}", "batch_size=32"} <= set(ran[1])
+    assert words | {"batch_size=32"} <= set(ran[1])
+    assert ("policy.eyes=package" in ran[1]) == (perception == "found")
 
 
 @pytest.mark.parametrize(("task", "referent", "strict"), [(BOWL, "random", False), (TWIN, "drawn", True)])

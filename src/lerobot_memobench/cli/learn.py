@@ -22,9 +22,10 @@ class Name(StrEnum):
 
 
 class Sight(StrEnum):
-    """What policies see by."""
+    """What policies see by (`studies.learning.experiments.PERCEPTIONS`)."""
 
     OBJECTS = "objects"
+    FOUND = "found"
     PIXELS = "pixels"
 
 
@@ -39,7 +40,11 @@ def learn(
         int | None, typer.Option(help="First seed of the rollouts; choose settings by 20000.")
     ] = None,
     perception: Annotated[
-        Sight, typer.Option(help="objects: no pictures are made; pixels: pictures, through the package's eyes.")
+        Sight,
+        typer.Option(
+            help="objects: no pictures are made; found: objects that the package's eyes find in pictures; pixels: "
+            "pictures, through these eyes."
+        ),
     ] = Sight.OBJECTS,
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="One more word for `lerobot train` of all policies; repeatable.")

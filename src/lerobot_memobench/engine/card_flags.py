@@ -36,7 +36,7 @@ REACHING_OUT = ("push_to_hub", "private", "use_peft", "trust_remote_code", "disc
 WORDS = (
     *("job_name", "env.task", "env.tasks", "env.suite", "env.obs_type", "env.referent", "env.prompt_in", "env.render"),
     *("policy.size", "policy.perception", "policy.align", "policy.subgoal_level", "policy.integration"),
-    "policy.memory_camera",
+    *("policy.memory_camera", "policy.eyes"),
     *("policy.dtype", "policy.dialect", "policy.gripper"),
 )
 """Words, which name one of several known things."""

@@ -39,6 +39,8 @@ def _policy(card: Mapping[str, Any]) -> list[str]:
     if card["checkpoint"]:
         lines += [f"| checkpoint | {card['checkpoint']['path']} |"]
         lines += [f"| its sha256 | {policy.get('sha256', 'not known')} |"]
+    if "eyes_sha256" in policy:
+        lines += [f"| sha256 of its eyes | {policy['eyes_sha256']} |"]
     return lines + [f"| trained on: {key} | {value} |" for key, value in (card["trained_on"] or {}).items()]
 
 

@@ -55,9 +55,34 @@ def encoded(policy: PreTrainedConfig) -> dict[str, Any]:
 
 
 def policy_facts(settings: Mapping[str, Any], seed: int | None) -> dict[str, Any]:
-    """Return what identifies a policy beside its weights: its configuration as LeRobot encodes it, the run's seed."""
+    """Return what identifies a policy beside its weights: its configuration as LeRobot encodes it, the run's seed.
+
+    Of eyes that are no part of its checkpoint also the hash.
+
+    Raises:
+        MemobenchError: there are no such eyes.
+    """
     kept = {key: value for key, value in settings.items() if key not in ELSEWHERE and key != "type"}
-    return {"type": settings.get("type"), "seed": seed, "settings": kept}
+    eyes = eyes_hash(kept)
+    return {
+        "type": settings.get("type"),
+        "seed": seed,
+        "settings": kept,
+        **({} if eyes is None else {"eyes_sha256": eyes}),
+    }
+
+
+def eyes_hash(settings: Mapping[str, Any]) -> str | None:
+    """Return the hash of the eyes that a policy finds objects with, None where it has none.
+
+    Raises:
+        MemobenchError: there are no such eyes.
+    """
+    if settings.get("perception") != "objects" or settings.get("eyes") is None:
+        return None
+    from lerobot_memobench.eyes.weights import eyes_file
+
+    return file_hash(eyes_file(settings["eyes"]))
 
 
 def checkpoint_files(folder: Path) -> dict[str, str]:

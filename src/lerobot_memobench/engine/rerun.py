@@ -11,7 +11,7 @@ from lerobot_memobench.engine.card_flags import allowed_flags
 from lerobot_memobench.engine.machine import gl_facts, versions
 from lerobot_memobench.engine.plan import EvaluationPlan
 from lerobot_memobench.engine.planning import plan_line
-from lerobot_memobench.engine.policy_identity import checkpoint_files, tree_hash
+from lerobot_memobench.engine.policy_identity import checkpoint_files, eyes_hash, tree_hash
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records.protocol import CARD_FILE, read_card
 from lerobot_memobench.policies.checkpoint import local_folder
@@ -57,6 +57,13 @@ def check_policy(card: Mapping[str, Any]) -> None:
         raise MemobenchError(
             f"the checkpoint {given} is not the one that was evaluated (sha256 {found[:12]}, on the card "
             f"{str(told)[:12]}); its results would be another policy's"
+        )
+    settings, eyes = card["policy"].get("settings", {}), card["policy"].get("eyes_sha256")
+    here = eyes_hash(settings)
+    if here != eyes:
+        raise MemobenchError(
+            f"the eyes {settings.get('eyes')} are not those that were looked through (sha256 {str(here)[:12]}, on the "
+            f"card {str(eyes)[:12]}); the results would be another policy's"
         )
 
 

@@ -57,7 +57,7 @@ def load_tower(name: str) -> Tower:
     Raises:
         MemobenchError: there are no such eyes, or their tower has other sizes than this version's.
     """
-    tower = eyes_named(name).tower
+    tower = load_eyes(name).tower
     if (tower.widths, tower.blocks) != (WIDTHS, BLOCKS):
         raise MemobenchError(
             f"the tower of {name} has stages of widths {tower.widths} and blocks {tower.blocks}, and policies look "
@@ -66,19 +66,25 @@ def load_tower(name: str) -> Tower:
     return tower
 
 
-def eyes_named(name: str) -> Eyes:
-    """Return the eyes of that name, `PACKAGE` or a file; errors as of `load_eyes`."""
-    return load_eyes(SHIPPED if name == PACKAGE else Path(name).expanduser())
+def eyes_file(name: str | Path) -> Path:
+    """Return the file of the eyes of that name, `PACKAGE` or a path.
+
+    Raises:
+        MemobenchError: it is not there.
+    """
+    path = SHIPPED if name == PACKAGE else Path(name).expanduser()
+    if not path.is_file():
+        raise MemobenchError(f"there is no file {path}; name one that `memobench eyes train` has written")
+    return path
 
 
-def load_eyes(path: Path) -> Eyes:
-    """Return the eyes of a file, in float32, in evaluation.
+def load_eyes(name: str | Path) -> Eyes:
+    """Return the eyes of that name, `PACKAGE` or a path, in float32, in evaluation.
 
     Raises:
         MemobenchError: the file is not there, or was not written by `save_eyes`.
     """
-    if not path.is_file():
-        raise MemobenchError(f"there is no file {path}; name one that `memobench eyes train` has written")
+    path = eyes_file(name)
     try:
         with safe_open(path, framework="pt") as file:
             shape = json.loads(file.metadata()["eyes"])

@@ -6,6 +6,7 @@ EVERYWHERE: dict[str, tuple[str, ...]] = {
     "align": ("policy.align",),
     "size": ("policy.size",),
     "perception": ("policy.perception",),
+    "eyes": ("policy.eyes",),
     "device": ("policy.device",),
     "replan": ("policy.n_action_steps", "env.replan_steps"),
     "tasks": ("env.tasks",),

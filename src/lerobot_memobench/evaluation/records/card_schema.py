@@ -12,9 +12,11 @@ from lerobot_memobench.files.reading import LARGEST, Count, Name, Whole
 
 
 class PolicySettings(TypedDict, total=False):
-    """Whatever a policy can be set to; reports read its own replan interval."""
+    """Whatever a policy can be set to; what reports and `memobench rerun` read of it."""
 
     n_action_steps: Count | None
+    perception: str | None
+    eyes: str | None
 
 
 class Policy(TypedDict, total=False):
@@ -24,6 +26,7 @@ class Policy(TypedDict, total=False):
     seed: Whole | None
     settings: PolicySettings
     sha256: str | None
+    eyes_sha256: str
 
 
 class Checkpoint(TypedDict):

@@ -17,7 +17,7 @@ from lerobot.policies.pi_gemma import PaliGemmaForConditionalGenerationWithPiGem
 from torch import Tensor, nn
 
 from lerobot_memobench.eyes.tower import Tower
-from lerobot_memobench.eyes.weights import eyes_named
+from lerobot_memobench.eyes.weights import load_eyes
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.dimensions import Dimensions, Gemma
 from lerobot_memobench.policies.memobench_mem.integration.integration import Prefix
@@ -96,7 +96,7 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
         shape = config.object_classes, config.tokens_per_frame, config.dimensions.vlm.width
         if config.eyes is None:
             return ObjectPerception(*shape)
-        return FoundObjects(ObjectsInPictures(eyes_named(config.eyes)), *shape)
+        return FoundObjects(ObjectsInPictures(load_eyes(config.eyes)), *shape)
 
     def _set_requires_grad(self) -> None:
         super()._set_requires_grad()

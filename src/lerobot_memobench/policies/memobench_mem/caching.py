@@ -21,7 +21,7 @@ from lerobot_memobench.datasets.memory_cache import (
 )
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.eyes.tower import Tower
-from lerobot_memobench.eyes.weights import eyes_named, load_tower
+from lerobot_memobench.eyes.weights import load_eyes, load_tower
 from lerobot_memobench.policies.memobench_mem.backbone import SizedPaliGemmaWithExpert
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.found_in_pictures import make_found, open_found
@@ -47,7 +47,7 @@ RECORDED = (OBS_STATE, OBS_ENV_STATE, ACTION, "timestamp", "frame_index", "episo
 _VISION_PREFIX = "paligemma_with_expert.paligemma.model."
 
 
-def load_eyes(config: MemobenchMemConfig, weights: str | Path | None = None) -> EyePerception:
+def load_sight(config: MemobenchMemConfig, weights: str | Path | None = None) -> EyePerception:
     """Load the tower of ``config``'s eyes alone; arguments and errors as of `load_perception`."""
     source = weights or config.base_weights
     if source is None:
@@ -115,9 +115,9 @@ def cache_dataset(
     how: dict[str, Any] = {"batch_size": batch_size, "workers": workers, "progress": progress, "tell": tell}
     if config.finds_objects:
         assert config.eyes is not None
-        return make_found(root, config, ObjectsInPictures(eyes_named(config.eyes)), _text_encoder(config), **how).folder
+        return make_found(root, config, ObjectsInPictures(load_eyes(config.eyes)), _text_encoder(config), **how).folder
     if config.has_eyes:
-        return make_caches(root, config, load_eyes(config, weights), _text_encoder(config), **how)[0].folder
+        return make_caches(root, config, load_sight(config, weights), _text_encoder(config), **how)[0].folder
     perception = load_perception(config, weights)
     return _build(root, config, perception, **how)
 

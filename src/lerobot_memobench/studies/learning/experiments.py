@@ -11,7 +11,13 @@ MEMORY, MEMORYLESS = "memory", "no memory"
 ARMS: dict[str, tuple[str, ...]] = {MEMORY: (), MEMORYLESS: ("policy.integration=none",)}
 """Who is compared -> what is said of it to `lerobot train` beside what all share."""
 
-OBJECTS = "objects"
+OBJECTS, PIXELS = "objects", "pixels"
+PERCEPTIONS: dict[str, tuple[str, ...]] = {
+    OBJECTS: ("perception=objects",),
+    "found": ("perception=objects", "policy.eyes=package"),
+    PIXELS: ("perception=pixels",),
+}
+"""By what policies see -> what is said of it to `lerobot train`; all but objects need pictures."""
 
 EVALUATION_SEEDS = 7
 TUNING_SEEDS = 20_000
@@ -28,7 +34,7 @@ class Experiment:
         steps: updates. pixel_steps: updates from pixels, where these are others.
         settings: more words for `lerobot train`, of all arms.
         arms: name -> words for `lerobot train`.
-        perception: `objects`, or `pixels`: then demonstrations have pictures.
+        perception: by what policies see, of `PERCEPTIONS`.
         seeds: of training; the first ``seeds`` numbers.
         rollouts: of each task and policy. first_seed: of the rollouts. referent: of demonstrations and rollouts.
     """
@@ -54,7 +60,7 @@ def prompted() -> tuple[str, ...]:
 def experiment(name: str, perception: str = OBJECTS) -> Experiment:
     """Return the experiment of a name in `EXPERIMENTS`, by policies that see in this way."""
     named = EXPERIMENTS[name]
-    steps = named.steps if perception == OBJECTS else named.pixel_steps or named.steps
+    steps = (named.pixel_steps if perception == PIXELS else None) or named.steps
     return replace(named, perception=perception, steps=steps)
 
 

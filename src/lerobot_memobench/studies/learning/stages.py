@@ -8,7 +8,7 @@ from pathlib import Path
 
 from lerobot_memobench.settings.words import split_words
 from lerobot_memobench.studies.learning.commands import Cost, run_once
-from lerobot_memobench.studies.learning.experiments import OBJECTS, Experiment
+from lerobot_memobench.studies.learning.experiments import OBJECTS, PERCEPTIONS, Experiment
 from lerobot_memobench.tasks.catalogue import suite_of
 from lerobot_memobench.tasks.task import STRICT
 
@@ -62,7 +62,7 @@ class Stages:
 
     def training_words(self, arm: str, seed: int) -> list[str]:
         """Return the command that trains an arm's policy with one seed."""
-        words = ["lerobot", "train", *SHARED, f"perception={self.experiment.perception}"]
+        words = ["lerobot", "train", *SHARED, *PERCEPTIONS[self.experiment.perception]]
         words += [f"dataset={self.data}", f"steps={self.experiment.steps}"]
         words += [f"seed={seed}", f"output_dir={self.policy(arm, seed)}"]
         return [*words, *self.experiment.settings, *self.experiment.arms[arm]]
