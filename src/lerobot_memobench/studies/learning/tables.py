@@ -34,13 +34,17 @@ def contrasts_table(found: Mapping[str, Contrast], seeds: int, reference: str = 
     rows = [
         [
             f"{name} less {reference}",
-            *(f"{100 * one.value:+.1f}", f"{100 * one.low:+.1f} to {100 * one.high:+.1f}", f"{one.p:.3f}"),
+            *(f"{100 * one.value:+.1f}", f"{100 * one.low:+.1f} to {100 * one.high:+.1f}", _probability(one.p)),
             "–" if one.detectable is None else f"{100 * one.detectable:.1f}",
         ]
         for name, one in found.items()
     ]
     trained = f"95 % interval, {seeds} training seed{'s' if seeds > 1 else ''}"
     return markdown(("", "difference, points", trained, "p (Holm)", "detectable"), rows)
+
+
+def _probability(p: float) -> str:
+    return f"{p:.3f}" if p >= 0.001 else "< 0.001"
 
 
 def costs_table(costs: Costs) -> str:
