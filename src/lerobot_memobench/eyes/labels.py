@@ -139,6 +139,11 @@ def rays(places: Array, picture: Rows | Mapping[str, Array]) -> Array:
     return np.asarray(np.einsum("...ij,...j->...i", picture["turned"], local))
 
 
+def level_depth(sight: Array, height: Array, picture: Rows | Mapping[str, Array]) -> Array:
+    """Return the depth (...) at which lines of sight (..., 3) meet level planes; far away where they look up."""
+    return np.asarray((height - picture["eye"][2]) / np.minimum(sight[..., 2], -1e-3))
+
+
 def settle(sim: Simulation) -> None:
     """Bring all that depends on poses up to date after they were written."""
     mujoco.mj_fwdPosition(sim.model, sim.data)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from lerobot_memobench.eyes.finding import found
 from lerobot_memobench.eyes.kinds import DRAWERS, PARTS
-from lerobot_memobench.eyes.labels import rays
+from lerobot_memobench.eyes.labels import level_depth, rays
 from lerobot_memobench.eyes.tower import shrunk
 from lerobot_memobench.eyes.views import View, view_of
 from lerobot_memobench.eyes.weights import Eyes
@@ -111,7 +111,8 @@ class ObjectFinder:
 
     def merged(self, finds: Mapping[str, Things], state: Array) -> list[Sighting]:
         """Return the things that there are by what each camera found, the surest first."""
-        single = [self._sighting(camera, view_of(camera, state), find) for camera in finds for find in finds[camera]]
+        views = {camera: view_of(camera, state) for camera in finds}
+        single = [self._sighting(camera, views[camera], find) for camera in finds for find in finds[camera]]
         things: list[Sighting] = []
         for seen in sorted(single, key=lambda thing: -thing.score):
             if self._class[seen.kind] is None:
@@ -138,7 +139,7 @@ class ObjectFinder:
         if camera == "wrist":
             depth = float(find["depth"])
         else:
-            depth = float((TABLE_TOP + find["height"] - view["eye"][2]) / min(sight[2], -1e-3))
+            depth = float(level_depth(sight, TABLE_TOP + find["height"], view))
             axis = axis - turned[:, 2] * (axis[2] / turned[2, 2])  # it is level, where the picture is not
         level = np.array([axis[0], axis[1], 0.0])
         level /= max(float(np.linalg.norm(level)), 1e-9)

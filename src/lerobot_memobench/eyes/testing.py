@@ -12,7 +12,7 @@ from scipy.optimize import linear_sum_assignment
 
 from lerobot_memobench.eyes.finding import found
 from lerobot_memobench.eyes.kinds import DRAWERS
-from lerobot_memobench.eyes.labels import Rows, images_of, projected, rays
+from lerobot_memobench.eyes.labels import Rows, images_of, level_depth, projected, rays
 from lerobot_memobench.eyes.pictures import Pictures
 from lerobot_memobench.eyes.tower import Tower, shrunk
 from lerobot_memobench.eyes.walk import NEAR
@@ -96,9 +96,8 @@ def _errors(row: Rows, things: Things, finds: Things) -> Array:
 
 
 def _on_plane(row: Rows, sight: Array, height: Array) -> Array:
-    """Return where lines of sight (..., 3) meet level planes; far away where they look up."""
-    down = np.minimum(sight[..., 2], -1e-3)
-    return np.asarray(row["eye"] + sight * ((height - row["eye"][2]) / down)[..., None])
+    """Return where lines of sight (..., 3) meet level planes."""
+    return np.asarray(row["eye"] + sight * level_depth(sight, height, row)[..., None])
 
 
 def _told(row: Rows, things: Things, finds: Things, matched: NDArray[np.int64]) -> Things:

@@ -24,14 +24,14 @@ from lerobot_memobench.eyes.tower import Tower
 from lerobot_memobench.eyes.weights import load_eyes, load_tower
 from lerobot_memobench.policies.memobench_mem.backbone import SizedPaliGemmaWithExpert
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.found_in_pictures import make_found, open_found
+from lerobot_memobench.policies.memobench_mem.found_in_pictures import found_in, make_found
 from lerobot_memobench.policies.memobench_mem.language.text_encoders import (
     SiglipTextEncoder,
     WordTextEncoder,
     make_text_encoder,
 )
 from lerobot_memobench.policies.memobench_mem.perception.eyes import EyePerception
-from lerobot_memobench.policies.memobench_mem.perception.found import FoundObjects, ObjectsInPictures
+from lerobot_memobench.policies.memobench_mem.perception.found import FOUND, FoundObjects, ObjectsInPictures
 from lerobot_memobench.policies.memobench_mem.perception.frozen import VISION_SEED, seed_parameters
 from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_PHASE, OBS_RAW_STATE
 from lerobot_memobench.policies.memobench_mem.perception.perception import Perception
@@ -130,11 +130,12 @@ def open_frames(root: Path, config: MemobenchMemConfig, perception: Perception) 
     """
     if isinstance(perception, PixelPerception):
         return open_cache(root, config, perception)
-    if isinstance(perception, EyePerception | FoundObjects):
-        names = [name for name in RECORDED if name != OBS_ENV_STATE]
-        open_seen = open_pictures if isinstance(perception, EyePerception) else open_found
-        return open_seen(root, config, perception, _text_encoder(config), names)
-    columns, table = read_recorded(root, RECORDED)
+    names = [name for name in RECORDED if name != OBS_ENV_STATE] if config.sees_pictures else RECORDED
+    if isinstance(perception, EyePerception):
+        return open_pictures(root, config, perception, _text_encoder(config), names)
+    columns, table = read_recorded(root, names)
+    if isinstance(perception, FoundObjects):
+        columns[FOUND] = found_in(root, config, perception.look, _text_encoder(config))
     phase = torch.from_numpy(table.phase)
     logger.info("%d frames of %s are read into memory", table.episodes[-1], root)
     return RecordedFrames(

@@ -281,7 +281,7 @@ class MemobenchMemConfig(MemobenchMemSettings):
             self.input_features |= {
                 f"{OBS_IMAGES}.{name}": PolicyFeature(FeatureType.VISUAL, shape) for name in IMAGE_KEYS
             }
-        if self.sees_objects and not self.has_eyes and OBS_ENV_STATE not in self.input_features:
+        if not self.sees_pictures and OBS_ENV_STATE not in self.input_features:
             raise MemobenchError(
                 f"perception=objects sees by '{OBS_ENV_STATE}', which is not there; train on a dataset of this "
                 "version's `memobench generate`, and evaluate with --env.obs_type=environment_state_agent_pos."

@@ -7,7 +7,6 @@ what that leaves of it.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,8 @@ from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
 from lerobot_memobench.datasets.memory_cache import (
+    FrameReader,
     MemoryCache,
-    RecordedFrames,
     TextEncoder,
     build_memory_cache,
     find_cache,
@@ -26,8 +25,7 @@ from lerobot_memobench.datasets.memory_cache import (
     read_recorded,
 )
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.perception.found import FOUND, VIEWS, FoundObjects, ObjectsInPictures
-from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_PHASE, OBS_RAW_STATE
+from lerobot_memobench.policies.memobench_mem.perception.found import VIEWS, ObjectsInPictures
 from lerobot_memobench.sim.object_slots import SIZE
 
 logger = logging.getLogger(__name__)
@@ -75,7 +73,7 @@ def make_found(
     return MemoryCache.open(root, folder.name, frames_key=look.key, **where)
 
 
-def _reader(root: Path) -> Callable[[int, list[int]], Look]:
+def _reader(root: Path) -> FrameReader:
     """Return what reads frames of all cameras, and the states at them."""
     readers = {name: frame_reader(root, name) for name in VIEWS}
     columns, table = read_recorded(root, [OBS_STATE])
@@ -87,26 +85,10 @@ def _reader(root: Path) -> Callable[[int, list[int]], Look]:
     return read
 
 
-def open_found(
-    root: Path, config: MemobenchMemConfig, eyes: FoundObjects, texts: TextEncoder, names: Sequence[str]
-) -> RecordedFrames:
-    """Open what training looks up of the dataset at ``root``: its columns ``names``, and what ``eyes`` find.
+def found_in(root: Path, config: MemobenchMemConfig, look: ObjectsInPictures, texts: TextEncoder) -> Tensor:
+    """Return what is found at every frame of the dataset at ``root``, (N, SIZE) float32; errors as of `make_found`."""
 
-    Raises:
-        MemobenchError: the dataset lacks a column or a camera, or the cache cannot be made.
-    """
-    cache = make_found(
-        root,
-        config,
-        eyes.look,
-        texts,
-        progress=lambda done, count: logger.info("objects found in %d of %d episodes", done, count),
-    )
-    columns, table = read_recorded(root, names)
-    columns[FOUND] = cache.all_tokens().sum(dim=1, dtype=torch.float32)
-    phase = torch.from_numpy(table.phase)
+    def tell(done: int, count: int) -> None:
+        logger.info("objects found in %d of %d episodes", done, count)
 
-    def remember(seen: Any, frames: Sequence[int]) -> Tensor:
-        return eyes.remember({FOUND: seen[FOUND], OBS_RAW_STATE: seen[OBS_STATE], OBS_PHASE: phase}, frames)
-
-    return RecordedFrames(root, columns, table, texts, remember=remember, key=eyes.key, stride=config.memory_stride)
+    return make_found(root, config, look, texts, progress=tell).all_tokens().sum(dim=1, dtype=torch.float32)
