@@ -178,9 +178,8 @@ def open_cache(root: Path, config: MemobenchMemConfig, perception: PixelPercepti
 
 def _build(root: Path, config: MemobenchMemConfig, perception: PixelPerception, **how: Any) -> Path:
     """Make or finish the cache of what ``perception`` remembers, beside the dataset or where ``config`` says."""
-    place = None if config.memory_cache_dir is None else Path(config.memory_cache_dir).expanduser()
     seen: dict[str, Any] = {"camera": perception.remembers, "stride": config.memory_stride}
-    folder = find_cache(root, config.cache_name, frames_key=perception.key, place=place, **seen)
+    folder = find_cache(root, config.cache_name, frames_key=perception.key, place=config.cache_place, **seen)
     return build_memory_cache(root, folder.name, perception, _text_encoder(config), place=folder.parent, **seen, **how)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
@@ -226,6 +227,11 @@ class MemobenchMemConfig(MemobenchMemSettings):
     def sees_pictures(self) -> bool:
         """Whether pictures are looked at."""
         return self.has_eyes or not self.sees_objects
+
+    @property
+    def cache_place(self) -> Path | None:
+        """Folder that holds memory caches; None: the one beside each dataset."""
+        return None if self.memory_cache_dir is None else Path(self.memory_cache_dir).expanduser()
 
     @property
     def decodes_nothing(self) -> bool:

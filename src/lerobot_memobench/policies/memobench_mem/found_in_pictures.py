@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -65,9 +66,8 @@ def make_found(
     Raises:
         MemobenchError: the dataset lacks a camera, or the disk has no room.
     """
-    place = None if config.memory_cache_dir is None else Path(config.memory_cache_dir).expanduser()
     where: dict[str, Any] = {"camera": next(iter(VIEWS)), "stride": 1}
-    folder = find_cache(root, "objects", frames_key=look.key, place=place, **where)
+    folder = find_cache(root, "objects", frames_key=look.key, place=config.cache_place, **where)
     where["place"] = folder.parent
     build_memory_cache(root, folder.name, SlotEncoder(look), texts, read=_reader(root), **where, **how)
     return MemoryCache.open(root, folder.name, frames_key=look.key, **where)
@@ -76,9 +76,10 @@ def make_found(
 def _reader(root: Path) -> FrameReader:
     """Return what reads frames of all cameras, and the states at them."""
     readers = {name: frame_reader(root, name) for name in VIEWS}
-    columns, table = read_recorded(root, [OBS_STATE])
+    recorded = cache(lambda: read_recorded(root, [OBS_STATE]))  # read when a frame is: a whole cache needs none
 
     def read(episode: int, numbers: list[int]) -> Look:
+        columns, table = recorded()
         states = columns[OBS_STATE][[int(table.episodes[episode]) + number for number in numbers]]
         return {name: one(episode, numbers) for name, one in readers.items()}, states
 

@@ -109,10 +109,9 @@ def _make(root: Path, cache: Wanted, texts: TextEncoder, **how: Any) -> None:
 
 def _wanted(root: Path, config: MemobenchMemConfig, eyes: EyePerception, cameras: Sequence[str]) -> list[Wanted]:
     """Return the caches: of the present of each camera, and last the memory's."""
-    place = None if config.memory_cache_dir is None else Path(config.memory_cache_dir).expanduser()
 
     def wanted(camera: str, stride: int, name: str, tokens: Tokens) -> Wanted:
-        where: dict[str, Any] = {"camera": camera, "stride": stride, "place": place}
+        where: dict[str, Any] = {"camera": camera, "stride": stride, "place": config.cache_place}
         return Wanted(camera, stride, tokens, find_cache(root, name, frames_key=tokens.key, **where))
 
     whole = Tokens(eyes.present_key, GRID**2, eyes.look)
