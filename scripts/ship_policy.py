@@ -47,7 +47,11 @@ tags: [lerobot, memobench, memory]
 
 
 def ship(
-    run: Path, name: str, rollouts: Path | None, merged: Mapping[Path, Sequence[Path]], commit: str | None
+    run: Path,
+    name: str,
+    rollouts: Path | None,
+    merged: Mapping[Path, Sequence[Path]],
+    commits: Sequence[tuple[str, str]],
 ) -> Path:
     """Write the last checkpoint of a training run as the package's policy ``name``; return its folder."""
     source, folder = checkpoint_folder(str(run)), SHIPPED / name
@@ -63,7 +67,7 @@ def ship(
     write_file(
         folder / "config.json", json.dumps({**config, "device": "cpu", "pretrained_path": None}, indent=4) + "\n"
     )
-    write_file(folder / "README.md", card(name, source, weights, rollouts, merged, commit))
+    write_file(folder / "README.md", card(name, source, weights, rollouts, merged, commits))
     size = sum(path.stat().st_size for path in folder.iterdir())
     if size > LARGEST:
         raise SystemExit(f"{folder} takes {size:,} bytes; expected at most {LARGEST:,}")
@@ -76,12 +80,13 @@ def card(
     weights: dict[str, torch.Tensor],
     rollouts: Path | None,
     merged: Mapping[Path, Sequence[Path]],
-    commit: str | None = None,
+    commits: Sequence[tuple[str, str]] = (),
 ) -> str:
     """Return the Markdown that goes with a policy.
 
     Args:
-        merged: datasets, and those that LeRobot made each of. commit: by which the demonstrations were made.
+        merged: datasets, and those that LeRobot made each of.
+        commits: datasets, and by which commit each was made, where the expert has changed since.
     """
     runs = trainings(source)
     begun = runs.pop(0) if "shipped" in runs[0] else None
@@ -93,7 +98,7 @@ def card(
         f"`memobench_mem`, {count:.1f} million parameters, bfloat16; sees {policy['perception']}.",
         *([] if begun is None else [began_with(begun["shipped"])]),
         *demonstrations(runs, training_facts(source) or {}, merged),
-        *([f"The expert that made them is that of commit `{commit}`."] if commit else []),
+        *(f"The expert that made {place(part)} is that of commit `{commit}`." for part, commit in commits),
         "",
         "```bash",
         *(
@@ -255,7 +260,14 @@ if __name__ == "__main__":
         metavar=("DATASET", "PART"),
         help="a dataset trained on, and those that lerobot-edit-dataset made it of; may be said again, in order",
     )
-    parser.add_argument("--commit", help="that made the demonstrations, where the expert has changed since")
+    parser.add_argument(
+        "--commit",
+        nargs=2,
+        action="append",
+        default=[],
+        metavar=("DATASET", "COMMIT"),
+        help="by which a dataset was made, where the expert has changed since; may be said again",
+    )
     given = parser.parse_args()
     parts = {whole: parts for whole, *parts in given.merged}
     print(ship(given.run, given.name, given.rollouts, parts, given.commit))

@@ -129,9 +129,9 @@ def test_a_card_tells_how_the_demonstrations_were_made(script: ModuleType, tmp_p
     assert text.count("memobench generate") == 2, "what both were trained on is made once"
     again["policy"]["pretrained_path"] = str(SHIPPED / "memobench_small")
     (later / "train_config.json").write_text(json.dumps(again))
-    text = str(script.card("mine", source, {"a": torch.zeros(3)}, None, {}, commit="0123abc"))
+    text = str(script.card("mine", source, {"a": torch.zeros(3)}, None, {}, commits=[("data/more", "0123abc")]))
     assert "It went on from `memobench_small` as of commit `" in text
-    assert "is that of commit `0123abc`" in text
+    assert "The expert that made outputs/more is that of commit `0123abc`." in text
     assert "lerobot train policy=memobench_small \\\n    dataset=outputs/more " in text
     assert text.count("lerobot train") == 1
     strict = {**request, "tasks": task_names(suite="strict"), "referent": "drawn"}
