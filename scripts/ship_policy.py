@@ -219,6 +219,7 @@ def generation(request: dict[str, Any]) -> list[str]:
         "--tasks": "all" if every else ",".join(request["tasks"]),
         "--suite": suite,
         "--episodes": request["episodes"],
+        "--prompted-episodes": request.get("prompted_episodes"),
         "--seed-base": request["seed_base"],
         "--referent": None if request["referent"] == DRAWN else request["referent"],
         "--image-size": request["image_size"] if request["images"] else None,

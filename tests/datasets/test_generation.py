@@ -24,6 +24,7 @@ from lerobot_memobench.datasets.generation import generate
 from lerobot_memobench.datasets.lerobot_format import is_dataset
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs import processes
+from lerobot_memobench.tasks.catalogue import BOWL, get_task
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
 
@@ -219,7 +220,17 @@ def test_a_worker_that_is_killed(tasks, recorded, tmp_path, monkeypatch):
     monkeypatch.undo()
 
 
-@pytest.mark.parametrize("arguments", [{"episodes": 0}, {"workers": 0}])
+def test_tasks_with_a_prompt_have_a_number_of_their_own(tasks, recorded, tmp_path):
+    shown = replace(tasks[1], prompt=get_task(BOWL).prompt)
+    summary = run([tasks[0], shown], tmp_path / "ds", episodes=1, prompted_episodes=3, images=False)
+    assert [(task.name, task.episodes) for task in summary.tasks] == [("task_a", 1), ("task_b", 3)]
+    assert recorded == [("task_a", 10_000), *(("task_b", 10_000 + i) for i in range(3))]
+    assert "1 seeds per task (3 of those with a prompt)" in (tmp_path / "ds" / "README.md").read_text()
+    with pytest.raises(MemobenchError, match="prompted_episodes=3, now None was asked for"):
+        run([tasks[0], shown], tmp_path / "ds", episodes=1, images=False)
+
+
+@pytest.mark.parametrize("arguments", [{"episodes": 0}, {"prompted_episodes": 0}, {"workers": 0}])
 def test_nothing_to_do(tasks, recorded, tmp_path, arguments):
     with pytest.raises(MemobenchError, match="each must be at least 1"):
         run(tasks, tmp_path / "ds", **arguments)

@@ -48,6 +48,9 @@ def generate(
     tasks: Annotated[str, typer.Option(help="all, memory types or task names, separated by commas.")] = "all",
     suite: WhichSuite = Suite.PUBLISHED,
     episodes: Annotated[int, typer.Option(min=1, help="Demonstrations per task.")] = 50,
+    prompted_episodes: Annotated[
+        int | None, typer.Option(min=1, help="Demonstrations per task that begins with a prompt, if not --episodes.")
+    ] = None,
     seed_base: Annotated[int, typer.Option(help="Demonstration i uses the seed seed_base + i.")] = 10_000,
     referent: Annotated[
         Referent, typer.Option(help="fixed: the catalogue's goal; random: the seed decides.")
@@ -83,7 +86,9 @@ def generate(
     from lerobot_memobench.datasets.generation import generate as run
 
     screen = console()
-    with counting(screen, "episodes", len(chosen) * episodes) as count:
+    prompted = sum(task.prompt is not None for task in chosen)
+    total = (len(chosen) - prompted) * episodes + prompted * (prompted_episodes or episodes)
+    with counting(screen, "episodes", total) as count:
 
         def advance(news: Advance) -> None:
             what = f"{news.task_name}, seed {news.seed}"
@@ -93,6 +98,7 @@ def generate(
             chosen,
             episodes,
             out,
+            prompted_episodes=prompted_episodes,
             seed_base=seed_base,
             referent=referent.value,
             images=images,

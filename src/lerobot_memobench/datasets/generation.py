@@ -48,6 +48,7 @@ def generate(
     episodes: int,
     out: Path | str,
     *,
+    prompted_episodes: int | None = None,
     seed_base: int = FIRST_SEED,
     referent: str = "fixed",
     images: bool = True,
@@ -64,7 +65,7 @@ def generate(
     repo_id: str = DEFAULT_REPO_ID,
     progress: ProgressCallback | None = None,
 ) -> GenerationSummary:
-    """Make ``episodes`` demonstrations of each task into the folder ``out``.
+    """Make ``episodes`` demonstrations of each task (with a prompt: ``prompted_episodes``) into the folder ``out``.
 
     With ``perturb`` the arm is moved off its way at random (`datasets.perturbation`), with ``policy``, the folder of a
     checkpoint, by that policy (`datasets.driving`), and ``action`` is what the expert does there. ``formats`` says what
@@ -81,9 +82,11 @@ def generate(
             episode could not be run at all (which no later run would change).
     """
     out = Path(out)
-    if not tasks or episodes < 1 or workers < 1:
+    most = episodes if prompted_episodes is None else prompted_episodes
+    if not tasks or min(episodes, most, workers) < 1:
         raise MemobenchError(
-            f"{len(tasks)} tasks, {episodes} episodes, {workers} workers were asked for; each must be at least 1"
+            f"{len(tasks)} tasks, {episodes} episodes ({most} with a prompt), {workers} workers were asked for; each "
+            "must be at least 1"
         )
     check_executor(executor, executor_options)
     _check_prompts(tasks, prompt_video)
@@ -91,7 +94,7 @@ def generate(
     if perturb and policy is not None:
         raise MemobenchError("the arm is to be moved both at random and by a policy; leave out --perturb or --policy")
     settings = RecordingSettings(referent, images, image_size, prompt_video, hold_frames, perturb, policy)
-    plan = _Plan(tuple(tasks), episodes, seed_base, settings, _checked_formats(formats, settings))
+    plan = _Plan(tuple(tasks), episodes, prompted_episodes, seed_base, settings, _checked_formats(formats, settings))
     if is_finished(out):
         return _finished(out, plan)
     check_destination(out)
@@ -127,6 +130,7 @@ class _Plan:
 
     tasks: tuple[Task, ...]
     episodes: int
+    prompted_episodes: int | None
     seed_base: int
     settings: RecordingSettings
     formats: tuple[str, ...]
@@ -143,6 +147,7 @@ class _Plan:
             "tasks": [task.name for task in self.tasks],
             "formats": list(self.formats),
             "episodes": self.episodes,
+            "prompted_episodes": self.prompted_episodes,
             "seed_base": self.seed_base,
             **asdict(self.settings),
             "policy": self.settings.policy and policy_told(self.settings.policy),
@@ -154,15 +159,21 @@ class _Plan:
     def made_by(self) -> str:
         """A sentence for the card."""
         referent, prompts = self.settings.referent, "" if self.settings.prompt_video else ", prompt videos left out"
-        seeds = f"{self.episodes} seeds per task from {self.seed_base} on"
+        more = "" if self.prompted_episodes is None else f" ({self.prompted_episodes} of those with a prompt)"
+        seeds = f"{self.episodes} seeds per task{more} from {self.seed_base} on"
         moved = ", the arm moved off its way at random in two thirds of them" if self.settings.perturb else ""
         if self.settings.policy is not None:
             moved = f", the arm moved by the policy {policy_told(self.settings.policy)} for some steps at a time"
         return f"`memobench generate`, {seeds}, referent {referent}{prompts}{moved}. {SCRIPTED}"
 
+    def count(self, task: Task) -> int:
+        """Return how many demonstrations of a task are asked for."""
+        own = None if task.prompt is None else self.prompted_episodes
+        return self.episodes if own is None else own
+
     def jobs(self, folder: Path) -> list[RecordingJob]:
         """Return one job per seed of each task, each with a folder of its own in ``folder``."""
-        seeds = [(task, self.seed_base + i) for task in self.tasks for i in range(self.episodes)]
+        seeds = [(task, self.seed_base + i) for task in self.tasks for i in range(self.count(task))]
         return [
             RecordingJob(task, seed, self.settings, folder / f"{number:06d}", self.formats)
             for number, (task, seed) in enumerate(seeds)
@@ -181,6 +192,7 @@ def _finish_on_slurm(plan: _Plan, out: Path, repo_id: str) -> None:
         plan.tasks,
         plan.episodes,
         out,
+        prompted_episodes=plan.prompted_episodes,
         seed_base=plan.seed_base,
         **asdict(plan.settings),
         formats=plan.formats,

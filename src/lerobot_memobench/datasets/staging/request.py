@@ -56,7 +56,8 @@ def _check_request(staging: Path, request: dict[str, Any], out: Path, advice: st
 
 def compare_requests(earlier: dict[str, Any], request: dict[str, Any], what: str, advice: str) -> None:
     """Raise with the first thing that was asked for differently."""
-    earlier = {"formats": [LEROBOT], "perturb": False, "policy": None, **earlier}  # written before there was a choice
+    before = {"formats": [LEROBOT], "perturb": False, "policy": None, "prompted_episodes": None}
+    earlier = {**before, **earlier}  # written before there was a choice
     for key, value in request.items():
         if earlier.get(key) != value:
             there = short(earlier.get(key))
