@@ -150,6 +150,7 @@ def test_generate_tells_what_became_of_every_seed(
     assert asked == {
         "tasks": [TASK],
         "episodes": 2,
+        "prompted_episodes": None,
         "out": out,
         "seed_base": 10_000,
         "referent": "random",
