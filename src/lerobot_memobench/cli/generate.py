@@ -83,11 +83,11 @@ def generate(
     options = executor_options(executor_option or [])
     named: dict[str, Any] = {} if repo_id is None else {"repo_id": repo_id}
     chosen = [get_task(name) for name in resolve_tasks(tasks, suite)]
+    from lerobot_memobench.datasets.generation import episodes_of
     from lerobot_memobench.datasets.generation import generate as run
 
     screen = console()
-    prompted = sum(task.prompt is not None for task in chosen)
-    total = (len(chosen) - prompted) * episodes + prompted * (prompted_episodes or episodes)
+    total = sum(episodes_of(task, episodes, prompted_episodes) for task in chosen)
     with counting(screen, "episodes", total) as count:
 
         def advance(news: Advance) -> None:

@@ -115,6 +115,11 @@ def generate(
         return _assemble(plan, jobs, out, repo_id)
 
 
+def episodes_of(task: Task, episodes: int, prompted_episodes: int | None) -> int:
+    """Return how many demonstrations of a task `generate` is asked for."""
+    return episodes if task.prompt is None or prompted_episodes is None else prompted_episodes
+
+
 def _check_prompts(tasks: Sequence[Task], prompt_video: bool) -> None:
     hiding = next((task for task in tasks if task.prompt is not None and not task.prompt.restores), None)
     if hiding is not None and not prompt_video:
@@ -166,14 +171,13 @@ class _Plan:
             moved = f", the arm moved by the policy {policy_told(self.settings.policy)} for some steps at a time"
         return f"`memobench generate`, {seeds}, referent {referent}{prompts}{moved}. {SCRIPTED}"
 
-    def count(self, task: Task) -> int:
-        """Return how many demonstrations of a task are asked for."""
-        own = None if task.prompt is None else self.prompted_episodes
-        return self.episodes if own is None else own
-
     def jobs(self, folder: Path) -> list[RecordingJob]:
         """Return one job per seed of each task, each with a folder of its own in ``folder``."""
-        seeds = [(task, self.seed_base + i) for task in self.tasks for i in range(self.count(task))]
+        seeds = [
+            (task, self.seed_base + i)
+            for task in self.tasks
+            for i in range(episodes_of(task, self.episodes, self.prompted_episodes))
+        ]
         return [
             RecordingJob(task, seed, self.settings, folder / f"{number:06d}", self.formats)
             for number, (task, seed) in enumerate(seeds)
