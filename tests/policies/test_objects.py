@@ -83,6 +83,10 @@ def test_small_brings_its_recipe_and_leaves_it_to_the_user(tmp_path: Path) -> No
         ({"final_lr": 2.0}, "final_lr"),
         ({"size": "small", "perception": "objects", "prompted_weight": 0.0}, "prompted_weight=0.0 must be above 0"),
         ({"prompted_weight": 3.0}, r"balance_tasks=0.0\)"),
+        ({"size": "small", "perception": "objects", "sight_errors": -1.0}, "sight_errors=-1.0 must not be negative"),
+        ({"sight_errors": 1.0}, "use --policy.perception=objects"),
+        ({"size": "small", "perception": "objects", "told_objects": "hand"}, "or name --policy.eyes too"),
+        ({"told_objects": "hands"}, "no told_objects 'hands'.*'hand'"),
     ],
 )
 def test_bad_values_are_refused(fields: dict[str, Any], message: str) -> None:

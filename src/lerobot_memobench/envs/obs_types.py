@@ -21,9 +21,11 @@ def obs_type_of(policy: Any) -> str | None:
     """Return what a policy must be shown by its configuration; None where that is not known, or nothing is needed.
 
     A policy that says by ``perception`` what it sees (`pixels`, `objects` or `any`) is taken at its word; one that
-    ``finds_objects`` does so in pictures.
+    ``finds_objects`` does so in pictures, and is told some all the same by ``told_objects``.
     """
-    perception = "pixels" if getattr(policy, "finds_objects", False) else getattr(policy, "perception", None)
+    if getattr(policy, "finds_objects", False):
+        return PIXELS if policy.told_objects == "nothing" else BOTH
+    perception = getattr(policy, "perception", None)
     if policy is None or perception is not None:
         return {"objects": OBJECTS, "pixels": PIXELS}.get(str(perception))
     objects = policy.type in READ_OBJECTS and policy.env_state_feature is not None

@@ -95,8 +95,8 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
         config.object_classes = config.object_classes or list(classes())
         shape = config.object_classes, config.tokens_per_frame, config.dimensions.vlm.width
         if config.eyes is None:
-            return ObjectPerception(*shape)
-        return FoundObjects(ObjectsInPictures(load_eyes(config.eyes)), *shape)
+            return ObjectPerception(*shape, config.sight_errors)
+        return FoundObjects(ObjectsInPictures(load_eyes(config.eyes)), *shape, config.told_objects)
 
     def _set_requires_grad(self) -> None:
         super()._set_requires_grad()

@@ -25,6 +25,7 @@ ALIGN_WEIGHTS = {"none": 0.0, "semantic": 0.1, "contrastive": 0.1, "framewise": 
 INTEGRATIONS = ("modulation", "context", "none")
 PERCEPTIONS = ("pixels", "objects")
 SUBGOAL_LEVELS = ("coarse", "intermediate", "fine")
+TOLD_OBJECTS = ("nothing", "hand", "present", "memory")
 TOKENS_PER_FRAME = {"pixels": GRID**2, "objects": 2}
 MEMORY_STRIDE, MOMENTS_PER_EPISODE = 8, 6
 """Where samples are made of what was read before training; 1 elsewhere."""
@@ -60,6 +61,7 @@ class MemobenchMemConfig(MemobenchMemSettings):
         _choose("perception", self.perception, PERCEPTIONS)
         _choose("integration", self.integration, INTEGRATIONS)
         _choose("subgoal_level", self.subgoal_level, SUBGOAL_LEVELS)
+        _choose("told_objects", self.told_objects, TOLD_OBJECTS)
         self._check_dimensions()
         self._choose_eyes()
         dims = self.dimensions
@@ -152,10 +154,20 @@ class MemobenchMemConfig(MemobenchMemSettings):
             raise MemobenchError(f"--policy.align_weight={self.align_weight} must not be negative.")
 
     def _check_perception(self) -> None:
+        if self.sight_errors < 0 or (self.sight_errors and not self.sees_objects):
+            raise MemobenchError(
+                f"--policy.sight_errors={self.sight_errors} must not be negative, and are errors of slots: leave it "
+                "out, or use --policy.perception=objects."
+            )
         if self.perception == "pixels" and self.tokens_per_frame != GRID**2:
             raise MemobenchError(
                 f"--policy.tokens_per_frame={self.tokens_per_frame} is not supported: frames are pooled to a "
                 f"4x4 grid, so leave it at {GRID**2}."
+            )
+        if self.told_objects != "nothing" and not self.finds_objects:
+            raise MemobenchError(
+                f"--policy.told_objects={self.told_objects} is for objects that eyes find: leave it out, or name "
+                "--policy.eyes too."
             )
         if not self.freeze_vision_encoder:
             raise MemobenchError(

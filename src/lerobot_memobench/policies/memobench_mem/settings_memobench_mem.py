@@ -34,6 +34,12 @@ class MemobenchMemSettings(PI05Config):
     package, or ``random``: pi0.5's image tower with random weights. With ``perception=objects``, the eyes that find
     them in pictures; none: the environment tells them. With pixels at ``size=small``, whose tower's tokens are seen;
     none: ``package``. A checkpoint of pixels holds its tower; there this only says where it was from."""
+    told_objects: str = "nothing"
+    """What rollouts through ``eyes`` are told by the environment all the same (``--env.obs_type=both``), to know what a
+    failure is from: ``nothing``, ``hand`` (what stands near the hand now), ``present`` or ``memory``."""
+    sight_errors: float = 0.0
+    """With which errors told objects are seen in training, so that the policy acts through ``eyes`` afterwards; 1: as
+    large as those of the package's eyes, 0: none."""
     object_classes: list[str] | None = None
     """Names of the classes that slots were trained with, in order of their indices; none: those of this version."""
 

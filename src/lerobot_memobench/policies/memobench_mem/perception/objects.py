@@ -15,6 +15,7 @@ from torch.nn.functional import rms_norm
 
 from lerobot_memobench.policies.memobench_mem.perception.perception import Perception, Seen
 from lerobot_memobench.policies.memobench_mem.perception.pooled_memory import PooledMemory
+from lerobot_memobench.policies.memobench_mem.perception.sight_errors import as_found
 from lerobot_memobench.policies.memobench_mem.perception.slots import HAND_DIM, SlotEncoder
 from lerobot_memobench.sim.object_slots import SIZE, SLOTS, WIDTH, classes
 
@@ -43,8 +44,9 @@ class FramePool(nn.Module):
     to it. At unit size, 400 updates chose the right one of three bowls at 85 % of moments, instead of at 58 %.
     """
 
-    def __init__(self, order: Sequence[int], kinds: int, tokens: int, width: int) -> None:
+    def __init__(self, order: Sequence[int], kinds: int, tokens: int, width: int, errors: float = 0.0) -> None:
         super().__init__()
+        self.errors = errors
         self.slot = SlotEncoder(order, kinds, width, width)
         self.score = nn.Linear(width, tokens)
         self.phase = nn.Linear(1, width)
@@ -53,7 +55,10 @@ class FramePool(nn.Module):
     def forward(self, frames: Tensor) -> Tensor:
         """Return tokens (N, tokens, width) of frames (N, 1, SIZE + 6 + 1)."""
         slots, hand, phase = frames.flatten(1).split([SIZE, HAND_DIM, 1], dim=1)
-        made, there = self.slot(slots.unflatten(1, (SLOTS, WIDTH)), hand)
+        slots = slots.unflatten(1, (SLOTS, WIDTH))
+        if self.training and self.errors:
+            slots = as_found(slots, hand, self.errors)
+        made, there = self.slot(slots, hand)
         score = self.score(made)
         # A finite score keeps a frame in which nothing is seen finite: it becomes zeros.
         scores, values = in_slots(score, there, -1e4), in_slots(made, there)
@@ -68,6 +73,7 @@ class ObjectPerception(nn.Module, Perception):
     Args:
         trained: names of the classes that it knows, in order of their indices.
         tokens_per_frame: memory tokens of a frame. width: of all tokens.
+        errors: with which slots are seen while it learns (`sight_errors`); 1 is as eyes err.
     """
 
     remembers = OBS_ENV_STATE
@@ -75,18 +81,20 @@ class ObjectPerception(nn.Module, Perception):
     grid = 0
     pictures = False
 
-    def __init__(self, trained: Sequence[str], tokens_per_frame: int, width: int) -> None:
+    def __init__(self, trained: Sequence[str], tokens_per_frame: int, width: int, errors: float = 0.0) -> None:
         super().__init__()
-        self.tokens_per_frame, self.dim = tokens_per_frame, width
+        self.tokens_per_frame, self.dim, self.errors = tokens_per_frame, width, errors
         self.order = [trained.index(name) if name in trained else len(trained) for name in classes()]
         self.kinds = len(trained) + 1
         self.slot = SlotEncoder(self.order, self.kinds, 2 * width, width)
 
     def present(self, batch: Mapping[str, Tensor]) -> Seen:
         """Return what is seen now: slots and hand (B, SIZE + 6), and which slots hold something (B, SLOTS)."""
-        slots = batch[OBS_ENV_STATE].to(torch.float32)
-        seen = torch.cat([slots, batch[OBS_RAW_STATE][:, :HAND_DIM].to(slots)], dim=1)
-        return [seen], [slots.unflatten(1, (SLOTS, WIDTH))[..., 0] > 0]
+        slots = batch[OBS_ENV_STATE].to(torch.float32).unflatten(1, (SLOTS, WIDTH))
+        hand = batch[OBS_RAW_STATE][:, :HAND_DIM].to(slots)
+        if self.training and self.errors:
+            slots = as_found(slots, hand, self.errors)
+        return [torch.cat([slots.flatten(1), hand], dim=1)], [slots[..., 0] > 0]
 
     def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
         """Return the rows (n, 1, D') of frames; without a phase all is execution."""
@@ -103,4 +111,4 @@ class ObjectPerception(nn.Module, Perception):
 
     def memory(self, encoder: nn.Module) -> nn.Module:
         """Return the encoder behind a pool of each frame."""
-        return PooledMemory(FramePool(self.order, self.kinds, self.tokens_per_frame, self.dim), encoder)
+        return PooledMemory(FramePool(self.order, self.kinds, self.tokens_per_frame, self.dim, self.errors), encoder)

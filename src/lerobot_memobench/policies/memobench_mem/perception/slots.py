@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from lerobot_memobench.sim.object_slots import FIELDS, STARTS
+from lerobot_memobench.sim.object_slots import FIELDS, STARTS, WIDTH
 
 CLASS_DIM = 32
 MIDDLE = (-0.05, 0.0, 0.95)
@@ -27,6 +27,14 @@ FEATURES = 3 * (2 + 2 * len(NEAR)) + 2 * FIELDS["rotation"] + FIELDS["joint"] + 
 def field(slots: Tensor, name: str) -> Tensor:
     """Return a field (..., size) of slots (..., WIDTH)."""
     return slots[..., STARTS[name] : STARTS[name] + FIELDS[name]]
+
+
+def in_order(slots: Tensor) -> Tensor:
+    """Return slots (N, n, WIDTH) sorted as by `sim.object_slots.in_slots`: by class and place, the empty ones last."""
+    x = field(slots, "position")[..., 0].clamp(-4, 4) / 10
+    order = (field(slots, "class").squeeze(-1) + x).masked_fill(field(slots, "present").squeeze(-1) == 0, torch.inf)
+    rows: Tensor = slots.gather(1, order.argsort(dim=1)[..., None].expand(-1, -1, WIDTH))
+    return rows
 
 
 def rotation(axis_angle: Tensor) -> Tensor:

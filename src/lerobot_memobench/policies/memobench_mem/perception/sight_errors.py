@@ -1,0 +1,106 @@
+"""Slots as eyes would find them: what the environment tells, with errors like theirs, drawn anew for every batch.
+
+So a policy learns from told objects, of any number of demonstrations without a picture, what it will be shown of found
+ones. Sizes are those of the package's eyes at 2,617 moments of the thirty tasks (tuning seeds, arms moved at random).
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from lerobot_memobench.eyes.objects import ROUND, TURNED
+from lerobot_memobench.policies.memobench_mem.perception.slots import field, in_order
+from lerobot_memobench.sim.object_slots import classes
+
+PLACE, KIND_PLACE = (0.001, 1.3), (0.0014, 0.7)
+"""Error of a place in each direction, m, and by how much its size varies (spread of its logarithm): of each sight of a
+thing, and of all sights of a kind."""
+AT_HAND, TWICE = 0.1, 2.0
+"""How far from the hand places are found as many times worse, m."""
+TURN, JOINT = (0.002, 2.0), {"drawer": (0.001, 0.7), "door": (0.02, 0.8), "knob": (0.02, 0.8)}
+"""Errors of a turn, rad, and of moving parts, m or rad."""
+MISSED, KIND_MISSED = 0.015, 0.015
+"""How often a thing is not found at a moment, and a kind at no moment."""
+FALSE, MISNAMED, ASTRAY = 1.3, 0.015, 0.06
+"""Things found at a moment that are none: half of them a second name for one that is, and half that thing once more
+and elsewhere; and how far from it they are, m."""
+
+
+def as_found(slots: Tensor, hand: Tensor, size: float) -> Tensor:
+    """Return slots (N, SLOTS, WIDTH) as eyes would find them.
+
+    Args:
+        hand: its place in the world, m, and its turn, (N, >= 3). size: of the errors; 1 is as the package's eyes err.
+    """
+    seen = _settled(slots)
+    there = field(seen, "present").squeeze(-1) > 0
+    kind = field(seen, "class").squeeze(-1).long()
+    place, joint = field(seen, "position"), field(seen, "joint")
+    near = 1 + (TWICE - 1) * ((place - hand[:, None, :3]).norm(dim=-1, keepdim=True) < AT_HAND)
+    of_kinds = _error(place.new_empty(len(classes()), 3), *KIND_PLACE)[kind]
+    place += size * (near * _error(place, *PLACE) + of_kinds)
+    for name, how in JOINT.items():
+        joint += size * _error(joint, *how) * (kind == classes().index(name))[..., None]
+    _turn(seen, size * _error(joint, *TURN).squeeze(-1))
+    missed = torch.rand_like(joint).squeeze(-1) < size * MISSED
+    missed |= (torch.rand(len(classes()), device=kind.device) < size * KIND_MISSED)[kind]
+    _add_false(seen, there & ~missed, size)
+    return in_order(seen)
+
+
+def _error(like: Tensor, size: float, spread: float) -> Tensor:
+    """Return errors in the shape of ``like``: normal, and so is the logarithm of their size, one for the last axis."""
+    return torch.randn_like(like) * size * (spread * torch.randn_like(like[..., :1])).exp()
+
+
+@cache
+def _kinds(names: frozenset[str]) -> Tensor:
+    return torch.tensor([name in names for name in classes()])
+
+
+def _settled(slots: Tensor) -> Tensor:
+    """Return a copy in which things stand as eyes take them to stand (`eyes.objects`): level, and with their front on
+    the side where tasks have it.
+    """
+    seen = slots.clone()
+    kind = field(seen, "class").squeeze(-1).long().cpu()
+    axis = field(seen, "rotation")[..., :3].clone()
+    axis[..., 2] = 0.0
+    axis = normalize(axis, dim=-1, eps=1e-6)
+    turned = _kinds(TURNED | {"drawer"})[kind].to(axis.device)
+    axis = torch.where(((axis[..., 0] < 0) != turned)[..., None], -axis, axis)
+    round_ = _kinds(ROUND)[kind].to(axis.device)
+    axis = torch.where(round_[..., None], axis.new_tensor([1.0, 0.0, 0.0]), axis)
+    _set_axis(seen, axis)
+    return seen
+
+
+def _turn(seen: Tensor, angle: Tensor) -> None:
+    """Turn the level x axes of things by angles (N, SLOTS), rad."""
+    x, y, z = field(seen, "rotation")[..., :3].unbind(-1)
+    sine, cosine = angle.sin(), angle.cos()
+    _set_axis(seen, torch.stack([cosine * x - sine * y, sine * x + cosine * y, z], dim=-1))
+
+
+def _set_axis(seen: Tensor, axis: Tensor) -> None:
+    x, y, z = axis.unbind(-1)
+    field(seen, "rotation")[:] = torch.stack([x, y, z, -y, x, z], dim=-1)
+
+
+def _add_false(seen: Tensor, there: Tensor, size: float) -> None:
+    """Take away what is not ``there`` (N, SLOTS), and put what is none into some of the slots that are empty then."""
+    empty = (~there).sum(dim=1, keepdim=True).clamp(min=1)
+    chance = size * FALSE / empty * there.any(dim=1, keepdim=True)
+    false = ~there & (torch.rand(there.shape, device=seen.device) < chance)
+    row = false.nonzero()[:, 0]
+    made = seen[row, torch.multinomial(there[row].float(), 1)[:, 0]] if len(row) else seen[false]
+    misnamed = torch.rand(len(made), 1, device=seen.device) < 0.5
+    kind, place = field(made, "class"), field(made, "position")
+    kind[:] = torch.where(misnamed, torch.randint_like(kind, len(classes())), kind)
+    place += torch.randn_like(place) * torch.where(misnamed, MISNAMED, ASTRAY)
+    seen[~there] = 0.0
+    seen[false] = made
