@@ -12,13 +12,15 @@ import numpy as np
 import pytest
 from PIL import Image, ImageColor
 
+from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records.runs import read_rollouts
 from lerobot_memobench.studies.alignment.settings import ALIGNMENTS
 from lerobot_memobench.studies.learning import stages as stages_module
+from lerobot_memobench.studies.learning import study as study_module
 from lerobot_memobench.studies.learning.commands import Cost, run_once
-from lerobot_memobench.studies.learning.experiments import MEMORY, MEMORYLESS, changed, experiment
+from lerobot_memobench.studies.learning.experiments import MEMORY, MEMORYLESS, Experiment, changed, experiment
 from lerobot_memobench.studies.learning.figure import COLOURS
 from lerobot_memobench.studies.learning.outcomes import outcomes_of
 from lerobot_memobench.studies.learning.stages import Stages
@@ -160,24 +162,41 @@ def test_what_is_told_in_training_is_told_in_rollouts(tmp_path: Path, monkeypatc
 
 
 @pytest.mark.parametrize(
-    ("perception", "words"),
+    ("perception", "trained", "rolled_out"),
     [
-        ("objects", {"perception=objects", "steps=1000"}),
-        ("found", {"perception=objects", "policy.eyes=package", "steps=1000"}),
-        ("pixels", {"perception=pixels", "steps=2000"}),
+        ("objects", {"perception=objects", "steps=1000"}, set()),
+        ("found", {"perception=objects", "policy.sight_errors=1", "steps=1000"}, {"eyes=package"}),
+        ("pixels", {"perception=pixels", "steps=2000"}, set()),
     ],
 )
-def test_pictures_are_made_for_policies_that_see_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, perception: str, words: set[str]
+def test_policies_learn_and_act_by_what_they_see(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, perception: str, trained: set[str], rolled_out: set[str]
 ) -> None:
     ran: list[list[str]] = []
     monkeypatch.setattr(stages_module, "run_once", lambda words, log, **options: ran.append(words))
     stages = Stages(changed(experiment("bowl", perception), settings=("batch_size=32",)), tmp_path)
     stages.generate()
     stages.train(MEMORY, 0)
-    assert ("--no-images" in ran[0]) == (perception == "objects")
-    assert words | {"batch_size=32"} <= set(ran[1])
-    assert ("policy.eyes=package" in ran[1]) == (perception == "found")
+    stages.evaluate(MEMORY, 0)
+    assert ("--no-images" in ran[0]) == (perception != "pixels"), "pictures are made for who learns from them"
+    assert trained | {"batch_size=32"} <= set(ran[1])
+    assert ("policy.sight_errors=1" in ran[1]) == (perception == "found")
+    assert {word for word in ran[2] if word.startswith("eyes=")} == rolled_out
+
+
+@pytest.mark.parametrize("name", ["prompted", "joint"])
+def test_prompts_are_learned_from_more_demonstrations_by_an_aligned_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    ran: list[list[str]] = []
+    monkeypatch.setattr(stages_module, "run_once", lambda words, log, **options: ran.append(words))
+    stages = Stages(experiment(name), tmp_path)
+    stages.generate()
+    for arm in (MEMORY, MEMORYLESS):
+        stages.train(arm, 0)
+    more = dict(zip(ran[0], ran[0][1:], strict=False))
+    assert more.get("--prompted-episodes", more["--episodes"]) == "240"
+    assert ["align=semantic" in words for words in ran[1:]] == [True, False]
 
 
 @pytest.mark.parametrize(("task", "referent", "strict"), [(BOWL, "random", False), (TWIN, "drawn", True)])
@@ -189,3 +208,15 @@ def test_rollouts_are_of_the_demonstrations_kind(
     Stages(replace(experiment("bowl"), tasks=(task,), referent=referent), tmp_path).evaluate(MEMORY, 0)
     assert f"referent={referent}" in ran
     assert ("suite=strict" in ran) == strict
+
+
+@pytest.mark.parametrize(
+    ("told", "made"), [([], (80, 240)), (["--episodes", "3"], (3, 3)), (["--prompted-episodes", "5"], (80, 5))]
+)
+def test_the_command_takes_how_many_demonstrations(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: list[str], made: tuple[int, int]
+) -> None:
+    asked: list[Experiment] = []
+    monkeypatch.setattr(study_module, "learn", lambda which, *_, **__: asked.append(which) or "")
+    assert main(["learn", "joint", "--out", str(tmp_path / "out"), *told]) == 0
+    assert (asked[0].episodes, asked[0].prompted_episodes) == made

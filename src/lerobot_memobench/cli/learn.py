@@ -33,6 +33,9 @@ def learn(
     name: Annotated[Name, typer.Argument(help=EXPERIMENTS)],
     out: Annotated[Path, typer.Option(help="Folder of data, policies, rollouts and tables; the same command goes on.")],
     episodes: Annotated[int | None, typer.Option(min=1, help="Demonstrations per task.")] = None,
+    prompted_episodes: Annotated[
+        int | None, typer.Option(min=1, help="Demonstrations per task with a prompt; --episodes unless told.")
+    ] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Updates per policy.")] = None,
     seeds: Annotated[int | None, typer.Option(min=1, help="Training seeds.")] = None,
     rollouts: Annotated[int | None, typer.Option(min=1, help="Rollouts per task and policy.")] = None,
@@ -42,8 +45,8 @@ def learn(
     perception: Annotated[
         Sight,
         typer.Option(
-            help="objects: no pictures are made; found: objects that the package's eyes find in pictures; pixels: "
-            "pictures, through these eyes."
+            help="objects: told by the environment; found: in rollouts by the package's eyes, in training told with "
+            "errors like theirs; pixels: the tokens of these eyes, from demonstrations with pictures."
         ),
     ] = Sight.OBJECTS,
     settings: Annotated[
@@ -58,6 +61,7 @@ def learn(
 
     screen = console()
     given = {"episodes": episodes, "steps": steps, "seeds": seeds, "rollouts": rollouts, "first_seed": first_seed}
+    given["prompted_episodes"] = prompted_episodes or episodes
     chosen = experiment(name.value, perception.value)
     chosen = changed(chosen, **given, settings=(*chosen.settings, *(settings or ())))
     screen.print(run(chosen, out, lambda text: screen.print(text, soft_wrap=True), dataset=dataset, workers=workers))

@@ -10,14 +10,27 @@ from lerobot_memobench.tasks.catalogue import BOWL, get_task, task_names
 MEMORY, MEMORYLESS = "memory", "no memory"
 ARMS: dict[str, tuple[str, ...]] = {MEMORY: (), MEMORYLESS: ("policy.integration=none",)}
 """Who is compared -> what is said of it to `lerobot train` beside what all share."""
+ALIGNED = {**ARMS, MEMORY: ("align=semantic",)}
+"""The same, with a memory aligned with checkpoint language, which learns referents in fewer updates."""
 
-OBJECTS, PIXELS = "objects", "pixels"
-PERCEPTIONS: dict[str, tuple[str, ...]] = {
-    OBJECTS: ("perception=objects",),
-    "found": ("perception=objects", "policy.eyes=package"),
-    PIXELS: ("perception=pixels",),
+OBJECTS, FOUND, PIXELS = "objects", "found", "pixels"
+
+
+@dataclass(frozen=True)
+class Sight:
+    """How policies see: words of it for `lerobot train` and `lerobot eval`, and whether they learn from pictures."""
+
+    training: tuple[str, ...]
+    evaluation: tuple[str, ...] = ()
+    pictures: bool = False
+
+
+PERCEPTIONS = {
+    OBJECTS: Sight(("perception=objects",)),
+    FOUND: Sight(("perception=objects", "policy.sight_errors=1"), ("eyes=package",)),
+    PIXELS: Sight(("perception=pixels",), pictures=True),
 }
-"""By what policies see -> what is said of it to `lerobot train`; all but objects need pictures."""
+"""Ways to see. Who is to act by objects that eyes find learns by objects that are told with errors like theirs."""
 
 EVALUATION_SEEDS = 7
 TUNING_SEEDS = 20_000
@@ -30,7 +43,7 @@ class Experiment:
 
     Attributes:
         tasks: task names, of one suite. episodes: demonstrations of each, two thirds of them with the arm moved off
-            its way; 0 where they are given.
+            its way; 0 where they are given. prompted_episodes: of each that begins with a prompt; None: as many.
         steps: updates. pixel_steps: updates from pixels, where these are others.
         settings: more words for `lerobot train`, of all arms.
         arms: name -> words for `lerobot train`.
@@ -50,6 +63,7 @@ class Experiment:
     rollouts: int = 50
     first_seed: int = EVALUATION_SEEDS
     referent: str = "random"
+    prompted_episodes: int | None = None
 
 
 def prompted() -> tuple[str, ...]:
@@ -66,8 +80,15 @@ def experiment(name: str, perception: str = OBJECTS) -> Experiment:
 
 EXPERIMENTS: dict[str, Experiment] = {
     "bowl": Experiment((BOWL,), episodes=120, steps=1000, pixel_steps=2000, seeds=3),
-    "prompted": Experiment(prompted(), episodes=40, steps=8_000),
-    "joint": Experiment(tuple(task_names()), episodes=40, steps=20_000),
+    "prompted": Experiment(prompted(), episodes=240, steps=12_000, arms=ALIGNED),
+    "joint": Experiment(
+        tuple(task_names()),
+        episodes=80,
+        prompted_episodes=240,
+        steps=25_000,
+        settings=("policy.prompted_weight=4",),
+        arms=ALIGNED,
+    ),
 }
 """Butter into the prompted bowl, in minutes; the ten prompted tasks, by one policy; all thirty, by one policy."""
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from lerobot_memobench.settings.words import split_words
 from lerobot_memobench.studies.learning.commands import Cost, run_once
-from lerobot_memobench.studies.learning.experiments import OBJECTS, PERCEPTIONS, Experiment
+from lerobot_memobench.studies.learning.experiments import PERCEPTIONS, Experiment, Sight
 from lerobot_memobench.tasks.catalogue import suite_of
 from lerobot_memobench.tasks.task import STRICT
 
@@ -31,6 +31,10 @@ class Stages:
     workers: int = 1
 
     @property
+    def _sight(self) -> Sight:
+        return PERCEPTIONS[self.experiment.perception]
+
+    @property
     def data(self) -> Path:
         """Where the demonstrations are."""
         return self.dataset or self.out / "data"
@@ -41,8 +45,10 @@ class Stages:
             return None
         words = ["memobench", "generate", "--tasks", ",".join(self.experiment.tasks)]
         words += ["--referent", self.experiment.referent, "--episodes", str(self.experiment.episodes)]
+        more = self.experiment.prompted_episodes
+        words += [] if more is None else ["--prompted-episodes", str(more)]
         words += ["--perturb", "--out", str(self.data)]
-        words += ["--no-images"] if self.experiment.perception == OBJECTS else []
+        words += [] if self._sight.pictures else ["--no-images"]
         return run_once([*words, "--workers", str(self.workers)], self.out / "data.log", threads=1, accept=(0, 1))
 
     def check_settings(self) -> None:
@@ -62,7 +68,7 @@ class Stages:
 
     def training_words(self, arm: str, seed: int) -> list[str]:
         """Return the command that trains an arm's policy with one seed."""
-        words = ["lerobot", "train", *SHARED, *PERCEPTIONS[self.experiment.perception]]
+        words = ["lerobot", "train", *SHARED, *self._sight.training]
         words += [f"dataset={self.data}", f"steps={self.experiment.steps}"]
         words += [f"seed={seed}", f"output_dir={self.policy(arm, seed)}"]
         return [*words, *self.experiment.settings, *self.experiment.arms[arm]]
@@ -80,7 +86,8 @@ class Stages:
     def evaluate(self, arm: str, seed: int) -> Cost:
         """Roll a trained policy out on the experiment's evaluation seeds."""
         words = ["lerobot", "eval", "env=memobench", f"policy={self.policy(arm, seed)}"]
-        words += [f"referent={self.experiment.referent}", "films=0", f"tasks={','.join(self.experiment.tasks)}"]
+        words += [*self._sight.evaluation, f"referent={self.experiment.referent}", "films=0"]
+        words += [f"tasks={','.join(self.experiment.tasks)}"]
         words += [f"episodes={self.experiment.rollouts}", f"seed={self.experiment.first_seed}"]
         words += [f"output_dir={self.rollouts(arm, seed)}", "resume=true"]
         words += ["suite=strict"] if suite_of(self.experiment.tasks[0]) == STRICT else []
