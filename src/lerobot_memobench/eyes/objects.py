@@ -92,12 +92,13 @@ class ObjectFinder:
             pictures: of each camera, `agentview` and `wrist`, (N, 3, H, H) in [0, 1].
             states: (N, >= 6) the hand's place, m, and its turn as axis times angle, rad.
         """
-        said = {camera: self.eyes.heads(self.eyes.tower(shrunk(pictures[camera]))) for camera in CAMERAS}
-        finds = {camera: found(heads, SURE) for camera, heads in said.items()}
+        both = torch.cat([shrunk(pictures[camera]) for camera in CAMERAS])  # one pass is quicker than two
+        finds = found(self.eyes.heads(self.eyes.tower(both)), SURE)
         hands = states.cpu().numpy().astype(np.float64)
-        slots = [
-            self.slots({camera: finds[camera][row] for camera in CAMERAS}, hands[row]) for row in range(len(hands))
-        ]
+        slots = []
+        for row, hand in enumerate(hands):
+            seen = dict(zip(CAMERAS, finds[row :: len(hands)], strict=True))
+            slots.append(self.slots(seen, hand))
         return torch.from_numpy(np.array(slots))
 
     def slots(self, finds: Mapping[str, Things], state: Array) -> NDArray[np.float32]:
