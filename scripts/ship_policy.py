@@ -30,7 +30,6 @@ from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import DRAWN
 
-ROOT = Path(__file__).resolve().parents[1]
 TRAINED = "train_config.json"
 LARGEST = 4_000_000
 """Bytes that one policy may take."""
@@ -52,8 +51,13 @@ def ship(
     rollouts: Path | None,
     merged: Mapping[Path, Sequence[Path]],
     commits: Sequence[tuple[str, str]],
+    eyes: str | None = None,
 ) -> Path:
-    """Write the last checkpoint of a training run as the package's policy ``name``; return its folder."""
+    """Write the last checkpoint of a training run as the package's policy ``name``; return its folder.
+
+    Args:
+        eyes: through which it is to see, where it was trained on told objects; None: as it was trained.
+    """
     source, folder = checkpoint_folder(str(run)), SHIPPED / name
     if source is None:
         raise SystemExit(f"{run} holds no checkpoint; name the output_dir of a `lerobot train`")
@@ -63,11 +67,10 @@ def ship(
     save_file(narrow, folder / WEIGHTS_FILE, metadata={"format": "pt"})
     for path in source.glob("policy_*processor*"):
         shutil.copy(path, folder)
-    config = json.loads((source / "config.json").read_text())
-    write_file(
-        folder / "config.json", json.dumps({**config, "device": "cpu", "pretrained_path": None}, indent=4) + "\n"
-    )
-    write_file(folder / "README.md", card(name, source, weights, rollouts, merged, commits))
+    config = json.loads((source / "config.json").read_text()) | {"device": "cpu", "pretrained_path": None}
+    config |= {} if eyes is None else {"eyes": eyes}
+    write_file(folder / "config.json", json.dumps(config, indent=4) + "\n")
+    write_file(folder / "README.md", card(name, source, weights, rollouts, merged, commits, eyes))
     size = sum(path.stat().st_size for path in folder.iterdir())
     if size > LARGEST:
         raise SystemExit(f"{folder} takes {size:,} bytes; expected at most {LARGEST:,}")
@@ -81,12 +84,14 @@ def card(
     rollouts: Path | None,
     merged: Mapping[Path, Sequence[Path]],
     commits: Sequence[tuple[str, str]] = (),
+    eyes: str | None = None,
 ) -> str:
     """Return the Markdown that goes with a policy.
 
     Args:
         merged: datasets, and those that LeRobot made each of.
         commits: datasets, and by which commit each was made, where the expert has changed since.
+        eyes: through which it sees, if it was trained on told objects.
     """
     runs = trainings(source)
     begun = runs.pop(0) if "shipped" in runs[0] else None
@@ -95,8 +100,9 @@ def card(
     lines = [
         f"# {name}",
         "",
-        f"`memobench_mem`, {count:.1f} million parameters, bfloat16; sees {policy['perception']}.",
-        *([] if begun is None else [began_with(begun["shipped"])]),
+        f"`memobench_mem`, {count:.1f} million parameters, bfloat16; sees {policy['perception']}"
+        + ("." if eyes is None else f" that eyes (`eyes={eyes}`) find in pictures, and was trained on told ones."),
+        *([] if begun is None else [began_with(begun["folder"])]),
         *demonstrations(runs, training_facts(source) or {}, merged),
         *(f"The expert that made {place(part)} is that of commit `{commit}`." for part, commit in commits),
         "",
@@ -112,10 +118,10 @@ def card(
     return HEAD + "\n".join(lines) + "\n"
 
 
-def began_with(shipped: str) -> str:
-    """Return that the first training began with a policy of the package, and of which commit that is."""
-    of = git(ROOT, "log", "-1", "--format=%h", "--", str(SHIPPED / shipped))
-    return f"It went on from `{shipped}` as of commit `{of}`, whose card says how that was made."
+def began_with(shipped: Path) -> str:
+    """Return that the first training began with a policy of the package, by its folder, and of which commit that is."""
+    of = git(shipped, "log", "-1", "--format=%h", "--", ".")
+    return f"It went on from `{shipped.name}` as of commit `{of}`, whose card says how that was made."
 
 
 def trainings(source: Path) -> list[dict[str, Any]]:
@@ -124,7 +130,8 @@ def trainings(source: Path) -> list[dict[str, Any]]:
     A policy of the package knows of none; it stands for its own by its name.
     """
     if not (source / TRAINED).is_file():
-        return [{"shipped": source.name, "policy": json.loads((source / "config.json").read_text())}]
+        policy = json.loads((source / "config.json").read_text())
+        return [{"shipped": source.name, "folder": source, "policy": policy}]
     told: dict[str, Any] = json.loads((source / TRAINED).read_text())
     begun = told["policy"].get("pretrained_path")  # of a training that went on after an interruption: its own
     another = begun is not None and not Path(begun).is_relative_to(told["output_dir"])
@@ -269,6 +276,7 @@ if __name__ == "__main__":
         metavar=("DATASET", "COMMIT"),
         help="by which a dataset was made, where the expert has changed since; may be said again",
     )
+    parser.add_argument("--eyes", help="through which it is to see, where it was trained on told objects")
     given = parser.parse_args()
     parts = {whole: parts for whole, *parts in given.merged}
-    print(ship(given.run, given.name, given.rollouts, parts, given.commit))
+    print(ship(given.run, given.name, given.rollouts, parts, given.commit, given.eyes))
