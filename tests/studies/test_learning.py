@@ -39,6 +39,7 @@ def test_a_command_that_ended_well_is_not_run_again(tmp_path: Path) -> None:
     assert json.loads(log.read_text())["slots"] == 16
     assert first.cpu_s > 0
     assert run_once(["memobench", "objects", "--json"], log) == first
+    assert run_once(["memobench", "objects", "--json"], log, how=["--workers", "2"]) == first, "by whomever it was done"
     with pytest.raises(MemobenchError, match="is of another command"):
         run_once(["memobench", "objects"], log)
 
@@ -220,3 +221,17 @@ def test_the_command_takes_how_many_demonstrations(
     monkeypatch.setattr(study_module, "learn", lambda which, *_, **__: asked.append(which) or "")
     assert main(["learn", "joint", "--out", str(tmp_path / "out"), *told]) == 0
     assert (asked[0].episodes, asked[0].prompted_episodes) == made
+
+
+def test_how_many_processes_work_decides_nothing_that_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[tuple[list[str], list[str]]] = []
+    monkeypatch.setattr(stages_module, "run_once", lambda words, log, how=(), **_: told.append((words, [*how])))
+    for workers in (1, 2):
+        stages = Stages(experiment("bowl"), tmp_path, workers=workers)
+        stages.generate()
+        stages.train(MEMORY, 0)
+        stages.evaluate(MEMORY, 0)
+    kept = [words for words, _ in told]
+    assert kept[:3] == kept[3:]
+    assert told[0][1] == ["--workers", "1"]
+    assert [how for _, how in told[3:]] == [["--workers", "2"], [], ["shards=2", "workers=2"]]

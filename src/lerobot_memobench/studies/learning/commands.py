@@ -34,6 +34,7 @@ def run_once(
     words: Sequence[str],
     log: Path,
     *,
+    how: Sequence[str] = (),
     threads: int | None = None,
     accept: Sequence[int] = (0,),
     going_on: Sequence[str] | None = None,
@@ -43,6 +44,7 @@ def run_once(
     Its output goes to ``log``, its cost and its words beside it.
 
     Args:
+        how: more words, which decide nothing that comes out: in how many processes it is done.
         threads: of processors' mathematics; as many as there are cores where None.
         accept: exit statuses of a command that did its work.
         going_on: what is run instead, to finish what an earlier attempt has begun.
@@ -61,7 +63,7 @@ def run_once(
             return spent
     log.parent.mkdir(parents=True, exist_ok=True)
     environment = os.environ if threads is None else {**os.environ, "OMP_NUM_THREADS": str(threads)}
-    status, took = _run(going_on or words, log, environment)
+    status, took = _run(going_on or [*words, *how], log, environment)
     spent, ended = spent + took, status in accept
     write_file(kept, json.dumps({"words": list(words), "ended": ended, **asdict(spent)}, indent=1))
     if not ended:

@@ -49,7 +49,8 @@ class Stages:
         words += [] if more is None else ["--prompted-episodes", str(more)]
         words += ["--perturb", "--out", str(self.data)]
         words += [] if self._sight.pictures else ["--no-images"]
-        return run_once([*words, "--workers", str(self.workers)], self.out / "data.log", threads=1, accept=(0, 1))
+        how = ["--workers", str(self.workers)]
+        return run_once(words, self.out / "data.log", how=how, threads=1, accept=(0, 1))
 
     def check_settings(self) -> None:
         """Refuse what training would, before anything is made; LeRobot's import is left out where nothing was added.
@@ -92,8 +93,8 @@ class Stages:
         words += [f"output_dir={self.rollouts(arm, seed)}", "resume=true"]
         words += ["suite=strict"] if suite_of(self.experiment.tasks[0]) == STRICT else []
         words += ["env.oracle_memory=true"] if "policy.oracle_memory=true" in self.experiment.arms[arm] else []
-        words += [f"shards={self.workers}", f"workers={self.workers}"] if self.workers > 1 else []
-        return run_once(words, self.log("evaluation", arm, seed), threads=1)
+        how = [f"shards={self.workers}", f"workers={self.workers}"] if self.workers > 1 else []
+        return run_once(words, self.log("evaluation", arm, seed), how=how, threads=1)
 
     def policy(self, arm: str, seed: int) -> Path:
         """Return the folder of a training run."""
