@@ -3,7 +3,7 @@
     python scripts/learned_figure.py "with memory=outputs/eval/small" "without memory=outputs/eval/memoryless" \
         --out docs/figures/learned.png
 
-Bars are of all rollouts of an arm; differences from the first arm are of the episodes that all arms have.
+Bars are of all rollouts of the tasks that all arms have; differences from the first arm of the episodes that they have.
 """
 
 from __future__ import annotations
@@ -27,6 +27,14 @@ def shared(arms: dict[str, list[Record]]) -> dict[str, list[Record]]:
     return {name: [one for one in records if (one["task"], one["seed"]) in common] for name, records in arms.items()}
 
 
+def of_shared_tasks(arms: dict[str, list[Record]]) -> dict[str, list[Record]]:
+    """Return the rollouts of the tasks that all arms have."""
+    common = set.intersection(*({one["task"] for one in records} for records in arms.values()))
+    if not common:
+        raise SystemExit(f"{', '.join(arms)} have no task in common; name evaluations of the same tasks")
+    return {name: [one for one in records if one["task"] in common] for name, records in arms.items()}
+
+
 def differences(arms: dict[str, list[Record]]) -> str:
     """Return a table of all arms against the first, on shared episodes of all tasks and of the prompted ones."""
     reference, parts = next(iter(arms)), []
@@ -45,7 +53,7 @@ def main() -> None:
     parser.add_argument("arms", nargs="+", help="NAME=FOLDER of an evaluation")
     parser.add_argument("--out", type=Path, required=True, help="the picture")
     given = parser.parse_args()
-    arms = {run.name: list(run.records) for run in read_runs(given.arms)}
+    arms = of_shared_tasks({run.name: list(run.records) for run in read_runs(given.arms)})
     found = {name: outcomes_of([records]) for name, records in arms.items()}
     draw(found, given.out)
     means = {name: {scope: one[scope] for scope in one if scope in SCOPES} for name, one in found.items()}

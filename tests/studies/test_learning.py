@@ -13,7 +13,7 @@ import pytest
 from PIL import Image, ImageColor
 
 from lerobot_memobench.cli.memobench import main
-from lerobot_memobench.envs.episode_log import write_episodes
+from lerobot_memobench.envs.episode_log import MERGED_FILE, write_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records.runs import read_rollouts
 from lerobot_memobench.studies.alignment.settings import ALIGNMENTS
@@ -25,7 +25,7 @@ from lerobot_memobench.studies.learning.figure import COLOURS
 from lerobot_memobench.studies.learning.outcomes import outcomes_of
 from lerobot_memobench.studies.learning.stages import Stages
 from lerobot_memobench.studies.learning.study import learn
-from lerobot_memobench.tasks.catalogue import BOWL
+from lerobot_memobench.tasks.catalogue import BOWL, get_task
 
 from ..scripts import load_script
 
@@ -59,12 +59,20 @@ def test_a_command_that_fails_is_told_and_gone_on_with(tmp_path: Path) -> None:
     assert spent.wall_s == kept["wall_s"] > 0
 
 
-def write_rollouts(folder: Path, solved: int, wrong: int, episodes: int = 10) -> None:
+def write_rollouts(folder: Path, solved: int, wrong: int, episodes: int = 10, task: str = BOWL) -> None:
     from logs import rollout
 
     failures = ["reference_drift"] * wrong + ["storage_failure"] * (episodes - solved - wrong)
     records = [
-        rollout(BOWL, "object", "S", [k < solved], k < solved, k, failure=None if k < solved else failures[k - solved])
+        rollout(
+            task,
+            get_task(task).memory_type,
+            "S",
+            [k < solved],
+            k < solved,
+            k,
+            failure=None if k < solved else failures[k - solved],
+        )
         for k in range(episodes)
     ]
     write_episodes(folder, records)
@@ -87,11 +95,19 @@ def test_the_figure_of_two_evaluations_tells_differences_on_what_both_have(
 ) -> None:
     write_rollouts(tmp_path / "with", solved=15, wrong=5, episodes=20)
     write_rollouts(tmp_path / "without", solved=4, wrong=6, episodes=10)
+    write_rollouts(tmp_path / "other", solved=20, wrong=0, episodes=20, task="turn_on_the_stove_and_turn_it_off")
+    with (tmp_path / "with" / MERGED_FILE).open("a") as file:
+        file.write((tmp_path / "other" / MERGED_FILE).read_text())
     arms = [f"{name}={tmp_path / name}" for name in ("with", "without")]
     monkeypatch.setattr(sys, "argv", ["learned_figure.py", *arms, "--out", str(tmp_path / "figure.png")])
     load_script("learned_figure").main()
     told = capsys.readouterr().out
+    assert "| all, with | 75.0 |" in told, "of what both have done"
     assert "| object, with | 75.0 |" in told
+    assert "temporal" not in told
+    monkeypatch.setattr(sys, "argv", ["learned_figure.py", arms[1], f"other={tmp_path / 'other'}", "--out", "none.png"])
+    with pytest.raises(SystemExit, match="no task in common"):
+        load_script("learned_figure").main()
     assert "prompted tasks, 10 shared episodes" in told
     assert "| without less with | -60.0 |" in told
     assert (tmp_path / "figure.png").is_file()

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from lerobot_memobench.studies.learning.contrasts import Contrast
 from lerobot_memobench.studies.learning.experiments import MEMORY
+from lerobot_memobench.studies.learning.figure import SCOPES
 from lerobot_memobench.studies.learning.outcomes import Outcome
 from lerobot_memobench.studies.learning.running import Costs
 
@@ -15,10 +16,9 @@ COLUMNS = ("", "success", "95 % interval", "training seeds", "wrong referent", "
 def outcomes_table(arms: Mapping[str, Mapping[str, Outcome]]) -> str:
     """Return a table of all arms and scopes; a mean over several tasks comes before its tasks."""
     scopes = list(next(iter(arms.values())))
-    several = len(scopes) > 3  # one task has itself, its type and the mean
-    rows = [
-        [f"{scope}, {arm}", *_cells(arms[arm][scope])] for scope in (scopes if several else scopes[-1:]) for arm in arms
-    ]
+    tasks = [scope for scope in scopes if scope not in SCOPES]
+    told = tasks if len(tasks) == 1 else scopes
+    rows = [[f"{scope}, {arm}", *_cells(arms[arm][scope])] for scope in told for arm in arms]
     return markdown(COLUMNS, rows)
 
 
