@@ -40,7 +40,8 @@ def draw(arms: Mapping[str, Mapping[str, Outcome]], path: Path) -> Path:
     handles = [plt.Rectangle((0, 0), 1, 1, color=COLOURS[place % len(COLOURS)]) for place in range(len(arms))]
     handles.append(plt.Rectangle((0, 0), 1, 1, color=WRONG, alpha=0.35))
     labels = [*arms, "failed at a wrong referent"]
-    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), fontsize=9, frameon=False)
+    columns = len(labels) if sum(map(len, labels)) < 72 else 2  # what the figure is wide enough for
+    figure.legend(handles, labels, loc="outside upper center", ncols=columns, fontsize=9, frameon=False)
     with draft_of(path) as draft:
         figure.savefig(draft, dpi=130)
     plt.close(figure)
