@@ -25,7 +25,8 @@ def learn(experiment: Experiment, out: Path, say: Say, *, dataset: Path | None =
     """
     stages = Stages(experiment, out, dataset, workers)
     stages.check_settings()
-    say(f"demonstrations: {experiment.episodes} of each of {len(experiment.tasks)} tasks, to {stages.data}")
+    more = "" if experiment.prompted_episodes is None else f" ({experiment.prompted_episodes} where it has a prompt)"
+    say(f"demonstrations: {experiment.episodes} of each of {len(experiment.tasks)} tasks{more}, to {stages.data}")
     costs: Costs = {"data": [stages.generate()]}
     rolled = train_and_roll_out(stages, say)
     found = rolled.outcomes()

@@ -110,7 +110,7 @@ class FoundObjects(ObjectPerception):
 
 def _told_near(found: Tensor, told: Tensor, hand: Tensor) -> Tensor:
     """Return slots (N, SIZE): what is found, but near the hand (N, >= 3) what is told."""
-    both = torch.cat([found, told], dim=1).unflatten(1, (2 * SLOTS, WIDTH)).clone()
+    both = torch.cat([found, told], dim=1).unflatten(1, (2 * SLOTS, WIDTH))
     near = (field(both, "position") - hand[:, None, :3]).norm(dim=-1) < AT_HAND
     kept = torch.cat([~near[:, :SLOTS], near[:, SLOTS:]], dim=1)
     return in_order(both * kept[..., None])[:, :SLOTS].flatten(1)
