@@ -17,7 +17,7 @@ DRAWERS = "put_the_tomato_into_the_top_drawer_of_the_cabinet"
 @pytest.fixture
 def small_tower() -> Callable[[], Tower]:
     """Make a tower of a few thousand weights."""
-    return lambda: Tower((4, 8, 8, 16), (0, 0, 1, 0))
+    return lambda: Tower((4, 4, 8, 8, 16), (0, 0, 0, 1, 0))
 
 
 @pytest.fixture

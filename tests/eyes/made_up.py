@@ -9,7 +9,7 @@ from lerobot_memobench.eyes.tower import SIDE
 from lerobot_memobench.sim.scene import TABLE_TOP
 from lerobot_memobench.sim.simulation import CAMERAS
 
-HEIGHT, SLOPE, HALF = 0.8, 0.4, 6
+HEIGHT, SLOPE, HALF = 0.8, 0.4, 12
 """Of the camera over the table, m; tangent of half its field of view; half a square's side, pixels."""
 
 
@@ -37,4 +37,4 @@ def _show(row: Rows, kind: int, kinds: int, rng: np.random.Generator) -> None:
     row["mask"][box[0].start // step : box[0].stop // step, box[1].start // step : box[1].stop // step] = kind + 1
     position = row["eye"] + rays(place, row) * HEIGHT
     turn = (np.cos(angle), np.sin(angle))
-    row["things"][kind] = (kind, 400, place, position, 0.1 * kind if kind < 2 else np.nan, turn)
+    row["things"][kind] = (kind, 400, place, position, 0.1 * kind if kind < 2 else np.nan, kind == 1, turn)

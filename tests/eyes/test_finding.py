@@ -9,7 +9,7 @@ import torch
 from lerobot_memobench.eyes.finding import found
 from lerobot_memobench.eyes.heads import GEOMETRY, Said
 from lerobot_memobench.eyes.labels import projected
-from lerobot_memobench.eyes.targets import Targets, loss, targets
+from lerobot_memobench.eyes.targets import LIT, Targets, loss, targets
 from lerobot_memobench.eyes.tower import GRID, POOLED
 from lerobot_memobench.sim.scene import TABLE_TOP
 
@@ -23,7 +23,9 @@ def perfect(wanted: Targets) -> Said:
     pictures, kinds, side, _ = wanted.heat.shape
     geometry = torch.zeros(pictures, kinds, len(GEOMETRY), side // 2, side // 2)
     picture, kind, row, column = wanted.cells.T
-    geometry[picture, kind, :, row, column] = wanted.geometry.nan_to_num()
+    said = wanted.geometry.nan_to_num()
+    said[:, LIT] = torch.where(said[:, LIT] > 0.5, 10.0, -10.0)
+    geometry[picture, kind, :, row, column] = said
     mask = 20 * torch.nn.functional.one_hot(wanted.mask, kinds + 1).float().permute(0, 3, 1, 2)
     return Said(torch.where(wanted.heat == 1, 10.0, -10.0), geometry, mask)
 
@@ -42,6 +44,7 @@ def test_what_was_there_is_found(grid: int) -> None:
         jointed = ~np.isnan(true["joint"])
         assert np.allclose(things["joint"][jointed], true["joint"][jointed], atol=1e-6)
         assert np.allclose(things["turn"], true["turn"], atol=1e-5)
+        assert ((things["lit"] > 0.5) == true["lit"]).all()
 
 
 def test_saying_so_costs_nothing_and_anything_else_does() -> None:
@@ -50,8 +53,8 @@ def test_saying_so_costs_nothing_and_anything_else_does() -> None:
     assert all(float(value) < 1e-3 for value in loss(right, wanted).values())
     wrong = {
         "heat": Said(-right.heat, right.geometry, right.mask),
-        "place": Said(right.heat, right.geometry + torch.eye(7)[0][:, None, None], right.mask),
-        "rest": Said(right.heat, right.geometry + torch.eye(7)[2][:, None, None], right.mask),
+        "place": Said(right.heat, right.geometry + torch.eye(8)[0][:, None, None], right.mask),
+        "rest": Said(right.heat, right.geometry + torch.eye(8)[2][:, None, None], right.mask),
         "mask": Said(right.heat, right.geometry, right.mask.flip(1)),
     }
     for name, said in wrong.items():

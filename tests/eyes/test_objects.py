@@ -9,13 +9,14 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from lerobot_memobench.experts.prompts import highlight_of
 from lerobot_memobench.eyes.finding import FOUND
 from lerobot_memobench.eyes.kinds import PARTS, kinds
 from lerobot_memobench.eyes.labels import Labeller, Rows, projected, settle
 from lerobot_memobench.eyes.objects import ALONE, APART, ONE, ROUND, SAME, SURE, ObjectFinder
 from lerobot_memobench.eyes.poses import reach
 from lerobot_memobench.eyes.tower import Tower
-from lerobot_memobench.eyes.views import view_of
+from lerobot_memobench.eyes.views import view_of, views_of
 from lerobot_memobench.eyes.weights import PACKAGE, Eyes, load_eyes
 from lerobot_memobench.sim.assets.registry import split_class
 from lerobot_memobench.sim.object_slots import SIZE, SLOTS, WIDTH, ObjectSlots, classes
@@ -32,7 +33,7 @@ PLACE = slice(2, 5)
 
 @pytest.fixture(scope="module")
 def finder() -> ObjectFinder:
-    return ObjectFinder(Eyes(Tower((4, 8, 8, 16), (0, 0, 1, 0)), kinds()))
+    return ObjectFinder(Eyes(Tower((4, 4, 8, 8, 16), (0, 0, 0, 1, 0)), kinds()))
 
 
 def perfect(row: Rows, score: float = 1.0) -> NDArray[np.void]:
@@ -42,7 +43,7 @@ def perfect(row: Rows, score: float = 1.0) -> NDArray[np.void]:
     place, depth = projected(things["position"].astype(float), row)
     finds["kind"], finds["score"], finds["place"], finds["depth"] = things["kind"], score, place, depth
     finds["height"], finds["joint"] = things["position"][:, 2] - TABLE_TOP, things["joint"]
-    finds["turn"] = np.nan_to_num(things["turn"])
+    finds["turn"], finds["lit"] = np.nan_to_num(things["turn"]), things["lit"]
     return finds
 
 
@@ -74,10 +75,13 @@ def test_perfect_finds_are_what_the_simulator_tells(
     gl: str, simulate: Simulate, finder: ObjectFinder, task: str
 ) -> None:
     sim = bent(simulate(task))
+    sim.highlights = (highlight_of(sim, next(name for name, asset in sim.assets.items() if asset.kind == "object")),)
     labeller = Labeller(sim)
     finds = {camera: perfect(labeller.look(camera), score) for camera, score in zip(CAMERAS, (1.0, 0.9), strict=True)}
-    found, true = told(finder.slots(finds, sim.proprio().astype(float))), told(ObjectSlots(sim).observe())
+    found, true = told(finder.slots(finds, views_of(sim.proprio()))), told(ObjectSlots(sim).observe())
     assert len(true) > 3
+    assert true[:, -1].any()
+    assert not true[:, -1].all()
     assert (np.diff(found[:, 1]) >= 0).all(), "in the order of their classes"
     for thing in true:
         alike = found[found[:, 1] == thing[1]]
@@ -110,7 +114,7 @@ def seen(finder: ObjectFinder, state: NDArray[np.floating], *things: tuple[str, 
         at, depth = projected(np.array([place]), view_of(camera, state))
         find["kind"], find["score"], find["turn"] = kinds().index(kind), score, (1.0, 0.0)
         find["place"], find["depth"], find["height"] = at, depth, place[2] - TABLE_TOP
-    return len(told(finder.slots(finds, state)))
+    return len(told(finder.slots(finds, views_of(state))))
 
 
 def test_one_thing_is_seen_by_both_cameras(simulate: Simulate, finder: ObjectFinder) -> None:
@@ -138,13 +142,13 @@ def test_what_one_camera_finds_alone_must_be_surer(simulate: Simulate, finder: O
 
 
 def test_a_kind_that_this_version_does_not_know_is_passed_over(simulate: Simulate) -> None:
-    foreign = ObjectFinder(Eyes(Tower((4, 8, 8, 16), (0, 0, 1, 0)), ("teapot", "butter")))
+    foreign = ObjectFinder(Eyes(Tower((4, 4, 8, 8, 16), (0, 0, 0, 1, 0)), ("teapot", "butter")))
     finds = np.zeros(1, FOUND)
     finds["score"], finds["place"], finds["depth"], finds["turn"] = 1.0, 0.5, 1.0, (1.0, 0.0)
     state = simulate(BOWLS).proprio().astype(float)
     for kind, count in ((0, 0), (1, 1)):
         finds["kind"] = kind
-        assert len(told(foreign.slots({"agentview": finds, "wrist": finds[:0]}, state))) == count
+        assert len(told(foreign.slots({"agentview": finds, "wrist": finds[:0]}, views_of(state)))) == count
 
 
 def test_the_packages_eyes_find_what_stands_on_a_table(gl: str, simulate: Simulate) -> None:

@@ -11,12 +11,13 @@ import pytest
 from PIL import Image
 
 from lerobot_memobench.cli.memobench import main
+from lerobot_memobench.eyes import testing
 from lerobot_memobench.eyes.finding import FOUND
 from lerobot_memobench.eyes.labels import Rows, projected
 from lerobot_memobench.eyes.pictures import Pictures
 from lerobot_memobench.eyes.report import NUMBERS, PICTURE, TABLE, Tested, drawn, numbers, write_report
-from lerobot_memobench.eyes.testing import OUTCOME, See, Things, outcomes
-from lerobot_memobench.eyes.tower import Tower
+from lerobot_memobench.eyes.testing import OBJECT, OUTCOME, See, Things, object_outcomes, outcomes
+from lerobot_memobench.eyes.tower import SIDE, Tower
 from lerobot_memobench.eyes.weights import Eyes, save_eyes
 from lerobot_memobench.sim.scene import TABLE_TOP
 from lerobot_memobench.sim.simulation import CAMERAS
@@ -26,6 +27,7 @@ from .made_up import HEIGHT, SLOPE, made_up
 KINDS = ("red", "green", "blue")
 CENTIMETRE = 0.01 / (2 * SLOPE * HEIGHT)
 """On the table, as a fraction of a picture's side."""
+NOTHING, NO = np.zeros(0, OBJECT), np.zeros(0, OUTCOME)
 
 
 def perfect(rows: Rows) -> list[Things]:
@@ -38,7 +40,7 @@ def _as_found(row: Rows) -> Things:
     finds = np.zeros(len(things), FOUND)
     finds["kind"], finds["score"], finds["joint"], finds["turn"] = things["kind"], 1, things["joint"], things["turn"]
     finds["place"], finds["depth"] = projected(things["position"].astype(float), row)
-    finds["height"] = things["position"][:, 2] - TABLE_TOP
+    finds["height"], finds["lit"] = things["position"][:, 2] - TABLE_TOP, things["lit"]
     return finds
 
 
@@ -99,7 +101,7 @@ def test_what_is_missed_is_infinitely_far_and_what_is_not_there_is_false(shown: 
     told, false = outcomes(lambda rows: [things[1:] for things in perfect(rows)], pictures)
     assert np.isinf(told["error"]).sum() == 10
     assert false == 0
-    table = numbers(Tested(KINDS, told, told, false, 10, 1.0))["rows"]
+    table = numbers(Tested(KINDS, told, told, false, 10, 1.0, NOTHING, NOTHING))["rows"]
     red = next(row for row in table if row["kind"] == "red")
     assert (red["found"], red["median_cm"], red["shown"]) == (0.0, None, 10)
     everything, scene = (next(row for row in table if row["kind"] == kind) for kind in ("all", "all, as it was"))
@@ -124,23 +126,48 @@ def test_equal_things_are_matched_so_that_all_fit(shown: Callable[..., Pictures]
     assert told["error"].max() < 1e-3
 
 
+def test_both_cameras_find_objects_together(
+    shown: Callable[..., Pictures], small_tower: Callable[[], Tower], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = np.repeat(made_up(4), 2)
+    rows["camera"][1::2] = list(CAMERAS).index("wrist")
+    rows["things"]["pixels"][:, 1] = (29, 400) * 4  # the wrist shows it
+    eyes = Eyes(small_tower().eval(), ("butter", "milk", "plate", "cork"))
+    seen: dict[str, See] = {"see": perfect}
+    monkeypatch.setattr(testing, "found", lambda _, sure: seen["see"](rows))
+    told, false = object_outcomes(eyes, shown(rows))
+    assert (len(told), len(false)) == (12, 0)
+    assert told["error"].max() < 0.01
+    assert (told["lit"] == (told["kind"] == 1)).all()
+    assert (told["lit"] == told["said_lit"]).all()
+    table = {row["scene"]: row for row in numbers(Tested(KINDS, NO, NO, 0.0, 8, 1.0, told, false))["objects"]}
+    assert table["as it was"] | {"median_cm": 0} == {
+        **{"scene": "as it was", "shown": 12, "found": 1.0, "median_cm": 0, "p90_cm": table["as it was"]["p90_cm"]},
+        **{"false_per_shown": 0.0, "lit": 4, "lit_right": 4, "lit_wrong": 0},
+    }
+    seen["see"] = off(kind=1)
+    told, false = object_outcomes(eyes, shown(rows))
+    assert np.isinf(told["error"]).all()
+    assert len(false) == 12
+
+
 def test_the_report_is_written(shown: Callable[..., Pictures], tmp_path: Path) -> None:
     pictures = shown(made_up(8))
     told, false = outcomes(perfect, pictures)
     rows = pictures.rows(np.arange(8))
     table = write_report(
-        Tested(KINDS, told, np.zeros(0, OUTCOME), false, 8, 2.5), drawn(rows, perfect(rows), KINDS), tmp_path
+        Tested(KINDS, told, NO, false, 8, 2.5, NOTHING, NOTHING), drawn(rows, perfect(rows), KINDS), tmp_path
     )
     assert (tmp_path / TABLE).read_text() == table
     assert "| red | 0.00 / 0.00 (1.000 of 8) |" in table
     assert json.loads((tmp_path / NUMBERS).read_text())["ms_per_picture"] == 2.5
     with Image.open(tmp_path / PICTURE) as sheet:
-        assert sheet.size == (6 * 256, 2 * 256)
+        assert sheet.size == (6 * SIDE, 2 * SIDE)
         assert ((np.asarray(sheet) == (0, 255, 0)).all(axis=-1)).sum() > 8 * 3 * 10  # rings
 
 
 def test_eyes_of_other_kinds_are_not_tested(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    save_eyes(Eyes(Tower((4, 8, 8, 16), (0, 0, 0, 0)), ("sock",)), tmp_path / "eyes.safetensors")
+    save_eyes(Eyes(Tower((4, 4, 8, 8, 16), (0, 0, 0, 0, 0)), ("sock",)), tmp_path / "eyes.safetensors")
     assert main(["eyes", "test", str(tmp_path / "eyes.safetensors"), "--out", str(tmp_path)]) == 2
     assert "train them anew" in capsys.readouterr().err
 

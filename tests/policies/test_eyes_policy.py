@@ -128,8 +128,8 @@ def test_bad_settings_are_refused(fields: dict[str, Any], message: str) -> None:
 def test_eyes_that_are_none_are_refused(root: Path, tmp_path: Path) -> None:
     with pytest.raises(MemobenchError, match=r"there is no file.*memobench eyes train"):
         cache_dataset(root, small_config(size="small", eyes=str(tmp_path / "absent")))
-    save_eyes(Eyes(Tower((4, 8, 8, 16), (0, 0, 1, 0)), ("cork",)), tmp_path / "narrow.safetensors")
-    with pytest.raises(MemobenchError, match=r"widths \(4, 8, 8, 16\).*memobench eyes train"):
+    save_eyes(Eyes(Tower((4, 4, 8, 8, 16), (0, 0, 0, 1, 0)), ("cork",)), tmp_path / "narrow.safetensors")
+    with pytest.raises(MemobenchError, match=r"widths \(4, 4, 8, 8, 16\).*memobench eyes train"):
         cache_dataset(root, small_config(size="small", eyes=str(tmp_path / "narrow.safetensors")))
 
 

@@ -124,7 +124,11 @@ def highlights_at(task: Task, sim: Simulation, frame: int) -> tuple[Highlight, .
         return ()
     if not PAUSE <= frame < PAUSE + HIGHLIGHT_STEPS:
         return ()
-    asset = sim.assets[prompt.target]
-    place, _ = sim.body_pose(prompt.target)
+    return (highlight_of(sim, prompt.target),)
+
+
+def highlight_of(sim: Simulation, name: str) -> Highlight:
+    """Return the highlight of the place where a thing stands."""
+    asset, (place, _) = sim.assets[name], sim.body_pose(name)
     spot = (float(place[0]), float(place[1]), float(place[2] + asset.bottom + 0.002))
-    return (Highlight(spot, asset.radius + 0.035),)
+    return Highlight(spot, asset.radius + 0.035)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.special import expit
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
@@ -18,11 +19,12 @@ FOUND = np.dtype(
         ("depth", "<f4"),
         ("height", "<f4"),
         ("joint", "<f4"),
+        ("lit", "<f4"),
         ("turn", "<f4", 2),
     ]
 )
 """A thing that was found. ``score``: probability. ``place``: of its origin in the picture, a fraction of its side from
-the upper left corner. The others as `heads.GEOMETRY` has them."""
+the upper left corner. ``lit``: probability. The others as `heads.GEOMETRY` has them."""
 SURE = 0.3
 """Probability from which on a thing counts as found."""
 MOST = 32
@@ -44,6 +46,7 @@ def found(said: Said, sure: float = SURE) -> list[NDArray[np.void]]:
     things["place"] = geometry[:, :2]
     for name in ("depth", "height", "joint"):
         things[name] = geometry[:, GEOMETRY.index(name)]
+    things["lit"] = expit(geometry[:, GEOMETRY.index("lit")])
     things["turn"] = geometry[:, -2:]
     owner = picture.numpy()
     return [things[owner == number] for number in range(len(heat))]

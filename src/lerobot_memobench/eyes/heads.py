@@ -13,10 +13,11 @@ from torch import Tensor, nn
 
 FINE, COARSE = 4, 2
 """Cells along a token's side: of heat and mask, and of geometry."""
-GEOMETRY = ("across", "down", "depth", "height", "joint", "turn cosine", "turn sine")
+GEOMETRY = ("across", "down", "depth", "height", "joint", "lit", "turn cosine", "turn sine")
 """What is said of a thing of each kind in each coarse cell. ``across``, ``down``: from the cell's middle to its origin,
 in cells. ``depth``: of its origin along the camera's view, m. ``height``: of its origin over the table, m. ``joint``:
-of a moving part, m or rad. ``turn``: of twice the angle at which its x axis lies in the picture, see `labels.THING`."""
+of a moving part, m or rad. ``lit``: logit that it stands in a highlight. ``turn``: of twice the angle at which its x
+axis lies in the picture, see `labels.THING`."""
 RARE = 0.01
 """Probability of a thing in a cell that an untrained head says."""
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.eyes.kinds import kinds_of
 from lerobot_memobench.eyes.tower import SIDE, shrunk
-from lerobot_memobench.sim.object_slots import SLOTS, ObjectSlots
+from lerobot_memobench.sim.object_slots import SLOTS, ObjectSlots, is_lit
 from lerobot_memobench.sim.simulation import CAMERAS, Simulation
 
 MASK = 32
@@ -28,11 +28,13 @@ THING = np.dtype(
         ("anchor", "<f4", 2),
         ("position", "<f4", 3),
         ("joint", "<f4"),
+        ("lit", "?"),
         ("turn", "<f4", 2),
     ]
 )
 """``pixels``: how many of the rendered picture (256 x 256) show it. ``anchor``: the middle of those, a place in the
 picture. ``position``: of its origin in the world, m. ``joint``: m or rad, NaN without one.
+``lit``: it stands in a highlight.
 ``turn``: cosine and sine of twice the angle at which its x axis lies in the picture (a half turn changes what it looks
 like little); NaN of round things."""
 
@@ -108,7 +110,8 @@ class Labeller:
             anchor = np.array([across[index] / width, down[index] / height]) / max(counts[index], 1)
             joint = np.nan if thing.joint is None else self._sim.data.qpos[thing.joint]
             position = self._sim.data.xpos[thing.body]
-            found[index] = (self._kinds[index], counts[index], anchor, position, joint, self._turn(thing.body, camera))
+            lit, turn = is_lit(position, self._sim.highlights), self._turn(thing.body, camera)
+            found[index] = (self._kinds[index], counts[index], anchor, position, joint, lit, turn)
         return found[counts > 0]
 
     def _turn(self, body: int, camera: Array) -> Array:

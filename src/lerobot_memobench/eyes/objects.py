@@ -2,7 +2,7 @@
 
 Nothing is known but the present pictures and where the hand is. What stands in slots is what was found, right or
 wrong. How things are tilted is not looked for, nor where they have their front, which is taken to be where tasks have
-it; and no highlight is seen.
+it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from lerobot_memobench.eyes.finding import found
 from lerobot_memobench.eyes.kinds import DRAWERS, PARTS
 from lerobot_memobench.eyes.labels import level_depth, rays
 from lerobot_memobench.eyes.tower import shrunk
-from lerobot_memobench.eyes.views import View, view_of
+from lerobot_memobench.eyes.views import View, views_of
 from lerobot_memobench.eyes.weights import Eyes
 from lerobot_memobench.sim.object_slots import SLOTS, WIDTH, classes, in_slots
 from lerobot_memobench.sim.scene import TABLE_TOP
@@ -44,6 +44,8 @@ SURE, ALONE = 0.2, {"agentview": 0.3, "wrist": 0.4}
 """Probability from which on what both cameras find is there, and what one of them finds alone."""
 APART, SAME = 0.03, 0.05
 """How near to one another two things of a kind can stand, and how far apart two cameras may see one thing, m."""
+LIT = 0.5
+"""Probability from which on a thing is said to stand in a highlight."""
 NEAR = 0.3
 """Depth up to which the wrist's camera may see better than the other where things are, m."""
 
@@ -55,6 +57,7 @@ class Sighting:
     Attributes:
         cameras: that found it. depth: from the one by which it was placed, m.
         place: of its origin in the world, m. axis: (3,) its x axis, level, of length 1. joint: m or rad.
+        lit: probability that it stands in a highlight.
     """
 
     kind: int
@@ -64,6 +67,7 @@ class Sighting:
     place: Array
     axis: Array
     joint: float
+    lit: float
 
     def seen_too(self, other: Sighting, one: bool) -> None:
         """Take in how another camera, less sure of it, sees this thing, which is the only one of its kind if ``one``.
@@ -71,6 +75,7 @@ class Sighting:
         The surer one places it, unless it is the wrist's and far; fixtures and their parts are placed from outside.
         """
         self.cameras += other.cameras
+        self.lit = max(self.lit, other.lit)
         if self.cameras[0] == "wrist" and (one or self.depth > NEAR):
             self.depth, self.place, self.axis, self.joint = other.depth, other.place, other.axis, other.joint
 
@@ -98,21 +103,21 @@ class ObjectFinder:
         slots = []
         for row, hand in enumerate(hands):
             seen = dict(zip(CAMERAS, finds[row :: len(hands)], strict=True))
-            slots.append(self.slots(seen, hand))
+            slots.append(self.slots(seen, views_of(hand)))
         return torch.from_numpy(np.array(slots))
 
-    def slots(self, finds: Mapping[str, Things], state: Array) -> NDArray[np.float32]:
+    def slots(self, finds: Mapping[str, Things], views: Mapping[str, View]) -> NDArray[np.float32]:
         """Return the slots (SIZE,) of what each camera found at one moment, of dtype `finding.FOUND`."""
         rows = []
-        for thing in self.merged(finds, state)[:SLOTS]:
+        for thing in self.merged(finds, views)[:SLOTS]:
             side = np.cross([0.0, 0.0, 1.0], thing.axis)
             joint = thing.joint if self.eyes.kinds[thing.kind] in PARTS else 0.0
-            rows.append([1.0, self._class[thing.kind], *thing.place, *thing.axis, *side, joint, 0.0])
+            lit = float(thing.lit > LIT)
+            rows.append([1.0, self._class[thing.kind], *thing.place, *thing.axis, *side, joint, lit])
         return in_slots(np.array(rows).reshape(-1, WIDTH))
 
-    def merged(self, finds: Mapping[str, Things], state: Array) -> list[Sighting]:
+    def merged(self, finds: Mapping[str, Things], views: Mapping[str, View]) -> list[Sighting]:
         """Return the things that there are by what each camera found, the surest first."""
-        views = {camera: view_of(camera, state) for camera in finds}
         single = [self._sighting(camera, views[camera], find) for camera in finds for find in finds[camera]]
         things: list[Sighting] = []
         for seen in sorted(single, key=lambda thing: -thing.score):
@@ -157,4 +162,5 @@ class ObjectFinder:
             view["eye"] + sight * depth,
             level,
             float(find["joint"]),
+            float(find["lit"]),
         )

@@ -96,6 +96,7 @@ class _Stage:
             for _ in range(TRIES):
                 crowd.set_state(widened(moment.state, sim, crowd), self._fixed)
                 if self._scatter.stir(reach=scene == len(SCENES) - 1):
+                    crowd.highlights = self._scatter.marks()
                     yield from (self._full.look(camera, scene) for camera in CAMERAS)
                     break
 

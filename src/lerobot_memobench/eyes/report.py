@@ -23,8 +23,8 @@ from lerobot_memobench.sim.simulation import CAMERAS
 
 VIEWS = ("third person", "wrist", "wrist, hand within 15 cm")
 TABLE, NUMBERS, PICTURE = "eyes_test.md", "eyes_test.json", "eyes_test.png"
-SCALE, COLUMNS = 2, 6
-"""How much larger pictures are drawn, and how many stand in a row."""
+COLUMNS = 6
+"""How many pictures stand in a row."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,7 @@ class Tested:
     Attributes:
         kinds: names. told: outcomes by all tokens, (n,) of dtype `testing.OUTCOME`; pooled: by the pooled ones.
         false: false finds per picture. pictures: how many were looked at. milliseconds: of one core for a picture.
+        objects: outcomes by both cameras together, of dtype `testing.OBJECT`; no_objects: false ones.
     """
 
     kinds: Sequence[str]
@@ -42,6 +43,8 @@ class Tested:
     false: float
     pictures: int
     milliseconds: float
+    objects: Things
+    no_objects: Things
 
 
 def in_view(told: Things, view: int) -> Things:
@@ -85,8 +88,34 @@ def numbers(tested: Tested) -> dict[str, Any]:
         "ms_per_picture": round(tested.milliseconds, 2),
         "false_finds_per_picture": round(tested.false, 3),
         "rows": rows,
+        "objects": _object_rows(tested),
         "joints": [row for kind, name in enumerate(PARTS) for row in _joint_rows(tested.told, kind, name)],
     }
+
+
+def _object_rows(tested: Tested) -> list[dict[str, Any]]:
+    """What is found by both cameras together, in each kind of scene, and of that what the hand is near."""
+    rows = []
+    for scene, name in enumerate(SCENES):
+        told = tested.objects[tested.objects["scene"] == scene]
+        false = int((tested.no_objects["scene"] == scene).sum())
+        for which, some in ((name, told), (f"{name}, hand within 15 cm", told[told["near"]])):
+            if len(some):
+                found = np.isfinite(some["error"])
+                rows.append(
+                    {
+                        "scene": which,
+                        "shown": len(some),
+                        "found": float(found.mean()),
+                        "median_cm": _rank(some["error"], 50),
+                        "p90_cm": _rank(some["error"], 90),
+                        "false_per_shown": round(false / len(told), 4),
+                        "lit": int(some["lit"].sum()),
+                        "lit_right": int((some["lit"] & some["said_lit"]).sum()),
+                        "lit_wrong": int((~some["lit"] & some["said_lit"]).sum()),
+                    }
+                )
+    return rows
 
 
 def _joint_rows(told: Things, kind: int, name: str) -> list[dict[str, Any]]:
@@ -120,7 +149,17 @@ def markdown(test: dict[str, Any]) -> str:
         f"{test['pictures']} pictures; – is infinite: not found. {test['false_finds_per_picture']} false finds per "
         f"picture, {test['ms_per_picture']} ms per picture on one core."
     )
-    return f"{said}\n\n{table(['error, cm', *VIEWS], rows)}\n"
+    together = [
+        [
+            row["scene"],
+            f"{_text(row['median_cm'])} / {_text(row['p90_cm'])} ({row['found']:.3f} of {row['shown']})",
+            f"{row['false_per_shown']:.3f}",
+            f"{row['lit_right']} of {row['lit']}, {row['lit_wrong']} wrong",
+        ]
+        for row in test["objects"]
+    ]
+    head = ["objects, by both cameras", "error in space, cm", "false ones, per shown", "highlighted"]
+    return f"{said}\n\n{table(['error, cm', *VIEWS], rows)}\n\n{table(head, together)}\n"
 
 
 def _text(value: float | None, digits: int = 2) -> str:
@@ -129,20 +168,19 @@ def _text(value: float | None, digits: int = 2) -> str:
 
 def drawn(rows: Rows, finds: Sequence[Things], kinds: Sequence[str]) -> Image.Image:
     """Return pictures beside one another: found things as green rings with their names, the true places as crosses."""
-    side = SCALE * SIDE
-    sheet = Image.new("RGB", (COLUMNS * side, -(-len(rows) // COLUMNS) * side))
+    sheet = Image.new("RGB", (COLUMNS * SIDE, -(-len(rows) // COLUMNS) * SIDE))
     for index, (row, things) in enumerate(zip(rows, finds, strict=True)):
-        picture = Image.fromarray(row["pixels"].transpose(1, 2, 0)).resize((side, side))
+        picture = Image.fromarray(row["pixels"].transpose(1, 2, 0))
         pen = ImageDraw.Draw(picture)
         shown = row["things"][: row["count"]]
-        for x, y in side * projected(shown["position"][shown["pixels"] >= SHOWN].astype(np.float64), row)[0]:
+        for x, y in SIDE * projected(shown["position"][shown["pixels"] >= SHOWN].astype(np.float64), row)[0]:
             pen.line((x - 3, y, x + 3, y), "white")
             pen.line((x, y - 3, x, y + 3), "white")
         for thing in things:
-            x, y = side * thing["place"].astype(float)
+            x, y = SIDE * thing["place"].astype(float)
             pen.ellipse((x - 5, y - 5, x + 5, y + 5), outline="lime")
             pen.text((x + 7, y - 6), kinds[thing["kind"]].replace("_", " "), "yellow")
-        sheet.paste(picture, (index % COLUMNS * side, index // COLUMNS * side))
+        sheet.paste(picture, (index % COLUMNS * SIDE, index // COLUMNS * SIDE))
     return sheet
 
 

@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from lerobot_memobench.experts.hand import downward
+from lerobot_memobench.experts.prompts import highlight_of
 from lerobot_memobench.eyes import poses
 from lerobot_memobench.eyes.crowd import MORE
 from lerobot_memobench.eyes.labels import settle
 from lerobot_memobench.eyes.walk import NEAR
 from lerobot_memobench.sim.assets.asset import Asset
 from lerobot_memobench.sim.placement import PENETRATION
+from lerobot_memobench.sim.rendering import Highlight
 from lerobot_memobench.sim.robot import FINGER_JOINTS
 from lerobot_memobench.sim.scene import TABLE_TOP
 from lerobot_memobench.sim.simulation import Simulation
@@ -28,6 +30,8 @@ AREA = ((-0.30, 0.25), (-0.38, 0.38))
 MOVED, LYING, SUPPORTED, HELD, ABSENT = 0.7, 0.1, 0.25, 0.3, 0.05
 """Chances: of a thing to be moved, and then to lie in any way, to be put on or into another, to be taken away; and of
 one of them to be held."""
+MARKED = 0.3
+"""Chance of a picture to show a highlight."""
 SLIDE, TURN = 0.03, 0.1
 """How far a fixture is moved at most along x and y, m, and turned, rad."""
 ROUNDS = 6
@@ -73,6 +77,12 @@ class Scatter:
             self._take_away(name)
         settle(self._sim)
         return not self._overlapping(held)
+
+    def marks(self) -> tuple[Highlight, ...]:
+        """Return the highlight of one of the things, or none."""
+        if not self._objects or self._rng.random() >= MARKED:
+            return ()
+        return (highlight_of(self._sim, str(self._rng.choice(list(self._objects)))),)
 
     def _move_fixtures(self) -> None:
         """Fixtures a little, their moving parts anywhere between their ends, half of them to one of those."""

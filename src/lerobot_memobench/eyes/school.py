@@ -12,7 +12,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.eyes.kinds import kinds
 from lerobot_memobench.eyes.pictures import Pictures, make_pictures
 from lerobot_memobench.eyes.report import COLUMNS, Tested, drawn, write_report
-from lerobot_memobench.eyes.testing import milliseconds, outcomes, seeing
+from lerobot_memobench.eyes.testing import milliseconds, object_outcomes, outcomes, seeing
 from lerobot_memobench.eyes.training import Progress, Training, train
 from lerobot_memobench.eyes.weights import load_eyes
 from lerobot_memobench.jobs.job import Advance
@@ -80,7 +80,8 @@ def examine(file: Path, folder: Path, lessons: Lessons, *, made: Callable[[Advan
     pictures = lessons.pictures(folder / "pictures", TESTED, made)
     told, false = outcomes(seeing(eyes), pictures)
     pooled, _ = outcomes(seeing(eyes, pooled=True), pictures)
-    tested = Tested(eyes.kinds, told, pooled, false, len(pictures), milliseconds(eyes.tower))
+    took = milliseconds(eyes.tower)
+    tested = Tested(eyes.kinds, told, pooled, false, len(pictures), took, *object_outcomes(eyes, pictures))
     count = min(len(pictures), COLUMNS * DRAWN_ROWS)
     rows = pictures.rows(np.linspace(0, len(pictures) - 1, count).astype(np.int64))
     return write_report(tested, drawn(rows, seeing(eyes)(rows), eyes.kinds), folder)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import cross_entropy, logsigmoid
+from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, logsigmoid
 
 from lerobot_memobench.eyes.heads import COARSE, FINE, GEOMETRY, Said
 from lerobot_memobench.eyes.labels import MASK, Rows, projected
@@ -18,8 +18,10 @@ LEAST = 15
 """Pixels of the rendered picture that must show a thing for it to be taught."""
 SIGMA, SPREAD = 0.8, 2
 """How far a thing's heat reaches: standard deviation and half side, in cells."""
-SCALES = (1.0, 1.0, 5.0, 5.0, 10.0, 0.3, 0.3)
-"""What an error of one is worth, for each of `GEOMETRY`: cells, metres (radians), and parts of a circle."""
+SCALES = (1.0, 1.0, 5.0, 5.0, 10.0, 1.0, 0.3, 0.3)
+"""What an error of one is worth, for each of `GEOMETRY`: cells, metres (radians), a cross entropy, and parts of a
+circle."""
+LIT = GEOMETRY.index("lit")
 REACH = 4.0
 """Cells from which on a place is no farther: of a large thing of which a corner shows."""
 
@@ -79,7 +81,9 @@ def _geometry(
 ) -> tuple[NDArray[np.int64], Array, Array]:
     """Return the four cells around each visible middle, (n, 4), what is asked there and how much that counts."""
     place, depth = projected(things["position"].astype(np.float64), rows[pictures])
-    facts = np.column_stack([depth, things["position"][:, 2] - TABLE_TOP, things["joint"], things["turn"]])
+    facts = np.column_stack(
+        [depth, things["position"][:, 2] - TABLE_TOP, things["joint"], things["lit"], things["turn"]]
+    )
     corner = np.floor(things["anchor"] * side - 0.5).astype(np.int64)
     found: list[tuple[NDArray[np.int64], Array, Array]] = []
     for offset in np.ndindex(2, 2):
@@ -100,7 +104,9 @@ def loss(said: Said, wanted: Targets) -> dict[str, Tensor]:
     """Return the losses (scalars) of what heads said: ``heat``, ``place``, ``rest`` and ``mask``."""
     picture, kind, row, column = wanted.cells.T
     asked = said.geometry[picture, kind, :, row, column]
-    error = (asked - wanted.geometry).abs() * torch.tensor(SCALES)
+    error = (asked - wanted.geometry).abs()
+    error[:, LIT] = binary_cross_entropy_with_logits(asked[:, LIT], wanted.geometry[:, LIT], reduction="none")
+    error = error * torch.tensor(SCALES)
     error = torch.where(wanted.geometry.isnan(), torch.zeros(()), error) * wanted.weights[:, None]
     each = error.sum(dim=0) / wanted.weights.sum().clamp(min=1.0)
     known = GEOMETRY.index("depth")

@@ -13,6 +13,7 @@ from scipy.optimize import linear_sum_assignment
 from lerobot_memobench.eyes.finding import found
 from lerobot_memobench.eyes.kinds import DRAWERS
 from lerobot_memobench.eyes.labels import Rows, images_of, level_depth, projected, rays
+from lerobot_memobench.eyes.objects import LIT, SURE, ObjectFinder
 from lerobot_memobench.eyes.pictures import Pictures
 from lerobot_memobench.eyes.tower import Tower, shrunk
 from lerobot_memobench.eyes.walk import NEAR
@@ -43,6 +44,10 @@ was not found: for the third-person camera on the level plane of its origin, for
 ``space``: of its place in the world by the found depth (wrist) or height (third person), cm. ``joint``: cm or rad;
 ``turn``: degrees. Both NaN where there is nothing to say."""
 
+OBJECT = np.dtype([("kind", "u1"), ("scene", "u1"), ("near", "?"), ("lit", "?"), ("said_lit", "?"), ("error", "<f4")])
+"""What became of a thing that a camera shows, by both cameras together. ``error``: of its place in the world, cm,
+infinite where it was not found. ``lit``: it stands in a highlight; ``said_lit``: so it is said."""
+
 Things = NDArray[np.void]
 See = Callable[[Rows], list[Things]]
 """From pictures to what was found in each, of dtype `finding.FOUND`."""
@@ -70,6 +75,61 @@ def outcomes(see: See, pictures: Pictures) -> tuple[Things, float]:
             false += len(finds) - int((matched >= 0).sum())
             told.append(_told(row, things, finds, matched)[things["pixels"] >= SHOWN])
     return np.concatenate(told), false / max(1, len(pictures))
+
+
+def object_outcomes(eyes: Eyes, pictures: Pictures) -> tuple[Things, Things]:
+    """Return what became of every shown thing where policies see objects, which both cameras find together.
+
+    Args:
+        pictures: both cameras' of each moment, one after the other.
+
+    Returns:
+        Outcomes (n,) of dtype `OBJECT`, and the false ones (m,) likewise.
+    """
+    finder = ObjectFinder(eyes)
+    told: list[Things] = [np.zeros(0, OBJECT)]
+    false: list[Things] = [np.zeros(0, OBJECT)]
+    for start in range(0, len(pictures), BATCH):
+        rows = pictures.rows(np.arange(start, min(start + BATCH, len(pictures))))
+        with torch.inference_mode():
+            finds = found(eyes(images_of(rows))[0], SURE)
+        for pair in range(0, len(rows), len(CAMERAS)):
+            both = slice(pair, pair + len(CAMERAS))
+            right, wrong = _objects(rows[both], finder, finds[both])
+            told.append(right)
+            false.append(wrong)
+    return np.concatenate(told), np.concatenate(false)
+
+
+def _objects(rows: Rows, finder: ObjectFinder, finds: list[Things]) -> tuple[Things, Things]:
+    """Return the outcomes of one moment, and the false ones."""
+    names = [list(CAMERAS)[row["camera"]] for row in rows]
+    seen = finder.merged(dict(zip(names, finds, strict=True)), dict(zip(names, rows, strict=True)))
+    true = {(int(one["kind"]), *one["position"]): one for row in rows for one in row["things"][: row["count"]]}
+    shown = {key for row in rows for key in _shown(row)}
+    told, places = np.zeros(len(true), OBJECT), np.array([one["position"] for one in true.values()]).reshape(-1, 3)
+    told["kind"], told["scene"], told["error"] = [kind for kind, *_ in true], rows["scene"][0], np.inf
+    told["near"] = np.linalg.norm(places - rows["hand"][0], axis=1) <= NEAR
+    told["lit"] = [one["lit"] for one in true.values()]
+    wrong = np.ones(len(seen), bool)
+    for kind in {thing.kind for thing in seen}:
+        mine, theirs = np.flatnonzero(told["kind"] == kind), [i for i, one in enumerate(seen) if one.kind == kind]
+        far = 100 * np.linalg.norm(places[mine][:, None] - np.array([seen[i].place for i in theirs])[None], axis=-1)
+        for thing, find in zip(*linear_sum_assignment(np.minimum(far, FAR)), strict=True):
+            if far[thing, find] < FAR:
+                told["error"][mine[thing]], told["said_lit"][mine[thing]] = (
+                    far[thing, find],
+                    seen[theirs[find]].lit > LIT,
+                )
+                wrong[theirs[find]] = False
+    others = np.zeros(int(wrong.sum()), OBJECT)
+    others["kind"], others["scene"] = [one.kind for one, no in zip(seen, wrong, strict=True) if no], rows["scene"][0]
+    return told[[key in shown for key in true]], others
+
+
+def _shown(row: Rows) -> set[tuple[float, ...]]:
+    things = row["things"][: row["count"]]
+    return {(int(one["kind"]), *one["position"]) for one in things[things["pixels"] >= SHOWN]}
 
 
 def _matched(row: Rows, things: Things, finds: Things) -> NDArray[np.int64]:

@@ -8,13 +8,13 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate, relu
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-SIDE = 128
-"""Side of the pictures that the tower sees, pixels."""
+SIDE = 256
+"""Side of the pictures that the tower sees, pixels: the benchmark's own."""
 GRID, POOLED = 8, 4
 """Sides of the squares of tokens."""
 WIDTH = 192
 """Numbers of a token."""
-WIDTHS, BLOCKS = (16, 32, 96, WIDTH), (0, 1, 2, 1)
+WIDTHS, BLOCKS = (8, 16, 48, 96, WIDTH), (0, 0, 1, 3, 1)
 """Channels of each halving of the picture, and the residual blocks that follow it."""
 
 

@@ -22,8 +22,13 @@ ANGLES = {"agentview": 45.0, "wrist": 75.0}
 """Fields of view, degrees."""
 
 
+def views_of(state: NDArray[np.floating]) -> dict[str, View]:
+    """Return the views of both cameras for a robot's state (>= 6,): the hand's place and turn."""
+    return {camera: view_of(camera, state) for camera in ANGLES}
+
+
 def view_of(camera: str, state: NDArray[np.floating]) -> View:
-    """Return the view of a camera (`agentview` or `wrist`) for a robot's state (>= 6,): the hand's place and turn."""
+    """Return the view of a camera (`agentview` or `wrist`) for a robot's state, see `views_of`."""
     slope = np.tan(np.radians(ANGLES[camera]) / 2)
     if camera == "agentview":
         turned = Rotation.from_quat(AGENTVIEW_QUATERNION, scalar_first=True).as_matrix()

@@ -8,6 +8,7 @@ they are sorted by class and place, so exchanging two equal objects changes noth
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, get_args, get_type_hints
@@ -21,9 +22,22 @@ from lerobot_memobench.sim.assets.asset import Articulation, Asset
 from lerobot_memobench.sim.assets.builder import VISUAL_GROUP
 from lerobot_memobench.sim.assets.registry import known_classes, split_class
 from lerobot_memobench.sim.object_layout import FIELDS, SIZE, SLOTS, STARTS, WIDTH
+from lerobot_memobench.sim.rendering import Highlight
 from lerobot_memobench.sim.simulation import CAMERAS, Simulation
 
-__all__ = ["FIELDS", "SIZE", "SLOTS", "STARTS", "WIDTH", "ObjectSlots", "Thing", "classes", "in_slots", "layout"]
+__all__ = [
+    "FIELDS",
+    "SIZE",
+    "SLOTS",
+    "STARTS",
+    "WIDTH",
+    "ObjectSlots",
+    "Thing",
+    "classes",
+    "in_slots",
+    "is_lit",
+    "layout",
+]
 
 POINTS = 24
 """Points of a thing to which rays run."""
@@ -165,10 +179,13 @@ class ObjectSlots:
         position = data.xpos[thing.body]
         turned = data.xmat[thing.body].reshape(3, 3)
         joint = 0.0 if thing.joint is None else data.qpos[thing.joint]
-        lit = any(
-            np.hypot(*(position[:2] - np.array(mark.position[:2]))) < mark.radius for mark in self._sim.highlights
-        )
-        return np.array([1.0, thing.kind, *position, *turned[:, 0], *turned[:, 1], joint, float(lit)])
+        lit = float(is_lit(position, self._sim.highlights))
+        return np.array([1.0, thing.kind, *position, *turned[:, 0], *turned[:, 1], joint, lit])
+
+
+def is_lit(position: Array, highlights: Iterable[Highlight]) -> bool:
+    """Whether what stands at a position (3,) stands in a highlight."""
+    return any(np.hypot(*(position[:2] - np.array(mark.position[:2]))) < mark.radius for mark in highlights)
 
 
 def in_slots(things: Array) -> NDArray[np.float32]:
