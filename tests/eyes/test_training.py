@@ -14,6 +14,7 @@ from lerobot_memobench.eyes.labels import Rows
 from lerobot_memobench.eyes.pictures import Pictures
 from lerobot_memobench.eyes.tower import Tower
 from lerobot_memobench.eyes.training import CHECKPOINT, CURVE, Training, changed, train
+from lerobot_memobench.eyes.weights import READINGS
 
 from .made_up import made_up
 
@@ -58,7 +59,8 @@ def test_it_learns(pictures: Pictures, small_tower: Callable[[], Tower], tmp_pat
     train(pictures, KINDS, tmp_path / "run", settings, tower=small_tower, save_every=60)
     points = torch.load(tmp_path / "run" / CHECKPOINT, weights_only=True)["points"]
     assert len(points) == 6
-    assert all(points[-1][name] < 0.8 * points[0][name] for name in ("heat", "place", "rest", "mask")), points
+    assert all(points[-1][name] < 0.8 * points[0][name] for name in points[0]), points
+    assert {name.split()[0] for name in points[0]} == set(READINGS)
 
 
 def test_other_settings_do_not_go_on(pictures: Pictures, small_tower: Callable[[], Tower], tmp_path: Path) -> None:

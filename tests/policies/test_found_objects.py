@@ -41,7 +41,7 @@ def made_eyes(path: Path, seed: int) -> Path:
     """Write eyes that find something everywhere."""
     torch.manual_seed(seed)
     eyes = Eyes(Tower().eval(), kinds())
-    torch.nn.init.zeros_(eyes.heads.heat.bias)
+    torch.nn.init.zeros_(eyes.fine_heads.heat.bias)
     save_eyes(eyes, path)
     return path
 

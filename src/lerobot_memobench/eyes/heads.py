@@ -41,24 +41,25 @@ class Heads(nn.Module):
     """Linear maps from tokens to what they show.
 
     Args:
-        width: of a token. kinds: how many kinds of things there are. grid: side of the square of tokens.
+        width: of a token. kinds: how many kinds of things there are. grid: side of the square of tokens. fine, coarse:
+            cells along a token's side.
     """
 
-    def __init__(self, width: int, kinds: int, grid: int) -> None:
+    def __init__(self, width: int, kinds: int, grid: int, fine: int = FINE, coarse: int = COARSE) -> None:
         super().__init__()
-        self.grid = grid
-        self.heat = nn.Linear(width, kinds * FINE**2)
-        self.geometry = nn.Linear(width, kinds * len(GEOMETRY) * COARSE**2)
-        self.mask = nn.Linear(width, (kinds + 1) * FINE**2)
+        self.grid, self.fine, self.coarse = grid, fine, coarse
+        self.heat = nn.Linear(width, kinds * fine**2)
+        self.geometry = nn.Linear(width, kinds * len(GEOMETRY) * coarse**2)
+        self.mask = nn.Linear(width, (kinds + 1) * fine**2)
         nn.init.constant_(self.heat.bias, float(torch.logit(torch.tensor(RARE))))
 
     def forward(self, tokens: Tensor) -> Said:
         """Say what tokens (N, grid * grid, width) show."""
-        geometry = self._spread(self.geometry(tokens), COARSE)
+        geometry = self._spread(self.geometry(tokens), self.coarse)
         return Said(
-            self._spread(self.heat(tokens), FINE),
+            self._spread(self.heat(tokens), self.fine),
             rearrange(geometry, "n (k v) y x -> n k v y x", v=len(GEOMETRY)),
-            self._spread(self.mask(tokens), FINE),
+            self._spread(self.mask(tokens), self.fine),
         )
 
     def _spread(self, values: Tensor, cells: int) -> Tensor:

@@ -98,7 +98,7 @@ class ObjectFinder:
             states: (N, >= 6) the hand's place, m, and its turn as axis times angle, rad.
         """
         both = torch.cat([shrunk(pictures[camera]) for camera in CAMERAS])  # one pass is quicker than two
-        finds = found(self.eyes.heads(self.eyes.tower(both)), SURE)
+        finds = found(self.eyes.find(both), SURE)
         hands = states.cpu().numpy().astype(np.float64)
         slots = []
         for row, hand in enumerate(hands):

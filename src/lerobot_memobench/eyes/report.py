@@ -32,13 +32,15 @@ class Tested:
     """A test of eyes.
 
     Attributes:
-        kinds: names. told: outcomes by all tokens, (n,) of dtype `testing.OUTCOME`; pooled: by the pooled ones.
+        kinds: names. told: outcomes by the finer map, (n,) of dtype `testing.OUTCOME`; tokens, pooled: by all tokens,
+            and by the pooled ones.
         false: false finds per picture. pictures: how many were looked at. milliseconds: of one core for a picture.
         objects: outcomes by both cameras together, of dtype `testing.OBJECT`; no_objects: false ones.
     """
 
     kinds: Sequence[str]
     told: Things
+    tokens: Things
     pooled: Things
     false: float
     pictures: int
@@ -73,7 +75,7 @@ def _rank(values: NDArray[Any], percent: int) -> float | None:
 
 def numbers(tested: Tested) -> dict[str, Any]:
     """Return the whole test as JSON has it; errors that are infinite are null."""
-    groups = [("all", tested.told), ("all, pooled tokens", tested.pooled)]
+    groups = [("all", tested.told), ("all, by tokens", tested.tokens), ("all, by pooled tokens", tested.pooled)]
     groups += [(f"all, {name}", tested.told[tested.told["scene"] == scene]) for scene, name in enumerate(SCENES)]
     groups += [(name, tested.told[tested.told["kind"] == kind]) for kind, name in enumerate(tested.kinds)]
     rows = [

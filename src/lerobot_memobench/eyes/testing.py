@@ -54,12 +54,12 @@ See = Callable[[Rows], list[Things]]
 Array = NDArray[np.float64]
 
 
-def seeing(eyes: Eyes, *, pooled: bool = False) -> See:
-    """Return how eyes see pictures, by all tokens or by the pooled ones."""
+def seeing(eyes: Eyes, reading: str = "fine") -> See:
+    """Return how eyes see pictures, by one of `READINGS`."""
 
     @torch.inference_mode()
     def see(rows: Rows) -> list[Things]:
-        return found(eyes(images_of(rows))[int(pooled)])
+        return found(eyes(images_of(rows))[reading])
 
     return see
 
@@ -92,7 +92,7 @@ def object_outcomes(eyes: Eyes, pictures: Pictures) -> tuple[Things, Things]:
     for start in range(0, len(pictures), BATCH):
         rows = pictures.rows(np.arange(start, min(start + BATCH, len(pictures))))
         with torch.inference_mode():
-            finds = found(eyes(images_of(rows))[0], SURE)
+            finds = found(eyes.find(images_of(rows)), SURE)
         for pair in range(0, len(rows), len(CAMERAS)):
             both = slice(pair, pair + len(CAMERAS))
             right, wrong = _objects(rows[both], finder, finds[both])

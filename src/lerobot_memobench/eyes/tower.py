@@ -14,7 +14,7 @@ GRID, POOLED = 8, 4
 """Sides of the squares of tokens."""
 WIDTH = 192
 """Numbers of a token."""
-WIDTHS, BLOCKS = (8, 16, 48, 96, WIDTH), (0, 0, 1, 3, 1)
+WIDTHS, BLOCKS = (16, 24, 48, 96, WIDTH), (0, 0, 2, 3, 1)
 """Channels of each halving of the picture, and the residual blocks that follow it."""
 
 
@@ -68,10 +68,10 @@ class Tower(nn.Module):
     ) -> None:
         super().__init__()
         self.widths, self.blocks = widths, blocks
-        stages: list[nn.Module] = []
-        for here, there, count in zip((3, *widths[:-1]), widths, blocks, strict=True):
-            stages += [Convolution(here, there, stride=2), nn.ReLU(), *(Block(there) for _ in range(count))]
-        self.stages = nn.Sequential(*stages)
+        self.stages = nn.ModuleList(
+            nn.Sequential(Convolution(here, there, stride=2), nn.ReLU(), *(Block(there) for _ in range(count)))
+            for here, there, count in zip((3, *widths[:-1]), widths, blocks, strict=True)
+        )
         self.place = nn.Parameter(torch.zeros(widths[-1], GRID, GRID))
         self.even: nn.Module = nn.Identity()
         self.pool = nn.Linear(widths[-1] * (GRID // POOLED) ** 2, widths[-1])
@@ -85,9 +85,14 @@ class Tower(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """Return the tokens (N, 64, width) of pictures (N, 3, SIDE, SIDE) in [0, 1], row by row."""
+        return self.looked(images)[0]
+
+    def looked(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the tokens, and the map (N, widths[-2], 16, 16) of the stage before the last, of which they are."""
         x = (images * 2 - 1).contiguous(memory_format=torch.channels_last)
-        tokens: Tensor = self.even(rearrange(self.stages(x) + self.place, "n d y x -> n (y x) d"))
-        return tokens
+        for stage in self.stages[:-1]:
+            x = stage(x)
+        return self.even(rearrange(self.stages[-1](x) + self.place, "n d y x -> n (y x) d")), x
 
     def pooled(self, tokens: Tensor) -> Tensor:
         """Return 16 tokens (N, 16, width) of 64: each of a square of four, which keeps what is where in it."""
@@ -96,10 +101,15 @@ class Tower(nn.Module):
 
     def fold(self) -> None:
         """Make batch normalisation part of the convolutions, and room for `whitening`: no more for training."""
-        for module in self.modules():
-            if isinstance(module, Convolution):
-                module.fold()
+        fold(self)
         if isinstance(self.even, nn.Identity):
             self.even = nn.Linear(self.width, self.width)
             nn.init.eye_(self.even.weight)
             nn.init.zeros_(self.even.bias)
+
+
+def fold(module: nn.Module) -> None:
+    """Make all batch normalisation of a module part of its convolutions."""
+    for part in module.modules():
+        if isinstance(part, Convolution):
+            part.fold()

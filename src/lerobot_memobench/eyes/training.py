@@ -26,8 +26,10 @@ from lerobot_memobench.files.curve import draw_curve, mean_of
 CHECKPOINT, WEIGHTS, CURVE = "training.pt", "eyes.safetensors", "training_curve.png"
 SHARES = {"heat": 1.0, "place": 2.0, "rest": 1.0, "mask": 0.5}
 """What each loss counts."""
-OF_POOLED = 0.5
-"""What the losses of the pooled tokens count beside the others."""
+COUNT = {"fine": 1.0, "tokens": 0.5, "pooled": 0.5}
+"""What the losses of each reading count."""
+GRIDS = {"fine": GRID, "tokens": GRID, "pooled": POOLED}
+"""Side of the square of tokens, a quarter of its heat's, in each reading."""
 GAIN, SHIFT, NOISE = 0.12, 0.06, 0.02
 """Changes of pictures: largest gain of each colour and shift of all, and the noise's standard deviation at most, as
 shares of white. Videos change colours and edges about as much."""
@@ -126,10 +128,9 @@ class _Learner:
         """Make one update."""
         self.eyes.train()
         losses = self._losses(rows)
-        total = torch.stack([SHARES[name.removeprefix("pooled ")] * value for name, value in losses.items()])
-        weights = torch.tensor([OF_POOLED if name.startswith("pooled ") else 1.0 for name in losses])
+        total = [COUNT[name.split()[0]] * SHARES[name.split()[1]] * value for name, value in losses.items()]
         self._optimizer.zero_grad()
-        (total * weights).sum().backward()
+        torch.stack(total).sum().backward()
         torch.nn.utils.clip_grad_norm_(self.eyes.parameters(), CLIP)
         self._optimizer.step()
         self._schedule.step()
@@ -143,10 +144,13 @@ class _Learner:
         chance = torch.Generator().manual_seed(self._settings.seed * 2**32 + self.update)
         images = changed(images_of(rows), chance)
         with torch.autocast("cpu", torch.bfloat16):
-            said, said_pooled = self.eyes(images)
-        kinds = len(self.eyes.kinds)
-        pooled = loss(said_pooled, targets(rows, kinds, POOLED))
-        return {**loss(said, targets(rows, kinds, GRID)), **{f"pooled {name}": one for name, one in pooled.items()}}
+            said = self.eyes(images)
+        wanted = {grid: targets(rows, len(self.eyes.kinds), grid) for grid in set(GRIDS.values())}
+        return {
+            f"{reading} {name}": value
+            for reading, grid in GRIDS.items()
+            for name, value in loss(said[reading], wanted[grid]).items()
+        }
 
     def save(self, folder: Path) -> None:
         """Write checkpoint and curve."""

@@ -1,4 +1,4 @@
-"""Eyes as a file: tower and heads in bfloat16, with the names of the kinds that the heads tell apart."""
+"""Eyes as a file: tower, neck and heads in bfloat16, with the names of the kinds that the heads tell apart."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.eyes.heads import Heads, Said
-from lerobot_memobench.eyes.tower import BLOCKS, GRID, POOLED, WIDTHS, Tower
+from lerobot_memobench.eyes.heads import COARSE, FINE, Heads, Said
+from lerobot_memobench.eyes.neck import FINER, Neck
+from lerobot_memobench.eyes.tower import BLOCKS, GRID, POOLED, WIDTHS, Tower, fold
 from lerobot_memobench.files import write_file
 
 SHIPPED = Path(__file__).parent / "eyes.safetensors"
@@ -21,31 +22,42 @@ PACKAGE, RANDOM = "package", "random"
 """Names of eyes that are no file's: those of the package, and none, where a policy's tower has random weights."""
 
 
+READINGS = ("fine", "tokens", "pooled")
+"""What is read off: the finer map, the 64 tokens, and the 16 pooled ones."""
+
+
 class Eyes(nn.Module):
-    """Tower and heads.
+    """Tower, neck and heads.
 
     Args:
         tower: makes the tokens. kinds: names of the kinds of things that the heads tell apart.
 
     Attributes:
-        heads, pooled_heads: of the 64 tokens, and of the 16 pooled ones.
+        fine_heads, heads, pooled_heads: of the neck's finer map, of the 64 tokens, and of the 16 pooled ones.
     """
 
     def __init__(self, tower: Tower, kinds: tuple[str, ...]) -> None:
         super().__init__()
-        self.tower, self.kinds = tower, kinds
+        self.tower, self.neck, self.kinds = tower, Neck(tower), kinds
+        self.fine_heads = Heads(tower.widths[-2], len(kinds), FINER * GRID, FINE // FINER, COARSE // FINER)
         self.heads = Heads(tower.width, len(kinds), GRID)
         self.pooled_heads = Heads(tower.width, len(kinds), POOLED)
 
-    def forward(self, images: Tensor) -> tuple[Said, Said]:
-        """Say what pictures (N, 3, SIDE, SIDE) in [0, 1] show, by all tokens and by the pooled ones."""
-        tokens = self.tower(images)
-        return self.heads(tokens), self.pooled_heads(self.tower.pooled(tokens))
+    def forward(self, images: Tensor) -> dict[str, Said]:
+        """Say what pictures (N, 3, SIDE, SIDE) in [0, 1] show, by each of `READINGS`."""
+        tokens, fine = self.tower.looked(images)
+        pooled = self.pooled_heads(self.tower.pooled(tokens))
+        return {"fine": self.fine_heads(self.neck(tokens, fine)), "tokens": self.heads(tokens), "pooled": pooled}
+
+    def find(self, images: Tensor) -> Said:
+        """Say what pictures (N, 3, SIDE, SIDE) in [0, 1] show, by the finer map, which says it best."""
+        return self.fine_heads(self.neck(*self.tower.looked(images)))
 
 
 def save_eyes(eyes: Eyes, path: Path) -> None:
     """Write eyes to a file, their towers folded: they learn no more."""
     eyes.tower.fold()
+    fold(eyes.neck)
     tensors = {name: value.detach().to(torch.bfloat16).contiguous() for name, value in eyes.state_dict().items()}
     shape = {"widths": eyes.tower.widths, "blocks": eyes.tower.blocks, "kinds": eyes.kinds}
     write_file(path, save(tensors, {"eyes": json.dumps(shape)}))
@@ -90,6 +102,7 @@ def load_eyes(name: str | Path) -> Eyes:
             shape = json.loads(file.metadata()["eyes"])
             tensors = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118 (not a dict)
         eyes = Eyes(Tower(tuple(shape["widths"]), tuple(shape["blocks"]), folded=True), tuple(shape["kinds"]))
+        fold(eyes.neck)
         eyes.load_state_dict(tensors)
     except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
         reason = str(error).splitlines()[0]

@@ -10,8 +10,8 @@ from typing import Any
 
 from lerobot_memobench.files import draft_of
 
-DASHED = "pooled "
-"""What the name of a loss begins with that is drawn dashed, in the colour of the loss whose name follows."""
+STYLES = {"fine": "-", "tokens": ":", "pooled": "--"}
+"""How a loss is drawn whose name begins with this word, in one colour with all whose names go on alike."""
 
 
 def mean_of(window: Sequence[Mapping[str, Any]]) -> dict[str, float]:
@@ -67,10 +67,9 @@ def draw_curve(
 def _looks(names: Iterable[str]) -> dict[str, dict[str, str]]:
     """Return name -> style and colour of its line."""
     colours: dict[str, str] = {}
-    return {
-        name: {
-            "linestyle": "--" if name.startswith(DASHED) else "-",
-            "color": colours.setdefault(name.removeprefix(DASHED), f"C{len(colours)}"),
-        }
-        for name in names
-    }
+    looks = {}
+    for name in names:
+        first, _, rest = name.partition(" ")
+        of = rest if first in STYLES else name
+        looks[name] = {"linestyle": STYLES.get(first, "-"), "color": colours.setdefault(of, f"C{len(colours)}")}
+    return looks
