@@ -51,13 +51,8 @@ def ship(
     rollouts: Path | None,
     merged: Mapping[Path, Sequence[Path]],
     commits: Sequence[tuple[str, str]],
-    eyes: str | None = None,
 ) -> Path:
-    """Write the last checkpoint of a training run as the package's policy ``name``; return its folder.
-
-    Args:
-        eyes: through which it is to see, where it was trained on told objects; None: as it was trained.
-    """
+    """Write the last checkpoint of a training run as the package's policy ``name``; return its folder."""
     source, folder = checkpoint_folder(str(run)), SHIPPED / name
     if source is None:
         raise SystemExit(f"{run} holds no checkpoint; name the output_dir of a `lerobot train`")
@@ -68,9 +63,8 @@ def ship(
     for path in source.glob("policy_*processor*"):
         shutil.copy(path, folder)
     config = json.loads((source / "config.json").read_text()) | {"device": "cpu", "pretrained_path": None}
-    config |= {} if eyes is None else {"eyes": eyes}
     write_file(folder / "config.json", json.dumps(config, indent=4) + "\n")
-    write_file(folder / "README.md", card(name, source, weights, rollouts, merged, commits, eyes))
+    write_file(folder / "README.md", card(name, source, weights, rollouts, merged, commits))
     size = sum(path.stat().st_size for path in folder.iterdir())
     if size > LARGEST:
         raise SystemExit(f"{folder} takes {size:,} bytes; expected at most {LARGEST:,}")
@@ -84,14 +78,12 @@ def card(
     rollouts: Path | None,
     merged: Mapping[Path, Sequence[Path]],
     commits: Sequence[tuple[str, str]] = (),
-    eyes: str | None = None,
 ) -> str:
     """Return the Markdown that goes with a policy.
 
     Args:
         merged: datasets, and those that LeRobot made each of.
         commits: datasets, and by which commit each was made, where the expert has changed since.
-        eyes: through which it sees, if it was trained on told objects.
     """
     runs = trainings(source)
     begun = runs.pop(0) if "shipped" in runs[0] else None
@@ -100,8 +92,7 @@ def card(
     lines = [
         f"# {name}",
         "",
-        f"`memobench_mem`, {count:.1f} million parameters, bfloat16; sees {policy['perception']}"
-        + ("." if eyes is None else f" that eyes (`eyes={eyes}`) find in pictures, and was trained on told ones."),
+        f"`memobench_mem`, {count:.1f} million parameters, bfloat16; sees {policy['perception']}.",
         *([] if begun is None else [began_with(begun["folder"])]),
         *demonstrations(runs, training_facts(source) or {}, merged),
         *(f"The expert that made {place(part)} is that of commit `{commit}`." for part, commit in commits),
@@ -276,7 +267,6 @@ if __name__ == "__main__":
         metavar=("DATASET", "COMMIT"),
         help="by which a dataset was made, where the expert has changed since; may be said again",
     )
-    parser.add_argument("--eyes", help="through which it is to see, where it was trained on told objects")
     given = parser.parse_args()
     parts = {whole: parts for whole, *parts in given.merged}
-    print(ship(given.run, given.name, given.rollouts, parts, given.commit, given.eyes))
+    print(ship(given.run, given.name, given.rollouts, parts, given.commit))

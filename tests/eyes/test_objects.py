@@ -55,9 +55,9 @@ def bent(sim: Simulation) -> Simulation:
     return sim
 
 
-def told(slots: NDArray[np.float32]) -> NDArray[np.float32]:
+def told(slots: NDArray[np.float32] | torch.Tensor) -> NDArray[np.float32]:
     """Return the things (n, WIDTH) of an observation."""
-    rows = slots.reshape(SLOTS, WIDTH)
+    rows = np.asarray(slots).reshape(SLOTS, WIDTH)
     return rows[rows[:, 0] > 0]
 
 
@@ -158,6 +158,6 @@ def test_the_packages_eyes_find_what_stands_on_a_table(gl: str, simulate: Simula
     assert found.shape == (1, SIZE)
     assert found.dtype == torch.float32
     for thing in told(ObjectSlots(sim).observe()):
-        alike = told(found.numpy())
+        alike = told(found)
         alike = alike[alike[:, 1] == thing[1]]
         assert np.linalg.norm(alike[:, PLACE] - thing[PLACE], axis=1).min() < 0.02, classes()[int(thing[1])]

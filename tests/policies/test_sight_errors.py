@@ -8,7 +8,7 @@ import torch
 
 from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_RAW_STATE, FramePool, ObjectPerception
 from lerobot_memobench.policies.memobench_mem.perception.sight_errors import FALSE, KIND_MISSED, MISSED, as_found
-from lerobot_memobench.policies.memobench_mem.perception.slots import field
+from lerobot_memobench.sim.object_layout import field
 from lerobot_memobench.sim.object_slots import SIZE, SLOTS, WIDTH, classes, in_slots
 
 KIND = {name: classes().index(name) for name in ("butter", "akita_black_bowl", "drawer", "plate", "milk")}

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from lerobot_memobench.eyes.finding import found
 from lerobot_memobench.eyes.kinds import DRAWERS, PARTS
@@ -21,6 +23,7 @@ from lerobot_memobench.eyes.labels import level_depth, rays
 from lerobot_memobench.eyes.tower import shrunk
 from lerobot_memobench.eyes.views import View, views_of
 from lerobot_memobench.eyes.weights import Eyes
+from lerobot_memobench.sim.object_layout import field
 from lerobot_memobench.sim.object_slots import SLOTS, WIDTH, classes, in_slots
 from lerobot_memobench.sim.scene import TABLE_TOP
 from lerobot_memobench.sim.simulation import CAMERAS
@@ -30,8 +33,9 @@ Things = NDArray[np.void]
 
 ONE = frozenset({*PARTS, "flat_stove", "kitchen_table", "microwave", "wooden_cabinet", "wooden_two_layer_shelf"})
 """Kinds of which a scene has one."""
-TURNED = ONE - {"flat_stove", "kitchen_table", "knob"}
-"""Kinds whose x axis points to the robot; that of others points away from it, as near as half a turn allows."""
+TURNED = ONE - {"flat_stove", "kitchen_table", "knob"} | {"drawer"}
+"""Kinds, and the class of drawers, whose x axis points to the robot; that of others points away from it, as near as
+half a turn allows."""
 # fmt: off
 ROUND = frozenset({
     "akita_black_bowl", "artichoke", "beefsteak_tomato", "biscuit", "bottle_of_coffee",
@@ -56,7 +60,7 @@ class Sighting:
 
     Attributes:
         cameras: that found it. depth: from the one by which it was placed, m.
-        place: of its origin in the world, m. axis: (3,) its x axis, level, of length 1. joint: m or rad.
+        place: of its origin in the world, m. axis: (3,) its x axis or the opposite one, level. joint: m or rad.
         lit: probability that it stands in a highlight.
     """
 
@@ -104,17 +108,17 @@ class ObjectFinder:
         for row, hand in enumerate(hands):
             seen = dict(zip(CAMERAS, finds[row :: len(hands)], strict=True))
             slots.append(self.slots(seen, views_of(hand)))
-        return torch.from_numpy(np.array(slots))
+        return torch.stack(slots)
 
-    def slots(self, finds: Mapping[str, Things], views: Mapping[str, View]) -> NDArray[np.float32]:
+    def slots(self, finds: Mapping[str, Things], views: Mapping[str, View]) -> Tensor:
         """Return the slots (SIZE,) of what each camera found at one moment, of dtype `finding.FOUND`."""
         rows = []
         for thing in self.merged(finds, views)[:SLOTS]:
-            side = np.cross([0.0, 0.0, 1.0], thing.axis)
             joint = thing.joint if self.eyes.kinds[thing.kind] in PARTS else 0.0
             lit = float(thing.lit > LIT)
-            rows.append([1.0, self._class[thing.kind], *thing.place, *thing.axis, *side, joint, lit])
-        return in_slots(np.array(rows).reshape(-1, WIDTH))
+            rows.append([1.0, self._class[thing.kind], *thing.place, *thing.axis, 0.0, 0.0, 0.0, joint, lit])
+        found = torch.from_numpy(in_slots(np.array(rows).reshape(-1, WIDTH)))
+        return settled(found.unflatten(0, (SLOTS, WIDTH))).flatten()
 
     def merged(self, finds: Mapping[str, Things], views: Mapping[str, View]) -> list[Sighting]:
         """Return the things that there are by what each camera found, the surest first."""
@@ -147,20 +151,39 @@ class ObjectFinder:
         else:
             depth = float(level_depth(sight, TABLE_TOP + find["height"], view))
             axis = axis - turned[:, 2] * (axis[2] / turned[2, 2])  # it is level, where the picture is not
-        level = np.array([axis[0], axis[1], 0.0])
-        level /= max(float(np.linalg.norm(level)), 1e-9)
-        kind = self.eyes.kinds[find["kind"]]
-        if kind in ROUND:
-            level = np.array([1.0, 0.0, 0.0])
-        elif (level[0] < 0) != (kind in TURNED):
-            level = -level
         return Sighting(
             int(find["kind"]),
             float(find["score"]),
             (camera,),
             depth,
             view["eye"] + sight * depth,
-            level,
+            axis,
             float(find["joint"]),
             float(find["lit"]),
         )
+
+
+def settled(slots: Tensor) -> Tensor:
+    """Return slots (..., SLOTS, WIDTH) in which things stand as they are taken to: level, with the front where tasks
+    have it. Of their rotation only the x axis is read.
+    """
+    seen = slots.clone()
+    there, kind = field(seen, "present") > 0, field(seen, "class").squeeze(-1).long().cpu()
+    axis = normalize(field(seen, "rotation")[..., :3] * seen.new_tensor([1.0, 1.0, 0.0]), dim=-1, eps=1e-6)
+    turned, from_all_sides = (_classes(kinds)[kind][..., None].to(seen.device) for kinds in (TURNED, ROUND))
+    axis = torch.where((axis[..., :1] < 0) != turned, -axis, axis)
+    axis = torch.where(from_all_sides, seen.new_tensor([1.0, 0.0, 0.0]), axis)
+    set_axis(seen, axis * there)
+    return seen
+
+
+def set_axis(slots: Tensor, axis: Tensor) -> None:
+    """Write rotations about the vertical into slots (..., WIDTH), given the level x axes (..., 3)."""
+    x, y, z = axis.unbind(-1)
+    field(slots, "rotation")[:] = torch.stack([x, y, z, -y, x, z], dim=-1)
+
+
+@cache
+def _classes(names: frozenset[str]) -> Tensor:
+    """Return for each class whether it is one of those, (classes,) bool."""
+    return torch.tensor([name in names for name in classes()])

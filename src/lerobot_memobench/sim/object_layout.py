@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 SLOTS = 16
 """Things that an observation has room for. The catalogue's fullest scene has ten."""
@@ -22,3 +23,8 @@ SIZE = SLOTS * WIDTH
 
 STARTS = dict(zip(FIELDS, itertools.accumulate(FIELDS.values(), initial=0), strict=False))
 """Field -> where it begins in its slot."""
+
+
+def field[Numbers: Any](slots: Numbers, name: str) -> Numbers:
+    """Return a field (..., size) of slots (..., WIDTH), an array or a tensor; a view."""
+    return slots[..., STARTS[name] : STARTS[name] + FIELDS[name]]

@@ -23,9 +23,9 @@ from lerobot_memobench.policies.memobench_mem.perception.eyes import SEEN
 from lerobot_memobench.policies.memobench_mem.perception.frozen import fingerprint
 from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_PHASE, OBS_RAW_STATE, ObjectPerception
 from lerobot_memobench.policies.memobench_mem.perception.perception import Seen
-from lerobot_memobench.policies.memobench_mem.perception.slots import field, in_order
+from lerobot_memobench.policies.memobench_mem.perception.slots import in_order
 from lerobot_memobench.policies.shown import cure
-from lerobot_memobench.sim.object_slots import SIZE, SLOTS, WIDTH
+from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH, field
 
 FOUND = f"{SEEN}objects"
 """Name in a training sample of what was found in its pictures, (B, SIZE)."""

@@ -6,14 +6,12 @@ ones. Sizes are those of the package's eyes at 2,617 moments of the thirty tasks
 
 from __future__ import annotations
 
-from functools import cache
-
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
-from lerobot_memobench.eyes.objects import ROUND, TURNED
-from lerobot_memobench.policies.memobench_mem.perception.slots import field, in_order
+from lerobot_memobench.eyes.objects import set_axis, settled
+from lerobot_memobench.policies.memobench_mem.perception.slots import in_order
+from lerobot_memobench.sim.object_layout import field
 from lerobot_memobench.sim.object_slots import classes
 
 PLACE, KIND_PLACE = (0.001, 1.3), (0.0014, 0.7)
@@ -36,7 +34,7 @@ def as_found(slots: Tensor, hand: Tensor, size: float) -> Tensor:
     Args:
         hand: its place in the world, m, and its turn, (N, >= 3). size: of the errors; 1 is as the package's eyes err.
     """
-    seen = _settled(slots)
+    seen = settled(slots)
     there = field(seen, "present").squeeze(-1) > 0
     kind = field(seen, "class").squeeze(-1).long()
     place, joint = field(seen, "position"), field(seen, "joint")
@@ -57,38 +55,11 @@ def _error(like: Tensor, size: float, spread: float) -> Tensor:
     return torch.randn_like(like) * size * (spread * torch.randn_like(like[..., :1])).exp()
 
 
-@cache
-def _kinds(names: frozenset[str]) -> Tensor:
-    return torch.tensor([name in names for name in classes()])
-
-
-def _settled(slots: Tensor) -> Tensor:
-    """Return a copy in which things stand as eyes take them to stand (`eyes.objects`): level, and with their front on
-    the side where tasks have it.
-    """
-    seen = slots.clone()
-    kind = field(seen, "class").squeeze(-1).long().cpu()
-    axis = field(seen, "rotation")[..., :3].clone()
-    axis[..., 2] = 0.0
-    axis = normalize(axis, dim=-1, eps=1e-6)
-    turned = _kinds(TURNED | {"drawer"})[kind].to(axis.device)
-    axis = torch.where(((axis[..., 0] < 0) != turned)[..., None], -axis, axis)
-    round_ = _kinds(ROUND)[kind].to(axis.device)
-    axis = torch.where(round_[..., None], axis.new_tensor([1.0, 0.0, 0.0]), axis)
-    _set_axis(seen, axis)
-    return seen
-
-
 def _turn(seen: Tensor, angle: Tensor) -> None:
     """Turn the level x axes of things by angles (N, SLOTS), rad."""
     x, y, z = field(seen, "rotation")[..., :3].unbind(-1)
     sine, cosine = angle.sin(), angle.cos()
-    _set_axis(seen, torch.stack([cosine * x - sine * y, sine * x + cosine * y, z], dim=-1))
-
-
-def _set_axis(seen: Tensor, axis: Tensor) -> None:
-    x, y, z = axis.unbind(-1)
-    field(seen, "rotation")[:] = torch.stack([x, y, z, -y, x, z], dim=-1)
+    set_axis(seen, torch.stack([cosine * x - sine * y, sine * x + cosine * y, z], dim=-1))
 
 
 def _add_false(seen: Tensor, there: Tensor, size: float) -> None:

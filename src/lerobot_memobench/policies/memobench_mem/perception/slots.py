@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from lerobot_memobench.sim.object_slots import FIELDS, STARTS, WIDTH
+from lerobot_memobench.sim.object_layout import FIELDS, WIDTH, field
 
 CLASS_DIM = 32
 MIDDLE = (-0.05, 0.0, 0.95)
@@ -22,11 +22,6 @@ PER_METRE = 5.0
 HAND_DIM = 6
 """The first numbers of the robot's state: the hand's place, and its rotation as axis times angle."""
 FEATURES = 3 * (2 + 2 * len(NEAR)) + 2 * FIELDS["rotation"] + FIELDS["joint"] + FIELDS["highlighted"]
-
-
-def field(slots: Tensor, name: str) -> Tensor:
-    """Return a field (..., size) of slots (..., WIDTH)."""
-    return slots[..., STARTS[name] : STARTS[name] + FIELDS[name]]
 
 
 def in_order(slots: Tensor) -> Tensor:
