@@ -3,21 +3,25 @@
     python scripts/learned_figure.py "with memory=outputs/eval/small" "without memory=outputs/eval/memoryless" \
         --out docs/figures/learned.png
 
-Bars are of all rollouts of the tasks that all arms have; differences from the first arm of the episodes that they have.
+Bars are of all rollouts of the tasks that all arms have; differences from the first arm, and the table by task, of the
+episodes that they have.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
-from lerobot_memobench.evaluation.metrics.rollouts import Record
+from lerobot_memobench.datasets.lerobot_format.card_tables import markdown
+from lerobot_memobench.evaluation.metrics.rollouts import Record, by_task
 from lerobot_memobench.evaluation.records.runs import read_runs
 from lerobot_memobench.studies.learning.contrasts import contrasts
 from lerobot_memobench.studies.learning.experiments import prompted
 from lerobot_memobench.studies.learning.figure import SCOPES, draw
 from lerobot_memobench.studies.learning.outcomes import outcomes_of
 from lerobot_memobench.studies.learning.tables import contrasts_table, outcomes_table
+from lerobot_memobench.tasks.failures import REFERENCE_DRIFT
 
 
 def shared(arms: dict[str, list[Record]]) -> dict[str, list[Record]]:
@@ -47,6 +51,19 @@ def differences(arms: dict[str, list[Record]]) -> str:
     return "\n\n".join(parts)
 
 
+def tasks_table(arms: dict[str, list[Record]]) -> str:
+    """Return how many of the shared episodes of each task are solved, and in how many a wrong referent was taken."""
+    found = {name: by_task(records) for name, records in shared(arms).items()}
+    return markdown(
+        ("task", *arms), [[task, *(_told(own[task]) for own in found.values())] for task in found[next(iter(arms))]]
+    )
+
+
+def _told(records: Sequence[Record]) -> str:
+    wrong = sum(one.get("failure") == REFERENCE_DRIFT for one in records)
+    return f"{sum(one['success'] for one in records)} of {len(records)}" + (f", {wrong} wrong" if wrong else "")
+
+
 def main() -> None:
     """Draw and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -57,7 +74,7 @@ def main() -> None:
     found = {name: outcomes_of([records]) for name, records in arms.items()}
     draw(found, given.out)
     means = {name: {scope: one[scope] for scope in one if scope in SCOPES} for name, one in found.items()}
-    print(outcomes_table(means), differences(arms), sep="\n\n")
+    print(outcomes_table(means), differences(arms), tasks_table(arms), sep="\n\n")
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from safetensors.torch import save_file
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.eyes.kinds import kinds
+from lerobot_memobench.eyes.neck import FINER, Neck
 from lerobot_memobench.eyes.tower import GRID, POOLED, SIDE, WIDTH, Tower, shrunk
 from lerobot_memobench.eyes.weights import READINGS, Eyes, load_eyes, save_eyes
 from lerobot_memobench.eyes.whitening import whiten
@@ -106,3 +107,19 @@ def test_a_pooled_token_is_of_its_own_four(small_tower: Callable[[], Tower]) -> 
     assert used.nonzero().tolist() == [[2, 4], [2, 5], [3, 4], [3, 5]]
     parts = tower.pool.weight.reshape(tower.width, 4, tower.width)
     assert not torch.allclose(parts[:, 0], parts[:, 1])  # what is where in it is kept
+
+
+def test_the_neck_knows_which_token_a_cell_lies_in(small_tower: Callable[[], Tower]) -> None:
+    tower = small_tower()
+    neck = Neck(tower).eval()
+    for convolution in (neck.block.first, neck.block.second):
+        torch.nn.init.zeros_(convolution.weigh.weight)  # it would look at the cells beside, too
+    tokens = torch.rand(1, GRID**2, tower.width, requires_grad=True)
+    fine = torch.rand(1, tower.widths[-2], FINER * GRID, FINER * GRID, requires_grad=True)
+    cells = neck(tokens, fine).unflatten(1, (FINER * GRID, FINER * GRID))
+    cells[0, 3, 5].sum().backward()
+    assert tokens.grad is not None
+    assert fine.grad is not None
+    assert tokens.grad[0].any(dim=1).nonzero().flatten().tolist() == [1 * GRID + 2]
+    assert fine.grad[0].any(dim=0).nonzero().tolist() == [[3, 5]]
+    assert not torch.allclose(cells[0, 2, 4], cells[0, 2, 5]), "what is where in a token's square is told apart"
