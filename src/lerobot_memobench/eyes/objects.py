@@ -46,11 +46,11 @@ ROUND = frozenset({
 """Kinds that are alike from all sides: their x axis is taken to be the world's, as tasks place them."""
 SURE, ALONE = 0.2, {"agentview": 0.3, "wrist": 0.4}
 """Probability from which on what both cameras find is there, and what one of them finds alone."""
-APART, SAME = 0.03, 0.05
+APART, SAME = 0.03, 0.04
 """How near to one another two things of a kind can stand, and how far apart two cameras may see one thing, m."""
 LIT = 0.5
 """Probability from which on a thing is said to stand in a highlight."""
-NEAR = 0.3
+NEAR = 0.2
 """Depth up to which the wrist's camera may see better than the other where things are, m."""
 
 
