@@ -47,6 +47,14 @@ def test_what_was_there_is_found(grid: int) -> None:
         assert ((things["lit"] > 0.5) == true["lit"]).all()
 
 
+def test_doubts_are_of_the_picture_and_of_metres() -> None:
+    said = perfect(targets(made_up(2), KINDS, GRID))
+    doubt = torch.tensor([0.16, 0.01, 0.02]).log()[:, None, None].expand(2, KINDS, 3, 2 * GRID, 2 * GRID)
+    assert not found(said)[0]["doubt"].any()
+    for things in found(Said(said.heat, said.geometry, said.mask, doubt)):
+        assert things["doubt"] == pytest.approx(np.tile([0.01, 0.01, 0.02], (KINDS, 1)), rel=1e-4)
+
+
 def test_saying_so_costs_nothing_and_anything_else_does() -> None:
     wanted = targets(made_up(3), KINDS, GRID)
     right = perfect(wanted)

@@ -131,6 +131,26 @@ def test_one_thing_is_seen_by_both_cameras(simulate: Simulate, finder: ObjectFin
     assert seen(finder, state, ("wrist", "wooden_cabinet", 0.9, here), far) == 1, "a scene has one"
 
 
+def test_a_place_is_where_both_lines_of_sight_meet(simulate: Simulate, finder: ObjectFinder) -> None:
+    state = simulate(BOWLS).proprio().astype(float)
+    true, finds = np.array([float(state[0]) + 0.03, float(state[1]), 0.91]), {}
+    for camera in CAMERAS:
+        finds[camera] = one = np.zeros(1, FOUND)
+        place, depth = projected(true[None], view_of(camera, state))
+        one["kind"], one["score"], one["turn"] = kinds().index("butter"), 0.9, (1.0, 0.0)
+        one["place"], one["depth"], one["height"] = place, depth + 0.012, true[2] - TABLE_TOP + 0.012
+        one["doubt"] = (0.001, 0.01, 0.01)
+    views = views_of(state)
+    alone = {
+        camera: told(finder.slots({**finds, other: finds[other][:0]}, views))[0, PLACE]
+        for camera, other in zip(CAMERAS, reversed(CAMERAS), strict=True)
+    }
+    assert min(np.linalg.norm(place - true) for place in alone.values()) > 0.01
+    assert np.linalg.norm(told(finder.slots(finds, views))[0, PLACE] - true) < 0.004
+    finds["wrist"]["doubt"] = (0.1, 0.1, 0.1)
+    assert told(finder.slots(finds, views))[0, PLACE] == pytest.approx(alone["agentview"], abs=1e-3)
+
+
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_what_one_camera_finds_alone_must_be_surer(simulate: Simulate, finder: ObjectFinder, camera: str) -> None:
     state = simulate(BOWLS).proprio().astype(float)

@@ -10,11 +10,14 @@ import pytest
 import torch
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.eyes.labels import Rows
+from lerobot_memobench.eyes import training
+from lerobot_memobench.eyes.heads import Said
+from lerobot_memobench.eyes.labels import Rows, images_of
 from lerobot_memobench.eyes.pictures import Pictures
-from lerobot_memobench.eyes.tower import Tower
-from lerobot_memobench.eyes.training import CHECKPOINT, CURVE, Training, changed, train
-from lerobot_memobench.eyes.weights import READINGS
+from lerobot_memobench.eyes.targets import doubt_loss, targets
+from lerobot_memobench.eyes.tower import GRID, Tower
+from lerobot_memobench.eyes.training import CHECKPOINT, CURVE, Training, changed, learn_doubts, train
+from lerobot_memobench.eyes.weights import READINGS, load_eyes
 
 from .made_up import made_up
 
@@ -49,7 +52,9 @@ def test_a_stopped_run_ends_as_another(
     with pytest.raises(Stopped):
         train(pictures, KINDS, tmp_path / "stopped", settings, tower=small_tower, save_every=2)
     stopped = train(pictures, KINDS, tmp_path / "stopped", settings, tower=small_tower, save_every=2)
-    assert len(asked) == 8 + 12 - 6 + 1  # it went on from the checkpoint of update 6; one more whitens
+    assert (
+        len(asked) == 8 + 12 - 6 + 1 + 12
+    )  # it went on from the checkpoint of update 6; one more whitens, then doubts
     assert stopped.read_bytes() == whole.read_bytes()
     assert (tmp_path / "stopped" / CURVE).is_file()
 
@@ -61,6 +66,26 @@ def test_it_learns(pictures: Pictures, small_tower: Callable[[], Tower], tmp_pat
     assert len(points) == 6
     assert all(points[-1][name] < 0.8 * points[0][name] for name in points[0]), points
     assert {name.split()[0] for name in points[0]} == set(READINGS)
+
+
+def test_doubts_are_learned_and_change_nothing_else(
+    pictures: Pictures, small_tower: Callable[[], Tower], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training, "DOUBT_RATE", 0.1)
+    settings = Training(updates=30, batch=12, rate=1e-2)
+    eyes = load_eyes(train(pictures, KINDS, tmp_path / "run", settings, tower=small_tower, save_every=30))
+    before = {name: value.clone() for name, value in eyes.state_dict().items()}
+    learn_doubts(eyes, pictures, Training(updates=150, batch=12))
+    changed_ones = {name for name, value in eyes.state_dict().items() if not torch.equal(value, before[name])}
+    assert changed_ones == {"fine_heads.doubt.weight", "fine_heads.doubt.bias"}
+    rows = pictures.rows(np.arange(12))
+    wanted = targets(rows, len(KINDS), GRID)
+    with torch.inference_mode():
+        learned = eyes.find(images_of(rows))
+    assert learned.doubt is not None
+    for times in (0.5, 2.0):
+        other = Said(learned.heat, learned.geometry, learned.mask, learned.doubt + np.log(times))
+        assert doubt_loss(learned, wanted) < doubt_loss(other, wanted), "as large as errors are"
 
 
 def test_other_settings_do_not_go_on(pictures: Pictures, small_tower: Callable[[], Tower], tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from scipy.special import expit
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from lerobot_memobench.eyes.heads import GEOMETRY, Said
+from lerobot_memobench.eyes.heads import DOUBTS, GEOMETRY, Said
 
 FOUND = np.dtype(
     [
@@ -21,10 +21,12 @@ FOUND = np.dtype(
         ("joint", "<f4"),
         ("lit", "<f4"),
         ("turn", "<f4", 2),
+        ("doubt", "<f4", len(DOUBTS)),
     ]
 )
 """A thing that was found. ``score``: probability. ``place``: of its origin in the picture, a fraction of its side from
-the upper left corner. ``lit``: probability. The others as `heads.GEOMETRY` has them."""
+the upper left corner. ``lit``: probability. ``doubt``: how far off it may be: its place, a fraction of the picture's
+side, its depth and its height, m; 0 where nothing is said. The others as `heads.GEOMETRY` has them."""
 SURE = 0.3
 """Probability from which on a thing counts as found."""
 MOST = 32
@@ -40,7 +42,8 @@ def found(said: Said, sure: float = SURE) -> list[NDArray[np.void]]:
     picture, rank = torch.nonzero(scores > sure, as_tuple=True)
     place = places[picture, rank]
     kind, row, column = place // side**2, place // side % side, place % side
-    geometry = _between(said.geometry, picture, kind, (row + 0.5) / side, (column + 0.5) / side)
+    middle = ((row + 0.5) / side, (column + 0.5) / side)
+    geometry = _between(_placed(said.geometry), picture, kind, *middle)
     things = np.zeros(len(picture), FOUND)
     things["kind"], things["score"] = kind.numpy(), scores[picture, rank].detach().numpy()
     things["place"] = geometry[:, :2]
@@ -48,20 +51,31 @@ def found(said: Said, sure: float = SURE) -> list[NDArray[np.void]]:
         things[name] = geometry[:, GEOMETRY.index(name)]
     things["lit"] = expit(geometry[:, GEOMETRY.index("lit")])
     things["turn"] = geometry[:, -2:]
+    if said.doubt is not None:
+        doubt = np.exp(_between(said.doubt, picture, kind, *middle))
+        things["doubt"] = doubt / [said.doubt.shape[-1], 1, 1]
     owner = picture.numpy()
     return [things[owner == number] for number in range(len(heat))]
 
 
-def _between(geometry: Tensor, picture: Tensor, kind: Tensor, down: Tensor, across: Tensor) -> NDArray[np.float32]:
-    """Return what the four cells around places say, (n, len(GEOMETRY)), the nearer the more; offsets made places."""
+def _placed(geometry: Tensor) -> Tensor:
+    """Return geometry with places in the picture, fractions of its side, instead of offsets from cells."""
     side = geometry.shape[-1]
+    middles = (torch.arange(side) + 0.5).to(geometry.dtype)
+    down, across = torch.meshgrid(middles, middles, indexing="ij")
+    placed = geometry.detach().clone()
+    placed[:, :, :2] = (placed[:, :, :2] + torch.stack([across, down])) / side
+    return placed
+
+
+def _between(values: Tensor, picture: Tensor, kind: Tensor, down: Tensor, across: Tensor) -> NDArray[np.float32]:
+    """Return what the four cells around places say, (n, values), the nearer the more."""
+    side = values.shape[-1]
     y, x = down * side - 0.5, across * side - 0.5
-    whole, total = torch.zeros(len(y), len(GEOMETRY)), torch.zeros(len(y), 1)
+    whole, total = torch.zeros(len(y), values.shape[2]), torch.zeros(len(y), 1)
     for row, column in ((y.floor() + a, x.floor() + b) for a in (0, 1) for b in (0, 1)):
         inside = (row >= 0) & (row < side) & (column >= 0) & (column < side)
         weight = (inside * (1 - (y - row).abs()) * (1 - (x - column).abs()))[:, None]
         at = (picture, kind, slice(None), row.long().clamp(0, side - 1), column.long().clamp(0, side - 1))
-        said = geometry[at].detach().clone()
-        said[:, :2] = (said[:, :2] + torch.stack([column, row], dim=1) + 0.5) / side
-        whole, total = whole + weight * said, total + weight
+        whole, total = whole + weight * values[at].detach(), total + weight
     return np.asarray((whole / total).numpy())

@@ -18,6 +18,10 @@ GEOMETRY = ("across", "down", "depth", "height", "joint", "lit", "turn cosine", 
 in cells. ``depth``: of its origin along the camera's view, m. ``height``: of its origin over the table, m. ``joint``:
 of a moving part, m or rad. ``lit``: logit that it stands in a highlight. ``turn``: of twice the angle at which its x
 axis lies in the picture, see `labels.THING`."""
+DOUBTS = ("place", "depth", "height")
+"""Of what heads may also say how far off it is: of ``across`` and ``down`` together in cells, of the others in m."""
+DOUBTED = (0.3, 0.01, 0.01)
+"""How far off they say it is before they have learned."""
 RARE = 0.01
 """Probability of a thing in a cell that an untrained head says."""
 
@@ -30,11 +34,13 @@ class Said:
         heat: (N, kinds, 4 grid, 4 grid), logit that a thing's visible middle is there.
         geometry: (N, kinds, len(GEOMETRY), 2 grid, 2 grid).
         mask: (N, kinds + 1, 4 grid, 4 grid), logits of what is shown, first of nothing.
+        doubt: (N, kinds, len(DOUBTS), 2 grid, 2 grid), logarithms of how far off the geometry is; None: it is not said.
     """
 
     heat: Tensor
     geometry: Tensor
     mask: Tensor
+    doubt: Tensor | None = None
 
 
 class Heads(nn.Module):
@@ -42,25 +48,36 @@ class Heads(nn.Module):
 
     Args:
         width: of a token. kinds: how many kinds of things there are. grid: side of the square of tokens. fine, coarse:
-            cells along a token's side.
+            cells along a token's side. doubting: say how far off things may be.
     """
 
-    def __init__(self, width: int, kinds: int, grid: int, fine: int = FINE, coarse: int = COARSE) -> None:
+    def __init__(
+        self, width: int, kinds: int, grid: int, fine: int = FINE, coarse: int = COARSE, *, doubting: bool = False
+    ) -> None:
         super().__init__()
         self.grid, self.fine, self.coarse = grid, fine, coarse
         self.heat = nn.Linear(width, kinds * fine**2)
         self.geometry = nn.Linear(width, kinds * len(GEOMETRY) * coarse**2)
         self.mask = nn.Linear(width, (kinds + 1) * fine**2)
+        self.doubt = nn.Linear(width, kinds * len(DOUBTS) * coarse**2) if doubting else None
         nn.init.constant_(self.heat.bias, float(torch.logit(torch.tensor(RARE))))
+        if self.doubt is not None:
+            nn.init.zeros_(self.doubt.weight)
+            first = torch.tensor(DOUBTED).log()
+            self.doubt.bias.data = first.repeat_interleave(coarse**2).repeat(kinds)
 
     def forward(self, tokens: Tensor) -> Said:
         """Say what tokens (N, grid * grid, width) show."""
-        geometry = self._spread(self.geometry(tokens), self.coarse)
         return Said(
             self._spread(self.heat(tokens), self.fine),
-            rearrange(geometry, "n (k v) y x -> n k v y x", v=len(GEOMETRY)),
+            self._of_kinds(self.geometry(tokens), len(GEOMETRY)),
             self._spread(self.mask(tokens), self.fine),
+            None if self.doubt is None else self._of_kinds(self.doubt(tokens), len(DOUBTS)),
         )
+
+    def _of_kinds(self, values: Tensor, each: int) -> Tensor:
+        """Lay so many numbers of each kind out as a picture, (N, kinds, each, grid * coarse, grid * coarse)."""
+        return rearrange(self._spread(values, self.coarse), "n (k v) y x -> n k v y x", v=each)
 
     def _spread(self, values: Tensor, cells: int) -> Tensor:
         """Lay what each token says of its cells out as a picture, (N, values, grid * cells, grid * cells), float32."""

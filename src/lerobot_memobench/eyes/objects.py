@@ -51,7 +51,9 @@ APART, SAME = 0.03, 0.04
 LIT = 0.5
 """Probability from which on a thing is said to stand in a highlight."""
 NEAR = 0.2
-"""Depth up to which the wrist's camera may see better than the other where things are, m."""
+"""Depth up to which the wrist's camera may see better than the other how things lie, m."""
+LEAST = 0.0005
+"""No place is taken to be surer than this, m."""
 
 
 @dataclass
@@ -60,7 +62,8 @@ class Sighting:
 
     Attributes:
         cameras: that found it. depth: from the one by which it was placed, m.
-        place: of its origin in the world, m. axis: (3,) its x axis or the opposite one, level. joint: m or rad.
+        place: of its origin in the world, m. sureness: (3, 3) the inverse covariance of that, 1/m².
+        axis: (3,) its x axis or the opposite one, level. joint: m or rad.
         lit: probability that it stands in a highlight.
     """
 
@@ -69,6 +72,7 @@ class Sighting:
     cameras: tuple[str, ...]
     depth: float
     place: Array
+    sureness: Array
     axis: Array
     joint: float
     lit: float
@@ -76,12 +80,16 @@ class Sighting:
     def seen_too(self, other: Sighting, one: bool) -> None:
         """Take in how another camera, less sure of it, sees this thing, which is the only one of its kind if ``one``.
 
-        The surer one places it, unless it is the wrist's and far; fixtures and their parts are placed from outside.
+        What each says of its place counts as much as it is sure of it, along its line of sight and across. The surer
+        one says how it lies, unless it is the wrist's and far; of fixtures and their parts the one outside.
         """
         self.cameras += other.cameras
         self.lit = max(self.lit, other.lit)
+        both = self.sureness + other.sureness
+        self.place = np.asarray(np.linalg.solve(both, self.sureness @ self.place + other.sureness @ other.place))
+        self.sureness = both
         if self.cameras[0] == "wrist" and (one or self.depth > NEAR):
-            self.depth, self.place, self.axis, self.joint = other.depth, other.place, other.axis, other.joint
+            self.depth, self.axis, self.joint = other.depth, other.axis, other.joint
 
 
 class ObjectFinder:
@@ -146,10 +154,12 @@ class ObjectFinder:
         sight, turned = rays(find["place"].astype(np.float64), view), np.asarray(view["turned"])
         angle = np.arctan2(find["turn"][1], find["turn"][0]) / 2
         axis = np.cos(angle) * turned[:, 0] + np.sin(angle) * turned[:, 1]
+        across, depth_off, height_off = find["doubt"].astype(np.float64)
         if camera == "wrist":
-            depth = float(find["depth"])
+            depth, along = float(find["depth"]), depth_off
         else:
             depth = float(level_depth(sight, TABLE_TOP + find["height"], view))
+            along = height_off / max(-sight[2], 1e-3)
             axis = axis - turned[:, 2] * (axis[2] / turned[2, 2])  # it is level, where the picture is not
         return Sighting(
             int(find["kind"]),
@@ -157,10 +167,20 @@ class ObjectFinder:
             (camera,),
             depth,
             view["eye"] + sight * depth,
+            sureness(sight, 2 * float(view["slope"]) * abs(depth) * across, along * float(np.linalg.norm(sight))),
             axis,
             float(find["joint"]),
             float(find["lit"]),
         )
+
+
+def sureness(sight: Array, across: float, along: float) -> Array:
+    """Return the inverse covariance (3, 3), 1/m², of a place that may be so far off across a line of sight (3,) and
+    along it, m.
+    """
+    line = sight / np.linalg.norm(sight)
+    on_it = np.outer(line, line)
+    return np.asarray((np.eye(3) - on_it) / max(across, LEAST) ** 2 + on_it / max(along, LEAST) ** 2)
 
 
 def settled(slots: Tensor) -> Tensor:

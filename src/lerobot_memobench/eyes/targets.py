@@ -21,7 +21,7 @@ SIGMA, SPREAD = 0.8, 2
 SCALES = (1.0, 1.0, 5.0, 5.0, 10.0, 1.0, 0.3, 0.3)
 """What an error of one is worth, for each of `GEOMETRY`: cells, metres (radians), a cross entropy, and parts of a
 circle."""
-LIT = GEOMETRY.index("lit")
+DEPTH, HEIGHT, LIT = (GEOMETRY.index(name) for name in ("depth", "height", "lit"))
 REACH = 4.0
 """Cells from which on a place is no farther: of a large thing of which a corner shows."""
 
@@ -109,13 +109,28 @@ def loss(said: Said, wanted: Targets) -> dict[str, Tensor]:
     error = error * torch.tensor(SCALES)
     error = torch.where(wanted.geometry.isnan(), torch.zeros(()), error) * wanted.weights[:, None]
     each = error.sum(dim=0) / wanted.weights.sum().clamp(min=1.0)
-    known = GEOMETRY.index("depth")
     return {
         "heat": _heat_loss(said.heat, wanted.heat),
-        "place": each[:known].sum(),
-        "rest": each[known:].sum(),
+        "place": each[:DEPTH].sum(),
+        "rest": each[DEPTH:].sum(),
         "mask": cross_entropy(said.mask, wanted.mask),
     }
+
+
+def doubt_loss(said: Said, wanted: Targets) -> Tensor:
+    """Return how badly the doubts of heads fit the errors of their geometry, which learns nothing of it: a Laplace
+    distribution's negative logarithm.
+
+    Raises:
+        ValueError: they say no doubts.
+    """
+    if said.doubt is None:
+        raise ValueError("these heads have no doubts")
+    picture, kind, row, column = wanted.cells.T
+    off = (said.geometry[picture, kind, :, row, column].detach() - wanted.geometry).abs()
+    size = torch.column_stack([torch.linalg.vector_norm(off[:, :2], dim=1), off[:, DEPTH], off[:, HEIGHT]])
+    doubt = said.doubt[picture, kind, :, row, column]
+    return ((doubt + size * torch.exp(-doubt)).sum(dim=1) * wanted.weights).sum() / wanted.weights.sum().clamp(min=1.0)
 
 
 def _heat_loss(logits: Tensor, heat: Tensor) -> Tensor:

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.eyes.labels import Rows, images_of
 from lerobot_memobench.eyes.pictures import Pictures
-from lerobot_memobench.eyes.targets import loss, targets
+from lerobot_memobench.eyes.targets import doubt_loss, loss, targets
 from lerobot_memobench.eyes.tower import GRID, POOLED, Tower
 from lerobot_memobench.eyes.weights import Eyes, save_eyes
 from lerobot_memobench.eyes.whitening import whiten
@@ -37,6 +37,8 @@ WINDOW = 10
 """Updates that one point of the curve is the mean of."""
 WHITENED = 2048
 """Pictures over which tokens are made white in the end."""
+DOUBTED, DOUBT_RATE = 600, 1e-2
+"""Updates of the doubts alone, after that, and their highest learning rate."""
 BATCH = 64
 """Pictures that are looked at together then."""
 CLIP = 5.0
@@ -93,6 +95,7 @@ def train(
             newest = ", ".join(f"{name} {value:.3f}" for name, value in learner.points[-1].items())
             progress(learner.update, settings.updates, newest)
     whiten(learner.eyes, _some(pictures))
+    learn_doubts(learner.eyes, pictures, settings, progress)
     save_eyes(learner.eyes, folder / WEIGHTS)
     return folder / WEIGHTS
 
@@ -102,6 +105,39 @@ def _some(pictures: Pictures) -> Iterator[Tensor]:
     chosen = np.linspace(0, len(pictures) - 1, min(len(pictures), WHITENED)).astype(np.int64)
     for numbers in np.array_split(chosen, -(-len(chosen) // BATCH)):
         yield images_of(pictures.rows(numbers))
+
+
+def learn_doubts(eyes: Eyes, pictures: Pictures, settings: Training, progress: Progress | None = None) -> None:
+    """Have trained eyes learn how far off they are where they find things; all else in them stays as it is."""
+    eyes.eval().requires_grad_(False)
+    doubts = [*nn.ModuleList([eyes.fine_heads.doubt]).requires_grad_(True).parameters()]
+    updates = min(DOUBTED, settings.updates)
+    optimizer = torch.optim.Adam(doubts, DOUBT_RATE)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, updates)
+    for update in range(updates):
+        rows = pictures.rows(_chosen(settings, settings.updates + update, len(pictures)))
+        images = changed(images_of(rows), _chance(settings, settings.updates + update))
+        with torch.autocast("cpu", torch.bfloat16):
+            fine = eyes.neck(*eyes.tower.looked(images))
+        fit = doubt_loss(eyes.fine_heads(fine.float()), targets(rows, len(eyes.kinds), GRID))  # bfloat16 is off itself
+        optimizer.zero_grad()
+        fit.backward()
+        optimizer.step()
+        schedule.step()
+        if progress is not None and update % WINDOW == WINDOW - 1:
+            progress(settings.updates, settings.updates, f"doubt {float(fit):.2f} after {update + 1} of {updates}")
+
+
+def _chosen(settings: Training, update: int, count: int) -> NDArray[np.int64]:
+    """Return the numbers of the pictures of an update: all of them once, then all in another order."""
+    size = min(settings.batch, count)
+    epoch, place = divmod(update, count // size)
+    return _permutation(settings.seed, epoch, count)[place * size : (place + 1) * size]
+
+
+def _chance(settings: Training, update: int) -> torch.Generator:
+    """Return where an update's changes of pictures are drawn from."""
+    return torch.Generator().manual_seed(settings.seed * 2**32 + update)
 
 
 class _Learner:
@@ -119,10 +155,8 @@ class _Learner:
         self._window: list[Mapping[str, Tensor]] = []
 
     def order(self) -> NDArray[np.int64]:
-        """Return the numbers of the pictures of the next update: all of them once, then all in another order."""
-        size = min(self._settings.batch, self._pictures)
-        epoch, place = divmod(self.update, self._pictures // size)
-        return _permutation(self._settings.seed, epoch, self._pictures)[place * size : (place + 1) * size]
+        """Return the numbers of the pictures of the next update."""
+        return _chosen(self._settings, self.update, self._pictures)
 
     def learn(self, rows: Rows) -> None:
         """Make one update."""
@@ -141,8 +175,7 @@ class _Learner:
             self._window = []
 
     def _losses(self, rows: Rows) -> dict[str, Tensor]:
-        chance = torch.Generator().manual_seed(self._settings.seed * 2**32 + self.update)
-        images = changed(images_of(rows), chance)
+        images = changed(images_of(rows), _chance(self._settings, self.update))
         with torch.autocast("cpu", torch.bfloat16):
             said = self.eyes(images)
         wanted = {grid: targets(rows, len(self.eyes.kinds), grid) for grid in set(GRIDS.values())}

@@ -39,7 +39,8 @@ class Eyes(nn.Module):
     def __init__(self, tower: Tower, kinds: tuple[str, ...]) -> None:
         super().__init__()
         self.tower, self.neck, self.kinds = tower, Neck(tower), kinds
-        self.fine_heads = Heads(tower.widths[-2], len(kinds), FINER * GRID, FINE // FINER, COARSE // FINER)
+        cells = (FINE // FINER, COARSE // FINER)
+        self.fine_heads = Heads(tower.widths[-2], len(kinds), FINER * GRID, *cells, doubting=True)
         self.heads = Heads(tower.width, len(kinds), GRID)
         self.pooled_heads = Heads(tower.width, len(kinds), POOLED)
 
