@@ -81,13 +81,15 @@ class Sighting:
         """Take in how another camera, less sure of it, sees this thing, which is the only one of its kind if ``one``.
 
         What each says of its place counts as much as it is sure of it, along its line of sight and across. The surer
-        one says how it lies, unless it is the wrist's and far; of fixtures and their parts the one outside.
+        one says how it lies, unless it is the wrist's and far. Fixtures and their parts, whose origin is outside the
+        wrist's picture, are placed from outside alone.
         """
+        outside = other if self.cameras[0] == "wrist" else self
         self.cameras += other.cameras
         self.lit = max(self.lit, other.lit)
         both = self.sureness + other.sureness
-        self.place = np.asarray(np.linalg.solve(both, self.sureness @ self.place + other.sureness @ other.place))
-        self.sureness = both
+        place = np.linalg.solve(both, self.sureness @ self.place + other.sureness @ other.place)
+        self.place, self.sureness = (outside.place, outside.sureness) if one else (np.asarray(place), both)
         if self.cameras[0] == "wrist" and (one or self.depth > NEAR):
             self.depth, self.axis, self.joint = other.depth, other.axis, other.joint
 

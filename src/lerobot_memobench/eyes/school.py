@@ -16,6 +16,7 @@ from lerobot_memobench.eyes.testing import milliseconds, object_outcomes, outcom
 from lerobot_memobench.eyes.training import Progress, Training, train
 from lerobot_memobench.eyes.weights import load_eyes
 from lerobot_memobench.jobs.job import Advance
+from lerobot_memobench.sim.simulation import CAMERAS
 
 TRAINED, TESTED = range(20_000, 40_000), range(40_000, 60_000)
 """Seeds that eyes may be trained and tested on. The evaluation's (7 to 56) are in neither."""
@@ -83,5 +84,6 @@ def examine(file: Path, folder: Path, lessons: Lessons, *, made: Callable[[Advan
     took = milliseconds(eyes.tower)
     tested = Tested(eyes.kinds, told, tokens, pooled, false, len(pictures), took, *object_outcomes(eyes, pictures))
     count = min(len(pictures), COLUMNS * DRAWN_ROWS)
-    rows = pictures.rows(np.linspace(0, len(pictures) - 1, count).astype(np.int64))
+    chosen = np.linspace(0, len(pictures) - 1, count).astype(np.int64)
+    rows = pictures.rows(chosen - (chosen + np.arange(count)) % len(CAMERAS))  # one camera's after the other's
     return write_report(tested, drawn(rows, seeing(eyes)(rows), eyes.kinds), folder)
