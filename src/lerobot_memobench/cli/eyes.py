@@ -29,10 +29,10 @@ Workers = Annotated[int, typer.Option(min=1, help="Processes that make pictures.
 def train(
     out: Annotated[Path, typer.Option(help="Folder of pictures, checkpoint and weights; the same command goes on.")],
     tasks: Tasks = None,
-    episodes: Episodes = 4,
+    episodes: Episodes = 8,
     moments: Moments = 22,
     first_seed: Annotated[int, typer.Option(help="First seed of the episodes, 20000 to 39999.")] = 20_000,
-    updates: Annotated[int, typer.Option(min=1, help="Updates of the weights.")] = 5000,
+    updates: Annotated[int, typer.Option(min=1, help="Updates of the weights.")] = 7000,
     batch: Annotated[int, typer.Option(min=1, help="Pictures of each.")] = 64,
     seed: Annotated[int, typer.Option(min=0, help="Of first weights, order and changes of pictures.")] = 0,
     workers: Workers = 1,

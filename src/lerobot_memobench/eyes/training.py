@@ -57,7 +57,7 @@ class Training:
             and falls as a cosine. decay: of the weights. seed: of weights, order and changes of pictures.
     """
 
-    updates: int = 5000
+    updates: int = 7000
     batch: int = 64
     rate: float = 2e-3
     decay: float = 0.02
