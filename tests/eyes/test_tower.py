@@ -13,7 +13,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.eyes.kinds import kinds
 from lerobot_memobench.eyes.neck import FINER, Neck
 from lerobot_memobench.eyes.tower import GRID, POOLED, SIDE, WIDTH, Tower, shrunk
-from lerobot_memobench.eyes.weights import READINGS, Eyes, load_eyes, save_eyes
+from lerobot_memobench.eyes.weights import PACKAGE, READINGS, SHIPPED, Eyes, eyes_file, load_eyes, save_eyes
 from lerobot_memobench.eyes.whitening import whiten
 
 LARGEST, MOST = 6_000_000, 3_000_000
@@ -78,6 +78,10 @@ def test_white_tokens_say_what_the_others_said(small_tower: Callable[[], Tower],
             assert rows.mean(dim=0).abs().max() < 0.1
             assert variances.max() < 1.2
             assert variances[-3:].min() > 0.8
+
+
+def test_the_packages_eyes_have_a_name() -> None:
+    assert eyes_file(PACKAGE) == eyes_file(Path(PACKAGE)) == SHIPPED  # the command line makes paths of names
 
 
 def test_other_files_are_no_eyes(tmp_path: Path) -> None:

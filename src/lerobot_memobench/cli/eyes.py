@@ -52,7 +52,7 @@ def train(
 
 @app.command("test")
 def examine(
-    eyes: Annotated[Path, typer.Argument(help="File that `memobench eyes train` has written.")],
+    eyes: Annotated[Path, typer.Argument(help="File that `memobench eyes train` has written, or package.")],
     out: Annotated[Path, typer.Option(help="Folder of pictures, table, numbers and a picture of what was found.")],
     tasks: Tasks = None,
     episodes: Episodes = 1,

@@ -85,7 +85,7 @@ def eyes_file(name: str | Path) -> Path:
     Raises:
         MemobenchError: it is not there.
     """
-    path = SHIPPED if name == PACKAGE else Path(name).expanduser()
+    path = SHIPPED if str(name) == PACKAGE else Path(name).expanduser()
     if not path.is_file():
         raise MemobenchError(f"there is no file {path}; name one that `memobench eyes train` has written")
     return path
