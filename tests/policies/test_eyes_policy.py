@@ -116,7 +116,7 @@ def test_the_packages_eyes_are_the_default_of_small_pixels(tmp_path: Path) -> No
     ("fields", "message"),
     [
         ({"size": "tiny", "eyes": "package"}, r"size=small, or --policy\.perception=objects.*leave it out"),
-        ({"size": "small", "eyes": "package", "image_resolution": (96, 96)}, "128 x 128.*eyes=random"),
+        ({"size": "small", "eyes": "package", "image_resolution": (96, 96)}, f"{SIDE} x {SIDE}.*eyes=random"),
         ({"size": "small", "eyes": "package", "tokens_per_frame": 4}, "tokens_per_frame"),
     ],
 )

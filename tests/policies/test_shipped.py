@@ -8,7 +8,6 @@ from types import ModuleType
 
 import pytest
 import torch
-from lerobot.configs import PreTrainedConfig
 from safetensors.torch import save_file
 
 from lerobot_memobench.engine import memory_demo
@@ -141,7 +140,7 @@ def test_a_card_tells_how_the_demonstrations_were_made(script: ModuleType, tmp_p
     assert "--referent" not in script.generation(strict)
 
 
-def test_a_policy_of_told_objects_is_shipped_with_eyes(
+def test_the_card_tells_of_the_errors_of_eyes(
     script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
@@ -152,9 +151,6 @@ def test_a_policy_of_told_objects_is_shipped_with_eyes(
     told = {"policy": encoded(config), "dataset": {"root": "gone"}, "batch_size": 6, "steps": 5, "seed": 1}
     (source / "train_config.json").write_text(json.dumps({**told, "output_dir": str(tmp_path / "run")}))
     monkeypatch.setattr(script, "SHIPPED", tmp_path / "shipped")
-    folder = script.ship(tmp_path / "run", "seeing", None, {}, [], eyes="package")
-    assert PreTrainedConfig.from_pretrained(folder).finds_objects
-    text = (folder / "README.md").read_text()
-    assert "sees objects that eyes (`eyes=package`) find in pictures, and was trained on told ones." in text
-    assert "policy.sight_errors=1.0" in text
-    assert "eyes=package" not in text.partition("lerobot train")[2], "training is told of no eyes"
+    text = (script.ship(tmp_path / "run", "seeing", None, {}, []) / "README.md").read_text()
+    assert "sees objects." in text
+    assert "policy.sight_errors=1.0" in text.partition("lerobot train")[2]
