@@ -52,9 +52,8 @@ def test_a_stopped_run_ends_as_another(
     with pytest.raises(Stopped):
         train(pictures, KINDS, tmp_path / "stopped", settings, tower=small_tower, save_every=2)
     stopped = train(pictures, KINDS, tmp_path / "stopped", settings, tower=small_tower, save_every=2)
-    assert (
-        len(asked) == 8 + 12 - 6 + 1 + 12
-    )  # it went on from the checkpoint of update 6; one more whitens, then doubts
+    # It went on from the checkpoint of update 6; one more whitens, and doubts take twelve.
+    assert len(asked) == 8 + 12 - 6 + 1 + 12
     assert stopped.read_bytes() == whole.read_bytes()
     assert (tmp_path / "stopped" / CURVE).is_file()
 

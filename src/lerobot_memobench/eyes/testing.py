@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
@@ -52,6 +53,7 @@ Things = NDArray[np.void]
 See = Callable[[Rows], list[Things]]
 """From pictures to what was found in each, of dtype `finding.FOUND`."""
 Array = NDArray[np.float64]
+Numbers = NDArray[np.int64]
 
 
 def seeing(eyes: Eyes, reading: str = "fine") -> See:
@@ -71,7 +73,7 @@ def outcomes(see: See, pictures: Pictures) -> tuple[Things, float]:
         rows = pictures.rows(np.arange(start, min(start + BATCH, len(pictures))))
         for row, finds in zip(rows, see(rows), strict=True):
             things = row["things"][: row["count"]]
-            matched = _matched(row, things, finds)
+            matched = _matched(things["kind"], finds["kind"], partial(_off, row, things, finds))
             false += len(finds) - int((matched >= 0).sum())
             told.append(_told(row, things, finds, matched)[things["pixels"] >= SHOWN])
     return np.concatenate(told), false / max(1, len(pictures))
@@ -111,19 +113,19 @@ def _objects(rows: Rows, finder: ObjectFinder, finds: list[Things]) -> tuple[Thi
     told["kind"], told["scene"], told["error"] = [kind for kind, *_ in true], rows["scene"][0], np.inf
     told["near"] = np.linalg.norm(places - rows["hand"][0], axis=1) <= NEAR
     told["lit"] = [one["lit"] for one in true.values()]
-    wrong = np.ones(len(seen), bool)
-    for kind in {thing.kind for thing in seen}:
-        mine, theirs = np.flatnonzero(told["kind"] == kind), [i for i, one in enumerate(seen) if one.kind == kind]
-        far = 100 * np.linalg.norm(places[mine][:, None] - np.array([seen[i].place for i in theirs])[None], axis=-1)
-        for thing, find in zip(*linear_sum_assignment(np.minimum(far, FAR)), strict=True):
-            if far[thing, find] < FAR:
-                told["error"][mine[thing]], told["said_lit"][mine[thing]] = (
-                    far[thing, find],
-                    seen[theirs[find]].lit > LIT,
-                )
-                wrong[theirs[find]] = False
-    others = np.zeros(int(wrong.sum()), OBJECT)
-    others["kind"], others["scene"] = [one.kind for one, no in zip(seen, wrong, strict=True) if no], rows["scene"][0]
+    kinds = np.array([one.kind for one in seen], np.int64)
+    found_at = np.array([one.place for one in seen]).reshape(-1, 3)
+    lit = np.array([one.lit > LIT for one in seen], bool)
+
+    def off(mine: Numbers, theirs: Numbers) -> Array:
+        return np.asarray(100 * np.linalg.norm(places[mine] - found_at[theirs], axis=-1))
+
+    matched = _matched(told["kind"], kinds, off)
+    there = matched >= 0
+    told["error"][there], told["said_lit"][there] = off(np.flatnonzero(there), matched[there]), lit[matched[there]]
+    wrong = np.setdiff1d(np.arange(len(seen)), matched)
+    others = np.zeros(len(wrong), OBJECT)
+    others["kind"], others["scene"] = kinds[wrong], rows["scene"][0]
     return told[[key in shown for key in true]], others
 
 
@@ -132,16 +134,25 @@ def _shown(row: Rows) -> set[tuple[float, ...]]:
     return {(int(one["kind"]), *one["position"]) for one in things[things["pixels"] >= SHOWN]}
 
 
-def _matched(row: Rows, things: Things, finds: Things) -> NDArray[np.int64]:
-    """Return for each thing which find is of it, -1 for none: of its kind, each at most once, the nearest in all."""
-    matched = np.full(len(things), -1)
-    for kind in np.intersect1d(things["kind"], finds["kind"]):
-        mine, theirs = np.flatnonzero(things["kind"] == kind), np.flatnonzero(finds["kind"] == kind)
-        far = np.minimum(_errors(row, things[mine][:, None], finds[theirs][None]), FAR)
+def _matched(kinds: Numbers, found_kinds: Numbers, off: Callable[[Numbers, Numbers], Array]) -> Numbers:
+    """Return for each thing which find is of it, -1 for none: of its kind, each at most once, the nearest in all.
+
+    Args:
+        off: how far finds are from things by the numbers of both, which broadcast, cm.
+    """
+    matched = np.full(len(kinds), -1)
+    for kind in np.intersect1d(kinds, found_kinds):
+        mine, theirs = np.flatnonzero(kinds == kind), np.flatnonzero(found_kinds == kind)
+        far = np.minimum(off(mine[:, None], theirs[None]), FAR)
         for thing, find in zip(*linear_sum_assignment(far), strict=True):
             if far[thing, find] < FAR:
                 matched[mine[thing]] = theirs[find]
     return matched
+
+
+def _off(row: Rows, things: Things, finds: Things, mine: Numbers, theirs: Numbers) -> Array:
+    """Return `_errors` of things and finds by their numbers."""
+    return _errors(row, things[mine], finds[theirs])
 
 
 def _errors(row: Rows, things: Things, finds: Things) -> Array:
@@ -160,7 +171,7 @@ def _on_plane(row: Rows, sight: Array, height: Array) -> Array:
     return np.asarray(row["eye"] + sight * level_depth(sight, height, row)[..., None])
 
 
-def _told(row: Rows, things: Things, finds: Things, matched: NDArray[np.int64]) -> Things:
+def _told(row: Rows, things: Things, finds: Things, matched: Numbers) -> Things:
     """Return the outcome of each thing of a picture."""
     told = np.zeros(len(things), OUTCOME)
     told["kind"], told["camera"], told["scene"] = things["kind"], row["camera"], row["scene"]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.eyes.labels import Rows, images_of
@@ -37,7 +37,7 @@ WINDOW = 10
 """Updates that one point of the curve is the mean of."""
 WHITENED = 2048
 """Pictures over which tokens are made white in the end."""
-DOUBTED, DOUBT_RATE = 600, 1e-2
+DOUBT_UPDATES, DOUBT_RATE = 600, 1e-2
 """Updates of the doubts alone, after that, and their highest learning rate."""
 BATCH = 64
 """Pictures that are looked at together then."""
@@ -110,9 +110,10 @@ def _some(pictures: Pictures) -> Iterator[Tensor]:
 def learn_doubts(eyes: Eyes, pictures: Pictures, settings: Training, progress: Progress | None = None) -> None:
     """Have trained eyes learn how far off they are where they find things; all else in them stays as it is."""
     eyes.eval().requires_grad_(False)
-    doubts = [*nn.ModuleList([eyes.fine_heads.doubt]).requires_grad_(True).parameters()]
-    updates = min(DOUBTED, settings.updates)
-    optimizer = torch.optim.Adam(doubts, DOUBT_RATE)
+    doubt = eyes.fine_heads.doubt
+    assert doubt is not None
+    updates = min(DOUBT_UPDATES, settings.updates)
+    optimizer = torch.optim.Adam(doubt.requires_grad_(True).parameters(), DOUBT_RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, updates)
     for update in range(updates):
         rows = pictures.rows(_chosen(settings, settings.updates + update, len(pictures)))
