@@ -11,12 +11,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from lerobot_memobench.datasets.recording import HOLD_FRAMES
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.observations import EXECUTION
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.expert import Expert, steps_of
-from lerobot_memobench.experts.hand import Hand
+from lerobot_memobench.experts.hand import EMPTY, Hand
 from lerobot_memobench.experts.surroundings import stands_out
+from lerobot_memobench.experts.travel import PRESSED
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import Atom, atoms
@@ -212,6 +214,50 @@ def test_a_handle_that_slipped_is_taken_again() -> None:
     assert left == 0
 
 
+def test_a_miss_is_seen_at_once() -> None:
+    """Fingers that met go back to where the thing is, and lift nothing first."""
+    left, lowest, highest = 8, np.inf, 0.0
+
+    def miss(episode: Episode, action: np.ndarray) -> np.ndarray:
+        nonlocal left, lowest, highest
+        if left and action[6] > 0:
+            left -= 1
+            return np.array([0.0, 0.0, 0.8, 0.0, 0.0, 0.0, 1.0])
+        if not left and episode.sim.gripper_opening() <= EMPTY and action[6] > 0:
+            height = episode.sim.eef_pose()[0][2]
+            lowest, highest = min(lowest, height), max(highest, height)
+        return action
+
+    assert not play(get_task(BOWL), 10_000, disturb=miss).faults
+    assert left == 0
+    assert 0 < highest - lowest < 0.05
+
+
+@pytest.mark.parametrize(
+    ("name", "shut"),
+    [
+        (STOVE, Atom("turnoff", ("flat_stove_1",))),
+        (MICROWAVE, Atom("close", ("microwave_1",))),
+        ("check_the_top_drawer_of_the_cabinet", Atom("close", ("wooden_cabinet_1_top_region",))),
+    ],
+)
+def test_what_has_a_stop_is_pushed_on_against_it(name: str, shut: Atom) -> None:
+    """Who sees it less exactly ends some steps earlier, and has it shut all the same."""
+    moved, pressed = False, 0
+
+    def look(episode: Episode, action: np.ndarray) -> np.ndarray:
+        nonlocal moved, pressed
+        moved = moved or not episode.sim.holds(shut)
+        pressed += bool(moved and episode.sim.holds(shut) and action[6] > 0 and np.abs(action[:6]).max() > 0.05)
+        return action
+
+    played = play(get_task(name), 20_000, disturb=look)
+    assert not played.faults
+    for _ in range(HOLD_FRAMES):
+        played.episode.step(look(played.episode, played.episode.expert_action()))
+    assert pressed >= PRESSED
+
+
 @pytest.mark.parametrize("name", [SWAP, MILK])
 def test_fingers_that_are_stopped_close(name: str) -> None:
     """On a carton's top, or a plate's rim: a policy without a memory of it could not learn how long to wait there."""
@@ -238,10 +284,10 @@ def test_seeds_differ_and_repeat() -> None:
     assert np.abs(first[:length] - other[:length]).max() > 0.05
 
 
-def test_rests_once_the_goal_holds() -> None:
+def test_rests_once_its_plan_is_through() -> None:
     task = get_task(STOVE)
     episode = play(task, 10_000).episode
-    for _ in range(8):
+    for _ in range(80):
         action = episode.expert_action()
         episode.step(action)
     np.testing.assert_array_equal(action, [0, 0, 0, 0, 0, 0, -1])

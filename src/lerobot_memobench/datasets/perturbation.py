@@ -15,10 +15,23 @@ NOISE = 0.05
 """Standard deviation of what is added to each of an action's six displacements (1 is 5 cm or 0.5 rad)."""
 PUSH_CHANCE = 0.02
 """Probability per step that a push begins."""
-PUSH = 0.6
-"""Standard deviation of a push, per axis and step, of the hand's displacement."""
+PUSH = np.array([0.6, 0.6, 0.6, 0.1, 0.1, 0.3])
+"""Standard deviations of a push, per step: the hand is moved, and turned, mostly as about the vertical."""
 PUSH_STEPS = (3, 8)
 """A push lasts at least the first, and less than the second, number of steps."""
+MISS_CHANCE = 0.2
+"""Probability that the hand is pushed away when its fingers begin to close: they meet, and the expert goes back. Who
+never saw that brings nothing to where the thing should go."""
+MISS, MISS_SPREAD = np.array([0.0, 0.0, 0.8, 0.0, 0.0, 0.0]), np.array([0.25, 0.25, 0.25, 0.0, 0.0, 0.0])
+"""Such a push, upwards, and its standard deviations."""
+MISS_STEPS = (6, 10)
+"""It lasts at least the first, and less than the second, number of steps: about as long as fingers take to close."""
+DROP_CHANCE = 0.05
+"""Probability that what fingers have closed on is let go of on its way."""
+DROP_AFTER, DROP_STEPS = (15, 50), 8
+"""That begins at least the first, and less than the second, number of steps after they began to close, and lasts."""
+
+Array = NDArray[np.float64]
 
 
 class Perturbation:
@@ -28,18 +41,34 @@ class Perturbation:
         self._rng = rng
         self._clean = rng.random() < CLEAN
         self._left = 0
-        self._push: NDArray[np.float64] = np.zeros(3)
+        self._push: Array = np.zeros(6)
+        self._closed = 0  # steps for which the fingers have been told to close
+        self._drop = 0  # the step, counted so, at which they let go; 0: they hold
 
     def moved(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return what is executed in place of an action (7,); the gripper does as it is told. Ask once per step."""
+        """Return what is executed in place of an action (7,). Ask once per step."""
         if self._clean:
             return action
+        self._closed = self._closed + 1 if action[6] > 0 else 0
+        if self._closed == 1:
+            self._grasp()
+        elif not self._left and self._rng.random() < PUSH_CHANCE:
+            self._begin(PUSH * self._rng.normal(size=6), PUSH_STEPS)
         found = action.astype(np.float64)
         found[:6] += NOISE * self._rng.normal(size=6)
-        if not self._left and self._rng.random() < PUSH_CHANCE:
-            self._left = int(self._rng.integers(*PUSH_STEPS))
-            self._push = PUSH * self._rng.normal(size=3)
         if self._left:
-            found[:3] += self._push
+            found[:6] += self._push
             self._left -= 1
+        if 0 < self._drop <= self._closed < self._drop + DROP_STEPS:
+            found[6] = -1.0
         return found.astype(np.float32)
+
+    def _grasp(self) -> None:
+        """Decide what goes wrong with a grasp."""
+        draw = self._rng.random()
+        if draw < MISS_CHANCE:
+            self._begin(MISS + MISS_SPREAD * self._rng.normal(size=6), MISS_STEPS)
+        self._drop = int(self._rng.integers(*DROP_AFTER)) if MISS_CHANCE <= draw < MISS_CHANCE + DROP_CHANCE else 0
+
+    def _begin(self, push: Array, steps: tuple[int, int]) -> None:
+        self._push, self._left = push, int(self._rng.integers(*steps))

@@ -21,11 +21,11 @@ from lerobot_memobench.envs.episode import Episode, generator
 from lerobot_memobench.envs.observations import EXECUTION
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.rendering import RenderSettings
-from lerobot_memobench.sim.simulation import NO_OP
 from lerobot_memobench.tasks.task import Task
 
 HOLD_FRAMES = 10
-"""Frames kept after success, without motion: the last event has a frame, and a policy learns to stop."""
+"""Frames kept after success: the last event has a frame, and the expert goes on with what it is at, so that a policy
+which sees less exactly does not stop short of it."""
 
 PERTURBATION = 4
 """Stream of the episode's random numbers that decides how the arm is moved off its way."""
@@ -117,7 +117,7 @@ def record(
         idle += getattr(episode, "expert_done", False)
         over = reached or episode.done or idle > PATIENCE
         held += over
-        wanted = np.asarray(NO_OP, dtype=np.float32) if over else episode.expert_action()
+        wanted = episode.expert_action()
         acting = disturb is not None and episode.phase == EXECUTION
         episode.step(disturb.moved(wanted) if disturb is not None and acting and not over else wanted)
         tape.executed.append(episode.applied_action)

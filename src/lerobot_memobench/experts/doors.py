@@ -24,7 +24,7 @@ from lerobot_memobench.experts.hand import (
     unit,
 )
 from lerobot_memobench.experts.leaning import far, leaning, reach_lean
-from lerobot_memobench.experts.travel import LOST, Doing, Steps, let_go, rise
+from lerobot_memobench.experts.travel import LOST, Doing, Steps, let_go, pressed, rise
 from lerobot_memobench.sim.assets.asset import Articulation
 
 REACH = 0.72
@@ -151,7 +151,7 @@ def _pull_door(hand: Hand, name: str) -> Steps:
         door = door_now(hand, name)
         if wanted(door.q, articulation, True) or far(door.handle) > REACH:
             break
-        if length(hand.position - door.handle - up) > LOST:
+        if hand.empty or length(hand.position - door.handle - up) > LOST:
             break
         yield hand.toward(at(0.0, way * SWING_LEAD)(), turned(way * SWING_LEAD / 2), CLOSED, speed=0.8)
     yield from let_go(hand)
@@ -192,7 +192,7 @@ def _swung(hand: Hand, door: Door, articulation: Articulation, opening: bool) ->
         return True
     if not opening and far(door.handle + PUSH_GAP * door.outward) < REACH - 0.04:
         return True
-    return length(hand.position - door.edge) > LOST + EDGE_DEPTH
+    return hand.empty or length(hand.position - door.edge) > LOST + EDGE_DEPTH
 
 
 def _push_door(hand: Hand, name: str) -> Steps:
@@ -211,10 +211,11 @@ def _push_door(hand: Hand, name: str) -> Steps:
     yield from rise(hand, CLOSED, 0.26)
     yield from hand.move(lambda: at(PUSH_GAP, 0.15), turned, CLOSED, tolerance=0.02, turn_tolerance=0.1)
     yield from hand.move(lambda: at(PUSH_GAP), turned, CLOSED, tolerance=0.012, turn_tolerance=0.1)
+    shut = pressed(lambda: wanted(door_now(hand, name).q, articulation, False))
     for _ in range(160):
-        door = door_now(hand, name)
-        if wanted(door.q, articulation, False):
+        if shut():
             break
+        door = door_now(hand, name)
         if abs(float((hand.position - door.handle) @ door.along)) > 0.04:
             break
         yield hand.toward(at(0.01, 0.0, way * SWING_LEAD), turned(), CLOSED, speed=0.8)

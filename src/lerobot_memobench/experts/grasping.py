@@ -50,8 +50,6 @@ CLOSING_LEAD = 0.03
 """How much narrower than they are the fingers are taken to be while they close: the arm is slower than they, m."""
 SUNK = 0.002
 """How deep a thing may lie in what it rests on, m."""
-EMPTY = 0.003
-"""Opening under which the fingers hold nothing, m."""
 WIDE = 0.068
 """Width from which an object is hard to take, m."""
 RIM_LEAN = np.radians(14)
@@ -258,7 +256,8 @@ def pick(
         yield from hand.move(way.above, way.turned, OPEN, tolerance=0.012, turn_tolerance=0.08)
         yield from hand.move(way.at, way.turned, OPEN, tolerance=0.005, speed=0.6, timeout=60, give_up=way.stopped())
         yield from hand.close(way.closing, hand.rotation)
-        held = yield from _lift(hand, name)
+        # Fingers that met go back at once: what is to be learned of a miss is then not that it is lifted first.
+        held = None if hand.empty else (yield from _lift(hand, name))
         if held is not None:
             return held
         yield from hand.wait(4, OPEN)
@@ -272,7 +271,7 @@ def _lift(hand: Hand, name: str) -> Generator[NDArray[np.float32], None, Held | 
     lifted = hand.position - LIFT * hand.rotation[:, 2]
     yield from hand.move(lifted, hand.rotation, CLOSED, tolerance=0.02, speed=0.7, timeout=60)
     now, turn = hand.sim.body_pose(name)
-    if hand.sim.gripper_opening() <= EMPTY or now[2] - start[2] <= LIFT * 0.5:
+    if hand.empty or now[2] - start[2] <= LIFT * 0.5:
         return None
     position, rotation = hand.sim.eef_pose()
     return Held(name, rotation.T @ (now - position), rotation.T @ turn)

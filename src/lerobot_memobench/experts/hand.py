@@ -41,6 +41,8 @@ COMFORTABLE = 0.685
 """Distance from shoulder to wrist up to which the arm is as good as anywhere, m."""
 ELBOW_STRAIGHT = -0.42
 """Angle of the elbow above which the arm is bent the wrong way round its straight pose, rad."""
+EMPTY = 0.003
+"""Opening under which the fingers hold nothing, m."""
 LAST_JOINT_STOP = 2.75
 """How far the last joint of the arm is turned at most, rad; it turns with the hand about the fingers' direction."""
 
@@ -110,6 +112,11 @@ class Hand:
     def rotation(self) -> Array:
         """How the hand is turned, (3, 3)."""
         return self.sim.eef_pose()[1]
+
+    @property
+    def empty(self) -> bool:
+        """Whether the fingers have closed on each other."""
+        return self.sim.gripper_opening() <= EMPTY
 
     def toward(self, position: Array, rotation: Array, gripper: float, speed: float = 1.0) -> NDArray[np.float32]:
         """Return the action (7,) that brings the hand nearer to a pose."""

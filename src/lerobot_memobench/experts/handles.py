@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -10,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from lerobot_memobench.experts.grasping import ATTEMPTS, HOVER
 from lerobot_memobench.experts.hand import CLOSED, OPEN, UP, Array, Hand, cross, downward, frame, length
 from lerobot_memobench.experts.surroundings import outward_of
-from lerobot_memobench.experts.travel import LOST, Doing, Steps, let_go, rise
+from lerobot_memobench.experts.travel import LOST, Doing, Steps, let_go, pressed, rise
 from lerobot_memobench.sim.assets.asset import Articulation
 
 TILT = np.radians(35)
@@ -80,7 +81,7 @@ def _pull(hand: Hand, region: str, rotation: Array, out: Array) -> Steps:
         if q < articulation.open_below - 0.006:
             break
         handle, _ = hand.sim.site_pose(articulation.handle_site)
-        if length(hand.position - handle) > LOST:
+        if hand.empty or length(hand.position - handle) > LOST:
             break
         yield hand.toward(handle + 0.035 * out, rotation, CLOSED, speed=0.8)
 
@@ -117,10 +118,12 @@ def _come_before(hand: Hand, articulation: Articulation, rotation: Array, out: A
 
 def _push(hand: Hand, region: str, rotation: Array, out: Array) -> Steps:
     """Push a drawer by its handle until it is shut, or the fingers slip off sideways."""
+    articulation, _ = hand.sim.world.articulation(region)
+    closed_above = articulation.closed_above
+    assert closed_above is not None
+    shut = pressed(lambda: hand.sim.world.articulation(region)[1] > closed_above + 0.003)
     for _ in range(110):
-        articulation, q = hand.sim.world.articulation(region)
-        assert articulation.closed_above is not None
-        if q > articulation.closed_above + 0.003:
+        if shut():
             break
         handle, _ = hand.sim.site_pose(articulation.handle_site)
         gap = hand.position - handle
@@ -135,7 +138,7 @@ def turn_knob(hand: Hand, name: str, on: bool) -> Doing:
     on_from, off_to = articulation.on_at_least, articulation.off_below
     assert on_from is not None
     assert off_to is not None
-    aim = on_from + float(hand.rng.uniform(0.12, 0.25)) if on else off_to - 0.06
+    aim = on_from + float(hand.rng.uniform(0.12, 0.25)) if on else off_to - 0.15
 
     def reached(spare: float) -> bool:
         _, q = hand.sim.world.articulation(name)
@@ -143,7 +146,8 @@ def turn_knob(hand: Hand, name: str, on: bool) -> Doing:
 
     for _ in range(ATTEMPTS):
         yield from _take_ridge(hand, articulation)
-        yield from _twist(hand, name, aim, lambda: reached(0.08))
+        turned = partial(reached, 0.08)
+        yield from _twist(hand, name, aim, turned if on else pressed(turned))
         yield from let_go(hand, 0.10)
         if reached(0.0):
             return True
@@ -175,7 +179,7 @@ def _twist(hand: Hand, name: str, aim: float, reached: Callable[[], bool]) -> St
     grip = hand.rotation
     articulation, start = hand.sim.world.articulation(name)
     for _ in range(100):
-        if reached():
+        if reached() or hand.empty:
             break
         angle = float(Rotation.from_matrix(hand.rotation @ grip.T).as_rotvec()[2])
         lead = float(np.clip(aim - start - angle, -0.25, 0.25)) + angle

@@ -26,6 +26,10 @@ HAND_BESIDE = 0.05
 """How far the hand reaches sideways on its way, m."""
 
 
+PRESSED = 5
+"""Steps for which what has a stop is pushed on against it."""
+
+
 @dataclass
 class Held:
     """What the hand holds and how."""
@@ -42,6 +46,21 @@ def holding(hand: Hand, held: Held) -> bool:
     position, rotation = hand.sim.eef_pose()
     now, _ = hand.sim.body_pose(held.name)
     return length(rotation.T @ (now - position) - held.offset) < LOST
+
+
+def pressed(reached: Callable[[], bool]) -> Callable[[], bool]:
+    """Return what tells, asked at every step, that something has been reached for `PRESSED` steps.
+
+    Who sees a knob or a door less exactly than the expert, and ends some steps earlier, has it shut all the same.
+    """
+    since = 0
+
+    def asked() -> bool:
+        nonlocal since
+        since = since + 1 if reached() else 0
+        return since > PRESSED
+
+    return asked
 
 
 def rise(hand: Hand, gripper: float, least: float = 0.12) -> Steps:

@@ -85,8 +85,8 @@ EXPERIMENTS: dict[str, Experiment] = {
         tuple(task_names()),
         episodes=80,
         prompted_episodes=240,
-        steps=25_000,
-        settings=("policy.prompted_weight=4",),
+        steps=36_000,
+        settings=("policy.prompted_weight=3",),
         arms=ALIGNED,
     ),
 }
