@@ -12,8 +12,8 @@ from lerobot_memobench.studies.learning.experiments import PERCEPTIONS, Experime
 from lerobot_memobench.tasks.catalogue import suite_of
 from lerobot_memobench.tasks.task import STRICT
 
-SHARED = ("policy=memobench_mem", "size=small")
-"""What every policy of an experiment is told."""
+SHARED = ("policy=memobench_mem", "size=small", "save_freq=2000")
+"""What every policy of an experiment is told; a run that is killed goes on from its last checkpoint."""
 
 
 @dataclass(frozen=True)
