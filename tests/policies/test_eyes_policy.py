@@ -12,25 +12,23 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.policies import make_policy, make_pre_post_processors
+from picture_rollouts import CAMERAS, observed, refuses_pictures_in_a_batch, trained_and_acted
 from small_policy import batch_of, losses_in_training, made_for_training, small_config
 from torch.nn.functional import scaled_dot_product_attention
 from transformers.models.gemma import modeling_gemma
 
 from lerobot_memobench.datasets.memory_cache import FOLDER
-from lerobot_memobench.datasets.memory_cache.decoding import frame_reader
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.eyes.tower import GRID, POOLED, SIDE, WIDTH, Tower
 from lerobot_memobench.eyes.weights import Eyes, save_eyes
 from lerobot_memobench.policies.memobench_mem import fused_attention
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, STEPS, TOKENS
+from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.perception.eyes import seen_key
 from synthetic_dataset import LENGTHS
 
-CAMERAS = ("observation.images.image", "observation.images.wrist_image")
-STARTS = np.cumsum([0, *LENGTHS])
 FRAME_BYTES = 2 * GRID**2 * WIDTH
 ROUNDED = 2**-7
 """What bfloat16 may round off, as a share of a number."""
@@ -79,20 +77,6 @@ def looked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 def apart(one: torch.Tensor, other: torch.Tensor) -> float:
     """How far numbers are apart at most, as a share of the largest."""
     return float((one.float() - other.float()).abs().max() / other.float().abs().max())
-
-
-def observed(root: Path, dataset: Any, index: int) -> dict[str, Any]:
-    """An observation of a rollout: frame ``index`` as the dataset's videos show it."""
-    episode = int(np.searchsorted(STARTS, index, "right")) - 1
-    step = int(index - STARTS[episode])
-    row = dataset.hf_dataset[index]
-    return {
-        **{camera: frame_reader(root, camera)(episode, [step]) for camera in CAMERAS},
-        "observation.state": row["observation.state"][None],
-        "observation.step": torch.tensor([float(step)]),
-        "observation.phase": torch.ones(1),
-        "task": [dataset[index]["task"]],
-    }
 
 
 # -- settings ------------------------------------------------------------------------------------------------------
@@ -242,26 +226,15 @@ def test_pictures_that_are_changed_are_refused(root: Path, seeing: dict[str, Any
 
 
 def test_pictures_in_a_batch_are_refused(root: Path, seeing: dict[str, Any]) -> None:
-    """As LeRobot's loader processes make them, which know nothing of what was seen."""
-    policy, before, _, dataset = made_for_training(root, **seeing)
-    batch = before(torch.utils.data.default_collate([DatasetReader.get_item.__wrapped__(dataset.reader, 45)]))
-    with pytest.raises(MemobenchError, match=r"has pictures, and not what eyes saw.*--num_workers=0"):
-        policy.train().forward(batch)
+    refuses_pictures_in_a_batch(root, seeing)
 
 
 # -- training and rollouts see alike -------------------------------------------------------------------------------
 
 
 def test_a_rollout_sees_and_remembers_what_training_reads(root: Path, seeing: dict[str, Any]) -> None:
-    policy, before, _, dataset = made_for_training(root, **seeing)
-    index = int(STARTS[1]) + 14
-    trained = before(batch_of(dataset, [index]))
-    for frame in range(int(STARTS[1]), index + 1):
-        acted = before(observed(root, dataset, frame))
-        policy.observe(acted)
-    tokens, steps, mask = policy.history.gather([0])
-    assert torch.equal(steps, trained[STEPS])
-    assert torch.equal(mask, trained[MASK])
+    policy, *others = made_for_training(root, **seeing)
+    trained, acted, tokens = trained_and_acted(root, (policy, *others))
     (of_cache, _), (of_pictures, _) = (policy.perception.present(batch) for batch in (trained, acted))
     for one, other in ((trained[TOKENS], tokens), *zip(of_cache, of_pictures, strict=True)):
         assert apart(one, other) <= ROUNDED

@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
-from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.policies import make_pre_post_processors
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
+from picture_rollouts import observed, pictures_of, refuses_pictures_in_a_batch, trained_and_acted
 from small_policy import batch_of, losses_in_training, made_for_training, small_config
 
 from lerobot_memobench.datasets.memory_cache import FOLDER
-from lerobot_memobench.datasets.memory_cache.decoding import frame_reader
 from lerobot_memobench.envs.obs_types import BOTH, PIXELS, obs_type_of
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.eyes.kinds import kinds
@@ -25,14 +24,13 @@ from lerobot_memobench.eyes.tower import Tower
 from lerobot_memobench.eyes.weights import Eyes, save_eyes
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, STEPS, TOKENS
+from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.perception.found import FOUND, VIEWS
 from lerobot_memobench.sim.object_slots import SIZE, SLOTS, WIDTH
 from object_dataset import make_object_dataset
 from synthetic_dataset import LENGTHS
 
-STARTS = np.cumsum([0, *LENGTHS])
 ROUNDED = 2**-15
 """What two bfloat16 numbers leave of one, as a share of it."""
 
@@ -61,19 +59,6 @@ def root(dataset_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The dataset, in which nothing says what objects there are."""
     to = tmp_path_factory.mktemp("seen") / "data"
     return shutil.copytree(dataset_root, to, ignore=shutil.ignore_patterns(FOLDER))
-
-
-def pictures_of(root: Path, index: int) -> dict[str, torch.Tensor]:
-    episode = int(np.searchsorted(STARTS, index, "right")) - 1
-    return {name: frame_reader(root, name)(episode, [int(index - STARTS[episode])]) for name in VIEWS}
-
-
-def observed(root: Path, dataset: Any, index: int) -> dict[str, Any]:
-    """An observation of a rollout: frame ``index`` as the dataset's videos show it."""
-    step = float(index - STARTS[int(np.searchsorted(STARTS, index, "right")) - 1])
-    clock = {"observation.step": torch.tensor([step]), "observation.phase": torch.ones(1)}
-    state = {OBS_STATE: dataset.hf_dataset[index][OBS_STATE][None]}
-    return {**pictures_of(root, index), **state, **clock, "task": [dataset[index]["task"]]}
 
 
 # -- settings ------------------------------------------------------------------------------------------------------
@@ -133,22 +118,12 @@ def test_a_dataset_with_one_camera_is_refused(finding: dict[str, Any], tmp_path:
 
 
 def test_pictures_in_a_batch_are_refused(root: Path, finding: dict[str, Any]) -> None:
-    policy, before, _, dataset = made_for_training(root, **finding)
-    batch = before(torch.utils.data.default_collate([DatasetReader.get_item.__wrapped__(dataset.reader, 45)]))
-    with pytest.raises(MemobenchError, match=r"has pictures, and not what eyes saw.*--num_workers=0"):
-        policy.train().forward(batch)
+    refuses_pictures_in_a_batch(root, finding)
 
 
 def test_a_rollout_sees_and_remembers_what_training_reads(root: Path, finding: dict[str, Any]) -> None:
-    policy, before, _, dataset = made_for_training(root, **finding)
-    index = int(STARTS[1]) + 14
-    trained = before(batch_of(dataset, [index]))
-    for frame in range(int(STARTS[1]), index + 1):
-        acted = before(observed(root, dataset, frame))
-        policy.observe(acted)
-    tokens, steps, mask = policy.history.gather([0])
-    assert torch.equal(steps, trained[STEPS])
-    assert torch.equal(mask, trained[MASK])
+    policy, *others = made_for_training(root, **finding)
+    trained, acted, tokens = trained_and_acted(root, (policy, *others))
     assert torch.allclose(tokens[..., :SIZE], trained[TOKENS][..., :SIZE], rtol=ROUNDED, atol=1e-6)
     (of_cache, real), (of_pictures, shown) = (policy.perception.present(batch) for batch in (trained, acted))
     assert torch.equal(real[0], shown[0])
