@@ -132,6 +132,7 @@ def test_both_cameras_find_objects_together(
     rows = np.repeat(made_up(4), 2)
     rows["camera"][1::2] = list(CAMERAS).index("wrist")
     rows["things"]["pixels"][:, 1] = (29, 400) * 4  # the wrist shows it
+    rows["hand"] = rows["things"]["position"][:, 0]
     eyes = Eyes(small_tower().eval(), ("butter", "milk", "plate", "cork"))
     seen: dict[str, See] = {"see": perfect}
     monkeypatch.setattr(testing, "found", lambda _, sure: seen["see"](rows))
@@ -149,6 +150,7 @@ def test_both_cameras_find_objects_together(
     told, false = object_outcomes(eyes, shown(rows))
     assert np.isinf(told["error"]).all()
     assert len(false) == 12
+    assert 0 < told["near"].sum() == false["near"].sum() < 12
 
 
 def test_the_report_is_written(shown: Callable[..., Pictures], tmp_path: Path) -> None:

@@ -100,8 +100,9 @@ def _object_rows(tested: Tested) -> list[dict[str, Any]]:
     rows = []
     for scene, name in enumerate(SCENES):
         told = tested.objects[tested.objects["scene"] == scene]
-        false = int((tested.no_objects["scene"] == scene).sum())
-        for which, some in ((name, told), (f"{name}, hand within 15 cm", told[told["near"]])):
+        false = tested.no_objects[tested.no_objects["scene"] == scene]
+        near = f"{name}, hand within 15 cm"
+        for which, some, none in ((name, told, false), (near, told[told["near"]], false[false["near"]])):
             if len(some):
                 found = np.isfinite(some["error"])
                 rows.append(
@@ -111,7 +112,7 @@ def _object_rows(tested: Tested) -> list[dict[str, Any]]:
                         "found": float(found.mean()),
                         "median_cm": _rank(some["error"], 50),
                         "p90_cm": _rank(some["error"], 90),
-                        "false_per_shown": round(false / len(told), 4),
+                        "false_per_shown": round(len(none) / len(some), 4),
                         "lit": int(some["lit"].sum()),
                         "lit_right": int((some["lit"] & some["said_lit"]).sum()),
                         "lit_wrong": int((~some["lit"] & some["said_lit"]).sum()),

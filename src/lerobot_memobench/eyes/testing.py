@@ -105,13 +105,17 @@ def object_outcomes(eyes: Eyes, pictures: Pictures) -> tuple[Things, Things]:
 
 def _objects(rows: Rows, finder: ObjectFinder, finds: list[Things]) -> tuple[Things, Things]:
     """Return the outcomes of one moment, and the false ones."""
+
+    def near(where: Array) -> NDArray[np.bool_]:
+        return np.asarray(np.linalg.norm(where - rows["hand"][0], axis=1) <= NEAR)
+
     names = [list(CAMERAS)[row["camera"]] for row in rows]
     seen = finder.merged(dict(zip(names, finds, strict=True)), dict(zip(names, rows, strict=True)))
     true = {(int(one["kind"]), *one["position"]): one for row in rows for one in row["things"][: row["count"]]}
     shown = {key for row in rows for key in _shown(row)}
     told, places = np.zeros(len(true), OBJECT), np.array([one["position"] for one in true.values()]).reshape(-1, 3)
     told["kind"], told["scene"], told["error"] = [kind for kind, *_ in true], rows["scene"][0], np.inf
-    told["near"] = np.linalg.norm(places - rows["hand"][0], axis=1) <= NEAR
+    told["near"] = near(places)
     told["lit"] = [one["lit"] for one in true.values()]
     kinds = np.array([one.kind for one in seen], np.int64)
     found_at = np.array([one.place for one in seen]).reshape(-1, 3)
@@ -125,7 +129,7 @@ def _objects(rows: Rows, finder: ObjectFinder, finds: list[Things]) -> tuple[Thi
     told["error"][there], told["said_lit"][there] = off(np.flatnonzero(there), matched[there]), lit[matched[there]]
     wrong = np.setdiff1d(np.arange(len(seen)), matched)
     others = np.zeros(len(wrong), OBJECT)
-    others["kind"], others["scene"] = kinds[wrong], rows["scene"][0]
+    others["kind"], others["scene"], others["near"] = kinds[wrong], rows["scene"][0], near(found_at[wrong])
     return told[[key in shown for key in true]], others
 
 
