@@ -116,6 +116,11 @@ def test_solves_a_twin_of_each_family(name: str, variant: int) -> None:
     play(get_task(name).variant(variant), 20_000)
 
 
+def test_lets_go_of_a_bowl_that_tipped_as_it_was_grasped() -> None:
+    # It had slipped out of the fingers on its way, and fallen onto its side in the drawer.
+    play(get_task("check_the_middle_drawer_once_then_put_the_black_bowl_in_the_top_drawer"), 10_027)
+
+
 def test_leans_over_what_keeps_it_from_reaching() -> None:
     """The carton stands behind a bottle as tall: it had been reached for in vain, upright, until the end."""
     assert play(get_task(MILK), 20_034).exec_steps < 500

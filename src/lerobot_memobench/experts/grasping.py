@@ -48,6 +48,8 @@ RIM_GAP = 0.004
 """Room left between a rim and the inner finger while the hand comes down, m."""
 CLOSING_LEAD = 0.03
 """How much narrower than they are the fingers are taken to be while they close: the arm is slower than they, m."""
+TIPPED = 0.08
+"""By how much less upright a bowl may be once it is grasped, as a cosine: where fingers pressed on its rim, it slips."""
 SUNK = 0.002
 """How deep a thing may lie in what it rests on, m."""
 WIDE = 0.068
@@ -251,13 +253,15 @@ def pick(
     """
     for attempt in range(ATTEMPTS):
         way = _choose_grasp(hand, name, attempt, avoid, place)
+        upright = hand.sim.body_pose(name)[1][2, 2] if _is_rim(hand, name, way.grasp) else -1.0
         yield from rise(hand, OPEN)
         yield from travel(hand, way.above, way.turned, OPEN, target=name)
         yield from hand.move(way.above, way.turned, OPEN, tolerance=0.012, turn_tolerance=0.08)
         yield from hand.move(way.at, way.turned, OPEN, tolerance=0.005, speed=0.6, timeout=60, give_up=way.stopped())
         yield from hand.close(way.closing, hand.rotation)
         # Fingers that met go back at once: what is to be learned of a miss is then not that it is lifted first.
-        held = None if hand.empty else (yield from _lift(hand, name))
+        missed = hand.empty or hand.sim.body_pose(name)[1][2, 2] < upright - TIPPED
+        held = None if missed else (yield from _lift(hand, name))
         if held is not None:
             return held
         yield from hand.wait(4, OPEN)

@@ -24,8 +24,9 @@ SETTLING = 18
 """Control steps within which a hand comes to rest at home, once it is near."""
 HAND_BESIDE = 0.05
 """How far the hand reaches sideways on its way, m."""
-PRESSED = 5
-"""Steps for which what has a stop is pushed on against it."""
+PRESSED = 2
+"""Steps for which what has a stop is pushed on against it: fewer than the six that a policy executes of a plan, or
+whoever does not see the difference would plan them again and again."""
 
 
 @dataclass
