@@ -49,7 +49,7 @@ RIM_GAP = 0.004
 CLOSING_LEAD = 0.03
 """How much narrower than they are the fingers are taken to be while they close: the arm is slower than they, m."""
 TIPPED = 0.08
-"""By how much less upright a bowl may be once it is grasped, as a cosine: where fingers pressed on its rim, it slips."""
+"""By how much less upright a bowl may be once it is grasped, as a cosine: it slips if its rim was pressed on."""
 SUNK = 0.002
 """How deep a thing may lie in what it rests on, m."""
 WIDE = 0.068
