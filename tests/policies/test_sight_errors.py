@@ -69,6 +69,18 @@ def test_near_the_hand_things_are_found_worse() -> None:
     assert at_hand > 1.3 * far_off
 
 
+def test_what_is_lifted_is_found_too_low() -> None:
+    """Along the third-person camera's line of sight, by up to all of its height."""
+    stands, lifted = (scene(thing("butter", (0.0, 0.1, 0.909 + height))) for height in (0.0, 0.05))
+    off, higher = (errors(many(one, FAR), one).mean() for one in (stands, lifted))
+    assert higher > off + 0.01
+    seen = many(lifted, FAR)
+    there = (field(seen, "present").squeeze(-1) > 0) & (field(seen, "class").squeeze(-1) == KIND["butter"])
+    x, _, z = (field(seen, "position")[there] - lifted[0, 0, 2:5]).median(dim=0).values
+    assert -0.03 < z < -0.008
+    assert x / -z == pytest.approx(-0.6586 / (1.6103 - 0.959), rel=0.2)
+
+
 def test_how_things_lie_is_what_eyes_take_them_to() -> None:
     tilted = (0.0, 0.6, 0.8, 1.0, 0.0, 0.0)  # x axis to the side and up
     behind = (-0.8, 0.6, 0.0, -0.6, -0.8, 0.0)

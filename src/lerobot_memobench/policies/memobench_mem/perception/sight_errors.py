@@ -7,20 +7,29 @@ moved at random): 1.6 mm off in the median, 8 at the 90th percentile and 18 at t
 
 from __future__ import annotations
 
+from functools import cache
+
+import mujoco
 import torch
 from torch import Tensor
 
 from lerobot_memobench.eyes.objects import set_axis, settled
 from lerobot_memobench.policies.memobench_mem.perception.slots import in_order
+from lerobot_memobench.sim.assets.registry import build_asset, known_classes
 from lerobot_memobench.sim.object_layout import field
 from lerobot_memobench.sim.object_slots import classes
+from lerobot_memobench.sim.scene import AGENTVIEW_POSITION, TABLE_TOP
 
 PLACE, KIND_PLACE = (0.0006, 1.45), (0.00065, 1.0)
 """Error of a place in each direction, m, and by how much its size varies (spread of its logarithm): of each sight of a
 thing, and of all sights of a kind."""
 AT_HAND, AT_HAND_PLACE, HIGHER = 0.2, (0.0015, 1.2), 1.5
 """Up to how far from the hand places are found worse, m; the errors that are added there, and how many times larger
-they are in height. What is held is found up to 5 cm off, and often as if it stood on the table."""
+they are in height."""
+LOW, LOW_UP_TO = 0.35, 0.06
+"""What does not stand on the table is found too low, along the third-person camera's line of sight: of a kind, by which
+share of its height over the table (standard deviation), and up to which height that counts, m. A pan that is carried is
+found 3 cm off."""
 TURN, JOINT = (0.002, 2.0), {"drawer": (0.0025, 0.7), "door": (0.013, 0.6), "knob": (0.034, 0.6)}
 """Errors of a turn, rad, and of moving parts, m or rad."""
 MISSED, KIND_MISSED = 0.01, 0.003
@@ -43,7 +52,11 @@ def as_found(slots: Tensor, hand: Tensor, size: float) -> Tensor:
     at_hand = _error(place, *AT_HAND_PLACE) * place.new_tensor([1.0, 1.0, HIGHER])
     at_hand *= (place - hand[:, None, :3]).norm(dim=-1, keepdim=True) < AT_HAND
     of_kinds = _error(place.new_empty(len(classes()), 3), *KIND_PLACE)[kind]
-    place += size * (_error(place, *PLACE) + of_kinds + at_hand)
+    low = (LOW * torch.randn(len(classes()), device=kind.device)).abs().clamp(max=1.0)[kind]
+    height = (place[..., 2] - _standing().to(place)[kind]).clamp(0.0, LOW_UP_TO)
+    sight = place - place.new_tensor(AGENTVIEW_POSITION)
+    down = sight / -sight[..., 2:].clamp(max=-0.1) * (low * height)[..., None]
+    place += size * (_error(place, *PLACE) + of_kinds + at_hand + down)
     for name, how in JOINT.items():
         joint += size * _error(joint, *how) * (kind == classes().index(name))[..., None]
     _turn(seen, size * _error(joint, *TURN).squeeze(-1))
@@ -56,6 +69,17 @@ def as_found(slots: Tensor, hand: Tensor, size: float) -> Tensor:
 def _error(like: Tensor, size: float, spread: float) -> Tensor:
     """Return errors in the shape of ``like``: normal, and so is the logarithm of their size, one for the last axis."""
     return torch.randn_like(like) * size * (spread * torch.randn_like(like[..., :1])).exp()
+
+
+@cache
+def _standing() -> Tensor:
+    """Return where the origin of each class is as it stands on the table, m; infinite where it is no object."""
+    spec, heights = mujoco.MjSpec(), torch.full((len(classes()),), torch.inf)
+    for index, name in enumerate(classes()):
+        if name in known_classes():
+            asset = build_asset(spec, spec.worldbody, name, name)
+            heights[index] = TABLE_TOP - asset.bottom if asset.kind == "object" else torch.inf
+    return heights
 
 
 def _turn(seen: Tensor, angle: Tensor) -> None:
