@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.experts.hand import CLOSED, COMFORTABLE, OPEN, STRETCHED, Array, Hand, downward, length
+from lerobot_memobench.experts.hand import CLOSED, COMFORTABLE, OPEN, STRETCHED, Array, Hand, downward, length, unit
 from lerobot_memobench.experts.leaning import clear_of_objects, lean_from_fixtures, reach_lean
 from lerobot_memobench.experts.surroundings import (
     FINGER_REACH,
@@ -52,6 +52,9 @@ TIPPED = 0.08
 """By how much less upright a bowl may be once it is grasped, as a cosine: it slips if its rim was pressed on."""
 SUNK = 0.002
 """How deep a thing may lie in what it rests on, m."""
+FAR_SIDE = 0.15
+"""Cost of a rim's side across from the arm's foot. Two sides of a bowl are often as good, and who learns from both, not
+seeing why one was taken, puts the hand into the middle."""
 WIDE = 0.068
 """Width from which an object is hard to take, m."""
 RIM_LEAN = np.radians(14)
@@ -232,6 +235,9 @@ def _cost(way: _Approach, avoid: Array | None) -> float:
     blocked = in_the_way(hand, name, target, turn)
     cost += (0.0 if way.reaching else 2.0) + 20.0 * blocked if blocked > 0.0 else 0.0
     cost += 0.3 if way.grasp.width > WIDE else 0.0
+    if _is_rim(hand, name, way.grasp):
+        place, _ = hand.sim.body_pose(name)
+        cost += FAR_SIDE * (1.0 + float(unit(target - place) @ hand.radial(place)))
     ends = [target] if way.place is None else [target, way.place + target - hand.sim.body_pose(name)[0]]
     cost += 20.0 * max(0.0, max(hand.stretch(end, turn) for end in ends) - COMFORTABLE)
     return cost
@@ -251,15 +257,18 @@ def pick(
     Returns:
         How it is held, or None when every attempt missed.
     """
+    failed = 0
     for attempt in range(ATTEMPTS):
-        way = _choose_grasp(hand, name, attempt, avoid, place)
+        way = _choose_grasp(hand, name, failed, avoid, place)
         upright = hand.sim.body_pose(name)[1][2, 2] if _is_rim(hand, name, way.grasp) else -1.0
         yield from rise(hand, OPEN)
         yield from travel(hand, way.above, way.turned, OPEN, target=name)
         yield from hand.move(way.above, way.turned, OPEN, tolerance=0.012, turn_tolerance=0.08)
         yield from hand.move(way.at, way.turned, OPEN, tolerance=0.005, speed=0.6, timeout=60, give_up=way.stopped())
         yield from hand.close(way.closing, hand.rotation)
-        # Fingers that met go back at once: what is to be learned of a miss is then not that it is lifted first.
+        # Fingers that met go back at once, the first time to the same place: what is learned of a miss is then not that
+        # nothing is lifted first, nor that another way is tried for no reason that can be seen.
+        failed += attempt > 0 or not hand.empty
         missed = hand.empty or hand.sim.body_pose(name)[1][2, 2] < upright - TIPPED
         held = None if missed else (yield from _lift(hand, name))
         if held is not None:
