@@ -78,7 +78,7 @@ def test_white_tokens_say_what_the_others_said(small_tower: Callable[[], Tower],
         assert torch.allclose(said.mask, was.mask, atol=1e-3)
     save_eyes(eyes, tmp_path / "eyes.safetensors")
     kept = load_eyes(tmp_path / "eyes.safetensors")
-    for tower, rounding in ((eyes.tower, 1e-3), (kept.tower, 0.2)):  # the file's bfloat16 moves means: .03 to .17
+    for tower, rounding in ((eyes.tower, 1e-3), (kept.tower, 0.1)):  # the file's bfloat16 moves means
         for tokens in (tower(images), tower.pooled(tower(images))):
             rows = tokens.flatten(0, 1)
             variances = torch.linalg.eigvalsh(torch.cov(rows.T))

@@ -233,8 +233,9 @@ def test_pictures_in_a_batch_are_refused(root: Path, seeing: dict[str, Any]) -> 
 
 
 def test_a_rollout_sees_and_remembers_what_training_reads(root: Path, seeing: dict[str, Any]) -> None:
-    policy, *others = made_for_training(root, **seeing)
-    trained, acted, tokens = trained_and_acted(root, (policy, *others))
+    made = made_for_training(root, **seeing)
+    trained, acted, tokens = trained_and_acted(root, made)
+    policy = made[0]
     (of_cache, _), (of_pictures, _) = (policy.perception.present(batch) for batch in (trained, acted))
     for one, other in ((trained[TOKENS], tokens), *zip(of_cache, of_pictures, strict=True)):
         assert apart(one, other) <= ROUNDED

@@ -122,8 +122,9 @@ def test_pictures_in_a_batch_are_refused(root: Path, finding: dict[str, Any]) ->
 
 
 def test_a_rollout_sees_and_remembers_what_training_reads(root: Path, finding: dict[str, Any]) -> None:
-    policy, *others = made_for_training(root, **finding)
-    trained, acted, tokens = trained_and_acted(root, (policy, *others))
+    made = made_for_training(root, **finding)
+    trained, acted, tokens = trained_and_acted(root, made)
+    policy = made[0]
     assert torch.allclose(tokens[..., :SIZE], trained[TOKENS][..., :SIZE], rtol=ROUNDED, atol=1e-6)
     (of_cache, real), (of_pictures, shown) = (policy.perception.present(batch) for batch in (trained, acted))
     assert torch.equal(real[0], shown[0])

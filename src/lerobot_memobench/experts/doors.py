@@ -211,7 +211,7 @@ def _push_door(hand: Hand, name: str) -> Steps:
     yield from rise(hand, CLOSED, 0.26)
     yield from hand.move(lambda: at(PUSH_GAP, 0.15), turned, CLOSED, tolerance=0.02, turn_tolerance=0.1)
     yield from hand.move(lambda: at(PUSH_GAP), turned, CLOSED, tolerance=0.012, turn_tolerance=0.1)
-    shut = pressed(lambda: wanted(door_now(hand, name).q, articulation, False))
+    shut = pressed(lambda: wanted(hand.sim.world.articulation(name)[1], articulation, False))
     for _ in range(160):
         if shut():
             break

@@ -39,7 +39,7 @@ class MemobenchMemSettings(PI05Config):
     failure is from: ``nothing``, ``hand`` (what stands near the hand now), ``present`` or ``memory``."""
     sight_errors: float = 0.0
     """With which errors told objects are seen in training, so that the policy acts through ``eyes`` afterwards; 1: as
-    large as those of the package's first eyes, 0: none."""
+    large as those of the package's eyes, 0: none."""
     object_classes: list[str] | None = None
     """Names of the classes that slots were trained with, in order of their indices; none: those of this version."""
 

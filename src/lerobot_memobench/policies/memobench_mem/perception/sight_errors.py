@@ -52,10 +52,7 @@ def as_found(slots: Tensor, hand: Tensor, size: float) -> Tensor:
     at_hand = _error(place, *AT_HAND_PLACE) * place.new_tensor([1.0, 1.0, HIGHER])
     at_hand *= (place - hand[:, None, :3]).norm(dim=-1, keepdim=True) < AT_HAND
     of_kinds = _error(place.new_empty(len(classes()), 3), *KIND_PLACE)[kind]
-    low = (LOW * torch.randn(len(classes()), device=kind.device)).abs().clamp(max=1.0)[kind]
-    height = (place[..., 2] - _standing().to(place)[kind]).clamp(0.0, LOW_UP_TO)
-    sight = place - place.new_tensor(AGENTVIEW_POSITION)
-    down = sight / -sight[..., 2:].clamp(max=-0.1) * (low * height)[..., None]
+    down = _too_low(place, kind)
     place += size * (_error(place, *PLACE) + of_kinds + at_hand + down)
     for name, how in JOINT.items():
         joint += size * _error(joint, *how) * (kind == classes().index(name))[..., None]
@@ -69,6 +66,14 @@ def as_found(slots: Tensor, hand: Tensor, size: float) -> Tensor:
 def _error(like: Tensor, size: float, spread: float) -> Tensor:
     """Return errors in the shape of ``like``: normal, and so is the logarithm of their size, one for the last axis."""
     return torch.randn_like(like) * size * (spread * torch.randn_like(like[..., :1])).exp()
+
+
+def _too_low(place: Tensor, kind: Tensor) -> Tensor:
+    """Return by how much lifted things (N, SLOTS) are found too low, (N, SLOTS, 3), m, along the line of sight."""
+    share = (LOW * torch.randn(len(classes()), device=kind.device)).abs().clamp(max=1.0)[kind]
+    height = (place[..., 2] - _standing().to(place)[kind]).clamp(0.0, LOW_UP_TO)
+    sight = place - place.new_tensor(AGENTVIEW_POSITION)
+    return sight / -sight[..., 2:].clamp(max=-0.1) * (share * height)[..., None]
 
 
 @cache
