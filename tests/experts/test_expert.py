@@ -284,6 +284,16 @@ def test_seeds_differ_and_repeat() -> None:
     assert np.abs(first[:length] - other[:length]).max() > 0.05
 
 
+def test_a_prompt_ends_with_what_it_shows() -> None:
+    """An order that was followed is not gone through again: what it began with no longer holds."""
+    episode = Episode(get_task(SWAP), prompt_video=True)
+    episode.reset(10_041)
+    while episode.phase != EXECUTION:
+        episode.step(episode.expert_action())
+    assert episode.prompt_shown
+    assert episode.step_index < 800
+
+
 def test_rests_once_its_plan_is_through() -> None:
     task = get_task(STOVE)
     episode = play(task, 10_000).episode

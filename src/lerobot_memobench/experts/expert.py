@@ -80,8 +80,8 @@ class Expert:
         rng: source of small variation in speed, grasp and approach.
 
     Attributes:
-        done: the plan has come to its end; it does not end as the goal comes to hold, a moment that who learns from it
-            cannot see.
+        done: nothing is left to do: the goal holds, or the plan has come to its end. Asked on, it goes on with what it
+            was at: who learns from it cannot see the moment at which the goal comes to hold.
         succeeded: the goal held when the expert was last asked.
         hand: the arm it moves.
     """
@@ -102,12 +102,12 @@ class Expert:
         if self._started:
             # Latches and order are followed here too: what an atom says now does not tell whether a goal is reached.
             self.succeeded, *_ = self._watch.step(self.sim.holds)
+            self.done = self.done or self.succeeded
         self._started = True
-        if not self.done:
-            try:
-                return np.clip(next(self._doing), -1.0, 1.0)
-            except StopIteration:
-                self.done = True
+        try:
+            return np.clip(next(self._doing), -1.0, 1.0)
+        except StopIteration:
+            self.done = True
         return self.hand.rest(OPEN)
 
     def _plan(self) -> Doing:
