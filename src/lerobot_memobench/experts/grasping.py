@@ -239,8 +239,9 @@ def _cost(way: _Approach, avoid: Array | None) -> float:
         place, _ = hand.sim.body_pose(name)
         cost += FAR_SIDE * (1.0 + float(unit(target - place) @ hand.radial(place)))
     ends = [target] if way.place is None else [target, way.place + target - hand.sim.body_pose(name)[0]]
-    cost += 20.0 * max(0.0, max(hand.stretch(end, turn) for end in ends) - COMFORTABLE)
-    return cost
+    stretch = max(hand.stretch(end, turn) for end in ends)
+    # Beyond `STRETCHED` the hand stays short of it and closes on an edge, which slips.
+    return cost + 20.0 * max(0.0, stretch - COMFORTABLE) + 40.0 * max(0.0, stretch - STRETCHED)
 
 
 def pick(
