@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from lerobot_memobench.sim.scene import AGENTVIEW_POSITION, AGENTVIEW_QUATERNION
+from lerobot_memobench.sim.scene import AGENTVIEW_ANGLE, AGENTVIEW_POSITION, AGENTVIEW_QUATERNION
 
 Array = NDArray[np.float64]
 View = Mapping[str, Array]
@@ -18,7 +18,7 @@ HUNG_AT = (0.05, 0.0, -0.097)
 """The wrist's camera from between the finger tips, in the hand's frame, m."""
 HUNG = ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 """Its rotation in the hand's frame."""
-ANGLES = {"agentview": 45.0, "wrist": 75.0}
+ANGLES = {"agentview": AGENTVIEW_ANGLE, "wrist": 75.0}
 """Fields of view, degrees."""
 
 

@@ -50,15 +50,19 @@ class Eyes(nn.Module):
         pooled = self.pooled_heads(self.tower.pooled(tokens))
         return {"fine": self.fine_heads(self.neck(tokens, fine)), "tokens": self.heads(tokens), "pooled": pooled}
 
+    def fold(self) -> None:
+        """Make batch normalisation part of the convolutions: no more for training."""
+        self.tower.fold()
+        fold(self.neck)
+
     def find(self, images: Tensor) -> Said:
         """Say what pictures (N, 3, SIDE, SIDE) in [0, 1] show, by the finer map, which says it best."""
         return self.fine_heads(self.neck(*self.tower.looked(images)))
 
 
 def save_eyes(eyes: Eyes, path: Path) -> None:
-    """Write eyes to a file, their towers folded: they learn no more."""
-    eyes.tower.fold()
-    fold(eyes.neck)
+    """Write eyes to a file, folded: they learn no more."""
+    eyes.fold()
     tensors = {name: value.detach().to(torch.bfloat16).contiguous() for name, value in eyes.state_dict().items()}
     shape = {"widths": eyes.tower.widths, "blocks": eyes.tower.blocks, "kinds": eyes.kinds}
     write_file(path, save(tensors, {"eyes": json.dumps(shape)}))
@@ -102,8 +106,8 @@ def load_eyes(name: str | Path) -> Eyes:
         with safe_open(path, framework="pt") as file:
             shape = json.loads(file.metadata()["eyes"])
             tensors = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118 (not a dict)
-        eyes = Eyes(Tower(tuple(shape["widths"]), tuple(shape["blocks"]), folded=True), tuple(shape["kinds"]))
-        fold(eyes.neck)
+        eyes = Eyes(Tower(tuple(shape["widths"]), tuple(shape["blocks"])), tuple(shape["kinds"]))
+        eyes.fold()
         eyes.load_state_dict(tensors)
     except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
         reason = str(error).splitlines()[0]

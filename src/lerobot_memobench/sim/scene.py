@@ -22,6 +22,8 @@ AGENTVIEW = "agentview"
 
 AGENTVIEW_POSITION = (0.6586131746834771, 0.0, 1.6103500240372423)
 AGENTVIEW_QUATERNION = (0.6380177736282349, 0.3048497438430786, 0.30484986305236816, 0.6380177736282349)
+AGENTVIEW_ANGLE = 45.0
+"""Its field of view, degrees."""
 
 PHYSICS_STEP = 0.002
 CONTROL_HZ = 20
@@ -71,7 +73,8 @@ def scene_spec(task: Task) -> tuple[mujoco.MjSpec, dict[str, Asset]]:
     # robosuite's files reserve room for 5,000 contacts, 1.3 GB of addresses per simulation; no scene uses 1 MB.
     spec.nconmax, spec.njmax, spec.memory = -1, -1, ARENA_BYTES
     build_kitchen(spec)
-    spec.worldbody.add_camera(name=AGENTVIEW, pos=list(AGENTVIEW_POSITION), quat=list(AGENTVIEW_QUATERNION), fovy=45.0)
+    place, turn = list(AGENTVIEW_POSITION), list(AGENTVIEW_QUATERNION)
+    spec.worldbody.add_camera(name=AGENTVIEW, pos=place, quat=turn, fovy=AGENTVIEW_ANGLE)
     assets: dict[str, Asset] = {}
     for name, class_name in task.fixtures.items():
         if name != TABLE:
