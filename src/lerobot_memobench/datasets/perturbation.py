@@ -6,6 +6,8 @@ of the episodes stays as the expert made it.
 
 from __future__ import annotations
 
+from bisect import bisect
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,6 +28,13 @@ MISS, MISS_SPREAD = np.array([0.0, 0.0, 0.8, 0.0, 0.0, 0.0]), np.array([0.25, 0.
 """Such a push, upwards, and its standard deviations."""
 MISS_STEPS = (6, 10)
 """It lasts at least the first, and less than the second, number of steps: about as long as fingers take to close."""
+TWIST_CHANCE = 0.15
+"""Probability that it is turned away first, with open fingers: they then stop at another width than along a side. Who
+never saw that waits for them to go on."""
+TWIST = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.25])
+"""Standard deviations of such a push, per step."""
+TWIST_STEPS = (3, 6)
+"""It lasts at least the first, and less than the second, number of steps."""
 DROP_CHANCE = 0.05
 """Probability that what fingers have closed on is let go of on its way."""
 DROP_AFTER, DROP_STEPS = (15, 50), 8
@@ -43,6 +52,7 @@ class Perturbation:
         self._left = 0
         self._push: Array = np.zeros(6)
         self._closed = 0  # steps for which the fingers have been told to close
+        self._late = 0  # for how many of these they stay open
         self._drop = 0  # the step, counted so, at which they let go; 0: they hold
 
     def moved(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -59,16 +69,21 @@ class Perturbation:
         if self._left:
             found[:6] += self._push
             self._left -= 1
-        if 0 < self._drop <= self._closed < self._drop + DROP_STEPS:
+        if 0 < self._closed <= self._late or 0 < self._drop <= self._closed < self._drop + DROP_STEPS:
             found[6] = -1.0
         return found.astype(np.float32)
 
     def _grasp(self) -> None:
         """Decide what goes wrong with a grasp."""
-        draw = self._rng.random()
-        if draw < MISS_CHANCE:
+        self._late = self._drop = 0
+        which = bisect(np.cumsum([MISS_CHANCE, TWIST_CHANCE, DROP_CHANCE]).tolist(), self._rng.random())
+        if which == 0:
             self._begin(MISS + MISS_SPREAD * self._rng.normal(size=6), MISS_STEPS)
-        self._drop = int(self._rng.integers(*DROP_AFTER)) if MISS_CHANCE <= draw < MISS_CHANCE + DROP_CHANCE else 0
+        elif which == 1:
+            self._begin(TWIST * self._rng.normal(size=6), TWIST_STEPS)
+            self._late = self._left
+        elif which == 2:
+            self._drop = int(self._rng.integers(*DROP_AFTER))
 
     def _begin(self, push: Array, steps: tuple[int, int]) -> None:
         self._push, self._left = push, int(self._rng.integers(*steps))

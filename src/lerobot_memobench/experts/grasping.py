@@ -44,8 +44,11 @@ LIFT = 0.10
 """How high a thing is lifted before it is carried, m."""
 HOVER = 0.09
 """Height over a grasp at which the hand turns and aligns, m."""
-RIM_GAP = 0.004
-"""Room left between a rim and the inner finger while the hand comes down, m."""
+RIM_GAP, DEEP_GAP = 0.004, 0.012
+"""Room left between a rim and the inner finger while the hand comes down, m: on a plate, at most in a deep bowl. Who
+learns to see where the rim is needs room."""
+STEEP = 0.7
+"""How much of it there is for each metre that the finger then stands over the floor."""
 CLOSING_LEAD = 0.03
 """How much narrower than they are the fingers are taken to be while they close: the arm is slower than they, m."""
 TIPPED = 0.08
@@ -93,7 +96,9 @@ def grasp_pose(
     outward = np.zeros(3)
     if rim:
         outward = spun[:, 0] * np.sign(grasp.position[0])
-        target = target + outward * max(0.0, opening / 2 - grasp.width / 2 - RIM_GAP)
+        over = grasp.position[2] - FINGER_REACH - hand.sim.assets[name].supports
+        gap = float(np.clip(STEEP * over, RIM_GAP, DEEP_GAP))
+        target = target + outward * max(0.0, opening / 2 - grasp.width / 2 - gap)
     closing = _yaw(rotation) + spin + grasp.yaw
     if rotation[2, 2] < LYING:
         target, rim = position.copy(), False
