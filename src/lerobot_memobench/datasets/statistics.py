@@ -7,6 +7,9 @@ from numpy.typing import NDArray
 
 QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
 
+BLOCK = 16
+"""Columns of which statistics are made at once: of all, a copy in float64 for thousands of episodes is gigabytes."""
+
 Stats = dict[str, NDArray]
 
 
@@ -66,8 +69,13 @@ def numeric_stats(values: NDArray) -> Stats:
     LeRobot averages the episodes' quantiles; over a whole dataset that is no quantile. pi0.5 normalises by
     q01 and q99, so they are computed from all frames here.
     """
-    flat = values.reshape(len(values), -1).astype(np.float64)
-    stats = {"min": flat.min(0), "max": flat.max(0), "mean": flat.mean(0), "std": flat.std(0)}
-    for q, row in zip(QUANTILES, np.quantile(flat, QUANTILES, axis=0), strict=True):
-        stats[f"q{int(q * 100):02d}"] = row
+    flat = values.reshape(len(values), -1)
+    blocks = [_stats_of(flat[:, start : start + BLOCK].astype(np.float64)) for start in range(0, flat.shape[1], BLOCK)]
+    stats = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
     return stats | {"count": np.array([len(values)])}
+
+
+def _stats_of(flat: NDArray[np.float64]) -> Stats:
+    stats = {"min": flat.min(0), "max": flat.max(0), "mean": flat.mean(0), "std": flat.std(0)}
+    quantiles = np.quantile(flat, QUANTILES, axis=0, overwrite_input=True)
+    return stats | {f"q{int(q * 100):02d}": row for q, row in zip(QUANTILES, quantiles, strict=True)}
