@@ -6,8 +6,6 @@ of the episodes stays as the expert made it.
 
 from __future__ import annotations
 
-from bisect import bisect
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -52,8 +50,7 @@ class Perturbation:
         self._left = 0
         self._push: Array = np.zeros(6)
         self._closed = 0  # steps for which the fingers have been told to close
-        self._late = 0  # for how many of these they stay open
-        self._drop = 0  # the step, counted so, at which they let go; 0: they hold
+        self._open = range(0)  # the steps, counted so, in which they are open all the same
 
     def moved(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return what is executed in place of an action (7,). Ask once per step."""
@@ -69,21 +66,22 @@ class Perturbation:
         if self._left:
             found[:6] += self._push
             self._left -= 1
-        if 0 < self._closed <= self._late or 0 < self._drop <= self._closed < self._drop + DROP_STEPS:
+        if self._closed in self._open:
             found[6] = -1.0
         return found.astype(np.float32)
 
     def _grasp(self) -> None:
         """Decide what goes wrong with a grasp."""
-        self._late = self._drop = 0
-        which = bisect(np.cumsum([MISS_CHANCE, TWIST_CHANCE, DROP_CHANCE]).tolist(), self._rng.random())
-        if which == 0:
+        self._open = range(0)
+        draw = self._rng.random()
+        if draw < MISS_CHANCE:
             self._begin(MISS + MISS_SPREAD * self._rng.normal(size=6), MISS_STEPS)
-        elif which == 1:
+        elif draw < MISS_CHANCE + TWIST_CHANCE:
             self._begin(TWIST * self._rng.normal(size=6), TWIST_STEPS)
-            self._late = self._left
-        elif which == 2:
-            self._drop = int(self._rng.integers(*DROP_AFTER))
+            self._open = range(1, self._left + 1)
+        elif draw < MISS_CHANCE + TWIST_CHANCE + DROP_CHANCE:
+            first = int(self._rng.integers(*DROP_AFTER))
+            self._open = range(first, first + DROP_STEPS)
 
     def _begin(self, push: Array, steps: tuple[int, int]) -> None:
         self._push, self._left = push, int(self._rng.integers(*steps))

@@ -240,10 +240,10 @@ def _cost(way: _Approach, avoid: Array | None) -> float:
     blocked = in_the_way(hand, name, target, turn)
     cost += (0.0 if way.reaching else 2.0) + 20.0 * blocked if blocked > 0.0 else 0.0
     cost += 0.3 if way.grasp.width > WIDE else 0.0
+    position, _ = hand.sim.body_pose(name)
     if _is_rim(hand, name, way.grasp):
-        place, _ = hand.sim.body_pose(name)
-        cost += FAR_SIDE * (1.0 + float(unit(target - place) @ hand.radial(place)))
-    ends = [target] if way.place is None else [target, way.place + target - hand.sim.body_pose(name)[0]]
+        cost += FAR_SIDE * (1.0 + float(unit(target - position) @ hand.radial(position)))
+    ends = [target] if way.place is None else [target, way.place + target - position]
     stretch = max(hand.stretch(end, turn) for end in ends)
     # Beyond `STRETCHED` the hand stays short of it and closes on an edge, which slips.
     return cost + 20.0 * max(0.0, stretch - COMFORTABLE) + 40.0 * max(0.0, stretch - STRETCHED)
