@@ -37,4 +37,4 @@ def nearest(given: str, known: Iterable[str], count: int = 3) -> str:
         return "did you mean " + " or ".join(repr(word) for word in close) + "?"
     if len(words) <= 12:
         return "known are " + ", ".join(repr(word) for word in words)
-    return f"there are {len(words)} known ones"
+    return f"none of the {len(words)} known ones is near"

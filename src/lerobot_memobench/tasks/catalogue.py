@@ -100,7 +100,7 @@ def resolve_tasks(spec: str | Iterable[str], suite: str = PUBLISHED) -> list[str
             hint = nearest(word, ["all", *MEMORY_TYPES, *task_names(suite=suite)])
             raise MemobenchError(
                 f"found {word!r} among the tasks, expected 'all', a memory type ({', '.join(MEMORY_TYPES)}) "
-                f"or a task's name, {hint}"
+                f"or a task's name (`memobench tasks` lists them), {hint}"
             )
     return list(dict.fromkeys(chosen))
 
