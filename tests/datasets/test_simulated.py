@@ -40,6 +40,7 @@ from lerobot_memobench.tasks.catalogue import task_names
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
 BUTTER = "put_the_butter_into_the_bowl_from_the_prompt_video"
+COUNTING = "turn_the_stove_on_and_off_a_given_number_of_times"
 SEED = 10_000
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 FULL_RUNS = {"published": DOCS / "full_run" / "manifest.json", "strict": DOCS / "strict_run" / "manifest.json"}
@@ -170,6 +171,13 @@ def test_the_expert_finds_back_and_says_how(moved):
     undisturbed = record_demonstration(get_task(MILK), SEED + 1, images=False, referent="random")
     np.testing.assert_array_equal(undisturbed.states[: moved.exec_start], moved.states[: moved.exec_start])
     assert undisturbed.executed is None
+
+
+def test_an_arm_that_was_pushed_comes_to_rest_at_home():
+    """Or no round of a counting twin would begin there, and none would end."""
+    counted = record_demonstration(get_task(COUNTING), SEED + 1, images=False, referent="random", perturb=True)
+    assert counted.success
+    assert np.abs(counted.applied - counted.actions)[:, :6].max(axis=1).any(), "it was pushed"
 
 
 def test_a_policy_drives_for_some_steps_at_a_time(butter):

@@ -92,8 +92,12 @@ class Driver:
             action = self._policy.select_action(self._before(batch))
         self._wanted = np.clip(self._behind(action)[0].numpy(), -1.0, 1.0)
 
-    def moved(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return what is executed in place of the expert's action (7,). Ask once per step, after `look`."""
+    def moved(self, action: NDArray[np.float32], at_detent: bool = False) -> NDArray[np.float32]:
+        """Return what is executed in place of the expert's action (7,). Ask once per step, after `look`.
+
+        Args:
+            at_detent: makes no difference: a policy may leave home too soon.
+        """
         if not self._left:
             self._drives, self._left = not self._drives, int(self._rng.integers(*SPELL))
         self._left -= 1

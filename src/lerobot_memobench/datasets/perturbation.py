@@ -37,6 +37,8 @@ DROP_CHANCE = 0.05
 """Probability that what fingers have closed on is let go of on its way."""
 DROP_AFTER, DROP_STEPS = (15, 50), 8
 """That begins at least the first, and less than the second, number of steps after they began to close, and lasts."""
+COMING_TO_REST = 0.4
+"""Largest component of a displacement, at home's detent, by which an expert means to stay there (2 cm)."""
 
 Array = NDArray[np.float64]
 
@@ -52,9 +54,13 @@ class Perturbation:
         self._closed = 0  # steps for which the fingers have been told to close
         self._open = range(0)  # the steps, counted so, in which they are open all the same
 
-    def moved(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return what is executed in place of an action (7,). Ask once per step."""
-        if self._clean:
+    def moved(self, action: NDArray[np.float32], at_detent: bool = False) -> NDArray[np.float32]:
+        """Return what is executed in place of an action (7,). Ask once per step.
+
+        Args:
+            at_detent: the hand is where home catches what rests; who means to stay is let be, or it never would.
+        """
+        if self._clean or (at_detent and np.abs(action[:6]).max() <= COMING_TO_REST):
             return action
         self._closed = self._closed + 1 if action[6] > 0 else 0
         if self._closed == 1:

@@ -119,7 +119,10 @@ def record(
         held += over
         wanted = episode.expert_action()
         acting = disturb is not None and episode.phase == EXECUTION
-        episode.step(disturb.moved(wanted) if disturb is not None and acting and not over else wanted)
+        done = wanted
+        if disturb is not None and acting and not over:
+            done = disturb.moved(wanted, episode.sim.at_detent)
+        episode.step(done)
         tape.executed.append(episode.applied_action)
         tape.actions.append(np.clip(wanted, -1.0, 1.0) if acting else episode.applied_action)
     return tape.demonstration(episode, fixture_poses, success=reached and episode.prompt_shown is not False)

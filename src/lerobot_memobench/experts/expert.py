@@ -144,7 +144,10 @@ class Expert:
         """Bring one atom about, unless it is already so; for home that is not near enough."""
         hand = self.hand
         if atom.predicate == "handhome":
-            yield from motions.come_home(hand, *self.sim.home)
+            for _ in range(TRIES):  # the arm may be pushed on the way
+                yield from motions.come_home(hand, *self.sim.home)
+                if self._holds(atom):
+                    return
             return
         if self._holds(atom):
             return

@@ -262,6 +262,11 @@ class Simulation:
         """Position (3,) and rotation (3, 3) of the grip site after the scene has settled."""
         return self._start.home
 
+    @property
+    def at_detent(self) -> bool:
+        """Whether the hand is where home's detent catches it once it rests; there is one in strict scenes alone."""
+        return self._at_home is not None and self._start.at_detent()
+
     def gripper_opening(self) -> float:
         """Return the distance between the fingers, m."""
         fingers = self.data.qpos[self._finger_qpos]

@@ -79,13 +79,16 @@ class Start:
 
     def in_detent(self) -> bool:
         """Return whether the open hand has come to rest near its home, so that the detent catches it."""
+        return self.at_detent() and bool(np.all(self._speed() <= DETENT_SPEED))
+
+    def at_detent(self) -> bool:
+        """Return whether the open hand is so near its home that the detent would catch it at rest."""
         position, rotation, opening = self._hand()
         cosine = (np.trace(self._rotation.T @ rotation) - 1.0) / 2.0
         return bool(
             np.linalg.norm(position - self._position) <= DETENT_DISTANCE
             and np.arccos(np.clip(cosine, -1.0, 1.0)) <= DETENT_ANGLE
             and np.all(np.abs(opening - self._opening) <= DETENT_OPENING)
-            and np.all(self._speed() <= DETENT_SPEED)
         )
 
     def _speed(self) -> NDArray[np.float64]:
