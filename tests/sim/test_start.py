@@ -50,12 +50,12 @@ def arm(sim: Simulation) -> bytes:
 
 
 @pytest.mark.parametrize(
-    "move", [{}, {"x": 0.08}, {"y": -0.1, "z": 0.1}, {"rx": 0.1}, {"y": 0.06, "rz": -0.08}, {"z": 0.1, "grip": 1.0}]
+    "move", [{}, {"x": 0.25}, {"y": -0.2, "z": 0.2}, {"rx": 0.15}, {"y": 0.2, "rz": -0.1}, {"z": 0.2, "grip": 1.0}]
 )
 def test_a_hand_that_rests_near_home_stands_as_at_first_to_the_bit(sim: Simulation, move: dict[str, float]) -> None:
     """No policy can leave itself a note in where, or how, it stands at home."""
     first = arm(sim)
-    act(sim, 6, **move)
+    act(sim, 3, **move)
     assert (arm(sim) == first) == (not move)
     act(sim, 30)
     assert arm(sim) == first
@@ -89,14 +89,14 @@ def test_who_leaves_home_in_the_very_first_step_was_there(sim: Simulation) -> No
 
 
 def test_a_small_action_leaves_home(sim: Simulation) -> None:
-    act(sim, 3, x=0.1)
+    act(sim, 3, x=0.2)
     assert not sim.holds(HOME)
 
 
 def test_published_scenes_have_no_detent() -> None:
     sim = Simulation(get_task("open_and_close_the_microwave"))
     sim.reset(20_000)
-    act(sim, 6, x=0.08)
+    act(sim, 3, x=0.25)
     act(sim, 30)
     assert np.linalg.norm(sim.eef_pose()[0] - sim.home[0]) > 0.005
 
