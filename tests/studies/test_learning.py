@@ -62,7 +62,8 @@ def test_a_command_that_fails_is_told_and_gone_on_with(tmp_path: Path) -> None:
 def write_rollouts(folder: Path, solved: int, wrong: int, episodes: int = 10, task: str = BOWL) -> None:
     from logs import rollout
 
-    failures = ["reference_drift"] * wrong + ["storage_failure"] * (episodes - solved - wrong)
+    kinds = ("reference_drift", "wrong_place", "miscount")
+    failures = [kinds[k % len(kinds)] for k in range(wrong)] + ["storage_failure"] * (episodes - solved - wrong)
     records = [
         rollout(
             task,
@@ -78,7 +79,7 @@ def write_rollouts(folder: Path, solved: int, wrong: int, episodes: int = 10, ta
     write_episodes(folder, records)
 
 
-def test_outcomes_tell_wrong_referents_apart(tmp_path: Path) -> None:
+def test_outcomes_tell_wrong_referents_places_and_counts_apart(tmp_path: Path) -> None:
     for seed, (solved, wrong) in enumerate([(9, 1), (5, 3)]):
         write_rollouts(tmp_path / str(seed), solved, wrong)
     found = outcomes_of([read_rollouts(tmp_path / "0")[0], read_rollouts(tmp_path / "1")[0]])
@@ -137,7 +138,7 @@ def test_an_experiment_runs_its_parts_in_order(tmp_path: Path, monkeypatch: pyte
     assert f"| {MEMORYLESS} less {MEMORY} | -60.0 | " in text
     assert "| training | 4 | 1.0 | 6.0 |" in text
     assert (tmp_path / "out" / "learning.md").read_text() == text
-    assert json.loads((tmp_path / "out" / "learning.json").read_text())[MEMORYLESS][BOWL]["wrong_referent"] == 12
+    assert json.loads((tmp_path / "out" / "learning.json").read_text())[MEMORYLESS][BOWL]["wrong"] == 12
     with Image.open(tmp_path / "out" / "learning.png") as picture:
         pixels = np.asarray(picture.convert("RGB")).reshape(-1, 3)
     memory, memoryless = ((pixels == ImageColor.getrgb(colour)).all(axis=1).sum() for colour in COLOURS[:2])

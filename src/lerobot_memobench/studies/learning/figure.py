@@ -1,4 +1,4 @@
-"""The experiment as a picture: what share of rollouts each arm solved, and what share failed at a wrong referent."""
+"""The experiment as a picture: what share of rollouts each arm solved, and what share was wrong about what was seen."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def draw(arms: Mapping[str, Mapping[str, Outcome]], path: Path) -> Path:
     axis.spines[["top", "right"]].set_visible(False)
     handles = [plt.Rectangle((0, 0), 1, 1, color=COLOURS[place % len(COLOURS)]) for place in range(len(arms))]
     handles.append(plt.Rectangle((0, 0), 1, 1, color=WRONG, alpha=0.35))
-    labels = [*arms, "failed at a wrong referent"]
+    labels = [*arms, "failed at a wrong referent, place or count"]
     columns = len(labels) if sum(map(len, labels)) < 72 else 2  # what the figure is wide enough for
     figure.legend(handles, labels, loc="outside upper center", ncols=columns, fontsize=9, frameon=False)
     with draft_of(path) as draft:
@@ -56,7 +56,7 @@ def scopes_of(found: Mapping[str, Outcome]) -> list[str]:
 
 
 def _draw_bar(axis: Any, at: float, height: float, outcome: Outcome, place: int) -> None:
-    """Draw one arm: solved, wrong referents behind it, and the interval of the first."""
+    """Draw one arm: solved, what was wrong behind it, and the interval of the first."""
     solved = 100 * (outcome.success.value or 0.0)
     low, high = (100 * bound for bound in outcome.success.interval or (0.0, 0.0))
     axis.barh(at, solved, height, color=COLOURS[place % len(COLOURS)])

@@ -1,4 +1,4 @@
-"""What the rollouts of an experiment show: success, and of the failures, how many took a wrong referent."""
+"""What the rollouts of an experiment show: success, and of the failures, how many were wrong about what was seen."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ from lerobot_memobench.evaluation.metrics.rates import Rate, mean_rate, success_
 from lerobot_memobench.evaluation.metrics.rollouts import Record, by_task
 from lerobot_memobench.studies.learning.contrasts import Runs
 from lerobot_memobench.tasks.failures import REFERENCE_DRIFT
-from lerobot_memobench.tasks.task import MEMORY_TYPES
+from lerobot_memobench.tasks.task import MEMORY_TYPES, STRICT_FAILURES
+
+WRONG = (REFERENCE_DRIFT, *STRICT_FAILURES)
+"""Failures that are a memory's and no hand's: a wrong referent, place or count."""
 
 
 @dataclass(frozen=True)
@@ -20,7 +23,7 @@ class Outcome:
     Attributes:
         success: over all rollouts, or the mean of tasks.
         of_seeds: the same of each training seed.
-        wrong: rollouts that failed with a wrong referent. others: that failed otherwise.
+        wrong: rollouts that failed with a wrong referent, place or count. others: that failed otherwise.
     """
 
     success: Rate
@@ -30,7 +33,7 @@ class Outcome:
 
     @property
     def wrong_share(self) -> float:
-        """What share of rollouts failed with a wrong referent, tasks averaged as in ``success``, about."""
+        """What share of rollouts failed as ``wrong`` ones, tasks averaged as in ``success``, about."""
         failures = self.wrong + self.others
         return (1 - _value(self.success)) * self.wrong / failures if failures else 0.0
 
@@ -55,7 +58,7 @@ def _outcome(runs: Sequence[Sequence[Sequence[Record]]]) -> Outcome:
     """Put together the rollouts of one or several tasks, (training seed, task, rollout)."""
     tasks = [[record for run in runs for record in run[k]] for k in range(len(runs[0]))]
     failures = [record.get("failure") for group in tasks for record in group if not record["success"]]
-    wrong = failures.count(REFERENCE_DRIFT)
+    wrong = sum(failure in WRONG for failure in failures)
     return Outcome(
         success=mean_rate([success_rate(group) for group in tasks]),
         of_seeds=tuple(_value(mean_rate([success_rate(group) for group in run])) for run in runs),
@@ -92,7 +95,7 @@ def _figures(outcome: Outcome) -> dict[str, Any]:
         "interval": [low, high],
         "rollouts": outcome.success.n,
         "of_seeds": list(outcome.of_seeds),
-        "wrong_referent": outcome.wrong,
+        "wrong": outcome.wrong,
         "wrong_share": outcome.wrong_share,
         "other_failures": outcome.others,
     }
