@@ -36,6 +36,9 @@ Doing = Generator[NDArray[np.float32], None, None]
 
 TRIES = 3
 """How often a thing is picked up and placed before the plan goes on without it."""
+LINGER = 10
+"""Control steps for which it stays at home between two events: who learns from a hand that turns there in a single step
+learns to turn short of it."""
 REPAIRS = 3
 """How often the goal is gone through again when something in it does not hold at the end."""
 
@@ -130,9 +133,12 @@ class Expert:
     def _take(self, step: Step) -> Doing:
         """Bring an atom about, or rest at home."""
         if isinstance(step, Atom):
+            came = step.predicate == "handhome" and not self._holds(step)
             yield from self.achieve(step)
-            return
-        for _ in range(step.number):
+            rest = LINGER if came else 0
+        else:
+            rest = step.number
+        for _ in range(rest):
             yield self.hand.toward(*self.sim.home, OPEN)
 
     def _holds(self, atom: Atom) -> bool:
