@@ -15,6 +15,7 @@ from lerobot_memobench.policies.memobench_mem.alignment.objectives import Alignm
 from lerobot_memobench.policies.memobench_mem.averaging import WeightAverage
 from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, PHASE, STEPS, TOKENS, MemoryBatch
 from lerobot_memobench.policies.memobench_mem.perception.eyes import SEEN
+from lerobot_memobench.policies.memobench_mem.quick_products import begin_quick_products, end_quick_products
 from lerobot_memobench.policies.memobench_mem.seeing import SeeingPolicy
 from lerobot_memobench.policies.memobench_mem.training_curve import TrainingCurve
 
@@ -48,6 +49,7 @@ class LearningPolicy(SeeingPolicy):
 
     def update(self) -> None:
         """Called by lerobot-train after each optimiser step: move the average of the weights."""
+        end_quick_products()
         if self.average is not None:
             self.average.update()
 
@@ -69,6 +71,8 @@ class LearningPolicy(SeeingPolicy):
         self._require_memory(batch)
         if self._averages and self.average is None and self.training:
             self.average = self._new_average()
+        if self.training and self._device.type == "cpu":
+            begin_quick_products()
         with self.precision.computing(self._device):
             memory = self._read_memory(batch)
             per_sample, total, logged = self._action_loss(batch)

@@ -1,0 +1,67 @@
+"""Products in bfloat16 while a policy learns: when they are on, and that the same is learned."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from small_policy import batch_of, made_for_training
+
+from lerobot_memobench.policies.memobench_mem import learning
+from lerobot_memobench.policies.memobench_mem.quick_products import end_quick_products
+from object_dataset import make_object_dataset
+
+OBJECTS = {"perception": "objects", "size": "small", "n_action_steps": 3, "memory_stride": 1, "width": 256}
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_object_dataset(tmp_path_factory.mktemp("objects") / "data")
+
+
+@pytest.fixture(autouse=True)
+def put_back() -> Iterator[None]:
+    end_quick_products()
+    yield
+    end_quick_products()
+
+
+def settings() -> tuple[str, bool]:
+    return torch.backends.mkldnn.matmul.fp32_precision, torch.backends.cuda.flash_sdp_enabled()
+
+
+def test_they_are_on_from_a_forward_pass_to_its_update(root: Path) -> None:
+    policy, before, _, dataset = made_for_training(root, **OBJECTS)
+    batch = before(batch_of(dataset, [10, 30, 50]))
+    usual = settings()
+    policy.eval().forward(batch)
+    assert settings() == usual, "what measures a loss computes as everywhere"
+    for _ in range(2):  # two batches for one update
+        policy.train().forward(batch)[0].backward()
+        assert settings() == ("bf16", False)
+    policy.update()
+    assert settings() == usual
+    policy.update()
+    assert settings() == usual
+
+
+def test_the_same_is_learned(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gradients point the same way as with products in float32; where a CPU has none in bfloat16 they are equal."""
+    policy, before, _, dataset = made_for_training(root, **OBJECTS | {"align": "semantic"})
+    batch = before(batch_of(dataset, list(range(8, 38)) * 8))
+    found = []
+    for on in (True, False):
+        if not on:
+            monkeypatch.setattr(learning, "begin_quick_products", lambda: None)
+        policy.zero_grad()
+        loss, _ = policy.train().forward(batch)
+        loss.backward()
+        policy.update()
+        learned = [weight.grad for weight in policy.get_optim_params() if weight.grad is not None]
+        gradients = torch.cat([gradient.flatten() for gradient in learned])
+        found.append((loss.item(), gradients))
+    (quick, quick_gradients), (usual, gradients) = found
+    assert quick == pytest.approx(usual, rel=2e-3)
+    assert torch.cosine_similarity(quick_gradients, gradients, dim=0) > 0.999
