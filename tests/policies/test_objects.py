@@ -14,6 +14,7 @@ from lerobot.datasets import EpisodeAwareSampler
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.policies import make_pre_post_processors
+from lerobot.utils.constants import OBS_ENV_STATE
 from small_policy import batch_of, losses_in_training, made_for_training, small_config
 
 import object_dataset
@@ -27,6 +28,7 @@ from lerobot_memobench.policies.memobench_mem.execution_frames import (
 )
 from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, STEPS, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from lerobot_memobench.sim.object_layout import WIDTH as SLOT_WIDTH
 from object_dataset import LENGTHS, PROMPTS, make_object_dataset
 
 OBJECTS: dict[str, Any] = {"perception": "objects", "size": "small", "n_action_steps": 3, "memory_stride": 1}
@@ -342,14 +344,31 @@ def test_the_present_is_the_same_in_training_and_in_a_rollout(root: Path) -> Non
     trained, acted = before(batch_of(dataset, [index])), before(observed(dataset, index, task=dataset[index]["task"]))
     words = ("observation.language.tokens", "observation.language.attention_mask")
     prefixes = [
-        policy.model.embed_prefix(*policy._preprocess_images(batch), *(batch[key] for key in words))
-        for batch in (trained, acted)
+        policy.train(learning).model.embed_prefix(*policy._preprocess_images(batch), *(batch[key] for key in words))
+        for batch, learning in ((trained, True), (acted, False))
     ]
-    for one, other in zip(*prefixes, strict=True):
-        assert torch.equal(one, other)
-    embeddings, real, _ = prefixes[0]
-    assert real.sum() == 3 + 1 + trained[words[1]].sum(), "three things, the state and the words"
-    assert embeddings.shape[1] == 16 + 1 + trained[words[1]].sum()
+    seen = [embeddings[real] for embeddings, real, _ in prefixes]
+    torch.testing.assert_close(*seen, rtol=1e-6, atol=1e-6)
+    count = trained[words[1]].sum()
+    assert len(seen[0]) == 3 + 1 + count, "three things, the state and the words"
+    assert [embeddings.shape[1] for embeddings, *_ in prefixes] == [3 + 1 + count, 16 + 1 + count]
+
+
+def test_a_batch_to_learn_from_has_the_slots_of_its_fullest_sample(root: Path) -> None:
+    """The same is learned as with all slots, and of a batch in which nothing is seen, too."""
+    policy, before, _, dataset = made_for_training(root, **OBJECTS)
+    batch = before(batch_of(dataset, [20, 44]))
+    fewer = batch | {OBS_ENV_STATE: batch[OBS_ENV_STATE].clone()}
+    fewer[OBS_ENV_STATE][0, SLOT_WIDTH:] = 0.0
+    nothing = batch | {OBS_ENV_STATE: torch.zeros_like(batch[OBS_ENV_STATE])}
+    assert [policy.train().perception.present(seen)[1][0].shape for seen in (batch, fewer, nothing)] == [
+        (2, 3),
+        (2, 3),
+        (2, 1),
+    ]
+    losses = [policy.train(learning).forward(fewer, reduction="none")[0] for learning in (True, False)]
+    torch.testing.assert_close(*losses, rtol=1e-4, atol=1e-5)
+    assert torch.isfinite(policy.train().forward(nothing)[0])
 
 
 def test_no_memory_is_nothing_in_training_and_in_a_rollout(root: Path) -> None:

@@ -60,7 +60,7 @@ def item(frames: RecordedFrames, meta: Any, deltas: dict[str, list[int]], number
         wanted = number + torch.tensor(deltas[name])
         found[f"{name}_is_pad"] = (wanted < first) | (wanted >= end)
         found[name] = frames.columns[name][wanted.clamp(first, end - 1)]
-    found["task"] = meta.tasks.iloc[int(found["task_index"])].name
+    found["task"] = meta.tasks.index[int(found["task_index"])]
     return found
 
 

@@ -8,12 +8,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import torch
 from lerobot.processor import ProcessorStepRegistry, TokenizerProcessorStep
 from tokenizers import Regex, Tokenizer
 from tokenizers.models import WordLevel
 from tokenizers.normalizers import Lowercase
 from tokenizers.pre_tokenizers import Split
 from tokenizers.processors import TemplateProcessing
+from torch import Tensor
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.processing.training_run import training_run
@@ -82,6 +84,13 @@ class WordTokenizerProcessorStep(TokenizerProcessorStep):
             self.vocabulary = extend(self.vocabulary, run.prompt_texts(), run.config.dimensions.vocabulary)
         self.tokenizer = make_word_tokenizer(self.vocabulary)
         super().__post_init__()
+
+    def _tokenize_text(self, text: str | list[str]) -> dict[str, Tensor]:
+        """Do as LeRobot does, with each of the texts once: the samples of a batch share a few instructions."""
+        texts = [text] if isinstance(text, str) else text
+        row = {different: number for number, different in enumerate(dict.fromkeys(texts))}
+        rows = torch.tensor([row[text] for text in texts])
+        return {name: of_different[rows] for name, of_different in super()._tokenize_text([*row]).items()}
 
     def get_config(self) -> dict[str, Any]:
         """Return what the processor file holds, the words included."""

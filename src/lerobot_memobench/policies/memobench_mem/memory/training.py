@@ -17,7 +17,7 @@ class CachedEpisode:
     def load(self, slots: Sequence[int]) -> list[Frame]:
         """Read these frames, and no others, from the cache's file."""
         tokens = self.cache.tokens(self.episode, slots)
-        return [Frame(slot * self.cache.meta.stride, seen) for slot, seen in zip(slots, tokens, strict=True)]
+        return [Frame(slot * self.cache.meta.stride, seen) for slot, seen in zip(slots, tokens.unbind(), strict=True)]
 
 
 def recall_at(cache: FrameLookup, mechanism: MemoryMechanism, episode: int, frame: int) -> list[Frame]:

@@ -89,11 +89,17 @@ class ObjectPerception(nn.Module, Perception):
         self.slot = SlotEncoder(self.order, self.kinds, 2 * width, width)
 
     def present(self, batch: Mapping[str, Tensor]) -> Seen:
-        """Return what is seen now: slots and hand (B, SIZE + 6), and which slots hold something (B, SLOTS)."""
+        """Return what is seen now: slots and hand (B, n WIDTH + 6), and which of the n slots hold something (B, n).
+
+        A batch to learn from has as many slots as the fullest of its samples; elsewhere there are all of them, so that
+        what is done does not depend on what else is in the batch.
+        """
         slots = batch[OBS_ENV_STATE].to(torch.float32).unflatten(1, (SLOTS, WIDTH))
         hand = batch[OBS_RAW_STATE][:, :HAND_DIM].to(slots)
         if self.training and self.errors:
             slots = as_found(slots, hand, self.errors)
+        if self.training:
+            slots = slots[:, : max(1, int((slots[..., 0] > 0).sum(dim=1).max()))]
         return [torch.cat([slots.flatten(1), hand], dim=1)], [slots[..., 0] > 0]
 
     def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
@@ -104,9 +110,9 @@ class ObjectPerception(nn.Module, Perception):
         return frame_row(slots, state.to(slots), phase.to(slots))
 
     def prefix(self, observed: Tensor) -> Tensor:
-        """Return a token (B, SLOTS, d_vlm) per slot of what `present` returns; zeros for empty ones."""
-        slots, hand = observed.split([SIZE, HAND_DIM], dim=1)
-        made, there = self.slot(slots.unflatten(1, (SLOTS, WIDTH)), hand)
+        """Return a token (B, n, d_vlm) per slot of what `present` returns; zeros for empty ones."""
+        slots, hand = observed[:, :-HAND_DIM], observed[:, -HAND_DIM:]
+        made, there = self.slot(slots.unflatten(1, (-1, WIDTH)), hand)
         return in_slots(made * LOUD, there)
 
     def memory(self, encoder: nn.Module) -> nn.Module:
