@@ -15,13 +15,18 @@ import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
+from lerobot.processor import TokenizerProcessorStep
 from safetensors.torch import load_file, save_file
 from small_policy import CHUNK, batch_of, made_for_training, small_config
 
 from lerobot_memobench.datasets.memory_cache import MemoryCache, find_cache
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.language.text_encoders import WordTextEncoder
-from lerobot_memobench.policies.memobench_mem.language.tokenizer import make_vocabulary, make_word_tokenizer
+from lerobot_memobench.policies.memobench_mem.language.tokenizer import (
+    WordTokenizerProcessorStep,
+    make_vocabulary,
+    make_word_tokenizer,
+)
 from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import sample_frames
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.processing.gather_memory import GatherMemoryProcessorStep
@@ -483,6 +488,16 @@ def test_word_tokenizer() -> None:
         "<unk>",
     ]
     assert len(make_vocabulary((f"word{i}" for i in range(5000)), 1024)) == 1024
+
+
+def test_texts_that_come_again_are_tokenized_as_by_lerobot() -> None:
+    texts = ["put the bowl away", "wait", "put the bowl away", "wait", "put it away"]
+    step = WordTokenizerProcessorStep(vocabulary=make_vocabulary(texts, 1024), max_length=8, padding="max_length")
+    found, lerobots = step._tokenize_text(texts), TokenizerProcessorStep._tokenize_text(step, texts)
+    assert [*found] == [*lerobots]
+    for name, expected in lerobots.items():
+        assert torch.equal(found[name], expected)
+    assert torch.equal(step._tokenize_text("wait")["input_ids"], found["input_ids"][1:2])
 
 
 def test_word_text_encoder_tells_texts_apart() -> None:
