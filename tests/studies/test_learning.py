@@ -182,8 +182,8 @@ def test_what_is_told_in_training_is_told_in_rollouts(tmp_path: Path, monkeypatc
 @pytest.mark.parametrize(
     ("perception", "trained", "rolled_out"),
     [
-        ("objects", {"perception=objects", "steps=1000"}, set()),
-        ("found", {"perception=objects", "policy.sight_errors=1", "steps=1000"}, {"eyes=package"}),
+        ("objects", {"perception=objects", "steps=1600"}, set()),
+        ("found", {"perception=objects", "policy.sight_errors=1", "steps=1600"}, {"eyes=package"}),
         ("pixels", {"perception=pixels", "steps=2000"}, set()),
     ],
 )

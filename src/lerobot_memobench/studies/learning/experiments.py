@@ -79,7 +79,7 @@ def experiment(name: str, perception: str = OBJECTS) -> Experiment:
 
 
 EXPERIMENTS: dict[str, Experiment] = {
-    "bowl": Experiment((BOWL,), episodes=120, steps=1000, pixel_steps=2000, seeds=3),
+    "bowl": Experiment((BOWL,), episodes=120, steps=1600, pixel_steps=2000, seeds=3),
     "prompted": Experiment(prompted(), episodes=240, steps=12_000, arms=ALIGNED),
     "joint": Experiment(
         tuple(task_names()),
