@@ -26,11 +26,10 @@ from lerobot_memobench.policies.memobench_mem import learning
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.freed_memory import keep_freed_memory
 from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, STEPS, TOKENS
-from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import sample_frames
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_RAW_STATE, frame_row
 from lerobot_memobench.sim.object_slots import SIZE, SLOTS, WIDTH
-from policies import config, training_batch, updates
+from policies import config, remembered, training_batch, updates
 
 REMEMBERED, THINGS = 50, 10
 """Frames that are remembered of an episode of 400 steps, and things in each."""
@@ -78,10 +77,7 @@ def object_batch(settings: MemobenchMemConfig, episodes: int, moments: int) -> d
     """Return a preprocessed training batch of some moments of each of some episodes."""
     torch.manual_seed(0)
     rows, frames = episodes * moments, settings.memory_frames
-    numbers = torch.full((rows, frames), -1)
-    for row in range(rows):
-        read = torch.tensor(sample_frames(int(torch.randint(REMEMBERED // 3, REMEMBERED, ())), frames))
-        numbers[row, : len(read)] = row // moments * REMEMBERED + read
+    numbers = remembered(rows, moments, frames, REMEMBERED)
     mask = numbers >= 0
     count = episodes * REMEMBERED
     stored = frame_row(scene(count), torch.randn(count, 8), torch.ones(count))

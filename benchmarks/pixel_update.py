@@ -25,10 +25,9 @@ from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import
 from lerobot_memobench.policies.memobench_mem.freed_memory import keep_freed_memory
 from lerobot_memobench.policies.memobench_mem.fused_attention import attend_fused
 from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, STEPS, TOKENS
-from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import sample_frames
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.perception.eyes import seen_key
-from policies import config, training_batch, updates
+from policies import config, remembered, training_batch, updates
 
 SLOTS = 50
 """Remembered frames of an episode: its prompt, and an execution of 250 steps."""
@@ -59,10 +58,7 @@ def pixel_batch(settings: MemobenchMemConfig, episodes: int, moments: int) -> di
     """Return a preprocessed training batch of some moments of each of some episodes."""
     torch.manual_seed(0)
     rows, frames = episodes * moments, settings.memory_frames
-    numbers = torch.full((rows, frames), -1)
-    for row in range(rows):
-        read = torch.tensor(sample_frames(int(torch.randint(SLOTS // 3, SLOTS, ())), frames))
-        numbers[row, : len(read)] = row // moments * SLOTS + read
+    numbers = remembered(rows, moments, frames, SLOTS)
     mask = numbers >= 0
     stored = torch.randn(episodes * SLOTS, POOLED**2, WIDTH).to(torch.bfloat16)
     batch = {key: value for key, value in training_batch(settings, rows).items() if "images" not in key}

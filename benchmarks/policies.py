@@ -12,6 +12,7 @@ from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TO
 
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.dimensions import SIZES, Gemma, Vision
+from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import sample_frames
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 
 # A size between tiny and pi05 that a CPU can train, with the full size's proportions: 256 patches per image, a VLM
@@ -77,6 +78,15 @@ def observation(settings: MemobenchMemConfig, rows: int) -> dict[str, torch.Tens
         OBS_LANGUAGE_TOKENS: tokens,
         OBS_LANGUAGE_ATTENTION_MASK: torch.arange(length).expand(rows, -1) < min(length, 60),
     }
+
+
+def remembered(rows: int, moments: int, frames: int, kept: int) -> torch.Tensor:
+    """Numbers (rows, frames) of the frames that some moments of each episode read, of ``kept`` ones; -1 where none."""
+    numbers = torch.full((rows, frames), -1)
+    for row in range(rows):
+        read = torch.tensor(sample_frames(int(torch.randint(kept // 3, kept, ())), frames))
+        numbers[row, : len(read)] = row // moments * kept + read
+    return numbers
 
 
 def training_batch(settings: MemobenchMemConfig, rows: int) -> dict[str, torch.Tensor]:

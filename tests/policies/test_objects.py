@@ -348,7 +348,7 @@ def test_the_present_is_the_same_in_training_and_in_a_rollout(root: Path) -> Non
         for batch, learning in ((trained, True), (acted, False))
     ]
     seen = [embeddings[real] for embeddings, real, _ in prefixes]
-    torch.testing.assert_close(*seen, rtol=1e-6, atol=1e-6)
+    assert torch.equal(*seen)
     count = trained[words[1]].sum()
     assert len(seen[0]) == 3 + 1 + count, "three things, the state and the words"
     assert [embeddings.shape[1] for embeddings, *_ in prefixes] == [3 + 1 + count, 16 + 1 + count]
