@@ -32,7 +32,13 @@ def settings() -> tuple[str, bool]:
     return torch.backends.mkldnn.matmul.fp32_precision, torch.backends.cuda.flash_sdp_enabled()
 
 
-def test_they_are_on_from_a_forward_pass_to_its_update(root: Path) -> None:
+@pytest.mark.parametrize(
+    ("capable", "quick"), [({"avx512_bf16": True}, True), ({"amx_bf16": True}, True), ({"avx512_bf16": False}, False)]
+)
+def test_they_are_on_from_a_forward_pass_to_its_update(
+    root: Path, capable: dict[str, bool], quick: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capable)
     policy, before, _, dataset = made_for_training(root, **OBJECTS)
     batch = before(batch_of(dataset, [10, 30, 50]))
     usual = settings()
@@ -40,7 +46,7 @@ def test_they_are_on_from_a_forward_pass_to_its_update(root: Path) -> None:
     assert settings() == usual, "what measures a loss computes as everywhere"
     for _ in range(2):  # two batches for one update
         policy.train().forward(batch)[0].backward()
-        assert settings() == ("bf16", False)
+        assert settings() == (("bf16", False) if quick else usual)
     policy.update()
     assert settings() == usual
     policy.update()
