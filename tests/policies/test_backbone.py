@@ -7,7 +7,7 @@ import torch
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from lerobot.policies.pi05.modeling_pi05 import PI05Pytorch
 
-from lerobot_memobench.policies.memobench_mem.backbone import SizedPI05
+from lerobot_memobench.policies.memobench_mem.backbone import InstructionCondition, SizedPI05
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory_pi05 import MemoryPI05
 from lerobot_memobench.policies.memobench_mem.perception.slots import HAND_DIM
@@ -236,3 +236,19 @@ def test_the_tower_without_weights_is_the_same_every_time() -> None:
     assert tokens.dtype == torch.bfloat16
     assert torch.equal(tokens, second(images))
     assert tokens.float().std(dim=0).mean() > 0.05  # images are told apart
+
+
+@pytest.mark.parametrize(("places", "told"), [(0, False), (2, True), (6, True)])
+def test_the_order_of_words_is_told_where_it_is_asked_for(places: int, told: bool) -> None:
+    torch.manual_seed(0)
+    instruction = InstructionCondition(8, 16, places)
+    words = torch.randn(1, 4, 8)
+    real = torch.tensor([[True, True, True, False]])
+    exchanged = words[:, [1, 0, 2, 3]]
+    others = torch.cat([words[:, :3], torch.randn(1, 1, 8)], dim=1)
+    said = []
+    for each in (words, exchanged, others):
+        instruction.read(each, real)
+        said.append(instruction())
+    assert torch.equal(said[0], said[2]), "padding is not said"
+    assert torch.allclose(said[0], said[1], atol=1e-6) is not told

@@ -89,6 +89,7 @@ def test_small_brings_its_recipe_and_leaves_it_to_the_user(tmp_path: Path) -> No
         ({"sight_errors": 1.0}, "use --policy.perception=objects"),
         ({"size": "small", "perception": "objects", "told_objects": "hand"}, "or name --policy.eyes too"),
         ({"told_objects": "hands"}, "no told_objects 'hands'.*'hand'"),
+        ({"size": "tiny", "word_order": True}, "size=tiny perception=pixels; leave it out"),
     ],
 )
 def test_bad_values_are_refused(fields: dict[str, Any], message: str) -> None:
@@ -294,7 +295,7 @@ def test_statistics_are_those_of_execution_frames(root: Path) -> None:
         {"align": "contrastive"},
         {"align": "framewise"},
         {"align": "framewise", "integration": "context", "tokens_per_frame": 3},
-        {"integration": "none", "oracle_memory": True},
+        {"integration": "none", "oracle_memory": True, "word_order": True},
         {"size": "tiny", "memory_stride": 2},
     ],
     ids=lambda fields: "-".join(map(str, fields.values())),

@@ -15,6 +15,7 @@ from einops import rearrange, repeat
 from lerobot.policies.pi05.modeling_pi05 import GemmaConfig, PaliGemmaWithExpertModel, PI05Pytorch
 from lerobot.policies.pi_gemma import PaliGemmaForConditionalGenerationWithPiGemma, PiGemmaForCausalLM
 from torch import Tensor, nn
+from torch.nn.functional import pad, rms_norm
 
 from lerobot_memobench.eyes.tower import Tower
 from lerobot_memobench.eyes.weights import load_eyes
@@ -130,17 +131,25 @@ class InstructionCondition(nn.Module):
     Attention alone has to find the one word that tells two tasks apart. On six tasks of one cabinet, one microwave and
     one stove, 2,000 updates, the loss was 2 % lower with it and 28 of 30 rollouts were solved, not 24 (one training
     seed, and seeds that settings may be chosen by).
+
+    Args:
+        places: of how many words, from the first, the order counts: each place weighs the numbers of its word, so that
+            "the top, then the middle" has another mean than "the middle, then the top". 0: order is not told.
     """
 
-    def __init__(self, words_dim: int, width: int) -> None:
+    def __init__(self, words_dim: int, width: int, places: int) -> None:
         super().__init__()
         self.mlp = nn.Sequential(nn.Linear(words_dim, width), nn.SiLU(), nn.Linear(width, width))
+        self.places = nn.Parameter(torch.randn(places, words_dim)) if places else None
         self.said: Tensor | None = None
 
     def read(self, words: Tensor, real: Tensor) -> None:
         """Begin a pass with these words (B, n, D), of which ``real`` (B, n) are no padding."""
+        if self.places is not None:
+            words = words * (1 + pad(self.places, (0, 0, 0, words.shape[1] - len(self.places))))  # or cropped
         weights = real.unsqueeze(-1).to(words.dtype)
-        self.said = (words * weights).sum(dim=1) / weights.sum(dim=1).clamp(min=1)
+        said = (words * weights).sum(dim=1) / weights.sum(dim=1).clamp(min=1)
+        self.said = said if self.places is None else rms_norm(said, said.shape[-1:])
 
     def forward(self) -> Tensor:
         """Return what is added to the condition (B, width)."""
@@ -165,7 +174,8 @@ class SizedPI05(PI05Pytorch):
         self.time_mlp_out = nn.Linear(width, width)
         seen = config.dimensions.vlm.width
         self.state_token = StateToken(config.max_state_dim, seen) if config.state_token else None
-        self.instruction = InstructionCondition(seen, width) if config.state_token else None
+        places = config.dimensions.tokenizer_max_length if config.word_order else 0
+        self.instruction = InstructionCondition(seen, width, places) if config.state_token else None
 
     def embed_suffix(self, noisy_actions: Tensor, timestep: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """LeRobot's action tokens, their masks, and the condition of the expert's norms."""

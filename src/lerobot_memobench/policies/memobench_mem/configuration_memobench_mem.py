@@ -89,6 +89,7 @@ class MemobenchMemConfig(MemobenchMemSettings):
         super().__post_init__()
         self._check_numbers()
         self._check_perception()
+        self._check_word_order()
         self._check_objective()
         self._check_alignment()
 
@@ -133,6 +134,13 @@ class MemobenchMemConfig(MemobenchMemSettings):
             raise MemobenchError(f"--policy.width={self.width} must be a multiple of 16, for 8 heads of even width.")
         if self.depth is not None and self.depth < 1:
             raise MemobenchError(f"--policy.depth={self.depth} must be at least 1.")
+
+    def _check_word_order(self) -> None:
+        if self.word_order and not self.state_token:
+            raise MemobenchError(
+                f"--policy.word_order=true is for policies whose state enters as numbers, and not for size={self.size} "
+                f"perception={self.perception}; leave it out, or use --policy.size=small."
+            )
 
     def _check_numbers(self) -> None:
         counts = ("memory_frames", "memory_stride", "n_action_steps", "tokens_per_frame", "moments_per_episode")
