@@ -221,6 +221,7 @@ def generation(request: dict[str, Any]) -> list[str]:
         "--seed-base": request["seed_base"],
         "--referent": None if request["referent"] == DRAWN else request["referent"],
         "--image-size": request["image_size"] if request["images"] else None,
+        "--policy": (request.get("policy") or "").rpartition(" ")[0] or None,  # told with a hash of its weights
     }
     flags = {"--perturb": request["perturb"], "--no-images": not request["images"]}
     flags["--no-prompt-video"] = not request["prompt_video"]

@@ -138,6 +138,8 @@ def test_a_card_tells_how_the_demonstrations_were_made(script: ModuleType, tmp_p
     strict = {**request, "tasks": task_names(suite="strict"), "referent": "drawn"}
     assert script.generation(strict)[:6] == ["--tasks", "all", "--suite", "strict", "--episodes", "3"]
     assert "--referent" not in script.generation(strict)
+    moved = script.generation({**strict, "policy": "outputs/my policy 0123456789abcdef"})
+    assert moved[moved.index("--policy") + 1] == "outputs/my policy"
 
 
 def test_the_card_tells_of_the_errors_of_eyes(
