@@ -3,10 +3,9 @@
     python benchmarks/pixel_update.py [--moments 6] [--episodes 12] [--repeats 5]
 
 The batch has several moments of each episode, which remember many of the same frames. The other side attends by
-LeRobot's eager attention and encodes each moment's memory by itself. Without a memory only the attention differs, and
-where a CPU multiplies bfloat16 itself (`lscpu | grep -E 'avx512_bf16|amx_bf16'`) nothing does. An update is forward,
-backward, clipping, AdamW and the weight average, on one thread; seconds are of the CPU. Prints one JSON line: ratio
-(other side / as it is made) and seconds.
+LeRobot's eager attention and encodes each moment's memory by itself. Without a memory only the attention differs. An
+update is forward, backward, clipping, AdamW and the weight average, on one thread; seconds are of the CPU. Prints one
+JSON line: ratio (other side / as it is made) and seconds.
 """
 
 from __future__ import annotations

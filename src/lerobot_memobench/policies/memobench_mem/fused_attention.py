@@ -2,8 +2,7 @@
 
 LeRobot's pi0.5 attends by Hugging Face's ``eager_attention_forward``, which keeps a weight for each pair of tokens: of
 72 samples with two pictures 56 MB in a layer, which come from the system page by page. torch's kernel keeps none and
-takes a third of the time. It rounds otherwise, so what acts goes on with LeRobot's; and so do updates with quick
-products, which leave that kernel out.
+takes a third of the time. It rounds otherwise, so what acts goes on with LeRobot's.
 """
 
 from __future__ import annotations
@@ -15,8 +14,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import scaled_dot_product_attention
 from transformers.models.gemma import modeling_gemma
-
-from lerobot_memobench.policies.memobench_mem.quick_products import products_are_quick
 
 MARK = "learns_fused"
 """Attribute of the attention modules that it is for."""
@@ -35,7 +32,7 @@ def attend_fused(model: nn.Module) -> None:
     def attention(
         module: nn.Module, query: Tensor, key: Tensor, value: Tensor, mask: Tensor | None, scaling: float, **more: Any
     ) -> tuple[Tensor, Tensor | None]:
-        if products_are_quick() or not (hasattr(module, MARK) and torch.is_grad_enabled()):
+        if not (hasattr(module, MARK) and torch.is_grad_enabled()):
             weighed: tuple[Tensor, Tensor] = original(module, query, key, value, mask, scaling, **more)
             return weighed
         key, value = (modeling_gemma.repeat_kv(kept, module.num_key_value_groups) for kept in (key, value))

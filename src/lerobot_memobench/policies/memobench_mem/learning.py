@@ -71,7 +71,7 @@ class LearningPolicy(SeeingPolicy):
         self._require_memory(batch)
         if self._averages and self.average is None and self.training:
             self.average = self._new_average()
-        if self.training and self._device.type == "cpu":
+        if self.training and self._device.type == "cpu" and not self.config.sees_tokens:
             begin_quick_products()
         with self.precision.computing(self._device):
             memory = self._read_memory(batch)
