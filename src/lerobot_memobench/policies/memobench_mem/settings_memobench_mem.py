@@ -42,10 +42,10 @@ class MemobenchMemSettings(PI05Config):
     large as those of the package's eyes, 0: none."""
     object_classes: list[str] | None = None
     """Names of the classes that slots were trained with, in order of their indices; none: those of this version."""
-
     word_order: bool = False
     """Whether the action expert's norms are told in which order an instruction's words stand, and not only which words
     (`backbone.InstructionCondition`): for tasks whose instruction says one. Not where the state enters as words."""
+
     base_weights: str | None = None
     """Folder or repository of pi0.5 weights to start from (e.g. ``lerobot/pi05_base``); none: from scratch."""
 
