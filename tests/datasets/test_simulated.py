@@ -186,7 +186,9 @@ def test_a_policy_drives_for_some_steps_at_a_time(butter):
     assert driven.success
     off = np.abs(driven.applied - driven.actions)
     np.testing.assert_array_equal(butter.states[: driven.exec_start], driven.states[: driven.exec_start])
-    assert not off[:, 6].any(), "the fingers do as the expert says"
+    late = off[:, 6] > 0
+    assert (driven.applied[late, 6] > 0).all(), "fingers open as the expert says, or later"
+    assert (driven.applied[np.flatnonzero(late) - 1, 6] > 0).all()
     driving = off[driven.exec_start : -HOLD_FRAMES, :6].max(axis=1) > 0
     assert 0.2 < driving.mean() < 0.9
     changes = int(np.abs(np.diff(driving.astype(int))).sum())
@@ -223,9 +225,12 @@ def test_a_third_of_the_episodes_stays_clean():
 
 
 def test_some_grasps_miss_and_some_are_lost():
-    """A third is clean; of the other closings a fifth is pushed up, 15 % turned and late, a twentieth let go of."""
+    """A third is clean; of the other closings a fifth is pushed up, 15 % turned and late, a twentieth let go of.
+
+    And of what is opened then a fifth opens late.
+    """
     opens, closes = np.array([0, 0, 0, 0, 0, 0, -1], np.float32), np.array([0, 0, 0, 0, 0, 0, 1], np.float32)
-    up, late, lost = 0, 0, 0
+    up, late, lost, shut = 0, 0, 0, 0
     for seed in range(1500):
         moves = Perturbation(np.random.default_rng(seed))
         assert moves.moved(opens)[6] < 0
@@ -237,9 +242,13 @@ def test_some_grasps_miss_and_some_are_lost():
         lost += len(let_go) > 0
         assert len(let_go) in (0, 8)
         assert not (let_go < 8).any(), "once it holds"
+        stays = np.flatnonzero([moves.moved(opens)[6] > 0 for _ in range(20)])
+        shut += len(stays) > 0
+        assert len(stays) == 0 or (3 <= len(stays) < 16 and stays[-1] == len(stays) - 1)
     assert 0.08 < up / 1500 < 0.2
     assert 0.06 < late / 1500 < 0.15
     assert 0.02 < lost / 1500 < 0.05
+    assert 0.09 < shut / 1500 < 0.18
 
 
 def test_replay_agrees_on_moved_arms_and_seen_objects(moved, tmp_path):

@@ -2,10 +2,23 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from lerobot_memobench.experts.hand import DOWN, EASY_CLOSING, cross, downward, frame, length, unit
+from lerobot_memobench.experts.hand import (
+    DOWN,
+    EASY_CLOSING,
+    LATE,
+    OPEN,
+    Hand,
+    cross,
+    downward,
+    frame,
+    length,
+    unit,
+)
 
 
 @pytest.fixture
@@ -39,3 +52,21 @@ def test_downward_closes_along_the_angle_the_easy_way_round(yaw: float) -> None:
     np.testing.assert_allclose(turn[:, 2], DOWN, atol=1e-12)
     assert abs(turn[:, 0] @ [np.cos(yaw), np.sin(yaw), 0.0]) == pytest.approx(1.0)
     assert turn[:, 0] @ EASY_CLOSING > -1e-9
+
+
+@pytest.mark.parametrize(("kept_shut", "most"), [(0, 3), (9, 12), (500, LATE)])
+def test_fingers_that_open_late_are_waited_for(
+    kept_shut: int, most: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three steps in which they are told to open count; those in which something kept them shut do not."""
+    told = iter([1.0] * (kept_shut + 1) + [0.75, 0.5, 0.25])
+    sim = SimpleNamespace(eef_pose=lambda: (np.zeros(3), np.eye(3)), command=1.0)
+    sim.gripper_command = lambda: sim.command
+    monkeypatch.setattr(Hand, "toward", lambda self, position, rotation, gripper: np.full(7, gripper, np.float32))
+    actions = []
+    next(told)
+    for action in Hand(sim, rng).open(3):
+        actions.append(action)
+        sim.command = next(told)
+    assert len(actions) == most
+    assert {float(action[6]) for action in actions} == {OPEN}

@@ -86,6 +86,8 @@ def test_small_brings_its_recipe_and_leaves_it_to_the_user(tmp_path: Path) -> No
         ({"size": "small", "perception": "objects", "prompted_weight": 0.0}, "prompted_weight=0.0 must be above 0"),
         ({"prompted_weight": 3.0}, r"balance_tasks=0.0\)"),
         ({"size": "small", "perception": "objects", "sight_errors": -1.0}, "sight_errors=-1.0 must not be negative"),
+        ({"size": "small", "perception": "objects", "sight_errors": 1.0, "sight_errors_share": 0.0}, "must be above 0"),
+        ({"size": "small", "perception": "objects", "sight_errors_share": 0.5}, "or set these too"),
         ({"sight_errors": 1.0}, "use --policy.perception=objects"),
         ({"size": "small", "perception": "objects", "told_objects": "hand"}, "or name --policy.eyes too"),
         ({"told_objects": "hands"}, "no told_objects 'hands'.*'hand'"),

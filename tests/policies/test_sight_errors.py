@@ -7,7 +7,13 @@ import pytest
 import torch
 
 from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_RAW_STATE, FramePool, ObjectPerception
-from lerobot_memobench.policies.memobench_mem.perception.sight_errors import FALSE, KIND_MISSED, MISSED, as_found
+from lerobot_memobench.policies.memobench_mem.perception.sight_errors import (
+    FALSE,
+    KIND_MISSED,
+    MISSED,
+    SightErrors,
+    as_found,
+)
 from lerobot_memobench.sim.object_layout import field
 from lerobot_memobench.sim.object_slots import SIZE, SLOTS, WIDTH, classes, in_slots
 
@@ -112,8 +118,14 @@ def test_slots_stay_in_order_and_empty_ones_empty() -> None:
     assert as_found(torch.zeros(2, SLOTS, WIDTH), FAR.expand(2, -1), 1.0).eq(0).all(), "of nothing, nothing"
 
 
+def test_a_share_of_the_frames_is_seen_with_errors() -> None:
+    torch.manual_seed(3)
+    seen = SightErrors(1.0, share=0.25).seen(TABLE.expand(2000, -1, -1), FAR.expand(2000, -1))
+    assert (seen != TABLE).flatten(1).any(dim=1).float().mean() == pytest.approx(0.25, abs=0.04)
+
+
 def test_only_what_learns_sees_errors() -> None:
-    perception = ObjectPerception(classes(), 2, 32, errors=1.0)
+    perception = ObjectPerception(classes(), 2, 32, SightErrors(1.0))
     batch = {"observation.environment_state": TABLE.reshape(1, SIZE), OBS_RAW_STATE: FAR}
     memory = perception.memory(torch.nn.Identity())
     pool = memory.pool

@@ -1,7 +1,8 @@
 """A trained policy drives for some steps at a time: demonstrations of how to go on from where it brings the arm.
 
 What is learned at each frame is what the expert does there (DAgger, Ross et al. 2011); what was executed is kept for
-replay. The policy moves the arm alone: the fingers do as the expert says, or its plan would be left behind.
+replay. The policy moves the arm, and fingers that are shut stay so while it keeps them shut. Else they do as the expert
+says, or its plan would be left behind.
 """
 
 from __future__ import annotations
@@ -62,6 +63,7 @@ class Driver:
         self._rng = rng
         self._drives, self._left = bool(rng.random() < 0.5), 0
         self._wanted: NDArray[np.float32] = np.zeros(7, np.float32)
+        self._shut = False  # the fingers were last told to close
 
     def look(self, episode: Episode, seen: NDArray[np.float32], pictures: dict[str, NDArray[np.uint8]] | None) -> None:
         """Show the policy the present frame: the visible objects, and the cameras where they are recorded.
@@ -101,4 +103,6 @@ class Driver:
         if not self._left:
             self._drives, self._left = not self._drives, int(self._rng.integers(*SPELL))
         self._left -= 1
-        return np.append(self._wanted[:6], action[6]).astype(np.float32) if self._drives else action
+        fingers = self._wanted[6] if self._drives and self._shut and self._wanted[6] > 0 else action[6]
+        self._shut = bool(fingers > 0)
+        return np.append((self._wanted if self._drives else action)[:6], fingers).astype(np.float32)

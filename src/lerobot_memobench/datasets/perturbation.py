@@ -37,6 +37,9 @@ DROP_CHANCE = 0.05
 """Probability that what fingers have closed on is let go of on its way."""
 DROP_AFTER, DROP_STEPS = (15, 50), 8
 """That begins at least the first, and less than the second, number of steps after they began to close, and lasts."""
+LATE_CHANCE, LATE_STEPS = 0.2, (3, 16)
+"""Probability that fingers stay shut, told to open: for at least the first, and less than the second, number
+of steps. Who never saw a hand that stands where it should have let go stands there for ever."""
 COMING_TO_REST = 0.4
 """Largest component of a displacement, at home's detent, by which an expert means to stay there (2 cm)."""
 
@@ -53,6 +56,7 @@ class Perturbation:
         self._push: Array = np.zeros(6)
         self._closed = 0  # steps for which the fingers have been told to close
         self._open = range(0)  # the steps, counted so, in which they are open all the same
+        self._late = 0  # steps for which they stay shut, told to open
 
     def moved(self, action: NDArray[np.float32], at_detent: bool = False) -> NDArray[np.float32]:
         """Return what is executed in place of an action (7,). Ask once per step.
@@ -62,7 +66,10 @@ class Perturbation:
         """
         if self._clean or (at_detent and np.abs(action[:6]).max() <= COMING_TO_REST):
             return action
+        opens = self._closed > 0 and action[6] < 0
         self._closed = self._closed + 1 if action[6] > 0 else 0
+        if opens:
+            self._late = int(self._rng.integers(*LATE_STEPS)) if self._rng.random() < LATE_CHANCE else 0
         if self._closed == 1:
             self._grasp()
         elif not self._left and self._rng.random() < PUSH_CHANCE:
@@ -74,6 +81,9 @@ class Perturbation:
             self._left -= 1
         if self._closed in self._open:
             found[6] = -1.0
+        elif self._late and action[6] < 0:
+            found[6] = 1.0
+            self._late -= 1
         return found.astype(np.float32)
 
     def _grasp(self) -> None:

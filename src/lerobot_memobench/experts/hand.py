@@ -43,6 +43,8 @@ ELBOW_STRAIGHT = -0.42
 """Angle of the elbow above which the arm is bent the wrong way round its straight pose, rad."""
 EMPTY = 0.003
 """Opening under which the fingers hold nothing, m."""
+LATE = 40
+"""Most steps for which fingers are told to open, before the hand goes on."""
 LAST_JOINT_STOP = 2.75
 """How far the last joint of the arm is turned at most, rad; it turns with the hand about the fingers' direction."""
 
@@ -219,6 +221,17 @@ class Hand:
         position, rotation = self.sim.eef_pose()
         for _ in range(steps):
             yield self.toward(position, rotation, gripper)
+
+    def open(self, steps: int) -> Motion:
+        """Open the fingers at rest for some steps; such in which they were kept shut all the same do not count."""
+        position, rotation = self.sim.eef_pose()
+        for _ in range(LATE):
+            before = self.sim.gripper_command()
+            yield self.toward(position, rotation, OPEN)
+            now = self.sim.gripper_command()
+            steps -= now < before or now <= OPEN
+            if steps == 0:
+                return
 
     def close(
         self, position: Target | None = None, rotation: Array | None = None, least: int = 8, most: int = 24

@@ -50,7 +50,7 @@ def open_drawer(hand: Hand, region: str) -> Doing:
         yield from _take_handle(hand, articulation, tilt)
         rotation = _at_handle(hand, articulation, tilt)[2]
         yield from _pull(hand, region, rotation, out)
-        yield from hand.wait(6, OPEN)
+        yield from hand.open(6)
         back = _off_handle(hand, articulation, tilt, 0.09)
         yield from hand.move(back, rotation, OPEN, tolerance=0.02, turn_tolerance=1.0, timeout=50)
         _, q = hand.sim.world.articulation(region)

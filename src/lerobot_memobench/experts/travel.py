@@ -112,7 +112,7 @@ def _load(hand: Hand, held: Held | None) -> tuple[float, float, tuple[str, ...]]
 
 def let_go(hand: Hand, height: float = 0.12) -> Steps:
     """Open the fingers and go straight up, clear of what was held."""
-    yield from hand.wait(6, OPEN)
+    yield from hand.open(6)
     up = hand.position + height * UP
     yield from hand.move(up, hand.rotation, OPEN, tolerance=0.02, turn_tolerance=1.0, timeout=50)
 
@@ -123,7 +123,7 @@ def release(hand: Hand, up: float = 0.12) -> Steps:
     The hand rises while the fingers still open: fully open inside a bowl they would press against its wall and take
     it along.
     """
-    yield from hand.wait(3, OPEN)
+    yield from hand.open(3)
     target = hand.position + up * UP
     yield from hand.move(target, hand.rotation, OPEN, tolerance=0.02, turn_tolerance=1.0, speed=0.7, timeout=60)
 

@@ -22,7 +22,7 @@ from lerobot_memobench.sim import robot
 Array = NDArray[np.float64]
 
 
-_CLOSING = np.array([-1.0, 1.0])
+CLOSING = np.array([-1.0, 1.0])
 """Sign of the fingers' commands that closes them."""
 
 
@@ -130,7 +130,7 @@ class OSCController:
 
     def gripper_change(self, gripper_action: float) -> Array:
         """Return by how much the fingers' command moves in one physics step, (2,)."""
-        change: Array = _CLOSING * (self.config.gripper_speed * np.sign(gripper_action))
+        change: Array = CLOSING * (self.config.gripper_speed * np.sign(gripper_action))
         return change
 
     def advance(self, data: mujoco.MjData, gripper_action: float, substeps: int) -> None:

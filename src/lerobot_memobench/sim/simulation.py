@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.compiled_controller import make_controller
+from lerobot_memobench.sim.controller import CLOSING
 from lerobot_memobench.sim.placement import Placement, Placer
 from lerobot_memobench.sim.rendering import Highlight, Image, Renderer, RenderSettings, get_renderer
 from lerobot_memobench.sim.scene import AGENTVIEW, SUBSTEPS, get_scene, state_size
@@ -271,6 +272,10 @@ class Simulation:
         """Return the distance between the fingers, m."""
         fingers = self.data.qpos[self._finger_qpos]
         return float(fingers[0] - fingers[1])
+
+    def gripper_command(self) -> float:
+        """Return what the fingers are told, from −1 (open) to 1 (closed): an action changes it by a quarter."""
+        return float(self._controller.gripper @ CLOSING) / 2
 
     def body_pose(self, name: str) -> tuple[Array, Array]:
         """Return position (3,) and rotation (3, 3) of an instance or body."""

@@ -28,6 +28,7 @@ from lerobot_memobench.policies.memobench_mem.perception.frozen import VISION_SE
 from lerobot_memobench.policies.memobench_mem.perception.objects import LOUD, ObjectPerception
 from lerobot_memobench.policies.memobench_mem.perception.perception import Perception
 from lerobot_memobench.policies.memobench_mem.perception.pixels import PixelPerception
+from lerobot_memobench.policies.memobench_mem.perception.sight_errors import SightErrors
 from lerobot_memobench.sim.object_slots import classes
 
 
@@ -96,7 +97,7 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
         config.object_classes = config.object_classes or list(classes())
         shape = config.object_classes, config.tokens_per_frame, config.dimensions.vlm.width
         if config.eyes is None:
-            return ObjectPerception(*shape, config.sight_errors)
+            return ObjectPerception(*shape, SightErrors(config.sight_errors, config.sight_errors_share))
         return FoundObjects(ObjectsInPictures(load_eyes(config.eyes)), *shape, config.told_objects)
 
     def _set_requires_grad(self) -> None:

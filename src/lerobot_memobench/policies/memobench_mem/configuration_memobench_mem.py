@@ -167,6 +167,11 @@ class MemobenchMemConfig(MemobenchMemSettings):
                 f"--policy.sight_errors={self.sight_errors} must not be negative, and are errors of slots: leave it "
                 "out, or use --policy.perception=objects."
             )
+        if not 0 < self.sight_errors_share <= 1 or (self.sight_errors_share < 1 and not self.sight_errors):
+            raise MemobenchError(
+                f"--policy.sight_errors_share={self.sight_errors_share} must be above 0 and at most 1, and is a share "
+                "of the frames, seen with --policy.sight_errors; leave it out, or set these too."
+            )
         if self.perception == "pixels" and self.tokens_per_frame != GRID**2:
             raise MemobenchError(
                 f"--policy.tokens_per_frame={self.tokens_per_frame} is not supported: frames are pooled to a "

@@ -40,6 +40,8 @@ class MemobenchMemSettings(PI05Config):
     sight_errors: float = 0.0
     """With which errors told objects are seen in training, so that the policy acts through ``eyes`` afterwards; 1: as
     large as those of the package's eyes, 0: none."""
+    sight_errors_share: float = 1.0
+    """Which share of the frames is seen so; the others as they are told: a policy for both."""
     object_classes: list[str] | None = None
     """Names of the classes that slots were trained with, in order of their indices; none: those of this version."""
     word_order: bool = False

@@ -15,7 +15,7 @@ from torch.nn.functional import rms_norm
 
 from lerobot_memobench.policies.memobench_mem.perception.perception import Perception, Seen
 from lerobot_memobench.policies.memobench_mem.perception.pooled_memory import PooledMemory
-from lerobot_memobench.policies.memobench_mem.perception.sight_errors import as_found
+from lerobot_memobench.policies.memobench_mem.perception.sight_errors import TOLD, SightErrors
 from lerobot_memobench.policies.memobench_mem.perception.slots import HAND_DIM, SlotEncoder
 from lerobot_memobench.sim.object_slots import SIZE, SLOTS, WIDTH, classes
 
@@ -44,7 +44,7 @@ class FramePool(nn.Module):
     to it. At unit size, 400 updates chose the right one of three bowls at 85 % of moments, instead of at 58 %.
     """
 
-    def __init__(self, order: Sequence[int], kinds: int, tokens: int, width: int, errors: float = 0.0) -> None:
+    def __init__(self, order: Sequence[int], kinds: int, tokens: int, width: int, errors: SightErrors = TOLD) -> None:
         super().__init__()
         self.errors = errors
         self.slot = SlotEncoder(order, kinds, width, width)
@@ -56,8 +56,8 @@ class FramePool(nn.Module):
         """Return tokens (N, tokens, width) of frames (N, 1, SIZE + 6 + 1)."""
         slots, hand, phase = frames.flatten(1).split([SIZE, HAND_DIM, 1], dim=1)
         slots = slots.unflatten(1, (SLOTS, WIDTH))
-        if self.training and self.errors:
-            slots = as_found(slots, hand, self.errors)
+        if self.training:
+            slots = self.errors.seen(slots, hand)
         made, there = self.slot(slots, hand)
         score = self.score(made)
         # A finite score keeps a frame in which nothing is seen finite: it becomes zeros.
@@ -73,7 +73,7 @@ class ObjectPerception(nn.Module, Perception):
     Args:
         trained: names of the classes that it knows, in order of their indices.
         tokens_per_frame: memory tokens of a frame. width: of all tokens.
-        errors: with which slots are seen while it learns (`sight_errors`); 1 is as eyes err.
+        errors: with which slots are seen while it learns.
     """
 
     remembers = OBS_ENV_STATE
@@ -81,7 +81,7 @@ class ObjectPerception(nn.Module, Perception):
     grid = 0
     pictures = False
 
-    def __init__(self, trained: Sequence[str], tokens_per_frame: int, width: int, errors: float = 0.0) -> None:
+    def __init__(self, trained: Sequence[str], tokens_per_frame: int, width: int, errors: SightErrors = TOLD) -> None:
         super().__init__()
         self.tokens_per_frame, self.dim, self.errors = tokens_per_frame, width, errors
         self.order = [trained.index(name) if name in trained else len(trained) for name in classes()]
@@ -96,9 +96,8 @@ class ObjectPerception(nn.Module, Perception):
         """
         slots = batch[OBS_ENV_STATE].to(torch.float32).unflatten(1, (SLOTS, WIDTH))
         hand = batch[OBS_RAW_STATE][:, :HAND_DIM].to(slots)
-        if self.training and self.errors:
-            slots = as_found(slots, hand, self.errors)
         if self.training:
+            slots = self.errors.seen(slots, hand)
             slots = slots[:, : max(1, int((slots[..., 0] > 0).sum(dim=1).max()))]
         return [torch.cat([slots.flatten(1), hand], dim=1)], [slots[..., 0] > 0]
 

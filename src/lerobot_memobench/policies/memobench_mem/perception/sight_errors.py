@@ -8,6 +8,7 @@ moved at random): 1.6 mm off in the median, 8 at the 90th percentile and 18 at t
 from __future__ import annotations
 
 from functools import cache
+from typing import NamedTuple
 
 import mujoco
 import torch
@@ -37,6 +38,29 @@ MISSED, KIND_MISSED = 0.01, 0.003
 FALSE, SECOND_NAME, MISNAMED, ASTRAY = 0.6, 0.8, 0.015, 0.06
 """Things found at a moment that are none: which share of them is a second name for one that is, where the others are
 that thing once more and elsewhere; and how far from it both are, m."""
+
+
+class SightErrors(NamedTuple):
+    """With which errors slots are seen in training.
+
+    Attributes:
+        size: of the errors; 1 is as the package's eyes err, 0 none.
+        share: of the frames that are seen so; the others are seen as they are told.
+    """
+
+    size: float = 0.0
+    share: float = 1.0
+
+    def seen(self, slots: Tensor, hand: Tensor) -> Tensor:
+        """Return slots (N, SLOTS, WIDTH) as they are seen beside a hand (N, >= 3)."""
+        if not self.size:
+            return slots
+        wrong = torch.rand(len(slots), 1, 1, device=slots.device) < self.share
+        return torch.where(wrong, as_found(slots, hand, self.size), slots)
+
+
+TOLD = SightErrors()
+"""None: things are seen as they are told."""
 
 
 def as_found(slots: Tensor, hand: Tensor, size: float) -> Tensor:
