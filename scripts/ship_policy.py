@@ -25,7 +25,7 @@ from lerobot_memobench.engine.policy_identity import ELSEWHERE, encoded, trainin
 from lerobot_memobench.envs.episode_log import MERGED_FILE
 from lerobot_memobench.evaluation.documents.report import REPORT_JSON
 from lerobot_memobench.files import file_hash, write_file
-from lerobot_memobench.policies.checkpoint import SHIPPED, WEIGHTS_FILE, checkpoint_folder
+from lerobot_memobench.policies.checkpoint import SHIPPED, WEIGHTS_FILE, checkpoint_folder, shipped_policies
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import DRAWN
@@ -221,12 +221,18 @@ def generation(request: dict[str, Any]) -> list[str]:
         "--seed-base": request["seed_base"],
         "--referent": None if request["referent"] == DRAWN else request["referent"],
         "--image-size": request["image_size"] if request["images"] else None,
-        "--policy": (request.get("policy") or "").rpartition(" ")[0] or None,  # told with a hash of its weights
+        "--policy": driver(request),
     }
     flags = {"--perturb": request["perturb"], "--no-images": not request["images"]}
     flags["--no-prompt-video"] = not request["prompt_video"]
     given = [str(word) for option in options.items() if option[1] is not None for word in option]
     return given + [flag for flag, meant in flags.items() if meant]
+
+
+def driver(request: dict[str, Any]) -> str | None:
+    """Return the policy that moved the arm, as a command names it; None if none did."""
+    name, _, _ = (request.get("policy") or "").rpartition(" ")  # told with a hash of its weights
+    return (name if name in shipped_policies() else place(name)) if name else None
 
 
 def results(name: str, rollouts: Path) -> list[str]:

@@ -230,6 +230,15 @@ def test_tasks_with_a_prompt_have_a_number_of_their_own(tasks, recorded, tmp_pat
         run([tasks[0], shown], tmp_path / "ds", episodes=1, images=False)
 
 
+@pytest.mark.parametrize("where", ["mine", "mine/checkpoints/000100/pretrained_model", "mine/pretrained_model"])
+def test_a_driving_policy_is_told_by_the_name_of_its_run(tmp_path, where):
+    (tmp_path / where).mkdir(parents=True)
+    (tmp_path / where / "model.safetensors").write_bytes(b"weights")
+    name, _, digest = generation.policy_told(str(tmp_path / where)).partition(" ")
+    assert name == "mine"
+    assert digest == hashlib.sha256(b"weights").hexdigest()[:16]
+
+
 @pytest.mark.parametrize("arguments", [{"episodes": 0}, {"prompted_episodes": 0}, {"workers": 0}])
 def test_nothing_to_do(tasks, recorded, tmp_path, arguments):
     with pytest.raises(MemobenchError, match="each must be at least 1"):

@@ -140,6 +140,7 @@ def test_a_card_tells_how_the_demonstrations_were_made(script: ModuleType, tmp_p
     assert "--referent" not in script.generation(strict)
     moved = script.generation({**strict, "policy": "outputs/my policy 0123456789abcdef"})
     assert moved[moved.index("--policy") + 1] == "outputs/my policy"
+    assert script.driver({"policy": "memobench_small 0123456789abcdef"}) == "memobench_small"
 
 
 def test_the_card_tells_of_the_errors_of_eyes(

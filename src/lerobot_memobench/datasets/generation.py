@@ -17,6 +17,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR
+
 from lerobot_memobench.datasets.generation_summary import GenerationSummary, summarise
 from lerobot_memobench.datasets.lerobot_format.assembling import assemble
 from lerobot_memobench.datasets.lerobot_format.card import SCRIPTED
@@ -262,11 +264,13 @@ def _finished(out: Path, plan: _Plan) -> GenerationSummary:
 
 
 def policy_told(checkpoint: str) -> str:
-    """Return the name of a checkpoint's folder and the hash of its weights: another one is another run."""
+    """Return a checkpoint's name, or its training run's, and the hash of its weights: another one is another run."""
     weights = Path(checkpoint) / WEIGHTS
     if not weights.is_file():
         raise MemobenchError(f"{checkpoint} holds no {WEIGHTS}; name the folder of a policy's checkpoint")
-    return f"{Path(checkpoint).name} {file_hash(weights)[:16]}"
+    parts = [part for part in Path(checkpoint).parts if part != PRETRAINED_MODEL_DIR]
+    name = parts[parts.index(CHECKPOINTS_DIR) - 1] if CHECKPOINTS_DIR in parts[1:] else parts[-1]
+    return f"{name} {file_hash(weights)[:16]}"
 
 
 def task_hash(task: Task) -> str:
