@@ -91,6 +91,7 @@ def test_small_brings_its_recipe_and_leaves_it_to_the_user(tmp_path: Path) -> No
         ({"sight_errors": 1.0}, "use --policy.perception=objects"),
         ({"size": "small", "perception": "objects", "told_objects": "hand"}, "or name --policy.eyes too"),
         ({"told_objects": "hands"}, "no told_objects 'hands'.*'hand'"),
+        ({"size": "small", "whole_plan_if_still": True}, "use --policy.perception=objects"),
         ({"size": "tiny", "word_order": True}, "size=tiny perception=pixels; leave it out"),
     ],
 )
@@ -411,6 +412,19 @@ def test_memory_that_is_masked_is_nothing(root: Path) -> None:
     assert loss(changed) == pytest.approx(loss(batch[TOKENS]), abs=1e-6)
     changed[:, 1] = changed[:, 1] * 0.9
     assert loss(changed) != pytest.approx(loss(batch[TOKENS]), abs=1e-6)
+
+
+def test_a_hand_that_stands_still_carries_out_a_whole_plan(root: Path) -> None:
+    """Of the first plan three actions of six, then all of one where nothing moves, and three where the hand does."""
+    policy, before, _, dataset = made_for_training(root, **OBJECTS, whole_plan_if_still=True)
+    policy.reset()
+    left = []
+    for step, index in enumerate([30] * 9 + [50] * 3):
+        seen = observed(dataset, index, **{"observation.step": torch.tensor([float(step)])})
+        seen["observation.state"] = seen["observation.state"] + 0.02 * (index > 30)
+        policy.select_action(before(seen))
+        left.append(len(policy.plans.queues[0]))
+    assert left == [2, 1, 0, *reversed(range(6)), 2, 1, 0]
 
 
 # -- rollouts and checkpoints --------------------------------------------------------------------------------------

@@ -37,6 +37,8 @@ MUCH_WORSE = 1.5
 """Cost by which a hold is behind the best one and not tried."""
 FUNNEL, FUNNEL_MOUTH = 4.0, 0.006
 """Height kept per distance from the line over the target, and the distance from which on, m."""
+TIGHT = 0.6
+"""Share of the room between open fingers and a thing's side up to which the hand may be off when it comes down."""
 STOPPED, NEAR = 6, 0.015
 """Steps without getting nearer after which the fingers close where they are, once they are so near, m: on a plate's
 rim, say. A longer wait, in which nothing changes, is hard to learn."""
@@ -174,7 +176,9 @@ class _Approach:
         target, turn = self.pose()
         off = self.hand.position - target
         beside = length(off - (off @ turn[:, 2]) * turn[:, 2])
-        return target - min(HOVER, FUNNEL * max(0.0, beside - FUNNEL_MOUTH)) * turn[:, 2]
+        room = (FULLY_OPEN - self.grasp.width) / 2
+        mouth = min(FUNNEL_MOUTH, TIGHT * room)
+        return target - min(HOVER, FUNNEL * max(0.0, beside - mouth)) * turn[:, 2]
 
     def turned(self) -> Array:
         return self.pose()[1]

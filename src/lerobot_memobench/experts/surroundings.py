@@ -14,6 +14,9 @@ FINGER_THICKNESS = 0.014
 """Of a finger's tip along the closing axis, m."""
 FULLY_OPEN = 0.079
 """Distance between the open fingers, m."""
+BLOCKED, BLOCKED_COST = 0.010, 2.0
+"""Level distance between the middle of a finger's tip and a thing, m, under which it comes down on that, and the
+penalty: who learns from it learns a grasp that fails before the one that does not."""
 HAND_MARGIN = 0.006
 """Room left between the hand and its neighbours, m."""
 HAND_POINTS = np.array(
@@ -105,7 +108,7 @@ def crowding(hand: Hand, name: str, target: Array, turn: Array) -> float:
             continue
         for side in (-1.0, 1.0):
             gap = _gap(asset, rotation.T @ (target + side * apart * turn[:, 0] - position))
-            penalty += 40.0 * max(0.0, FINGER_THICKNESS - gap)
+            penalty += 40.0 * max(0.0, FINGER_THICKNESS - gap) + BLOCKED_COST * (gap < BLOCKED)
     return penalty
 
 

@@ -15,7 +15,7 @@ from lerobot_memobench.policies.freshness import PICTURE_STEP, require_fresh
 from lerobot_memobench.policies.memobench_mem.action_objective import REGRESSION
 from lerobot_memobench.policies.memobench_mem.noise import EpisodeNoise
 from lerobot_memobench.policies.memobench_mem.one_thread import OneThread
-from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_PHASE
+from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_PHASE, OBS_RAW_STATE
 from lerobot_memobench.policies.memobench_mem.plans import RowPlans
 from lerobot_memobench.policies.memobench_mem.seeing import SeeingPolicy
 from lerobot_memobench.policies.shown import cure
@@ -121,9 +121,9 @@ class ActingPolicy(SeeingPolicy):
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Next action of every row (B, A), normalised.
 
-        Every row keeps its own plan of ``n_action_steps``: it is made when the row's execution begins or its last plan
-        is used up, from that row alone, so rows of a batch are independent. In the prompt phase, where actions have no
-        effect, and for frozen rows nothing is planned.
+        Every row keeps its own plan of ``n_action_steps``, or a whole one (``whole_plan_if_still``), from that row
+        alone, so rows of a batch are independent. It is made when the row's execution begins or its last plan is used
+        up. In the prompt phase, where actions have no effect, and for frozen rows nothing is planned.
         """
         self.thread.check()
         if self.training:  # a millisecond, if it were said at every step
@@ -141,6 +141,7 @@ class ActingPolicy(SeeingPolicy):
         wanting = self.plans.wanting(acting)
         if wanting:
             plans = self.plan(batch, wanting, self._noise(wanting, steps))
-            for row, plan in zip(wanting, plans[:, : self.config.n_action_steps].float().cpu(), strict=True):
-                self.plans.queues[row].extend(plan)
+            states = batch[OBS_RAW_STATE] if self.config.whole_plan_if_still else None
+            for row, plan in zip(wanting, plans.float().cpu(), strict=True):
+                self.plans.begin(row, plan, self.config.n_action_steps, None if states is None else states[row])
         return self.plans.step(acting).to(self._device)

@@ -172,6 +172,11 @@ class MemobenchMemConfig(MemobenchMemSettings):
                 f"--policy.sight_errors_share={self.sight_errors_share} must be above 0 and at most 1, and is a share "
                 "of the frames, seen with --policy.sight_errors; leave it out, or set these too."
             )
+        if self.whole_plan_if_still and not self.sees_objects:
+            raise MemobenchError(
+                "--policy.whole_plan_if_still=true is for policies that see objects, which are told where the hand is; "
+                "leave it out, or use --policy.perception=objects."
+            )
         if self.perception == "pixels" and self.tokens_per_frame != GRID**2:
             raise MemobenchError(
                 f"--policy.tokens_per_frame={self.tokens_per_frame} is not supported: frames are pooled to a "

@@ -106,6 +106,9 @@ class MemobenchMemSettings(PI05Config):
     # -- pi0.5's fields with this recipe's values, or the size's where they are None or empty
     chunk_size: int = SIZES_OWN
     n_action_steps: int = SIZES_OWN
+    whole_plan_if_still: bool = False
+    """Whether all of a plan is carried out, and not its first ``n_action_steps``, where the hand stands as it stood at
+    the plan before: on a rim it might stand for ever, and plan each time to let go a little later."""
     normalization_mapping: dict[str, NormalizationMode] = field(default_factory=dict)
     image_resolution: tuple[int, int] | None = None
     tokenizer_name: str | None = None
