@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,6 +29,8 @@ ATTEMPTS = 4
 """How often a thing is reached for, a handle, door or knob moved, before it is given up."""
 LOW_ATTEMPTS = 2
 """How many of them are made before a tall thing is held higher."""
+OUT_OF_REACH = 0.04
+"""By how much the arm may be too short for a low hold that is tried before the higher ones, m."""
 HIGHER, BELOW_TOP = 0.02, 0.0122
 """By how much, and how much of it then still stands over the middle of the fingers, m."""
 LYING = 0.7
@@ -205,21 +207,33 @@ def _choose_grasp(hand: Hand, name: str, attempt: int, avoid: Array | None, plac
         raise MemobenchError(
             f"the expert does not know how to hold {name!r}: class {asset.class_name} declares no grasp"
         )
-    grasps, reaching = asset.grasps, attempt >= LOW_ATTEMPTS
-    if reaching and (higher := _higher(asset)):
-        # What stands beside had kept the hand from leaning to where the arm can reach; over it there is room.
-        grasps, attempt = higher, attempt - LOW_ATTEMPTS
-    options: list[tuple[float, _Approach]] = []
-    for grasp in grasps:
-        for spin in np.arange(0.0, 2 * np.pi, np.pi / 12) if grasp.symmetric else [0.0]:
-            way = _Approach(hand, name, grasp, float(spin), place, reaching)
-            options.append((_cost(way, avoid), way))
-    options.sort(key=lambda option: option[0])
+    options, higher = _options(hand, name, asset.grasps, avoid, place, reaching=False), _higher(asset)
+    if attempt >= LOW_ATTEMPTS or (higher and _short(options[0][1]) > OUT_OF_REACH):
+        # What stands beside keeps the hand from leaning to where the arm can reach; over it there is room.
+        options = _options(hand, name, higher or asset.grasps, avoid, place, reaching=True)
+        attempt = max(0, attempt - LOW_ATTEMPTS) if higher else attempt
     options = [option for option in options if option[0] < options[0][0] + MUCH_WORSE]
     # A later attempt tries the next different way; each varies a little between episodes.
     rank = min(attempt * max(1, len(options) // 6), len(options) - 1)
     _, way = options[rank]
     return replace(way, spin=way.spin + float(hand.rng.uniform(-0.1, 0.1))) if way.grasp.symmetric else way
+
+
+def _options(
+    hand: Hand, name: str, grasps: Sequence[Grasp], avoid: Array | None, place: Array | None, *, reaching: bool
+) -> list[tuple[float, _Approach]]:
+    """Return the ways to some grasps with their costs, the cheapest first."""
+    options: list[tuple[float, _Approach]] = []
+    for grasp in grasps:
+        for spin in np.arange(0.0, 2 * np.pi, np.pi / 12) if grasp.symmetric else [0.0]:
+            way = _Approach(hand, name, grasp, float(spin), place, reaching)
+            options.append((_cost(way, avoid), way))
+    return sorted(options, key=lambda option: option[0])
+
+
+def _short(way: _Approach) -> float:
+    """Return by how much the arm is too short for a grasp, m."""
+    return way.hand.stretch(*way.pose(FULLY_OPEN)) - STRETCHED
 
 
 def _higher(asset: Asset) -> tuple[Grasp, ...]:
