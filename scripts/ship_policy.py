@@ -13,6 +13,7 @@ import json
 import shlex
 import shutil
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -137,14 +138,22 @@ def training(told: dict[str, Any], before: dict[str, Any] | None, named: bool) -
     """
     policy = told["policy"]
     if before is None:
-        kind, known = f"policy=memobench_mem perception={policy['perception']} size={policy['size']}", []
+        kind = f"policy=memobench_mem perception={policy['perception']} size={policy['size']}"
     else:
-        begun = before.get("shipped") or place(before["output_dir"])
-        kind, known = f"policy={begun}", settings(before["policy"])
-    words = [f"dataset={place(told['dataset']['root'])}", *(word for word in settings(policy) if word not in known)]
+        kind = f"policy={before.get('shipped') or place(before['output_dir'])}"
+    words = [f"dataset={place(told['dataset']['root'])}", *settings(policy, before and before["policy"])]
     words += [f"{key}={told[key]}" for key in ("batch_size", "steps", "seed")]
     words += [f"output_dir={place(told['output_dir'])}"] if named else []
-    return [f"lerobot train {kind} \\", f"    {shlex.join(words)}"]
+    chosen = told["dataset"].get("episodes")
+    some = [] if chosen is None else [f"    {episodes(chosen)} \\"]
+    return [f"lerobot train {kind} \\", *some, f"    {shlex.join(words)}"]
+
+
+def episodes(chosen: Sequence[int]) -> str:
+    """Return the word that chooses episodes of a dataset, short where many follow one another."""
+    gaps = [0, *(index for index in range(1, len(chosen)) if chosen[index] != chosen[index - 1] + 1), len(chosen)]
+    runs = [(chosen[first], chosen[past - 1]) for first, past in pairwise(gaps)]
+    return f'episodes="[{",".join(f"$(seq -s, {first} {last})" for first, last in runs)}]"'
 
 
 def place(folder: str | Path) -> str:
@@ -152,14 +161,15 @@ def place(folder: str | Path) -> str:
     return f"outputs/{Path(folder).name}"
 
 
-def settings(policy: dict[str, Any]) -> list[str]:
-    """Return what was said of a policy in training: where it is not as its size and perception decide."""
+def settings(policy: dict[str, Any], before: dict[str, Any] | None = None) -> list[str]:
+    """Return what was said of a policy in training: what is not as its size and perception have it, or ``before``."""
     usual = encoded(MemobenchMemConfig(device="cpu", size=policy["size"], perception=policy["perception"]))
+    known = usual | (before or {})
     said = {key: policy[key] for key in sorted({*usual} & {*policy} - {*ELSEWHERE, *OF_THE_DATA})}
     return [
         f"policy.{key}={value if isinstance(value, str) else json.dumps(value)}"
         for key, value in said.items()
-        if value != usual[key]
+        if value != known[key]
     ]
 
 

@@ -128,6 +128,8 @@ def test_a_card_tells_how_the_demonstrations_were_made(script: ModuleType, tmp_p
     assert "perception=objects size=small \\\n    dataset=outputs/data policy.memory_stride=4 batch_size=6 " in text
     assert "train policy=outputs/run \\\n    dataset=outputs/more policy.optimizer_lr=0.0001 batch_size=6 " in text
     assert text.count("memobench generate") == 2, "what both were trained on is made once"
+    back = {**again, "policy": {**policy, "memory_stride": 8}}
+    assert " policy.memory_stride=8 " in script.training(back, told, named=False)[1], "what is usual again is said"
     again["policy"]["pretrained_path"] = str(SHIPPED / "memobench_small")
     (later / "train_config.json").write_text(json.dumps(again))
     text = str(script.card("mine", source, {"a": torch.zeros(3)}, None, {}, commits=[("data/more", "0123abc")]))
@@ -135,6 +137,10 @@ def test_a_card_tells_how_the_demonstrations_were_made(script: ModuleType, tmp_p
     assert "The expert that made outputs/more is that of commit `0123abc`." in text
     assert "lerobot train policy=memobench_small \\\n    dataset=outputs/more " in text
     assert text.count("lerobot train") == 1
+    again["dataset"]["episodes"] = [0, 1, 2, 7, 9, 10]
+    (later / "train_config.json").write_text(json.dumps(again))
+    text = str(script.card("mine", source, {"a": torch.zeros(3)}, None, {}))
+    assert '    episodes="[$(seq -s, 0 2),$(seq -s, 7 7),$(seq -s, 9 10)]" \\\n    dataset=outputs/more ' in text
     strict = {**request, "tasks": task_names(suite="strict"), "referent": "drawn"}
     assert script.generation(strict)[:6] == ["--tasks", "all", "--suite", "strict", "--episodes", "3"]
     assert "--referent" not in script.generation(strict)
