@@ -207,8 +207,9 @@ def _choose_grasp(hand: Hand, name: str, attempt: int, avoid: Array | None, plac
         raise MemobenchError(
             f"the expert does not know how to hold {name!r}: class {asset.class_name} declares no grasp"
         )
-    options, higher = _options(hand, name, asset.grasps, avoid, place, reaching=False), _higher(asset)
-    if attempt >= LOW_ATTEMPTS or (higher and _short(options[0][1]) > OUT_OF_REACH):
+    higher = _higher(asset)
+    options = [] if attempt >= LOW_ATTEMPTS else _options(hand, name, asset.grasps, avoid, place, reaching=False)
+    if not options or (higher and _short(options[0][1]) > OUT_OF_REACH):
         # What stands beside keeps the hand from leaning to where the arm can reach; over it there is room.
         options = _options(hand, name, higher or asset.grasps, avoid, place, reaching=True)
         attempt = max(0, attempt - LOW_ATTEMPTS) if higher else attempt
