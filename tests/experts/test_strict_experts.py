@@ -21,6 +21,7 @@ STOVE = "turn_the_stove_on_and_off_once_then_put_the_frying_pan_on_it"
 CHARGER = "find_the_charger_hidden_in_one_of_the_drawers"
 PAIR = "find_the_charger_or_the_cap_hidden_in_two_of_the_drawers"
 MILK = "put_only_the_milk_pointed_out_in_the_prompt_video_on_the_plate"
+WASTE_FIRST = "follow_the_prompt_to_determine_the_items,_discard_the_waste_first,_then_plate_the_remaining_item"
 WASTE = "discard_and_plate_strictly_as_demonstrated_in_the_prompt_video"
 SMOOTH = 0.25
 """Largest change of an action's component from one step to the next."""
@@ -129,6 +130,7 @@ def test_leans_over_what_keeps_it_from_reaching() -> None:
 def test_a_prompt_goes_on_until_what_it_shows_has_held() -> None:
     """The plan had ended at the ninth of the ten steps for which the goal has to hold."""
     assert play(get_task(WASTE), 20_043).prompt_shown
+    assert play(get_task(WASTE_FIRST), 10_011).prompt_shown
 
 
 def test_comes_home_between_events_and_does_not_rest_there() -> None:

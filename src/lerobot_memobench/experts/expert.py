@@ -14,7 +14,7 @@ from lerobot_memobench.experts.plans import Step, counts, plan_of
 from lerobot_memobench.experts.surroundings import drawer_around, stands_out
 from lerobot_memobench.sim.scene import TABLE, TABLE_TOP
 from lerobot_memobench.sim.simulation import Simulation
-from lerobot_memobench.tasks.evaluator import Evaluator
+from lerobot_memobench.tasks.evaluator import HOLD_STEPS, Evaluator
 from lerobot_memobench.tasks.formula import (
     LATCHES,
     And,
@@ -65,8 +65,14 @@ def steps_of(formula: Formula) -> list[Atom]:
 
 
 def rest_of(formula: Formula) -> int:
-    """Return for how many steps a goal has to hold once it does."""
-    own = formula.number if isinstance(formula, Hold) else 0
+    """Return for how many steps a goal has to hold once it does, at most."""
+    match formula:
+        case Hold(number=own):
+            pass
+        case Then():
+            own = HOLD_STEPS
+        case _:
+            own = 0
     return max([own, *(rest_of(child) for child in children(formula))])
 
 
