@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
+from torch import Tensor
 
+from lerobot_memobench.eyes.heads import GEOMETRY, Ask, Said
 from lerobot_memobench.eyes.labels import MASK, PICTURE, Rows, rays
+from lerobot_memobench.eyes.targets import LIT, Targets
 from lerobot_memobench.eyes.tower import SIDE
 from lerobot_memobench.sim.scene import TABLE_TOP
 from lerobot_memobench.sim.simulation import CAMERAS
@@ -38,3 +42,25 @@ def _show(row: Rows, kind: int, kinds: int, rng: np.random.Generator) -> None:
     position = row["eye"] + rays(place, row) * HEIGHT
     turn = (np.cos(angle), np.sin(angle))
     row["things"][kind] = (kind, 400, place, position, 0.1 * kind if kind < 2 else np.nan, kind == 1, turn)
+
+
+def perfect(wanted: Targets, side: int) -> Said:
+    """Return what heads with so many coarse cells along a picture say that have learned all there is to learn."""
+    pictures, kinds, _, _ = wanted.heat.shape
+    geometry = torch.zeros(pictures, kinds, len(GEOMETRY), side, side)
+    picture, kind, row, column = wanted.cells.T
+    said = wanted.geometry.nan_to_num()
+    said[:, LIT] = torch.where(said[:, LIT] > 0.5, 10.0, -10.0)
+    geometry[picture, kind, :, row, column] = said
+    mask = 20 * torch.nn.functional.one_hot(wanted.mask, kinds + 1).float().permute(0, 3, 1, 2)
+    return Said(torch.where(wanted.heat == 1, 10.0, -10.0), laid_out(geometry), side, mask)
+
+
+def laid_out(values: Tensor) -> Ask:
+    """Return what says of cells what stands there in (N, kinds, values, side, side)."""
+    return lambda picture, kind, row, column: values[picture, kind, :, row, column]
+
+
+def everywhere(ask: Ask, shape: tuple[int, ...]) -> Tensor:
+    """Ask of every kind in every cell, (n, values), given how many pictures, kinds and cells along a side there are."""
+    return ask(*torch.cartesian_prod(*map(torch.arange, (*shape, shape[-1]))).T)

@@ -2,38 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from lerobot_memobench.eyes.finding import found
-from lerobot_memobench.eyes.heads import GEOMETRY, Said
 from lerobot_memobench.eyes.labels import projected
-from lerobot_memobench.eyes.targets import LIT, Targets, loss, targets
-from lerobot_memobench.eyes.tower import GRID, POOLED
+from lerobot_memobench.eyes.targets import loss, targets
+from lerobot_memobench.eyes.tower import GRID
+from lerobot_memobench.eyes.training import CELLS
 from lerobot_memobench.sim.scene import TABLE_TOP
 
-from .made_up import HEIGHT, made_up
+from .made_up import HEIGHT, SLOPE, laid_out, made_up, perfect
 
-KINDS = 3
-
-
-def perfect(wanted: Targets) -> Said:
-    """Return what heads say that have learned all there is to learn."""
-    pictures, kinds, side, _ = wanted.heat.shape
-    geometry = torch.zeros(pictures, kinds, len(GEOMETRY), side // 2, side // 2)
-    picture, kind, row, column = wanted.cells.T
-    said = wanted.geometry.nan_to_num()
-    said[:, LIT] = torch.where(said[:, LIT] > 0.5, 10.0, -10.0)
-    geometry[picture, kind, :, row, column] = said
-    mask = 20 * torch.nn.functional.one_hot(wanted.mask, kinds + 1).float().permute(0, 3, 1, 2)
-    return Said(torch.where(wanted.heat == 1, 10.0, -10.0), geometry, mask)
+KINDS, SIDE = 3, 2 * GRID
 
 
-@pytest.mark.parametrize("grid", [GRID, POOLED])
-def test_what_was_there_is_found(grid: int) -> None:
-    rows = made_up(6)
-    for row, things in zip(rows, found(perfect(targets(rows, KINDS, grid))), strict=True):
+@pytest.mark.parametrize("cells", CELLS.values(), ids=CELLS)
+def test_what_was_there_is_found(cells: tuple[int, int, int]) -> None:
+    rows, (grid, _, coarse) = made_up(6), cells
+    for row, things in zip(rows, found(perfect(targets(rows, KINDS, *cells), grid * coarse)), strict=True):
         assert sorted(things["kind"]) == list(range(KINDS))
         true = row["things"][things["kind"]]
         place, depth = projected(true["position"].astype(float), row)
@@ -48,22 +38,22 @@ def test_what_was_there_is_found(grid: int) -> None:
 
 
 def test_doubts_are_of_the_picture_and_of_metres() -> None:
-    said = perfect(targets(made_up(2), KINDS, GRID))
-    doubt = torch.tensor([0.16, 0.01, 0.02]).log()[:, None, None].expand(2, KINDS, 3, 2 * GRID, 2 * GRID)
+    said = perfect(targets(made_up(2), KINDS, GRID), SIDE)
+    doubt = torch.tensor([0.16, 0.01, 0.02]).log()[:, None, None].expand(2, KINDS, 3, SIDE, SIDE)
     assert not found(said)[0]["doubt"].any()
-    for things in found(Said(said.heat, said.geometry, said.mask, doubt)):
+    for things in found(replace(said, doubt=laid_out(doubt))):
         assert things["doubt"] == pytest.approx(np.tile([0.01, 0.01, 0.02], (KINDS, 1)), rel=1e-4)
 
 
 def test_saying_so_costs_nothing_and_anything_else_does() -> None:
     wanted = targets(made_up(3), KINDS, GRID)
-    right = perfect(wanted)
+    right = perfect(wanted, SIDE)
     assert all(float(value) < 1e-3 for value in loss(right, wanted).values())
     wrong = {
-        "heat": Said(-right.heat, right.geometry, right.mask),
-        "place": Said(right.heat, right.geometry + torch.eye(8)[0][:, None, None], right.mask),
-        "rest": Said(right.heat, right.geometry + torch.eye(8)[2][:, None, None], right.mask),
-        "mask": Said(right.heat, right.geometry, right.mask.flip(1)),
+        "heat": replace(right, heat=-right.heat),
+        "place": replace(right, geometry=lambda *cells: right.geometry(*cells) + torch.eye(8)[0]),
+        "rest": replace(right, geometry=lambda *cells: right.geometry(*cells) + torch.eye(8)[2]),
+        "mask": replace(right, mask=right.mask.flip(1)),
     }
     for name, said in wrong.items():
         costs = loss(said, wanted)
@@ -84,3 +74,12 @@ def test_of_two_of_a_kind_in_a_cell_the_nearer_is_asked_for() -> None:
     rows["things"]["anchor"][0, :2] = [(0.5, 0.53), (0.5, 0.58)]
     cells = targets(rows, KINDS, GRID).cells.tolist()
     assert len(cells) == len({tuple(cell) for cell in cells})
+
+
+def test_an_origin_outside_the_picture_is_told() -> None:
+    """Of a stove or a pan the wrist's camera shows a corner; what was asked for then had once ended at a quarter."""
+    rows = made_up(4)
+    rows["things"]["position"][:, :, 0] += 0.8 * 2 * HEIGHT * SLOPE
+    for row, things in zip(rows, found(perfect(targets(rows, KINDS, GRID), SIDE)), strict=True):
+        true = row["things"][things["kind"]]["position"].astype(float)
+        assert np.allclose(things["place"], projected(true, row)[0], atol=1e-5)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,11 @@ import torch
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.eyes import training
-from lerobot_memobench.eyes.heads import Said
 from lerobot_memobench.eyes.labels import Rows, images_of
 from lerobot_memobench.eyes.pictures import Pictures
 from lerobot_memobench.eyes.targets import doubt_loss, targets
-from lerobot_memobench.eyes.tower import GRID, Tower
-from lerobot_memobench.eyes.training import CHECKPOINT, CURVE, Training, changed, learn_doubts, train
+from lerobot_memobench.eyes.tower import Tower
+from lerobot_memobench.eyes.training import CELLS, CHECKPOINT, CURVE, Training, changed, learn_doubts, train
 from lerobot_memobench.eyes.weights import READINGS, load_eyes
 
 from .made_up import made_up
@@ -78,12 +78,13 @@ def test_doubts_are_learned_and_change_nothing_else(
     changed_ones = {name for name, value in eyes.state_dict().items() if not torch.equal(value, before[name])}
     assert changed_ones == {"fine_heads.doubt.weight", "fine_heads.doubt.bias"}
     rows = pictures.rows(np.arange(12))
-    wanted = targets(rows, len(KINDS), GRID)
+    wanted = targets(rows, len(KINDS), *CELLS["fine"])
     with torch.inference_mode():
         learned = eyes.find(images_of(rows))
-    assert learned.doubt is not None
+    doubt = learned.doubt
+    assert doubt is not None
     for times in (0.5, 2.0):
-        other = Said(learned.heat, learned.geometry, learned.mask, learned.doubt + np.log(times))
+        other = replace(learned, doubt=lambda *cells, more=times: doubt(*cells) + np.log(more))
         assert doubt_loss(learned, wanted) < doubt_loss(other, wanted), "as large as errors are"
 
 

@@ -32,8 +32,8 @@ def train(
     episodes: Episodes = 8,
     moments: Moments = 22,
     first_seed: Annotated[int, typer.Option(help="First seed of the episodes, 20000 to 39999.")] = 20_000,
-    updates: Annotated[int, typer.Option(min=1, help="Updates of the weights.")] = 7000,
-    batch: Annotated[int, typer.Option(min=1, help="Pictures of each.")] = 64,
+    updates: Annotated[int, typer.Option(min=1, help="Updates of the weights.")] = 18_000,
+    batch: Annotated[int, typer.Option(min=1, help="Pictures of each.")] = 32,
     seed: Annotated[int, typer.Option(min=0, help="Of first weights, order and changes of pictures.")] = 0,
     workers: Workers = 1,
 ) -> int:

@@ -9,7 +9,7 @@ from scipy.special import expit
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from lerobot_memobench.eyes.heads import DOUBTS, GEOMETRY, Said
+from lerobot_memobench.eyes.heads import DOUBTS, GEOMETRY, Ask, Said
 
 FOUND = np.dtype(
     [
@@ -42,8 +42,8 @@ def found(said: Said, sure: float = SURE) -> list[NDArray[np.void]]:
     picture, rank = torch.nonzero(scores > sure, as_tuple=True)
     place = places[picture, rank]
     kind, row, column = place // side**2, place // side % side, place % side
-    middle = ((row + 0.5) / side, (column + 0.5) / side)
-    geometry = _between(_placed(said.geometry), picture, kind, *middle)
+    there = (picture, kind, (row + 0.5) / side, (column + 0.5) / side)
+    geometry = _between(_placed(said), said.side, *there)
     things = np.zeros(len(picture), FOUND)
     things["kind"], things["score"] = kind.numpy(), scores[picture, rank].detach().numpy()
     things["place"] = geometry[:, :2]
@@ -52,30 +52,30 @@ def found(said: Said, sure: float = SURE) -> list[NDArray[np.void]]:
     things["lit"] = expit(geometry[:, GEOMETRY.index("lit")])
     things["turn"] = geometry[:, -2:]
     if said.doubt is not None:
-        doubt = np.exp(_between(said.doubt, picture, kind, *middle))
-        things["doubt"] = doubt / [said.doubt.shape[-1], 1, 1]
+        things["doubt"] = np.exp(_between(said.doubt, said.side, *there)) / [said.side, 1, 1]
     owner = picture.numpy()
     return [things[owner == number] for number in range(len(heat))]
 
 
-def _placed(geometry: Tensor) -> Tensor:
+def _placed(said: Said) -> Ask:
     """Return geometry with places in the picture, fractions of its side, instead of offsets from cells."""
-    side = geometry.shape[-1]
-    middles = (torch.arange(side) + 0.5).to(geometry.dtype)
-    down, across = torch.meshgrid(middles, middles, indexing="ij")
-    placed = geometry.detach().clone()
-    placed[:, :, :2] = (placed[:, :, :2] + torch.stack([across, down])) / side
-    return placed
+
+    def ask(picture: Tensor, kind: Tensor, row: Tensor, column: Tensor) -> Tensor:
+        offset, rest = said.geometry(picture, kind, row, column).split([2, len(GEOMETRY) - 2], dim=1)
+        return torch.cat([(offset + torch.stack([column, row], dim=1) + 0.5) / said.side, rest], dim=1)
+
+    return ask
 
 
-def _between(values: Tensor, picture: Tensor, kind: Tensor, down: Tensor, across: Tensor) -> NDArray[np.float32]:
+def _between(ask: Ask, side: int, picture: Tensor, kind: Tensor, down: Tensor, across: Tensor) -> NDArray[np.float32]:
     """Return what the four cells around places say, (n, values), the nearer the more."""
-    side = values.shape[-1]
     y, x = down * side - 0.5, across * side - 0.5
-    whole, total = torch.zeros(len(y), values.shape[2]), torch.zeros(len(y), 1)
+    sums: list[Tensor] = []
+    total = torch.zeros(len(y), 1)
     for row, column in ((y.floor() + a, x.floor() + b) for a in (0, 1) for b in (0, 1)):
         inside = (row >= 0) & (row < side) & (column >= 0) & (column < side)
         weight = (inside * (1 - (y - row).abs()) * (1 - (x - column).abs()))[:, None]
-        at = (picture, kind, slice(None), row.long().clamp(0, side - 1), column.long().clamp(0, side - 1))
-        whole, total = whole + weight * values[at].detach(), total + weight
-    return np.asarray((whole / total).numpy())
+        cell = (row.long().clamp(0, side - 1), column.long().clamp(0, side - 1))
+        sums.append(weight * ask(picture, kind, *cell).detach())
+        total = total + weight
+    return np.asarray((torch.stack(sums).sum(dim=0) / total).numpy())

@@ -5,6 +5,7 @@ What policies are given are the tokens; that linear maps can read all of this fr
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -26,21 +27,27 @@ RARE = 0.01
 """Probability of a thing in a cell that an untrained head says."""
 
 
+Ask = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
+"""From pictures, kinds, rows and columns of coarse cells, (n,) each, to numbers (n, values), float32: of a thing of
+that kind there. Asked for few cells it is much less work than saying it of all kinds in all cells."""
+
+
 @dataclass(frozen=True)
 class Said:
     """What heads say of pictures.
 
     Attributes:
-        heat: (N, kinds, 4 grid, 4 grid), logit that a thing's visible middle is there.
-        geometry: (N, kinds, len(GEOMETRY), 2 grid, 2 grid).
-        mask: (N, kinds + 1, 4 grid, 4 grid), logits of what is shown, first of nothing.
-        doubt: (N, kinds, len(DOUBTS), 2 grid, 2 grid), logarithms of how far off the geometry is; None: it is not said.
+        heat: (N, kinds, fine cells, fine cells), logit that a thing's visible middle is there.
+        geometry: len(GEOMETRY) values. side: coarse cells along the picture's side.
+        mask: (N, kinds + 1, fine cells, fine cells), logits of what is shown, first of nothing.
+        doubt: len(DOUBTS) values, logarithms of how far off the geometry is; None: it is not said.
     """
 
     heat: Tensor
-    geometry: Tensor
+    geometry: Ask
+    side: int
     mask: Tensor
-    doubt: Tensor | None = None
+    doubt: Ask | None = None
 
 
 class Heads(nn.Module):
@@ -69,18 +76,29 @@ class Heads(nn.Module):
     def forward(self, tokens: Tensor) -> Said:
         """Say what tokens (N, grid * grid, width) show."""
         return Said(
-            self._spread(self.heat(tokens), self.fine),
-            self._of_kinds(self.geometry(tokens), len(GEOMETRY)),
-            self._spread(self.mask(tokens), self.fine),
-            None if self.doubt is None else self._of_kinds(self.doubt(tokens), len(DOUBTS)),
+            self._spread(self.heat(tokens)),
+            self._asked(self.geometry, tokens, len(GEOMETRY)),
+            self.grid * self.coarse,
+            self._spread(self.mask(tokens)),
+            None if self.doubt is None else self._asked(self.doubt, tokens, len(DOUBTS)),
         )
 
-    def _of_kinds(self, values: Tensor, each: int) -> Tensor:
-        """Lay so many numbers of each kind out as a picture, (N, kinds, each, grid * coarse, grid * coarse)."""
-        return rearrange(self._spread(values, self.coarse), "n (k v) y x -> n k v y x", v=each)
+    def _asked(self, linear: nn.Linear, tokens: Tensor, each: int) -> Ask:
+        """Return what a linear map says of so many numbers of each kind in each coarse cell."""
 
-    def _spread(self, values: Tensor, cells: int) -> Tensor:
-        """Lay what each token says of its cells out as a picture, (N, values, grid * cells, grid * cells), float32."""
-        return rearrange(
-            values.float(), "n (gy gx) (v y x) -> n v (gy y) (gx x)", gy=self.grid, gx=self.grid, y=cells, x=cells
-        )
+        def ask(picture: Tensor, kind: Tensor, row: Tensor, column: Tensor) -> Tensor:
+            c, layout = self.coarse, "(k v y x) ... -> (k y x) v ..."
+            which = (kind * c + row % c) * c + column % c
+            weight, bias = (
+                rearrange(values, layout, v=each, y=c, x=c).index_select(0, which)
+                for values in (linear.weight, linear.bias)
+            )
+            token = (picture * self.grid + row // c) * self.grid + column // c
+            return bias + torch.einsum("nvw,nw->nv", weight, tokens.flatten(0, 1).index_select(0, token).float())
+
+        return ask
+
+    def _spread(self, values: Tensor) -> Tensor:
+        """Lay what each token says of its fine cells out as a picture, (N, values, fine cells, fine cells), float32."""
+        sides = {"gy": self.grid, "gx": self.grid, "y": self.fine, "x": self.fine}
+        return rearrange(values.float(), "n (gy gx) (v y x) -> n v (gy y) (gx x)", **sides)

@@ -22,21 +22,22 @@ SCALES = (1.0, 1.0, 5.0, 5.0, 10.0, 1.0, 0.3, 0.3)
 """What an error of one is worth, for each of `GEOMETRY`: cells, metres (radians), a cross entropy, and parts of a
 circle."""
 DEPTH, HEIGHT, LIT = (GEOMETRY.index(name) for name in ("depth", "height", "lit"))
-REACH = 4.0
-"""Cells from which on a place is no farther: of a large thing of which a corner shows."""
+REACH = 1.0
+"""How far from a cell's middle a thing's origin is said to be at most along each side of the picture, its side being
+one: of a door, a stove or a pan the wrist's camera shows a part, and the origin lies outside."""
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Targets:
-    """What heads of a grid should say of a batch of pictures.
+    """What heads should say of a batch of pictures.
 
     Attributes:
-        heat: (N, kinds, 4 grid, 4 grid), 1 at a thing's visible middle, falling off around it.
+        heat: (N, kinds, fine cells, fine cells), 1 at a thing's visible middle, falling off around it.
         cells: (n, 4) of things near coarse cells: picture, kind, row, column.
         geometry: (n, len(GEOMETRY)) of those, NaN where nothing is asked. weights: (n,).
-        mask: (N, 4 grid, 4 grid), kind + 1 of what is shown, 0 for nothing.
+        mask: (N, fine cells, fine cells), kind + 1 of what is shown, 0 for nothing.
     """
 
     heat: Tensor
@@ -46,17 +47,21 @@ class Targets:
     mask: Tensor
 
 
-def targets(rows: Rows, kinds: int, grid: int) -> Targets:
-    """Return what heads of a grid should say of pictures (N,)."""
+def targets(rows: Rows, kinds: int, grid: int, fine: int = FINE, coarse: int = COARSE) -> Targets:
+    """Return what heads should say of pictures (N,).
+
+    Args:
+        kinds, grid, fine, coarse: as of `heads.Heads`.
+    """
     pictures, places = np.nonzero(
         (np.arange(rows["things"].shape[1]) < rows["count"][:, None]) & (rows["things"]["pixels"] >= LEAST)
     )
     things = rows["things"][pictures, places]
-    cells, geometry, weights = _geometry(rows, things, pictures, COARSE * grid)
-    step = MASK // (FINE * grid)
+    cells, geometry, weights = _geometry(rows, things, pictures, coarse * grid)
+    step = MASK // (fine * grid)
     mask = rows["mask"][:, step // 2 :: step, step // 2 :: step].astype(np.int64)
     return Targets(
-        torch.from_numpy(_heat(things, pictures, (len(rows), kinds, FINE * grid, FINE * grid))),
+        torch.from_numpy(_heat(things, pictures, (len(rows), kinds, fine * grid, fine * grid))),
         torch.from_numpy(cells),
         torch.from_numpy(geometry.astype(np.float32)),
         torch.from_numpy(weights.astype(np.float32)),
@@ -89,7 +94,7 @@ def _geometry(
     for offset in np.ndindex(2, 2):
         cell = corner + np.array(offset)
         far = np.abs(things["anchor"] * side - 0.5 - cell)
-        from_middle = np.clip(place * side - 0.5 - cell, -REACH, REACH)
+        from_middle = np.clip(place * side - 0.5 - cell, -REACH * side, REACH * side)
         index = np.column_stack([pictures, things["kind"], cell[:, 1], cell[:, 0]]).astype(np.int64)
         found.append((index, np.column_stack([from_middle, facts]), np.prod(1 - far, axis=1)))
     cells, geometry, weights = (np.concatenate(parts) for parts in zip(*found, strict=True))
@@ -102,8 +107,7 @@ def _geometry(
 
 def loss(said: Said, wanted: Targets) -> dict[str, Tensor]:
     """Return the losses (scalars) of what heads said: ``heat``, ``place``, ``rest`` and ``mask``."""
-    picture, kind, row, column = wanted.cells.T
-    asked = said.geometry[picture, kind, :, row, column]
+    asked = said.geometry(*wanted.cells.T)
     error = (asked - wanted.geometry).abs()
     error[:, LIT] = binary_cross_entropy_with_logits(asked[:, LIT], wanted.geometry[:, LIT], reduction="none")
     error = error * torch.tensor(SCALES)
@@ -126,10 +130,9 @@ def doubt_loss(said: Said, wanted: Targets) -> Tensor:
     """
     if said.doubt is None:
         raise ValueError("these heads have no doubts")
-    picture, kind, row, column = wanted.cells.T
-    off = (said.geometry[picture, kind, :, row, column].detach() - wanted.geometry).abs()
+    off = (said.geometry(*wanted.cells.T).detach() - wanted.geometry).abs()
     size = torch.column_stack([torch.linalg.vector_norm(off[:, :2], dim=1), off[:, DEPTH], off[:, HEIGHT]])
-    doubt = said.doubt[picture, kind, :, row, column]
+    doubt = said.doubt(*wanted.cells.T)
     return ((doubt + size * torch.exp(-doubt)).sum(dim=1) * wanted.weights).sum() / wanted.weights.sum().clamp(min=1.0)
 
 

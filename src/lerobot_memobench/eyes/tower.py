@@ -87,12 +87,14 @@ class Tower(nn.Module):
         """Return the tokens (N, 64, width) of pictures (N, 3, SIDE, SIDE) in [0, 1], row by row."""
         return self.looked(images)[0]
 
-    def looked(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the tokens, and the map (N, widths[-2], 16, 16) of the stage before the last, of which they are."""
+    def looked(self, images: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """Return the tokens, and the maps of the stages before the last, (N, width, side, side), the finest first."""
         x = (images * 2 - 1).contiguous(memory_format=torch.channels_last)
+        maps = []
         for stage in self.stages[:-1]:
             x = stage(x)
-        return self.even(rearrange(self.stages[-1](x) + self.place, "n d y x -> n (y x) d")), x
+            maps.append(x)
+        return self.even(rearrange(self.stages[-1](x) + self.place, "n d y x -> n (y x) d")), maps
 
     def pooled(self, tokens: Tensor) -> Tensor:
         """Return 16 tokens (N, 16, width) of 64: each of a square of four, which keeps what is where in it."""

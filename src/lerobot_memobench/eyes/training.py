@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.eyes.heads import COARSE, FINE
 from lerobot_memobench.eyes.labels import Rows, images_of
+from lerobot_memobench.eyes.neck import FINER
 from lerobot_memobench.eyes.pictures import Pictures
 from lerobot_memobench.eyes.targets import doubt_loss, loss, targets
 from lerobot_memobench.eyes.tower import GRID, POOLED, Tower
@@ -22,14 +24,15 @@ from lerobot_memobench.eyes.weights import Eyes, save_eyes
 from lerobot_memobench.eyes.whitening import whiten
 from lerobot_memobench.files import draft_of
 from lerobot_memobench.files.curve import draw_curve, mean_of
+from lerobot_memobench.jobs.freed_memory import keep_freed_memory
 
 CHECKPOINT, WEIGHTS, CURVE = "training.pt", "eyes.safetensors", "training_curve.png"
 SHARES = {"heat": 1.0, "place": 2.0, "rest": 1.0, "mask": 0.5}
 """What each loss counts."""
 COUNT = {"fine": 1.0, "tokens": 0.5, "pooled": 0.5}
 """What the losses of each reading count."""
-GRIDS = {"fine": GRID, "tokens": GRID, "pooled": POOLED}
-"""Side of the square of tokens, a quarter of its heat's, in each reading."""
+CELLS = {"fine": (FINER * GRID, FINE // FINER, 1), "tokens": (GRID, FINE, COARSE), "pooled": (POOLED, FINE, COARSE)}
+"""Side of the square of tokens, and the cells of heat and geometry along a token's side, in each reading."""
 GAIN, SHIFT, NOISE = 0.12, 0.06, 0.02
 """Changes of pictures: largest gain of each colour and shift of all, and the noise's standard deviation at most, as
 shares of white. Videos change colours and edges about as much."""
@@ -57,8 +60,8 @@ class Training:
             and falls as a cosine. decay: of the weights. seed: of weights, order and changes of pictures.
     """
 
-    updates: int = 7000
-    batch: int = 64
+    updates: int = 18_000
+    batch: int = 32
     rate: float = 2e-3
     decay: float = 0.02
     seed: int = 0
@@ -84,6 +87,7 @@ def train(
         MemobenchError: the folder's training has other settings.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    keep_freed_memory()
     torch.manual_seed(settings.seed)
     learner = _Learner(Eyes(tower(), kinds), settings, len(pictures))
     learner.restore(folder / CHECKPOINT)
@@ -120,7 +124,8 @@ def learn_doubts(eyes: Eyes, pictures: Pictures, settings: Training, progress: P
         images = changed(images_of(rows), _chance(settings, settings.updates + update))
         with torch.autocast("cpu", torch.bfloat16):
             fine = eyes.neck(*eyes.tower.looked(images))
-        fit = doubt_loss(eyes.fine_heads(fine.float()), targets(rows, len(eyes.kinds), GRID))  # bfloat16 is off itself
+        wanted = targets(rows, len(eyes.kinds), *CELLS["fine"])
+        fit = doubt_loss(eyes.fine_heads(fine.float()), wanted)  # bfloat16 is off itself
         optimizer.zero_grad()
         fit.backward()
         optimizer.step()
@@ -179,11 +184,10 @@ class _Learner:
         images = changed(images_of(rows), _chance(self._settings, self.update))
         with torch.autocast("cpu", torch.bfloat16):
             said = self.eyes(images)
-        wanted = {grid: targets(rows, len(self.eyes.kinds), grid) for grid in set(GRIDS.values())}
         return {
             f"{reading} {name}": value
-            for reading, grid in GRIDS.items()
-            for name, value in loss(said[reading], wanted[grid]).items()
+            for reading, cells in CELLS.items()
+            for name, value in loss(said[reading], targets(rows, len(self.eyes.kinds), *cells)).items()
         }
 
     def save(self, folder: Path) -> None:
@@ -229,5 +233,5 @@ def changed(images: Tensor, chance: torch.Generator) -> Tensor:
     def draw(channels: int) -> Tensor:
         return 2 * torch.rand(len(images), channels, 1, 1, generator=chance) - 1
 
-    images = images * (1 + GAIN * draw(3)) + SHIFT * draw(1)
-    return (images + NOISE * draw(1).abs() * torch.randn(images.shape, generator=chance)).clamp(0, 1)
+    images = (images * (1 + GAIN * draw(3))).add_(SHIFT * draw(1))
+    return images.addcmul_(NOISE * draw(1).abs(), torch.randn(images.shape, generator=chance)).clamp_(0, 1)

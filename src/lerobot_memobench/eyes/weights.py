@@ -11,7 +11,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.eyes.heads import COARSE, FINE, Heads, Said
+from lerobot_memobench.eyes.heads import FINE, Heads, Said
 from lerobot_memobench.eyes.neck import FINER, Neck
 from lerobot_memobench.eyes.tower import BLOCKS, GRID, POOLED, WIDTHS, Tower, fold
 from lerobot_memobench.files import write_file
@@ -39,8 +39,7 @@ class Eyes(nn.Module):
     def __init__(self, tower: Tower, kinds: tuple[str, ...]) -> None:
         super().__init__()
         self.tower, self.neck, self.kinds = tower, Neck(tower), kinds
-        cells = (FINE // FINER, COARSE // FINER)
-        self.fine_heads = Heads(tower.widths[-2], len(kinds), FINER * GRID, *cells, doubting=True)
+        self.fine_heads = Heads(self.neck.width, len(kinds), FINER * GRID, FINE // FINER, 1, doubting=True)
         self.heads = Heads(tower.width, len(kinds), GRID)
         self.pooled_heads = Heads(tower.width, len(kinds), POOLED)
 

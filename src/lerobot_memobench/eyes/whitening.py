@@ -58,7 +58,7 @@ def whiten(eyes: Eyes, batches: Iterable[Tensor]) -> None:
     _follow(tower.even, levelled, mean)
     near = tower.pool.in_features // tower.width
     _read(tower.pool, torch.block_diag(*[levelled] * near), mean.repeat(near))
-    for linear in (*_linears(eyes.heads), eyes.neck.spread):
+    for linear in (*_linears(eyes.heads), eyes.neck.steps[0].spread):
         _read(linear, levelled, mean)
     mean, levelled = pooled.levelling()
     _follow(tower.pool, levelled, mean)
