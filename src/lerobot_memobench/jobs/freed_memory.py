@@ -14,7 +14,7 @@ def keep_freed_memory() -> None:
     """Let this process's malloc hold on to what is freed; nothing where the C library is not glibc.
 
     An update frees and takes some hundred MB: without the pages' faults a small policy's took 16 % less, and one of
-    eyes, whose pictures alone are mapped anew each time, half.
+    eyes, whose pictures alone were mapped anew each time, too (benchmarks/eyes_update.py).
     """
     if platform.libc_ver()[0] != "glibc":
         return
