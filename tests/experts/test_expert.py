@@ -15,14 +15,15 @@ from lerobot_memobench.datasets.recording import HOLD_FRAMES
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.observations import EXECUTION
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.experts.expert import Expert, steps_of
+from lerobot_memobench.experts.expert import Expert, rest_of, steps_of
 from lerobot_memobench.experts.grasping import grasp_pose
 from lerobot_memobench.experts.hand import EMPTY, Hand
 from lerobot_memobench.experts.surroundings import FULLY_OPEN, stands_out
 from lerobot_memobench.experts.travel import PRESSED
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.formula import Atom, atoms
+from lerobot_memobench.tasks.evaluator import HOLD_STEPS
+from lerobot_memobench.tasks.formula import And, Atom, Then, atoms
 from lerobot_memobench.tasks.formula_parsing import parse_formula
 from lerobot_memobench.tasks.task import Task
 
@@ -312,6 +313,13 @@ def test_a_prompt_ends_with_what_it_shows() -> None:
         episode.step(episode.expert_action())
     assert episode.prompt_shown
     assert episode.step_index < 800
+
+
+def test_an_order_within_an_order_is_waited_for_twice() -> None:
+    first, second = Atom("close", ("a",)), Atom("close", ("b",))
+    assert rest_of(And((first, second))) == 0
+    assert rest_of(Then((first, second))) == HOLD_STEPS
+    assert rest_of(Then((first, And((Then((first, second)), second))))) == 2 * HOLD_STEPS
 
 
 def test_rests_once_its_plan_is_through() -> None:

@@ -65,7 +65,7 @@ def steps_of(formula: Formula) -> list[Atom]:
 
 
 def rest_of(formula: Formula) -> int:
-    """Return for how many steps a goal has to hold once it does, at most."""
+    """Return for how many steps at most a goal's atoms have to hold until it does: each operator waits for its own."""
     match formula:
         case Hold(number=own):
             pass
@@ -73,7 +73,7 @@ def rest_of(formula: Formula) -> int:
             own = HOLD_STEPS
         case _:
             own = 0
-    return max([own, *(rest_of(child) for child in children(formula))])
+    return own + max((rest_of(child) for child in children(formula)), default=0)
 
 
 class Expert:

@@ -70,12 +70,10 @@ def _placed(said: Said) -> Ask:
 def _between(ask: Ask, side: int, picture: Tensor, kind: Tensor, down: Tensor, across: Tensor) -> NDArray[np.float32]:
     """Return what the four cells around places say, (n, values), the nearer the more."""
     y, x = down * side - 0.5, across * side - 0.5
-    sums: list[Tensor] = []
-    total = torch.zeros(len(y), 1)
+    whole = total = torch.zeros(len(y), 1)
     for row, column in ((y.floor() + a, x.floor() + b) for a in (0, 1) for b in (0, 1)):
         inside = (row >= 0) & (row < side) & (column >= 0) & (column < side)
         weight = (inside * (1 - (y - row).abs()) * (1 - (x - column).abs()))[:, None]
         cell = (row.long().clamp(0, side - 1), column.long().clamp(0, side - 1))
-        sums.append(weight * ask(picture, kind, *cell).detach())
-        total = total + weight
-    return np.asarray((torch.stack(sums).sum(dim=0) / total).numpy())
+        whole, total = whole + weight * ask(picture, kind, *cell).detach(), total + weight
+    return np.asarray((whole / total).numpy())

@@ -85,16 +85,14 @@ class Heads(nn.Module):
 
     def _asked(self, linear: nn.Linear, tokens: Tensor, each: int) -> Ask:
         """Return what a linear map says of so many numbers of each kind in each coarse cell."""
+        c, layout = self.coarse, "(k v y x) ... -> (k y x) v ..."
+        weight, bias = (rearrange(values, layout, v=each, y=c, x=c) for values in (linear.weight, linear.bias))
 
         def ask(picture: Tensor, kind: Tensor, row: Tensor, column: Tensor) -> Tensor:
-            c, layout = self.coarse, "(k v y x) ... -> (k y x) v ..."
             which = (kind * c + row % c) * c + column % c
-            weight, bias = (
-                rearrange(values, layout, v=each, y=c, x=c).index_select(0, which)
-                for values in (linear.weight, linear.bias)
-            )
             token = (picture * self.grid + row // c) * self.grid + column // c
-            return bias + torch.einsum("nvw,nw->nv", weight, tokens.flatten(0, 1).index_select(0, token).float())
+            seen = tokens.flatten(0, 1).index_select(0, token).float()
+            return bias.index_select(0, which) + torch.einsum("nvw,nw->nv", weight.index_select(0, which), seen)
 
         return ask
 

@@ -24,7 +24,6 @@ from lerobot_memobench.eyes.weights import Eyes, save_eyes
 from lerobot_memobench.eyes.whitening import whiten
 from lerobot_memobench.files import draft_of
 from lerobot_memobench.files.curve import draw_curve, mean_of
-from lerobot_memobench.jobs.freed_memory import keep_freed_memory
 
 CHECKPOINT, WEIGHTS, CURVE = "training.pt", "eyes.safetensors", "training_curve.png"
 SHARES = {"heat": 1.0, "place": 2.0, "rest": 1.0, "mask": 0.5}
@@ -87,7 +86,6 @@ def train(
         MemobenchError: the folder's training has other settings.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    keep_freed_memory()
     torch.manual_seed(settings.seed)
     learner = _Learner(Eyes(tower(), kinds), settings, len(pictures))
     learner.restore(folder / CHECKPOINT)

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from lerobot_memobench.datasets.memory_cache import RecordedFrames
 from lerobot_memobench.eyes.weights import load_tower
-from lerobot_memobench.jobs.freed_memory import keep_freed_memory
 from lerobot_memobench.policies.memobench_mem.acting import ActingPolicy
 from lerobot_memobench.policies.memobench_mem.adapters import trained_whole
 from lerobot_memobench.policies.memobench_mem.alignment.objectives import make_alignment
@@ -35,6 +34,7 @@ from lerobot_memobench.policies.memobench_mem.execution_frames import (
     prompted_factors,
     task_of_frames,
 )
+from lerobot_memobench.policies.memobench_mem.freed_memory import keep_freed_memory
 from lerobot_memobench.policies.memobench_mem.fused_attention import attend_fused
 from lerobot_memobench.policies.memobench_mem.learning import LearningPolicy
 from lerobot_memobench.policies.memobench_mem.memory.registry import make_mechanism
