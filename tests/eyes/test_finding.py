@@ -45,6 +45,14 @@ def test_doubts_are_of_the_picture_and_of_metres() -> None:
         assert things["doubt"] == pytest.approx(np.tile([0.01, 0.01, 0.02], (KINDS, 1)), rel=1e-4)
 
 
+def test_a_second_look_says_which_finds_are_right() -> None:
+    said = perfect(targets(made_up(2), KINDS, GRID), SIDE)
+    logits = torch.tensor([-4.0, 0.0, 2.0])
+    for things in found(replace(said, sure=lambda picture, kind, row, column: logits[kind][:, None])):
+        assert things["kind"].tolist() == [2, 1], "the surest first, and one not"
+        assert things["score"] == pytest.approx(torch.sigmoid(logits[[2, 1]]).numpy())
+
+
 def test_saying_so_costs_nothing_and_anything_else_does() -> None:
     wanted = targets(made_up(3), KINDS, GRID)
     right = perfect(wanted, SIDE)

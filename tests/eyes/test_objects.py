@@ -155,10 +155,10 @@ def test_a_place_is_where_both_lines_of_sight_meet(simulate: Simulate, finder: O
 def test_what_one_camera_finds_alone_must_be_surer(simulate: Simulate, finder: ObjectFinder, camera: str) -> None:
     state = simulate(BOWLS).proprio().astype(float)
     here = (float(state[0]), float(state[1]), 0.91)
-    doubtful = [(name, "butter", (SURE + min(ALONE.values())) / 2, here) for name in CAMERAS]
+    doubtful = [(name, "butter", (SURE + ALONE) / 2, here) for name in CAMERAS]
     assert seen(finder, state, *doubtful) == 1
     assert seen(finder, state, next(one for one in doubtful if one[0] == camera)) == 0
-    assert seen(finder, state, (camera, "butter", ALONE[camera] + 0.01, here)) == 1
+    assert seen(finder, state, (camera, "butter", ALONE + 0.01, here)) == 1
 
 
 def test_a_kind_that_this_version_does_not_know_is_passed_over(simulate: Simulate) -> None:

@@ -14,10 +14,10 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.eyes import training
 from lerobot_memobench.eyes.labels import Rows, images_of
 from lerobot_memobench.eyes.pictures import Pictures
-from lerobot_memobench.eyes.targets import doubt_loss, targets
+from lerobot_memobench.eyes.targets import doubt_loss, sure_loss, targets
 from lerobot_memobench.eyes.tower import Tower
-from lerobot_memobench.eyes.training import CELLS, CHECKPOINT, CURVE, Training, changed, learn_doubts, train
-from lerobot_memobench.eyes.weights import READINGS, load_eyes
+from lerobot_memobench.eyes.training import CELLS, CHECKPOINT, CURVE, Training, changed, learn_last, train
+from lerobot_memobench.eyes.weights import READINGS, Eyes, load_eyes
 
 from .made_up import made_up
 
@@ -67,25 +67,45 @@ def test_it_learns(pictures: Pictures, small_tower: Callable[[], Tower], tmp_pat
     assert {name.split()[0] for name in points[0]} == set(READINGS)
 
 
-def test_doubts_are_learned_and_change_nothing_else(
+def test_every_weight_learns(pictures: Pictures, small_tower: Callable[[], Tower], tmp_path: Path) -> None:
+    settings = Training(updates=3, batch=4)
+    train(pictures, KINDS, tmp_path, settings, tower=small_tower)
+    learned = torch.load(tmp_path / CHECKPOINT, weights_only=True)["eyes"]
+    torch.manual_seed(settings.seed)
+    first = dict(Eyes(small_tower(), KINDS).named_parameters())
+    same = {name for name, value in first.items() if torch.equal(value, learned[name])}
+    assert {name.rpartition(".")[0] for name in same} == {
+        "fine_heads.doubt",
+        *(f"second_look.{part}" for part in ("around", "heard", "kind", "sure")),
+    }, "only what is learned last"
+
+
+def test_what_is_learned_last_fits_and_changes_nothing_else(
     pictures: Pictures, small_tower: Callable[[], Tower], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(training, "DOUBT_RATE", 0.1)
     settings = Training(updates=30, batch=12, rate=1e-2)
     eyes = load_eyes(train(pictures, KINDS, tmp_path / "run", settings, tower=small_tower, save_every=30))
     before = {name: value.clone() for name, value in eyes.state_dict().items()}
-    learn_doubts(eyes, pictures, Training(updates=150, batch=12))
+    learn_last(eyes, pictures, Training(updates=150, batch=12))
     changed_ones = {name for name, value in eyes.state_dict().items() if not torch.equal(value, before[name])}
-    assert changed_ones == {"fine_heads.doubt.weight", "fine_heads.doubt.bias"}
+    assert {name.rpartition(".")[0] for name in changed_ones} == {
+        "fine_heads.doubt",
+        *(f"second_look.{part}" for part in ("around", "heard", "kind", "sure")),
+    }
     rows = pictures.rows(np.arange(12))
     wanted = targets(rows, len(KINDS), *CELLS["fine"])
     with torch.inference_mode():
         learned = eyes.find(images_of(rows))
-    doubt = learned.doubt
-    assert doubt is not None
-    for times in (0.5, 2.0):
-        other = replace(learned, doubt=lambda *cells, more=times: doubt(*cells) + np.log(more))
-        assert doubt_loss(learned, wanted) < doubt_loss(other, wanted), "as large as errors are"
+        doubt, sure = learned.doubt, learned.sure
+        assert doubt is not None
+        assert sure is not None
+        for times in (0.5, 2.0):
+            other = replace(learned, doubt=lambda *cells, more=times: doubt(*cells) + np.log(more))
+            assert doubt_loss(learned, wanted) < doubt_loss(other, wanted), "as large as errors are"
+        for more in (-1.0, 1.0):
+            other = replace(learned, sure=lambda *cells, more=more: sure(*cells) + more)
+            assert sure_loss(learned, wanted) < sure_loss(other, wanted), "as sure as finds are right"
 
 
 def test_other_settings_do_not_go_on(pictures: Pictures, small_tower: Callable[[], Tower], tmp_path: Path) -> None:

@@ -27,25 +27,29 @@ FOUND = np.dtype(
 """A thing that was found. ``score``: probability. ``place``: of its origin in the picture, a fraction of its side from
 the upper left corner. ``lit``: probability. ``doubt``: how far off it may be: its place, a fraction of the picture's
 side, its depth and its height, m; 0 where nothing is said. The others as `heads.GEOMETRY` has them."""
-SURE = 0.3
-"""Probability from which on a thing counts as found."""
+SURE, HOT = 0.08, 0.3
+"""Probability from which on a thing counts as found, at a second look and by heat alone: heat promises more."""
 MOST = 32
 """Things that are looked for in a picture."""
 
 
-def found(said: Said, sure: float = SURE) -> list[NDArray[np.void]]:
-    """Return the things (n,) of dtype `FOUND` that each picture shows, more probable than ``sure``, by probability."""
-    heat = torch.sigmoid(said.heat)
-    peaks = torch.where(heat == max_pool2d(heat, 3, 1, 1), heat, torch.zeros(()))
-    side = heat.shape[-1]
-    scores, places = peaks.flatten(1).topk(MOST, dim=1)
-    picture, rank = torch.nonzero(scores > sure, as_tuple=True)
-    place = places[picture, rank]
-    kind, row, column = place // side**2, place // side % side, place % side
+def found(said: Said, sure: float | None = None) -> list[NDArray[np.void]]:
+    """Return the things (n,) of dtype `FOUND` that each picture shows, more probable than ``sure``, by probability.
+
+    Args:
+        sure: `SURE` by default, or `HOT` where no second look is taken.
+    """
+    if sure is None:
+        sure = HOT if said.sure is None else SURE
+    scores, cells = peaks(said)
+    scores, order = scores.sort(dim=1, descending=True, stable=True)
+    which, rank = torch.nonzero(scores > sure, as_tuple=True)
+    picture, kind, row, column = (cell.gather(1, order)[which, rank] for cell in cells)
+    side = said.heat.shape[-1]
     there = (picture, kind, (row + 0.5) / side, (column + 0.5) / side)
     geometry = _between(_placed(said), said.side, *there)
     things = np.zeros(len(picture), FOUND)
-    things["kind"], things["score"] = kind.numpy(), scores[picture, rank].detach().numpy()
+    things["kind"], things["score"] = kind.numpy(), scores[which, rank].detach().numpy()
     things["place"] = geometry[:, :2]
     for name in ("depth", "height", "joint"):
         things[name] = geometry[:, GEOMETRY.index(name)]
@@ -54,7 +58,21 @@ def found(said: Said, sure: float = SURE) -> list[NDArray[np.void]]:
     if said.doubt is not None:
         things["doubt"] = np.exp(_between(said.doubt, said.side, *there)) / [said.side, 1, 1]
     owner = picture.numpy()
-    return [things[owner == number] for number in range(len(heat))]
+    return [things[owner == number] for number in range(len(scores))]
+
+
+def peaks(said: Said) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor, Tensor]]:
+    """Return the hottest places of pictures, hotter than all around them: probabilities (N, MOST) that they are right,
+    0 where there are no more, and picture, kind, row and column of each, (N, MOST).
+    """
+    heat, side = torch.sigmoid(said.heat), said.heat.shape[-1]
+    scores, places = torch.where(heat == max_pool2d(heat, 3, 1, 1), heat, torch.zeros(())).flatten(1).topk(MOST, dim=1)
+    pictures = torch.arange(len(heat))[:, None].expand_as(places)
+    cells = (pictures, places // side**2, places // side % side, places % side)
+    if said.sure is not None:
+        sure = torch.sigmoid(said.sure(*(cell.flatten() for cell in cells))).view_as(scores)
+        scores = torch.where(scores > 0, sure, scores)
+    return scores, cells
 
 
 def _placed(said: Said) -> Ask:

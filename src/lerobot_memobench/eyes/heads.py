@@ -41,6 +41,7 @@ class Said:
         geometry: len(GEOMETRY) values. side: coarse cells along the picture's side.
         mask: (N, kinds + 1, fine cells, fine cells), logits of what is shown, first of nothing.
         doubt: len(DOUBTS) values, logarithms of how far off the geometry is; None: it is not said.
+        sure: one value, logit that such a thing is there, where the heat has a peak; None: it is as likely as hot.
     """
 
     heat: Tensor
@@ -48,6 +49,7 @@ class Said:
     side: int
     mask: Tensor
     doubt: Ask | None = None
+    sure: Ask | None = None
 
 
 class Heads(nn.Module):

@@ -44,7 +44,7 @@ ROUND = frozenset({
 })
 # fmt: on
 """Kinds that are alike from all sides: their x axis is taken to be the world's, as tasks place them."""
-SURE, ALONE = 0.2, {"agentview": 0.3, "wrist": 0.4}
+SURE, ALONE = 0.03, 0.1
 """Probability from which on what both cameras find is there, and what one of them finds alone."""
 APART, SAME = 0.03, 0.04
 """How near to one another two things of a kind can stand, and how far apart two cameras may see one thing, m."""
@@ -142,7 +142,7 @@ class ObjectFinder:
                 things.append(seen)
             elif seen.cameras[0] not in known.cameras:
                 known.seen_too(seen, self._one[seen.kind])
-        return [thing for thing in things if len(thing.cameras) > 1 or thing.score > ALONE[thing.cameras[0]]]
+        return [thing for thing in things if len(thing.cameras) > 1 or thing.score > ALONE]
 
     def _is(self, thing: Sighting, seen: Sighting) -> bool:
         """Whether two finds are of one thing."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, logsigmoid
 
+from lerobot_memobench.eyes.finding import peaks
 from lerobot_memobench.eyes.heads import COARSE, FINE, GEOMETRY, Said
 from lerobot_memobench.eyes.labels import MASK, Rows, projected
 from lerobot_memobench.sim.scene import TABLE_TOP
@@ -18,6 +19,8 @@ LEAST = 15
 """Pixels of the rendered picture that must show a thing for it to be taught."""
 SIGMA, SPREAD = 0.8, 2
 """How far a thing's heat reaches: standard deviation and half side, in cells."""
+BESIDE = 0.2
+"""Heat from which on a find is right: the middle's cell and those that touch it."""
 SCALES = (1.0, 1.0, 5.0, 5.0, 10.0, 1.0, 0.3, 0.3)
 """What an error of one is worth, for each of `GEOMETRY`: cells, metres (radians), a cross entropy, and parts of a
 circle."""
@@ -134,6 +137,19 @@ def doubt_loss(said: Said, wanted: Targets) -> Tensor:
     size = torch.column_stack([torch.linalg.vector_norm(off[:, :2], dim=1), off[:, DEPTH], off[:, HEIGHT]])
     doubt = said.doubt(*wanted.cells.T)
     return ((doubt + size * torch.exp(-doubt)).sum(dim=1) * wanted.weights).sum() / wanted.weights.sum().clamp(min=1.0)
+
+
+def sure_loss(said: Said, wanted: Targets) -> Tensor:
+    """Return how badly the sureness of finds, of all peaks that heads said, fits whether they are right.
+
+    Raises:
+        ValueError: it is not said.
+    """
+    if said.sure is None:
+        raise ValueError("these eyes take no second look")
+    _, cells = peaks(said)
+    right = (wanted.heat[cells] > BESIDE).float().flatten()
+    return binary_cross_entropy_with_logits(said.sure(*(cell.flatten() for cell in cells)).flatten(), right)
 
 
 def _heat_loss(logits: Tensor, heat: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from lerobot_memobench.eyes.heads import COARSE, FINE
 from lerobot_memobench.eyes.labels import Rows, images_of
 from lerobot_memobench.eyes.neck import FINER
 from lerobot_memobench.eyes.pictures import Pictures
-from lerobot_memobench.eyes.targets import doubt_loss, loss, targets
+from lerobot_memobench.eyes.targets import doubt_loss, loss, sure_loss, targets
 from lerobot_memobench.eyes.tower import GRID, POOLED, Tower
 from lerobot_memobench.eyes.weights import Eyes, save_eyes
 from lerobot_memobench.eyes.whitening import whiten
@@ -39,8 +39,8 @@ WINDOW = 10
 """Updates that one point of the curve is the mean of."""
 WHITENED = 2048
 """Pictures over which tokens are made white in the end."""
-DOUBT_UPDATES, DOUBT_RATE = 600, 1e-2
-"""Updates of the doubts alone, after that, and their highest learning rate."""
+LAST_UPDATES, DOUBT_RATE, SURE_RATE = 1200, 1e-2, 3e-3
+"""Updates of the doubts and the second look alone, after that, and the highest learning rates of both."""
 BATCH = 64
 """Pictures that are looked at together then."""
 CLIP = 5.0
@@ -97,7 +97,7 @@ def train(
             newest = ", ".join(f"{name} {value:.3f}" for name, value in learner.points[-1].items())
             progress(learner.update, settings.updates, newest)
     whiten(learner.eyes, _some(pictures))
-    learn_doubts(learner.eyes, pictures, settings, progress)
+    learn_last(learner.eyes, pictures, settings, progress)
     save_eyes(learner.eyes, folder / WEIGHTS)
     return folder / WEIGHTS
 
@@ -109,27 +109,33 @@ def _some(pictures: Pictures) -> Iterator[Tensor]:
         yield images_of(pictures.rows(numbers))
 
 
-def learn_doubts(eyes: Eyes, pictures: Pictures, settings: Training, progress: Progress | None = None) -> None:
-    """Have trained eyes learn how far off they are where they find things; all else in them stays as it is."""
+def learn_last(eyes: Eyes, pictures: Pictures, settings: Training, progress: Progress | None = None) -> None:
+    """Have trained eyes learn how far off they are where they find things, and how sure finds are at a second look; all
+    else in them stays as it is.
+    """
     eyes.eval().requires_grad_(False)
-    doubt = eyes.fine_heads.doubt
+    doubt, second_look = eyes.fine_heads.doubt, eyes.second_look
     assert doubt is not None
-    updates = min(DOUBT_UPDATES, settings.updates)
-    optimizer = torch.optim.Adam(doubt.requires_grad_(True).parameters(), DOUBT_RATE)
+    updates = min(LAST_UPDATES, settings.updates)
+    parts = ((doubt, DOUBT_RATE), (second_look, SURE_RATE))
+    optimizer = torch.optim.Adam(
+        [{"params": part.requires_grad_(True).parameters(), "lr": rate} for part, rate in parts]
+    )
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, updates)
     for update in range(updates):
         rows = pictures.rows(_chosen(settings, settings.updates + update, len(pictures)))
         images = changed(images_of(rows), _chance(settings, settings.updates + update))
         with torch.autocast("cpu", torch.bfloat16):
             fine = eyes.neck(*eyes.tower.looked(images))
-        wanted = targets(rows, len(eyes.kinds), *CELLS["fine"])
-        fit = doubt_loss(eyes.fine_heads(fine.float()), wanted)  # bfloat16 is off itself
+        said, wanted = eyes.read(fine.float()), targets(rows, len(eyes.kinds), *CELLS["fine"])  # bfloat16 is off itself
+        off, wrong = doubt_loss(said, wanted), sure_loss(said, wanted)
         optimizer.zero_grad()
-        fit.backward()
+        (off + wrong).backward()
         optimizer.step()
         schedule.step()
         if progress is not None and update % WINDOW == WINDOW - 1:
-            progress(settings.updates, settings.updates, f"doubt {float(fit):.2f} after {update + 1} of {updates}")
+            newest = f"doubt {off.item():.2f}, sure {wrong.item():.3f} after {update + 1} of {updates}"
+            progress(settings.updates, settings.updates, newest)
 
 
 def _chosen(settings: Training, update: int, count: int) -> NDArray[np.int64]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -13,6 +14,7 @@ from torch import Tensor, nn
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.eyes.heads import FINE, Heads, Said
 from lerobot_memobench.eyes.neck import FINER, Neck
+from lerobot_memobench.eyes.second_look import SecondLook
 from lerobot_memobench.eyes.tower import BLOCKS, GRID, POOLED, WIDTHS, Tower, fold
 from lerobot_memobench.files import write_file
 
@@ -34,6 +36,7 @@ class Eyes(nn.Module):
 
     Attributes:
         fine_heads, heads, pooled_heads: of the neck's finer map, of the 64 tokens, and of the 16 pooled ones.
+        second_look: at what is found by the finer map.
     """
 
     def __init__(self, tower: Tower, kinds: tuple[str, ...]) -> None:
@@ -42,12 +45,13 @@ class Eyes(nn.Module):
         self.fine_heads = Heads(self.neck.width, len(kinds), FINER * GRID, FINE // FINER, 1, doubting=True)
         self.heads = Heads(tower.width, len(kinds), GRID)
         self.pooled_heads = Heads(tower.width, len(kinds), POOLED)
+        self.second_look = SecondLook(self.neck.width, len(kinds))
 
     def forward(self, images: Tensor) -> dict[str, Said]:
         """Say what pictures (N, 3, SIDE, SIDE) in [0, 1] show, by each of `READINGS`."""
-        tokens, fine = self.tower.looked(images)
+        tokens, maps = self.tower.looked(images)
         pooled = self.pooled_heads(self.tower.pooled(tokens))
-        return {"fine": self.fine_heads(self.neck(tokens, fine)), "tokens": self.heads(tokens), "pooled": pooled}
+        return {"fine": self.read(self.neck(tokens, maps)), "tokens": self.heads(tokens), "pooled": pooled}
 
     def fold(self) -> None:
         """Make batch normalisation part of the convolutions: no more for training."""
@@ -56,7 +60,12 @@ class Eyes(nn.Module):
 
     def find(self, images: Tensor) -> Said:
         """Say what pictures (N, 3, SIDE, SIDE) in [0, 1] show, by the finer map, which says it best."""
-        return self.fine_heads(self.neck(*self.tower.looked(images)))
+        return self.read(self.neck(*self.tower.looked(images)))
+
+    def read(self, fine: Tensor) -> Said:
+        """Say what the finer map (N, (8 FINER)², its width) of pictures shows."""
+        said: Said = self.fine_heads(fine)
+        return replace(said, sure=self.second_look(fine, said.heat))
 
 
 def save_eyes(eyes: Eyes, path: Path) -> None:
