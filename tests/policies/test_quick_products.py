@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -10,7 +9,6 @@ import torch
 from small_policy import batch_of, made_for_training
 
 from lerobot_memobench.policies.memobench_mem import learning
-from lerobot_memobench.policies.memobench_mem.quick_products import end_quick_products
 from object_dataset import make_object_dataset
 
 OBJECTS = {"perception": "objects", "size": "small", "n_action_steps": 3, "memory_stride": 1, "width": 256}
@@ -19,13 +17,6 @@ OBJECTS = {"perception": "objects", "size": "small", "n_action_steps": 3, "memor
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_object_dataset(tmp_path_factory.mktemp("objects") / "data")
-
-
-@pytest.fixture(autouse=True)
-def put_back() -> Iterator[None]:
-    end_quick_products()
-    yield
-    end_quick_products()
 
 
 def settings() -> tuple[str, bool]:
