@@ -1,4 +1,4 @@
-"""The synthetic dataset that policies are trained on."""
+"""The synthetic dataset that policies are trained on, and torch as it was before each test."""
 
 from __future__ import annotations
 
