@@ -3,8 +3,8 @@
     python benchmarks/object_update.py [--moments 6] [--episodes 12] [--repeats 15]
 
 An update is forward, backward, clipping, AdamW and the weight average, on one thread, with a memory and without;
-seconds are of the CPU. Prints one JSON line: ratio (float32 / as it is made) and seconds. A CPU that multiplies no
-bfloat16 (`lscpu | grep -E 'avx512_bf16|amx_bf16'`) has a ratio of 1.
+seconds are of the CPU. Prints one JSON line: ratio (float32 / as it is made) and seconds. A CPU that is not quicker
+in bfloat16 has a ratio of 1.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.utils.constants import OBS_ENV_STATE
 from turns import medians
 
+from lerobot_memobench.computing.freed_memory import keep_freed_memory
 from lerobot_memobench.policies.memobench_mem import learning
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.freed_memory import keep_freed_memory
 from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, STEPS, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_RAW_STATE, frame_row

@@ -17,7 +17,7 @@ sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
 @pytest.fixture(autouse=True)
 def usual_products() -> Iterator[None]:
     """Put torch's settings back: what makes no update after a training's forward pass leaves quick products on."""
-    from lerobot_memobench.policies.memobench_mem.quick_products import end_quick_products
+    from lerobot_memobench.computing.bfloat16 import end_quick_products
 
     end_quick_products()
     yield

@@ -13,6 +13,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lerobot_memobench.computing.bfloat16 import quicker_in_bfloat16
+from lerobot_memobench.computing.freed_memory import keep_freed_memory
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.eyes.heads import COARSE, FINE
 from lerobot_memobench.eyes.labels import Rows, images_of
@@ -86,6 +88,7 @@ def train(
         MemobenchError: the folder's training has other settings.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    keep_freed_memory()
     torch.manual_seed(settings.seed)
     learner = _Learner(Eyes(tower(), kinds), settings, len(pictures))
     learner.restore(folder / CHECKPOINT)
@@ -125,7 +128,7 @@ def learn_last(eyes: Eyes, pictures: Pictures, settings: Training, progress: Pro
     for update in range(updates):
         rows = pictures.rows(_chosen(settings, settings.updates + update, len(pictures)))
         images = changed(images_of(rows), _chance(settings, settings.updates + update))
-        with torch.autocast("cpu", torch.bfloat16):
+        with torch.autocast("cpu", torch.bfloat16, enabled=quicker_in_bfloat16()):
             fine = eyes.neck(*eyes.tower.looked(images))
         said, wanted = eyes.read(fine.float()), targets(rows, len(eyes.kinds), *CELLS["fine"])  # bfloat16 is off itself
         off, wrong = doubt_loss(said, wanted), sure_loss(said, wanted)
@@ -186,7 +189,7 @@ class _Learner:
 
     def _losses(self, rows: Rows) -> dict[str, Tensor]:
         images = changed(images_of(rows), _chance(self._settings, self.update))
-        with torch.autocast("cpu", torch.bfloat16):
+        with torch.autocast("cpu", torch.bfloat16, enabled=quicker_in_bfloat16()):
             said = self.eyes(images)
         return {
             f"{reading} {name}": value

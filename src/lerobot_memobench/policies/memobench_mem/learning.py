@@ -7,6 +7,7 @@ from typing import Any
 from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 from torch import Tensor, nn
 
+from lerobot_memobench.computing.bfloat16 import begin_quick_products, end_quick_products
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.action_loss import counted_actions, mean_losses
 from lerobot_memobench.policies.memobench_mem.action_objective import losses_of, noise_and_time
@@ -15,7 +16,6 @@ from lerobot_memobench.policies.memobench_mem.alignment.objectives import Alignm
 from lerobot_memobench.policies.memobench_mem.averaging import WeightAverage
 from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, PHASE, STEPS, TOKENS, MemoryBatch
 from lerobot_memobench.policies.memobench_mem.perception.eyes import SEEN
-from lerobot_memobench.policies.memobench_mem.quick_products import begin_quick_products, end_quick_products
 from lerobot_memobench.policies.memobench_mem.seeing import SeeingPolicy
 from lerobot_memobench.policies.memobench_mem.training_curve import TrainingCurve
 

@@ -12,6 +12,7 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from safetensors.torch import load_file
 from torch import Tensor
 
+from lerobot_memobench.computing.freed_memory import keep_freed_memory
 from lerobot_memobench.datasets.memory_cache import RecordedFrames
 from lerobot_memobench.eyes.weights import load_tower
 from lerobot_memobench.policies.memobench_mem.acting import ActingPolicy
@@ -34,7 +35,6 @@ from lerobot_memobench.policies.memobench_mem.execution_frames import (
     prompted_factors,
     task_of_frames,
 )
-from lerobot_memobench.policies.memobench_mem.freed_memory import keep_freed_memory
 from lerobot_memobench.policies.memobench_mem.fused_attention import attend_fused
 from lerobot_memobench.policies.memobench_mem.learning import LearningPolicy
 from lerobot_memobench.policies.memobench_mem.memory.registry import make_mechanism

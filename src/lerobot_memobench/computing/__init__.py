@@ -1,0 +1,1 @@
+"""How does torch compute quickest on this CPU? What training may use of it, policies and eyes alike."""

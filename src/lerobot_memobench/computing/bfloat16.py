@@ -1,0 +1,69 @@
+"""Products of float32 numbers computed in bfloat16 while something learns on a CPU, where that is quicker.
+
+Weights, gradients, sums and all that is no product stay float32. Nothing changes on a CPU without instructions for
+bfloat16, or where these are slow, nor for a policy with eyes, which is quicker by attention in one kernel
+(`fused_attention`). The setting is torch's and the process's, so it is on from a forward pass to its update only: what
+acts, or measures a loss, in between two updates computes as everywhere.
+"""
+
+from __future__ import annotations
+
+import time
+from functools import cache
+
+import torch
+
+INSTRUCTIONS = ("avx512_bf16", "amx_bf16")
+CLEARLY = 0.8
+"""Share of float32's time that products in bfloat16 may take at most: the same machine decides the same each time."""
+_before: tuple[str, bool] | None = None
+
+
+@cache
+def quicker_in_bfloat16() -> bool:
+    """Return whether this CPU has instructions for products in bfloat16 and is clearly quicker by them; not where torch
+    cannot tell.
+
+    It is tried once, in some 70 ms: of two CPUs with ``avx512_bf16`` an AMD EPYC made twice as many a second as in
+    float32, an Intel Xeon without AMX no more.
+    """
+    # LeRobot takes torch from 2.7 on, which could not be asked yet.
+    known: dict[str, bool] = getattr(torch.cpu, "get_capabilities", dict)()
+    if not any(known.get(name, False) for name in INSTRUCTIONS):
+        return False
+    products = torch.backends.mkldnn.matmul
+    before, seconds = products.fp32_precision, dict.fromkeys(("ieee", "bf16"), float("inf"))
+    try:
+        for precision in [*seconds] * 6:
+            products.fp32_precision = precision
+            seconds[precision] = min(seconds[precision], _seconds())
+    finally:
+        products.fp32_precision = before
+    return seconds["bf16"] < CLEARLY * seconds["ieee"]
+
+
+def _seconds() -> float:
+    """Return how long a product takes."""
+    left, right = torch.ones(1024, 512), torch.ones(512, 512)
+    start = time.perf_counter()
+    left @ right
+    return time.perf_counter() - start
+
+
+def begin_quick_products() -> None:
+    """Round the factors of products from now on; attention in one kernel, whose many small ones suffer, is left out."""
+    global _before
+    if _before is None and quicker_in_bfloat16():
+        products = torch.backends.mkldnn.matmul
+        _before = products.fp32_precision, torch.backends.cuda.flash_sdp_enabled()  # of the CPU's kernel, too
+        products.fp32_precision = "bf16"
+        torch.backends.cuda.enable_flash_sdp(False)
+
+
+def end_quick_products() -> None:
+    """Put everything back, if they had begun."""
+    global _before
+    if _before is not None:
+        torch.backends.mkldnn.matmul.fp32_precision, fused = _before
+        torch.backends.cuda.enable_flash_sdp(fused)
+        _before = None
