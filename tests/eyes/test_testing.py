@@ -15,7 +15,7 @@ from lerobot_memobench.eyes import testing
 from lerobot_memobench.eyes.finding import FOUND
 from lerobot_memobench.eyes.labels import Rows, projected
 from lerobot_memobench.eyes.pictures import Pictures
-from lerobot_memobench.eyes.report import NUMBERS, PICTURE, TABLE, Tested, drawn, numbers, write_report
+from lerobot_memobench.eyes.report import NUMBERS, PICTURE, TABLE, Examined, drawn, numbers, write_report
 from lerobot_memobench.eyes.testing import OBJECT, OUTCOME, See, Things, object_outcomes, outcomes
 from lerobot_memobench.eyes.tower import SIDE, Tower
 from lerobot_memobench.eyes.weights import Eyes, save_eyes
@@ -101,7 +101,7 @@ def test_what_is_missed_is_infinitely_far_and_what_is_not_there_is_false(shown: 
     told, false = outcomes(lambda rows: [things[1:] for things in perfect(rows)], pictures)
     assert np.isinf(told["error"]).sum() == 10
     assert false == 0
-    table = numbers(Tested(KINDS, told, told, told, false, 10, 1.0, NOTHING, NOTHING))["rows"]
+    table = numbers(Examined(KINDS, told, told, told, false, 10, 1.0, NOTHING, NOTHING))["rows"]
     red = next(row for row in table if row["kind"] == "red")
     assert (red["found"], red["median_cm"], red["shown"]) == (0.0, None, 10)
     everything, scene = (next(row for row in table if row["kind"] == kind) for kind in ("all", "all, as it was"))
@@ -141,7 +141,7 @@ def test_both_cameras_find_objects_together(
     assert told["error"].max() < 0.01
     assert (told["lit"] == (told["kind"] == 1)).all()
     assert (told["lit"] == told["said_lit"]).all()
-    table = {row["scene"]: row for row in numbers(Tested(KINDS, NO, NO, NO, 0.0, 8, 1.0, told, false))["objects"]}
+    table = {row["scene"]: row for row in numbers(Examined(KINDS, NO, NO, NO, 0.0, 8, 1.0, told, false))["objects"]}
     assert table["as it was"] | {"median_cm": 0} == {
         **{"scene": "as it was", "shown": 12, "found": 1.0, "median_cm": 0, "p90_cm": table["as it was"]["p90_cm"]},
         **{"false_per_shown": 0.0, "lit": 4, "lit_right": 4, "lit_wrong": 0},
@@ -158,7 +158,7 @@ def test_the_report_is_written(shown: Callable[..., Pictures], tmp_path: Path) -
     told, false = outcomes(perfect, pictures)
     rows = pictures.rows(np.arange(8))
     table = write_report(
-        Tested(KINDS, told, NO, NO, false, 8, 2.5, NOTHING, NOTHING), drawn(rows, perfect(rows), KINDS), tmp_path
+        Examined(KINDS, told, NO, NO, false, 8, 2.5, NOTHING, NOTHING), drawn(rows, perfect(rows), KINDS), tmp_path
     )
     assert (tmp_path / TABLE).read_text() == table
     assert "| red | 0.00 / 0.00 (1.000 of 8) |" in table

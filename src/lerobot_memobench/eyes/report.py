@@ -28,7 +28,7 @@ COLUMNS = 6
 
 
 @dataclass(frozen=True)
-class Tested:
+class Examined:
     """A test of eyes.
 
     Attributes:
@@ -73,7 +73,7 @@ def _rank(values: NDArray[Any], percent: int) -> float | None:
     return round(found, 4) if math.isfinite(found) else None
 
 
-def numbers(tested: Tested) -> dict[str, Any]:
+def numbers(tested: Examined) -> dict[str, Any]:
     """Return the whole test as JSON has it; errors that are infinite are null."""
     groups = [("all", tested.told), ("all, by tokens", tested.tokens), ("all, by pooled tokens", tested.pooled)]
     groups += [(f"all, {name}", tested.told[tested.told["scene"] == scene]) for scene, name in enumerate(SCENES)]
@@ -95,7 +95,7 @@ def numbers(tested: Tested) -> dict[str, Any]:
     }
 
 
-def _object_rows(tested: Tested) -> list[dict[str, Any]]:
+def _object_rows(tested: Examined) -> list[dict[str, Any]]:
     """What is found by both cameras together, in each kind of scene, and of that what the hand is near."""
     rows = []
     for scene, name in enumerate(SCENES):
@@ -187,7 +187,7 @@ def drawn(rows: Rows, finds: Sequence[Things], kinds: Sequence[str]) -> Image.Im
     return sheet
 
 
-def write_report(tested: Tested, sheet: Image.Image, folder: Path) -> str:
+def write_report(tested: Examined, sheet: Image.Image, folder: Path) -> str:
     """Write table, numbers and picture to a folder; return the table."""
     folder.mkdir(parents=True, exist_ok=True)
     found = numbers(tested)

@@ -11,7 +11,7 @@ import numpy as np
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.eyes.kinds import kinds
 from lerobot_memobench.eyes.pictures import Pictures, make_pictures
-from lerobot_memobench.eyes.report import COLUMNS, Tested, drawn, write_report
+from lerobot_memobench.eyes.report import COLUMNS, Examined, drawn, write_report
 from lerobot_memobench.eyes.testing import milliseconds, object_outcomes, outcomes, seeing
 from lerobot_memobench.eyes.training import Progress, Training, train
 from lerobot_memobench.eyes.weights import load_eyes
@@ -82,7 +82,7 @@ def examine(file: Path, folder: Path, lessons: Lessons, *, made: Callable[[Advan
     told, false = outcomes(seeing(eyes), pictures)
     tokens, pooled = (outcomes(seeing(eyes, reading), pictures)[0] for reading in ("tokens", "pooled"))
     took = milliseconds(eyes.tower)
-    tested = Tested(eyes.kinds, told, tokens, pooled, false, len(pictures), took, *object_outcomes(eyes, pictures))
+    tested = Examined(eyes.kinds, told, tokens, pooled, false, len(pictures), took, *object_outcomes(eyes, pictures))
     count = min(len(pictures), COLUMNS * DRAWN_ROWS)
     chosen = np.linspace(0, len(pictures) - 1, count).astype(np.int64)
     rows = pictures.rows(chosen - (chosen + np.arange(count)) % len(CAMERAS))  # one camera's after the other's
