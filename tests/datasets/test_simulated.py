@@ -47,7 +47,7 @@ FULL_RUNS = {"published": DOCS / "full_run" / "manifest.json", "strict": DOCS / 
 """Hashes of 1,500 demonstrations, as ``memobench describe`` wrote them."""
 
 
-@pytest.mark.parametrize(("suite", "solved"), [("published", 1_500), ("strict", 1_498)])
+@pytest.mark.parametrize(("suite", "solved"), [("published", 1_500), ("strict", 1_499)])
 def test_a_committed_run_is_whole(suite, solved):
     tasks = json.loads(FULL_RUNS[suite].read_text())["tasks"]
     assert set(tasks) == set(task_names(suite=suite))
@@ -428,15 +428,17 @@ print(digest(record_demonstration(get_task(sys.argv[1]), int(sys.argv[2]), image
 @pytest.mark.slow
 @pytest.mark.parametrize(("suite", "name"), [(suite, name) for suite in FULL_RUNS for name in task_names(suite=suite)])
 def test_a_full_run_is_repeated(suite, name):
-    """The first demonstration of each task is the one whose hash was committed.
+    """The first demonstration of each task that was solved is the one whose hash was committed.
 
     OpenBLAS multiplies by other kernels on other processors, which round differently, unless it is told which before
     NumPy is imported: so it is another process that records.
     """
     told = {**os.environ, "OPENBLAS_CORETYPE": "Haswell"}
-    command = [sys.executable, "-c", RECORD, name, str(SEED)]
+    entries = json.loads(FULL_RUNS[suite].read_text())["tasks"][name]
+    seed, committed = next((seed, entry) for seed, entry in entries.items() if re.fullmatch("[0-9a-f]{64}", entry))
+    command = [sys.executable, "-c", RECORD, name, seed]
     run = subprocess.run(command, env=told, capture_output=True, text=True, check=True)
-    assert run.stdout.split() == [json.loads(FULL_RUNS[suite].read_text())["tasks"][name][str(SEED)]]
+    assert run.stdout.split() == [committed]
 
 
 @pytest.mark.slow
