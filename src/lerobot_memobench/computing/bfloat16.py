@@ -1,9 +1,9 @@
-"""Products of float32 numbers computed in bfloat16 while something learns on a CPU, where that is quicker.
+"""Where a CPU is quicker in bfloat16, which eyes ask before they learn by torch's autocast, and policies by products.
 
-Weights, gradients, sums and all that is no product stay float32. Nothing changes on a CPU without instructions for
-bfloat16, or where these are slow, nor for a policy with eyes, which is quicker by attention in one kernel
-(`fused_attention`). The setting is torch's and the process's, so it is on from a forward pass to its update only: what
-acts, or measures a loss, in between two updates computes as everywhere.
+Between `begin_quick_products` and `end_quick_products` weights, gradients, sums and all that is no product stay
+float32. A policy with eyes does without: it is quicker by attention in one kernel (`fused_attention`). The setting is
+torch's and the process's, so it is on from a forward pass to its update only: what acts, or measures a loss, in between
+two updates computes as everywhere.
 """
 
 from __future__ import annotations
@@ -51,7 +51,9 @@ def _seconds() -> float:
 
 
 def begin_quick_products() -> None:
-    """Round the factors of products from now on; attention in one kernel, whose many small ones suffer, is left out."""
+    """Round the factors of products from now on, if that is quicker; attention in one kernel, whose many small ones
+    suffer, is left out.
+    """
     global _before
     if _before is None and quicker_in_bfloat16():
         products = torch.backends.mkldnn.matmul
