@@ -10,6 +10,7 @@ import torch
 
 from lerobot_memobench.eyes.finding import found
 from lerobot_memobench.eyes.labels import projected
+from lerobot_memobench.eyes.second_look import SecondLook
 from lerobot_memobench.eyes.targets import loss, targets
 from lerobot_memobench.eyes.tower import GRID
 from lerobot_memobench.eyes.training import CELLS
@@ -48,9 +49,39 @@ def test_doubts_are_of_the_picture_and_of_metres() -> None:
 def test_a_second_look_says_which_finds_are_right() -> None:
     said = perfect(targets(made_up(2), KINDS, GRID), SIDE)
     logits = torch.tensor([-4.0, 0.0, 2.0])
-    for things in found(replace(said, sure=lambda picture, kind, row, column: logits[kind][:, None])):
+
+    def sure(picture: torch.Tensor, _: torch.Tensor, row: torch.Tensor, column: torch.Tensor) -> torch.Tensor:
+        return torch.where(said.heat[picture, :, row, column] > 0, logits, -9.0)
+
+    for things in found(replace(said, sure=sure)):
         assert things["kind"].tolist() == [2, 1], "the surest first, and one not"
         assert things["score"] == pytest.approx(torch.sigmoid(logits[[2, 1]]).numpy())
+
+
+def test_a_second_look_is_at_what_is_around_a_find() -> None:
+    """Elsewhere it says of a place what it said of it, nothing far from it matters, and its square's edge does."""
+    torch.manual_seed(0)
+    look, side = SecondLook(6, 5, KINDS), 16
+    maps = {"fine": torch.rand(side, side, 6), "close": torch.rand(2 * side, 2 * side, 5)}
+    maps["heat"] = torch.rand(side, side, KINDS)
+
+    def said(row: int, column: int, **changed: torch.Tensor) -> torch.Tensor:
+        seen = {**maps, **changed}
+        close, heat = (seen[name].permute(2, 0, 1)[None] for name in ("close", "heat"))
+        cells = (torch.tensor([value]) for value in (0, 1, row, column))
+        return look(seen["fine"].flatten(0, 1)[None], close, heat)(*cells)
+
+    first = said(7, 8)
+    assert first.shape == (1, KINDS)
+    moved = {name: values.roll((4, -4) if name == "close" else (2, -2), (0, 1)) for name, values in maps.items()}
+    assert torch.allclose(said(9, 6, **moved), first, atol=1e-6)
+    for name, row, column, reach in (("fine", 7, 8, 2), ("close", 14, 16, 6), ("heat", 7, 8, 1)):
+        far = torch.full_like(maps[name], 9.0)
+        near = (slice(row - reach, row + reach + 1), slice(column - reach, column + reach + 1))
+        far[near] = maps[name][near]
+        assert torch.allclose(said(7, 8, **{name: far}), first, atol=1e-6)
+        far[row - reach, column + reach] = 9.0
+        assert not torch.allclose(said(7, 8, **{name: far}), first, atol=1e-3)
 
 
 def test_saying_so_costs_nothing_and_anything_else_does() -> None:

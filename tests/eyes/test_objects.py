@@ -10,10 +10,10 @@ import torch
 from numpy.typing import NDArray
 
 from lerobot_memobench.experts.prompts import highlight_of
-from lerobot_memobench.eyes.finding import FOUND
+from lerobot_memobench.eyes.finding import FOUND, SURE
 from lerobot_memobench.eyes.kinds import PARTS, kinds
 from lerobot_memobench.eyes.labels import Labeller, Rows, projected, settle
-from lerobot_memobench.eyes.objects import ALONE, APART, ONE, ROUND, SAME, SURE, ObjectFinder
+from lerobot_memobench.eyes.objects import ALONE, APART, ONE, ROUND, SAME, ObjectFinder
 from lerobot_memobench.eyes.poses import reach
 from lerobot_memobench.eyes.tower import Tower
 from lerobot_memobench.eyes.views import view_of, views_of

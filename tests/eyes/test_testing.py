@@ -135,7 +135,7 @@ def test_both_cameras_find_objects_together(
     rows["hand"] = rows["things"]["position"][:, 0]
     eyes = Eyes(small_tower().eval(), ("butter", "milk", "plate", "cork"))
     seen: dict[str, See] = {"see": perfect}
-    monkeypatch.setattr(testing, "found", lambda _, sure: seen["see"](rows))
+    monkeypatch.setattr(testing, "found", lambda _: seen["see"](rows))
     told, false = object_outcomes(eyes, shown(rows))
     assert (len(told), len(false)) == (12, 0)
     assert told["error"].max() < 0.01

@@ -76,6 +76,11 @@ def test_eyes_come_back_from_their_file(small_tower: Callable[[], Tower], tmp_pa
     back = load_eyes(tmp_path / "eyes.safetensors")
     assert back.kinds == ("cork", "cap")
     assert all(map(partial(torch.allclose, atol=0.05), all_said(back(images)), before))
+    for name, value in eyes.state_dict().items():
+        kept, rounding = back.state_dict()[name], 2**-8 * value.abs()
+        if name.startswith(("heads.", "pooled_heads.")) and value.ndim > 1:
+            rounding = value.abs().amax(dim=1, keepdim=True) / 253
+        assert ((kept - value).abs() <= rounding + 1e-9).all(), name
 
 
 @torch.no_grad()

@@ -22,7 +22,8 @@ from lerobot_memobench.eyes.weights import READINGS, Eyes, load_eyes
 from .made_up import made_up
 
 KINDS = ("red", "green", "blue")
-LEARNED_LAST = {"fine_heads.doubt", *(f"second_look.{part}" for part in ("around", "heard", "kind", "sure"))}
+PARTS = ("around", "close", "near", "heard", "deeper", "sure")
+LEARNED_LAST = {"fine_heads.doubt", *(f"second_look.{part}" for part in PARTS)}
 
 
 class Stopped(Exception):
@@ -36,8 +37,20 @@ def pictures(tmp_path: Path) -> Pictures:
     return Pictures([tmp_path / "pictures.npy"])
 
 
+@pytest.mark.parametrize(
+    ("at", "again"),
+    [
+        pytest.param(8, 6 + 1 + 12, id="from update 6, then one read whitens and what is learned last takes twelve"),
+        pytest.param(19, 1 + 8, id="from update 4 of what is learned last"),
+    ],
+)
 def test_a_stopped_run_ends_as_another(
-    pictures: Pictures, small_tower: Callable[[], Tower], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    at: int,
+    again: int,
+    pictures: Pictures,
+    small_tower: Callable[[], Tower],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     settings = Training(updates=12, batch=4)
     whole = train(pictures, KINDS, tmp_path / "whole", settings, tower=small_tower, save_every=2)
@@ -45,7 +58,7 @@ def test_a_stopped_run_ends_as_another(
 
     def rows(self: Pictures, indices: np.ndarray) -> Rows:
         asked.append(1)
-        if len(asked) == 8:
+        if len(asked) == at:
             raise Stopped
         return read(self, indices)
 
@@ -53,8 +66,7 @@ def test_a_stopped_run_ends_as_another(
     with pytest.raises(Stopped):
         train(pictures, KINDS, tmp_path / "stopped", settings, tower=small_tower, save_every=2)
     stopped = train(pictures, KINDS, tmp_path / "stopped", settings, tower=small_tower, save_every=2)
-    # It went on from the checkpoint of update 6; one more whitens, and doubts take twelve.
-    assert len(asked) == 8 + 12 - 6 + 1 + 12
+    assert len(asked) == at + again
     assert stopped.read_bytes() == whole.read_bytes()
     assert (tmp_path / "stopped" / CURVE).is_file()
 
@@ -98,9 +110,9 @@ def test_what_is_learned_last_fits_and_changes_nothing_else(
         for times in (0.5, 2.0):
             other = replace(learned, doubt=lambda *cells, more=times: doubt(*cells) + np.log(more))
             assert doubt_loss(learned, wanted) < doubt_loss(other, wanted), "as large as errors are"
-        for more in (-1.0, 1.0):
-            other = replace(learned, sure=lambda *cells, more=more: sure(*cells) + more)
-            assert sure_loss(learned, wanted) < sure_loss(other, wanted), "as sure as finds are right"
+        for same in np.linspace(-6, 0, 13):
+            other = replace(learned, sure=lambda *cells, same=same: torch.full_like(sure(*cells), same))
+            assert 5 * sure_loss(learned, wanted) < sure_loss(other, wanted), "right finds are told from wrong ones"
 
 
 def test_other_settings_do_not_go_on(pictures: Pictures, small_tower: Callable[[], Tower], tmp_path: Path) -> None:

@@ -27,9 +27,9 @@ FOUND = np.dtype(
 """A thing that was found. ``score``: probability. ``place``: of its origin in the picture, a fraction of its side from
 the upper left corner. ``lit``: probability. ``doubt``: how far off it may be: its place, a fraction of the picture's
 side, its depth and its height, m; 0 where nothing is said. The others as `heads.GEOMETRY` has them."""
-SURE, HOT = 0.08, 0.3
+SURE, HOT = 0.03, 0.3
 """Probability from which on a thing counts as found, at a second look and by heat alone: heat promises more."""
-MOST = 32
+MOST = 64
 """Things that are looked for in a picture."""
 
 
@@ -70,7 +70,8 @@ def peaks(said: Said) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor, Tensor]]:
     pictures = torch.arange(len(heat))[:, None].expand_as(places)
     cells = (pictures, places // side**2, places // side % side, places % side)
     if said.sure is not None:
-        sure = torch.sigmoid(said.sure(*(cell.flatten() for cell in cells))).view_as(scores)
+        every = said.sure(*(cell.flatten() for cell in cells)).view(*scores.shape, -1)
+        sure = torch.sigmoid(every.gather(2, cells[1][..., None])[..., 0])
         scores = torch.where(scores > 0, sure, scores)
     return scores, cells
 

@@ -41,7 +41,8 @@ class Said:
         geometry: len(GEOMETRY) values. side: coarse cells along the picture's side.
         mask: (N, kinds + 1, fine cells, fine cells), logits of what is shown, first of nothing.
         doubt: len(DOUBTS) values, logarithms of how far off the geometry is; None: it is not said.
-        sure: one value, logit that such a thing is there, where the heat has a peak; None: it is as likely as hot.
+        sure: as many values as kinds, logits that a thing of each is there, where the heat has a peak of any; None:
+            it is as likely as hot.
     """
 
     heat: Tensor

@@ -44,8 +44,8 @@ ROUND = frozenset({
 })
 # fmt: on
 """Kinds that are alike from all sides: their x axis is taken to be the world's, as tasks place them."""
-SURE, ALONE = 0.03, 0.1
-"""Probability from which on what both cameras find is there, and what one of them finds alone."""
+ALONE = 0.1
+"""Probability from which on what one camera alone finds is there."""
 APART, SAME = 0.03, 0.04
 """How near to one another two things of a kind can stand, and how far apart two cameras may see one thing, m."""
 LIT = 0.5
@@ -112,7 +112,7 @@ class ObjectFinder:
             states: (N, >= 6) the hand's place, m, and its turn as axis times angle, rad.
         """
         both = torch.cat([shrunk(pictures[camera]) for camera in CAMERAS])  # one pass is quicker than two
-        finds = found(self.eyes.find(both), SURE)
+        finds = found(self.eyes.find(both))
         hands = states.cpu().numpy().astype(np.float64)
         slots = []
         for row, hand in enumerate(hands):

@@ -140,7 +140,8 @@ def doubt_loss(said: Said, wanted: Targets) -> Tensor:
 
 
 def sure_loss(said: Said, wanted: Targets) -> Tensor:
-    """Return how badly the sureness of finds, of all peaks that heads said, fits whether they are right.
+    """Return how badly the sureness of finds, of all peaks that heads said, fits whether they are right; and that of
+    all other kinds at their places, which counts as much and teaches the same network.
 
     Raises:
         ValueError: it is not said.
@@ -148,8 +149,10 @@ def sure_loss(said: Said, wanted: Targets) -> Tensor:
     if said.sure is None:
         raise ValueError("these eyes take no second look")
     _, cells = peaks(replace(said, sure=None))  # asked below, once
-    right = (wanted.heat[cells] > BESIDE).float().flatten()
-    return binary_cross_entropy_with_logits(said.sure(*(cell.flatten() for cell in cells)).flatten(), right)
+    picture, kind, row, column = (cell.flatten() for cell in cells)
+    right = (wanted.heat[picture, :, row, column] > BESIDE).float()
+    every = binary_cross_entropy_with_logits(said.sure(picture, kind, row, column), right, reduction="none")
+    return every.gather(1, kind[:, None]).mean() + every.mean()
 
 
 def _heat_loss(logits: Tensor, heat: Tensor) -> Tensor:

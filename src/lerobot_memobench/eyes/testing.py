@@ -14,7 +14,7 @@ from scipy.optimize import linear_sum_assignment
 from lerobot_memobench.eyes.finding import found
 from lerobot_memobench.eyes.kinds import DRAWERS
 from lerobot_memobench.eyes.labels import Rows, images_of, level_depth, projected, rays
-from lerobot_memobench.eyes.objects import LIT, SURE, ObjectFinder
+from lerobot_memobench.eyes.objects import LIT, ObjectFinder
 from lerobot_memobench.eyes.pictures import Pictures
 from lerobot_memobench.eyes.tower import Tower, shrunk
 from lerobot_memobench.eyes.walk import NEAR
@@ -94,7 +94,7 @@ def object_outcomes(eyes: Eyes, pictures: Pictures) -> tuple[Things, Things]:
     for start in range(0, len(pictures), BATCH):
         rows = pictures.rows(np.arange(start, min(start + BATCH, len(pictures))))
         with torch.inference_mode():
-            finds = found(eyes.find(images_of(rows)), SURE)
+            finds = found(eyes.find(images_of(rows)))
         for pair in range(0, len(rows), len(CAMERAS)):
             both = slice(pair, pair + len(CAMERAS))
             right, wrong = _objects(rows[both], finder, finds[both])

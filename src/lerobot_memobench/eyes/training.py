@@ -27,7 +27,7 @@ from lerobot_memobench.eyes.whitening import whiten
 from lerobot_memobench.files import draft_of
 from lerobot_memobench.files.curve import draw_curve, mean_of
 
-CHECKPOINT, WEIGHTS, CURVE = "training.pt", "eyes.safetensors", "training_curve.png"
+CHECKPOINT, LAST, WEIGHTS, CURVE = "training.pt", "last.pt", "eyes.safetensors", "training_curve.png"
 SHARES = {"heat": 1.0, "place": 2.0, "rest": 1.0, "mask": 0.5}
 """What each loss counts."""
 COUNT = {"fine": 1.0, "tokens": 0.5, "pooled": 0.5}
@@ -41,7 +41,7 @@ WINDOW = 10
 """Updates that one point of the curve is the mean of."""
 WHITENED = 2048
 """Pictures over which tokens are made white in the end."""
-LAST_UPDATES, DOUBT_RATE, SURE_RATE = 1200, 1e-2, 3e-3
+LAST_UPDATES, DOUBT_RATE, SURE_RATE = 5000, 1e-2, 3e-3
 """Updates of the doubts and the second look alone, after that, and the highest learning rates of both."""
 BATCH = 64
 """Pictures that are looked at together then."""
@@ -100,7 +100,7 @@ def train(
             newest = ", ".join(f"{name} {value:.3f}" for name, value in learner.points[-1].items())
             progress(learner.update, settings.updates, newest)
     whiten(learner.eyes, _some(pictures))
-    learn_last(learner.eyes, pictures, settings, progress)
+    learn_last(learner.eyes, pictures, settings, progress, folder / LAST, save_every)
     save_eyes(learner.eyes, folder / WEIGHTS)
     return folder / WEIGHTS
 
@@ -112,9 +112,16 @@ def _some(pictures: Pictures) -> Iterator[Tensor]:
         yield images_of(pictures.rows(numbers))
 
 
-def learn_last(eyes: Eyes, pictures: Pictures, settings: Training, progress: Progress | None = None) -> None:
+def learn_last(
+    eyes: Eyes,
+    pictures: Pictures,
+    settings: Training,
+    progress: Progress | None = None,
+    checkpoint: Path | None = None,
+    save_every: int = 50,
+) -> None:
     """Have trained eyes learn how far off they are where they find things, and how sure finds are at a second look; all
-    else in them stays as it is.
+    else in them stays as it is. It goes on from a checkpoint, if there is one.
     """
     eyes.eval().requires_grad_(False)
     doubt, second_look = eyes.fine_heads.doubt, eyes.second_look
@@ -125,17 +132,28 @@ def learn_last(eyes: Eyes, pictures: Pictures, settings: Training, progress: Pro
         [{"params": part.requires_grad_(True).parameters(), "lr": rate} for part, rate in parts]
     )
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, updates)
-    for update in range(updates):
+    kept, done = {"doubt": doubt, "second look": second_look, "optimizer": optimizer, "schedule": schedule}, 0
+    if checkpoint is not None and checkpoint.is_file():
+        state: dict[str, Any] = torch.load(checkpoint, weights_only=True)
+        done = state["update"]
+        for name, part in kept.items():
+            part.load_state_dict(state[name])
+    for update in range(done, updates):
         rows = pictures.rows(_chosen(settings, settings.updates + update, len(pictures)))
         images = changed(images_of(rows), _chance(settings, settings.updates + update))
         with torch.autocast("cpu", torch.bfloat16, enabled=quicker_in_bfloat16()):
-            fine = eyes.neck(*eyes.tower.looked(images))
-        said, wanted = eyes.read(fine.float()), targets(rows, len(eyes.kinds), *CELLS["fine"])  # bfloat16 is off itself
+            tokens, maps = eyes.tower.looked(images)
+            fine = eyes.neck(tokens, maps)
+        said = eyes.read(fine.float(), maps)  # bfloat16 is off itself
+        wanted = targets(rows, len(eyes.kinds), *CELLS["fine"])
         off, wrong = doubt_loss(said, wanted), sure_loss(said, wanted)
         optimizer.zero_grad()
         (off + wrong).backward()
         optimizer.step()
         schedule.step()
+        if checkpoint is not None and (update + 1) % save_every == 0:
+            with draft_of(checkpoint) as draft:
+                torch.save({name: part.state_dict() for name, part in kept.items()} | {"update": update + 1}, draft)
         if progress is not None and update % WINDOW == WINDOW - 1:
             newest = f"doubt {off.item():.2f}, sure {wrong.item():.3f} after {update + 1} of {updates}"
             progress(settings.updates, settings.updates, newest)

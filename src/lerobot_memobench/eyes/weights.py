@@ -1,8 +1,12 @@
-"""Eyes as a file: tower, neck and heads in bfloat16, with the names of the kinds that the heads tell apart."""
+"""Eyes as a file, with the names of the kinds that the heads tell apart: in bfloat16, but for the heads of tokens.
+
+Those are as large as the tower and only tests read them: they are kept as whole numbers up to 127 and a scale a row.
+"""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +17,7 @@ from torch import Tensor, nn
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.eyes.heads import FINE, Heads, Said
-from lerobot_memobench.eyes.neck import FINER, Neck
+from lerobot_memobench.eyes.neck import FINER, STEPS, Neck
 from lerobot_memobench.eyes.second_look import SecondLook
 from lerobot_memobench.eyes.tower import BLOCKS, GRID, POOLED, WIDTHS, Tower, fold
 from lerobot_memobench.files import write_file
@@ -23,7 +27,8 @@ SHIPPED = Path(__file__).parent / "eyes.safetensors"
 PACKAGE, RANDOM = "package", "random"
 """Names of eyes that are no file's: those of the package, and none, where a policy's tower has random weights."""
 
-
+WHOLE, SCALE = ("heads.", "pooled_heads."), " scale"
+"""Where the weights that are kept as whole numbers are, and what follows their names where their scales are."""
 READINGS = ("fine", "tokens", "pooled")
 """What is read off: the finer map, the 64 tokens, and the 16 pooled ones."""
 
@@ -45,13 +50,13 @@ class Eyes(nn.Module):
         self.fine_heads = Heads(self.neck.width, len(kinds), FINER * GRID, FINE // FINER, 1, doubting=True)
         self.heads = Heads(tower.width, len(kinds), GRID)
         self.pooled_heads = Heads(tower.width, len(kinds), POOLED)
-        self.second_look = SecondLook(self.neck.width, len(kinds))
+        self.second_look = SecondLook(self.neck.width, tower.widths[-2 - STEPS], len(kinds))
 
     def forward(self, images: Tensor) -> dict[str, Said]:
         """Say what pictures (N, 3, SIDE, SIDE) in [0, 1] show, by each of `READINGS`."""
         tokens, maps = self.tower.looked(images)
         pooled = self.pooled_heads(self.tower.pooled(tokens))
-        return {"fine": self.read(self.neck(tokens, maps)), "tokens": self.heads(tokens), "pooled": pooled}
+        return {"fine": self.read(self.neck(tokens, maps), maps), "tokens": self.heads(tokens), "pooled": pooled}
 
     def fold(self) -> None:
         """Make batch normalisation part of the convolutions: no more for training."""
@@ -60,18 +65,26 @@ class Eyes(nn.Module):
 
     def find(self, images: Tensor) -> Said:
         """Say what pictures (N, 3, SIDE, SIDE) in [0, 1] show, by the finer map, which says it best."""
-        return self.read(self.neck(*self.tower.looked(images)))
+        tokens, maps = self.tower.looked(images)
+        return self.read(self.neck(tokens, maps), maps)
 
-    def read(self, fine: Tensor) -> Said:
-        """Say what the finer map (N, (8 FINER)², its width) of pictures shows."""
+    def read(self, fine: Tensor, maps: Sequence[Tensor]) -> Said:
+        """Say what the finer map (N, (8 FINER)², its width) of pictures shows, the tower's maps at a second look."""
         said: Said = self.fine_heads(fine)
-        return replace(said, sure=self.second_look(fine, said.heat))
+        return replace(said, sure=self.second_look(fine, maps[-1 - STEPS], said.heat))
 
 
 def save_eyes(eyes: Eyes, path: Path) -> None:
     """Write eyes to a file, folded: they learn no more."""
     eyes.fold()
-    tensors = {name: value.detach().to(torch.bfloat16).contiguous() for name, value in eyes.state_dict().items()}
+    tensors = {}
+    for name, value in eyes.state_dict().items():
+        kept = value.detach()
+        if name.startswith(WHOLE) and kept.ndim > 1:
+            scale = kept.abs().amax(dim=1, keepdim=True).clamp(min=1e-12) / 127
+            tensors[name], tensors[name + SCALE] = (kept / scale).round().to(torch.int8).contiguous(), scale
+        else:
+            tensors[name] = kept.to(torch.bfloat16).contiguous()
     shape = {"widths": eyes.tower.widths, "blocks": eyes.tower.blocks, "kinds": eyes.kinds}
     write_file(path, save(tensors, {"eyes": json.dumps(shape)}))
 
@@ -114,6 +127,8 @@ def load_eyes(name: str | Path) -> Eyes:
         with safe_open(path, framework="pt") as file:
             shape = json.loads(file.metadata()["eyes"])
             tensors = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118 (not a dict)
+        for scale in [key for key in tensors if key.endswith(SCALE)]:
+            tensors[scale.removesuffix(SCALE)] *= tensors.pop(scale)
         eyes = Eyes(Tower(tuple(shape["widths"]), tuple(shape["blocks"])), tuple(shape["kinds"]))
         eyes.fold()
         eyes.load_state_dict(tensors)
