@@ -71,6 +71,17 @@ def test_a_stopped_run_ends_as_another(
     assert (tmp_path / "stopped" / CURVE).is_file()
 
 
+def test_what_other_eyes_learned_last_is_not_gone_on_with(
+    pictures: Pictures, small_tower: Callable[[], Tower], tmp_path: Path
+) -> None:
+    settings = Training(updates=4, batch=4)
+    alone = train(pictures, KINDS, tmp_path / "alone", settings, tower=small_tower, save_every=2)
+    train(pictures, KINDS, tmp_path / "again", replace(settings, seed=1), tower=small_tower, save_every=2)
+    (tmp_path / "again" / CHECKPOINT).unlink()
+    again = train(pictures, KINDS, tmp_path / "again", settings, tower=small_tower, save_every=2)
+    assert again.read_bytes() == alone.read_bytes()
+
+
 def test_it_learns(pictures: Pictures, small_tower: Callable[[], Tower], tmp_path: Path) -> None:
     settings = Training(updates=60, batch=4, rate=1e-2)
     train(pictures, KINDS, tmp_path / "run", settings, tower=small_tower, save_every=60)
@@ -94,6 +105,7 @@ def test_what_is_learned_last_fits_and_changes_nothing_else(
     pictures: Pictures, small_tower: Callable[[], Tower], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(training, "DOUBT_RATE", 0.1)
+    monkeypatch.setattr(training, "SURE_RATE", 3e-4)  # quicker, it learns twelve pictures by heart, and is too sure
     settings = Training(updates=30, batch=12, rate=1e-2)
     eyes = load_eyes(train(pictures, KINDS, tmp_path / "run", settings, tower=small_tower, save_every=30))
     before = {name: value.clone() for name, value in eyes.state_dict().items()}
@@ -110,6 +122,15 @@ def test_what_is_learned_last_fits_and_changes_nothing_else(
         for times in (0.5, 2.0):
             other = replace(learned, doubt=lambda *cells, more=times: doubt(*cells) + np.log(more))
             assert doubt_loss(learned, wanted) < doubt_loss(other, wanted), "as large as errors are"
+        for more in (-1.0, 1.0):
+            other = replace(learned, sure=lambda *cells, more=more: sure(*cells) + more)
+            assert sure_loss(learned, wanted) < sure_loss(other, wanted), "as sure as finds are right"
+    monkeypatch.undo()
+    learn_last(eyes, pictures, Training(updates=150, batch=12))
+    with torch.inference_mode():
+        learned = eyes.find(images_of(rows))
+        sure = learned.sure
+        assert sure is not None
         for same in np.linspace(-6, 0, 13):
             other = replace(learned, sure=lambda *cells, same=same: torch.full_like(sure(*cells), same))
             assert 5 * sure_loss(learned, wanted) < sure_loss(other, wanted), "right finds are told from wrong ones"

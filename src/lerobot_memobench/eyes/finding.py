@@ -33,17 +33,13 @@ MOST = 64
 """Things that are looked for in a picture."""
 
 
-def found(said: Said, sure: float | None = None) -> list[NDArray[np.void]]:
-    """Return the things (n,) of dtype `FOUND` that each picture shows, more probable than ``sure``, by probability.
-
-    Args:
-        sure: `SURE` by default, or `HOT` where no second look is taken.
+def found(said: Said) -> list[NDArray[np.void]]:
+    """Return the things (n,) of dtype `FOUND` that each picture shows, more probable than `SURE`, or `HOT` where no
+    second look is taken, by probability.
     """
-    if sure is None:
-        sure = HOT if said.sure is None else SURE
     scores, cells = peaks(said)
     scores, order = scores.sort(dim=1, descending=True, stable=True)
-    which, rank = torch.nonzero(scores > sure, as_tuple=True)
+    which, rank = torch.nonzero(scores > (HOT if said.sure is None else SURE), as_tuple=True)
     picture, kind, row, column = (cell.gather(1, order)[which, rank] for cell in cells)
     side = said.heat.shape[-1]
     there = (picture, kind, (row + 0.5) / side, (column + 0.5) / side)

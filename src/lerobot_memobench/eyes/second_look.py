@@ -16,7 +16,7 @@ HIDDEN, CLOSE = 96, 24
 """Width of the network, and channels of what it sees of the tower."""
 AROUND, NEAR = 5, 13
 """Side of the square around a find that it sees: in cells of the finer map, and in the tower's, half as wide."""
-HOT = 4.0
+SPREAD = 4.0
 """What logits of the heat are divided by: about how far apart they are."""
 
 
@@ -43,16 +43,24 @@ class SecondLook(nn.Module):
             fine: (N, side², width) the finer map, row by row. close: (N, channels, 2 side, 2 side) the tower's.
             heat: (N, kinds, side, side) logits of the finer map.
         """
-        side, edge = heat.shape[-1], AROUND // 2
+        finer = fine.unflatten(1, heat.shape[-2:]).permute(0, 3, 1, 2)
 
         def ask(picture: Tensor, _: Tensor, row: Tensor, column: Tensor) -> Tensor:
-            around = pad(fine.unflatten(1, (side, side)).float(), (0, 0, edge, edge, edge, edge))
-            around = around.unfold(1, AROUND, 1).unfold(2, AROUND, 1)[picture, row, column]
-            near = pad(close.float(), (NEAR // 2,) * 4).unfold(2, NEAR, 2).unfold(3, NEAR, 2)[picture, :, row, column]
-            heard = max_pool2d(heat, 3, 1, 1)[picture, :, row, column] / HOT
-            closer = relu(self.close(near))
-            seen = relu(self.around(around.flatten(1)) + self.near(closer.flatten(1)) + self.heard(heard))
+            where = (picture, slice(None), row, column)
+            around = _squares(finer, AROUND, 1)[where]
+            near = relu(self.close(_squares(close, NEAR, 2)[where]))
+            heard = max_pool2d(heat, 3, 1, 1)[where] / SPREAD
+            seen = relu(self.around(around.flatten(1)) + self.near(near.flatten(1)) + self.heard(heard))
             said: Tensor = self.sure(seen + relu(self.deeper(seen)))
             return said
 
         return ask
+
+
+def _squares(maps: Tensor, side: int, step: int) -> Tensor:
+    """Return the squares around every ``step``-th cell of maps (N, C, H, W), zeros outside of them.
+
+    Returns:
+        (N, C, H / step, W / step, side, side).
+    """
+    return pad(maps.float(), (side // 2,) * 4).unfold(2, side, step).unfold(3, side, step)

@@ -92,6 +92,8 @@ def train(
     torch.manual_seed(settings.seed)
     learner = _Learner(Eyes(tower(), kinds), settings, len(pictures))
     learner.restore(folder / CHECKPOINT)
+    if learner.update < settings.updates:
+        (folder / LAST).unlink(missing_ok=True)  # of other eyes, whose checkpoint was taken away
     while learner.update < settings.updates:
         learner.learn(pictures.rows(learner.order()))
         if learner.update % save_every == 0 or learner.update == settings.updates:
@@ -132,13 +134,12 @@ def learn_last(
         [{"params": part.requires_grad_(True).parameters(), "lr": rate} for part, rate in parts]
     )
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, updates)
-    kept, done = {"doubt": doubt, "second look": second_look, "optimizer": optimizer, "schedule": schedule}, 0
+    kept = {"doubt": doubt, "second look": second_look, "optimizer": optimizer, "schedule": schedule}
     if checkpoint is not None and checkpoint.is_file():
         state: dict[str, Any] = torch.load(checkpoint, weights_only=True)
-        done = state["update"]
         for name, part in kept.items():
             part.load_state_dict(state[name])
-    for update in range(done, updates):
+    for update in range(schedule.last_epoch, updates):
         rows = pictures.rows(_chosen(settings, settings.updates + update, len(pictures)))
         images = changed(images_of(rows), _chance(settings, settings.updates + update))
         with torch.autocast("cpu", torch.bfloat16, enabled=quicker_in_bfloat16()):
@@ -153,7 +154,7 @@ def learn_last(
         schedule.step()
         if checkpoint is not None and (update + 1) % save_every == 0:
             with draft_of(checkpoint) as draft:
-                torch.save({name: part.state_dict() for name, part in kept.items()} | {"update": update + 1}, draft)
+                torch.save({name: part.state_dict() for name, part in kept.items()}, draft)
         if progress is not None and update % WINDOW == WINDOW - 1:
             newest = f"doubt {off.item():.2f}, sure {wrong.item():.3f} after {update + 1} of {updates}"
             progress(settings.updates, settings.updates, newest)
