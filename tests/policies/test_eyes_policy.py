@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from small_policy import batch_of, losses_in_training, made_for_training, small_
 from torch.nn.functional import scaled_dot_product_attention
 from transformers.models.gemma import modeling_gemma
 
-from lerobot_memobench.datasets.memory_cache import FOLDER
+from lerobot_memobench.datasets.memory_cache import FOLDER, building
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.eyes.tower import GRID, POOLED, SIDE, WIDTH, Tower
 from lerobot_memobench.eyes.weights import Eyes, save_eyes
@@ -167,6 +168,38 @@ def test_a_cache_that_was_killed_is_finished(
     made = [path.relative_to(killed) for path in killed.glob(f"{FOLDER}/*/tokens.bin")]
     assert len(made) == 3
     assert all((killed / path).read_bytes() == (root / path).read_bytes() for path in made)
+
+
+def test_of_two_trainings_each_looks_at_one_camera(
+    dataset_root: Path, tmp_path: Path, seeing: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, original = copy(dataset_root, tmp_path / "data"), Tower.forward
+    begun, waits, go = threading.Event(), threading.Event(), threading.Event()
+    looked = {"first": 0, "second": 0}
+
+    def held(tower: Tower, images: torch.Tensor) -> torch.Tensor:
+        looked[threading.current_thread().name] += len(images)
+        if threading.current_thread().name == "first":
+            begun.set()
+            assert go.wait(60)
+        return original(tower, images)
+
+    monkeypatch.setattr(Tower, "forward", held)
+    monkeypatch.setattr(building.logger, "warning", lambda *_: waits.set())
+    first, second = (
+        threading.Thread(target=cache_dataset, args=(root, small_config(**seeing)), name=name, daemon=True)
+        for name in looked
+    )
+    first.start()
+    assert begun.wait(60)
+    second.start()
+    assert waits.wait(60)
+    assert looked["second"] == sum(LENGTHS)
+    go.set()
+    first.join(60)
+    second.join(60)
+    assert looked == {"first": sum(LENGTHS), "second": sum(LENGTHS)}
+    assert len(list((root / FOLDER).glob("*/tokens.bin"))) == len(CAMERAS) + 1
 
 
 def test_a_disk_without_room_for_all_is_told_before_any_is_made(

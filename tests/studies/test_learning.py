@@ -25,7 +25,7 @@ from lerobot_memobench.studies.learning.figure import COLOURS
 from lerobot_memobench.studies.learning.outcomes import outcomes_of
 from lerobot_memobench.studies.learning.stages import Stages
 from lerobot_memobench.studies.learning.study import learn
-from lerobot_memobench.tasks.catalogue import BOWL, get_task
+from lerobot_memobench.tasks.catalogue import BOWL, get_task, task_names
 
 from ..scripts import load_script
 
@@ -238,6 +238,17 @@ def test_the_command_takes_how_many_demonstrations(
     monkeypatch.setattr(study_module, "learn", lambda which, *_, **__: asked.append(which) or "")
     assert main(["learn", "joint", "--out", str(tmp_path / "out"), *told]) == 0
     assert (asked[0].episodes, asked[0].prompted_episodes) == made
+
+
+def test_the_command_takes_some_of_the_tasks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Experiment] = []
+    monkeypatch.setattr(study_module, "learn", lambda which, *_, **__: asked.append(which) or "")
+    for told in (["--tasks", "object"], ["--tasks", f"{BOWL},temporal"], []):
+        assert main(["learn", "prompted", "--out", str(tmp_path / "out"), *told]) == 0
+    object_tasks, named, all_of_them = (which.tasks for which in asked)
+    assert object_tasks == tuple(task_names("object")) == all_of_them[:5]
+    assert named == (BOWL, *task_names("temporal"))
+    assert main(["learn", "prompted", "--out", str(tmp_path / "out"), "--tasks", "objekt"]) == 2
 
 
 def test_how_many_processes_work_decides_nothing_that_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -32,6 +32,9 @@ class Sight(StrEnum):
 def learn(
     name: Annotated[Name, typer.Argument(help=EXPERIMENTS)],
     out: Annotated[Path, typer.Option(help="Folder of data, policies, rollouts and tables; the same command goes on.")],
+    tasks: Annotated[
+        str | None, typer.Option(help="These alone: memory types or task names, separated by commas.")
+    ] = None,
     episodes: Annotated[int | None, typer.Option(min=1, help="Demonstrations per task.")] = None,
     prompted_episodes: Annotated[
         int | None, typer.Option(min=1, help="Demonstrations per task with a prompt; --episodes unless told.")
@@ -58,11 +61,13 @@ def learn(
     """Generate demonstrations, train policies with a memory and without, roll them out on the evaluation seeds."""
     from lerobot_memobench.studies.learning.experiments import changed, experiment
     from lerobot_memobench.studies.learning.study import learn as run
+    from lerobot_memobench.tasks.catalogue import resolve_tasks
 
     screen = console()
     given = {"episodes": episodes, "steps": steps, "seeds": seeds, "rollouts": rollouts, "first_seed": first_seed}
     given["prompted_episodes"] = prompted_episodes or episodes
+    alone = None if tasks is None else tuple(resolve_tasks(tasks))
     chosen = experiment(name.value, perception.value)
-    chosen = changed(chosen, **given, settings=(*chosen.settings, *(settings or ())))
+    chosen = changed(chosen, tasks=alone, **given, settings=(*chosen.settings, *(settings or ())))
     screen.print(run(chosen, out, lambda text: screen.print(text, soft_wrap=True), dataset=dataset, workers=workers))
     return 0

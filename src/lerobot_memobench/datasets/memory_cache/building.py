@@ -46,6 +46,7 @@ def build_memory_cache(
     place: Path | None = None,
     read: FrameReader | None = None,
     tell: Callable[[str], None] = logger.info,
+    wait: Callable[[Path], None] | None = None,
 ) -> Path:
     """Build, or finish building, the cache ``<root>/memory_cache/<name>``; a fitting complete one is left alone.
 
@@ -63,6 +64,8 @@ def build_memory_cache(
         place: folder in which the cache's is made, where it is not to lie beside the dataset.
         read: from where frames come; from the camera's videos by default.
         tell: told what is made, and how large it will be, before it is made.
+        wait: called with the cache's folder where another builder is at it, before that is waited for; it may raise
+            instead. A warning by default.
 
     Returns:
         The cache's folder.
@@ -82,7 +85,7 @@ def build_memory_cache(
     read = read or frame_reader(root, camera)
     with telling_of_the_disk(work.folder):
         work.folder.parent.mkdir(parents=True, exist_ok=True)
-        with taking_turns(work.folder.parent / f"{name}.lock", work.wait):
+        with taking_turns(work.folder.parent / f"{name}.lock", lambda: (wait or _warn)(work.folder)):
             begun = work.begin()
             encoding = Encoding(work.folder, begun, table, batch_size, workers or min(_cores(), MOST_THREADS))
             encoding.run(frames, read, progress)
@@ -108,6 +111,10 @@ def _describe(
         oracle=table.memory is not None,
         complete=False,
     )
+
+
+def _warn(folder: Path) -> None:
+    logger.warning("Another process is making the memory cache %s; waiting for it to finish.", folder)
 
 
 def _cores() -> int:
@@ -140,10 +147,6 @@ class _Work:
         if there is None or not there.complete:
             return False
         return (self.folder / texts_file(there.texts_key, self.texts.key)).is_file()
-
-    def wait(self) -> None:
-        """Say that somebody else is at it."""
-        logger.warning("Another process is making the memory cache %s; waiting for it to finish.", self.folder)
 
     def begin(self) -> CacheMeta:
         """Make everything but the tokens, for which room is taken; return what is there now."""

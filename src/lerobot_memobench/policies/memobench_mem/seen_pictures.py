@@ -94,12 +94,25 @@ def make_caches(
         f"{in_words(2 * POOLED**2 * WIDTH)} of every frame that is remembered; what is not there yet is made now."
     )
     require_room(memory.folder.parent, sizes)
-    opened = {}
+    busy = []
     for cache in present:
+        try:
+            _make(root, cache, texts, tell=tell, wait=_come_back, **how)
+        except _Busy:
+            busy.append(cache)  # whoever trains beside us is at it; the other camera's is made here meanwhile
+    for cache in busy:
         _make(root, cache, texts, tell=tell, **how)
-        opened[cache.camera] = cache.open(root)
+    opened = {cache.camera: cache.open(root) for cache in present}
     _make(root, memory, texts, read=opened[memory.camera].tokens, tell=tell, **how)
     return memory.open(root), opened
+
+
+class _Busy(Exception):
+    """Another process is making this."""
+
+
+def _come_back(folder: Path) -> None:
+    raise _Busy(folder)
 
 
 def _make(root: Path, cache: Wanted, texts: TextEncoder, **how: Any) -> None:
