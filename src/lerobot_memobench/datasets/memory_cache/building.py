@@ -7,6 +7,7 @@ import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from lerobot_memobench.datasets.memory_cache.decoding import FrameReader, frame_reader
@@ -32,6 +33,10 @@ logger = logging.getLogger(__name__)
 MOST_THREADS = 8
 
 
+def _warn(folder: Path) -> None:
+    logger.warning("Another process is making the memory cache %s; waiting for it to finish.", folder)
+
+
 def build_memory_cache(
     root: Path,
     name: str,
@@ -46,7 +51,7 @@ def build_memory_cache(
     place: Path | None = None,
     read: FrameReader | None = None,
     tell: Callable[[str], None] = logger.info,
-    wait: Callable[[Path], None] | None = None,
+    wait: Callable[[Path], None] = _warn,
 ) -> Path:
     """Build, or finish building, the cache ``<root>/memory_cache/<name>``; a fitting complete one is left alone.
 
@@ -85,7 +90,7 @@ def build_memory_cache(
     read = read or frame_reader(root, camera)
     with telling_of_the_disk(work.folder):
         work.folder.parent.mkdir(parents=True, exist_ok=True)
-        with taking_turns(work.folder.parent / f"{name}.lock", lambda: (wait or _warn)(work.folder)):
+        with taking_turns(work.folder.parent / f"{name}.lock", partial(wait, work.folder)):
             begun = work.begin()
             encoding = Encoding(work.folder, begun, table, batch_size, workers or min(_cores(), MOST_THREADS))
             encoding.run(frames, read, progress)
@@ -111,10 +116,6 @@ def _describe(
         oracle=table.memory is not None,
         complete=False,
     )
-
-
-def _warn(folder: Path) -> None:
-    logger.warning("Another process is making the memory cache %s; waiting for it to finish.", folder)
 
 
 def _cores() -> int:
