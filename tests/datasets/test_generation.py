@@ -419,12 +419,13 @@ def kill_at(call: int, work) -> bool:
         os._exit(1)
 
 
-def test_killed_at_every_change_to_the_disk(tasks, recorded, tmp_path):
-    """Kill after every n-th step of a run, resume, compare with an undisturbed run, byte for byte."""
+@pytest.mark.parametrize("every", [14, pytest.param(2, marks=pytest.mark.slow)])
+def test_killed_at_every_change_to_the_disk(tasks, recorded, tmp_path, every):
+    """Kill at every n-th change, resume, compare with an undisturbed run, byte for byte."""
     out = tmp_path / "ds"
     reference = tree_hash_of_run(tasks, tmp_path / "undisturbed")
     killed = unfinished = 0
-    for call in range(1, 400, 9):
+    for call in range(1, 400, every):
         shutil.rmtree(out, ignore_errors=True)
         if not kill_at(call, lambda: run(tasks, out)):
             break

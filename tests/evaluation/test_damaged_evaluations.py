@@ -148,7 +148,7 @@ def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_damaged_evaluations(tmp_path: Path, kind: str) -> None:
-    results, refused = check(tmp_path, KINDS[kind], 150)
+    results, refused = check(tmp_path, KINDS[kind], 80)
     assert results > 20
     assert refused > (5 if kind != "lerobot's own" else -1)
 

@@ -223,7 +223,10 @@ def test_rollouts_are_of_the_demonstrations_kind(
 ) -> None:
     ran: list[str] = []
     monkeypatch.setattr(stages_module, "run_once", lambda words, log, **options: ran.extend(words))
-    Stages(replace(experiment("bowl"), tasks=(task,), referent=referent), tmp_path).evaluate(MEMORY, 0)
+    stages = Stages(replace(experiment("bowl"), tasks=(task,), referent=referent), tmp_path)
+    stages.generate()
+    assert ("--suite strict" in " ".join(ran)) == strict
+    stages.evaluate(MEMORY, 0)
     assert f"referent={referent}" in ran
     assert ("suite=strict" in ran) == strict
 
@@ -249,6 +252,18 @@ def test_the_command_takes_some_of_the_tasks(tmp_path: Path, monkeypatch: pytest
     assert object_tasks == tuple(task_names("object")) == all_of_them[:5]
     assert named == (BOWL, *task_names("temporal"))
     assert main(["learn", "prompted", "--out", str(tmp_path / "out"), "--tasks", "objekt"]) == 2
+
+
+@pytest.mark.parametrize("name", ["bowl", "prompted", "joint"])
+def test_the_command_takes_the_strict_twins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    asked: list[Experiment] = []
+    monkeypatch.setattr(study_module, "learn", lambda which, *_, **__: asked.append(which) or "")
+    for told in ([], ["--suite", "strict"], ["--suite", "strict", "--tasks", TWIN]):
+        assert main(["learn", name, "--out", str(tmp_path / "out"), *told]) == 0
+    published, twins, one = (which.tasks for which in asked)
+    assert sorted(get_task(twin).twin_of for twin in twins) == sorted(published)
+    assert one == (TWIN,)
+    assert main(["learn", name, "--out", str(tmp_path / "out"), "--tasks", TWIN]) == 2
 
 
 def test_how_many_processes_work_decides_nothing_that_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from lerobot_memobench.cli.console import console
+from lerobot_memobench.cli.suite import Suite, WhichSuite
 
 EXPERIMENTS = "bowl: one task, in minutes; prompted: ten tasks; joint: all thirty."
 
@@ -35,6 +36,7 @@ def learn(
     tasks: Annotated[
         str | None, typer.Option(help="These alone: memory types or task names, separated by commas.")
     ] = None,
+    suite: WhichSuite = Suite.PUBLISHED,
     episodes: Annotated[int | None, typer.Option(min=1, help="Demonstrations per task.")] = None,
     prompted_episodes: Annotated[
         int | None, typer.Option(min=1, help="Demonstrations per task with a prompt; --episodes unless told.")
@@ -66,8 +68,8 @@ def learn(
     screen = console()
     given = {"episodes": episodes, "steps": steps, "seeds": seeds, "rollouts": rollouts, "first_seed": first_seed}
     given["prompted_episodes"] = prompted_episodes or episodes
-    alone = None if tasks is None else tuple(resolve_tasks(tasks))
-    chosen = experiment(name.value, perception.value)
+    alone = None if tasks is None else tuple(resolve_tasks(tasks, suite))
+    chosen = experiment(name.value, perception.value, suite)
     chosen = changed(chosen, tasks=alone, **given, settings=(*chosen.settings, *(settings or ())))
     screen.print(run(chosen, out, lambda text: screen.print(text, soft_wrap=True), dataset=dataset, workers=workers))
     return 0

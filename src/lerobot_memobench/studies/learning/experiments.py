@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from lerobot_memobench.tasks.catalogue import BOWL, get_task, task_names
+from lerobot_memobench.tasks.task import PUBLISHED
 
 MEMORY, MEMORYLESS = "memory", "no memory"
 ARMS: dict[str, tuple[str, ...]] = {MEMORY: (), MEMORYLESS: ("policy.integration=none",)}
@@ -71,11 +72,12 @@ def prompted() -> tuple[str, ...]:
     return tuple(name for name in task_names() if get_task(name).prompt is not None)
 
 
-def experiment(name: str, perception: str = OBJECTS) -> Experiment:
-    """Return the experiment of a name in `EXPERIMENTS`, by policies that see in this way."""
+def experiment(name: str, perception: str = OBJECTS, suite: str = PUBLISHED) -> Experiment:
+    """Return the experiment of a name in `EXPERIMENTS`, by policies that see in this way, on a suite's tasks."""
     named = EXPERIMENTS[name]
     steps = (named.pixel_steps if perception == PIXELS else None) or named.steps
-    return replace(named, perception=perception, steps=steps)
+    tasks = tuple(task for task in task_names(suite=suite) if get_task(task).scene_name in named.tasks)
+    return replace(named, perception=perception, steps=steps, tasks=tasks)
 
 
 EXPERIMENTS: dict[str, Experiment] = {

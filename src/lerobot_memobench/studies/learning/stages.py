@@ -35,6 +35,10 @@ class Stages:
         return PERCEPTIONS[self.experiment.perception]
 
     @property
+    def _is_strict(self) -> bool:
+        return suite_of(self.experiment.tasks[0]) == STRICT
+
+    @property
     def data(self) -> Path:
         """Where the demonstrations are."""
         return self.dataset or self.out / "data"
@@ -47,6 +51,7 @@ class Stages:
         words += ["--referent", self.experiment.referent, "--episodes", str(self.experiment.episodes)]
         more = self.experiment.prompted_episodes
         words += [] if more is None else ["--prompted-episodes", str(more)]
+        words += ["--suite", STRICT] if self._is_strict else []
         words += ["--perturb", "--out", str(self.data)]
         words += [] if self._sight.pictures else ["--no-images"]
         how = ["--workers", str(self.workers)]
@@ -91,7 +96,7 @@ class Stages:
         words += [f"tasks={','.join(self.experiment.tasks)}"]
         words += [f"episodes={self.experiment.rollouts}", f"seed={self.experiment.first_seed}"]
         words += [f"output_dir={self.rollouts(arm, seed)}", "resume=true"]
-        words += ["suite=strict"] if suite_of(self.experiment.tasks[0]) == STRICT else []
+        words += [f"suite={STRICT}"] if self._is_strict else []
         words += ["env.oracle_memory=true"] if "policy.oracle_memory=true" in self.experiment.arms[arm] else []
         how = [f"shards={self.workers}", f"workers={self.workers}"] if self.workers > 1 else []
         return run_once(words, self.log("evaluation", arm, seed), how=how, threads=1)
