@@ -419,7 +419,7 @@ def kill_at(call: int, work) -> bool:
         os._exit(1)
 
 
-@pytest.mark.parametrize("every", [14, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("every", [9, pytest.param(2, marks=pytest.mark.slow)])
 def test_killed_at_every_change_to_the_disk(tasks, recorded, tmp_path, every):
     """Kill at every n-th change, resume, compare with an undisturbed run, byte for byte."""
     out = tmp_path / "ds"
