@@ -14,12 +14,24 @@ from small_policy import batch_of, made_for_training
 
 from lerobot_memobench.datasets.memory_cache.decoding import frame_reader
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.eyes.kinds import kinds
+from lerobot_memobench.eyes.tower import Tower
+from lerobot_memobench.eyes.weights import Eyes, save_eyes
 from lerobot_memobench.policies.memobench_mem.memory.batch import MASK, STEPS
 from synthetic_dataset import LENGTHS
 
 CAMERAS = ("observation.images.image", "observation.images.wrist_image")
 STARTS = np.cumsum([0, *LENGTHS])
 """First frames of the episodes."""
+
+
+def made_eyes(path: Path, seed: int) -> Path:
+    """Write eyes that find something everywhere."""
+    torch.manual_seed(seed)
+    eyes = Eyes(Tower().eval(), kinds())
+    torch.nn.init.zeros_(eyes.fine_heads.heat.bias)
+    save_eyes(eyes, path)
+    return path
 
 
 def pictures_of(root: Path, index: int) -> dict[str, torch.Tensor]:

@@ -13,15 +13,12 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_pre_post_processors
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
-from picture_rollouts import observed, pictures_of, refuses_pictures_in_a_batch, trained_and_acted
+from picture_rollouts import made_eyes, observed, pictures_of, refuses_pictures_in_a_batch, trained_and_acted
 from small_policy import batch_of, losses_in_training, made_for_training, small_config
 
 from lerobot_memobench.datasets.memory_cache import FOLDER
 from lerobot_memobench.envs.obs_types import BOTH, PIXELS, obs_type_of
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.eyes.kinds import kinds
-from lerobot_memobench.eyes.tower import Tower
-from lerobot_memobench.eyes.weights import Eyes, save_eyes
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, TOKENS
@@ -33,15 +30,6 @@ from synthetic_dataset import LENGTHS
 
 ROUNDED = 2**-15
 """What two bfloat16 numbers leave of one, as a share of it."""
-
-
-def made_eyes(path: Path, seed: int) -> Path:
-    """Write eyes that find something everywhere."""
-    torch.manual_seed(seed)
-    eyes = Eyes(Tower().eval(), kinds())
-    torch.nn.init.zeros_(eyes.fine_heads.heat.bias)
-    save_eyes(eyes, path)
-    return path
 
 
 @pytest.fixture(scope="module")

@@ -23,6 +23,7 @@ from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import
 from lerobot_memobench.policies.memobench_mem.dimensions import Dimensions, Gemma
 from lerobot_memobench.policies.memobench_mem.integration.integration import Prefix
 from lerobot_memobench.policies.memobench_mem.perception.eyes import EyePerception
+from lerobot_memobench.policies.memobench_mem.perception.finding_eyes import FindingEyes
 from lerobot_memobench.policies.memobench_mem.perception.found import FoundObjects, ObjectsInPictures
 from lerobot_memobench.policies.memobench_mem.perception.frozen import VISION_SEED, seed_parameters
 from lerobot_memobench.policies.memobench_mem.perception.objects import LOUD, ObjectPerception
@@ -48,6 +49,12 @@ def _resize(vlm: Any, dims: Dimensions, image_size: int) -> Any:
     vision.patch_size, vision.image_size = dims.vision.patch, image_size
     vision.projection_dim = dims.vlm.width
     return config
+
+
+def _slots(config: MemobenchMemConfig) -> tuple[list[str], int, int]:
+    """Return the classes of slots, a frame's memory tokens, and their width."""
+    config.object_classes = config.object_classes or list(classes())
+    return config.object_classes, config.tokens_per_frame, config.dimensions.vlm.width
 
 
 class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
@@ -88,17 +95,22 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
             # Where the frozen image tower lies in pi0.5; its weights are loaded by the policy.
             tower = seeing.vision_tower = Tower(folded=True).eval().requires_grad_(False)
             seeing.multi_modal_projector = nn.Identity()
-            return EyePerception(tower, [*config.image_features], config.memory_camera, config.dimensions.vlm.width)
+            how = tower, [*config.image_features], config.memory_camera, config.dimensions.vlm.width
+            return FindingEyes(*how, self._finding(config)) if config.finds else EyePerception(*how)
         if not config.sees_objects:
             return PixelPerception(
                 seeing.vision_tower, seeing.multi_modal_projector, config.image_size, config.memory_camera
             )
         seeing.vision_tower, seeing.multi_modal_projector = nn.Identity(), nn.Identity()
-        config.object_classes = config.object_classes or list(classes())
-        shape = config.object_classes, config.tokens_per_frame, config.dimensions.vlm.width
-        if config.eyes is None:
-            return ObjectPerception(*shape, SightErrors(config.sight_errors, config.sight_errors_share))
-        return FoundObjects(ObjectsInPictures(load_eyes(config.eyes)), *shape, config.told_objects)
+        if config.finds_objects:
+            return self._finding(config)
+        errors = SightErrors(config.sight_errors, config.sight_errors_share)
+        return ObjectPerception(*_slots(config), errors)
+
+    @staticmethod
+    def _finding(config: MemobenchMemConfig) -> FoundObjects:
+        assert config.eyes is not None
+        return FoundObjects(ObjectsInPictures(load_eyes(config.eyes)), *_slots(config), config.told_objects)
 
     def _set_requires_grad(self) -> None:
         super()._set_requires_grad()

@@ -31,6 +31,7 @@ from lerobot_memobench.policies.memobench_mem.language.text_encoders import (
     make_text_encoder,
 )
 from lerobot_memobench.policies.memobench_mem.perception.eyes import EyePerception
+from lerobot_memobench.policies.memobench_mem.perception.finding_eyes import FindingEyes
 from lerobot_memobench.policies.memobench_mem.perception.found import FOUND, FoundObjects, ObjectsInPictures
 from lerobot_memobench.policies.memobench_mem.perception.frozen import VISION_SEED, seed_parameters
 from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_PHASE, OBS_RAW_STATE
@@ -115,7 +116,9 @@ def cache_dataset(
     how: dict[str, Any] = {"batch_size": batch_size, "workers": workers, "progress": progress, "tell": tell}
     if config.finds_objects:
         assert config.eyes is not None
-        return make_found(root, config, ObjectsInPictures(load_eyes(config.eyes)), _text_encoder(config), **how).folder
+        found = make_found(root, config, ObjectsInPictures(load_eyes(config.eyes)), _text_encoder(config), **how)
+        if config.sees_objects:
+            return found.folder
     if config.has_eyes:
         return make_caches(root, config, load_sight(config, weights), _text_encoder(config), **how)[0].folder
     perception = load_perception(config, weights)
@@ -132,10 +135,11 @@ def open_frames(root: Path, config: MemobenchMemConfig, perception: Perception) 
         return open_cache(root, config, perception)
     names = [name for name in RECORDED if name != OBS_ENV_STATE] if config.sees_pictures else RECORDED
     if isinstance(perception, EyePerception):
-        return open_pictures(root, config, perception, _text_encoder(config), names)
+        found = _found_in(root, config, perception.finds) if isinstance(perception, FindingEyes) else {}
+        return open_pictures(root, config, perception, _text_encoder(config), names, found)
     columns, table = read_recorded(root, names)
     if isinstance(perception, FoundObjects):
-        columns[FOUND] = found_in(root, config, perception.look, _text_encoder(config))
+        columns |= _found_in(root, config, perception)
     phase = torch.from_numpy(table.phase)
     logger.info("%d frames of %s are read into memory", table.episodes[-1], root)
     return RecordedFrames(
@@ -174,6 +178,11 @@ def open_cache(root: Path, config: MemobenchMemConfig, perception: PixelPercepti
         texts_key=None if config.align == "none" else _text_encoder(config).key,
         place=folder.parent,
     )
+
+
+def _found_in(root: Path, config: MemobenchMemConfig, perception: FoundObjects) -> dict[str, torch.Tensor]:
+    """Return what is found at every frame of a dataset, as a column."""
+    return {FOUND: found_in(root, config, perception.look, _text_encoder(config))}
 
 
 def _build(root: Path, config: MemobenchMemConfig, perception: PixelPerception, **how: Any) -> Path:

@@ -172,7 +172,12 @@ class MemobenchMemConfig(MemobenchMemSettings):
                 f"--policy.sight_errors_share={self.sight_errors_share} must be above 0 and at most 1, and is a share "
                 "of the frames, seen with --policy.sight_errors; leave it out, or set these too."
             )
-        if self.whole_plan_if_still and not self.sees_objects:
+        if self.finds and not self.sees_tokens:
+            raise MemobenchError(
+                f"--policy.finds=true is for pictures that are seen through eyes, and not for size={self.size} "
+                f"perception={self.perception} eyes={self.eyes}; leave it out."
+            )
+        if self.whole_plan_if_still and not self.sees_slots:
             raise MemobenchError(
                 "--policy.whole_plan_if_still=true is for policies that see objects, which are told where the hand is; "
                 "leave it out, or use --policy.perception=objects."
@@ -250,8 +255,13 @@ class MemobenchMemConfig(MemobenchMemSettings):
 
     @property
     def finds_objects(self) -> bool:
-        """Whether the objects that are seen are those that eyes find in pictures."""
-        return self.sees_objects and self.has_eyes
+        """Whether the objects that are seen, alone or beside tokens, are those that eyes find in pictures."""
+        return self.has_eyes and self.sees_slots
+
+    @property
+    def sees_slots(self) -> bool:
+        """Whether things are seen as slots, with where they are from the hand."""
+        return self.sees_objects or self.finds
 
     @property
     def sees_pictures(self) -> bool:

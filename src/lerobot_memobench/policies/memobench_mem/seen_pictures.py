@@ -9,11 +9,13 @@ they lie (`recorded_items`).
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
 from lerobot_memobench.datasets.lerobot_format.info import read_info
@@ -30,6 +32,7 @@ from lerobot_memobench.datasets.memory_cache.room import in_words, require_room
 from lerobot_memobench.eyes.tower import GRID, POOLED, WIDTH
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.perception.eyes import EyePerception, seen_key
+from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_PHASE, OBS_RAW_STATE
 
 logger = logging.getLogger(__name__)
 
@@ -128,7 +131,7 @@ def _wanted(root: Path, config: MemobenchMemConfig, eyes: EyePerception, cameras
         return Wanted(camera, stride, tokens, find_cache(root, name, frames_key=tokens.key, **where))
 
     whole = Tokens(eyes.present_key, GRID**2, eyes.look)
-    pooled = Tokens(eyes.key, eyes.tokens_per_frame, eyes.pooled)
+    pooled = Tokens(eyes.pooled_key, eyes.tokens_per_frame, eyes.pooled)
     seen = dict.fromkeys([*(eyes.cameras or cameras), eyes.remembers])
     present = [wanted(camera, 1, f"{config.size}-present", whole) for camera in seen]
     return [*present, wanted(eyes.remembers, config.memory_stride, config.cache_name, pooled)]
@@ -140,9 +143,17 @@ def _bytes(cache: Wanted, frames: int) -> int:
 
 
 def open_pictures(
-    root: Path, config: MemobenchMemConfig, eyes: EyePerception, texts: TextEncoder, names: Sequence[str]
+    root: Path,
+    config: MemobenchMemConfig,
+    eyes: EyePerception,
+    texts: TextEncoder,
+    names: Sequence[str],
+    found: Mapping[str, Tensor],
 ) -> RecordedFrames:
     """Open what training looks up of the dataset at ``root``: its columns ``names``, and what ``eyes`` see.
+
+    Args:
+        found: more columns, of what they find.
 
     Raises:
         MemobenchError: the dataset lacks a column, or a cache cannot be made.
@@ -151,11 +162,13 @@ def open_pictures(
         root, config, eyes, texts, progress=lambda done, count: logger.info("seen: %d of %d episodes", done, count)
     )
     columns, table = read_recorded(root, names)
+    columns |= {**found, **{seen_key(camera): cache.all_tokens() for camera, cache in present.items()}}
+    told = {**columns, OBS_RAW_STATE: columns[OBS_STATE], OBS_PHASE: torch.from_numpy(table.phase)}
 
     def remember(_: Any, frames: Sequence[int]) -> Tensor:
         """Return what is remembered of frames of one episode, by their global numbers."""
         episode, first = memory.locate(frames[0])
-        return memory.tokens(episode, [(first + frame - frames[0]) // memory.meta.stride for frame in frames])
+        pooled = memory.tokens(episode, [(first + frame - frames[0]) // memory.meta.stride for frame in frames])
+        return eyes.recall(pooled, told, frames)
 
-    columns |= {seen_key(camera): cache.all_tokens() for camera, cache in present.items()}
     return RecordedFrames(root, columns, table, texts, remember=remember, key=eyes.key, stride=config.memory_stride)

@@ -34,6 +34,9 @@ class MemobenchMemSettings(PI05Config):
     package, or ``random``: pi0.5's image tower with random weights. With ``perception=objects``, the eyes that find
     them in pictures; none: the environment tells them. With pixels at ``size=small``, whose tower's tokens are seen;
     none: ``package``. A checkpoint of pixels holds its tower; there this only says where it was from."""
+    finds: bool = False
+    """Whether what ``eyes`` find in pictures stands beside their tokens, now and in memory; with pixels at
+    ``size=small``."""
     told_objects: str = "nothing"
     """What rollouts through ``eyes`` are told by the environment all the same (``--env.obs_type=both``), to know what a
     failure is from: ``nothing``, ``hand`` (what stands near the hand now), ``present`` or ``memory``."""

@@ -114,6 +114,10 @@ class ObjectPerception(nn.Module, Perception):
         made, there = self.slot(slots.unflatten(1, (-1, WIDTH)), hand)
         return in_slots(made * LOUD, there)
 
+    def pool(self) -> FramePool:
+        """Return what makes a stored frame's tokens."""
+        return FramePool(self.order, self.kinds, self.tokens_per_frame, self.dim, self.errors)
+
     def memory(self, encoder: nn.Module) -> nn.Module:
         """Return the encoder behind a pool of each frame."""
-        return PooledMemory(FramePool(self.order, self.kinds, self.tokens_per_frame, self.dim, self.errors), encoder)
+        return PooledMemory(self.pool(), encoder)

@@ -1,0 +1,145 @@
+"""Eyes whose finds stand beside their tokens: settings, caches, samples, training, rollouts, checkpoints."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies import make_pre_post_processors
+from lerobot.utils.constants import OBS_STATE
+from picture_rollouts import CAMERAS, made_eyes, observed, trained_and_acted
+from small_policy import batch_of, losses_in_training, made_for_training, small_config
+
+from lerobot_memobench.datasets.memory_cache import FOLDER
+from lerobot_memobench.envs.obs_types import PIXELS, obs_type_of
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.eyes.tower import GRID, POOLED, WIDTH
+from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.memory.batch import MASK, TOKENS
+from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from lerobot_memobench.policies.memobench_mem.perception.eyes import seen_key
+from lerobot_memobench.policies.memobench_mem.perception.finding_eyes import TOKENS as NUMBERS
+from lerobot_memobench.policies.memobench_mem.perception.found import FOUND
+from lerobot_memobench.policies.memobench_mem.perception.slots import HAND_DIM
+from lerobot_memobench.sim.object_slots import SIZE
+
+ROUNDED = 2**-7
+"""What bfloat16 may round off, as a share of a number."""
+
+
+@pytest.fixture(scope="module")
+def finding(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    eyes = made_eyes(tmp_path_factory.mktemp("eyes") / "eyes.safetensors", 1)
+    return {"size": "small", "eyes": str(eyes), "finds": True, "n_action_steps": 3, "memory_stride": 2}
+
+
+@pytest.fixture(scope="module")
+def root(dataset_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The dataset, in which nothing says what objects there are."""
+    to = tmp_path_factory.mktemp("seen") / "data"
+    return shutil.copytree(dataset_root, to, ignore=shutil.ignore_patterns(FOLDER))
+
+
+def test_pictures_are_all_that_is_needed(tmp_path: Path) -> None:
+    config = MemobenchMemConfig(device="cpu", size="small", finds=True, whole_plan_if_still=True)
+    assert (config.eyes, config.sees_tokens, config.finds_objects, config.sees_slots) == ("package", True, True, True)
+    assert obs_type_of(config) == PIXELS
+    config.save_pretrained(tmp_path)
+    assert PreTrainedConfig.from_pretrained(tmp_path).finds
+
+
+@pytest.mark.parametrize(
+    "fields", [{"size": "tiny"}, {"size": "small", "eyes": "random"}, {"size": "small", "perception": "objects"}]
+)
+def test_finds_without_tokens_of_eyes_are_refused(fields: dict[str, Any]) -> None:
+    with pytest.raises(MemobenchError, match=r"--policy\.finds=true is for pictures.*leave it out"):
+        MemobenchMemConfig(device="cpu", finds=True, **fields)
+
+
+def test_a_sample_has_both_and_a_remembered_frame_too(
+    root: Path, finding: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cache_dataset(root, small_config(**finding))
+    assert len(list((root / FOLDER).glob("*/tokens.bin"))) == len(CAMERAS) + 2
+
+    def refuse(*_: Any, **__: Any) -> None:
+        raise AssertionError("a video was opened")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("lerobot.datasets.dataset_reader.decode_video_frames", refuse)
+        patched.setattr("lerobot_memobench.datasets.memory_cache.building.frame_reader", refuse)
+        policy, before, _, dataset = made_for_training(root, **finding)
+        assert set(policy.config.input_features) == {OBS_STATE, *CAMERAS}
+        batch = before(batch_of(dataset, [45, 50]))
+    assert all(batch[seen_key(camera)].shape == (2, GRID**2, WIDTH) for camera in CAMERAS)
+    assert batch[FOUND].shape == (2, SIZE)
+    assert batch[FOUND].any()
+    assert batch[TOKENS].shape[2:] == (1, NUMBERS + SIZE + HAND_DIM + 1)
+    newest = batch[TOKENS][torch.arange(2), batch[MASK].sum(dim=1) - 1, 0]
+    # Every second frame is remembered, and this is its episode's eleventh: the newest that it remembers is itself.
+    assert torch.equal(newest[1, NUMBERS : NUMBERS + SIZE], batch[FOUND][1])
+    pooled = policy.perception.pooled(batch[seen_key(CAMERAS[0])])
+    assert torch.equal(newest[1, :NUMBERS], pooled[1].float().flatten())
+    memory, _ = policy._read_memory(batch)
+    assert memory.shape[1] == policy.config.memory_frames * POOLED**2
+
+
+def test_a_rollout_sees_and_remembers_what_training_reads(root: Path, finding: dict[str, Any]) -> None:
+    made = made_for_training(root, **finding)
+    trained, acted, tokens = trained_and_acted(root, made)
+    policy = made[0]
+    for part in (slice(NUMBERS), slice(NUMBERS, None)):
+        one, other = trained[TOKENS][..., part], tokens[..., part]
+        if part.start is None:
+            assert (one - other).abs().max() <= ROUNDED * other.abs().max()
+    assert torch.allclose(
+        trained[TOKENS][..., NUMBERS : NUMBERS + SIZE], tokens[..., NUMBERS : NUMBERS + SIZE], rtol=2**-15, atol=1e-6
+    )
+    (of_cache, real), (of_pictures, shown) = (policy.perception.present(batch) for batch in (trained, acted))
+    assert len(of_cache) == len(CAMERAS) + 1
+    assert all(torch.equal(one, other) for one, other in zip(real, shown, strict=True))
+    for one, other in zip(of_cache, of_pictures, strict=True):
+        assert (one.float() - other.float()).abs().max() <= ROUNDED * other.float().abs().max()
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [{"align": "framewise"}, {"align": "semantic"}, {"integration": "context"}, {"integration": "none"}],
+    ids=str,
+)
+def test_every_kind_trains_and_the_eyes_do_not(root: Path, finding: dict[str, Any], fields: dict[str, Any]) -> None:
+    policy, before, _, dataset = made_for_training(root, **finding | fields)
+    policy.train().forward(before(batch_of(dataset, [10, 30, 50, 80])))[0].backward()
+    assert all(parameter.grad is not None for parameter in policy.model.memory_parameters().values())
+    assert policy.perception.project.weight.grad.any()
+    assert policy.perception.finds.slot.mlp[0].weight.grad.any()
+    assert not any("look" in name for name, _ in policy.named_parameters()), "eyes that find are no part of it"
+
+
+def test_it_learns(root: Path, finding: dict[str, Any]) -> None:
+    policy, before, _, dataset = made_for_training(root, **finding | {"chunk_size": 4, "memory_frames": 4})
+    losses = losses_in_training(policy, before(batch_of(dataset, [*range(8, 38, 4)])), updates=30)
+    assert np.mean(losses[-5:]) < 0.5 * np.mean(losses[:5])
+
+
+def test_a_checkpoint_acts_as_the_policy_did(root: Path, finding: dict[str, Any], tmp_path: Path) -> None:
+    policy, before, after, dataset = made_for_training(root, **finding)
+    policy.train().forward(before(batch_of(dataset, [10, 30])))
+    policy.update()
+    for part in (policy, before, after):
+        part.save_pretrained(tmp_path)
+    again = MemobenchMemPolicy.from_pretrained(tmp_path)
+    pre, _ = make_pre_post_processors(again.config, pretrained_path=str(tmp_path))
+    assert again.perception.key == policy.perception.key
+    actions: list[list[torch.Tensor]] = []
+    for actor, step in ((policy, before), (again, pre)):
+        actor.reset()
+        actions.append([actor.select_action(step(observed(root, dataset, index))) for index in range(4)])
+    assert all(torch.allclose(one, other, atol=1e-6) for one, other in zip(*actions, strict=True))
+    assert actions[0][-1].any()
