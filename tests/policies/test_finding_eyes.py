@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -15,19 +16,20 @@ from lerobot.utils.constants import OBS_STATE
 from picture_rollouts import CAMERAS, made_eyes, observed, trained_and_acted
 from small_policy import batch_of, losses_in_training, made_for_training, small_config
 
-from lerobot_memobench.datasets.memory_cache import FOLDER
+from lerobot_memobench.datasets.memory_cache import FOLDER, building
 from lerobot_memobench.envs.obs_types import PIXELS, obs_type_of
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.eyes.tower import GRID, POOLED, WIDTH
-from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
+from lerobot_memobench.eyes.tower import GRID, POOLED, WIDTH, Tower
+from lerobot_memobench.policies.memobench_mem.caching import cache_dataset, open_frames
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.batch import MASK, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.perception.eyes import seen_key
 from lerobot_memobench.policies.memobench_mem.perception.finding_eyes import TOKENS as NUMBERS
-from lerobot_memobench.policies.memobench_mem.perception.found import FOUND
+from lerobot_memobench.policies.memobench_mem.perception.found import FOUND, ObjectsInPictures
 from lerobot_memobench.policies.memobench_mem.perception.slots import HAND_DIM
 from lerobot_memobench.sim.object_slots import SIZE
+from synthetic_dataset import LENGTHS
 
 ROUNDED = 2**-7
 """What bfloat16 may round off, as a share of a number."""
@@ -88,6 +90,47 @@ def test_a_sample_has_both_and_a_remembered_frame_too(
     assert torch.equal(newest[1, :NUMBERS], pooled[1].float().flatten())
     memory, _ = policy._read_memory(batch)
     assert memory.shape[1] == policy.config.memory_frames * POOLED**2
+
+
+def test_of_two_trainings_one_finds_and_the_other_sees(
+    root: Path, dataset_root: Path, finding: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy, *_ = made_for_training(root, **finding)
+    other = shutil.copytree(dataset_root, tmp_path / "data", ignore=shutil.ignore_patterns(FOLDER))
+    begun, waits, go = threading.Event(), threading.Event(), threading.Event()
+    looked, finds = {"first": 0, "second": 0}, {"first": 0, "second": 0}
+    find, see = ObjectsInPictures.__call__, Tower.forward
+
+    def held(look: ObjectsInPictures, pictures: Any, states: torch.Tensor) -> torch.Tensor:
+        finds[threading.current_thread().name] += len(states)
+        begun.set()
+        assert go.wait(60)
+        return find(look, pictures, states)
+
+    def counting(tower: Tower, images: torch.Tensor) -> torch.Tensor:
+        looked[threading.current_thread().name] += len(images)
+        return see(tower, images)
+
+    monkeypatch.setattr(ObjectsInPictures, "__call__", held)
+    monkeypatch.setattr(Tower, "forward", counting)
+    monkeypatch.setattr(building.logger, "warning", lambda *_: waits.set())
+    opened: dict[str, Any] = {}
+
+    def train() -> None:
+        opened[threading.current_thread().name] = open_frames(other, policy.config, policy.perception)
+
+    first, second = (threading.Thread(target=train, name=name, daemon=True) for name in looked)
+    first.start()
+    assert begun.wait(60)
+    second.start()
+    assert waits.wait(60)
+    assert looked == {"first": 0, "second": sum(LENGTHS) * len(CAMERAS)}
+    go.set()
+    first.join(60)
+    second.join(60)
+    assert finds == {"first": sum(LENGTHS), "second": 0}
+    assert looked["first"] == 0
+    assert torch.equal(*(opened[name].columns[FOUND] for name in ("first", "second")))
 
 
 def test_a_rollout_sees_and_remembers_what_training_reads(root: Path, finding: dict[str, Any]) -> None:

@@ -37,7 +37,7 @@ from lerobot_memobench.policies.memobench_mem.perception.frozen import VISION_SE
 from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_PHASE, OBS_RAW_STATE
 from lerobot_memobench.policies.memobench_mem.perception.perception import Perception
 from lerobot_memobench.policies.memobench_mem.perception.pixels import PixelPerception
-from lerobot_memobench.policies.memobench_mem.seen_pictures import make_caches, open_pictures
+from lerobot_memobench.policies.memobench_mem.seen_pictures import Busy, come_back, make_caches, open_pictures
 from lerobot_memobench.policies.memobench_mem.weights import load_exactly, read_weights
 
 logger = logging.getLogger(__name__)
@@ -135,7 +135,7 @@ def open_frames(root: Path, config: MemobenchMemConfig, perception: Perception) 
         return open_cache(root, config, perception)
     names = [name for name in RECORDED if name != OBS_ENV_STATE] if config.sees_pictures else RECORDED
     if isinstance(perception, EyePerception):
-        found = _found_in(root, config, perception.finds) if isinstance(perception, FindingEyes) else {}
+        found = _beside_tokens(root, config, perception) if isinstance(perception, FindingEyes) else {}
         return open_pictures(root, config, perception, _text_encoder(config), names, found)
     columns, table = read_recorded(root, names)
     if isinstance(perception, FoundObjects):
@@ -180,9 +180,18 @@ def open_cache(root: Path, config: MemobenchMemConfig, perception: PixelPercepti
     )
 
 
-def _found_in(root: Path, config: MemobenchMemConfig, perception: FoundObjects) -> dict[str, torch.Tensor]:
-    """Return what is found at every frame of a dataset, as a column."""
-    return {FOUND: found_in(root, config, perception.look, _text_encoder(config))}
+def _found_in(root: Path, config: MemobenchMemConfig, perception: FoundObjects, **how: Any) -> dict[str, torch.Tensor]:
+    """Return what is found at every frame of a dataset, as a column; ``how`` as of `build_memory_cache`."""
+    return {FOUND: found_in(root, config, perception.look, _text_encoder(config), **how)}
+
+
+def _beside_tokens(root: Path, config: MemobenchMemConfig, eyes: FindingEyes) -> dict[str, torch.Tensor]:
+    """Return what `_found_in` does; where another process is at it, tokens are made here meanwhile."""
+    try:
+        return _found_in(root, config, eyes.finds, wait=come_back)
+    except Busy:
+        make_caches(root, config, eyes, _text_encoder(config))
+        return _found_in(root, config, eyes.finds)
 
 
 def _build(root: Path, config: MemobenchMemConfig, perception: PixelPerception, **how: Any) -> Path:

@@ -86,10 +86,10 @@ def _reader(root: Path) -> FrameReader:
     return read
 
 
-def found_in(root: Path, config: MemobenchMemConfig, look: ObjectsInPictures, texts: TextEncoder) -> Tensor:
-    """Return what is found at every frame of the dataset at ``root``, (N, SIZE) float32; errors as of `make_found`."""
+def found_in(root: Path, config: MemobenchMemConfig, look: ObjectsInPictures, texts: TextEncoder, **how: Any) -> Tensor:
+    """Return what is found at every frame of the dataset at ``root``, (N, SIZE) float32; all else as `make_found`."""
 
     def tell(done: int, count: int) -> None:
         logger.info("objects found in %d of %d episodes", done, count)
 
-    return make_found(root, config, look, texts, progress=tell).all_tokens().sum(dim=1, dtype=torch.float32)
+    return make_found(root, config, look, texts, progress=tell, **how).all_tokens().sum(dim=1, dtype=torch.float32)

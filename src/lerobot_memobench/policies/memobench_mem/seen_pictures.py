@@ -100,8 +100,8 @@ def make_caches(
     busy = []
     for cache in present:
         try:
-            _make(root, cache, texts, tell=tell, wait=_come_back, **how)
-        except _Busy:
+            _make(root, cache, texts, tell=tell, wait=come_back, **how)
+        except Busy:
             busy.append(cache)  # whoever trains beside us is at it; the other camera's is made here meanwhile
     for cache in busy:
         _make(root, cache, texts, tell=tell, **how)
@@ -110,12 +110,17 @@ def make_caches(
     return memory.open(root), opened
 
 
-class _Busy(Exception):
+class Busy(Exception):
     """Another process is making this."""
 
 
-def _come_back(folder: Path) -> None:
-    raise _Busy(folder)
+def come_back(folder: Path) -> None:
+    """Wait for no other process: a ``wait`` of `build_memory_cache`.
+
+    Raises:
+        Busy: in any case.
+    """
+    raise Busy(folder)
 
 
 def _make(root: Path, cache: Wanted, texts: TextEncoder, **how: Any) -> None:
