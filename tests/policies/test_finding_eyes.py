@@ -7,14 +7,13 @@ import threading
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_pre_post_processors
 from lerobot.utils.constants import OBS_STATE
 from picture_rollouts import CAMERAS, made_eyes, observed, trained_and_acted
-from small_policy import batch_of, losses_in_training, made_for_training, small_config
+from small_policy import batch_of, made_for_training, small_config
 
 from lerobot_memobench.datasets.memory_cache import FOLDER, building
 from lerobot_memobench.envs.obs_types import PIXELS, obs_type_of
@@ -152,9 +151,7 @@ def test_a_rollout_sees_and_remembers_what_training_reads(root: Path, finding: d
 
 
 @pytest.mark.parametrize(
-    "fields",
-    [{"align": "framewise"}, {"align": "semantic"}, {"integration": "context"}, {"integration": "none"}],
-    ids=str,
+    "fields", [{"align": "framewise"}, {"integration": "context"}, {"integration": "none"}], ids=str
 )
 def test_every_kind_trains_and_the_eyes_do_not(root: Path, finding: dict[str, Any], fields: dict[str, Any]) -> None:
     policy, before, _, dataset = made_for_training(root, **finding | fields)
@@ -163,12 +160,6 @@ def test_every_kind_trains_and_the_eyes_do_not(root: Path, finding: dict[str, An
     assert policy.perception.project.weight.grad.any()
     assert policy.perception.finds.slot.mlp[0].weight.grad.any()
     assert not any("look" in name for name, _ in policy.named_parameters()), "eyes that find are no part of it"
-
-
-def test_it_learns(root: Path, finding: dict[str, Any]) -> None:
-    policy, before, _, dataset = made_for_training(root, **finding | {"chunk_size": 4, "memory_frames": 4})
-    losses = losses_in_training(policy, before(batch_of(dataset, [*range(8, 38, 4)])), updates=30)
-    assert np.mean(losses[-5:]) < 0.5 * np.mean(losses[:5])
 
 
 def test_a_checkpoint_acts_as_the_policy_did(root: Path, finding: dict[str, Any], tmp_path: Path) -> None:
