@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from lerobot.datasets.dataset_reader import DatasetReader
+from lerobot.policies import make_pre_post_processors
 from lerobot.utils.constants import OBS_STATE
 from small_policy import batch_of, made_for_training
 
@@ -18,6 +19,7 @@ from lerobot_memobench.eyes.kinds import kinds
 from lerobot_memobench.eyes.tower import Tower
 from lerobot_memobench.eyes.weights import Eyes, save_eyes
 from lerobot_memobench.policies.memobench_mem.memory.batch import MASK, STEPS
+from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from synthetic_dataset import LENGTHS
 
 CAMERAS = ("observation.images.image", "observation.images.wrist_image")
@@ -63,6 +65,19 @@ def trained_and_acted(root: Path, made: tuple[Any, ...]) -> tuple[dict[str, Any]
     assert torch.equal(steps, trained[STEPS])
     assert torch.equal(mask, trained[MASK])
     return trained, acted, tokens
+
+
+def acts_as_its_checkpoint(root: Path, policy: Any, before: Any, dataset: Any, folder: Path) -> None:
+    """Compare what a policy and its checkpoint in a folder do."""
+    again = MemobenchMemPolicy.from_pretrained(folder)
+    pre, _ = make_pre_post_processors(again.config, pretrained_path=str(folder))
+    assert again.perception.key == policy.perception.key
+    actions: list[list[torch.Tensor]] = []
+    for actor, step in ((policy, before), (again, pre)):
+        actor.reset()
+        actions.append([actor.select_action(step(observed(root, dataset, index))) for index in range(4)])
+    assert all(torch.allclose(one, other, atol=1e-6) for one, other in zip(*actions, strict=True))
+    assert actions[0][-1].any()
 
 
 def refuses_pictures_in_a_batch(root: Path, settings: dict[str, Any]) -> None:

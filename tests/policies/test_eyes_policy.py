@@ -13,7 +13,7 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.policies import make_policy, make_pre_post_processors
-from picture_rollouts import CAMERAS, observed, refuses_pictures_in_a_batch, trained_and_acted
+from picture_rollouts import CAMERAS, acts_as_its_checkpoint, observed, refuses_pictures_in_a_batch, trained_and_acted
 from small_policy import batch_of, losses_in_training, made_for_training, small_config
 from torch.nn.functional import scaled_dot_product_attention
 from transformers.models.gemma import modeling_gemma
@@ -374,16 +374,7 @@ def saved(root: Path, seeing: dict[str, Any], tmp_path_factory: pytest.TempPathF
 
 
 def test_a_checkpoint_holds_its_tower_and_acts_as_the_policy_did(saved: tuple[Any, ...], root: Path) -> None:
-    policy, before, dataset, folder = saved
-    again = MemobenchMemPolicy.from_pretrained(folder)
-    pre, _ = make_pre_post_processors(again.config, pretrained_path=str(folder))
-    assert again.perception.key == policy.perception.key
-    actions: list[list[torch.Tensor]] = []
-    for actor, step in ((policy, before), (again, pre)):
-        actor.reset()
-        actions.append([actor.select_action(step(observed(root, dataset, index))) for index in range(4)])
-    assert all(torch.allclose(one, other, atol=1e-6) for one, other in zip(*actions, strict=True))
-    assert actions[0][-1].any()
+    acts_as_its_checkpoint(root, *saved)
 
 
 def test_training_goes_on_through_the_tower_of_the_checkpoint(

@@ -18,7 +18,7 @@ from lerobot_memobench.policies.memobench_mem.perception.objects import FramePoo
 from lerobot_memobench.policies.memobench_mem.perception.perception import Seen
 from lerobot_memobench.policies.memobench_mem.perception.pooled_memory import PooledMemory
 
-TOKENS = POOLED**2 * WIDTH
+NUMBERS = POOLED**2 * WIDTH
 """Numbers of a remembered picture's tokens, with which a stored frame begins."""
 
 
@@ -34,8 +34,8 @@ class TokenAndFindPool(nn.Module):
         self.tokens, self.finds = tokens, finds
 
     def forward(self, frames: Tensor) -> Tensor:
-        """Return tokens (N, 16, width) of frames (N, 1, TOKENS + SIZE + 6 + 1)."""
-        pictures, found = frames[..., :TOKENS], frames[..., TOKENS:]
+        """Return tokens (N, 16, width) of frames (N, 1, NUMBERS + SIZE + 6 + 1)."""
+        pictures, found = frames[..., :NUMBERS], frames[..., NUMBERS:]
         made: Tensor = self.tokens(pictures.reshape(-1, POOLED**2, WIDTH)) + self.finds(found)
         return made
 
