@@ -12,13 +12,14 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.utils.constants import OBS_STATE
 from picture_rollouts import CAMERAS, acts_as_its_checkpoint, made_eyes, trained_and_acted
-from small_policy import batch_of, made_for_training, small_config
+from small_policy import batch_of, made_for_training
 
+from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.datasets.memory_cache import FOLDER, building
 from lerobot_memobench.envs.obs_types import PIXELS, obs_type_of
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.eyes.tower import GRID, POOLED, WIDTH, Tower
-from lerobot_memobench.policies.memobench_mem.caching import cache_dataset, open_frames
+from lerobot_memobench.policies.memobench_mem.caching import open_frames
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.batch import MASK, TOKENS
 from lerobot_memobench.policies.memobench_mem.perception.eyes import seen_key
@@ -61,10 +62,19 @@ def test_finds_without_tokens_of_eyes_are_refused(fields: dict[str, Any]) -> Non
         MemobenchMemConfig(device="cpu", finds=True, **fields)
 
 
+@pytest.mark.parametrize(
+    "fields", [{"tokens_dropped": 0.5}, {"finds": True, "tokens_dropped": 1.5}, {"finds": True, "tokens_dropped": -0.5}]
+)
+def test_tokens_are_dropped_beside_finds_alone(fields: dict[str, Any]) -> None:
+    with pytest.raises(MemobenchError, match=r"--policy\.tokens_dropped=-?\d\.5 must be in \[0, 1\].*leave it out"):
+        MemobenchMemConfig(device="cpu", size="small", **fields)
+
+
 def test_a_sample_has_both_and_a_remembered_frame_too(
     root: Path, finding: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    cache_dataset(root, small_config(**finding))
+    how = ["--size", "small", "--stride", "2", "--device", "cpu"]
+    assert main(["cache", str(root), "--finds", "--eyes", finding["eyes"], *how]) == 0
     assert len(list((root / FOLDER).glob("*/tokens.bin"))) == len(CAMERAS) + 2
 
     def refuse(*_: Any, **__: Any) -> None:
@@ -154,6 +164,37 @@ def test_every_kind_trains_and_the_eyes_do_not(root: Path, finding: dict[str, An
     assert policy.perception.project.weight.grad.any()
     assert policy.perception.finds.slot.mlp[0].weight.grad.any()
     assert not any("look" in name for name, _ in policy.named_parameters()), "eyes that find are no part of it"
+
+
+def test_without_tokens_it_learns_of_finds_alone_and_acts_by_both(root: Path, finding: dict[str, Any]) -> None:
+    policy, before, _, dataset = made_for_training(root, **finding, align="semantic", tokens_dropped=1.0)
+    batch = before(batch_of(dataset, [10, 30, 50, 80]))
+    eyes, pool = policy.perception, policy.model.memory.pool
+    policy.train().forward(batch)[0].backward()
+    assert eyes.project.weight.grad is None
+    assert pool.tokens.project.weight.grad is None
+    assert eyes.finds.slot.mlp[0].weight.grad.any()
+    assert pool.finds.slot.mlp[0].weight.grad.any()
+    policy.update()
+    policy.eval()
+    assert len(eyes.present(batch)[0]) == len(CAMERAS) + 1
+    others = batch[TOKENS].clone()
+    others[..., :NUMBERS] += 1.0
+    assert not torch.allclose(pool(others[0]), pool(batch[TOKENS][0]))
+
+
+def test_present_and_memory_are_without_tokens_as_often_as_was_asked(root: Path, finding: dict[str, Any]) -> None:
+    policy, before, _, dataset = made_for_training(root, **finding, tokens_dropped=0.5)
+    batch = before(batch_of(dataset, [10, 30]))
+    policy.train()
+    torch.manual_seed(0)
+    frames = batch[TOKENS][0]
+    alone = policy.model.memory.pool.finds(frames[..., NUMBERS:])
+    seen = [len(policy.perception.present(batch)[0]) == 1 for _ in range(40)]
+    remembered = [torch.equal(policy.model.memory.pool(frames), alone) for _ in range(40)]
+    assert 10 <= sum(seen) <= 30
+    assert 10 <= sum(remembered) <= 30
+    assert seen != remembered, "they are drawn apart"
 
 
 def test_a_checkpoint_acts_as_the_policy_did(root: Path, finding: dict[str, Any], tmp_path: Path) -> None:

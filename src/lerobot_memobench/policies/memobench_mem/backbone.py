@@ -96,7 +96,9 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
             tower = seeing.vision_tower = Tower(folded=True).eval().requires_grad_(False)
             seeing.multi_modal_projector = nn.Identity()
             how = tower, [*config.image_features], config.memory_camera, config.dimensions.vlm.width
-            return FindingEyes(*how, self._finding(config)) if config.finds else EyePerception(*how)
+            if not config.finds:
+                return EyePerception(*how)
+            return FindingEyes(*how, self._finding(config), config.tokens_dropped)
         if not config.sees_objects:
             return PixelPerception(
                 seeing.vision_tower, seeing.multi_modal_projector, config.image_size, config.memory_camera

@@ -177,10 +177,15 @@ class MemobenchMemConfig(MemobenchMemSettings):
                 f"--policy.finds=true is for pictures that are seen through eyes, and not for size={self.size} "
                 f"perception={self.perception} eyes={self.eyes}; leave it out."
             )
+        if not 0.0 <= self.tokens_dropped <= 1.0 or (self.tokens_dropped and not self.finds):
+            raise MemobenchError(
+                f"--policy.tokens_dropped={self.tokens_dropped} must be in [0, 1], and is for policies that are shown "
+                "what eyes find too: leave it out, or set --policy.finds=true."
+            )
         if self.whole_plan_if_still and not self.sees_slots:
             raise MemobenchError(
                 "--policy.whole_plan_if_still=true is for policies that see objects, which are told where the hand is; "
-                "leave it out, or use --policy.perception=objects."
+                "leave it out, or use --policy.perception=objects or --policy.finds=true."
             )
         if self.perception == "pixels" and self.tokens_per_frame != GRID**2:
             raise MemobenchError(

@@ -37,6 +37,9 @@ class MemobenchMemSettings(PI05Config):
     finds: bool = False
     """Whether what ``eyes`` find in pictures stands beside their tokens, now and in memory; with pixels at
     ``size=small``."""
+    tokens_dropped: float = 0.0
+    """With ``finds``, which share of the training batches has no tokens of pictures, drawn for the present and for the
+    memory apart: of finds alone it is learned sooner. A rollout has them all."""
     told_objects: str = "nothing"
     """What rollouts through ``eyes`` are told by the environment all the same (``--env.obs_type=both``), to know what a
     failure is from: ``nothing``, ``hand`` (what stands near the hand now), ``present`` or ``memory``."""

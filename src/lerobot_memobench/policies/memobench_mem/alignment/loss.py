@@ -42,7 +42,7 @@ def alignment_loss(
     logged = {"align_loss": loss.item()}
     if memory.requires_grad and torch.is_grad_enabled():
         # Two matrix products: cheap, and comparable with the gradient norm that LeRobot logs.
-        gradients = torch.autograd.grad(weighted, list(encoder), retain_graph=True)
+        gradients = torch.autograd.grad(weighted, list(encoder), retain_graph=True, materialize_grads=True)
         logged["align_grad_norm"] = torch.stack([gradient.norm() for gradient in gradients]).norm().item()
     with torch.no_grad():
         logged["align_top1"] = retrieval_accuracy(*map(joint, alignment.pairs(*usable)))

@@ -22,22 +22,28 @@ NUMBERS = POOLED**2 * WIDTH
 """Numbers of a remembered picture's tokens, with which a stored frame begins."""
 
 
+def _drawn(share: float) -> bool:
+    return share > 0 and float(torch.rand(())) < share
+
+
 class TokenAndFindPool(nn.Module):
     """A stored frame to the tokens of its picture, to each of which a mixture of the things that were found is added.
 
     Args:
-        tokens: of pictures. finds: to as many tokens.
+        tokens: of pictures. finds: to as many tokens. dropped: share of the training batches without pictures' tokens.
     """
 
-    def __init__(self, tokens: PicturePool, finds: FramePool) -> None:
+    def __init__(self, tokens: PicturePool, finds: FramePool, dropped: float = 0.0) -> None:
         super().__init__()
-        self.tokens, self.finds = tokens, finds
+        self.tokens, self.finds, self.dropped = tokens, finds, dropped
 
     def forward(self, frames: Tensor) -> Tensor:
         """Return tokens (N, 16, width) of frames (N, 1, NUMBERS + SIZE + 6 + 1)."""
         pictures, found = frames[..., :NUMBERS], frames[..., NUMBERS:]
-        made: Tensor = self.tokens(pictures.reshape(-1, POOLED**2, WIDTH)) + self.finds(found)
-        return made
+        made: Tensor = self.finds(found)
+        if self.training and _drawn(self.dropped):
+            return made
+        return made + self.tokens(pictures.reshape(-1, POOLED**2, WIDTH))
 
 
 class FindingEyes(EyePerception):
@@ -45,11 +51,21 @@ class FindingEyes(EyePerception):
 
     Args:
         tower, cameras, camera, width: as of `EyePerception`. finds: with as many tokens of a frame.
+        dropped: share of the training batches without pictures' tokens (Neverova et al. 2015, ModDrop); drawn once for
+            the present and once for the memory.
     """
 
-    def __init__(self, tower: Tower, cameras: Sequence[str], camera: str, width: int, finds: FoundObjects) -> None:
+    def __init__(
+        self,
+        tower: Tower,
+        cameras: Sequence[str],
+        camera: str,
+        width: int,
+        finds: FoundObjects,
+        dropped: float = 0.0,
+    ) -> None:
         super().__init__(tower, cameras, camera, width)
-        self.finds = finds
+        self.finds, self.dropped = finds, dropped
 
     @property
     def key(self) -> str:
@@ -58,7 +74,10 @@ class FindingEyes(EyePerception):
 
     def present(self, batch: Mapping[str, Tensor]) -> Seen:
         """Return each camera's tokens (B, 64, WIDTH), and what is found, as of `FoundObjects`."""
-        (tokens, shown), (found, there) = super().present(batch), self.finds.present(batch)
+        found, there = self.finds.present(batch)
+        if self.training and _drawn(self.dropped):
+            return found, there
+        tokens, shown = super().present(batch)
         return [*tokens, *found], [*shown, *there]
 
     def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
@@ -76,4 +95,4 @@ class FindingEyes(EyePerception):
 
     def memory(self, encoder: nn.Module) -> nn.Module:
         """Return the encoder behind a pool of each frame."""
-        return PooledMemory(TokenAndFindPool(PicturePool(self.dim), self.finds.pool()), encoder)
+        return PooledMemory(TokenAndFindPool(PicturePool(self.dim), self.finds.pool(), self.dropped), encoder)
