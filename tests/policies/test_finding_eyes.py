@@ -10,16 +10,16 @@ from typing import Any
 import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
-from lerobot.utils.constants import OBS_STATE
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from picture_rollouts import CAMERAS, acts_as_its_checkpoint, made_eyes, trained_and_acted
-from small_policy import batch_of, made_for_training
+from small_policy import batch_of, made_for_training, small_config
 
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.datasets.memory_cache import FOLDER, building
 from lerobot_memobench.envs.obs_types import PIXELS, obs_type_of
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.eyes.tower import GRID, POOLED, WIDTH, Tower
-from lerobot_memobench.policies.memobench_mem.caching import open_frames
+from lerobot_memobench.policies.memobench_mem.caching import cache_dataset, open_frames
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.batch import MASK, TOKENS
 from lerobot_memobench.policies.memobench_mem.perception.eyes import seen_key
@@ -27,6 +27,7 @@ from lerobot_memobench.policies.memobench_mem.perception.finding_eyes import NUM
 from lerobot_memobench.policies.memobench_mem.perception.found import FOUND, ObjectsInPictures
 from lerobot_memobench.policies.memobench_mem.perception.slots import HAND_DIM
 from lerobot_memobench.sim.object_slots import SIZE
+from object_dataset import make_object_dataset
 from synthetic_dataset import LENGTHS
 
 ROUNDED = 2**-7
@@ -195,6 +196,35 @@ def test_present_and_memory_are_without_tokens_as_often_as_was_asked(root: Path,
     assert 10 <= sum(seen) <= 30
     assert 10 <= sum(remembered) <= 30
     assert seen != remembered, "they are drawn apart"
+
+
+def test_told_objects_with_errors_stand_for_found_ones_in_training(
+    root: Path, finding: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: Any, **__: Any) -> None:
+        raise AssertionError("something was sought")
+
+    monkeypatch.setattr(ObjectsInPictures, "__call__", refuse)
+    fields = finding | {"sight_errors": 1.0}
+    told_root = make_object_dataset(tmp_path / "told", pictures=True)
+    cache_dataset(told_root, small_config(**fields))
+    policy, before, _, dataset = made_for_training(told_root, **fields)
+    assert OBS_ENV_STATE not in policy.config.input_features
+    batch = before(batch_of(dataset, [10, 30]))
+    told = torch.stack([torch.as_tensor(dataset.hf_dataset[row][OBS_ENV_STATE]) for row in (10, 30)])
+    assert torch.equal(batch[FOUND], told)
+    frames = batch[TOKENS][0]
+    policy.train()
+    torch.manual_seed(0)
+    assert not torch.equal(*(policy.perception.present(batch)[0][-1] for _ in range(2)))
+    assert not torch.equal(*(policy.model.memory.pool(frames) for _ in range(2)))
+    policy.forward(batch)[0].backward()
+    policy.eval()
+    seen = policy.perception.present(batch)[0][-1]
+    assert torch.equal(seen[:, :-HAND_DIM], told)
+    assert torch.equal(*(policy.model.memory.pool(frames) for _ in range(2)))
+    with pytest.raises(MemobenchError, match=r"no column 'observation\.environment_state'.*no --policy\.sight_errors"):
+        made_for_training(root, **fields)
 
 
 def test_a_checkpoint_acts_as_the_policy_did(root: Path, finding: dict[str, Any], tmp_path: Path) -> None:

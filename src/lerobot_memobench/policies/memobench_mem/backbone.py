@@ -29,7 +29,7 @@ from lerobot_memobench.policies.memobench_mem.perception.frozen import VISION_SE
 from lerobot_memobench.policies.memobench_mem.perception.objects import LOUD, ObjectPerception
 from lerobot_memobench.policies.memobench_mem.perception.perception import Perception
 from lerobot_memobench.policies.memobench_mem.perception.pixels import PixelPerception
-from lerobot_memobench.policies.memobench_mem.perception.sight_errors import SightErrors
+from lerobot_memobench.policies.memobench_mem.perception.sight_errors import TOLD, SightErrors
 from lerobot_memobench.sim.object_slots import classes
 
 
@@ -55,6 +55,10 @@ def _slots(config: MemobenchMemConfig) -> tuple[list[str], int, int]:
     """Return the classes of slots, a frame's memory tokens, and their width."""
     config.object_classes = config.object_classes or list(classes())
     return config.object_classes, config.tokens_per_frame, config.dimensions.vlm.width
+
+
+def _errors(config: MemobenchMemConfig) -> SightErrors:
+    return SightErrors(config.sight_errors, config.sight_errors_share)
 
 
 class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
@@ -106,13 +110,14 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
         seeing.vision_tower, seeing.multi_modal_projector = nn.Identity(), nn.Identity()
         if config.finds_objects:
             return self._finding(config)
-        errors = SightErrors(config.sight_errors, config.sight_errors_share)
-        return ObjectPerception(*_slots(config), errors)
+        return ObjectPerception(*_slots(config), _errors(config))
 
     @staticmethod
     def _finding(config: MemobenchMemConfig) -> FoundObjects:
         assert config.eyes is not None
-        return FoundObjects(ObjectsInPictures(load_eyes(config.eyes)), *_slots(config), config.told_objects)
+        # A policy of finds alone that learned of told objects goes on, if it does, by what eyes find.
+        errors = _errors(config) if config.finds else TOLD
+        return FoundObjects(ObjectsInPictures(load_eyes(config.eyes)), *_slots(config), config.told_objects, errors)
 
     def _set_requires_grad(self) -> None:
         super()._set_requires_grad()

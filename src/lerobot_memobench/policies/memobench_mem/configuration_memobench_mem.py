@@ -162,10 +162,10 @@ class MemobenchMemConfig(MemobenchMemSettings):
             raise MemobenchError(f"--policy.align_weight={self.align_weight} must not be negative.")
 
     def _check_perception(self) -> None:
-        if self.sight_errors < 0 or (self.sight_errors and not self.sees_objects):
+        if self.sight_errors < 0 or (self.sight_errors and not self.sees_slots):
             raise MemobenchError(
                 f"--policy.sight_errors={self.sight_errors} must not be negative, and are errors of slots: leave it "
-                "out, or use --policy.perception=objects."
+                "out, or use --policy.perception=objects or --policy.finds=true."
             )
         if not 0 < self.sight_errors_share <= 1 or (self.sight_errors_share < 1 and not self.sight_errors):
             raise MemobenchError(

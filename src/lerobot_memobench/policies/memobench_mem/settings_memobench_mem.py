@@ -45,7 +45,8 @@ class MemobenchMemSettings(PI05Config):
     failure is from: ``nothing``, ``hand`` (what stands near the hand now), ``present`` or ``memory``."""
     sight_errors: float = 0.0
     """With which errors told objects are seen in training, so that the policy acts through ``eyes`` afterwards; 1: as
-    large as those of the package's eyes, 0: none."""
+    large as those of the package's eyes, 0: none. With ``finds``, told objects stand then for found ones in training,
+    and nothing is sought in a dataset's pictures."""
     sight_errors_share: float = 1.0
     """Which share of the frames is seen so; the others as they are told: a policy for both."""
     object_classes: list[str] | None = None

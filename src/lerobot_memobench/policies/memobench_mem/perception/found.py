@@ -23,6 +23,7 @@ from lerobot_memobench.policies.memobench_mem.perception.eyes import SEEN
 from lerobot_memobench.policies.memobench_mem.perception.frozen import fingerprint
 from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_PHASE, OBS_RAW_STATE, ObjectPerception
 from lerobot_memobench.policies.memobench_mem.perception.perception import Seen
+from lerobot_memobench.policies.memobench_mem.perception.sight_errors import TOLD, SightErrors
 from lerobot_memobench.policies.memobench_mem.perception.slots import in_order
 from lerobot_memobench.policies.shown import cure
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH, field
@@ -68,15 +69,22 @@ class FoundObjects(ObjectPerception):
         look: no module, so that a checkpoint has no part of it.
         trained, tokens_per_frame, width: as of `ObjectPerception`.
         told: what rollouts are told by the environment instead, as of `told_objects`.
+        errors: with which a training batch's are seen; they are told ones then.
     """
 
     remembers = next(iter(VIEWS))
     pictures = True
 
     def __init__(
-        self, look: ObjectsInPictures, trained: Sequence[str], tokens_per_frame: int, width: int, told: str = "nothing"
+        self,
+        look: ObjectsInPictures,
+        trained: Sequence[str],
+        tokens_per_frame: int,
+        width: int,
+        told: str = "nothing",
+        errors: SightErrors = TOLD,
     ) -> None:
-        super().__init__(trained, tokens_per_frame, width)
+        super().__init__(trained, tokens_per_frame, width, errors)
         self.look, self.told = look, told
         self.key = look.key
 
