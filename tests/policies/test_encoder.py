@@ -36,8 +36,13 @@ def test_encoder_shapes_and_mask() -> None:
 def test_encoder_equals_its_formula_token_by_token() -> None:
     """concat(image, SiLU(Linear(position))) -> Linear, although the code never builds the concatenations."""
     encoder = MemoryEncoder(image_dim=6, memory_dim=10)
-    tokens, steps = torch.randn(2, 3, 16, 6), torch.tensor([[0, 4, 9], [100, 700, 1199]])
+    tokens, steps = torch.randn(2, 3, 16, 6), torch.tensor([[9, 4, 700], [4, 9, 1199]])
     memory, _ = encoder(tokens, steps, torch.ones(2, 3, dtype=torch.bool))
     position = torch.nn.functional.silu(encoder.position(position_features(steps)))
     expected = encoder.project(torch.cat([tokens, position], dim=-1)).flatten(1, 2)
     torch.testing.assert_close(memory, expected, rtol=1e-5, atol=1e-5)
+    weights = [*encoder.parameters()]
+    for made, by_formula in zip(
+        *(torch.autograd.grad(of.square().sum(), weights) for of in (memory, expected)), strict=True
+    ):
+        torch.testing.assert_close(made, by_formula, rtol=1e-4, atol=1e-4)
