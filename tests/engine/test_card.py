@@ -116,7 +116,9 @@ def test_eyes_that_find_objects_are_part_of_a_policy(tmp_path: Path) -> None:
     settings = {"type": "memobench_mem", "perception": "objects", "eyes": str(file)}
     assert policy_facts(settings, 7)["eyes_sha256"] == hashlib.sha256(b"one").hexdigest()
     assert "eyes_sha256" not in policy_facts({**settings, "eyes": None}, 7)
-    assert "eyes_sha256" not in policy_facts({**settings, "perception": "pixels"}, 7), "a checkpoint holds its tower"
+    pixels = {**settings, "perception": "pixels"}
+    assert "eyes_sha256" not in policy_facts(pixels, 7), "a checkpoint holds its tower"
+    assert policy_facts({**pixels, "finds": True}, 7)["eyes_sha256"] == hashlib.sha256(b"one").hexdigest()
     file.unlink()
     with pytest.raises(MemobenchError, match="there is no file"):
         policy_facts(settings, 7)

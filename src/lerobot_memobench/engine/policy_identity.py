@@ -78,7 +78,8 @@ def eyes_hash(settings: Mapping[str, Any]) -> str | None:
     Raises:
         MemobenchError: there are no such eyes.
     """
-    if settings.get("perception") != "objects" or settings.get("eyes") is None:
+    finds = settings.get("perception") == "objects" or settings.get("finds")
+    if not finds or settings.get("eyes") is None:
         return None
     from lerobot_memobench.eyes.weights import eyes_file
 
