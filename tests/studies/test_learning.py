@@ -185,6 +185,7 @@ def test_what_is_told_in_training_is_told_in_rollouts(tmp_path: Path, monkeypatc
         ("objects", {"perception=objects", "steps=1600"}, set()),
         ("found", {"perception=objects", "policy.sight_errors=1", "steps=1600"}, {"eyes=package"}),
         ("pixels", {"perception=pixels", "steps=2000"}, set()),
+        ("both", {"perception=pixels", "policy.finds=true", "policy.sight_errors=1", "steps=2000"}, set()),
     ],
 )
 def test_policies_learn_and_act_by_what_they_see(
@@ -196,9 +197,11 @@ def test_policies_learn_and_act_by_what_they_see(
     stages.generate()
     stages.train(MEMORY, 0)
     stages.evaluate(MEMORY, 0)
-    assert ("--no-images" in ran[0]) == (perception != "pixels"), "pictures are made for who learns from them"
+    assert ("--no-images" in ran[0]) == (perception in ("objects", "found")), (
+        "pictures are made for who learns from them"
+    )
     assert trained | {"batch_size=32"} <= set(ran[1])
-    assert ("policy.sight_errors=1" in ran[1]) == (perception == "found")
+    assert ("policy.sight_errors=1" in ran[1]) == (perception in ("found", "both"))
     assert {word for word in ran[2] if word.startswith("eyes=")} == rolled_out
 
 

@@ -28,6 +28,7 @@ class Sight(StrEnum):
     OBJECTS = "objects"
     FOUND = "found"
     PIXELS = "pixels"
+    BOTH = "both"
 
 
 def learn(
@@ -51,7 +52,8 @@ def learn(
         Sight,
         typer.Option(
             help="objects: told by the environment; found: in rollouts by the package's eyes, in training told with "
-            "errors like theirs; pixels: the tokens of these eyes, from demonstrations with pictures."
+            "errors like theirs; pixels: the tokens of these eyes, from demonstrations with pictures; both: tokens "
+            "and found objects."
         ),
     ] = Sight.OBJECTS,
     settings: Annotated[

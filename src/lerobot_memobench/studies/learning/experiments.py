@@ -14,7 +14,7 @@ ARMS: dict[str, tuple[str, ...]] = {MEMORY: (), MEMORYLESS: ("policy.integration
 ALIGNED = {**ARMS, MEMORY: ("align=semantic",)}
 """The same, with a memory aligned with checkpoint language, which learns referents in fewer updates."""
 
-OBJECTS, FOUND, PIXELS = "objects", "found", "pixels"
+OBJECTS, FOUND, PIXELS, BOTH = "objects", "found", "pixels", "both"
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,9 @@ PERCEPTIONS = {
     OBJECTS: Sight(("perception=objects",)),
     FOUND: Sight(("perception=objects", "policy.sight_errors=1"), ("eyes=package",)),
     PIXELS: Sight(("perception=pixels",), pictures=True),
+    BOTH: Sight(
+        ("perception=pixels", "policy.finds=true", "policy.sight_errors=1", "policy.tokens_dropped=0.8"), pictures=True
+    ),
 }
 """Ways to see. Who is to act by objects that eyes find learns by objects that are told with errors like theirs."""
 
@@ -75,7 +78,7 @@ def prompted() -> tuple[str, ...]:
 def experiment(name: str, perception: str = OBJECTS, suite: str = PUBLISHED) -> Experiment:
     """Return the experiment of a name in `EXPERIMENTS`, by policies that see in this way, on a suite's tasks."""
     named = EXPERIMENTS[name]
-    steps = (named.pixel_steps if perception == PIXELS else None) or named.steps
+    steps = (named.pixel_steps if PERCEPTIONS[perception].pictures else None) or named.steps
     tasks = tuple(task for task in task_names(suite=suite) if get_task(task).scene_name in named.tasks)
     return replace(named, perception=perception, steps=steps, tasks=tasks)
 
