@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 
 from lerobot_memobench.policies.memobench_mem.memory.encoder import MemoryEncoder, position_features
@@ -33,12 +34,15 @@ def test_encoder_shapes_and_mask() -> None:
     assert token_mask.tolist() == [[True] * 32 + [False] * 16]
 
 
-def test_encoder_equals_its_formula_token_by_token() -> None:
+@pytest.mark.parametrize(
+    "steps", [[[9, 4, 700], [4, 9, 1199]], [[9], [4], [700], [4], [9]]], ids=["rows", "one by one"]
+)
+def test_encoder_equals_its_formula_token_by_token(steps: list[list[int]]) -> None:
     """concat(image, SiLU(Linear(position))) -> Linear, although the code never builds the concatenations."""
-    encoder = MemoryEncoder(image_dim=6, memory_dim=10)
-    tokens, steps = torch.randn(2, 3, 16, 6), torch.tensor([[9, 4, 700], [4, 9, 1199]])
-    memory, _ = encoder(tokens, steps, torch.ones(2, 3, dtype=torch.bool))
-    position = torch.nn.functional.silu(encoder.position(position_features(steps)))
+    encoder, seen = MemoryEncoder(image_dim=6, memory_dim=10), torch.tensor(steps)
+    tokens = torch.randn(*seen.shape, 16, 6)
+    memory, _ = encoder(tokens, seen, torch.ones_like(seen, dtype=torch.bool))
+    position = torch.nn.functional.silu(encoder.position(position_features(seen)))
     expected = encoder.project(torch.cat([tokens, position], dim=-1)).flatten(1, 2)
     torch.testing.assert_close(memory, expected, rtol=1e-5, atol=1e-5)
     weights = [*encoder.parameters()]

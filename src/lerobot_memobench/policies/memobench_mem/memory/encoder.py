@@ -66,21 +66,23 @@ class MemoryEncoder(nn.Module):
         """
         of_image, of_position = self.project.weight.split([tokens.shape[-1], self.position.out_features], dim=1)
         image = F.linear(tokens.to(of_image.dtype), of_image, self.project.bias)
-        # A batch's frames were seen at a tenth as many different steps.
-        at, places = steps.unique(return_inverse=True)
+        # A training batch gives all its frames one by one (`PooledMemory.shared`), seen at a tenth as many steps.
+        at, places = steps.unique(return_inverse=True) if steps.shape[1] == 1 else (steps, None)
         positions = F.linear(F.silu(self._positions(at)), of_position)
-        encoded = image + positions.index_select(0, places.flatten()).unflatten(0, places.shape)
+        if places is not None:
+            positions = positions.index_select(0, places.flatten()).unflatten(0, places.shape)
+        encoded = image + positions
         mask = repeat(frame_mask.bool(), "b f -> b (f p)", p=tokens.shape[2])
         return rearrange(encoded, "b f p d -> b (f p) d"), mask
 
     def _positions(self, steps: Tensor) -> Tensor:
-        """`position` of `position_features` (N, 16, 768), by its parts; (N, 1, d_m) of the time alone."""
+        """`position` of `position_features` (..., 16, 768), by its parts; (..., 1, d_m) of the time alone."""
         weight = self.position.weight
         if not self.grid:
-            return rearrange(self.position(_waves(steps, _TIME_BASE).to(weight.dtype)), "n d -> n 1 d")
+            return rearrange(self.position(_waves(steps, _TIME_BASE).to(weight.dtype)), "... d -> ... 1 d")
         of_time, of_row, of_column = weight.split(2 * _FREQUENCIES, dim=1)
         grid = _grid_waves(steps.device).to(weight.dtype)
         time = F.linear(_waves(steps, _TIME_BASE).to(weight.dtype), of_time, self.position.bias)
         rows = rearrange(F.linear(grid, of_row), "y d -> y 1 d")
         columns = rearrange(F.linear(grid, of_column), "x d -> 1 x d")
-        return rearrange(time, "n d -> n 1 d") + rearrange(rows + columns, "y x d -> (y x) d")
+        return rearrange(time, "... d -> ... 1 d") + rearrange(rows + columns, "y x d -> (y x) d")
