@@ -116,7 +116,7 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
     def _finding(config: MemobenchMemConfig) -> FoundObjects:
         assert config.eyes is not None
         # A policy of finds alone that learned of told objects goes on, if it does, by what eyes find.
-        errors = _errors(config) if config.finds else TOLD
+        errors = _errors(config) if config.told_in_training else TOLD
         return FoundObjects(ObjectsInPictures(load_eyes(config.eyes)), *_slots(config), config.told_objects, errors)
 
     def _set_requires_grad(self) -> None:

@@ -114,7 +114,7 @@ def cache_dataset(
         eyes that of the memory's, beside which those of the present lie.
     """
     how: dict[str, Any] = {"batch_size": batch_size, "workers": workers, "progress": progress, "tell": tell}
-    if config.finds_objects and not (config.finds and config.sight_errors):
+    if config.finds_objects and not config.told_in_training:
         assert config.eyes is not None
         found = make_found(root, config, ObjectsInPictures(load_eyes(config.eyes)), _text_encoder(config), **how)
         if config.sees_objects:
@@ -186,11 +186,11 @@ def _found_in(root: Path, config: MemobenchMemConfig, perception: FoundObjects, 
 
 
 def _beside_tokens(root: Path, config: MemobenchMemConfig, eyes: FindingEyes) -> dict[str, torch.Tensor]:
-    """Return what `_found_in` does; where another process is at it, tokens are made here meanwhile.
+    """Return what `_found_in` does, or told objects where the policy learns of these.
 
-    Told objects where the policy learns of these with errors.
+    Where another process is at it, tokens are made here meanwhile.
     """
-    if config.sight_errors:
+    if config.told_in_training:
         return {FOUND: read_recorded(root, [OBS_ENV_STATE])[0][OBS_ENV_STATE]}
     try:
         return _found_in(root, config, eyes.finds, wait=come_back)

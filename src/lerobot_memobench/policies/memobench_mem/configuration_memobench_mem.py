@@ -264,6 +264,11 @@ class MemobenchMemConfig(MemobenchMemSettings):
         return self.has_eyes and self.sees_slots
 
     @property
+    def told_in_training(self) -> bool:
+        """Whether told objects, with errors, stand in training for those that eyes find."""
+        return self.finds and self.sight_errors > 0
+
+    @property
     def sees_slots(self) -> bool:
         """Whether things are seen as slots, with where they are from the hand."""
         return self.sees_objects or self.finds

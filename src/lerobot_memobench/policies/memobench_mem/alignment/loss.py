@@ -41,7 +41,8 @@ def alignment_loss(
     weighted = weight * loss
     logged = {"align_loss": loss.item()}
     if memory.requires_grad and torch.is_grad_enabled():
-        # Two matrix products: cheap, and comparable with the gradient norm that LeRobot logs.
+        # Two matrix products: cheap, and comparable with the gradient norm that LeRobot logs. What had no part in this
+        # batch's memory gets zeros.
         gradients = torch.autograd.grad(weighted, list(encoder), retain_graph=True, materialize_grads=True)
         logged["align_grad_norm"] = torch.stack([gradient.norm() for gradient in gradients]).norm().item()
     with torch.no_grad():
