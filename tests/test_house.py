@@ -1,13 +1,10 @@
-"""What docs/develop.md promises of the house, read from the source: floors, circles, private names, sizes."""
+"""What docs/develop.md promises of the house, read from the source: floors, circles, private names."""
 
 from __future__ import annotations
 
 import ast
 import re
-import statistics
 from collections.abc import Collection, Iterator
-
-import numpy as np
 
 from .scripts import load_script
 
@@ -124,17 +121,3 @@ def test_the_pages_for_newcomers_name_what_is_there() -> None:
         names = re.findall(r"`([\w/]+\.py)", page.read_text())
         here = [house.ROOT, source, page.parent, *(path for path in source.rglob("*") if path.is_dir())]
         assert [name for name in names if not any((base / name).is_file() for base in here)] == []
-
-
-def test_files_and_functions_are_short() -> None:
-    files = [len(path.read_text().splitlines()) for path in house.modules().values()]
-    functions = [
-        node.end_lineno - node.lineno + 1
-        for tree in TREES.values()
-        for node in ast.walk(tree)
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.end_lineno
-    ]
-    assert statistics.median(files) <= 120
-    assert np.percentile(files, 90) <= 350
-    assert statistics.median(functions) <= 9
-    assert np.percentile(functions, 90) <= 25
