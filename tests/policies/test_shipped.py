@@ -45,7 +45,9 @@ def test_a_policy_is_found_by_its_name(shipped: Path, tmp_path: Path, monkeypatc
     mine.mkdir(parents=True)
     (mine / "config.json").write_text("{}")
     monkeypatch.chdir(tmp_path / "here")
-    assert checkpoint_of("memobench_small", {"act"}) == "memobench_small", "a folder of the user's comes first"
+    assert checkpoint_of("memobench_small", {"act"}) == str(folder), "a known name, wherever the command is run"
+    assert checkpoint_of("./memobench_small", {"act"}) == "memobench_small", "a folder is named by a path"
+    assert checkpoint.local_folder("memobench_small") == folder
 
 
 def test_the_demo_compares_only_what_is_there(shipped: Path) -> None:

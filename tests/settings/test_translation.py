@@ -11,6 +11,7 @@ from lerobot.configs.train import TrainPipelineConfig
 
 import lerobot_memobench.registration  # noqa: F401
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.settings.recipes import recipe_file, recipes
 from lerobot_memobench.settings.translation import LerobotSettings, translate
 from lerobot_memobench.settings.words import split_words
 
@@ -105,10 +106,30 @@ def test_a_name_with_a_slash_is_a_repository() -> None:
     assert evaluated("env=memobench", "policy=lerobot/pi05_base")[1] == "--policy.path=lerobot/pi05_base"
 
 
-def test_a_folder_named_like_a_type_is_no_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("holds_checkpoint", [True, False])
+def test_a_known_type_is_the_type_and_a_folder_is_a_path(
+    holds_checkpoint: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     (tmp_path / "act").mkdir()
+    if holds_checkpoint:
+        (tmp_path / "act" / "config.json").write_text(json.dumps({"type": "diffusion"}))
     monkeypatch.chdir(tmp_path)
-    assert evaluated("env=memobench", "policy=act")[1] == "--policy.type=act"
+    assert evaluated("env=memobench", "policy=act", "policy.chunk_size=3")[1] == "--policy.type=act"
+    notes = [record.getMessage() for record in caplog.records]
+    told = "policy=act is the policy type; the checkpoint in the folder of that name is policy=./act"
+    assert notes == [told] * holds_checkpoint
+    if holds_checkpoint:
+        assert evaluated("env=memobench", "policy=./act")[1] == "--policy.path=act"
+
+
+def test_a_recipe_is_the_recipe_and_a_file_is_a_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "train_paper").write_text("steps: 1")
+    monkeypatch.chdir(tmp_path)
+    assert recipe_file("train_paper") == recipes()["train_paper"]
+    assert "the file of that name is config=./train_paper" in caplog.text
+    assert recipe_file("./train_paper") == Path("train_paper")
 
 
 def test_a_dataset_folder_is_a_root(tmp_path: Path) -> None:

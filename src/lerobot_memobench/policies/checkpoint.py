@@ -58,14 +58,19 @@ def shipped_policies() -> dict[str, Path]:
 
 
 def checkpoint_folder(text: str) -> Path | None:
-    """Return the checkpoint that a path means: itself, or the last one of a training run; or that of a policy that
-    comes with the package, by its name; None when there is none.
+    """Return the checkpoint that a text means: that of a policy that comes with the package, by its name; or a folder,
+    itself or the last one of a training run; None when there is none. Of two of one name, ``./name`` is the folder.
     """
+    return shipped_policies().get(text) or folder_with_checkpoint(text)
+
+
+def folder_with_checkpoint(text: str) -> Path | None:
+    """Return the checkpoint in a folder: itself, or the last one of a training run; None when there is none."""
     base = Path(text).expanduser()
     for folder in (base, base / "pretrained_model", base / "checkpoints" / "last" / "pretrained_model"):
         if (folder / CONFIG_FILE).is_file():
             return folder
-    return shipped_policies().get(text)
+    return None
 
 
 def portable_path(path: str) -> str:

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.policies.checkpoint import checkpoint_folder, checkpoint_type, looks_local, shipped_policies
+from lerobot_memobench.policies.checkpoint import (
+    checkpoint_folder,
+    checkpoint_type,
+    folder_with_checkpoint,
+    looks_local,
+    shipped_policies,
+)
 from lerobot_memobench.settings import fields
 from lerobot_memobench.settings.flags import flag_value
+
+logger = logging.getLogger(__name__)
 
 
 def choice_flags(config: type, key: str, value: str) -> list[str]:
@@ -33,8 +42,14 @@ def choice_flags(config: type, key: str, value: str) -> list[str]:
 
 
 def checkpoint_of(value: str, known: Collection[str]) -> str | None:
-    """Return the checkpoint folder or the repository that ``policy=`` means; None where it means a type."""
-    folder = checkpoint_folder(value)
+    """Return the checkpoint folder or the repository that ``policy=`` means; None where it means a type.
+
+    A known name is what has it, wherever the command is run: a folder of that name is named by a path.
+    """
+    if value in (*known, *shipped_policies()) and folder_with_checkpoint(value) is not None:
+        what = "the policy type" if value in known else "the policy of the package"
+        logger.warning("policy=%s is %s; the checkpoint in the folder of that name is policy=./%s", value, what, value)
+    folder = None if value in known else checkpoint_folder(value)
     if folder is not None:
         return str(folder)
     if value not in known and (looks_local(value) or Path(value).is_dir()):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
@@ -11,6 +12,7 @@ from lerobot_memobench.settings.flags import has_flag
 from lerobot_memobench.settings.words import Words
 
 KEY = "config"
+logger = logging.getLogger(__name__)
 
 
 def recipes() -> dict[str, Path]:
@@ -26,9 +28,11 @@ def recipe_file(value: str) -> Path:
         MemobenchError: there is none.
     """
     known = recipes()
-    if value in known:
-        return known[value]
     path = Path(value).expanduser()
+    if value in known:
+        if path.is_file():
+            logger.warning("%s=%s is the shipped recipe; the file of that name is %s=./%s", KEY, value, KEY, value)
+        return known[value]
     if path.is_file():
         return path
     if "/" in value or path.suffix:
