@@ -21,8 +21,10 @@ from small_policy import CHUNK, batch_of, made_for_training, small_config
 
 from lerobot_memobench.datasets.memory_cache import MemoryCache, find_cache
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.memobench_mem.language import tokenizer as tokenizer_module
 from lerobot_memobench.policies.memobench_mem.language.text_encoders import WordTextEncoder
 from lerobot_memobench.policies.memobench_mem.language.tokenizer import (
+    PromptTokenizerProcessorStep,
     WordTokenizerProcessorStep,
     make_vocabulary,
     make_word_tokenizer,
@@ -488,6 +490,56 @@ def test_word_tokenizer() -> None:
         "<unk>",
     ]
     assert len(make_vocabulary((f"word{i}" for i in range(5000)), 1024)) == 1024
+
+
+def step_of(texts: list[str], length: int = 24) -> WordTokenizerProcessorStep:
+    return WordTokenizerProcessorStep(vocabulary=make_vocabulary(texts, 1024), max_length=length, padding="max_length")
+
+
+def test_unknown_words_are_told_once_by_name(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    monkeypatch.setattr(tokenizer_module, "_told", set())
+    step = step_of(["Switch the stove on."])
+    for _ in range(3):
+        step._tokenize_text(["Switch the stove on.", "Switch the stove on twice, then once."])
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    told = caplog.text
+    assert "does not know 'twice', 'then', 'once' in 'Switch the stove on twice, then once.'" in told
+    monkeypatch.setattr(step, "input_tokenizer", None)  # what has been looked at is not tokenized again
+    tokenizer_module.warn_of_losses(None, "Switch the stove on twice, then once.", 24, full=False)
+    step = step_of(["Switch the stove on."])
+    step._tokenize_text("Task: Turn the stove on once, State: 1 2;")
+    assert "does not know 'turn' in 'Turn the stove on once'" in caplog.messages[1]
+
+
+def test_what_the_token_limit_cuts_off_is_told_once_per_instruction(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(tokenizer_module, "_told", set())
+    prompt = "Task: Switch the stove on. Memory: the stove was on, State: {} 12 200;\nAction: "
+    step = step_of([prompt], length=14)
+    for state in (7, 8, 9):
+        step._tokenize_text([prompt.format(state)])
+    assert len(caplog.messages) == 1
+    assert "prompt of 'Switch the stove on.' has 23 tokens and the policy reads 14" in caplog.text
+    assert "cut off: ', State: 7 12 200;\\nAction: '" in caplog.text
+    caplog.clear()
+    step._tokenize_text("switch the stove on. the stove was on. switch")
+    assert not caplog.messages, "what fits is not told"
+    exactly = "switch " * 13
+    step._tokenize_text(exactly)
+    assert not caplog.messages, "nor what fits exactly"
+    step._tokenize_text(exactly + "off")
+    assert "cut off: 'off'" in caplog.text
+
+
+def test_the_pretrained_tokenizer_tells_what_it_cuts_off(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(tokenizer_module, "_told", set())
+    words = make_word_tokenizer(make_vocabulary(["put the bowl"], 1024))
+    step = PromptTokenizerProcessorStep(tokenizer=words, max_length=3)
+    step._tokenize_text(["put the bowl"])
+    assert "cut off: 'bowl'" in caplog.text
 
 
 def test_texts_that_come_again_are_tokenized_as_by_lerobot() -> None:

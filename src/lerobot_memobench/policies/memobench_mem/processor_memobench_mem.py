@@ -18,7 +18,11 @@ from lerobot.processor import (
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.language.tokenizer import WordTokenizerProcessorStep, make_vocabulary
+from lerobot_memobench.policies.memobench_mem.language.tokenizer import (
+    PromptTokenizerProcessorStep,
+    WordTokenizerProcessorStep,
+    make_vocabulary,
+)
 from lerobot_memobench.policies.memobench_mem.processing.gather_memory import GatherMemoryProcessorStep, gathering
 from lerobot_memobench.policies.memobench_mem.processing.oracle_memory import OracleMemoryProcessorStep
 from lerobot_memobench.policies.memobench_mem.processing.raw_state import RawStateProcessorStep
@@ -79,7 +83,7 @@ def _tokenizer(config: MemobenchMemConfig, meta: Any | None) -> TokenizerProcess
     options = {"max_length": config.tokenizer_max_length, "padding_side": "right", "padding": "max_length"}
     if config.tokenizer_name != "words":
         try:
-            return TokenizerProcessorStep(tokenizer_name=config.tokenizer_name, **options)
+            return PromptTokenizerProcessorStep(tokenizer_name=config.tokenizer_name, **options)
         except OSError as error:
             raise MemobenchError(
                 f"The tokenizer '{config.tokenizer_name}' could not be loaded: give a folder that holds PaliGemma's "

@@ -48,7 +48,7 @@ def _held(
         yield "oracle_memory", _ORACLE in steps and bool(steps[_ORACLE].get("enabled", True))
     if not training:
         return
-    tokenizer = steps.get("tokenizer_processor")
+    tokenizer = steps.get("memobench_tokenizer", steps.get("tokenizer_processor"))  # ours, or LeRobot's pi05
     words = "memobench_word_tokenizer" in steps
     if tokenizer is not None or words:
         yield "tokenizer_name", "words" if tokenizer is None else tokenizer.get("tokenizer_name")

@@ -1,7 +1,11 @@
-"""The tokenizer of sizes without a pretrained one: words, from a list built out of the dataset's tasks."""
+"""The tokenizers of prompts: a pretrained one, or words from a list built out of the dataset's tasks.
+
+What either of them loses is told: words that it does not know, and what its length cuts off.
+"""
 
 from __future__ import annotations
 
+import logging
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -19,6 +23,9 @@ from torch import Tensor
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.processing.training_run import training_run
+from lerobot_memobench.tasks.memory_text import MARK
+
+logger = logging.getLogger(__name__)
 
 _WORD = re.compile(r"\w+|[^\w\s]")
 _SPECIAL = ("<pad>", "<unk>", "<bos>", "<eos>")
@@ -60,9 +67,64 @@ def make_word_tokenizer(vocabulary: Sequence[str]) -> Any:
     )
 
 
+_told: set[str] = set()
+"""Texts, instructions and words about which this process has been warned."""
+
+
+def warn_of_losses(tokenizer: Any, text: str, max_length: int, full: bool) -> None:
+    """Warn of what a policy does not read of a prompt: unknown words, each once per process; and what is cut off, once
+    per instruction: numbers of the state and memory texts differ from step to step.
+
+    Args:
+        full: the prompt takes all of ``max_length`` tokens, and may have had more.
+    """
+    prompt = text.partition(", State: ")[0]
+    instruction = prompt.partition(MARK)[0].removeprefix("Task: ")
+    if f"read {prompt}" in _told and (not full or f"cut {instruction}" in _told):
+        return
+    coded = tokenizer(text, return_offsets_mapping=True)
+    spans = list(zip(coded["input_ids"], coded["offset_mapping"], strict=True))
+    unknown = dict.fromkeys(text[a:b].lower() for token, (a, b) in spans if token == tokenizer.unk_token_id)
+    new = [repr(word) for word in unknown if f"word {word}" not in _told]
+    if new:
+        logger.warning(
+            "the policy does not know %s in %r, and reads unknown words all alike; it can act on these only after "
+            "training on instructions that hold them",
+            ", ".join(new),
+            instruction,
+        )
+    if len(spans) > max_length and f"cut {instruction}" not in _told:
+        logger.warning(
+            "the prompt of %r has %d tokens and the policy reads %d (policy.tokenizer_max_length when it is trained); "
+            "cut off: %r",
+            instruction,
+            len(spans),
+            max_length,
+            text[spans[max_length][1][0] :],
+        )
+        _told.add(f"cut {instruction}")
+    _told.update(f"word {word}" for word in unknown)
+    _told.add(f"read {prompt}")
+
+
+@dataclass
+@ProcessorStepRegistry.register(name="memobench_tokenizer")
+class PromptTokenizerProcessorStep(TokenizerProcessorStep):
+    """LeRobot's tokenizer step, which warns of what it loses of a prompt."""
+
+    def _tokenize_text(self, text: str | list[str]) -> dict[str, Tensor]:
+        found: dict[str, Tensor] = super()._tokenize_text(text)
+        # A full row may have been cut off. Both are looked at in numbers first: this runs at every step.
+        tokenizer, full = self.input_tokenizer, found["attention_mask"].bool().all(dim=-1)
+        unknown = (found["input_ids"] == (-1 if tokenizer.unk_token_id is None else tokenizer.unk_token_id)).any(dim=-1)
+        for row in (unknown | full).nonzero().flatten().tolist():
+            warn_of_losses(tokenizer, text if isinstance(text, str) else text[row], self.max_length, bool(full[row]))
+        return found
+
+
 @dataclass
 @ProcessorStepRegistry.register(name="memobench_word_tokenizer")
-class WordTokenizerProcessorStep(TokenizerProcessorStep):
+class WordTokenizerProcessorStep(PromptTokenizerProcessorStep):
     """LeRobot's tokenizer step with the word tokenizer; its words are saved in the checkpoint's processor file.
 
     A step that is rebuilt from a checkpoint for training takes the length of that run's prompts, and learns the words
