@@ -9,6 +9,7 @@ import pytest
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.bddl.problem import Region
 from lerobot_memobench.tasks.bddl.reading import parse_bddl
+from lerobot_memobench.tasks.bddl.writing import format_bddl
 from lerobot_memobench.tasks.formula import And, Atom, Not
 
 
@@ -57,6 +58,25 @@ def test_optional_sections(bddl: str) -> None:
     problem = parse_bddl(bddl.replace("(:domain robosuite)", "").replace("(:obj_of_interest cup_1 box_1)", ""))
     assert problem.domain == ""
     assert problem.objects_of_interest == ()
+
+
+def test_a_region_on_what_is_not_declared_is_let_pass_until_it_is_used(bddl: str) -> None:
+    """LIBERO's ten goal tasks have one: a region of a drainer that is not there, which no atom names."""
+    libero = bddl.replace("(top_region", "(right_region (:target Drainer_1))\n    (top_region")
+    problem, without = parse_bddl(libero), parse_bddl(bddl)
+    assert problem.regions == without.regions
+    assert (problem.init, problem.goal) == (without.init, without.goal)
+    assert parse_bddl(format_bddl(problem)).regions == without.regions
+    used = libero.replace("(Not (Open box_1_top_region))", "(On cup_1 drainer_1_right_region)")
+    with pytest.raises(
+        MemobenchError, match=r"^a\.bddl, line 7: found the target 'Drainer_1' of region 'right_region'"
+    ):
+        parse_bddl(used, "a.bddl")
+    checkpoint = Atom("on", ("cup_1", "drainer_1_right_region"))  # as checkpoints name it
+    with pytest.raises(MemobenchError, match="'right_region', which is not declared"):
+        problem.resolve(checkpoint, "a.json")
+    with pytest.raises(MemobenchError, match="'drainer_1_right_region' in :obj_of_interest"):
+        parse_bddl(libero.replace("(:obj_of_interest cup_1", "(:obj_of_interest drainer_1_right_region"))
 
 
 MALFORMED = [

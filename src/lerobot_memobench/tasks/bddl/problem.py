@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.tasks.formula import Atom, Formula, atoms, rename
@@ -42,7 +42,11 @@ class Region:
 
 @dataclass(frozen=True)
 class Problem:
-    """What a BDDL file says; names in ``init`` and ``goal`` are declared. Mappings keep the file's order."""
+    """What a BDDL file says; names in ``init`` and ``goal`` are declared. Mappings keep the file's order.
+
+    Attributes:
+        unplaced: region whose target is not declared -> the sentence that says so when it is used.
+    """
 
     name: str
     domain: str
@@ -53,6 +57,7 @@ class Problem:
     objects_of_interest: tuple[str, ...]
     init: tuple[Atom, ...]
     goal: Formula
+    unplaced: dict[Region, str] = field(default_factory=dict)
 
     def entity_kind(self, name: str) -> str | None:
         """Return "object", "fixture", "region" or None."""
@@ -69,6 +74,7 @@ class Problem:
         for atom in atoms(formula):
             for position, arg in enumerate(atom.args):
                 if arg.lower() not in declared:
+                    self._check_unplaced(arg)
                     raise MemobenchError(
                         f"{where}: found the name {arg!r}, which none of :objects, :fixtures and :regions "
                         f"(as <target>_<region>) declares, {nearest(arg, declared.values())}"
@@ -76,6 +82,12 @@ class Problem:
                 spelling[arg] = declared[arg.lower()]
                 self._check_kind(atom, position, spelling[arg], where)
         return rename(formula, spelling)
+
+    def _check_unplaced(self, name: str) -> None:
+        """Raise where a name means a region on what is not declared: as it is written, or as it should have been."""
+        for region, problem in self.unplaced.items():
+            if name.lower().endswith(f"_{region.name}".lower()):
+                raise MemobenchError(problem)
 
     def _check_kind(self, atom: Atom, position: int, name: str, where: str) -> None:
         kind = self.entity_kind(name)

@@ -3,7 +3,7 @@
 A file holds ``(define (problem NAME) (:domain ..) (:language ..) (:regions ..) (:fixtures ..) (:objects ..)
 (:obj_of_interest ..) (:init ..) (:goal ..))``. Keywords and predicates are read in any case; names keep
 theirs, and a reference that differs from the declared name only in case means that name. Anything unknown is
-an error that tells file and line, never dropped.
+an error that tells file and line, never dropped; but a region on what is not declared is let pass until it is used.
 """
 
 from __future__ import annotations
@@ -79,16 +79,18 @@ def _declared(reader: Reader, name: str, sections: Sections) -> Problem:
     names = Names(reader)
     fixtures = _declarations(reader, _items(sections, ":fixtures"), names)
     objects = _declarations(reader, _items(sections, ":objects"), names)
+    regions, unplaced = read_regions(reader, _items(sections, ":regions"), names)
     return Problem(
         name=name,
         domain=_domain(reader, sections.get(":domain")),
         language=_language(reader, sections[":language"]),
         objects=objects,
         fixtures=fixtures,
-        regions=read_regions(reader, _items(sections, ":regions"), names),
+        regions=regions,
         objects_of_interest=_of_interest(reader, _items(sections, ":obj_of_interest"), names),
         init=(),
         goal=And(()),
+        unplaced=unplaced,
     )
 
 

@@ -13,37 +13,45 @@ _EXPECTED = "a region such as (NAME (:target FIXTURE) (:ranges ((x1 y1 x2 y2))) 
 _CLAUSES = (":target", ":ranges", ":yaw_rotation")
 
 
-def read_regions(reader: Reader, nodes: list[Node], names: Names) -> dict[str, Region]:
-    """Return full name -> region, and declare these names."""
+def read_regions(reader: Reader, nodes: list[Node], names: Names) -> tuple[dict[str, Region], dict[Region, str]]:
+    """Return full name -> region, and declare these names; and the regions on what is not declared.
+
+    LIBERO's files hold some of those, which nothing uses. Each comes with the sentence for who does.
+    """
     regions: dict[str, Region] = {}
+    unplaced: dict[Region, str] = {}
     targets = names.spelling()
     for node in nodes:
-        region = _region(reader, node, targets)
+        region, problem = _region(reader, node, targets)
+        if problem is not None:
+            unplaced[region] = problem
+            continue
         names.declare(node, region.full_name, "the region")
         regions[region.full_name] = region
-    return regions
+    return regions, unplaced
 
 
-def _region(reader: Reader, node: Node, targets: Mapping[str, str]) -> Region:
+def _region(reader: Reader, node: Node, targets: Mapping[str, str]) -> tuple[Region, str | None]:
+    """Return a region, and what is wrong with its target."""
     items = reader.sequence(node, _EXPECTED)
     if not items:
         raise reader.error(node, "an empty list ()", _EXPECTED)
     name = reader.word(items[0], _EXPECTED)
-    target: str | None = None
+    target = problem = None
     ranges: list[tuple[float, float, float, float]] = []
     yaw = (0.0, 0.0)
     seen: set[str] = set()
     for clause in items[1:]:
         key, value = _clause(reader, clause, name, seen)
         if key == ":target":
-            target = _target(reader, clause, value, name, targets)
+            target, problem = _target(reader, clause, value, name, targets)
         elif key == ":ranges":
             ranges = _ranges(reader, clause, value, name)
         else:
             yaw = _yaw(reader, clause, value, name)
     if target is None:
         raise reader.error(node, f"region {name!r} without (:target ...)", _EXPECTED)
-    return Region(name, target, tuple(ranges), yaw)
+    return Region(name, target, tuple(ranges), yaw), problem
 
 
 def _clause(reader: Reader, clause: Node, name: str, seen: set[str]) -> tuple[str, Node]:
@@ -60,12 +68,14 @@ def _clause(reader: Reader, clause: Node, name: str, seen: set[str]) -> tuple[st
     return key, values[0]
 
 
-def _target(reader: Reader, clause: Node, value: Node, name: str, targets: Mapping[str, str]) -> str:
+def _target(reader: Reader, clause: Node, value: Node, name: str, targets: Mapping[str, str]) -> tuple[str, str | None]:
+    """Return a target as it is declared; one that is not as it is written, with the sentence that says so."""
     given = reader.word(value, "the name of a fixture or object")
-    if given.lower() not in targets:
-        expected = f"a name from :fixtures or :objects, {nearest(given, targets.values())}"
-        raise reader.error(clause, f"the target {given!r} of region {name!r}, which is not declared", expected)
-    return targets[given.lower()]
+    if given.lower() in targets:
+        return targets[given.lower()], None
+    expected = f"a name from :fixtures or :objects, {nearest(given, targets.values())}"
+    found = f"the target {given!r} of region {name!r}, which is not declared"
+    return given, str(reader.error(clause, found, expected))
 
 
 def _ranges(reader: Reader, clause: Node, value: Node, name: str) -> list[tuple[float, float, float, float]]:

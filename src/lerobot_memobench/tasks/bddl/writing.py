@@ -16,7 +16,7 @@ def format_bddl(problem: Problem, comment: str = "") -> str:
     if problem.domain:
         lines += [f"  (:domain {problem.domain})"]
     lines += [f"  (:language {problem.language})"]
-    lines += _section("regions", [_region(region) for region in problem.regions.values()])
+    lines += _section("regions", [_region(region) for region in (*problem.regions.values(), *problem.unplaced)])
     lines += _section("fixtures", _declarations(problem.fixtures))
     lines += _section("objects", _declarations(problem.objects))
     lines += _section("obj_of_interest", [" ".join(problem.objects_of_interest)] if problem.objects_of_interest else [])
