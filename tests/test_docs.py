@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from lerobot_memobench.settings.short_forms import MEANINGS
+
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("src/**/*.md")])
 BLOCK = re.compile(r"```.*?```", re.DOTALL)
@@ -48,3 +50,12 @@ def test_what_leads_nowhere_is_found(tmp_path: Path) -> None:
     assert links(document) == ["#here--there", "#nowhere", "two.md"]
     assert anchors(document) == {"here--there"}
     assert broken(document) == ["#nowhere", "two.md"]
+
+
+@pytest.mark.parametrize("command", ["eval", "train"])
+def test_the_table_of_short_forms_is_the_help(command: str) -> None:
+    text = (ROOT / "docs" / {"eval": "evaluate.md", "train": "train.md"}[command]).read_text()
+    lines = text[text.index("| short form |") :].split("\n\n")[0].splitlines()[2:]
+    plain = [re.sub(r"\[([^][]*)\]\([^)]*\)", r"\1", line).replace("`", "") for line in lines]
+    rows = [tuple(cell.strip() for cell in line.strip("| ").split(" | ")) for line in plain]
+    assert rows == [tuple(meaning)[: len(rows[0])] for meaning in MEANINGS[command]]

@@ -6,10 +6,12 @@ import json
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, NotRequired, TypedDict
+from typing import Annotated, Any, NotRequired, TypedDict
 
 import pytest
+from pydantic import AfterValidator
 
+from lerobot_memobench.datasets.lerobot_format.record import from_frames
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.files.reading import Count, Malformed, Name, Number, checked, parsed, read_json, refusing
 
@@ -68,6 +70,18 @@ def test_json_says_what_it_says() -> None:
     assert parsed(json.dumps(numbers)) == numbers
     assert parsed(b'\xef\xbb\xbf{"a": 1, "a": 2}') == {"a": 2}
     assert parsed(b"[Infinity]", nan=True) == [float("inf")]
+
+
+def test_no_library_speaks_in_a_sentence() -> None:
+    def ours(value: str) -> str:
+        raise MemobenchError("the seed 7 is an evaluation's")
+
+    with pytest.raises(Malformed) as caught:
+        checked({"a": "x"}, dict[str, Annotated[str, AfterValidator(ours)]])
+    assert str(caught.value) == "found a = 'x': the seed 7 is an evaluation's"
+    with pytest.raises(MemobenchError) as found:
+        from_frames('{"task_name": 3}', "a dataset")
+    assert "(found task_name = 3, expected text)" in str(found.value)
 
 
 def test_the_file_and_what_to_do_are_told(tmp_path: Path) -> None:

@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import io
 
-from rich.console import Console
+import pytest
+from rich.console import Console, RenderableType
 
 from lerobot_memobench.cli.console import counting
+from lerobot_memobench.cli.tasks import task_table
+from lerobot_memobench.evaluation.documents.report import table
+from lerobot_memobench.evaluation.documents.terminal import Unbroken
+from lerobot_memobench.evaluation.metrics.summary import summarise
+from lerobot_memobench.tasks.catalogue import get_task, task_names
 
 
 def test_a_log_file_tells_the_time_left_by_this_run_alone() -> None:
@@ -25,6 +31,38 @@ def test_a_log_file_tells_the_time_left_by_this_run_alone() -> None:
         "episode 6: it slipped",
         "7/10 episode 7, 0:00:06 left",
     ]
+
+
+def tables() -> dict[str, RenderableType]:
+    found = [get_task(name) for name in task_names()]
+    solved = [
+        {
+            "task": task.name,
+            "memory_type": task.memory_type,
+            "episode": 0,
+            "success": True,
+            "checkpoints": [{"operation": one.operation, "first_step": 1} for one in task.checkpoints],
+        }
+        for task in found
+    ]
+    return {"tasks": Unbroken(task_table(found), column=1), "report": table(summarise(solved))}
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+@pytest.mark.parametrize("width", [60, 80, 140, 300])
+@pytest.mark.parametrize("which", ["tasks", "report"])
+def test_no_table_breaks_a_tasks_name(which: str, width: int, terminal: bool) -> None:
+    written = io.StringIO()
+    screen = Console(
+        file=written, width=width, force_terminal=terminal, color_system=None, highlight=False, markup=False
+    )
+    screen.print(tables()[which], crop=False)
+    lines = written.getvalue().splitlines()
+    for name in task_names():
+        (line,) = (line for line in lines if name in line.replace("│", " ").split())
+        assert which == "report" or str(task_names().index(name) + 1) in line.split(name)[0]
+    if terminal:  # nothing but a name may be wider than the terminal
+        assert all(len(line) <= width or any(name in line for name in task_names()) for line in lines)
 
 
 def test_a_terminal_shows_a_bar_and_names_only_troubles() -> None:

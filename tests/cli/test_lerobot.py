@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import subprocess
 import sys
 from collections.abc import Callable
@@ -20,6 +21,7 @@ from lerobot_memobench.datasets.lerobot_format import DEFAULT_REPO_ID
 from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.settings.flags import flag_value
+from lerobot_memobench.settings.short_forms import EVALUATION_WORDS, MEANINGS, SHORT_FORMS, TRAINING_WORDS
 
 TASK = "turn_on_the_stove_and_turn_it_off"
 
@@ -159,7 +161,57 @@ def test_the_report_is_written_and_printed(evaluation: Called, capsys: pytest.Ca
     assert json.loads(Path("out/report.json").read_text())["average"]["SR"] == 100.0
     assert Path("out/report.md").is_file()
     assert len(Path("out/episodes.jsonl").read_text().splitlines()) == 2
-    assert TASK in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert TASK in out
+    assert out.startswith("evaluating memobench_expert on 1 task, 2 episodes each, into out\n")
+
+
+def log_as_lerobot_does() -> None:
+    from lerobot.utils.utils import init_logging
+
+    init_logging()  # as LeRobot's commands begin
+    # The messages come from where LeRobot's do: its files, by the root's functions or by loggers of its modules.
+    place = str(Path(lerobot.scripts.lerobot_eval.__file__))
+    for name, level, message in (
+        (None, logging.INFO, "{'env': {'blind_action': False"),
+        ("lerobot.scripts.lerobot_eval", logging.INFO, "Overall Aggregated Metrics:"),
+        ("lerobot.configs.eval", logging.WARNING, "No pretrained path was provided, evaluated policy will be built"),
+        ("lerobot.configs.eval", logging.WARNING, "No job name provided, using 'x' as job name."),
+        (None, logging.WARNING, "something is amiss in LeRobot"),
+    ):
+        logger = logging.getLogger(name)
+        if logger.isEnabledFor(level):
+            logger.handle(logger.makeRecord(logger.name, level, place, 1, message, (), None))
+    logging.getLogger("lerobot_memobench.envs").warning("something is amiss here")
+
+
+@pytest.mark.parametrize("verbose", ["true", "false"])
+@pytest.mark.parametrize("weights", [True, False])
+def test_nothing_is_said_that_is_no_news(
+    evaluation: Called, capsys: pytest.CaptureFixture[str], weights: bool, verbose: str
+) -> None:
+    root = logging.getLogger()
+    handlers, level = root.handlers[:], root.level
+
+    def act(flags: list[str]) -> None:
+        log_as_lerobot_does()
+        log_episodes(flags)
+
+    evaluation.action = act
+    policy = ["policy=act"] if weights else []
+    try:
+        assert main(["eval", "env=memobench", *policy, f"verbose={verbose}", f"tasks={TASK}", "episodes=1"]) == 0
+    finally:
+        root.handlers[:], filters = handlers, root.filters
+        root.setLevel(level)
+    told = capsys.readouterr().err
+    assert "something is amiss in LeRobot" in told
+    assert "something is amiss here" in told
+    for chatter in ("blind_action", "Overall Aggregated", "No job name"):
+        assert (chatter in told) == (verbose == "true")
+    assert ("No pretrained path" in told) == (weights or verbose == "true")
+    assert not filters
+    assert logging.getLogger("lerobot").level == logging.NOTSET
 
 
 def test_surplus_episodes_are_not_reported(evaluation: Called) -> None:
@@ -189,9 +241,25 @@ def test_an_environment_of_lerobots_own_gets_no_defaults(evaluation: Called) -> 
     assert evaluation.flags == ["--env.type=pusht", "--policy.type=diffusion"]
 
 
-def test_help_is_passed_on(evaluation: Called) -> None:
+def test_help_is_passed_on(evaluation: Called, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["eval", "env=memobench", "--help"]) == 0
     assert evaluation.flags == ["--help", "--env.type=memobench"]
+    assert "tasks=\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["eval", "train"])
+def test_help_explains_every_short_form(
+    command: str, evaluation: Called, training: Called, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([command, "--help"]) == 0
+    assert (evaluation if command == "eval" else training).flags == ["--help"]
+    told = capsys.readouterr().out
+    explained = {word for meaning in MEANINGS[command] for word in meaning.words.split(", ")}
+    known = {"eval": EVALUATION_WORDS, "train": TRAINING_WORDS}[command]
+    assert {f"{word}=" for word in (*SHORT_FORMS[command], *known, "policy")} <= explained
+    for meaning in MEANINGS[command]:
+        assert f"  {meaning.words}\n" in told
+        assert meaning.sets in " ".join(told.split())
 
 
 # --- train ---

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from lerobot_memobench.cli.memobench import main
+from lerobot_memobench.cli.memobench import COMMANDS, main
 from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.tasks.catalogue import task_names
 
@@ -114,6 +115,37 @@ def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     out = capsys.readouterr().out
     for command in ("tasks", "generate", "cache", "report", "doctor", "demo"):
         assert command in out
+
+
+def test_help_lists_every_command_once_in_its_group(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0
+    out = capsys.readouterr().out
+    names = [one if isinstance(one, str) else one.__name__ for one in _names()]
+    sections = [line for line in out.splitlines() if line.endswith(":") and not line.startswith(" ")]
+    assert sections == ["Options:", *(f"{group}:" for group in COMMANDS)]
+    listed = [line.split()[0] for line in out[out.index("Look around:") :].splitlines() if line.startswith("  ")]
+    assert [name for name in listed if name in names] == names
+    assert main([]) == 0
+    assert capsys.readouterr().out == out
+
+
+def _names() -> list[object]:
+    return [one[0] if isinstance(one, tuple) else one for group in COMMANDS.values() for one in group]
+
+
+def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert re.fullmatch(r"memobench \d+\.\d+\S* \(LeRobot \d+\.\d+\S*\)\n", capsys.readouterr().out)
+
+
+@pytest.mark.parametrize("words", [[], ["env=memobench", "tasks=object", "--seed=3"], ["--help"]])
+@pytest.mark.parametrize("command", ["eval", "train"])
+def test_lerobots_commands_are_pointed_to(command: str, words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([command, *words]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith(f"memobench: `memobench` has no command '{command}'")
+    assert f"lerobot {' '.join([command, *words])}" in told
+    assert told.count("\n") == 1
 
 
 def test_commands_without_lerobot_do_not_import_it() -> None:

@@ -19,11 +19,12 @@ from lerobot_memobench.tasks import (
     resolve_tasks,
     task_index,
     task_names,
+    task_number,
     task_record,
 )
 from lerobot_memobench.tasks.bddl.reading import parse_bddl
 from lerobot_memobench.tasks.formula import Then, atoms
-from lerobot_memobench.tasks.task import MEMORY_TYPES
+from lerobot_memobench.tasks.task import MEMORY_TYPES, SUITES
 
 COMMAS = "follow_the_prompt_to_determine_the_items,_discard_the_waste_first,_then_plate_the_remaining_item"
 
@@ -128,6 +129,18 @@ def test_names_and_resolution() -> None:
     assert resolve_tasks(COMMAS) == [COMMAS]
     assert resolve_tasks(f"{stove},{COMMAS},temporal")[:2] == [stove, COMMAS]
     assert resolve_tasks([COMMAS, "object"]) == [COMMAS, *task_names("object")]
+
+
+def test_a_task_has_a_short_number_in_its_suite() -> None:
+    for suite in SUITES:
+        names = task_names(suite=suite)
+        assert [task_number(name) for name in names] == list(range(1, 31))
+        assert resolve_tasks("12", suite) == [names[11]]
+        assert resolve_tasks("30, 1-3,object,2", suite) == [names[29], *names[:3], *task_names("object", suite)]
+        for wrong in ("0", "31", "7-3", "28-31"):
+            with pytest.raises(MemobenchError, match=f"found {wrong} among the tasks; .*{suite} suite .* 1 to 30"):
+                resolve_tasks(f"object,{wrong}", suite)
+    assert task_number(COMMAS) == resolve_tasks("all").index(COMMAS) + 1
 
 
 def test_unknown_names_tell_the_nearest() -> None:

@@ -96,7 +96,7 @@ def _show(report: Report, notes: Sequence[str], name: str, out: Path | None) -> 
     from lerobot_memobench.evaluation.documents.formats import latex, markdown, terminal
 
     screen = console()
-    screen.print(terminal(report))
+    screen.print(terminal(report), crop=False)
     for note in notes:
         screen.print(f"note: {note}")
     if out is not None:

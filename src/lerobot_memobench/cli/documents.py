@@ -94,7 +94,7 @@ def _print_table(report: Report) -> None:
     from lerobot_memobench.evaluation.documents.formats import terminal
 
     console().print(report.title, style="bold")
-    console().print(terminal(report))
+    console().print(terminal(report), crop=False)
 
 
 def _writer(format_: ReportFormat) -> Callable[[Report], str]:

@@ -47,7 +47,7 @@ def evaluate_here(plan: EvaluationPlan, say_where: bool = True) -> int:
     Args:
         say_where: whether the report's file is named.
     """
-    ended = run_evaluation(plan, tell)
+    ended = run_evaluation(plan, tell, lambda text: console().print(text, soft_wrap=True))
     if ended.report is not None:
         print_figures(ended.report)
         if say_where:
@@ -98,7 +98,7 @@ def print_figures(report: EvaluationReport) -> None:
     """Print a report's table, its failures and what a reader must know."""
     screen = console()
     screen.print()
-    screen.print(table(report.summary))
+    screen.print(table(report.summary), crop=False)
     screen.print(failure_line(report.summary))
     for note in report.notes:
         screen.print(f"note: {note}")

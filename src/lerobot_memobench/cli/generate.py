@@ -12,6 +12,7 @@ from rich.table import Table
 from lerobot_memobench.cli.console import console, counting
 from lerobot_memobench.cli.suite import Suite, WhichSuite
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.documents.terminal import Unbroken
 from lerobot_memobench.settings.words import executor_options
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 
@@ -133,7 +134,7 @@ def _folder_of(policy: str | None) -> str | None:
 def _print_summary(summary: GenerationSummary, out: Path) -> None:
     """Print what became of every seed, and where the dataset is."""
     screen = console()
-    screen.print(_summary_table(summary))
+    screen.print(Unbroken(_summary_table(summary)), crop=False)
     for failure in summary.failures:
         screen.print(f"no demonstration of {failure.task_name}, seed {failure.seed}: {failure.reason}")
     if summary.submitted:
@@ -146,7 +147,7 @@ def _print_summary(summary: GenerationSummary, out: Path) -> None:
 
 def _summary_table(summary: GenerationSummary) -> Table:
     table = Table(header_style="bold", pad_edge=False)
-    table.add_column("task", overflow="fold")
+    table.add_column("task")
     for name in ("solved", "of", "frames", "mean length"):
         table.add_column(name, justify="right")
     for task in summary.tasks:

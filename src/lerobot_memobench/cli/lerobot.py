@@ -16,6 +16,7 @@ from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.settings.lerobot_commands import lerobot_commands
 from lerobot_memobench.settings.reading import check_task_names, read_settings
 from lerobot_memobench.settings.recipes import resolve_recipe
+from lerobot_memobench.settings.short_forms import MEANINGS, help_text
 from lerobot_memobench.settings.words import Words, split_words
 
 USAGE_ERROR = 2
@@ -47,6 +48,8 @@ def run(words: Sequence[str]) -> int:
     name, rest = words[0], split_words(words[1:])
     if name not in commands:
         raise MemobenchError(f"there is no command {name!r}, {nearest(name, commands)}")
+    if rest.wants_help and name in MEANINGS:
+        print(help_text(name), flush=True)
     if name == "train":
         return train(rest)
     check_task_names(rest)
@@ -84,10 +87,8 @@ def overview(commands: Iterable[str]) -> str:
             "  lerobot train policy=memobench_mem align=contrastive dataset=<folder>",
             "  lerobot train config=train_contrastive dataset=<folder>      the paper's recipe (memobench recipe)",
             "",
-            "short forms: policy= env= dataset= align= size= replan= tasks= referent= episodes= batch_size=",
-            "device=; any other setting by its full name (policy.optimizer_lr=1e-4), as listed by",
-            "`lerobot <command> --help`. How the benchmark's evaluation is run: resume=true, shard=1/8, shards=8",
-            "workers= executor= executor_option=.",
+            "`lerobot eval --help` and `lerobot train --help` explain these short forms; any other setting goes by its",
+            "full name (policy.optimizer_lr=1e-4), as listed there.",
             "",
             "commands: " + ", ".join(sorted(commands)),
         ]

@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from lerobot_memobench.cli import controls, data, eyes, figures
 from lerobot_memobench.cli.cache import cache
@@ -32,46 +35,76 @@ __all__ = ["app", "main"]
 
 USAGE_ERROR = 2
 
+
+class Grouped(TyperGroup):
+    """Commands listed under what they are for."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write one section per panel, in the order of the commands."""
+        found = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
+        shown = [(name, one) for name, one in found if one is not None and not one.hidden]
+        width, names = formatter.width - 6, max(len(name) for name, _ in shown)
+        for panel in dict.fromkeys(getattr(one, "rich_help_panel", None) for _, one in shown):
+            members = [(name, one) for name, one in shown if getattr(one, "rich_help_panel", None) == panel]
+            with formatter.section(str(panel)):
+                formatter.write_dl(
+                    [(name.ljust(names), one.get_short_help_str(width - names)) for name, one in members]
+                )
+
+
 app = typer.Typer(
     name="memobench",
-    help="MEMOBench: a process-level memory benchmark for robot manipulation, as a LeRobot plugin.",
+    cls=Grouped,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
 
-COMMANDS: tuple[Callable[..., int | None], ...] = (
-    tasks,
-    objects,
-    generate,
-    cache,
-    data.convert,
-    data.validate,
-    data.describe,
-    data.push,
-    recipe,
-    study,
-    learn,
-    report,
-    compare,
-    agreement,
-    html,
-    necessity,
-    merge,
-    rerun,
-    doctor,
-    gallery,
-    bench,
-    demo,
-)
-"""In the order in which ``memobench --help`` lists them, before the groups."""
+COMMANDS: dict[str, tuple[Callable[..., int | None] | tuple[str, typer.Typer], ...]] = {
+    "Look around": (tasks, objects, gallery, doctor, demo),
+    "Demonstrations": (generate, data.convert, cache, data.validate, data.describe, data.push),
+    "Train": (recipe, study, learn, ("eyes", eyes.app)),
+    "Results": (report, compare, html, merge, rerun, ("figures", figures.app), ("controls", controls.app)),
+    "The benchmark itself": (necessity, agreement, bench),
+}
+"""Group -> its commands, as ``memobench --help`` lists them."""
 
-for command in COMMANDS:
-    app.command()(command)
-app.add_typer(figures.app, name="figures")
-app.add_typer(controls.app, name="controls")
-app.add_typer(eyes.app, name="eyes")
+for group, commands in COMMANDS.items():
+    for command in commands:
+        if isinstance(command, tuple):
+            app.add_typer(command[1], name=command[0], rich_help_panel=group)
+        else:
+            app.command(rich_help_panel=group)(command)
+
+
+def _elsewhere(name: str, example: str) -> None:
+    """Point from ``memobench <name>`` to LeRobot's command."""
+
+    def told(words: Annotated[list[str] | None, typer.Argument()] = None) -> None:
+        asked = f"here: lerobot {name} {' '.join(words)}" if words else f"such as: {example}"
+        raise MemobenchError(f"`memobench` has no command {name!r}, it is LeRobot's; {asked} (`lerobot {name} --help`)")
+
+    app.command(name, hidden=True, add_help_option=False, context_settings={"ignore_unknown_options": True})(told)
+
+
+_elsewhere("eval", "lerobot eval env=memobench policy=<checkpoint> tasks=object")
+_elsewhere("train", "lerobot train policy=memobench_mem dataset=<folder>")
+
+
+def _say_version(wanted: bool) -> None:
+    if wanted:
+        print(f"memobench {version('lerobot_policy_memobench')} (LeRobot {version('lerobot')})")
+        raise typer.Exit
+
+
+@app.callback(epilog="Evaluations and training are LeRobot's commands: `lerobot eval --help`, `lerobot train --help`.")
+def options(
+    shown: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_say_version, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """MEMOBench: a process-level memory benchmark for robot manipulation, as a LeRobot plugin."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -91,6 +124,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         message: Callable[[], str] | None = getattr(error, "format_message", None)  # click's usage errors
         if message is None:
             raise
+        if type(error).__name__ == "NoArgsIsHelpError":  # a group without a command: its help
+            print(message())
+            return 0
         print(f"memobench: {message()} (see `memobench --help`)", file=sys.stderr)
         return int(getattr(error, "exit_code", USAGE_ERROR))
     return result if isinstance(result, int) else 0

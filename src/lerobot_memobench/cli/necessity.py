@@ -82,7 +82,7 @@ def necessity(
     written = write(out, results)
     if page is not None:
         written.append(put_into_page(page, results, published))
-    screen.print(terminal_table(results))
+    screen.print(terminal_table(results), crop=False)
     for path in written:
         screen.print(str(path), soft_wrap=True)
     return 0

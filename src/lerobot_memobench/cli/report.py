@@ -75,7 +75,7 @@ def _print_report(runs: Sequence[Run], formats: Sequence[str], paper: bool) -> N
     found = build(runs, paper)
     for name in formats:
         if name == ReportFormat.TABLE:
-            console().print(terminal(found))
+            console().print(terminal(found), crop=False)
         else:
             print(render(found, runs, name, paper), end="")
 

@@ -14,7 +14,8 @@ from rich.table import Table
 from lerobot_memobench.cli.console import console
 from lerobot_memobench.cli.suite import Suite, WhichSuite
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.tasks.catalogue import find_tasks, get_task, task_names, task_record
+from lerobot_memobench.evaluation.documents.terminal import Unbroken
+from lerobot_memobench.tasks.catalogue import CATALOGUE_DIR, find_tasks, get_task, task_names, task_number, task_record
 from lerobot_memobench.tasks.loading import load_task
 from lerobot_memobench.tasks.task import PUBLISHED, Task
 
@@ -32,7 +33,7 @@ def tasks(
     if as_json:
         print(json.dumps(records(found), indent=1))
     else:
-        console().print(task_table(found))
+        console().print(Unbroken(task_table(found), column=1), crop=False)
     for problem in problems:
         print(f"memobench: {problem}", file=sys.stderr)
     return 1 if problems else 0
@@ -65,13 +66,16 @@ def records(found: Sequence[Task]) -> list[dict[str, Any]]:
 
 
 def task_table(found: Sequence[Task]) -> Table:
-    """Return one row per task."""
-    table = Table(title=f"{len(found)} tasks", title_justify="left", header_style="bold", pad_edge=False)
-    for name in ("memory type", "task", "checkpoints", "prompt video", "instruction"):
-        table.add_column(name, overflow="fold")
+    """Return one row per task; the numbers are what ``tasks=`` and ``--tasks`` take, a user's own tasks have none."""
+    suites = {task.suite for task in found}
+    title = f"{len(found)} tasks" + (f" of the {suites.pop()} suite" if len(suites) == 1 else "")
+    table = Table(title=title, title_justify="left", header_style="bold", pad_edge=False)
+    for name in ("no.", "task", "memory type", "checkpoints", "prompt video", "instruction"):
+        table.add_column(name, justify="right" if name == "no." else "left")
     for k, task in enumerate(found):
         if k and task.memory_type != found[k - 1].memory_type:
             table.add_section()
         prompt = task.prompt.kind if task.prompt else ""
-        table.add_row(task.memory_type, task.name, task.operations, prompt, task.title)
+        number = str(task_number(task.name)) if CATALOGUE_DIR in task.folder.parents else ""
+        table.add_row(number, task.name, task.memory_type, task.operations, prompt, task.title)
     return table

@@ -19,6 +19,7 @@ class Orders:
     """How an evaluation is run, as opposed to what is evaluated.
 
     Attributes:
+        verbose: LeRobot's own messages are shown, too.
         resume: go on with the evaluation in the output folder.
         shard: run this part alone.
         shards: run so many parts as jobs of their own, ``workers`` at a time, and merge them; 0: no parts.
@@ -26,6 +27,7 @@ class Orders:
         executor, executor_options: see `jobs.running.run_jobs`.
     """
 
+    verbose: bool = False
     resume: bool = False
     shard: Shard | None = None
     shards: int = 0
@@ -57,6 +59,7 @@ def take_orders(words: Words) -> tuple[Orders, Words]:
     rest = [(key, value) for key, value in words.settings if key not in EVALUATION_WORDS]
     last = {key: values[-1] for key, values in given.items()}
     orders = Orders(
+        verbose=_boolean("verbose", last.get("verbose", "false")),
         resume=_boolean("resume", last.get("resume", "false")),
         shard=parse_shard(last["shard"]) if "shard" in last else None,
         shards=_count("shards", last.get("shards")),

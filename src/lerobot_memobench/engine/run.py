@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +16,11 @@ from lerobot_memobench.engine.reporting import EvaluationReport, report_on
 from lerobot_memobench.engine.resume import Ranges, Tell, missing, remainder, resumed_card
 from lerobot_memobench.envs.episode_log import has_log, read_episodes
 from lerobot_memobench.envs.protocol import read_protocol_file
+from lerobot_memobench.evaluation.documents.sentences import count_of
 from lerobot_memobench.evaluation.records.protocol import POLICY, read_protocol
+from lerobot_memobench.policies.checkpoint import portable_path
+from lerobot_memobench.policies.untrained import UntrainedConfig
+from lerobot_memobench.settings.lerobot_commands import without_chatter
 
 
 @dataclass(frozen=True)
@@ -31,11 +36,12 @@ class Ended:
     report: EvaluationReport | None = None
 
 
-def run_evaluation(plan: EvaluationPlan, tell: Tell) -> Ended:
+def run_evaluation(plan: EvaluationPlan, tell: Tell, begin: Tell = lambda text: None) -> Ended:
     """Run what is missing, write report and card.
 
     Args:
         tell: told what matters and stops nothing, and how to go on when a run breaks off.
+        begin: told what is about to be run: the first episode takes a while.
 
     Raises:
         MemobenchError: the folder holds another evaluation. Whatever LeRobot raises.
@@ -48,16 +54,28 @@ def run_evaluation(plan: EvaluationPlan, tell: Tell) -> Ended:
         card = resumed_card(plan.log, card, tell)
     ranges = missing(plan)
     if ranges != {}:
+        begin(_what_is_run(plan))
         return _run_lerobot(plan, card, ranges, tell)
     return Ended(0, _finish(plan, card) if has_log(plan.log) else None)
+
+
+def _what_is_run(plan: EvaluationPlan) -> str:
+    who = portable_path(plan.policy_path) if plan.policy_path else getattr(plan.policy, "type", "the policy")
+    grid = plan.grid
+    what = "" if grid is None else f" on {count_of(len(grid.places), 'task')}, {count_of(grid.runs, 'episode')} each"
+    return f"evaluating {who}{what}, into {plan.output}"
 
 
 def _run_lerobot(plan: EvaluationPlan, card: dict[str, Any], ranges: Ranges | None, tell: Tell) -> Ended:
     """Run LeRobot's evaluation on what is left, in the folder that is held meanwhile."""
     calm_output()
-    status = 1
+    status, trained = 1, not isinstance(plan.policy, UntrainedConfig)
     try:
-        with held(plan), steered(plan.seed, ranges):
+        with (
+            nullcontext() if plan.orders.verbose else without_chatter(trained),
+            held(plan),
+            steered(plan.seed, ranges),
+        ):
             if card["protocol"]:
                 write_card(plan.log, card)
             left = remainder(plan, ranges)

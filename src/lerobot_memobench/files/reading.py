@@ -102,7 +102,7 @@ def checked(value: Any, schema: Any) -> Any:
     try:
         _adapter(schema).validate_python(value, strict=True)
     except ValidationError as error:
-        raise Malformed(_told(error.errors(include_url=False), value)) from None
+        raise Malformed(first_fault(error.errors(include_url=False), value)) from None
     return value
 
 
@@ -131,7 +131,7 @@ def _adapter(schema: Any) -> TypeAdapter[Any]:
     return TypeAdapter(schema)
 
 
-def _told(errors: Iterable[ErrorDetails], value: Any) -> str:
+def first_fault(errors: Iterable[ErrorDetails], value: Any) -> str:
     """Return the first error in words; those of one place are the alternatives of a union."""
     first, *others = [(*_place(error["loc"], value), error) for error in errors]
     place, found, error = first
@@ -140,8 +140,11 @@ def _told(errors: Iterable[ErrorDetails], value: Any) -> str:
             str(e["loc"][-1]) for p, _, e in (first, *others) if e["type"] == "missing" and p == place
         )
         return f"found no {', '.join(missing)}" + (f" in {place}" if place else "")
+    told = f"found {f'{place} = ' if place else ''}{short(found)}"
+    if error["type"] in ("value_error", "assertion_error"):  # a check of ours, in its own words
+        return f"{told}: {error['ctx']['error']}"
     alternatives = dict.fromkeys(_expected(e) for p, _, e in (first, *others) if p == place)
-    return f"found {f'{place} = ' if place else ''}{short(found)}, expected {' or '.join(alternatives)}"
+    return f"{told}, expected {' or '.join(alternatives)}"
 
 
 def _place(location: Iterable[int | str], value: Any) -> tuple[str, Any]:

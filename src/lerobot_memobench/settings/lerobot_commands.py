@@ -72,6 +72,47 @@ def quiet() -> Iterator[None]:
         logging.disable(level)
 
 
+@contextmanager
+def without_chatter(trained: bool) -> Iterator[None]:
+    """Keep to ourselves what LeRobot's evaluation says beside its work: its configuration, its own tables, what is no
+    cause for alarm here. Its other warnings and its errors are shown.
+
+    Args:
+        trained: whether the policy has weights; that those of one without any are random is no news.
+    """
+    import lerobot
+
+    home, false_alarms = os.path.dirname(lerobot.__file__), OF_NO_CONCERN + (() if trained else OF_WEIGHTS)
+
+    def matters(record: logging.LogRecord) -> bool:
+        if not record.pathname.startswith(home):
+            return True
+        return record.levelno >= logging.WARNING and not record.getMessage().startswith(false_alarms)
+
+    # LeRobot logs by the root's functions and by loggers of its modules' names; a filter holds for one logger alone.
+    loggers = [logging.getLogger(name) for name in (None, "lerobot.configs.eval", "lerobot.utils.device_utils")]
+    named = logging.getLogger("lerobot")
+    before = named.level
+    for logger in loggers:
+        logger.addFilter(matters)
+    named.setLevel(logging.WARNING)
+    try:
+        yield
+    finally:
+        named.setLevel(before)
+        for logger in loggers:
+            logger.removeFilter(matters)
+
+
+OF_NO_CONCERN = ("No job name provided",)
+OF_WEIGHTS = (
+    "No pretrained path was provided",
+    "You are instantiating a policy from scratch and its features are parsed from an environment",
+    "Using CPU, this will be slow",
+)
+"""How LeRobot's warnings begin that are none to who evaluates; and those that are none of a policy without weights."""
+
+
 def config_class(entry: Callable[[], Any]) -> type | None:
     """Return the configuration dataclass of a LeRobot command, None where it uses plain argparse.
 

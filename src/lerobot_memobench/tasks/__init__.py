@@ -1,7 +1,14 @@
 """What is the benchmark? Tasks, checkpoints, formulas and the catalogue. No simulator, no torch."""
 
 from lerobot_memobench.tasks.bddl.problem import Region
-from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks, task_index, task_names, task_record
+from lerobot_memobench.tasks.catalogue import (
+    get_task,
+    resolve_tasks,
+    task_index,
+    task_names,
+    task_number,
+    task_record,
+)
 from lerobot_memobench.tasks.evaluator import Evaluator
 from lerobot_memobench.tasks.formula import And, Atom, Formula, Not, Or, Then
 from lerobot_memobench.tasks.loading import load_task
@@ -27,5 +34,6 @@ __all__ = [
     "resolve_tasks",
     "task_index",
     "task_names",
+    "task_number",
     "task_record",
 ]

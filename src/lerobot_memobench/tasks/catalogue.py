@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from functools import cache, lru_cache
 from pathlib import Path
@@ -14,6 +15,9 @@ from lerobot_memobench.tasks.task import BDDL_FILE, MEMORY_TYPES, PUBLISHED, SUI
 
 #: <suite>/<memory type>/<task name>/{task_config.bddl, task_config.meta.json}; names are unique over both suites.
 CATALOGUE_DIR = Path(__file__).parent / "catalogue"
+
+NUMBERS = re.compile(r"(\d+)(?:-(\d+))?")
+"""A task's number, or a range of them, both ends included."""
 
 BOWL = "put_the_butter_into_the_bowl_from_the_prompt_video"
 """The task that shows in little time what a memory is for: which of three bowls it is, the prompt alone tells."""
@@ -68,6 +72,11 @@ def task_index(name: str) -> int:
     return list(_folders()).index(name)
 
 
+def task_number(name: str) -> int:
+    """Return the short number of a task: its place in its own suite's catalogue order, from 1 on."""
+    return task_names(suite=_suite_of(get_task(name).name)).index(name) + 1
+
+
 @cache
 def get_task(name: str) -> Task:
     """Return a task of the catalogue; an unknown name is an error that tells the nearest known ones."""
@@ -79,7 +88,8 @@ def get_task(name: str) -> Task:
 def resolve_tasks(spec: str | Iterable[str], suite: str = PUBLISHED) -> list[str]:
     """Return the task names of a suite meant by "all", memory types, names, or several of them separated by commas.
 
-    Names that hold commas themselves are recognised. The order given is kept and repetitions are dropped.
+    A number (`task_number`) or a range, such as ``12`` or ``3-7``, stands for tasks of the suite. Names that hold
+    commas themselves are recognised. The order given is kept and repetitions are dropped.
     """
     check_suite(suite)
     if not isinstance(spec, str):
@@ -99,8 +109,8 @@ def resolve_tasks(spec: str | Iterable[str], suite: str = PUBLISHED) -> list[str
             word = pieces[start].strip()
             hint = nearest(word, ["all", *MEMORY_TYPES, *task_names(suite=suite)])
             raise MemobenchError(
-                f"found {word!r} among the tasks, expected 'all', a memory type ({', '.join(MEMORY_TYPES)}) "
-                f"or a task's name (`memobench tasks` lists them), {hint}"
+                f"found {word!r} among the tasks, expected 'all', a memory type ({', '.join(MEMORY_TYPES)}), "
+                f"or a task's name or number (`memobench tasks` lists them), {hint}"
             )
     return list(dict.fromkeys(chosen))
 
@@ -109,6 +119,14 @@ def _expand(word: str, suite: str) -> list[str]:
     """Return the tasks that a word means, none for an unknown one."""
     if word == "all" or word in MEMORY_TYPES:
         return task_names(None if word == "all" else word, suite)
+    if (numbers := NUMBERS.fullmatch(word)) is not None:
+        names, first, last = task_names(suite=suite), int(numbers[1]), int(numbers[2] or numbers[1])
+        if not 1 <= first <= last <= len(names):
+            raise MemobenchError(
+                f"found {word} among the tasks; those of the {suite} suite are numbered 1 to {len(names)}, a range is "
+                "such as 3-7 (`memobench tasks` lists them)"
+            )
+        return names[first - 1 : last]
     if word not in _folders():
         return []
     if (own := _suite_of(word)) != suite:

@@ -100,6 +100,22 @@ def test_who_sees_the_prompt_is_the_policys_and_told(tmp_path: Path) -> None:
     assert compared(a, b).notes[0] == "compared although prompt_in: steps and reset"
 
 
+def test_all_that_must_be_allowed_is_named_at_once(tmp_path: Path) -> None:
+    settings = {"seed_base": 7, "horizon": 1200, "render": "default", "referent": "fixed"}
+    a = logs.evaluation(tmp_path / "a")
+    b = logs.evaluation(tmp_path / "b", scene_hash="another", referent="random", replan_steps=20)
+    (a / "protocol.json").write_text(json.dumps(settings))
+    (b / "protocol.json").write_text(json.dumps({**settings, "horizon": 600, "render": "fast", "referent": "random"}))
+    with pytest.raises(MemobenchError) as caught:
+        compared(a, b, allow=["render"])
+    told = str(caught.value)
+    assert told.count("--allow") == 4
+    assert "initial scenes" in told
+    names = told.replace("--allow ", "").rsplit(": ", 1)[1].split()
+    assert sorted(names) == ["horizon", "referent", "replan_steps", "scene_hash"]
+    assert compared(a, b, allow=["render", *names]).pairs == 8
+
+
 def test_other_seeds_are_other_episodes(tmp_path: Path) -> None:
     a, b = logs.evaluation(tmp_path / "a"), logs.evaluation(tmp_path / "b", seed=99)
     with pytest.raises(MemobenchError, match="seed"):

@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files.reading import Malformed, first_fault, parsed
 
 EPISODE_INFO = "episode_info"
 """The frames' column; empty but at an episode's first frame."""
@@ -67,13 +68,15 @@ def from_frames(text: str, where: str) -> EpisodeRecord:
         MemobenchError: the text is no record.
     """
     try:
-        return EpisodeRecord.model_validate_json(text)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        place = ".".join(map(str, first["loc"]))
+        value = parsed(text)
+        try:
+            return EpisodeRecord.model_validate(value)
+        except ValidationError as error:
+            raise Malformed(first_fault(error.errors(include_url=False), value)) from None
+    except Malformed as error:
         raise MemobenchError(
-            f"{where}: its column {EPISODE_INFO} is none that this package writes ({place and place + ': '}"
-            f"{first['msg']}); take the dataset from its source again"
+            f"{where}: its column {EPISODE_INFO} is none that this package writes ({error}); take the dataset from its "
+            "source again"
         ) from None
 
 

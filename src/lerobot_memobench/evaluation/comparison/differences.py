@@ -9,7 +9,7 @@ import numpy as np
 
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.evaluation.comparison import paired_tests
-from lerobot_memobench.evaluation.comparison.pairing import ALLOWED, Pair, common_episodes
+from lerobot_memobench.evaluation.comparison.pairing import ALLOWED, Pair, common_episodes, unlike_pairs
 from lerobot_memobench.evaluation.documents.evaluation_tables import AVERAGE
 from lerobot_memobench.evaluation.documents.sentences import count_of
 from lerobot_memobench.evaluation.metrics.rates import METRICS, value_of
@@ -81,8 +81,7 @@ def compare(
     Raises:
         MemobenchError: the protocols differ in something else, or no episode is in both.
     """
-    _refuse_unlike(a, b, allow)
-    pairs = common_episodes(a, b, allow)
+    pairs = _like_pairs(a, b, allow)
     rng = np.random.default_rng(seed)
     rows = [
         row
@@ -93,20 +92,26 @@ def compare(
     return Comparison(a.name, b.name, len(pairs), tuple(_adjusted(rows)), tuple(_notes(a, b, len(pairs))))
 
 
-def _refuse_unlike(a: Run, b: Run, allow: Collection[str]) -> None:
-    """Raise where the protocols differ in something that was not allowed."""
+def _like_pairs(a: Run, b: Run, allow: Collection[str]) -> list[Pair]:
+    """Return the episodes that both hold; raise where anything differs that was not allowed, with all that does."""
     for name in allow:
         if name not in ALLOWED:
             raise MemobenchError(
                 f"found --allow {name!r}, expected a setting of the protocol, {nearest(name, ALLOWED)}"
             )
     found = differences(a.protocol, b.protocol, ignore={*OF_THE_POLICY, *allow})
-    if found:
+    names = [one.split(":")[0] for one in found]
+    pairs = common_episodes(a, b, {*allow, *names})
+    unlike = unlike_pairs(pairs, {*allow, *names})
+    if found or unlike:
+        names += unlike
+        options = " ".join(f"--allow {name}" for name in names)
         raise MemobenchError(
-            f"{a.folder} and {b.folder} were not run under one protocol ({'; '.join(found)}), so their difference is "
-            "not the policies' alone; evaluate again, or name what is meant to differ: "
-            f"--allow {found[0].split(':')[0]}"
+            f"{a.folder} and {b.folder} are not of the same episodes under one protocol "
+            f"({'; '.join([*found, *unlike.values()])}), so their difference is not the policies' alone; evaluate again"
+            + (f", or name what is meant to differ: {options}" if set(names) <= set(ALLOWED) else "")
         )
+    return pairs
 
 
 def _notes(a: Run, b: Run, pairs: int) -> list[str]:

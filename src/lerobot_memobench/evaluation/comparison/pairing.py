@@ -24,7 +24,7 @@ def common_episodes(a: Run, b: Run, allow: Collection[str] = ()) -> list[Pair]:
         allow: which of `ALLOWED` may differ.
 
     Raises:
-        MemobenchError: there are none, or a pair differs in seed, scene or checkpoints.
+        MemobenchError: there are none, or a pair differs in its checkpoints.
     """
 
     def key(record: Record) -> tuple[str, int, str]:
@@ -38,10 +38,6 @@ def common_episodes(a: Run, b: Run, allow: Collection[str] = ()) -> list[Pair]:
             f"{a.folder} and {b.folder} have no episode in common; expected evaluations of the same tasks, episodes "
             "and referent"
         )
-    if "seed_base" not in allow:
-        _refuse(pairs, "seed", "seed_base", "seeds")
-        if SCENES not in allow:
-            _refuse(pairs, "scene_hash", SCENES, "initial scenes")
     for mine, other in pairs:
         if operations(mine) != operations(other):
             raise MemobenchError(
@@ -51,18 +47,20 @@ def common_episodes(a: Run, b: Run, allow: Collection[str] = ()) -> list[Pair]:
     return pairs
 
 
-def _refuse(pairs: Sequence[Pair], field: str, name: str, what: str) -> None:
-    """Refuse pairs that differ in a field that makes an episode; a side that does not tell it does not differ."""
-    different = [
-        (x, y) for x, y in pairs if x.get(field) is not None and y.get(field) is not None and x[field] != y[field]
-    ]
-    if different:
-        x, y = different[0]
-        raise MemobenchError(
-            f"{len(different)} of {len(pairs)} pairs do not have the same {what}, the first is {x['task']}, episode "
-            f"{x['episode']} ({field} {x[field]} and {y[field]}); these are different episodes. If that is meant: "
-            f"--allow {name}"
-        )
+def unlike_pairs(pairs: Sequence[Pair], allow: Collection[str]) -> dict[str, str]:
+    """Return what makes an episode and differs in pairs: the name that allows it -> it in words.
+
+    A side that does not tell it does not differ. Other seeds have other scenes, which need no name of their own.
+    """
+    for field, name, what in (("seed", "seed_base", "seeds"), ("scene_hash", SCENES, "initial scenes")):
+        different = [(x, y) for x, y in pairs if None not in (x.get(field), y.get(field)) and x[field] != y[field]]
+        if different and not {name, "seed_base"} & set(allow):
+            x, y = different[0]
+            return {
+                name: f"{len(different)} of {len(pairs)} pairs do not have the same {what}, the first is {x['task']}, "
+                f"episode {x['episode']} ({field} {x[field]} and {y[field]})"
+            }
+    return {}
 
 
 # --- rollouts of one replan interval ---

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from rich.table import Table as RichTable
+from rich.console import RenderableType
 
 from lerobot_memobench.envs.episode_log import read_episodes, write_episodes
 from lerobot_memobench.errors import MemobenchError, nearest
@@ -82,7 +82,7 @@ def write_report(directory: str | Path, episodes: int | None = None) -> tuple[Su
     return summary, notes
 
 
-def table(summary: Summary, title: str | None = None) -> RichTable:
+def table(summary: Summary, title: str | None = None) -> RenderableType:
     """Return the table of SR, MSR, MUR, MCR per task, memory type and on average, for the terminal."""
     return terminal_table(replace(tables.rates(summary), title=title or ""))
 

@@ -7,11 +7,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from rich import box
-from rich.console import Console, Group, RenderableType
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
+from rich.measure import Measurement
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from lerobot_memobench.evaluation.documents.tables import Cell, Report, Table, bounds, figure, plain
+from lerobot_memobench.evaluation.documents.tables import Cell, Name, Report, Table, bounds, figure, plain
 from lerobot_memobench.evaluation.metrics.rates import Rate
 
 WIDTH = 140
@@ -36,11 +37,74 @@ def terminal(report: Report, headings: bool = True) -> RenderableType:
 def text(report: Report) -> str:
     """Return what the terminal shows, as text for a file."""
     out = io.StringIO()
-    Console(file=out, width=WIDTH, highlight=False, markup=False).print(terminal(report))
+    Console(file=out, width=WIDTH, highlight=False, markup=False).print(terminal(report), crop=False)
     return "\n".join(line.rstrip() for line in out.getvalue().splitlines()).strip("\n") + "\n"
 
 
-def terminal_table(table: Table) -> RichTable:
+class Unbroken:
+    """A table in which no name is broken, however narrow the terminal is: to be printed with ``crop=False``.
+
+    In a terminal that is too narrow names stand on lines of their own, each over its row; a file has no edge.
+
+    Args:
+        table: not to be changed any more. column: that of the names.
+    """
+
+    def __init__(self, table: RichTable, column: int = 0) -> None:
+        self.table, self.column = table, column
+        names = table.columns[column]
+        names.no_wrap, names.overflow = True, "ignore"
+        widths = [Measurement.get(PLAIN, PLAIN.options, cell).maximum for cell in names.cells]
+        names.min_width = max(widths, default=1)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Render the table as it is where it fits."""
+        needed = Measurement.get(PLAIN, PLAIN.options, self.table)
+        if needed.minimum <= options.max_width:
+            yield self.table
+        elif not console.is_terminal:
+            yield from console.render(self.table, options.update(width=needed.maximum))
+        else:
+            yield from self._under_names(options.max_width)
+
+    def _under_names(self, room: int) -> RenderResult:
+        """Yield a row in two: what stands up to the name, and under it the rest."""
+        columns = self.table.columns
+        before, after = columns[: self.column + 1], columns[self.column + 1 :]
+        wished = [[Measurement.get(PLAIN, PLAIN.options, cell) for cell in (c.header, *c.cells)] for c in after]
+        least, most = ([max(one[end] for one in each) for each in wished] for end in (0, 1))
+        space = room - INDENT * len(after)
+        last = min(most[-1], space - sum(most[:-1]))  # text at the end of a row takes what is left
+        widths = [*most[:-1], last] if last >= least[-1] else least
+
+        def row(cells: Sequence[RenderableType], style: str = "") -> RichTable:
+            line = RichTable(box=None, show_header=False, padding=(0, 0, 0, INDENT))
+            for column, width in zip(after, widths, strict=True):
+                line.add_column(justify=column.justify, width=width, overflow="fold")
+            line.add_row(*cells, style=style)
+            return line
+
+        if self.table.title:
+            yield Text(str(self.table.title), style="italic")
+        yield row([column.header for column in after], "bold")
+        cells = [list(column.cells) for column in columns]
+        for k in range(self.table.row_count):
+            yield Text(" ", no_wrap=True, overflow="ignore").join(
+                cell if isinstance(cell, Text) else Text(str(cell))
+                for cell in (cells[c][k] for c in range(len(before)))
+            )
+            yield row([cells[c][k] for c in range(len(before), len(columns))])
+        if self.table.caption:
+            yield Text(str(self.table.caption))
+
+
+INDENT = 2
+
+PLAIN = Console(width=10_000, markup=False, highlight=False)
+"""What texts are measured with."""
+
+
+def terminal_table(table: Table) -> RichTable | Unbroken:
     """Return a table for the terminal; an interval goes to a line of its own where it is narrow."""
     result = RichTable(
         title=table.title or None, title_justify="left", header_style="bold", pad_edge=False, box=box.SIMPLE_HEAD
@@ -56,7 +120,8 @@ def terminal_table(table: Table) -> RichTable:
     if table.best:
         result.caption = "* best of its column"
         result.caption_justify = "left"
-    return result
+    named = next((k for k in range(len(table.header)) if any(isinstance(row[k], Name) for row in table.rows)), None)
+    return result if named is None else Unbroken(result, named)
 
 
 def _row(table: Table, index: int) -> list[Text]:
@@ -64,7 +129,9 @@ def _row(table: Table, index: int) -> list[Text]:
     for column, cell in enumerate(table.rows[index]):
         best = (index, column) in table.best
         style = "bold" if best or index in table.strong else ""
-        cells.append(Text(_cell(cell, table.intervals) + "*" * best, style=style))
+        text = _cell(cell, table.intervals) + "*" * best
+        whole = isinstance(cell, Name)
+        cells.append(Text(text, style=style, no_wrap=whole or None, overflow="ignore" if whole else None))
     return cells
 
 

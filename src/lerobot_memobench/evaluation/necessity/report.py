@@ -81,11 +81,13 @@ def rows(results: Sequence[Result]) -> list[tuple[str, str, list[str]]]:
 
 
 def terminal_table(results: Sequence[Result]) -> Any:
-    """Return the table for the terminal, a `rich.table.Table`."""
+    """Return the table for the terminal."""
     from rich.table import Table
 
+    from lerobot_memobench.evaluation.documents.terminal import Unbroken
+
     table = Table(header_style="bold", pad_edge=False)
-    table.add_column("task", overflow="fold")
+    table.add_column("task")
     for column in COLUMNS:
         table.add_column(column.name, justify="left" if column.name in ("referent", "memory needed") else "right")
     before = None
@@ -94,7 +96,7 @@ def terminal_table(results: Sequence[Result]) -> Any:
             table.add_section()
         before = memory_type
         table.add_row(task, *row)
-    return table
+    return Unbroken(table)
 
 
 def markdown(results: Sequence[Result]) -> str:
