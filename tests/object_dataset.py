@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS, PRIVILEGED
 from lerobot_memobench.datasets.lerobot_format.record import EPISODE_INFO, EpisodeRecord
 from lerobot_memobench.sim.object_slots import SLOTS, STARTS, WIDTH
 from lerobot_memobench.tasks.catalogue import BOWL
@@ -37,15 +38,16 @@ def record_of(name: str, seed: int, prompt: int) -> str:
 
 
 def make_object_dataset(
-    root: Path, seed: int = 0, pictures: bool = False, repeats: int = 1, records: bool = False
+    root: Path, seed: int = 0, pictures: bool = False, repeats: int = 1, records: bool = False, earlier: bool = False
 ) -> Path:
     """Write episodes in which the hand moves to the one of three things that was lit in the prompt.
 
     With ``repeats`` each of the three kinds of episodes has that many; with ``records`` each says which of two tasks it
-    is of.
+    is of; with ``earlier`` objects stand beside pictures under LeRobot's name of an input, as they once did.
     """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+    objects = PRIVILEGED if pictures and not earlier else OBJECTS
     number: dict[str, Any] = {"dtype": "float32", "names": None}
     string = {"dtype": "string", "shape": (1,), "names": None}
     camera = {"dtype": "video", "shape": (48, 48, 3), "names": ["height", "width", "channels"]}
@@ -57,7 +59,7 @@ def make_object_dataset(
         features={
             **({"observation.images.image": camera} if pictures else {}),
             "observation.state": number | {"shape": (8,)},
-            "observation.environment_state": number | {"shape": (SLOTS * WIDTH,)},
+            objects: number | {"shape": (SLOTS * WIDTH,)},
             "action": number | {"shape": (7,)},
             "phase": {"dtype": "int64", "shape": (1,), "names": None},
             **dict.fromkeys(("simple_subgoal", "grounded_subgoal", "coarse_subgoal", "memory"), string),
@@ -73,7 +75,7 @@ def make_object_dataset(
             way = np.clip((places[lit] - hand) / 0.05, -1, 1) if t >= prompt else np.zeros(3)
             frame = {
                 "observation.state": state_at(hand),
-                "observation.environment_state": slots_at(rng, places, lit if t < prompt else None),
+                objects: slots_at(rng, places, lit if t < prompt else None),
                 "action": np.array([*way, 0, 0, 0, 1 if t % 2 else -1], np.float32) * (t >= prompt),
                 "phase": np.array([int(t >= prompt)]),
                 "simple_subgoal": f"reach thing {lit}" if t >= prompt else "",

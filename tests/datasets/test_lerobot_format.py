@@ -172,7 +172,8 @@ def test_dataloader_batches(dataset):
     assert batch["observation.images.image"].shape == (4, 3, SIZE, SIZE)
 
 
-def test_policy_features_are_images_objects_state_and_action_only(dataset):
+def test_policy_features_are_images_state_and_action_only(dataset):
+    """Of objects, plain `lerobot-train` learns nothing where there are pictures."""
     from lerobot.configs import FeatureType
     from lerobot.utils.feature_utils import dataset_to_policy_features
 
@@ -181,11 +182,23 @@ def test_policy_features_are_images_objects_state_and_action_only(dataset):
         "observation.images.image",
         "observation.images.wrist_image",
         "observation.state",
-        "observation.environment_state",
         "action",
     }
-    assert features["observation.environment_state"].type is FeatureType.ENV
+    assert dataset.meta.features["privileged.environment_state"]["shape"] == (208,)
+    assert FeatureType.ENV not in {feature.type for feature in features.values()}
     assert features["observation.images.image"].shape == (3, SIZE, SIZE)
+
+
+def test_objects_are_an_input_where_there_are_no_pictures():
+    from lerobot.utils.feature_utils import dataset_to_policy_features
+
+    features = dataset_features(None, objects=True)
+    assert "privileged.environment_state" not in features
+    assert set(dataset_to_policy_features(features)) == {
+        "observation.environment_state",
+        "observation.state",
+        "action",
+    }
 
 
 def test_language_rows_feed_lerobots_recipes(dataset, demos):

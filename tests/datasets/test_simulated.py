@@ -266,6 +266,9 @@ def test_replay_agrees_on_moved_arms_and_seen_objects(moved, tmp_path):
     seen[moved.exec_start, 3] += 0.01
     found = replay(replace(episode, columns={**episode.columns, "observation.environment_state": seen}))
     assert (found.column, found.frame) == ("observation.environment_state", moved.exec_start)
+    rest = {key: value for key, value in episode.columns.items() if key != "observation.environment_state"}
+    found = replay(replace(episode, columns={**rest, "privileged.environment_state": seen}))
+    assert (found.column, found.frame) == ("privileged.environment_state", moved.exec_start), "beside pictures"
 
 
 def test_replay_finds_the_first_disagreement(stove, butter):

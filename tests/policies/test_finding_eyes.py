@@ -17,6 +17,7 @@ from small_policy import batch_of, made_for_training, small_config
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.datasets.memory_cache import FOLDER, building
 from lerobot_memobench.envs.obs_types import PIXELS, obs_type_of
+from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.eyes.tower import GRID, POOLED, WIDTH, Tower
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset, open_frames
@@ -211,7 +212,7 @@ def test_told_objects_with_errors_stand_for_found_ones_in_training(
     policy, before, _, dataset = made_for_training(told_root, **fields)
     assert OBS_ENV_STATE not in policy.config.input_features
     batch = before(batch_of(dataset, [10, 30]))
-    told = torch.stack([torch.as_tensor(dataset.hf_dataset[row][OBS_ENV_STATE]) for row in (10, 30)])
+    told = torch.stack([torch.as_tensor(dataset.hf_dataset[row][PRIVILEGED]) for row in (10, 30)])
     assert torch.equal(batch[FOUND], told)
     frames = batch[TOKENS][0]
     policy.train()

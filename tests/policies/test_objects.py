@@ -18,6 +18,7 @@ from lerobot.utils.constants import OBS_ENV_STATE
 from small_policy import batch_of, losses_in_training, made_for_training, small_config
 
 import object_dataset
+from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.execution_frames import (
@@ -136,15 +137,21 @@ def test_samples_from_memory_are_lerobots(root: Path, episodes: list[int] | None
             assert value == expected[key] if key == "task" else torch.equal(value, expected[key]), key
 
 
-def test_no_video_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("earlier", [False, True])
+def test_no_video_is_decoded(earlier: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And objects are read beside pictures, under today's name and that of earlier datasets."""
+
     def refuse(*_: Any, **__: Any) -> None:
         raise AssertionError("a video was opened")
 
-    folder = make_object_dataset(tmp_path / "filmed", pictures=True)
+    folder = make_object_dataset(tmp_path / "filmed", pictures=True, earlier=earlier)
     monkeypatch.setattr("lerobot.datasets.dataset_reader.decode_video_frames", refuse)
     policy, before, _, dataset = made_for_training(folder, **OBJECTS)
     assert set(policy.config.input_features) == {"observation.state", "observation.environment_state"}
-    loss, _ = policy.forward(before(batch_of(dataset, [10, 30])))
+    batch = before(batch_of(dataset, [10, 30]))
+    column = dataset.hf_dataset.data.column(OBS_ENV_STATE if earlier else PRIVILEGED)
+    assert torch.equal(batch[OBS_ENV_STATE], torch.tensor([column[10].as_py(), column[30].as_py()]))
+    loss, _ = policy.forward(batch)
     assert loss.isfinite()
     with pytest.raises(AssertionError, match="a video was opened"):  # any other policy's samples are LeRobot's
         DatasetReader.get_item.__wrapped__(dataset.reader, 10)

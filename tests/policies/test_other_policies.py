@@ -25,7 +25,7 @@ from lerobot_memobench.tasks.catalogue import get_task
 
 TASK = "turn_on_the_stove_and_turn_it_off"
 LENGTH, PROMPT, SIDE = 12, 4, 256
-STATE, OBJECTS = "observation.state", "observation.environment_state"
+STATE, OBJECTS, PRIVILEGED = "observation.state", "observation.environment_state", "privileged.environment_state"
 PICTURES = {"observation.images.image", "observation.images.wrist_image"}
 INPUTS = {*PICTURES, STATE}
 
@@ -91,6 +91,7 @@ def train_and_roll_out(dataset: Path, out: Path, *policy: str, inputs: set[str] 
 KEPT = {
     *PICTURES,
     OBJECTS,
+    PRIVILEGED,
     "phase",
     "executed_action",
     "checkpoint.index",

@@ -16,7 +16,7 @@ from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.digest import digest
 from lerobot_memobench.datasets.labels import labels
 from lerobot_memobench.datasets.language import persistent_rows
-from lerobot_memobench.datasets.lerobot_format.layout import EXECUTED_ACTION, OBJECTS
+from lerobot_memobench.datasets.lerobot_format.layout import EXECUTED_ACTION, OBJECTS, objects_column
 from lerobot_memobench.datasets.lerobot_format.reading import Columns, RecordedEpisode
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.prompts import highlights_at
@@ -65,9 +65,9 @@ def replay(recorded: Demonstration | RecordedEpisode, *, task: Task | None = Non
     executed = recorded.columns[EXECUTED_ACTION if EXECUTED_ACTION in recorded.columns else "action"]
     again = resimulate(task, recorded.seed, executed, recorded.exec_start)
     again = _labelled(again, wanted, referent=recorded.referent)
-    return _first_difference(recorded.columns, demonstration_columns(again)) or _whole_difference(
-        recorded.whole, _whole(again)
-    )
+    return _first_difference(
+        recorded.columns, demonstration_columns(again, objects_column(recorded.columns))
+    ) or _whole_difference(recorded.whole, _whole(again))
 
 
 def resimulate(task: Task, seed: int, actions: NDArray[np.float32], exec_start: int) -> Demonstration:
@@ -121,9 +121,9 @@ def _labelled(again: Demonstration, wanted: NDArray[np.float32], **identity: Any
     return replace(again, actions=wanted, executed=again.actions, **identity)
 
 
-def demonstration_columns(demo: Demonstration) -> Columns:
-    """Return states, proprioception and labels under the dataset's column names."""
-    seen = {} if demo.objects is None else {OBJECTS: demo.objects}
+def demonstration_columns(demo: Demonstration, objects: str = OBJECTS) -> Columns:
+    """Return states, proprioception and labels under the dataset's column names; ``objects`` is that of the objects."""
+    seen = {} if demo.objects is None else {objects: demo.objects}
     return {"states": demo.states, "observation.state": demo.proprio, **seen, **labels(demo).columns()}
 
 

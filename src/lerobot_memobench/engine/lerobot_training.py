@@ -17,9 +17,13 @@ from contextlib import contextmanager
 from types import ModuleType
 from typing import Any
 
+from lerobot.utils.constants import OBS_STATE
+
 from lerobot_memobench.datasets.execution_frames import ExecutionFrames, leave_out_prompts
+from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS as INPUT
+from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
 from lerobot_memobench.engine.loop.steering import check_version
-from lerobot_memobench.envs.obs_types import OBJECTS, PIXELS
+from lerobot_memobench.envs.obs_types import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.envs.prompting import knows_phases
 from lerobot_memobench.errors import MemobenchError
 
@@ -70,6 +74,9 @@ def _steered(make: Callable[..., Any], prompt_frames: bool | None, obs_type: str
             _check_streaming(config)
         check_transforms(config.policy, config.dataset.image_transforms.enable)
         train, held_out = make(config)
+        if _reads_objects(config.policy, obs_type):
+            for dataset in (train, held_out):
+                _take_for_input(dataset)
         _choose_inputs(config.policy, train.meta.features, obs_type)
         wanted = config.policy is None or knows_phases(config.policy) if prompt_frames is None else prompt_frames
         if not wanted:
@@ -93,6 +100,31 @@ def _check_streaming(config: Any) -> None:
             "frames; use dataset.streaming=false, prompt_frames=false to take execution frames as they come, or "
             "policy.prompt_loss=true to train on prompts as well"
         )
+
+
+def _reads_objects(policy: Any, obs_type: str | None) -> bool:
+    """Return whether a policy of LeRobot's is to see objects: as it was asked now, or when its training began."""
+    if policy is None or knows_phases(policy):
+        return False
+    begun = policy.input_features or {}
+    return INPUT in begun if begun else obs_type in (OBJECTS, BOTH)
+
+
+def _take_for_input(dataset: Any) -> None:
+    """Give the objects of an opened dataset with pictures the name that LeRobot takes for an input's."""
+    if dataset is None or PRIVILEGED not in dataset.meta.features:
+        return
+
+    def named(table: dict[str, Any]) -> dict[str, Any]:
+        return {INPUT if key == PRIVILEGED else key: value for key, value in table.items()}
+
+    dataset.meta.info.features, dataset.meta.stats = named(dataset.meta.features), named(dataset.meta.stats)
+    reader = getattr(dataset, "reader", dataset)  # a stream reads by itself
+    reader.hf_dataset = reader.hf_dataset.rename_column(PRIVILEGED, INPUT)
+    for holder, name in ((dataset, "delta_timestamps"), (reader, "delta_indices")):  # as of any other observation
+        deltas = getattr(holder, name, None)
+        if deltas and OBS_STATE in deltas:
+            setattr(holder, name, {**deltas, INPUT: deltas[OBS_STATE]})
 
 
 def _choose_inputs(policy: Any, features: dict[str, Any], obs_type: str | None) -> None:

@@ -31,6 +31,8 @@ COLUMNS = {
     "observation.state": "end-effector position 3, axis-angle 3, gripper joints 2",
     "action": "OSC pose delta 6 (±1 is ±0.05 m, ±0.5 rad), gripper (−1 opens, +1 closes)",
     "observation.environment_state": "what the cameras see as objects, 16 slots: see `memobench objects`",
+    "privileged.environment_state": "the same where there are pictures: true poses, which LeRobot's own training takes "
+    "for no input; `memobench_mem` with `perception=objects` reads them, others by `lerobot train obs_type=both`",
     "executed_action": "what moved the arm: `action`, but where it was moved off its way (`generate --perturb`)",
     "phase": "0 prompt video (the policy does not act), 1 execution",
     "checkpoint.index": "number of checkpoints completed in order before this frame",

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.demonstration import CAMERAS, FPS
-from lerobot_memobench.datasets.lerobot_format.layout import EXECUTED_ACTION, OBJECTS, image_key
+from lerobot_memobench.datasets.lerobot_format.layout import EXECUTED_ACTION, image_key, objects_column
 from lerobot_memobench.datasets.lerobot_format.record import EPISODE_INFO, EpisodeRecord
 from lerobot_memobench.datasets.lerobot_format.tables import ParquetFiles, frames_table, states_table
 from lerobot_memobench.datasets.staging.episode import StagedEpisode
@@ -97,7 +97,7 @@ class _FrameWriter:
             EPISODE_INFO: info,
         }
         if "objects" in arrays:
-            columns[OBJECTS] = arrays["objects"]
+            columns[objects_column(self._meta.features)] = arrays["objects"]
         return columns | {key: arrays[key] for key in self._meta.features if key in arrays}
 
     def _count(self, columns: dict[str, NDArray], episode: StagedEpisode) -> dict[str, Stats]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,9 @@ PROPRIO_NAMES = ["x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z", 
 ACTION_NAMES = ["x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z", "gripper"]
 
 OBJECTS = "observation.environment_state"
-"""What could be seen as objects, under LeRobot's name for a state of the environment."""
+"""What could be seen as objects, in datasets without pictures: LeRobot takes a column of this name for an input."""
+PRIVILEGED = "privileged.environment_state"
+"""The same in datasets with pictures: who trains on these by LeRobot's own commands learns from no object poses."""
 EXECUTED_ACTION = "executed_action"
 """What moved the arm; `action` is what the expert would have done, which differs where the arm was moved off its way.
 LeRobot takes every column that begins with `action` for something to be learned."""
@@ -31,6 +34,14 @@ TOP_LEVEL = (HDF5_FOLDER, "videos", "states", "data", "README.md", MANIFEST_FILE
 def image_key(camera: str) -> str:
     """Return the column name of a camera; the env's observations arrive at a policy under the same name."""
     return f"observation.images.{camera}"
+
+
+def objects_column(names: Collection[str]) -> str:
+    """Return which of a dataset's columns holds the objects.
+
+    Datasets with pictures of earlier versions have them under LeRobot's name.
+    """
+    return PRIVILEGED if PRIVILEGED in names else OBJECTS
 
 
 def dataset_features(image_size: tuple[int, int] | None, *, objects: bool = False) -> dict[str, dict[str, Any]]:
@@ -45,7 +56,7 @@ def dataset_features(image_size: tuple[int, int] | None, *, objects: bool = Fals
         for camera in CAMERAS:
             features[image_key(camera)] = feature("video", (*image_size, 3), ["height", "width", "channels"])
     if objects:
-        features[OBJECTS] = feature("float32", (SIZE,))
+        features[OBJECTS if image_size is None else PRIVILEGED] = feature("float32", (SIZE,))
     completed = [f"checkpoint_{k}" for k in range(MAX_CHECKPOINTS)]
     return features | {
         "observation.state": feature("float32", (PROPRIO_DIM,), PROPRIO_NAMES),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lerobot_memobench.datasets.lerobot_format.layout import EXECUTED_ACTION, OBJECTS, is_dataset
+from lerobot_memobench.datasets.lerobot_format.layout import EXECUTED_ACTION, OBJECTS, PRIVILEGED, is_dataset
 from lerobot_memobench.datasets.lerobot_format.record import EPISODE_INFO, EpisodeRecord, from_frames, from_meta
 from lerobot_memobench.datasets.lerobot_format.tables import LANGUAGE
 from lerobot_memobench.errors import MemobenchError
@@ -158,7 +158,7 @@ def _read_columns(root: Path, episode_index: int) -> Columns:
         values = table.column(name).to_pylist()
         is_text = name == LANGUAGE or isinstance(values[0], str)
         columns[name] = values if is_text else np.array(values)
-    for name in ("action", EXECUTED_ACTION, "observation.state", OBJECTS):
+    for name in ("action", EXECUTED_ACTION, "observation.state", OBJECTS, PRIVILEGED):
         if name in columns:
             columns[name] = columns[name].astype(np.float32)
     if (root / "states").is_dir():

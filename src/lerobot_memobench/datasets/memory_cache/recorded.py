@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
+from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS, objects_column
 from lerobot_memobench.datasets.memory_cache.frame_table import FrameTable, read_frame_table, resolve_subgoals
 from lerobot_memobench.datasets.memory_cache.layout import FORMAT, CacheMeta, slot_starts
 from lerobot_memobench.datasets.memory_cache.lookup import FrameLookup
@@ -78,6 +79,8 @@ class RecordedFrames(FrameLookup):
 def read_recorded(root: Path, names: Sequence[str]) -> tuple[dict[str, Tensor], FrameTable]:
     """Read columns of numbers, each (N, ...), and phases and texts of a dataset.
 
+    Objects are read by the observation's name, whatever the dataset's column is called.
+
     Raises:
         MemobenchError: a column is missing, or frames are not numbered 0, 1, 2, ...
     """
@@ -85,11 +88,13 @@ def read_recorded(root: Path, names: Sequence[str]) -> tuple[dict[str, Tensor], 
     frames = int(table.episodes[-1])
     columns: dict[str, np.ndarray] = {}
     for path in sorted((root / "data").rglob("*.parquet")):
-        _require(root, names, pq.read_schema(path).names)
-        part = pq.read_table(path, columns=sorted({"index", *names}))
+        there = pq.read_schema(path).names
+        column_of = {name: objects_column(there) if name == OBJECTS else name for name in names}
+        _require(root, list(column_of.values()), there)
+        part = pq.read_table(path, columns=sorted({"index", *column_of.values()}))
         places = part.column("index").to_numpy()
         for name in names:
-            numbers = _numbers(part.column(name))
+            numbers = _numbers(part.column(column_of[name]))
             column = columns.setdefault(name, np.empty((frames, *numbers.shape[1:]), numbers.dtype))
             column[places] = numbers
     return {name: torch.from_numpy(column) for name, column in columns.items()}, table

@@ -10,6 +10,7 @@ from typing import Any
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
 
+from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
 from lerobot_memobench.envs.observations import IMAGE_KEYS, IMAGE_SIZE
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.eyes.tower import SIDE
@@ -320,6 +321,15 @@ class MemobenchMemConfig(MemobenchMemSettings):
     def get_scheduler_preset(self) -> WarmupFractionSchedulerConfig:
         """Return the schedule that lerobot-train takes."""
         return WarmupFractionSchedulerConfig(warmup_fraction=self.warmup_fraction, final=self.final_lr)
+
+    def set_dataset_feature_metadata(self, features: dict[str, Any]) -> None:
+        """Take the objects of a dataset with pictures for the input that LeRobot does not take them for.
+
+        LeRobot calls this with a dataset's ``features`` before it makes a policy for it.
+        """
+        if not self.sees_pictures and PRIVILEGED in features:
+            shape = tuple(features[PRIVILEGED]["shape"])
+            self.input_features.setdefault(OBS_ENV_STATE, PolicyFeature(FeatureType.ENV, shape))
 
     def validate_features(self) -> None:
         """Keep of the features what this perception looks at, besides the state.

@@ -16,6 +16,7 @@ import torch
 from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.lerobot_types import EnvTransition, TransitionKey
 from lerobot.processor import ProcessorStep, ProcessorStepRegistry
+from lerobot.utils.constants import OBS_ENV_STATE
 from torch import Tensor
 
 from lerobot_memobench.datasets.memory_cache import FrameLookup, RecordedFrames
@@ -74,11 +75,13 @@ class GatherMemoryProcessorStep(ProcessorStep):
             return transition
         self._follow_run()
         cache = require_cache(self.cache, self._run)
+        indices = extra["index"].reshape(-1).tolist()
         transition = transition.copy()
-        transition[TransitionKey.COMPLEMENTARY_DATA] = {
-            **extra,
-            **self.gather(cache, extra["index"].reshape(-1).tolist()),
-        }
+        transition[TransitionKey.COMPLEMENTARY_DATA] = {**extra, **self.gather(cache, indices)}
+        told = transition.get(TransitionKey.OBSERVATION) or {}
+        # LeRobot passes on observations alone, and in a dataset with pictures objects are none by name.
+        if isinstance(cache, RecordedFrames) and OBS_ENV_STATE in cache.columns and OBS_ENV_STATE not in told:
+            transition[TransitionKey.OBSERVATION] = {**told, OBS_ENV_STATE: cache.columns[OBS_ENV_STATE][indices]}
         return transition
 
     def _follow_run(self) -> None:
