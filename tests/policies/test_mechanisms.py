@@ -76,7 +76,7 @@ def test_rows_of_a_rollout_and_the_cache_agree(name: str) -> None:
     history = RolloutMemory(mechanism, stride)
     step = GatherMemoryProcessorStep(frames=mechanism.frames, memory=name)
     for now in range(length):
-        history.observe([now], lambda rows, now=now: episode.frames[now // stride].tokens[None])
+        history.observe([(1, now)], lambda rows, now=now: episode.frames[now // stride].tokens[None])
         gathered = step.gather(Cache(), [now])  # type: ignore[arg-type]
         if mechanism.frames == 0:
             assert not history.rows[0].kept

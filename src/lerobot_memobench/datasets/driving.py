@@ -78,7 +78,7 @@ class Driver:
             "environment_state": seen[None],
             "agent_pos": episode.sim.proprio()[None],
             "phase": np.array([[episode.phase]], np.float32),
-            "step": np.array([[episode.step_index]], np.float32),
+            "step": np.array([[episode.clock]], np.float32),
         }
         if pictures is not None:
             observation["pixels"] = {name: picture[None] for name, picture in pictures.items()}

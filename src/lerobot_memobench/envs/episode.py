@@ -46,6 +46,7 @@ class Episode:
     Attributes:
         task: the task of this episode: a variant of the given one when the referent is random.
         step_index: control steps since the episode began, prompt included.
+        clock: control steps since the phase began: the same at the first execution frame, however long the prompt was.
         exec_start: the frame at which execution began; None during the prompt.
         progress: checkpoints and goal, counted in execution steps.
         applied_action: the action (7,) float32 that really moved the arm in the last step.
@@ -123,6 +124,11 @@ class Episode:
     def phase(self) -> int:
         """`PROMPT` or `EXECUTION`."""
         return PROMPT if self.exec_start is None else EXECUTION
+
+    @property
+    def clock(self) -> int:
+        """Control steps since the phase began. Counted through, it would tell how long the prompt was, and so what."""
+        return self.step_index - (self.exec_start or 0)
 
     @property
     def exec_steps(self) -> int:

@@ -39,7 +39,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     Observation: ``pixels/image`` and ``pixels/wrist_image`` uint8 (256, 256, 3) upright, or ``environment_state``
     float32 (208,): the visible objects (`sim.object_layout`), or both; ``agent_pos`` float32 (8,): end-effector
     position (3, m), axis-angle (3, rad), fingers (2, m); ``phase`` (1,): 0 while the prompt video plays and actions
-    have no effect, 1 in execution; ``step`` (1,): control steps since the episode began; on request ``expert_action``
+    have no effect, 1 in execution; ``step`` (1,): control steps since the phase began; on request ``expert_action``
     (7,), ``blind_action`` (7,).
 
     Action: float32 (7,) in [−1, 1]: end-effector displacement (±5 cm, ±0.5 rad per unit), gripper (−1 opens, 1 closes).
@@ -219,7 +219,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             **self._sight.observed(),
             "agent_pos": episode.sim.proprio(),
             "phase": np.array([episode.phase], dtype=np.float32),
-            "step": np.array([episode.step_index], dtype=np.float32),
+            "step": np.array([episode.clock], dtype=np.float32),
         }
         if self._expert_action:
             observation["expert_action"] = episode.expert_action()

@@ -52,7 +52,7 @@ class Sight:
 
     def _draw(self, episode: Episode) -> None:
         self._images: dict[str, Image] = episode.images()
-        self._picture_step = episode.step_index
+        self._picture_step, self._picture_clock = episode.step_index, episode.clock
 
     def observed(self) -> dict[str, Any]:
         """Return the observation's pictures and objects, see `observations.observation_space`."""
@@ -60,7 +60,7 @@ class Sight:
         if self._sees_pictures:
             seen["pixels"] = dict(self._images)
             if self._render_every > 1:
-                seen["picture_step"] = np.array([self._picture_step], dtype=np.float32)
+                seen["picture_step"] = np.array([self._picture_clock], dtype=np.float32)
         if self._sees_objects:
             seen["environment_state"] = self._objects
         return seen

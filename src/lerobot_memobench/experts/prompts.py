@@ -1,7 +1,6 @@
 """What prompt videos show, acted out by the arm.
 
-Whoever plays the prompt restores the scene exactly afterwards, or, where it hid something, the arm alone; here it only
-has to be shown.
+Whoever plays the prompt restores the scene exactly afterwards, but for what it hid; here it only has to be shown.
 """
 
 from __future__ import annotations

@@ -41,6 +41,9 @@ __all__ = [
 
 POINTS = 24
 """Points of a thing to which rays run."""
+QUANTUM = 1e-4
+"""Poses are told to 0.1 mm (rotations and angles to 1e-4): a drawer that holds something rests a nanometre from an
+empty one, and a difference like that would say what is inside, or change the order of slots."""
 SEEN_POINTS = 2
 """Rays that must arrive: one may slip through a gap between drawer and frame."""
 
@@ -180,7 +183,8 @@ class ObjectSlots:
         turned = data.xmat[thing.body].reshape(3, 3)
         joint = 0.0 if thing.joint is None else data.qpos[thing.joint]
         lit = float(is_lit(position, self._sim.highlights))
-        return np.array([1.0, thing.kind, *position, *turned[:, 0], *turned[:, 1], joint, lit])
+        pose = np.round(np.array([*position, *turned[:, 0], *turned[:, 1], joint]) / QUANTUM) * QUANTUM
+        return np.array([1.0, thing.kind, *pose, lit]) + 0.0  # no negative zeros
 
 
 def is_lit(position: Array, highlights: Iterable[Highlight]) -> bool:

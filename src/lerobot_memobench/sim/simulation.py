@@ -205,12 +205,22 @@ class Simulation:
         mujoco.mj_step1(self.model, self.data)
 
     def end_prompt(self, start: Snapshot) -> None:
-        """Undo what a prompt video has done since ``start``: all of it, or, where it hid something, the arm alone."""
+        """Undo what a prompt video has done since ``start``, but for what it hid: that lies at rest in its drawer.
+
+        Drawers and bystanders go back to the bit as well: a drawer that holds something settles a nanometre from an
+        empty one, and a bottle that was brushed tells which way the hand went.
+        """
         self.highlights = ()
-        if self.task.prompt is None or self.task.prompt.restores:
-            self.restore(start)
-        else:
-            self.restore_arm(start)
+        hidden = () if self.task.prompt is None else self.task.prompt.places
+        lies = [self.data.body(thing).xpos - self.data.site(drawer).xpos for thing, drawer in hidden]
+        turned = [self.data.body(thing).xquat.copy() for thing, _ in hidden]
+        self.restore(start)
+        for (thing, drawer), place, quaternion in zip(hidden, lies, turned, strict=True):
+            joint = self.model.joint(int(self.model.body(thing).jntadr[0]))
+            where, speed = int(joint.qposadr[0]), int(joint.dofadr[0])
+            self.data.qpos[where : where + 7] = np.concatenate([self.data.site(drawer).xpos + place, quaternion])
+            self.data.qvel[speed : speed + 6] = 0.0
+        mujoco.mj_step1(self.model, self.data)
 
     def restore_arm(self, snapshot: Snapshot) -> None:
         """Put arm, fingers and controller back as in a snapshot, to the bit; all other things stay as they are.

@@ -10,6 +10,7 @@ import torch
 from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
 from torch import Tensor
 
+from lerobot_memobench.envs.observations import EXECUTION, PROMPT
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.freshness import PICTURE_STEP, require_fresh
 from lerobot_memobench.policies.memobench_mem.action_objective import REGRESSION
@@ -53,17 +54,20 @@ class ActingPolicy(SeeingPolicy):
         return self.history.writes_next() or bool(self.plans.wanting(self._acting_rows))
 
     def observe(self, batch: dict[str, Tensor]) -> tuple[list[int], list[bool], list[bool]]:
-        """Take the current frames of all rows into their histories; return steps, new episodes and frozen rows."""
+        """Take the current frames of all rows into their histories.
+
+        Returns:
+            Per row its control step since the episode began, whether a new episode began, and whether it is frozen.
+        """
         seen = self.perception.remembers
         if seen not in batch:
             raise MemobenchError(f"The observation has no '{seen}', which this policy remembers; {cure(seen, batch)}")
         count = len(batch[seen])
-        if OBS_STEP in batch:
-            steps = [round(step) for step in batch[OBS_STEP].reshape(count, -1)[:, 0].tolist()]
-        else:
-            steps = [self._calls] * count  # an environment without a clock: one call is one step
+        steps = _column(batch, OBS_STEP) or [self._calls] * count  # without a clock one call is one step
+        phases = _column(batch, OBS_PHASE) if OBS_STEP in batch else None
+        clocks = list(zip(phases or [EXECUTION] * count, steps, strict=True))
         self._calls += 1
-        started, frozen = self.history.observe(steps, lambda rows: self._encode(batch, steps, rows))
+        steps, started, frozen = self.history.observe(clocks, lambda rows: self._encode(batch, clocks, rows))
         self.noise.resize(count)
         for row in range(count):
             if started[row]:
@@ -71,11 +75,11 @@ class ActingPolicy(SeeingPolicy):
                 self.noise.begin(row, (batch[key][row] for key in told))
         return steps, started, frozen
 
-    def _encode(self, batch: dict[str, Tensor], steps: list[int], rows: list[int]) -> Tensor:
+    def _encode(self, batch: dict[str, Tensor], clocks: list[tuple[int, int]], rows: list[int]) -> Tensor:
         """Tokens (n, P, D) of the present frames of some rows; a frame of an earlier step is refused."""
         if OBS_PICTURE in batch and self.perception.pictures:
             for row in rows:
-                require_fresh(steps[row], round(float(batch[OBS_PICTURE][row])))
+                require_fresh(clocks[row][1], round(float(batch[OBS_PICTURE][row])))
         return self.perception.remember(batch, rows)
 
     def plan(self, batch: dict[str, Tensor], rows: list[int], noise: Tensor, **kwargs: Any) -> Tensor:
@@ -131,9 +135,7 @@ class ActingPolicy(SeeingPolicy):
         steps, started, frozen = self.observe(batch)
         count = len(steps)
         self.plans.resize(count)
-        prompt = [False] * count
-        if OBS_PHASE in batch:
-            prompt = (batch[OBS_PHASE].reshape(count, -1)[:, 0] < 0.5).tolist()
+        prompt = [phase == PROMPT for phase in _column(batch, OBS_PHASE) or [EXECUTION] * count]
         for row in range(count):
             if started[row] or prompt[row]:
                 self.plans.drop(row)
@@ -145,3 +147,10 @@ class ActingPolicy(SeeingPolicy):
             for row, plan in zip(wanting, plans.float().cpu(), strict=True):
                 self.plans.begin(row, plan, self.config.n_action_steps, None if states is None else states[row])
         return self.plans.step(acting).to(self._device)
+
+
+def _column(batch: dict[str, Tensor], key: str) -> list[int] | None:
+    """Return a whole number per row, None where a batch does not have it."""
+    if key not in batch:
+        return None
+    return [round(value) for value in batch[key].reshape(len(batch[key]), -1)[:, 0].tolist()]

@@ -27,8 +27,8 @@ Action = NDArray[np.float32]
 class Actor:
     """One environment: when its episode begins, when the server is asked, which action is next.
 
-    The environment's ``step`` tells its rows' episodes apart: it goes back to 0 with each, and stands still once an
-    episode has ended. An environment that tells no step is taken to begin with the policy's reset and to go on.
+    The environment's ``phase`` and ``step`` tell its rows' episodes apart: they go back with each, and stand still once
+    an episode has ended. An environment that tells no step is taken to begin with the policy's reset and to go on.
     """
 
     def __init__(self, config: RemoteConfig, session: Session) -> None:
@@ -37,25 +37,23 @@ class Actor:
 
     def forget(self) -> None:
         """A rollout begins: whatever comes next is another episode."""
-        self._step: int | None = None
+        self._clock: tuple[int, int] | None = None
         self._prompt = self._rests = False
         self._queue: deque[Action] = deque()
 
     def act(self, row: Row) -> Action:
         """Return the action (7,) for the present observation; the server may be asked."""
-        told = row.scalar("step")
-        step = told if told is not None else (0 if self._step is None else self._step + 1)
-        self._rests = step == self._step or (told is not None and row.blank)
+        told, phase = row.scalar("step"), row.scalar("phase")
+        last, self._clock = self._clock, self._now(told, phase)
+        self._rests = self._clock == last or (told is not None and row.blank)
         if self._rests:
-            self._step = step
             return np.zeros(ACTION_SIZE, np.float32)  # the episode has ended, or was never run
-        if self._step is None or step < self._step:
+        if last is None or self._clock < last:
             self.session.begin()
             self._queue.clear()
             self._prompt = False
-        self._step = step
-        if row.scalar("phase") not in (None, EXECUTION):
-            return self._see_prompt(row, step)
+        if phase not in (None, EXECUTION):
+            return self._see_prompt(row, self._clock[1])
         if self._prompt:
             self.session.execution_starts()
             self._prompt = False
@@ -65,12 +63,18 @@ class Actor:
             self._queue.extend(self.session.ask(row)[: self.config.n_action_steps])
         return self._queue.popleft()
 
+    def _now(self, told: int | None, phase: int | None) -> tuple[int, int]:
+        """Return the phase and the control step since it began."""
+        if told is None:
+            return EXECUTION, 0 if self._clock is None else self._clock[1] + 1
+        return EXECUTION if phase is None else phase, told
+
     def looks_next(self) -> bool:
         """Whether the server is sent the pictures of the next observation; the first of an execution it always is."""
-        if self._rests or self._step is None:
+        if self._rests or self._clock is None:
             return not self._rests
         if self._prompt:
-            return self._shows_prompt(self._step + 1)
+            return self._shows_prompt(self._clock[1] + 1)
         return self.config.spoken.buffers or not self._queue
 
     def _shows_prompt(self, step: int) -> bool:

@@ -13,9 +13,14 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import Frame, Mem
 
 @dataclass
 class Row:
-    """History of one environment: the clock's last step, and what is kept of its episode."""
+    """History of one environment: its last clock, where that is in the episode, and what is kept of it.
 
-    last_step: int | None = None
+    Attributes:
+        clock: phase and control step since the phase began. position: control step since the episode began.
+    """
+
+    clock: tuple[int, int] | None = None
+    position: int = 0
     frozen: bool = False
     kept: list[Frame] = field(default_factory=list)
 
@@ -23,8 +28,8 @@ class Row:
 class RolloutMemory:
     """Histories of the rows of a vector environment.
 
-    A row starts anew when its step goes back (step 0), and is frozen while its step stays the same (its episode is
-    over, or the environment is waiting), whatever the other rows do.
+    A row starts anew when its clock goes back (to an earlier phase, or an earlier step of the phase), and is frozen
+    while its clock stays the same (its episode is over, or the environment is waiting), whatever the other rows do.
 
     Args:
         mechanism: what is kept and read.
@@ -39,40 +44,47 @@ class RolloutMemory:
         """Forget everything."""
         self.rows = []
 
-    def observe(self, steps: Sequence[int], encode: Callable[[list[int]], Tensor]) -> tuple[list[bool], list[bool]]:
+    def observe(
+        self, clocks: Sequence[tuple[int, int]], encode: Callable[[list[int]], Tensor]
+    ) -> tuple[list[int], list[bool], list[bool]]:
         """Take in one observation per row.
 
         Args:
-            steps: control step of each row since its episode began.
+            clocks: of each row its phase (0 prompt, 1 execution) and the control step since that began.
             encode: from row numbers (n,) to their frames' tokens (n, P, D); called at most once, for the rows whose
                 frames are written.
 
         Returns:
-            Per row: whether a new episode began, and whether the row is frozen.
+            Per row: its control step since the episode began, prompt included; whether a new episode began; and
+            whether the row is frozen.
         """
-        if len(self.rows) != len(steps):
-            self.rows = [Row() for _ in steps]
-        started, frozen = map(list, zip(*(self._tick(row, step) for row, step in enumerate(steps)), strict=True))
+        if len(self.rows) != len(clocks):
+            self.rows = [Row() for _ in clocks]
+        started = [self._tick(row, clock) for row, clock in enumerate(clocks)]
+        steps, frozen = [row.position for row in self.rows], [row.frozen for row in self.rows]
         wanted = [
             row for row, step in enumerate(steps) if not frozen[row] and (started[row] or step % self.stride == 0)
         ]
         if wanted and self.mechanism.frames:
             for row, tokens in zip(wanted, encode(wanted).to("cpu"), strict=True):
                 self.mechanism.write(self.rows[row].kept, Frame(steps[row], tokens))
-        return started, frozen
+        return steps, started, frozen
 
-    def _tick(self, number: int, step: int) -> tuple[bool, bool]:
-        """Set a row's clock; return whether a new episode began, and whether the row is frozen."""
-        last = self.rows[number].last_step
-        started = last is None or step < last
-        if started:
-            self.rows[number] = Row()
-        self.rows[number].last_step, self.rows[number].frozen = step, step == last
-        return started, step == last
+    def _tick(self, number: int, clock: tuple[int, int]) -> bool:
+        """Set a row's clock; return whether a new episode began."""
+        step, last = clock[1], self.rows[number].clock
+        if last is None or clock < last:
+            self.rows[number] = Row(clock, step)
+            return True
+        row = self.rows[number]
+        row.clock, row.frozen = clock, clock == last
+        if not row.frozen:  # a phase begins at step 0, one after the last of the prompt; or its clock counts through
+            row.position += step - last[1] if step > last[1] else 1 + step
+        return False
 
     def writes_next(self) -> bool:
         """Whether the frame after a row's present one is written."""
-        moving = [row.last_step for row in self.rows if row.last_step is not None and not row.frozen]
+        moving = [row.position for row in self.rows if row.clock is not None and not row.frozen]
         return self.mechanism.frames > 0 and any((step + 1) % self.stride == 0 for step in moving)
 
     def gather(self, rows: Sequence[int]) -> MemoryBatch:
