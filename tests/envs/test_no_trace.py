@@ -27,8 +27,8 @@ from lerobot_memobench.sim.object_slots import SLOTS, STARTS, WIDTH, ObjectSlots
 from lerobot_memobench.sim.rendering import Image
 from lerobot_memobench.sim.simulation import CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.task import Task
 from lerobot_memobench.tasks.formula import Atom
+from lerobot_memobench.tasks.task import Task
 
 FIXTURES, THINGS = 1e-6, 1e-4
 SAME_LEVEL, EDGES = 3, 4

@@ -18,7 +18,10 @@ class Suite(StrEnum):
 
 
 WhichSuite = Annotated[
-    Suite, typer.Option(help="published: the thirty tasks as published; strict: their twins that need a memory.")
+    Suite,
+    typer.Option(
+        help="published: the thirty tasks as published; strict: their twins, whose answer pictures do not show."
+    ),
 ]
 OfSuite = Annotated[
     Suite | None, typer.Option(help="Refuse a dataset that holds tasks of another suite; any when left out.")

@@ -64,4 +64,4 @@ def bounds(results: Sequence[Result]) -> str:
             ("best fixed map with the arm as it happens", [result["in_order"]["as_it_happens"] for result in searched]),
         )
     ]
-    return f"Memory is needed in {needed} of {len(drawn)} tasks. Without one, {'; '.join(told)}."
+    return f"From pictures alone {needed} of {len(drawn)} tasks were not solved: {'; '.join(told)}."

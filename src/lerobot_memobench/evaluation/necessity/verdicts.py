@@ -6,9 +6,9 @@ from lerobot_memobench.evaluation.necessity.study import Result
 
 VERDICTS = {
     "no": "pictures decide every step of the demonstrated routine: no memory is needed",
-    "order": "the demonstrated order needs memory; another order that the goal accepts does not",
-    "yes": "no order found reaches the goal from pictures alone: memory is needed",
-    "order?": "the demonstrated order needs memory; other ways were not looked for",
+    "order": "with the arm at home, pictures tell not the demonstrated order but another that the goal accepts",
+    "yes": "no order that was found reaches the goal from pictures alone",
+    "order?": "with the arm at home, pictures do not tell the demonstrated order; other ways were not looked for",
     "unknown": "the expert solved none of the scenes, so nothing can be said",
 }
 
