@@ -136,6 +136,8 @@ def test_objects_that_nobody_looks_at_are_those_seen_last() -> None:
     env.reset(seed=20_007)
     seen = env.step(moves(1, 1)[0])[0]["environment_state"]
     env.watch(False)
+    articulation, _ = env.episode.sim.world.articulation("wooden_cabinet_1_top_region")
+    env.episode.sim.data.joint(articulation.joint).qpos[0] = articulation.open_q
     for _ in range(3):
         stale = env.step(np.ones(7, np.float32))[0]
         np.testing.assert_array_equal(stale["environment_state"], seen)
