@@ -15,9 +15,9 @@ from picture_rollouts import CAMERAS, acts_as_its_checkpoint, made_eyes, trained
 from small_policy import batch_of, made_for_training, small_config
 
 from lerobot_memobench.cli.memobench import main
+from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
 from lerobot_memobench.datasets.memory_cache import FOLDER, building
 from lerobot_memobench.envs.obs_types import PIXELS, obs_type_of
-from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.eyes.tower import GRID, POOLED, WIDTH, Tower
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset, open_frames
