@@ -13,9 +13,11 @@ from filelock import lock_descriptor
 from note_job import Note
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.jobs.executors import Datatrove, Needs, asked_for, check_executor, options_told
 from lerobot_memobench.jobs.job import Advance
 from lerobot_memobench.jobs.locking import locked, taking_turns
 from lerobot_memobench.jobs.running import run_jobs
+from lerobot_memobench.settings.words import executor_options
 
 needs_datatrove = pytest.mark.skipif(find_spec("datatrove") is None, reason="datatrove is not installed")
 
@@ -57,6 +59,59 @@ def test_a_datatrove_rank_takes_neighbours_and_can_be_pickled(jobs: list[Note]) 
     step = dill.loads(dill.dumps(JobsStep(jobs)))  # noqa: S301 - pickled in this line
     list(step.run(rank=1, world_size=2))
     assert [job.finished() for job in jobs] == [False, False, True, True]
+
+
+@needs_datatrove
+def test_words_for_sbatch_are_handed_on_and_false_is_false() -> None:
+    from datatrove.executor import SlurmPipelineExecutor
+
+    words = ["partition=gpu", "time=08:00:00", "account=lab", "gres=gpu:a100:1", "requeue=false", "srun_args.mpi=none"]
+    words += ["sbatch_args.exclusive=true", "sbatch_args.mail-type=END", "requeue_signals=SIGUSR1,SIGTERM", "nice=0"]
+    options = executor_options(words)
+    check_executor("slurm", options)
+    told = options_told("slurm", options, Needs(cores=2, memory_gb=9, gpus=1))
+    making = Datatrove("slurm", 1, Path("logs"), 1, told).arguments
+    assert making["sbatch_args"] == {
+        "account": "lab",
+        "gres": "gpu:a100:1",
+        "exclusive": "",
+        "mail-type": "END",
+        "nice": "0",
+    }
+    assert making["srun_args"] == {"mpi": "none"}
+    assert making["requeue"] is False
+    assert making["requeue_signals"] == ("SIGUSR1", "SIGTERM")
+    asked = SlurmPipelineExecutor([], tasks=1, **making).get_sbatch_args()
+    assert (asked["cpus-per-task"], asked["mem-per-cpu"], asked["account"]) == (2, "5G", "lab")
+    assert "gpus" not in asked  # gres= asks for it
+    assert "requeue" not in asked
+    assert "2 cores, 10 GB, account=lab, gres=gpu:a100:1" in asked_for(told)
+
+
+def test_a_job_on_slurm_asks_for_what_it_needs_unless_told_otherwise() -> None:
+    needs = Needs(cores=2, memory_gb=8, gpus=1)
+    assert options_told("slurm", {}, needs) == {"cpus_per_task": 2, "mem_per_cpu_gb": 4, "gpus_per_task": 1}
+    own = {"cpus_per_task": 8, "mem_per_cpu_gb": 3, "gpus_per_task": 0}
+    assert options_told("slurm", own, needs) == own
+    assert "8 cores, 24 GB, no GPU" in asked_for(own)
+    assert options_told("local", {}, needs) == {}
+
+
+@needs_datatrove
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("requeue=maybe", "found requeue=maybe for executor 'slurm'; expected true or false"),
+        ("cpus_per_task=many", "found cpus_per_task=many for executor 'slurm'; expected a whole number"),
+        ("gpus_per_task=true", "expected a whole number"),
+        ("acount=lab", "found option 'acount' for executor 'slurm', did you mean 'account'"),
+        ("env.x=1", "found option 'env.x'"),
+        ("sbatch_args=account", "found option 'sbatch_args'"),
+    ],
+)
+def test_options_that_slurm_does_not_take(option: str, message: str) -> None:
+    with pytest.raises(MemobenchError, match=message):
+        check_executor("slurm", executor_options(["partition=gpu", "time=1:00", option]))
 
 
 def test_one_run_at_a_time_in_a_folder(tmp_path: Path) -> None:

@@ -27,5 +27,7 @@ def test_executor_options() -> None:
         "mem_per_cpu_gb": 4,
         "env_command": "a=b",
     }
+    told = executor_options(["requeue=false", "with_srun=True", "condaenv=none", "qos="])
+    assert told == {"requeue": False, "with_srun": True, "condaenv": None, "qos": ""}
     with pytest.raises(MemobenchError, match="expected key=value"):
         executor_options(["partition"])

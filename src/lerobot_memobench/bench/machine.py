@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import platform
 from functools import cache
 from pathlib import Path
 
 import mujoco
 
+from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.sim.rendering import close_renderers, gl_backend
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
@@ -20,8 +20,7 @@ TASK = "put_the_butter_into_the_bowl_from_the_prompt_video"
 @cache
 def machine() -> str:
     """Return processor, cores, GL device and versions, for a reader to compare with."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return f"{_processor()}, {cores} cores, {_gl_device()}, {platform.system()}, mujoco {mujoco.__version__}"
+    return f"{_processor()}, {cores()} cores, {_gl_device()}, {platform.system()}, mujoco {mujoco.__version__}"
 
 
 def _processor() -> str:

@@ -20,6 +20,7 @@ from lerobot_memobench.engine.planning import plan_line
 from lerobot_memobench.engine.run import run_evaluation
 from lerobot_memobench.envs.episode import HORIZON
 from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.tasks.catalogue import task_names
 
 SHORT, LONG = 10, 60
@@ -68,7 +69,7 @@ def rollouts_total(tasks: str = "all", processes: int | None = None, every: int 
         processes: as many as there are cores when None.
         every: steps from one look at the pictures to the next.
     """
-    team = processes or os.cpu_count() or 1
+    team = processes or cores()
     (short, short_cpu), (long, long_cpu) = (seconds(tasks, steps, team, every) for steps in (SHORT, LONG))
     more = len(short) * (LONG - SHORT)
     step = sum(long[task] - short[task] for task in short) / more

@@ -15,8 +15,9 @@ from lerobot_memobench.engine.plan import EvaluationPlan
 from lerobot_memobench.engine.planning import is_benchmark, make_plan
 from lerobot_memobench.engine.reporting import EvaluationReport
 from lerobot_memobench.engine.run import run_evaluation
-from lerobot_memobench.engine.shards import plan_shards, run_shards
+from lerobot_memobench.engine.shards import executor_options, plan_shards, run_shards
 from lerobot_memobench.evaluation.documents.report import failure_line, table
+from lerobot_memobench.jobs.executors import asked_for
 from lerobot_memobench.settings.reading import read_settings
 from lerobot_memobench.settings.words import Words
 
@@ -70,6 +71,7 @@ def evaluate_in_parts(plan: EvaluationPlan) -> int:
     if report is not None:
         return print_merged(report)
     screen.print(f"jobs are submitted; the last of them merges the parts in {plan.output.absolute()}", soft_wrap=True)
+    screen.print(asked_for(executor_options(plan)), soft_wrap=True, highlight=False)
     return 0
 
 

@@ -13,6 +13,7 @@ from lerobot_memobench.cli.console import console, counting
 from lerobot_memobench.cli.suite import Suite, WhichSuite
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.terminal import Unbroken
+from lerobot_memobench.jobs.executors import asked_for, options_told
 from lerobot_memobench.settings.words import executor_options
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 
@@ -75,7 +76,10 @@ def generate(
         Executor, typer.Option(help="processes here, or datatrove's: local, slurm, ray.")
     ] = Executor.PROCESSES,
     executor_option: Annotated[
-        list[str] | None, typer.Option(help="key=value for datatrove's executor, e.g. partition=cpu; repeatable.")
+        list[str] | None,
+        typer.Option(
+            help="key=value for datatrove's executor, e.g. partition=cpu, account=me, gres=gpu:1; repeatable."
+        ),
     ] = None,
 ) -> int:
     """Let the scripted experts make demonstrations into a LeRobotDataset. The same command continues a killed
@@ -84,7 +88,7 @@ def generate(
     options = executor_options(executor_option or [])
     named: dict[str, Any] = {} if repo_id is None else {"repo_id": repo_id}
     chosen = [get_task(name) for name in resolve_tasks(tasks, suite)]
-    from lerobot_memobench.datasets.generation import episodes_of
+    from lerobot_memobench.datasets.generation import NEEDS, episodes_of
     from lerobot_memobench.datasets.generation import generate as run
 
     screen = console()
@@ -115,6 +119,8 @@ def generate(
             **named,
         )
     _print_summary(summary, out)
+    if summary.submitted:
+        screen.print(asked_for(options_told(executor.value, options, NEEDS)), soft_wrap=True, highlight=False)
     return summary.exit_status
 
 

@@ -30,6 +30,7 @@ from lerobot_memobench.cli.simulator import bench, gallery
 from lerobot_memobench.cli.study import study
 from lerobot_memobench.cli.tasks import tasks
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.jobs.threads import ACTING, LEARNING, use_threads
 
 __all__ = ["app", "main"]
 
@@ -69,6 +70,9 @@ COMMANDS: dict[str, tuple[Callable[..., int | None] | tuple[str, typer.Typer], .
     "The benchmark itself": (necessity, agreement, bench),
 }
 """Group -> its commands, as ``memobench --help`` lists them."""
+
+LEARN = ("cache", "eyes", "learn", "study")
+"""Commands whose own process trains or encodes; every other simulates, or computes next to nothing."""
 
 for group, commands in COMMANDS.items():
     for command in commands:
@@ -111,8 +115,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status. Errors a user can mend are one sentence on stderr, status
     2.
     """
+    words = list(sys.argv[1:] if argv is None else argv)
+    use_threads(LEARNING if words and words[0] in LEARN else ACTING)
     try:
-        result = app(args=None if argv is None else list(argv), standalone_mode=False, prog_name="memobench")
+        result = app(args=words, standalone_mode=False, prog_name="memobench")
     except MemobenchError as error:
         print(f"memobench: {' '.join(str(error).split())}", file=sys.stderr)
         return USAGE_ERROR

@@ -35,12 +35,14 @@ from lerobot_memobench.datasets.staging.folders import STAGING
 from lerobot_memobench.datasets.staging.request import compare_requests, episodes_folder
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.files import file_hash
-from lerobot_memobench.jobs.executors import check_executor
+from lerobot_memobench.jobs.executors import Needs, check_executor, options_told
 from lerobot_memobench.jobs.job import ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.tasks.task import Task, referent_told
 
 WEIGHTS = "model.safetensors"
+NEEDS = Needs(cores=1, memory_gb=4)
+"""Of one job on Slurm, which makes one episode after another."""
 FIRST_SEED = 10_000
 """Demonstrations use the seeds 10,000 + i; evaluation uses 7 + i (paper, section 5.1)."""
 
@@ -108,7 +110,7 @@ def generate(
             workers=workers,
             progress=progress,
             executor=executor,
-            options=executor_options,
+            options=options_told(executor, executor_options or {}, NEEDS),
             logs=_logs(out, executor),
             finish=partial(_finish_on_slurm, plan, out.absolute(), repo_id),
         )

@@ -12,6 +12,7 @@ from lerobot_memobench.doctor.findings import Finding
 from lerobot_memobench.doctor.golden import TOLERANCE
 from lerobot_memobench.doctor.probe import run_probe
 from lerobot_memobench.errors import MemobenchError, unsupported_system
+from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.sim.rendering import BACKENDS, gl_backend
 
 SYSTEM_PACKAGES = "apt-get install libegl1 libgl1-mesa-dri libgles2 libopengl0 libosmesa6"
@@ -108,4 +109,4 @@ def device() -> Finding:
 
     if torch.cuda.is_available():
         return Finding("device", "ok", f"{torch.cuda.get_device_name()} ({torch.cuda.device_count()} in all)")
-    return Finding("device", "ok", f"CPU, {os.cpu_count()} cores; enough for size=tiny and the expert")
+    return Finding("device", "ok", f"CPU, {cores()} cores; enough for size=tiny and the expert")

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import datetime as dt
-import os
 from pathlib import Path
 
 from lerobot_memobench.engine.orders import Orders
 from lerobot_memobench.engine.resume import earlier_batch_size
 from lerobot_memobench.envs.obs_types import OBJECTS
+from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.settings.flags import whole_number
 from lerobot_memobench.settings.translation import LerobotSettings
 
@@ -60,7 +60,7 @@ def with_largest_batch(settings: LerobotSettings, most: int) -> LerobotSettings:
     if not _batch_is_open(settings):
         return settings
     episodes = int(settings.get("eval.n_episodes") or EPISODES)
-    limit = max(1, min(int((os.cpu_count() or 4) * 0.7), episodes, most))
+    limit = max(1, min(int(cores() * 0.7), episodes, most))
     return settings.changed("eval.batch_size", max(size for size in range(1, limit + 1) if episodes % size == 0))
 
 
@@ -68,15 +68,20 @@ def _batch_is_open(settings: LerobotSettings) -> bool:
     return (settings.get("eval.batch_size") or "0") == "0"
 
 
-def with_protocol(settings: LerobotSettings, n_action_steps: int | None) -> LerobotSettings:
-    """Return settings with the protocol's seed and episodes, a batch, a device, the policy's replan interval, films."""
+def with_protocol(settings: LerobotSettings, n_action_steps: int | None, in_parts: bool = False) -> LerobotSettings:
+    """Return settings with the protocol's seed and episodes, a batch, a device, the policy's replan interval, films.
+
+    Args:
+        in_parts: all of them are run as jobs, each of which decides on its own machine which device there is.
+    """
     import torch
 
     settings = settings.default("seed", FIRST_SEED).default("eval.n_episodes", EPISODES)
     if whole_number(settings.get("seed")) is not None:
         settings = settings.default("env.seed_base", settings.get("seed"))  # episodes are counted from the first
     settings = with_largest_batch(settings, LARGEST_BATCH)
-    if not torch.cuda.is_available() and not torch.backends.mps.is_available():
+    # Where parts run elsewhere, that machine decides: this one may be a login node without a GPU, or with the only one.
+    if not in_parts and not torch.cuda.is_available() and not torch.backends.mps.is_available():
         settings = settings.default("policy.device", "cpu")
     if n_action_steps is not None:
         settings = settings.default("env.replan_steps", n_action_steps)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import subprocess
 from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
+
+from lerobot_memobench.jobs.threads import cores
 
 PACKAGES = ("lerobot_policy_memobench", "lerobot", "mujoco", "robosuite", "torch", "transformers", "numpy", "gymnasium")
 
@@ -24,7 +25,7 @@ def run_facts(command: Sequence[str], batch: int, gl: Mapping[str, Any]) -> dict
         "batch_size": batch,
         "versions": versions(),
         "git_commit": git_commit(),
-        "machine": {"cpu": cpu_model(), "cores": os.cpu_count(), "gpu": gpu_model(), "system": platform.platform()},
+        "machine": {"cpu": cpu_model(), "cores": cores(), "gpu": gpu_model(), "system": platform.platform()},
         "gl": dict(gl),
     }
 

@@ -18,8 +18,12 @@ from lerobot_memobench.engine.policy_identity import (
 from lerobot_memobench.policies.checkpoint import ADAPTER_FILE, WEIGHTS_FILE, local_folder, portable_path
 
 
-def card_of(plan: EvaluationPlan) -> dict[str, Any]:
-    """Return the card of an evaluation that is about to begin. Hashes the checkpoint, opens a GL context if need be."""
+def card_of(plan: EvaluationPlan, *, here: bool = True) -> dict[str, Any]:
+    """Return the card of an evaluation that is about to begin. Hashes the checkpoint, opens a GL context if need be.
+
+    Args:
+        here: whether it is run on this machine, whose GL then counts.
+    """
     shard = plan.orders.shard
     card = new_card(
         protocol=_protocol(plan),
@@ -28,7 +32,7 @@ def card_of(plan: EvaluationPlan) -> dict[str, Any]:
         trained_on=None,
         task_files=_task_files(plan),
         flags=_flags(plan),
-        runs=[run_facts(plan.command, plan.batch, gl_facts() if plan.draws else {})],
+        runs=[run_facts(plan.command, plan.batch, gl_facts() if plan.draws and here else {})],
         shard=None if shard is None else str(shard),
     )
     return with_checkpoint(card, plan.policy_path)

@@ -17,6 +17,7 @@ from lerobot_memobench.engine.plan import LOG, OUTPUT, EvaluationPlan
 from lerobot_memobench.envs.obs_types import PIXELS, obs_type_of
 from lerobot_memobench.envs.prompting import prompt_in
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.jobs.executors import ELSEWHERE
 from lerobot_memobench.policies.checkpoint import check_checkpoint
 from lerobot_memobench.settings.configurations import check_sight, env_config, policy_config
 from lerobot_memobench.settings.flags import whole_number
@@ -69,7 +70,7 @@ def make_plan(settings: LerobotSettings, orders: Orders, command: Sequence[str])
     settings = with_batch_size(settings, orders, log, getattr(policy, "max_environments", None))
     if obs_type_of(policy) not in (None, PIXELS):
         settings = settings.default("env.obs_type", obs_type_of(policy))
-    settings = with_protocol(settings, getattr(policy, "n_action_steps", None))
+    settings = with_protocol(settings, getattr(policy, "n_action_steps", None), in_parts=orders.shards > 0)
     if policy is not None:  # else LeRobot's process finds out
         settings = settings.default("env.prompt_in", prompt_in(policy))
     environment = cast("MemobenchEnvConfig | None", env_config(settings))
@@ -89,7 +90,7 @@ def make_plan(settings: LerobotSettings, orders: Orders, command: Sequence[str])
         orders=orders,
         command=tuple(command),
     )
-    if plan.draws:
+    if plan.draws and orders.executor not in ELSEWHERE:  # there, each part finds out
         check_rendering()
     return plan
 

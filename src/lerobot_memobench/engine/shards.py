@@ -22,10 +22,12 @@ from lerobot_memobench.engine.plan_card import card_of
 from lerobot_memobench.engine.reporting import EvaluationReport
 from lerobot_memobench.engine.resume import Tell, resumed_card
 from lerobot_memobench.envs.episode_log import has_log
+from lerobot_memobench.envs.prompting import parameters_of
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.jobs.executors import check_executor
+from lerobot_memobench.jobs.executors import ELSEWHERE, Needs, check_executor, options_told
 from lerobot_memobench.jobs.job import ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
+from lerobot_memobench.jobs.threads import LARGE, sharing
 
 LOGS = "logs"
 
@@ -40,6 +42,7 @@ class ShardJob:
         out: folder of the evaluation.
         episodes: (task, episode) of those that the part consists of.
         directory: where relative paths are looked up.
+        beside: parts that run at once on the machine, this one included.
     """
 
     program: tuple[str, ...]
@@ -49,6 +52,7 @@ class ShardJob:
     episodes: frozenset[tuple[str, int]]
     referent: str
     directory: Path
+    beside: int = 1
 
     @property
     def folder(self) -> Path:
@@ -97,6 +101,7 @@ class ShardJob:
                 stdin=subprocess.PIPE,
                 stdout=file,
                 stderr=file,
+                env=sharing(self.beside),
             )
             try:
                 status = process.wait()
@@ -145,6 +150,7 @@ def plan_shards(plan: EvaluationPlan, program: Sequence[str], tell: Tell) -> lis
             episodes=frozenset(episode for cell in grid.cells(shard) for episode in grid.episodes(cell)),
             referent=plan.environment.referent,
             directory=Path.cwd(),
+            beside=1 if orders.executor == "slurm" else min(orders.workers or orders.shards, orders.shards),
         )
         for shard in (Shard(k + 1, orders.shards) for k in range(orders.shards))
     ]
@@ -156,12 +162,21 @@ def _check_folders(plan: EvaluationPlan, out: Path, jobs: Sequence[ShardJob], te
     """Refuse to mix an evaluation with another one in its folder or in those of its parts."""
     check_folder(out)
     if plan.orders.resume:
-        card = card_of(plan)
+        card = card_of(plan, here=plan.orders.executor not in ELSEWHERE)
         for folder in (out, *(job.folder for job in jobs)):
             resumed_card(folder, card, tell)
     else:
         for folder in (out, *out.glob(SHARDS)):
             check_new(folder)
+
+
+def executor_options(plan: EvaluationPlan) -> dict[str, Any]:
+    """Return the executor's options, complete: a large policy is given a GPU, and room for its weights twice."""
+    orders, device = plan.orders, plan.settings.get("policy.device")
+    parameters = parameters_of(plan.policy_path) or 0 if plan.policy_path is not None else 0
+    on_gpu = device.startswith("cuda") if device else parameters >= LARGE
+    needs = Needs(cores=2, memory_gb=8 + 2 * 4 * parameters // 10**9, gpus=int(on_gpu))
+    return options_told(orders.executor, orders.executor_options, needs)
 
 
 def run_shards(
@@ -181,7 +196,7 @@ def run_shards(
         workers=orders.workers or len(jobs),
         progress=progress,
         executor=orders.executor,
-        options=orders.executor_options,
+        options=executor_options(plan),
         logs=out / LOGS,
         finish=partial(finish, out, folders),
         jobs_per_rank=1,

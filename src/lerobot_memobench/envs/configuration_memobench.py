@@ -6,6 +6,7 @@ steps the environment, at its first reset.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -25,9 +26,10 @@ from lerobot_memobench.envs.observations import (
     policy_features,
     policy_names,
 )
-from lerobot_memobench.envs.prompting import AUTO, PLACES, policy_being_run, prompt_in
+from lerobot_memobench.envs.prompting import AUTO, PLACES, parameters_being_run, policy_being_run, prompt_in
 from lerobot_memobench.envs.protocol import SEED_BASE, SETTINGS, check_protocol
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.jobs.threads import ACTING, limit_torch, use_threads
 from lerobot_memobench.tasks.task import DRAWN, PUBLISHED, REFERENTS, STRICT, SUITES, referent_told
 
 
@@ -167,6 +169,7 @@ class MemobenchEnvConfig(EnvConfig):
         from lerobot_memobench.envs.resuming import skip_logged
 
         chosen = self.selected()  # before anything is written: a wrong name leaves nothing behind
+        _use_threads()
         use_async_envs = use_async_envs and n_envs > 1
         if use_async_envs:
             # LeRobot's workers are forked from a server: it imports torch and the simulator once for all of them.
@@ -211,3 +214,16 @@ class MemobenchEnvConfig(EnvConfig):
         # The configuration of an environment does not hold the run's output folder; LeRobot's parser tells it.
         output = parser.parse_arg("output_dir")
         return Path(output) if output else Path("outputs/eval") / f"{datetime.now():%Y-%m-%d/%H-%M-%S}_memobench"
+
+
+def _use_threads() -> None:
+    """Give plain ``lerobot-eval`` the threads that `lerobot eval` has, as far as its libraries have not begun theirs.
+
+    Any other program of LeRobot's, such as a training that evaluates in between, keeps what it has.
+    """
+    if Path(sys.argv[0]).stem.replace("_", "-") != "lerobot-eval":
+        return
+    use_threads(ACTING)
+    parameters = parameters_being_run()
+    if parameters is not None:
+        limit_torch(parameters)

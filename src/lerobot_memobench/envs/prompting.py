@@ -44,6 +44,34 @@ def policy_being_run() -> type | None:
     return known.get(name) if name is not None else None
 
 
+def parameters_being_run() -> int | None:
+    """Return about how many parameters the policy on LeRobot's command line has, None where that is not known yet."""
+    from lerobot.configs import parser
+
+    path = parser.get_path_arg("policy")
+    if path is None:
+        return 0 if getattr(policy_being_run(), "weightless", False) else None
+    return parameters_of(path)
+
+
+def parameters_of(path: str) -> int | None:
+    """Return about how many parameters a checkpoint's policy has, by the size of its weights, four bytes each.
+
+    Args:
+        path: its folder, or a repository. None is returned for one that is not on this machine.
+    """
+    from huggingface_hub import try_to_load_from_cache
+
+    folder = Path(path).expanduser()
+    if not folder.is_dir():
+        cached = try_to_load_from_cache(path, "config.json")
+        if not isinstance(cached, str):
+            return None
+        folder = Path(cached).parent
+    sizes = [file.stat().st_size for file in folder.glob("*model*.safetensors")]
+    return sum(sizes) // 4 if sizes else None
+
+
 def _type_in_file(path: str | None) -> str | None:
     """Return the policy type in a local file of LeRobot's settings, or in a checkpoint's folder; None without one."""
     if path is None:

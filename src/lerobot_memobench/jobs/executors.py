@@ -16,11 +16,93 @@ from lerobot_memobench.jobs.job import Job
 EXECUTORS = ("processes", "local", "slurm", "ray")
 """``processes``: this package's own; the others are datatrove's."""
 
+ELSEWHERE = ("slurm", "ray")
+"""Those whose jobs may run on other machines than this one."""
+
 DATATROVE = {"local": "LocalPipelineExecutor", "slurm": "SlurmPipelineExecutor", "ray": "RayPipelineExecutor"}
 SET_HERE = ("pipeline", "tasks", "workers", "depends")
 """Arguments of datatrove's executors that follow from the jobs and from ``workers``."""
+NESTED = ("sbatch_args", "srun_args")
+"""Arguments that are words of another program: ``sbatch_args.constraint=a100``."""
+SBATCH = ("account", "gres", "constraint", "reservation", "nodelist", "exclude", "signal", "nice")
+"""Words of sbatch that are understood without ``sbatch_args.`` before them."""
+GPU_WORDS = ("gres", "gpus", "gpus-per-task", "gpus-per-node")
+"""Those by which a user may ask for GPUs in another way than by ``gpus_per_task``."""
+NAME = "memobench"
+"""Of the jobs on Slurm."""
 
 POLL_SECONDS = 1.0
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What one job asks a cluster for, unless its user says otherwise: cores, memory (GB) and GPUs."""
+
+    cores: int = 2
+    memory_gb: int = 8
+    gpus: int = 0
+
+
+def options_told(executor: str, options: Mapping[str, Any], needs: Needs) -> dict[str, Any]:
+    """Return the options of an executor, with what a job needs where they say nothing of it; on Slurm alone.
+
+    Datatrove would ask for one core, 2 GB and no GPU.
+    """
+    if executor != "slurm":
+        return dict(options)
+    asked = {"cpus_per_task": needs.cores, "gpus_per_task": needs.gpus, **options}
+    if any(word in _sbatch_words(options) for word in GPU_WORDS):
+        asked["gpus_per_task"] = options.get("gpus_per_task", 0)  # a user's own way to ask for them
+    memory = -(-needs.memory_gb // max(1, int(asked["cpus_per_task"])))
+    return {"mem_per_cpu_gb": memory, **asked}
+
+
+def asked_for(options: Mapping[str, Any]) -> str:
+    """Return in a sentence what each job on Slurm asks for."""
+    cores, gpus = int(options["cpus_per_task"]), options["gpus_per_task"]
+    own = [f"{word}={value}" for word, value in _sbatch_words(options).items()]
+    gpu = [] if any(word in _sbatch_words(options) for word in GPU_WORDS) else [f"{gpus or 'no'} GPU"]
+    asked = ", ".join([f"{cores} core{'s' * (cores > 1)}", f"{cores * int(options['mem_per_cpu_gb'])} GB", *gpu, *own])
+    return (
+        f"each job asks for {asked}; change it by the executor's options cpus_per_task=, mem_per_cpu_gb=, "
+        "gpus_per_task=, and what else sbatch takes by account=, gres= or sbatch_args.<word>="
+    )
+
+
+def _sbatch_words(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what options hand to sbatch itself."""
+    prefix = f"{NESTED[0]}."
+    chosen = [key for key in options if key in SBATCH or key.startswith(prefix)]
+    return {**options.get(NESTED[0], {}), **{key.removeprefix(prefix): options[key] for key in chosen}}
+
+
+def _arguments(executor: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options as arguments of datatrove's executor: words of other programs gathered, numbers as numbers."""
+    kinds = {name: parameter.annotation for name, parameter in signature(_executor_class(executor)).parameters.items()}
+    found: dict[str, Any] = {}
+    for key, value in options.items():
+        outer, dot, inner = key.partition(".")
+        if executor == "slurm" and key in SBATCH and key not in kinds:
+            outer, dot, inner = NESTED[0], ".", key
+        if isinstance(value, Mapping):
+            found[key] = {**value, **found.get(key, {})}
+        elif not dot:
+            found[key] = _checked(executor, key, value, str(kinds.get(key)))
+        elif value is not False and value is not None:  # a word without a value is an empty one, as datatrove has it
+            found.setdefault(outer, {})[inner] = "" if value is True else str(value)
+    return found
+
+
+def _checked(executor: str, key: str, value: Any, kind: str) -> Any:
+    """Return an option's value after a look at what the executor takes."""
+    is_number = isinstance(value, int) and not isinstance(value, bool)
+    if "bool" in kind and not isinstance(value, bool):
+        raise MemobenchError(f"found {key}={value} for executor {executor!r}; expected true or false")
+    if "int" in kind and not (is_number or value is None):
+        raise MemobenchError(f"found {key}={value} for executor {executor!r}; expected a whole number")
+    if "tuple" in kind and isinstance(value, str):
+        return tuple(part for part in value.split(",") if part)
+    return value
 
 
 def check_executor(executor: str, options: Mapping[str, Any] | None) -> None:
@@ -36,14 +118,19 @@ def check_executor(executor: str, options: Mapping[str, Any] | None) -> None:
         return
     _check_installed(executor)
     takes = [name for name in signature(_executor_class(executor)).parameters if name not in SET_HERE]
-    for name in options or {}:
-        if name not in takes:
+    if executor == "slurm":
+        takes = [*(name for name in takes if name not in NESTED), *SBATCH]
+    for name, value in (options or {}).items():
+        outer, _, inner = name.partition(".")
+        nested = executor == "slurm" and outer in NESTED and (inner or isinstance(value, Mapping))
+        if name not in takes and not nested:
             raise MemobenchError(f"found option {name!r} for executor {executor!r}, {nearest(name, takes)}")
     missing = [name for name in ("partition", "time") if executor == "slurm" and name not in (options or {})]
     if missing:
         raise MemobenchError(
             f"executor 'slurm' needs {' and '.join(missing)}: pass e.g. partition=cpu and time=08:00:00 as options"
         )
+    _arguments(executor, options or {})
 
 
 def _check_installed(executor: str) -> None:
@@ -93,26 +180,31 @@ class Datatrove:
 
     def submit(self, jobs: Sequence[Job], finish: Callable[[], Any] | None) -> None:
         """Hand the jobs to Slurm, and with them a last one that calls ``finish`` when they are done."""
-        making = self._making(jobs, job_name="memobench")
+        making = self._making(jobs, job_name=NAME)
         if finish is None:
             making.run()
             return
         from lerobot_memobench.jobs.datatrove_steps import FinishStep
 
-        settings = {"job_name": "memobench-finish", **self._common, "logging_dir": str(self.logs / "finish")}
+        settings = {**self.arguments, "logging_dir": str(self.logs / "finish")}
+        settings["job_name"] = f"{settings.get('job_name', NAME)}-finish"
+        settings["gpus_per_task"] = 0  # it merges, or assembles
+        words = settings.get(NESTED[0], {})
+        settings[NESTED[0]] = {word: value for word, value in words.items() if word not in GPU_WORDS}
         _executor_class(self.executor)([FinishStep(finish)], tasks=1, depends=making, **settings).run()
 
     def _making(self, jobs: Sequence[Job], **settings: Any) -> Any:
         from lerobot_memobench.jobs.datatrove_steps import JobsStep
 
         ranks = max(min(self.workers, len(jobs)), -(-len(jobs) // self.jobs_per_rank))
-        settings = {**settings, "logging_dir": str(self.logs / "make"), **self._common}
+        settings = {**settings, "logging_dir": str(self.logs / "make"), **self.arguments}
         return _executor_class(self.executor)([JobsStep(list(jobs))], tasks=ranks, workers=self.workers, **settings)
 
     @property
-    def _common(self) -> dict[str, Any]:
+    def arguments(self) -> dict[str, Any]:
+        """What the executor is made with, beside the jobs, their number and the place of its logs."""
         # What is finished is known from the jobs' folders, better than from datatrove's list of completed tasks.
-        return {"skip_completed": False, **self.options}
+        return {"skip_completed": False, **_arguments(self.executor, self.options)}
 
 
 @contextlib.contextmanager

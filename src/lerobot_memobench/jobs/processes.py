@@ -14,6 +14,7 @@ from multiprocessing.connection import wait
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.job import Job
+from lerobot_memobench.jobs.threads import ACTING, use_threads
 
 
 def run_in_processes(jobs: Sequence[Job], workers: int, tell: Callable[[Job], None]) -> None:
@@ -51,6 +52,7 @@ def _begin_worker() -> None:
     Ctrl-C is the parent's to handle: the job at hand is finished, so that nothing is lost.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    use_threads(ACTING)  # one of as many as there are cores
     parent = multiprocessing.parent_process()
     assert parent is not None
 

@@ -16,6 +16,9 @@ class UntrainedConfig(PreTrainedConfig):
     perception: ClassVar[str] = "any"
     """Whatever is observed will do (`envs.obs_types`), also where a checkpoint lists pictures among its features."""
 
+    weightless: ClassVar[bool] = True
+    """Nothing is computed in this process that more than one core would be quicker at (`jobs.threads`)."""
+
     device: str | None = "cpu"
     push_to_hub: bool = False
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import os
 import sys
 import typing
 from collections.abc import Callable, Iterator
@@ -14,8 +13,11 @@ from importlib import metadata
 from typing import Any
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.jobs.threads import ACTING, LEARNING, use_threads
 
 PREFIX = "lerobot-"
+ROLES = {"eval": ACTING, "train": LEARNING}
+"""What the processes of commands do that compute: `jobs.threads`."""
 
 
 def lerobot_commands() -> dict[str, metadata.EntryPoint]:
@@ -33,23 +35,13 @@ def load_command(name: str) -> Callable[[], Any]:
     Raises:
         MemobenchError: LeRobot was installed without what it needs.
     """
-    if name == "eval":
-        wait_briefly()
+    if name in ROLES:
+        use_threads(ROLES[name])
     try:
         entry: Callable[[], Any] = lerobot_commands()[name].load()
     except ImportError as error:
         raise MemobenchError(f"{PREFIX}{name} needs what is not installed here: {error}") from error
     return entry
-
-
-def wait_briefly() -> None:
-    """Let torch's idle threads sleep after microseconds; by default they wait busily for milliseconds.
-
-    Between a policy's operations that is as good, and the cores are free for who draws and simulates after them. Holds
-    for a process that has not loaded torch; who has chosen otherwise in the environment is left alone.
-    """
-    if not {"GOMP_SPINCOUNT", "OMP_WAIT_POLICY"} & os.environ.keys():
-        os.environ["GOMP_SPINCOUNT"] = "2000"
 
 
 @cache

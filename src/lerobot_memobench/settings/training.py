@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from pathlib import Path
 
 from lerobot_memobench.datasets.lerobot_format import DEFAULT_REPO_ID
 from lerobot_memobench.envs.obs_types import OBS_TYPES
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.settings.configurations import check_sight, env_config, policy_config
 from lerobot_memobench.settings.fields import checked_value
 from lerobot_memobench.settings.short_forms import TRAINING_WORDS
@@ -58,9 +58,8 @@ def complete_training(settings: LerobotSettings) -> LerobotSettings:
     settings = with_logging(settings)
     if not from_file and getattr(policy, "decodes_nothing", False):
         settings = settings.default("batch_size", OBJECT_BATCH).default("num_workers", 0)
-    cores = os.cpu_count() or 4
-    if cores < 4 and not from_file:  # LeRobot's default of 4 loaders would only wait for one another
-        settings = settings.default("num_workers", cores)
+    if cores() < 4 and not from_file:  # LeRobot's default of 4 loaders would only wait for one another
+        settings = settings.default("num_workers", cores())
     return settings
 
 

@@ -54,11 +54,15 @@ def split_words(words: Sequence[str]) -> Words:
 
 
 def executor_options(given: Sequence[str]) -> dict[str, Any]:
-    """Return ``key=value`` words (``executor_option=partition=cpu``) as arguments; numbers as numbers."""
+    """Return ``key=value`` words (``executor_option=partition=cpu``) as arguments: numbers, truth values and nothing
+    (``none``) as such. In the words of another program (``srun_args.mpi=none``) that is a name.
+    """
+    plain: dict[str, bool | None] = {"true": True, "false": False}
     options: dict[str, Any] = {}
     for word in given:
         key, equals, value = word.partition("=")
         if not key or not equals:
             raise MemobenchError(f"found executor option {word!r}, expected key=value, such as partition=cpu")
-        options[key] = int(value) if value.isdigit() else value
+        known = plain if "." in key else {**plain, "none": None, "null": None}
+        options[key] = int(value) if value.isdecimal() else known.get(value.lower(), value)
     return options

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -27,6 +26,7 @@ from lerobot_memobench.datasets.memory_cache.room import free_bytes, in_words, r
 from lerobot_memobench.datasets.memory_cache.tables import TextEncoder, add_embeddings, write_meta, write_tables
 from lerobot_memobench.files import remove_drafts
 from lerobot_memobench.jobs.locking import taking_turns
+from lerobot_memobench.jobs.threads import cores
 
 logger = logging.getLogger(__name__)
 
@@ -92,7 +92,7 @@ def build_memory_cache(
         work.folder.parent.mkdir(parents=True, exist_ok=True)
         with taking_turns(work.folder.parent / f"{name}.lock", partial(wait, work.folder)):
             begun = work.begin()
-            encoding = Encoding(work.folder, begun, table, batch_size, workers or min(_cores(), MOST_THREADS))
+            encoding = Encoding(work.folder, begun, table, batch_size, workers or min(cores(), MOST_THREADS))
             encoding.run(frames, read, progress)
             write_meta(work.folder, replace(begun, complete=True))
     return work.folder
@@ -116,10 +116,6 @@ def _describe(
         oracle=table.memory is not None,
         complete=False,
     )
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from tqdm import trange
 
 from lerobot_memobench.engine.loop.looking import looking
+from lerobot_memobench.jobs.threads import limit_torch
 
 PIXELS, PHASE = "pixels", "phase"
 """Of an observation: what is left out when nobody looks; 0 while the prompt plays, 1 in execution."""
@@ -73,6 +74,7 @@ def sparing(
 
     @functools.wraps(rollout)
     def run(env: Any, policy: Any, *args: Any, **settings: Any) -> dict[str, Any]:
+        limit_torch(sum(parameter.numel() for parameter in policy.parameters()))
         if args or any(settings.get(name) for name in KEEPS_FRAMES):
             return rollout(env, policy, *args, **settings)
         return _roll(env, policy, settings, quiet=hides_progress())

@@ -103,7 +103,7 @@ def run_study(root: Path, out: Path, settings: StudySettings, say: Say, workers:
     """Do, or finish, a whole study; return its tables and the path of its figure, both written to ``out``.
 
     Args:
-        say: told what begins. workers: processes; as many policies are trained at once, on one core each.
+        say: told what begins. workers: processes; as many policies are trained at once, and share the cores.
 
     Raises:
         MemobenchError: the dataset cannot be studied, ``out`` holds another study, or a command failed.

@@ -14,6 +14,7 @@ from pathlib import Path
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.files import write_file
 from lerobot_memobench.files.reading import read_json
+from lerobot_memobench.jobs.threads import sharing
 
 MODULES = {"lerobot": "lerobot_memobench.cli.lerobot", "memobench": "lerobot_memobench.cli.memobench"}
 
@@ -35,7 +36,7 @@ def run_once(
     log: Path,
     *,
     how: Sequence[str] = (),
-    threads: int | None = None,
+    beside: int = 1,
     accept: Sequence[int] = (0,),
     going_on: Sequence[str] | None = None,
 ) -> Cost:
@@ -45,7 +46,7 @@ def run_once(
 
     Args:
         how: more words, which decide nothing that comes out: in how many processes it is done.
-        threads: of processors' mathematics; as many as there are cores where None.
+        beside: commands that run at once, this one included; they share the cores (`jobs.threads`).
         accept: exit statuses of a command that did its work.
         going_on: what is run instead, to finish what an earlier attempt has begun.
 
@@ -62,8 +63,7 @@ def run_once(
         if told["ended"]:
             return spent
     log.parent.mkdir(parents=True, exist_ok=True)
-    environment = os.environ if threads is None else {**os.environ, "OMP_NUM_THREADS": str(threads)}
-    status, took = _run(going_on or [*words, *how], log, environment)
+    status, took = _run(going_on or [*words, *how], log, sharing(beside))
     spent, ended = spent + took, status in accept
     write_file(kept, json.dumps({"words": list(words), "ended": ended, **asdict(spent)}, indent=1))
     if not ended:

@@ -37,7 +37,7 @@ class Rolled:
 def train_and_roll_out(stages: Stages, say: Say) -> Rolled:
     """Train every arm with every seed, then roll each out; what was done before is not done again.
 
-    With several workers as many policies are trained at once, on one core each.
+    With several workers as many policies are trained at once; they share the cores.
 
     Args:
         say: told what begins.
@@ -49,7 +49,7 @@ def train_and_roll_out(stages: Stages, say: Say) -> Rolled:
     def train(one: tuple[int, str]) -> Cost:
         seed, arm = one
         say(f"training: {name_of(arm, seed)}, {experiment.steps} updates; see {stages.log('training', arm, seed)}")
-        return stages.train(arm, seed, threads=1 if stages.workers > 1 else None)
+        return stages.train(arm, seed)
 
     def roll_out(one: tuple[int, str]) -> Cost:
         seed, arm = one

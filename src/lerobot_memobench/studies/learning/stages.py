@@ -55,7 +55,7 @@ class Stages:
         words += ["--perturb", "--out", str(self.data)]
         words += [] if self._sight.pictures else ["--no-images"]
         how = ["--workers", str(self.workers)]
-        return run_once(words, self.out / "data.log", how=how, threads=1, accept=(0, 1))
+        return run_once(words, self.out / "data.log", how=how, accept=(0, 1))
 
     def check_settings(self) -> None:
         """Refuse what training would, before anything is made; LeRobot's import is left out where nothing was added.
@@ -79,15 +79,15 @@ class Stages:
         words += [f"seed={seed}", f"output_dir={self.policy(arm, seed)}"]
         return [*words, *self.experiment.settings, *self.experiment.arms[arm]]
 
-    def train(self, arm: str, seed: int, threads: int | None = None) -> Cost:
-        """Train an arm's policy with one seed."""
+    def train(self, arm: str, seed: int) -> Cost:
+        """Train an arm's policy with one seed; as many at once as there are workers share the cores."""
         folder = self.policy(arm, seed)
         begun = self.checkpoint(arm, seed) / "train_config.json"
         going_on = ["lerobot", "train", f"config_path={begun}", "resume=true"] if begun.is_file() else None
         log = self.log("training", arm, seed)
         if going_on is None and not log.with_suffix(".json").is_file():
             shutil.rmtree(folder, ignore_errors=True)  # of an attempt that was killed before its first checkpoint
-        return run_once(self.training_words(arm, seed), log, threads=threads, going_on=going_on)
+        return run_once(self.training_words(arm, seed), log, beside=self.workers, going_on=going_on)
 
     def evaluate(self, arm: str, seed: int) -> Cost:
         """Roll a trained policy out on the experiment's evaluation seeds."""
@@ -99,7 +99,7 @@ class Stages:
         words += [f"suite={STRICT}"] if self._is_strict else []
         words += ["env.oracle_memory=true"] if "policy.oracle_memory=true" in self.experiment.arms[arm] else []
         how = [f"shards={self.workers}", f"workers={self.workers}"] if self.workers > 1 else []
-        return run_once(words, self.log("evaluation", arm, seed), how=how, threads=1)
+        return run_once(words, self.log("evaluation", arm, seed), how=how)
 
     def policy(self, arm: str, seed: int) -> Path:
         """Return the folder of a training run."""

@@ -21,7 +21,7 @@ def learn(experiment: Experiment, out: Path, say: Say, *, dataset: Path | None =
     Args:
         say: told what begins.
         dataset: demonstrations that are there already.
-        workers: processes; with more than one, as many policies are trained at once, on one core each.
+        workers: processes; with more than one, as many policies are trained at once, and share the cores.
     """
     stages = Stages(experiment, out, dataset, workers)
     stages.check_settings()

@@ -1,0 +1,206 @@
+"""Who gets how many threads, on machines of 2 and 16 cores that are made up."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from lerobot_memobench.jobs import threads
+from lerobot_memobench.jobs.threads import ACTING, BESIDE, LARGE, LEARNING, cores, limit_torch, sharing, torch_threads
+
+
+class Machine:
+    """So many processors for this process, of cores with so many hyperthreads each, in a container with a quota."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+        self.monkeypatch, self.folder = monkeypatch, tmp_path
+
+    def has(self, processors: int, quota: str | None = None, hyperthreads: int = 1) -> None:
+        self.monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(processors)))
+        self.monkeypatch.setattr(os, "cpu_count", lambda: 128)  # the machine's, which is not this process's
+        self.monkeypatch.setattr(threads, "_CGROUPS", self.folder)
+        (self.folder / "cpu.max").write_text(quota or "max 100000\n")
+        read = Path.read_text
+
+        def text(path: Path, *args: Any, **settings: Any) -> str:
+            if path == Path("/proc/self/cgroup"):
+                return "0::/\n"
+            if path.name == "thread_siblings_list":
+                return str(int(path.parts[-3].removeprefix("cpu")) // hyperthreads)
+            return read(path, *args, **settings)
+
+        self.monkeypatch.setattr(Path, "read_text", text)
+
+
+@pytest.fixture
+def machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Machine:
+    return Machine(monkeypatch, tmp_path)
+
+
+@pytest.fixture
+def environment(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+    found = {"HOME": "/nowhere"}
+    monkeypatch.setattr(os, "environ", found)
+    return found
+
+
+def test_cores_are_those_of_this_process(machine: Machine) -> None:
+    machine.has(16)
+    assert cores() == 16
+    machine.has(16, quota="350000 100000")
+    assert cores() == 3
+    machine.has(16, quota="50000 100000")
+    assert cores() == 1
+    machine.has(2, quota="800000 100000")
+    assert cores() == 2
+
+
+def test_a_limit_above_counts_as_well(machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    machine.has(16)
+    read = Path.read_text
+    place = tmp_path / "job_1" / "step_0"
+    place.mkdir(parents=True)
+    (place / "cpu.max").write_text("max 100000")
+    (tmp_path / "job_1" / "cpu.max").write_text("400000 100000")
+    monkeypatch.setattr(Path, "read_text", lambda path: "0::/job_1/step_0\n" if path.name == "cgroup" else read(path))
+    assert cores() == 4
+
+
+def test_control_groups_of_the_first_version(machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    machine.has(16)
+    read = Path.read_text
+    (tmp_path / "cpu" / "docker").mkdir(parents=True)
+    for name, value in (("quota", "200000"), ("period", "100000")):
+        (tmp_path / "cpu" / "docker" / f"cpu.cfs_{name}_us").write_text(value)
+    text = "4:memory:/docker\n2:cpu,cpuacct:/docker\n0::/\n"
+    monkeypatch.setattr(Path, "read_text", lambda path: text if path.name == "cgroup" else read(path))
+    assert cores() == 2
+    (tmp_path / "cpu" / "docker" / "cpu.cfs_quota_us").write_text("-1")
+    assert cores() == 16
+
+
+@pytest.mark.parametrize(
+    ("processors", "role", "large", "processes", "threads_of_torch"),
+    [
+        (2, ACTING, False, 1, 1),  # a small policy: one process, one core
+        (16, ACTING, False, 1, 1),
+        (16, ACTING, False, 8, 1),  # parts of an evaluation
+        (2, ACTING, True, 1, 2),  # size=pi05: all cores
+        (16, ACTING, True, 1, 16),
+        (16, ACTING, True, 4, 4),
+        (2, ACTING, True, 4, 1),
+        (2, LEARNING, False, 1, None),  # torch's own choice
+        (16, LEARNING, False, 1, None),
+        (16, LEARNING, False, 4, 4),  # policies trained at once
+        (2, LEARNING, False, 2, 1),
+    ],
+)
+def test_the_rule(
+    machine: Machine, processors: int, role: str, large: bool, processes: int, threads_of_torch: int | None
+) -> None:
+    machine.has(processors)
+    assert torch_threads(role, processes, large=large) == threads_of_torch
+
+
+def test_hyperthreads_and_quotas(machine: Machine) -> None:
+    machine.has(16, hyperthreads=2)
+    assert torch_threads(ACTING, large=True) == 8
+    machine.has(16, quota="400000 100000")
+    assert torch_threads(ACTING, large=True) == 4
+    assert torch_threads(LEARNING) == 4  # torch would see 16
+
+
+def test_what_simulates_has_one_thread_of_each_library(machine: Machine, environment: dict[str, str]) -> None:
+    machine.has(16)
+    threads.use_threads(ACTING)
+    known = {key: value for key, value in environment.items() if key.endswith(("_NUM_THREADS", "SPINCOUNT"))}
+    assert known == {
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+        "LP_NUM_THREADS": "1",
+        "GOMP_SPINCOUNT": "2000",
+    }
+
+
+@pytest.mark.parametrize("role", [ACTING, LEARNING])
+def test_a_users_own_setting_wins(machine: Machine, environment: dict[str, str], role: str) -> None:
+    machine.has(16)
+    own = {"OMP_NUM_THREADS": "7", "LP_NUM_THREADS": "4", "OPENBLAS_NUM_THREADS": "3", "OMP_WAIT_POLICY": "active"}
+    environment.update(own)
+    for _ in range(2):  # in this process, and in one that it starts
+        threads.use_threads(role)
+        assert {key: environment[key] for key in own} == own
+        assert "GOMP_SPINCOUNT" not in environment
+    before = torch.get_num_threads()
+    limit_torch(2 * LARGE)
+    assert torch.get_num_threads() == before
+
+
+def test_a_process_decides_anew_what_its_parent_has_decided(machine: Machine, environment: dict[str, str]) -> None:
+    machine.has(16)
+    threads.use_threads(ACTING)
+    threads.use_threads(LEARNING)
+    assert "OMP_NUM_THREADS" not in environment
+    assert "GOMP_SPINCOUNT" not in environment
+    environment.update(sharing(4, {}))
+    threads.use_threads(LEARNING)
+    assert environment["OMP_NUM_THREADS"] == "4"
+    assert environment["LP_NUM_THREADS"] == "1"
+
+
+def test_a_large_policy_gets_its_share_once_it_is_known(machine: Machine, environment: dict[str, str]) -> None:
+    machine.has(16)
+    threads.use_threads(ACTING)
+    before = torch.get_num_threads()
+    try:
+        for parameters, beside, found in ((LARGE, 1, 16), (LARGE - 1, 1, 1), (LARGE, 8, 2)):
+            environment[BESIDE] = str(beside)
+            limit_torch(parameters)
+            assert torch.get_num_threads() == found
+    finally:
+        torch.set_num_threads(before)
+
+
+ASK = """
+import sys
+from lerobot_memobench.{module} import {begin}
+{call}
+import torch, os
+print(torch.get_num_threads(), os.environ.get("OPENBLAS_NUM_THREADS"), os.environ.get("LP_NUM_THREADS"))
+"""
+
+
+@pytest.mark.parametrize(
+    ("module", "begin", "call", "found"),
+    [
+        ("settings.lerobot_commands", "load_command", 'load_command("eval")', "1 1 1"),
+        ("cli.memobench", "main", 'main(["tasks", "--help"])', "1 1 1"),
+        ("jobs.processes", "process_pool", "", None),
+    ],
+)
+def test_the_commands_follow_it_before_the_libraries_load(
+    module: str, begin: str, call: str, found: str | None, tmp_path: Path
+) -> None:
+    clean = {key: value for key, value in os.environ.items() if not key.endswith("_NUM_THREADS")}
+    code = ASK.format(module=module, begin=begin, call=call)
+    if found is None:  # a worker of a pool
+        (tmp_path / "asked.py").write_text(
+            "def ask():\n    import torch, os\n    return torch.get_num_threads(), os.environ['LP_NUM_THREADS']\n"
+        )
+        code = (
+            f"import sys\nsys.path.insert(0, {str(tmp_path)!r})\nfrom asked import ask\n"
+            "from lerobot_memobench.jobs.processes import process_pool\n"
+            "if __name__ == '__main__':\n    with process_pool(1) as pool:\n        print(*pool.submit(ask).result())\n"
+        )
+        found = "1 1"
+    (tmp_path / "here.py").write_text(code)
+    done = subprocess.run(
+        [sys.executable, str(tmp_path / "here.py")], env=clean, capture_output=True, text=True, check=True, timeout=300
+    )
+    assert done.stdout.splitlines()[-1] == found
