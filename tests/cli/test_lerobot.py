@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import logging
+import math
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -147,7 +149,7 @@ def test_what_the_user_sets_stays(evaluation: Called) -> None:
 
 
 def test_the_batch_divides_the_episodes(evaluation: Called, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("os.cpu_count", lambda: 16)
+    monkeypatch.setattr("lerobot_memobench.engine.defaults.cores", lambda: 16)
     evaluation.action = log_episodes
     assert main(["eval", "env=memobench", "episodes=9"]) == 0
     assert evaluation.value("eval.batch_size") == "9"
@@ -266,7 +268,7 @@ def test_help_explains_every_short_form(
 
 
 def test_train_as_the_table_says(training: Called, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("os.cpu_count", lambda: 8)
+    monkeypatch.setattr("lerobot_memobench.settings.training.cores", lambda: 8)
     assert main(["train", "policy=memobench_mem", "align=contrastive"]) == 0
     assert training.program == "lerobot-train"
     assert training.flags == [
@@ -278,7 +280,7 @@ def test_train_as_the_table_says(training: Called, monkeypatch: pytest.MonkeyPat
 
 
 def test_few_cores_get_few_loaders(training: Called, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    monkeypatch.setattr("lerobot_memobench.settings.training.cores", lambda: 2)
     assert main(["train", "policy=act"]) == 0
     assert training.value("num_workers") == "2"
 
@@ -305,6 +307,103 @@ def test_a_config_file_brings_its_own(training: Called, in_folder: Path) -> None
     Path("train.yaml").write_text("policy: {type: memobench_mem}\ndataset: {repo_id: a/b}\n")
     assert main(["train", "config_path=train.yaml", "align=semantic"]) == 0
     assert training.flags == ["--config_path=train.yaml", "--policy.align=semantic"]
+
+
+# --- a training is gone on with ---
+
+
+def training_run(folder: Path, steps: int = 100, done: tuple[int, ...] = (40, 80), final_lr: float = 0.1) -> Path:
+    """Write what matters of a training run of LeRobot's; return the folder of its last checkpoint."""
+    from lerobot.configs.default import DatasetConfig
+    from lerobot.configs.train import TrainPipelineConfig
+
+    from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+
+    policy = MemobenchMemConfig(final_lr=final_lr, warmup_fraction=0.1, device="cpu", push_to_hub=False)
+    config = TrainPipelineConfig(dataset=DatasetConfig(repo_id="a/b"), policy=policy, steps=steps, output_dir=folder)
+    config.optimizer, config.scheduler = policy.get_optimizer_preset(), policy.get_scheduler_preset()
+    for step in done:
+        place = folder / "checkpoints" / f"{step:06d}"
+        (place / "pretrained_model").mkdir(parents=True)
+        (place / "training_state").mkdir()
+        (place / "training_state" / "training_step.json").write_text(json.dumps({"step": step}))
+        config.save_pretrained(place / "pretrained_model")
+        (place.parent / "last").unlink(missing_ok=True)
+        (place.parent / "last").symlink_to(place.name)
+    return place / "pretrained_model"
+
+
+def test_a_training_goes_on_by_its_folder(training: Called, capsys: pytest.CaptureFixture[str]) -> None:
+    training_run(Path("run"))
+    # The command that began it, and resume=true behind it.
+    words = ["train", "policy=memobench_mem", "dataset.repo_id=a/b", "output_dir=run", "steps=100", "resume=true"]
+    assert main(words) == 0
+    assert training.flags == [
+        "--config_path=run/checkpoints/last/pretrained_model/train_config.json",
+        "--dataset.repo_id=a/b",
+        "--output_dir=run",
+        "--steps=100",
+        "--resume=true",
+    ]
+    assert capsys.readouterr().err == ""
+    assert main(["train", "config=train_contrastive", "output_dir=run", "--resume=true"]) == 0
+    assert training.value("config_path") == "run/checkpoints/last/pretrained_model/train_config.json"
+    training.flags = None
+    assert main(["train", "config_path=run/checkpoints/000040/pretrained_model/train_config.json", "resume=true"]) == 0
+    assert training.value("config_path") == "run/checkpoints/000040/pretrained_model/train_config.json"
+
+
+def test_a_copy_of_a_run_has_no_link(training: Called) -> None:
+    folder = training_run(Path("run"), done=(40, 80, 120), steps=200)
+    (Path("run") / "checkpoints" / "last").unlink()
+    (folder.parent / "training_state" / "training_step.json").unlink()  # killed while it was saved
+    assert main(["train", "output_dir=run", "resume=true"]) == 0
+    assert training.value("config_path") == "run/checkpoints/000080/pretrained_model/train_config.json"
+
+
+def test_a_longer_schedule_is_told_of(training: Called, capsys: pytest.CaptureFixture[str]) -> None:
+    """A cosine from 1e-4 down to a tenth over 100 steps is stretched to 200 when 80 are done."""
+    from lerobot.configs.train import TrainPipelineConfig
+
+    folder = training_run(Path("run"))
+    peak = TrainPipelineConfig.from_pretrained(folder).optimizer.lr
+
+    def rate(step: int, steps: int) -> float:
+        return peak * (1 - 0.9 * (1 - math.cos(math.pi * step / steps)) / 2)
+
+    assert main(["train", "output_dir=run", "resume=true", "steps=200"]) == 0
+    told = capsys.readouterr().err
+    assert "200 steps instead of 100" in told
+    assert f"at step 80 it jumps from {rate(80, 100):.2e} to {rate(80, 200):.2e}" in told
+    assert f"{rate(199, 200):.2e} at the end" in told
+    shutil.rmtree("run")
+    training_run(Path("run"), final_lr=1.0)  # constant
+    assert main(["train", "output_dir=run", "resume=true", "steps=200"]) == 0
+    assert f"it stays at {peak:.2e} at step 80" in capsys.readouterr().err
+
+
+def test_a_training_that_is_over(training: Called, capsys: pytest.CaptureFixture[str]) -> None:
+    training_run(Path("run"), done=(40, 100))
+    assert main(["train", "output_dir=run", "resume=true"]) == 0
+    assert training.flags is None
+    assert "has made all of its 100 steps; ask for more by steps=" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["output_dir=nowhere"], "output_dir=nowhere does not exist, so there is nothing to go on with"),
+        (["output_dir=empty"], "output_dir=empty holds no whole checkpoint"),
+        ([], "resume=true needs the folder of the training to go on with: output_dir=<folder>"),
+        (["output_dir=run", "policy=act"], "the training in run is of policy=memobench_mem, and policy=act was asked"),
+    ],
+)
+def test_nothing_to_go_on_with(
+    training: Called, capsys: pytest.CaptureFixture[str], words: list[str], message: str
+) -> None:
+    training_run(Path("run"))
+    Path("empty/checkpoints/000010").mkdir(parents=True)
+    assert message in refused(["train", "resume=true", *words], training, capsys)
 
 
 # --- mistakes: one sentence, status 2, LeRobot never called, nothing written ---

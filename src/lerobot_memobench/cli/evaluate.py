@@ -18,6 +18,7 @@ from lerobot_memobench.engine.run import run_evaluation
 from lerobot_memobench.engine.shards import executor_options, plan_shards, run_shards
 from lerobot_memobench.evaluation.documents.report import failure_line, table
 from lerobot_memobench.jobs.executors import asked_for
+from lerobot_memobench.jobs.processes import saying_how_to_go_on
 from lerobot_memobench.settings.reading import read_settings
 from lerobot_memobench.settings.words import Words
 
@@ -39,7 +40,8 @@ def evaluate(words: Words, command: Sequence[str]) -> int:
     if words.wants_help or not is_benchmark(settings, orders):
         return call_lerobot("eval", settings.flags)
     plan = make_plan(settings, orders, command)
-    return evaluate_in_parts(plan) if orders.shards else evaluate_here(plan)
+    with saying_how_to_go_on(lambda: f"lerobot: ended by SIGTERM; go on with: {plan.going_on}"):
+        return evaluate_in_parts(plan) if orders.shards else evaluate_here(plan)
 
 
 def evaluate_here(plan: EvaluationPlan, say_where: bool = True) -> int:

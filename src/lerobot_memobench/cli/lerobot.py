@@ -7,12 +7,15 @@ defaults that make them work as they stand (``engine.planning``, ``settings.trai
 
 from __future__ import annotations
 
+import shlex
 import sys
+import time
 from collections.abc import Iterable, Sequence
 
 from lerobot_memobench.cli.errors import one_sentence
 from lerobot_memobench.engine.lerobot_command import call_lerobot
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.jobs.processes import saying_how_to_go_on
 from lerobot_memobench.settings.lerobot_commands import lerobot_commands
 from lerobot_memobench.settings.reading import check_task_names, read_settings
 from lerobot_memobench.settings.recipes import resolve_recipe
@@ -27,8 +30,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     2.
     """
     words = list(sys.argv[1:] if argv is None else argv)
+    again = f"lerobot: ended by SIGTERM; begin anew with: {shlex.join(['lerobot', *words])}"
     try:
-        return run(words)
+        with saying_how_to_go_on(lambda: again):
+            return run(words)
     except KeyboardInterrupt:
         return 130
     except Exception as error:
@@ -51,7 +56,7 @@ def run(words: Sequence[str]) -> int:
     if rest.wants_help and name in MEANINGS:
         print(help_text(name), flush=True)
     if name == "train":
-        return train(rest)
+        return train(rest, words[1:])
     check_task_names(rest)
     if name == "eval":
         from lerobot_memobench.cli.evaluate import evaluate
@@ -60,11 +65,22 @@ def run(words: Sequence[str]) -> int:
     return call_lerobot(name, read_settings(name, rest).flags)
 
 
-def train(words: Words) -> int:
-    """Run ``lerobot train`` with the benchmark's defaults, checked."""
-    from lerobot_memobench.settings.training import complete_training, take_training_words
+def train(words: Words, line: Sequence[str]) -> int:
+    """Run ``lerobot train`` with the benchmark's defaults, checked.
 
-    prompt_frames, obs_type, words = take_training_words(resolve_recipe(words))
+    Args:
+        line: the words as they were given, for who is to go on with it.
+    """
+    from lerobot_memobench.settings.training import (
+        complete_training,
+        going_on,
+        how_to_go_on,
+        take_training_words,
+        told_of_going_on,
+    )
+
+    begun = time.time()
+    prompt_frames, obs_type, words = take_training_words(resolve_recipe(going_on(words)))
     check_task_names(words)
     settings = read_settings("train", words)
     if words.wants_help:
@@ -72,7 +88,15 @@ def train(words: Words) -> int:
     from lerobot_memobench.engine.lerobot_training import trained_on
 
     settings = complete_training(settings)
-    with trained_on(prompt_frames, obs_type):
+    note, left = told_of_going_on(settings)
+    if note is not None:
+        print(note, file=sys.stderr)
+    if not left:
+        return 0
+    with (
+        saying_how_to_go_on(lambda: f"lerobot: {how_to_go_on(settings, line, begun)}"),
+        trained_on(prompt_frames, obs_type),
+    ):
         return call_lerobot("train", settings.flags)
 
 

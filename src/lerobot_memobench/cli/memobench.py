@@ -6,6 +6,7 @@ imported by the commands that use them, so that the others answer at once.
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
@@ -30,6 +31,7 @@ from lerobot_memobench.cli.simulator import bench, gallery
 from lerobot_memobench.cli.study import study
 from lerobot_memobench.cli.tasks import tasks
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.jobs.processes import saying_how_to_go_on
 from lerobot_memobench.jobs.threads import ACTING, LEARNING, use_threads
 
 __all__ = ["app", "main"]
@@ -71,6 +73,8 @@ COMMANDS: dict[str, tuple[Callable[..., int | None] | tuple[str, typer.Typer], .
 }
 """Group -> its commands, as ``memobench --help`` lists them."""
 
+GO_ON = ("generate", "cache", "convert", "push", "eyes", "learn", "study", "necessity")
+"""Commands that go on when they are given again; any other begins anew."""
 LEARN = ("cache", "eyes", "learn", "study")
 """Commands whose own process trains or encodes; every other simulates, or computes next to nothing."""
 
@@ -117,8 +121,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if argv is None else argv)
     use_threads(LEARNING if words and words[0] in LEARN else ACTING)
+    begins = "go on" if words and words[0] in GO_ON else "begin anew"
+    again = f"memobench: ended by SIGTERM; {begins} with: {shlex.join(['memobench', *words])}"
     try:
-        result = app(args=words, standalone_mode=False, prog_name="memobench")
+        with saying_how_to_go_on(lambda: again):
+            result = app(args=words, standalone_mode=False, prog_name="memobench")
     except MemobenchError as error:
         print(f"memobench: {' '.join(str(error).split())}", file=sys.stderr)
         return USAGE_ERROR

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lerobot_memobench.engine.grid import Grid
 from lerobot_memobench.engine.orders import Orders
-from lerobot_memobench.settings.flags import joined_flags
+from lerobot_memobench.settings.flags import joined_flags, without_flag
 from lerobot_memobench.settings.translation import LerobotSettings
 
 if TYPE_CHECKING:
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 
 OUTPUT = "output_dir"
 LOG = "env.log_dir"
+GOES_ON = ("resume=", f"{OUTPUT}=")
+"""Beginnings of words that say whether, and with what, an evaluation goes on."""
 PATHS = ("policy.path", "env.task_dir", "config_path")
 """Settings that name what is read."""
 
@@ -58,6 +61,13 @@ class EvaluationPlan:
     def draws(self) -> bool:
         """Whether pictures are drawn, as far as is known."""
         return self.environment is None or self.environment.draws
+
+    @property
+    def going_on(self) -> str:
+        """The command line that goes on with it, ready to be typed."""
+        folder = self.output if self.orders.shard is None else self.output.parent
+        words = without_flag([word for word in self.command if not word.startswith(GOES_ON)], OUTPUT)
+        return shlex.join([*words, "resume=true", f"{OUTPUT}={folder}"])
 
     @property
     def lerobot_flags(self) -> list[str]:

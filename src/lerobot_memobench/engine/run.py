@@ -85,8 +85,8 @@ def _run_lerobot(plan: EvaluationPlan, card: dict[str, Any], ranges: Ranges | No
     finally:
         if status and has_log(plan.log):
             tell(
-                f"the episodes that ended are in {plan.log}; `memobench report {plan.log}` reports them, the same "
-                f"command with resume=true output_dir={plan.output} goes on"
+                f"the episodes that ended are in {plan.log}; `memobench report {plan.log}` reports them, "
+                f"`{plan.going_on}` goes on"
             )
 
 

@@ -8,6 +8,12 @@ from typing import Any
 from datatrove.pipeline.base import PipelineStep
 
 from lerobot_memobench.jobs.job import Job
+from lerobot_memobench.jobs.processes import saying_how_to_go_on
+
+PREEMPTED = (
+    "memobench: ended by SIGTERM; what is finished stays, and the job goes on when Slurm requeues it, or when the "
+    "command that submitted it is given again (an evaluation's with resume=true)"
+)
 
 
 class JobsStep(PipelineStep):
@@ -24,11 +30,12 @@ class JobsStep(PipelineStep):
         """Do what is not finished yet of every ``world_size``-th part of the list."""
         yield from data or ()
         count = len(self.jobs)
-        for job in self.jobs[rank * count // world_size : (rank + 1) * count // world_size]:
-            if not job.finished():
-                with self.track_time("job"):
-                    job.run()
-                self.stat_update("jobs")
+        with saying_how_to_go_on(lambda: PREEMPTED):
+            for job in self.jobs[rank * count // world_size : (rank + 1) * count // world_size]:
+                if not job.finished():
+                    with self.track_time("job"):
+                        job.run()
+                    self.stat_update("jobs")
 
 
 class FinishStep(PipelineStep):

@@ -1,4 +1,4 @@
-"""Processes of this machine."""
+"""Processes of this machine: a pool of them, and how one ends that is told to."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ import contextlib
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import wait
+from pathlib import Path
+from types import FrameType
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.job import Job
@@ -61,3 +64,74 @@ def _begin_worker() -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
+
+
+@contextlib.contextmanager
+def saying_how_to_go_on(how: Callable[[], str]) -> Iterator[None]:
+    """While this lasts, SIGTERM (a job is preempted, its time is up) ends this process and all that it has started.
+
+    Nothing is waited for: what is on the disk is whole, as after any kill. In another thread than the main one, and
+    where somebody else handles the signal, nothing changes.
+
+    Args:
+        how: returns what is said on stderr. An inner one takes the place of an outer one meanwhile.
+    """
+    own = os.getpid()
+
+    def end(number: int, frame: FrameType | None) -> None:
+        if os.getpid() != own:  # a process that was forked from this one
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+            return
+        try:
+            os.write(2, f"{how()}\n".encode())  # no stream: the signal may have come while one was being written to
+        finally:
+            _kill_descendants()
+            os._exit(128 + number)
+
+    before = signal.getsignal(signal.SIGTERM) if threading.current_thread() is threading.main_thread() else None
+    if before is not signal.SIG_DFL and getattr(before, "__qualname__", None) != end.__qualname__:
+        yield
+        return
+    signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _kill_descendants() -> None:
+    """Kill every process that descends from this one; each is stopped first, so that none starts another meanwhile."""
+    if sys.platform != "linux":
+        for child in multiprocessing.active_children():
+            child.kill()
+        return
+    stopped: set[int] = set()
+    while new := _descendants(os.getpid()) - stopped:
+        for pid in new:
+            _send(pid, signal.SIGSTOP)
+        stopped |= new
+    for pid in stopped:
+        _send(pid, signal.SIGKILL)
+
+
+def _send(pid: int, number: int) -> None:
+    with contextlib.suppress(OSError):
+        os.kill(pid, number)
+
+
+def _descendants(root: int) -> set[int]:
+    """Return the processes that descend from one, but for multiprocessing's own tracker, which ends last and tidies."""
+    children: dict[int, list[int]] = {}
+    for folder in Path("/proc").iterdir():
+        if folder.name.isdecimal():
+            with contextlib.suppress(OSError):
+                parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+                if b"resource_tracker" not in (folder / "cmdline").read_bytes():
+                    children.setdefault(parent, []).append(int(folder.name))
+    found: set[int] = set()
+    waiting = [root]
+    while waiting:
+        waiting += (new := children.get(waiting.pop(), []))
+        found.update(new)
+    return found

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,8 +11,11 @@ from lerobot_memobench.datasets.lerobot_format import DEFAULT_REPO_ID
 from lerobot_memobench.envs.obs_types import OBS_TYPES
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.jobs.threads import cores
+from lerobot_memobench.policies.checkpoint import checkpoint_folder, checkpoint_type, read_json
 from lerobot_memobench.settings.configurations import check_sight, env_config, policy_config
 from lerobot_memobench.settings.fields import checked_value
+from lerobot_memobench.settings.flags import whole_number, without_flag
+from lerobot_memobench.settings.lerobot_commands import quiet
 from lerobot_memobench.settings.short_forms import TRAINING_WORDS
 from lerobot_memobench.settings.translation import LerobotSettings
 from lerobot_memobench.settings.words import Words
@@ -19,6 +24,9 @@ INFO_FILE = Path("meta") / "info.json"
 OBJECT_BATCH = 72
 """Frames per update of a policy that sees objects, or through eyes: a dozen episodes, six moments of each. They lie in
 main memory, where no loader would be quicker."""
+TRAIN_CONFIG = "train_config.json"
+"""LeRobot's file of a training's whole configuration, in each of its checkpoints."""
+TRAINING_STEP = Path("training_state") / "training_step.json"
 TRAINED = ("policy.type", "policy.path", "reward_model.type", "reward_model.path")
 """What may say what is trained."""
 
@@ -41,6 +49,149 @@ def take_training_words(words: Words) -> tuple[bool | None, str | None, Words]:
     return wanted, obs_type, replace(words, settings=rest)
 
 
+def going_on(words: Words) -> Words:
+    """Return what LeRobot goes on with a training by, where ``output_dir=<run> resume=true`` asks for that.
+
+    LeRobot wants the configuration in the run's last checkpoint named. That holds all that was set when the run began;
+    what is given again, or changed, on the line counts before it.
+
+    Raises:
+        MemobenchError: there is nothing to go on with, or another policy is named than that of the run.
+    """
+    wanted = words.value("resume")
+    if wanted is None or checked_value("resume", bool, wanted) != "true":
+        return words
+    stated = words.value("config_path")
+    if stated is not None and Path(stated).name in (TRAIN_CONFIG, "pretrained_model"):
+        return words  # LeRobot's own form
+    folder = words.value("output_dir")
+    if folder is None:
+        raise MemobenchError("resume=true needs the folder of the training to go on with: output_dir=<folder>")
+    checkpoint = last_checkpoint(Path(folder).expanduser())
+    _check_same_policy(words, checkpoint, folder)
+    begun = ("config_path", "config", "policy")
+    flags = list(words.flags)
+    for key in ("config_path", "policy.path", "policy.type"):
+        flags = without_flag(flags, key)
+    chosen = ("policy.path", "policy.type")
+    settings = [(key, value) for key, value in words.settings if key not in (*begun, *chosen)]
+    return replace(words, settings=[("config_path", str(checkpoint / TRAIN_CONFIG)), *settings], flags=flags)
+
+
+def last_checkpoint(run: Path) -> Path:
+    """Return the folder ``pretrained_model`` of the last whole checkpoint of a training run.
+
+    Raises:
+        MemobenchError: there is none.
+    """
+    checkpoints = run / "checkpoints"
+    numbered = sorted(
+        (path for path in checkpoints.glob("*") if path.name.isdecimal()), key=lambda path: int(path.name)
+    )
+    # The link is set once a checkpoint is whole; a copy of the run may lack it.
+    for folder in (checkpoints / "last", *reversed(numbered)):
+        if (folder / "pretrained_model" / TRAIN_CONFIG).is_file() and (folder / TRAINING_STEP).is_file():
+            return folder / "pretrained_model"
+    what = "holds no whole checkpoint" if run.is_dir() else "does not exist"
+    raise MemobenchError(
+        f"output_dir={run} {what}, so there is nothing to go on with; a first one is saved after save_freq steps: "
+        "leave resume=true out and name a new folder"
+    )
+
+
+def _check_same_policy(words: Words, checkpoint: Path, folder: str) -> None:
+    """Refuse to go on with another type of policy than the run's."""
+    begun = (read_json(checkpoint / TRAIN_CONFIG).get("policy") or {}).get("type")
+    named = words.value("policy") or words.value("policy.type")
+    where = None if named is None else checkpoint_folder(named)
+    kind = named if where is None else checkpoint_type(str(where))
+    if kind is not None and begun is not None and "/" not in kind and kind != begun:
+        raise MemobenchError(f"the training in {folder} is of policy={begun}, and policy={named} was asked for")
+
+
+def schedule_told(checkpoint: Path, steps: int | None) -> str | None:
+    """Return what another number of steps does to the learning rate of a training that goes on; None: nothing.
+
+    LeRobot makes the schedule anew for the new number and goes on in it at the step that was reached.
+
+    Args:
+        checkpoint: the folder ``pretrained_model`` that is gone on with.
+        steps: those asked for; None: as many as before.
+    """
+    from lerobot.configs.train import TrainPipelineConfig
+    from torch import nn, optim
+
+    with quiet():
+        begun = TrainPipelineConfig.from_pretrained(checkpoint)
+        if steps is None or steps == begun.steps or begun.scheduler is None or begun.optimizer is None:
+            return None
+        peak = float(getattr(begun.optimizer, "lr", 1.0))
+        rates = []
+        for total in (begun.steps, steps):
+            weights = optim.SGD(nn.Linear(1, 1).parameters(), lr=peak)
+            made = begun.scheduler.build(weights, total)
+            rates.append(getattr(made, "lr_lambdas", [None])[0])
+    before, after = rates
+    done = step_reached(checkpoint)
+    if before is None or after is None:
+        return f"note: {begun.scheduler.type} is made anew for {steps} steps instead of {begun.steps}"
+    old, new, last = (peak * rate(step) for rate, step in ((before, done), (after, done), (after, steps - 1)))
+    if f"{old:.2e}" == f"{new:.2e}":
+        told = f"it stays at {new:.2e} at step {done}"
+    else:
+        told = f"at step {done} it jumps from {old:.2e} to {new:.2e}"
+    return (
+        f"note: {steps} steps instead of {begun.steps} make the schedule of the learning rate "
+        f"({begun.scheduler.type}) anew: {told} and is {last:.2e} at the end"
+    )
+
+
+def told_of_going_on(settings: LerobotSettings) -> tuple[str | None, bool]:
+    """Return what is said of a training that goes on (None: nothing), and whether anything is left to be done."""
+    path = settings.get("config_path")
+    if settings.get("resume") != "true" or path is None or not Path(path).exists():
+        return None, True
+    checkpoint = Path(path).expanduser() if Path(path).is_dir() else Path(path).expanduser().parent
+    steps = whole_number(settings.get("steps"))
+    total, done = (
+        steps or whole_number(str(read_json(checkpoint / TRAIN_CONFIG).get("steps"))),
+        step_reached(checkpoint),
+    )
+    if total is not None and done >= total:
+        return (
+            f"the training in {checkpoint.parents[2]} has made all of its {done} steps; ask for more by steps=",
+            False,
+        )
+    return schedule_told(checkpoint, steps), True
+
+
+def how_to_go_on(settings: LerobotSettings, words: Sequence[str], begun: float) -> str:
+    """Return what is said when a training is ended from outside: the command that goes on with its last checkpoint.
+
+    Args:
+        words: of its command line, after ``lerobot train``.
+        begun: when it began, seconds since the epoch: LeRobot itself names a folder that was not named.
+    """
+    given = settings.get("output_dir")
+    runs = [Path(given)] if given is not None else list(Path("outputs/train").glob("*/*"))
+    links = [run / "checkpoints" / "last" for run in runs]
+    saved = [link for link in links if link.exists() and (given is not None or link.lstat().st_mtime >= begun)]
+    if not saved:
+        again = shlex.join(["lerobot", "train", *words])
+        return f"ended by SIGTERM before a checkpoint was saved; begin anew with: {again}"
+    run = max(saved, key=lambda link: link.lstat().st_mtime).parents[1]
+    # LeRobot's configuration has no place for these.
+    kept = [word for word in words if word.partition("=")[0] in TRAINING_WORDS]
+    return (
+        f"ended by SIGTERM; go on with: {shlex.join(['lerobot', 'train', f'output_dir={run}', 'resume=true', *kept])}"
+    )
+
+
+def step_reached(checkpoint: Path) -> int:
+    """Return after how many steps a checkpoint was saved."""
+    return int(read_json(checkpoint.parent / TRAINING_STEP)["step"])
+
+
 def complete_training(settings: LerobotSettings) -> LerobotSettings:
     """Return a training run's settings with the benchmark's defaults; what is wrong with them is told here.
 
@@ -55,7 +206,8 @@ def complete_training(settings: LerobotSettings) -> LerobotSettings:
     check_dataset(settings)
     policy = policy_config(settings)
     check_sight(policy, env_config(settings))
-    settings = with_logging(settings)
+    if settings.get("resume") != "true":
+        settings = with_logging(settings)
     if not from_file and getattr(policy, "decodes_nothing", False):
         settings = settings.default("batch_size", OBJECT_BATCH).default("num_workers", 0)
     if cores() < 4 and not from_file:  # LeRobot's default of 4 loaders would only wait for one another
