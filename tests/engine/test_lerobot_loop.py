@@ -19,7 +19,7 @@ from lerobot.scripts import lerobot_eval
 from lerobot_memobench.engine.loop import rollout as our_loop
 from lerobot_memobench.engine.loop import steering
 from lerobot_memobench.engine.loop.looking import KNOWN
-from lerobot_memobench.engine.loop.rollout import KEEPS_FRAMES
+from lerobot_memobench.engine.loop.rollout import KEEPS_FRAMES, RECORDS
 from lerobot_memobench.engine.loop.steering import batch_seed, steered
 from lerobot_memobench.errors import MemobenchError
 
@@ -48,6 +48,7 @@ PARAMETERS = {
         "policy": "_seeded() seeds its generators",
         "seeds": "_seeded() knows the batch by its first one",
         **dict.fromkeys(KEEPS_FRAMES, "sparing() leaves LeRobot's own loop to it"),
+        **dict.fromkeys(RECORDS, "sparing() records the batch by it"),
         "preprocessor": "sparing() takes observations through it",
         "postprocessor": "sparing() takes actions through it",
         "env_preprocessor": "sparing() takes observations through it",
@@ -175,7 +176,7 @@ def test_lerobot_renders_no_films_of_its_own(ranges: Any, monkeypatch: pytest.Mo
 
 
 def test_what_keeps_frames_is_left_to_lerobots_loop(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where not only the policy looks: a recording, a world model's videos, observations that are returned."""
+    """Where not only the policy looks: a world model's videos, observations that are returned."""
     calls: list[dict[str, Any]] = []
     monkeypatch.setattr(lerobot_eval, "rollout", lambda env, policy, **settings: calls.append(settings))
     with steered(None):

@@ -169,6 +169,7 @@ class MemobenchEnvConfig(EnvConfig):
         from lerobot_memobench.envs.resuming import skip_logged
 
         chosen = self.selected()  # before anything is written: a wrong name leaves nothing behind
+        _check_recording(n_envs, self.obs_type)
         _use_threads()
         use_async_envs = use_async_envs and n_envs > 1
         if use_async_envs:
@@ -214,6 +215,28 @@ class MemobenchEnvConfig(EnvConfig):
         # The configuration of an environment does not hold the run's output folder; LeRobot's parser tells it.
         output = parser.parse_arg("output_dir")
         return Path(output) if output else Path("outputs/eval") / f"{datetime.now():%Y-%m-%d/%H-%M-%S}_memobench"
+
+
+def _check_recording(rows: int, obs_type: str) -> None:
+    """Refuse what LeRobot's own recorder cannot: pictures, and a second batch; `lerobot eval` has another.
+
+    Raises:
+        MemobenchError: plain ``lerobot-eval`` was asked for it.
+    """
+    from lerobot.configs import parser
+
+    if (parser.parse_arg("eval.recording") or "").lower() != "true":
+        return
+    script = sys.modules.get("lerobot.scripts.lerobot_eval")
+    if hasattr(getattr(script, "rollout", None), "__wrapped__"):  # `lerobot eval`, which lays its loop around LeRobot's
+        return
+    episodes = parser.parse_arg("eval.n_episodes") or "50"
+    if obs_type != OBJECTS or (episodes.isdecimal() and int(episodes) > rows):
+        raise MemobenchError(
+            "eval.recording=true was asked of plain lerobot-eval, whose recorder takes neither pictures of this "
+            "environment nor more episodes than run at once; `lerobot eval env=memobench eval.recording=true` records "
+            "both"
+        )
 
 
 def _use_threads() -> None:

@@ -1,6 +1,7 @@
 """LeRobot's loop over control steps, in which pictures are drawn and converted only for a policy that looks at them.
 
-It takes the same steps in the same order as ``lerobot_eval.rollout`` and returns the same tensors. Between two looks a
+It takes the same steps in the same order as ``lerobot_eval.rollout`` and returns the same tensors, and records what a
+dataset is asked for of (`recording`). Between two looks a
 policy is handed the pictures and objects that it saw last, which it has said it will not read; everything else of an
 observation is of the present.
 """
@@ -8,7 +9,9 @@ observation is of the present.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,12 +23,15 @@ from numpy.typing import NDArray
 from tqdm import trange
 
 from lerobot_memobench.engine.loop.looking import looking
+from lerobot_memobench.engine.loop.recording import Recorder
 from lerobot_memobench.jobs.threads import limit_torch
 
 PIXELS, PHASE = "pixels", "phase"
 """Of an observation: what is left out when nobody looks; 0 while the prompt plays, 1 in execution."""
-KEEPS_FRAMES = ("return_observations", "render_callback", "recording_dir", "predicted_latents_callback")
+KEEPS_FRAMES = ("return_observations", "render_callback", "predicted_latents_callback")
 """Settings of LeRobot's rollout that make use of every frame, or of what only its own loop does."""
+RECORDS = ("recording_dir", "env_features", "recording_repo_id", "recording_private")
+"""Settings by which a rollout is recorded as a dataset; see `recording`."""
 
 Processor = Callable[[Any], Any]
 
@@ -74,7 +80,7 @@ def sparing(
 
     @functools.wraps(rollout)
     def run(env: Any, policy: Any, *args: Any, **settings: Any) -> dict[str, Any]:
-        limit_torch(sum(parameter.numel() for parameter in policy.parameters()))
+        limit_torch(sum(parameter.numel() for parameter in getattr(policy, "parameters", tuple)()))
         if args or any(settings.get(name) for name in KEEPS_FRAMES):
             return rollout(env, policy, *args, **settings)
         return _roll(env, policy, settings, quiet=hides_progress())
@@ -88,17 +94,21 @@ def _roll(env: Any, policy: Any, settings: dict[str, Any], quiet: bool) -> dict[
     observation, _ = env.reset(seed=settings.get("seeds"), options={NEW_ROLLOUT_OPTION: True})
     limit = env.call("_max_episode_steps")[0]
     check_env_attributes_and_types(env)
-    eyes = Eyes(env, looking(policy))
     done = ever = np.zeros(env.num_envs, bool)
     steps: list[tuple[NDArray[Any], ...]] = []
-    with trange(limit, desc=f"Running rollout with at most {limit} steps", disable=quiet, leave=False) as bar:
+    bar = trange(limit, desc=f"Running rollout with at most {limit} steps", disable=quiet, leave=False)
+    with bar, _recorder(env, settings) as recorder:
+        eyes = Eyes(env, looking(policy) if recorder is None else lambda: True)
         while not done.all() and len(steps) < limit:
-            action = _act(env, policy, settings, eyes.see(observation))
+            before, seen = observation, eyes.see(observation)
+            action = _act(env, policy, settings, seen)
             eyes.announce()
             observation, reward, terminated, truncated, info = env.step(action)
             success = _successes(info, env.num_envs)
             done = terminated | truncated | done | (len(steps) + 1 == limit)
             ever = ever | success
+            if recorder is not None:
+                recorder.add(before, action, reward, success, done, seen["task"])
             steps.append((action, reward, success, done))
             bar.set_postfix({"running_success_rate": f"{ever.mean() * 100:.1f}%"}, refresh=False)
             bar.update()
@@ -106,6 +116,21 @@ def _roll(env: Any, policy: Any, settings: dict[str, Any], quiet: bool) -> dict[
         policy.use_original_modules()
     stacked = (torch.from_numpy(np.stack(parts, axis=1)) for parts in zip(*steps, strict=True))
     return dict(zip((ACTION, "reward", "success", "done"), stacked, strict=True))
+
+
+@contextmanager
+def _recorder(env: Any, settings: Mapping[str, Any]) -> Iterator[Recorder | None]:
+    """Yield what records the batch, None where nothing does; what it has recorded is whole when this ends."""
+    folder, features, repository, private = (settings.get(name) for name in RECORDS)
+    if folder is None or features is None:
+        yield None
+        return
+    fps = env.unwrapped.metadata["render_fps"]
+    recorder = Recorder(Path(folder), features, env.num_envs, fps, repository, bool(private))
+    try:
+        yield recorder
+    finally:
+        recorder.close()
 
 
 def _act(env: Any, policy: Any, through: Mapping[str, Processor], seen: dict[str, Any]) -> NDArray[np.float32]:
