@@ -208,12 +208,23 @@ def test_slurm_gets_a_job_per_part_and_one_that_merges(
     monkeypatch.setenv("PATH", f"{tools}{os.pathsep}{os.environ['PATH']}")
     monkeypatch.setenv("SBATCH_LOG", str(log))
     options = ["executor=slurm", "executor_option=partition=gpu", "executor_option=time=08:00:00"]
+    options += ["executor_option=account=lab", "executor_option=requeue=false"]
     assert lerobot([*COMMAND, "output_dir=out", "shards=4", "workers=2", *options]) == 0
-    assert "jobs are submitted" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "jobs are submitted" in told
+    assert "each job asks for 2 cores, 8 GB, no GPU, account=lab;" in told
     assert here.ran == []
     script = log.read_text()
-    for line in ("#SBATCH --partition=gpu", "#SBATCH --array=0-3%2", "--dependency=afterok:4711"):
+    for line in (
+        "#SBATCH --partition=gpu",
+        "#SBATCH --array=0-3%2",
+        "--dependency=afterok:4711",
+        "#SBATCH --account=lab",
+        "#SBATCH --cpus-per-task=2",
+        "#SBATCH --mem-per-cpu=4G",
+    ):
         assert line in script, line
+    assert "requeue" not in script
     for part, ranks in (("make", range(4)), ("finish", range(1))):
         for rank in ranks:
             monkeypatch.setenv("SLURM_ARRAY_TASK_ID", str(rank))

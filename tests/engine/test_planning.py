@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shlex
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from lerobot_memobench.engine.grid import Shard
 from lerobot_memobench.engine.plan_card import card_of
 from lerobot_memobench.engine.planning import plan_line
 from lerobot_memobench.engine.resume import remainder
+from lerobot_memobench.engine.shards import executor_options, plan_shards
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.errors import MemobenchError
@@ -164,3 +166,60 @@ def test_what_is_left_is_a_plan_of_its_own() -> None:
 def test_going_on_needs_a_folder() -> None:
     with pytest.raises(MemobenchError, match="output_dir=<folder>"):
         plan_line([*LINE, "resume=true"])
+
+
+@pytest.mark.parametrize("here", [False, True], ids=["without a GPU", "with one"])
+def test_the_device_is_decided_where_the_episodes_are_run(here: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not on the login node that hands the parts to Slurm; each part decides on its own machine."""
+    monkeypatch.setattr("torch.cuda.is_available", lambda: here)
+    monkeypatch.setattr("torch.backends.mps.is_available", lambda: False)
+    slurm = ["shards=2", "executor=slurm", "executor_option=partition=a", "executor_option=time=1:00"]
+    for parts in (slurm, ["shards=2"]):
+        (job, _) = plan_shards(plan_line([*LINE, "output_dir=out", *parts]), ("-m", "part"), print)
+        assert not any("policy.device" in word for word in job.words)
+        assert (job.beside == 2) is (parts != slurm)  # a node of its own, or this one
+    assert plan_line([*LINE, "shard=1/2", "output_dir=out"]).settings.get("policy.device") == (None if here else "cpu")
+    (job, _) = plan_shards(plan_line([*LINE, "output_dir=out", "device=cuda", *slurm]), ("-m", "part"), print)
+    assert "--policy.device=cuda" in job.words  # what a user says stays
+
+
+def test_a_login_node_needs_no_gl_library(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setattr("ctypes.util.find_library", lambda name: None)
+    slurm = ["executor=slurm", "executor_option=partition=a", "executor_option=time=1:00"]
+    assert plan_line([*LINE, "output_dir=out", "shards=2", *slurm]).draws
+    with pytest.raises(MemobenchError, match="libegl1"):
+        plan_line([*LINE, "output_dir=out", "shards=2"])
+
+
+@pytest.mark.parametrize(
+    ("parameters", "words", "needs"),
+    [
+        (900_000, [], (2, 4, 0)),
+        (3_500_000_000, [], (2, 18, 1)),  # 14 GB of weights, twice, beside 8 GB
+        (900_000, ["device=cuda"], (2, 4, 1)),
+        (3_500_000_000, ["device=cpu"], (2, 18, 0)),
+    ],
+)
+def test_a_part_on_slurm_asks_for_what_its_policy_needs(
+    parameters: int, words: list[str], needs: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("lerobot_memobench.engine.shards.parameters_of", lambda path: parameters)
+    slurm = ["executor=slurm", "executor_option=partition=a", "executor_option=time=1:00"]
+    line = [*LINE[:3], "policy=memobench_small", "obs_type=environment_state_agent_pos", *words]
+    options = executor_options(plan_line([*line, "output_dir=out", "shards=2", *slurm]))
+    assert (options["cpus_per_task"], options["mem_per_cpu_gb"], options["gpus_per_task"]) == needs
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        (["shard=2/4", "output_dir=out"], ["shard=2/4", "resume=true", "output_dir=out"]),
+        (["--output_dir", "my out", "resume=false"], ["resume=true", "output_dir=my out"]),
+    ],
+)
+def test_the_command_that_goes_on(words: list[str], found: list[str]) -> None:
+    plan = plan_line([*LINE, *words])
+    assert shlex.split(plan.going_on) == ["lerobot", "eval", *LINE, *found]
+    again = plan_line(shlex.split(plan.going_on)[2:])
+    assert (again.log, again.orders.resume) == (plan.log, True)

@@ -45,6 +45,55 @@ def mujoco_renderer(gl: str, monkeypatch: pytest.MonkeyPatch) -> type[mujoco.Ren
     return mujoco.Renderer
 
 
+GPUS = {0: 2, 1: 0, 2: 3, 3: 1}
+"""CUDA's number of each GPU -> EGL's, whose order is its own."""
+
+
+@pytest.mark.parametrize(
+    ("environment", "number"),
+    [
+        ({}, None),  # one process, nothing said: as MuJoCo chooses
+        ({"CUDA_VISIBLE_DEVICES": "2"}, 3),
+        ({"CUDA_VISIBLE_DEVICES": "1,3"}, 0),
+        ({"CUDA_VISIBLE_DEVICES": "1,3", "LOCAL_RANK": "1"}, 1),
+        ({"CUDA_VISIBLE_DEVICES": "1,3", "SLURM_LOCALID": "2"}, 0),
+        ({"SLURM_LOCALID": "3"}, 1),
+        ({"SLURM_LOCALID": "5"}, 0),
+        ({"LOCAL_RANK": "2", "SLURM_LOCALID": "0"}, 3),
+        ({"CUDA_VISIBLE_DEVICES": "GPU-1f0c,GPU-2f0c", "LOCAL_RANK": "1"}, None),
+        ({"CUDA_VISIBLE_DEVICES": ""}, None),
+        ({"CUDA_VISIBLE_DEVICES": "7"}, None),
+    ],
+)
+def test_ranks_draw_on_their_own_gpus(
+    environment: dict[str, str], number: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("CUDA_VISIBLE_DEVICES", *rendering.RANKS):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    assert rendering.egl_device(GPUS) == number
+    assert rendering.egl_device({}) is None  # no GPU that EGL could draw on
+
+
+@pytest.mark.parametrize("number", [0, 99])
+def test_a_device_that_cannot_be_opened_is_no_reason_not_to_draw(number: int) -> None:
+    """The one that the rank says is taken, if MuJoCo can; else another one. In a process without a context yet."""
+    if gl_backend() != "egl":
+        pytest.skip("MUJOCO_GL is not egl")
+    code = (
+        "import os\nfrom lerobot_memobench.sim import rendering\n"
+        f"rendering._cuda_devices = lambda egl: {{0: {number}}}\n"
+        "print(rendering.renderer_name(), 'MUJOCO_EGL_DEVICE_ID' in os.environ)\n"
+    )
+    environment = {key: value for key, value in os.environ.items() if key != "MUJOCO_EGL_DEVICE_ID"}
+    environment |= {"CUDA_VISIBLE_DEVICES": "0"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True, timeout=120
+    )
+    assert done.stdout.split()[-1] == "False"
+
+
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_frame(gl: str, simulate: Simulate, camera: str) -> None:
     frame = simulate().render(camera)

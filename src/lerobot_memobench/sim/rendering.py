@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import atexit
+import ctypes
 import ctypes.util
 import os
 import threading
 from collections import OrderedDict
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +24,14 @@ Image = NDArray[np.uint8]
 
 BACKENDS = {"egl": "EGL", "osmesa": "OSMesa"}
 """MuJoCo's headless backends and the system library each needs."""
+
+
+DEVICE_ID = "MUJOCO_EGL_DEVICE_ID"
+"""MuJoCo's variable for EGL's number of the device to draw on; a user's own choice stays."""
+RANKS = ("LOCAL_RANK", "SLURM_LOCALID", "OMPI_COMM_WORLD_LOCAL_RANK")
+"""Variables that may tell the rank of a process on its node."""
+CUDA_DEVICE = 0x323A
+"""EGL_CUDA_DEVICE_NV: CUDA's number of an EGL device."""
 
 
 @dataclass(frozen=True)
@@ -95,12 +105,15 @@ def _gl_context(width: int, height: int) -> Any:
     os.environ["MUJOCO_GL"] = backend
     try:
         if backend == "egl":
-            from mujoco.egl import GLContext
+            context = _egl_context(width, height)
         elif backend == "osmesa":
             from mujoco.osmesa import GLContext
+
+            context = GLContext(width, height)
         else:
-            from mujoco.glfw import GLContext
-        context = GLContext(width, height)
+            from mujoco import glfw
+
+            context = glfw.GLContext(width, height)
         context.make_current()
         return context
     except Exception as error:  # each backend fails in its own way: missing driver, no device, no display
@@ -109,6 +122,58 @@ def _gl_context(width: int, height: int) -> Any:
             f"the GL backend {backend!r} could not open a context ({error}); try MUJOCO_GL={other}, and see "
             "`memobench doctor`"
         ) from error
+
+
+def _egl_context(width: int, height: int) -> Any:
+    """Return an EGL context on the GPU of this process's rank, or on the first device that MuJoCo can open."""
+    from mujoco import egl
+
+    number = None if DEVICE_ID in os.environ or egl.EGL_DISPLAY is not None else egl_device(_cuda_devices(egl))
+    if number is not None:
+        os.environ[DEVICE_ID] = str(number)
+        try:
+            return egl.GLContext(width, height)
+        except Exception:  # it may be another job's
+            egl.EGL_DISPLAY = None
+        finally:
+            del os.environ[DEVICE_ID]
+    return egl.GLContext(width, height)
+
+
+def egl_device(devices: Mapping[int, int]) -> int | None:
+    """Return the number among EGL's devices of the GPU that this process draws on; None: as MuJoCo chooses.
+
+    EGL knows nothing of CUDA_VISIBLE_DEVICES: by itself every process of a node would draw on the node's first GPU.
+    Where a process sees several, those of a node take turns by their rank on it.
+
+    Args:
+        devices: CUDA's number of each GPU -> EGL's.
+    """
+    told = os.environ.get("CUDA_VISIBLE_DEVICES")
+    rank = next((os.environ[name] for name in RANKS if os.environ.get(name, "").isdecimal()), None)
+    if not devices or (told is None and rank is None):
+        return None
+    seen = (
+        [part.strip() for part in told.split(",")] if told is not None else [str(device) for device in sorted(devices)]
+    )
+    picked = seen[int(rank or 0) % len(seen)]
+    return devices.get(int(picked)) if picked.isdecimal() else None  # a name such as GPU-1f0c… says nothing to EGL
+
+
+def _cuda_devices(egl: Any) -> dict[int, int]:
+    """Return CUDA's number of each GPU -> its number among EGL's devices; {} where the driver tells none."""
+    try:
+        address = egl.EGL.eglGetProcAddress("eglQueryDeviceAttribEXT")
+        query = ctypes.CFUNCTYPE(ctypes.c_uint, ctypes.c_void_p, ctypes.c_int, ctypes.POINTER(ctypes.c_ssize_t))(
+            address
+        )
+        found, told = {}, ctypes.c_ssize_t()
+        for number, device in enumerate(egl.EGL.eglQueryDevicesEXT()):
+            if query(device, CUDA_DEVICE, told):
+                found[int(told.value)] = number
+    except Exception:  # each driver lacks it in its own way; MuJoCo then finds a device by itself
+        return {}
+    return found
 
 
 @dataclass(frozen=True)
