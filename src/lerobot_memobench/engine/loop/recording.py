@@ -85,7 +85,7 @@ class Recorder:
             if not dataset.has_pending_frames() and done[row]:
                 self._over[row] = True  # an episode that the log held already: it rests, and ends at its first step
                 continue
-            frame = {name: _value(observation, key, row) for key, name in self._names.items()}
+            frame: dict[str, Any] = {name: _value(observation, key, row) for key, name in self._names.items()}
             frame |= {PHASE: np.asarray(observation[PHASE][row], np.int64), ACTION: action[row], "task": tasks[row]}
             frame["next.reward"] = np.array([reward[row]], np.float32)
             frame |= {"next.success": np.array([success[row]]), "next.done": np.array([done[row]])}
