@@ -32,6 +32,8 @@ def unsupported_system() -> str:
 def nearest(given: str, known: Iterable[str], count: int = 3) -> str:
     """Return a hint that names the known words nearest to ``given``, or all of them when few."""
     words = sorted(known)
+    if not words:
+        return "there is none"
     close = difflib.get_close_matches(given, words, n=count, cutoff=0.4)
     if close:
         return "did you mean " + " or ".join(repr(word) for word in close) + "?"

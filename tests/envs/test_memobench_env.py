@@ -329,15 +329,6 @@ def test_log_holds_the_finished_episodes(tmp_path: Path) -> None:
     assert record["failure"] == "storage_failure"
 
 
-def test_seeds_go_on_by_themselves() -> None:
-    env = make(STOVE)
-    env.reset()
-    assert env.episode.seed == 7
-    env.reset()
-    assert env.episode.seed == 8
-    env.close()
-
-
 def test_render_is_annotated() -> None:
     env = make(STOVE)
     env.reset(seed=7)

@@ -27,7 +27,6 @@ from lerobot_memobench.errors import MemobenchError
         ),
         ({"actions": np.zeros((10, 8))}, r"actions of shape \(10, 8\); expected finite numbers of shape \(steps, 7\)"),
         ({"actions": np.zeros((2, 10, 7))}, r"actions of shape \(2, 10, 7\)"),
-        ({"actions": np.full((10, 7), np.nan)}, "NaN or infinite"),
         ({"actions": ["a"]}, "no numbers"),
         ({"action": 1}, r"without 'actions' \(it holds action\)"),
         ({"actions": np.zeros((3, 7))}, "answers 3 actions at a time, fewer than the 5.*replan=3 or less"),
@@ -41,6 +40,16 @@ def test_a_wrong_answer_is_named(answer: Any, told: str) -> None:
             policy.select_action(batch(0))
     assert "\n" not in str(caught.value)
     assert f"ws://127.0.0.1:{server.port}" in str(caught.value)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("gripper", ["rlds", None])
+def test_what_is_not_finite_is_passed_on(value: float, gripper: str | None) -> None:
+    """The environment ends the episode with it; here it would end all of them."""
+    with PolicyServer(lambda question: {"actions": np.full((10, 7), value)}) as server:
+        action = make(server, gripper=gripper).select_action(batch(0))
+    assert action.shape == (1, 7)
+    assert not torch.isfinite(action).any()
 
 
 def test_a_server_that_is_not_there_is_told() -> None:

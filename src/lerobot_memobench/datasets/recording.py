@@ -186,6 +186,8 @@ class _Tape:
 
 
 def _failure_reason(demo: Demonstration, episode: Episode) -> str | None:
+    if episode.fault is not None:
+        return episode.fault.why
     if episode.prompt_shown is False:
         return "the prompt video did not show what it had to"
     if not demo.success:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from lerobot_memobench.engine.card import remove_card
 from lerobot_memobench.engine.plan import EvaluationPlan
-from lerobot_memobench.envs.episode_log import has_log, read_episodes
+from lerobot_memobench.envs.episode_log import has_log, read_log
 from lerobot_memobench.envs.protocol import PROTOCOL_FILE
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.files import remove_drafts
@@ -35,10 +35,10 @@ def check_folder(folder: Path) -> None:
 
 
 def logged(folder: Path, referent: str) -> set[tuple[str, int]]:
-    """Return (task, episode) of the episodes in a folder's log."""
+    """Return (task, episode) of the episodes in a folder's log, those included that could not be run."""
     if not has_log(folder):
         return set()
-    records = read_episodes(folder)
+    records = read_log(folder)
     return {(record["task"], record["episode"]) for record in records if record.get("referent", "fixed") == referent}
 
 

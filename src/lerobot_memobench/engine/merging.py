@@ -12,7 +12,7 @@ from lerobot_memobench.engine.card import extended, remove_card, with_episodes, 
 from lerobot_memobench.engine.folder import VIDEOS
 from lerobot_memobench.engine.outcomes import disagreement, key_of
 from lerobot_memobench.engine.reporting import EvaluationReport, report_on
-from lerobot_memobench.envs.episode_log import has_log, read_episodes, write_episodes
+from lerobot_memobench.envs.episode_log import has_log, read_log, write_episodes
 from lerobot_memobench.envs.protocol import EXTENT, read_protocol_file, write_protocol
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records.protocol import (
@@ -50,7 +50,7 @@ def merge(out: Path, folders: Sequence[Path]) -> list[tuple[str, int]]:
     sources = list(dict.fromkeys([*([out] if has_log(out) else []), *folders]))
     if not folders:
         raise MemobenchError(f"{out} holds no parts ({SHARDS}); name the folders to merge")
-    records = {source: read_episodes(source) for source in sources}
+    records = {source: read_log(source) for source in sources}
     protocols = {source: read_protocol(source) for source in sources}
     _check_protocols(protocols)
     joined = join(records)
@@ -67,7 +67,7 @@ def merge(out: Path, folders: Sequence[Path]) -> list[tuple[str, int]]:
     if card is None:
         remove_card(out)
     else:
-        write_card(out, with_episodes(card, joined))
+        write_card(out, with_episodes(card, [record for record in joined if "not_run" not in record]))
     present = {(record["task"], record["episode"]) for record in joined}
     return [cell for cell in wanted if cell not in present]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-OUTCOME = ("success", "steps", "prompt_steps", "variant", "checkpoints", "failure", "scene_hash")
+OUTCOME = ("success", "steps", "prompt_steps", "variant", "checkpoints", "failure", "fault", "not_run", "scene_hash")
 """What two runs of the same episode must agree in."""
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +20,9 @@ from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.experts.prompts import PromptDemonstrator
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.rendering import Image, RenderSettings
-from lerobot_memobench.sim.simulation import Simulation
+from lerobot_memobench.sim.simulation import InvalidActionError, Simulation, UnstablePhysicsError, check_action
 from lerobot_memobench.tasks.catalogue import get_task
+from lerobot_memobench.tasks.failures import INVALID_ACTION, UNSTABLE_PHYSICS
 from lerobot_memobench.tasks.formula import Atom, atoms
 from lerobot_memobench.tasks.progress import Progress
 from lerobot_memobench.tasks.task import DRAWN, REFERENTS, STRICT, Task, referent_told
@@ -30,6 +32,13 @@ HORIZON = 1200
 PROMPT_LIMIT = 1500
 """Control steps after which a prompt video ends, whatever it still had to show. Two things are hidden in some 750; with
 one of them grasped at the fifth try in more than 1000."""
+
+
+class Fault(NamedTuple):
+    """What cut an execution off: one of `tasks.failures.FAULTS`, and why in a sentence."""
+
+    failure: str
+    why: str
 
 
 class Episode:
@@ -50,6 +59,7 @@ class Episode:
         exec_start: the frame at which execution began; None during the prompt.
         progress: checkpoints and goal, counted in execution steps.
         applied_action: the action (7,) float32 that really moved the arm in the last step.
+        fault: what cut the execution off; None as long as nothing has.
     """
 
     def __init__(
@@ -78,6 +88,7 @@ class Episode:
     def reset(self, seed: int) -> None:
         """Start the episode of a seed. Everything that follows is a function of task, settings, seed and actions."""
         self.seed = int(seed)
+        self.fault: Fault | None = None
         self.task = task = self.published if self.referent == "fixed" else referent_of(self.published, self.seed)
         self.sim.reset(self.seed)
         self.scene_hash = self.sim.scene_hash()
@@ -147,11 +158,11 @@ class Episode:
 
     @property
     def done(self) -> bool:
-        """Ended by success, horizon or loss; satisfied checkpoints alone end nothing."""
-        return self.success or self.exec_steps >= self.horizon or self.lost
+        """Ended by success, horizon, loss or fault; satisfied checkpoints alone end nothing."""
+        return self.success or self.exec_steps >= self.horizon or self.lost or self.fault is not None
 
     def step(self, action: NDArray[np.floating]) -> None:
-        """Advance by one control step; during the prompt the given action has no effect."""
+        """Advance by one control step; during the prompt the given action has no effect, after a fault nothing has."""
         if self.phase == PROMPT:
             assert self._demonstrator is not None
             assert self._next_prompt_action is not None
@@ -162,11 +173,25 @@ class Episode:
             if self._next_prompt_action is None or self.step_index >= PROMPT_LIMIT:
                 self._begin_execution()
             return
-        self.applied_action = np.clip(np.asarray(action, dtype=np.float32), -1.0, 1.0)
-        self.sim.step(self.applied_action)
+        if self.fault is None:
+            self.fault = self._act(np.asarray(action, dtype=np.float32))
+        if self.fault is not None:
+            return
         self.step_index += 1
         self.progress.step(self.sim.holds)
         self.drifted = self.drifted or any(self.sim.holds(atom) for atom in self._siblings)
+
+    def _act(self, action: NDArray[np.float32]) -> Fault | None:
+        """Carry out what the policy says; return what went wrong."""
+        try:
+            check_action(action)  # before it is clipped: infinity would become 1
+            self.applied_action = np.clip(action, -1.0, 1.0)
+            self.sim.step(self.applied_action)
+        except InvalidActionError as error:
+            return Fault(INVALID_ACTION, str(error))
+        except UnstablePhysicsError as error:
+            return Fault(UNSTABLE_PHYSICS, str(error))
+        return None
 
     def expert_action(self) -> NDArray[np.float32]:
         """Return what the scripted expert does now, (7,); zeros during the prompt. Ask once per step."""

@@ -10,7 +10,7 @@ import json
 import logging
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NotRequired, TypedDict
 
@@ -49,6 +49,7 @@ class Outcome(TypedDict, total=False):
     failure: Name | None
     suite: Name
     lost: bool
+    fault: str
     scene_hash: Name | None
 
 
@@ -62,6 +63,7 @@ class EpisodeRecord(Outcome):
     checkpoints: list[CheckpointRecord]
     prompt_shown: NotRequired[bool | None]
     wall_s: NotRequired[Number | None]
+    not_run: NotRequired[str]
     written_at: NotRequired[Number]
 
 
@@ -121,7 +123,34 @@ def _ends_torn(file: Any) -> bool:
 
 
 def read_episodes(directory: str | Path, problems: list[str] | None = None) -> list[dict[str, Any]]:
-    """Return the rollouts logged under ``directory``, sorted by task, episode and referent.
+    """Return the rollouts logged under ``directory``, see `read_log`; what could not be run is told in ``problems``."""
+    records = read_log(directory, problems)
+    if problems is not None:
+        problems += notes_on_not_run(records)
+    return [record for record in records if "not_run" not in record]
+
+
+def not_run(records: Iterable[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
+    """Return task -> those of its episodes that could not be run."""
+    found: dict[str, list[Mapping[str, Any]]] = {}
+    for record in records:
+        if "not_run" in record:
+            found.setdefault(record["task"], []).append(record)
+    return found
+
+
+def notes_on_not_run(records: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return a sentence for each task of which episodes could not be run, with the first of the reasons."""
+    notes = []
+    for task, lines in not_run(records).items():
+        all_of_it = len(lines) == sum(record["task"] == task for record in records)
+        part = "was not run" if all_of_it else f"was not run in {len(lines)} episodes"
+        notes.append(f"{task} {part}, and the figures are without that: {lines[0]['not_run']}")
+    return notes
+
+
+def read_log(directory: str | Path, problems: list[str] | None = None) -> list[dict[str, Any]]:
+    """Return all that is logged under ``directory``, sorted by task, episode and referent: what was not run as well.
 
     Reads the workers' files and a plain ``episodes.jsonl``; of several lines about the same task, episode and
     referent the newest counts. Lines that cannot be read, such as the last one of a killed run, are left out,

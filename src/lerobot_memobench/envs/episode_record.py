@@ -6,7 +6,7 @@ from typing import Any
 
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.tasks.failures import classify_failure
-from lerobot_memobench.tasks.task import PUBLISHED
+from lerobot_memobench.tasks.task import PUBLISHED, Task
 
 
 def episode_record(episode: Episode, *, seed_base: int, replan_steps: int | None, wall_s: float) -> dict[str, Any]:
@@ -17,7 +17,8 @@ def episode_record(episode: Episode, *, seed_base: int, replan_steps: int | None
         replan_steps: actions that the policy executes per prediction, where it is known.
         wall_s: seconds that the episode took.
     """
-    progress, task = episode.progress, episode.task
+    progress, task, fault = episode.progress, episode.task, episode.fault
+    failure = classify_failure(task, progress.first_step, episode.success, episode.drifted, episode.lost)
     return {
         "task": task.name,
         "memory_type": task.memory_type,
@@ -36,8 +37,24 @@ def episode_record(episode: Episode, *, seed_base: int, replan_steps: int | None
                 task.checkpoints, progress.first_step, progress.ordered_step, strict=True
             )
         ],
-        "failure": classify_failure(task, progress.first_step, episode.success, episode.drifted, episode.lost),
+        "failure": failure if fault is None else fault.failure,
+        **({} if fault is None else {"fault": fault.why}),
         **({} if task.suite == PUBLISHED else {"suite": task.suite, "lost": episode.lost}),
         "scene_hash": episode.scene_hash,
         "wall_s": round(wall_s, 3),
+    }
+
+
+def not_run_record(task: Task, seed: int, *, seed_base: int, referent: str, why: str) -> dict[str, Any]:
+    """Return the line for the log of an episode that could not be run."""
+    return {
+        "task": task.name,
+        "memory_type": task.memory_type,
+        "episode": seed - seed_base,
+        "seed": seed,
+        "referent": referent,
+        "success": False,
+        "checkpoints": [],
+        **({} if task.suite == PUBLISHED else {"suite": task.suite}),
+        "not_run": why,
     }

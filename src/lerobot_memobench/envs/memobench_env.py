@@ -2,35 +2,45 @@
 
 from __future__ import annotations
 
+import logging
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from numpy.typing import NDArray
 
+from lerobot_memobench.envs.annotate import BAND
 from lerobot_memobench.envs.episode import HORIZON, PROMPT_LIMIT, Episode
 from lerobot_memobench.envs.episode_log import EpisodeLog
-from lerobot_memobench.envs.episode_record import episode_record
+from lerobot_memobench.envs.episode_record import episode_record, not_run_record
 from lerobot_memobench.envs.film import Film
 from lerobot_memobench.envs.obs_types import PIXELS
 from lerobot_memobench.envs.observations import (
     ACTION_DIM,
+    EXECUTION,
     IMAGE_SIZE,
     METADATA,
     PROMPT,
     action_space,
+    blank,
     observation_space,
 )
 from lerobot_memobench.envs.prompting import RESET, STEPS
-from lerobot_memobench.envs.protocol import SEED_BASE
+from lerobot_memobench.envs.protocol import SEED_BASE, UNSEEDED
 from lerobot_memobench.envs.sight import Sight
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.files import file_name
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.tasks.loading import load_task
 from lerobot_memobench.tasks.memory_text import memory_text, with_memory
 from lerobot_memobench.tasks.task import PUBLISHED, referent_told
+
+logger = logging.getLogger(__name__)
 
 
 class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
@@ -43,6 +53,12 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     (7,), ``blind_action`` (7,).
 
     Action: float32 (7,) in [−1, 1]: end-effector displacement (±5 cm, ±0.5 rad per unit), gripper (−1 opens, 1 closes).
+
+    What cannot be carried out (an action that is none, a task that the simulator or the expert cannot do, physics that
+    break down) is raised as a `MemobenchError`. Where episodes are logged it ends its episode alone, truncated, with
+    the reason in the log and as `fault` in the info.
+
+    A pickled copy has the settings and must be reset: the running episode stays where it is.
 
     Args:
         folder: the task's folder.
@@ -102,6 +118,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._films_all = videos
         self._film: Film | None = None
         self._sight = Sight(obs_type, render_every)
+        self._referent = str(protocol["referent"])
         self._settings: dict[str, Any] = {
             "referent": referent,
             "prompt_video": prompt_video,
@@ -111,7 +128,13 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._prompt_in = prompt_in
         self._replan_steps = replan_steps
         self._expert_action, self._blind_action, self._seed_base = expert_action, blind_action, seed_base
-        self._next_seed = seed_base
+        self._began = self._closed = False
+        self._not_run: str | None = None
+        self._warned: set[str] = set()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy is made of: all but the running episode, with its scene, generators and GL context."""
+        return {**vars(self), "_episode": None, "_film": None, "_began": False}
 
     @property
     def episode(self) -> Episode:
@@ -129,25 +152,28 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start the episode of a seed; without one, of the seed after the last.
+        """Start the episode of a seed; without one, of a seed drawn from `np_random`, apart from all others in use.
 
         With the prompt played in here (`prompt_in`), the first observation is that of the first execution frame.
         """
         super().reset(seed=seed)
-        seed = self._next_seed if seed is None else int(seed)
-        self._next_seed = seed + 1
+        self._seed = seed = int(self.np_random.integers(*UNSEEDED)) if seed is None else int(seed)
         self._started = time.monotonic()
-        self._over = False
-        self.episode.reset(seed)
+        self._began, self._closed, self._over, self._not_run = True, False, False, None
+        self._discard_film()
+        with self._noting():
+            self.episode.reset(seed)
+        if self._not_run is not None:
+            return blank(self.observation_space), self._info()
         self._describe(0)
         self._sight.begin(self.episode)
-        self._discard_film()
         number = seed - self._seed_base
         if self._videos is not None and (self._films_all or number in self._filmed):
             self._film = Film(self._videos / f"{self.task}.{number}.mp4", METADATA["render_fps"])
             self._film.add(self.render())
-        if self._prompt_in == RESET and self.episode.phase == PROMPT:
-            self._play_prompt()
+        with self._noting():
+            if self._prompt_in == RESET and self.episode.phase == PROMPT:
+                self._play_prompt()
         return self._observation(), self._info()
 
     def _play_prompt(self) -> None:
@@ -162,14 +188,28 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         """Advance by one control step of 50 ms. The reward is 1 at success, else 0.
 
         An episode terminates by success and, of a strict task, by the loss of its goal; the horizon truncates it.
+
+        Raises:
+            gymnasium.error.ResetNeeded, gymnasium.error.ClosedEnvironmentError: it has not begun, or is closed.
+            MemobenchError: see the class.
         """
+        self._check_began("step")
+        if self._not_run is None:
+            # A dataset's labels count what was completed before a frame; what this step completes is told one later.
+            completed = self.episode.progress.index
+            with self._noting():
+                self.episode.step(np.asarray(action, dtype=np.float32))
+        if self._not_run is not None:
+            self._end()
+            return blank(self.observation_space), 0.0, False, True, self._info()
         episode = self.episode
-        # A dataset's labels count what was completed before a frame; what this step completes is told one frame later.
-        completed = episode.progress.index
-        episode.step(np.asarray(action, dtype=np.float32))
+        if episode.fault is not None:
+            if self._log is None:
+                raise MemobenchError(episode.fault.why)
+            self._warn(episode.fault.why)
         self._describe(completed)
         self._see()
-        if episode.done and not self._over:
+        if episode.done:
             self._end()
         success, ended = episode.success, episode.success or episode.lost
         return self._observation(), float(success), ended, episode.done and not ended, self._info()
@@ -184,12 +224,39 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         """Say whether somebody looks at the frames that follow, until the next reset or another word; see `Sight`."""
         self._sight.watched = watched
 
+    @contextmanager
+    def _noting(self) -> Iterator[None]:
+        """Note why an episode cannot be run, where there is a log to say it in."""
+        try:
+            yield
+        except MemobenchError as error:
+            if self._log is None:
+                raise
+            self._not_run = str(error)
+            self._warn(self._not_run)
+
+    def _warn(self, why: str) -> None:
+        """Say at once what ends this episode alone; the same once, if it ends all of them."""
+        if why not in self._warned:
+            self._warned.add(why)
+            logger.warning("%s, episode %d: %s", self.task, self._seed - self._seed_base, why)
+
+    def _check_began(self, call: str) -> None:
+        """Raise gymnasium's own error for a call that only a running episode can answer."""
+        if self._closed:
+            raise ClosedEnvironmentError(f"Trying to call `{call}` on a closed environment; `reset` opens it again")
+        if not self._began:
+            raise ResetNeeded(f"Cannot call env.{call}() before calling env.reset()")
+
     def _end(self) -> None:
-        """Close the books of an episode that has just ended."""
+        """Close the books of an episode that has ended, once."""
+        if self._over:
+            return
         self._over = True
-        if self._film is not None:
+        if self._film is not None and self._not_run is None:
             self._film.finish()
             self._film = None
+        self._discard_film()
         if self._log is not None:
             self._log.append(self.record())
 
@@ -206,6 +273,11 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     def record(self) -> dict[str, Any]:
         """Return the episode's line for the log."""
+        self._check_began("record")
+        if self._not_run is not None:
+            return not_run_record(
+                self._task, self._seed, seed_base=self._seed_base, referent=self._referent, why=self._not_run
+            )
         return episode_record(
             self.episode,
             seed_base=self._seed_base,
@@ -214,6 +286,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         )
 
     def _observation(self) -> dict[str, Any]:
+        if self._not_run is not None:
+            return blank(self.observation_space)
         episode = self.episode
         observation: dict[str, Any] = {
             **self._sight.observed(),
@@ -222,27 +296,45 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             "step": np.array([episode.clock], dtype=np.float32),
         }
         if self._expert_action:
-            observation["expert_action"] = episode.expert_action()
+            observation["expert_action"] = self._asked(episode.expert_action)
         if self._blind_action:
-            observation["blind_action"] = episode.blind_action()
+            observation["blind_action"] = self._asked(episode.blind_action)
         return observation
 
+    def _asked(self, who: Callable[[], NDArray[np.float32]]) -> NDArray[np.float32]:
+        """Return an action that is offered, zeros from whom the task is too much."""
+        action: NDArray[np.float32] = np.zeros(ACTION_DIM, np.float32)
+        with self._noting():
+            action = who()
+        return action
+
     def _info(self) -> dict[str, Any]:
+        if self._not_run is not None:
+            return {"is_success": False, "phase": EXECUTION, "checkpoints_completed": 0, "fault": self._not_run}
         episode = self.episode
         return {
             "is_success": episode.success,
             "phase": episode.phase,
             "checkpoints_completed": episode.progress.index,
+            **({} if episode.fault is None else {"fault": episode.fault.why}),
         }
 
     def render(self) -> NDArray[np.uint8]:
-        """Return both cameras side by side under what is being remembered and done; see `Sight.frame`."""
+        """Return both cameras side by side under what is being remembered and done; see `Sight.frame`.
+
+        Raises:
+            gymnasium.error.ResetNeeded, gymnasium.error.ClosedEnvironmentError: as `step`.
+        """
+        self._check_began("render")
+        if self._not_run is not None:
+            return np.zeros((BAND + IMAGE_SIZE, 2 * IMAGE_SIZE, 3), np.uint8)
         return self._sight.frame(self.episode)
 
     def close(self) -> None:
-        """Let the scene go; the next reset compiles or fetches it anew."""
+        """Let the scene go; the next reset compiles or fetches it anew. Closing twice does no harm."""
         self._discard_film()
         self._episode = None
+        self._began, self._closed = False, True
 
     def _discard_film(self) -> None:
         if self._film is not None:

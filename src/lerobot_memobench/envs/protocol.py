@@ -23,6 +23,10 @@ PROTOCOL_FILE = "protocol.json"
 SEED_BASE = 7
 """Seed of evaluation episode 0 (paper, section 5.1)."""
 
+UNSEEDED = (1_000_000_000, 2_000_000_000)
+"""Between these lie the seeds of episodes for which nobody named one: evaluations, sealed ones too, demonstrations and
+what settings are chosen on have seeds far below."""
+
 SETTINGS = (
     "suite",
     "seed_base",

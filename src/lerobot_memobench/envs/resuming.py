@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 
 from lerobot_memobench.envs.annotate import BAND
-from lerobot_memobench.envs.episode_log import has_log, read_episodes
+from lerobot_memobench.envs.episode_log import has_log, read_log
 from lerobot_memobench.envs.observations import EXECUTION, IMAGE_SIZE, blank
 
 
@@ -59,7 +59,7 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
     def _records(self) -> dict[int, dict[str, Any]]:
         """Episode -> line of the log, of this environment's task and referent."""
         if self._logged is None:
-            records = read_episodes(self._log_dir) if has_log(self._log_dir) else []
+            records = read_log(self._log_dir) if has_log(self._log_dir) else []
             name = self.get_wrapper_attr("task")
             self._logged = {
                 record["episode"]: record

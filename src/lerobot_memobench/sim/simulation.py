@@ -32,6 +32,24 @@ NO_OP = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 """No motion, gripper open."""
 
 
+class InvalidActionError(MemobenchError):
+    """An action that cannot be carried out: of another shape, or not finite."""
+
+
+class UnstablePhysicsError(MemobenchError):
+    """MuJoCo itself warns of its state: it has begun the scene anew, or left out what it had no room for."""
+
+
+def check_action(action: NDArray[np.floating]) -> None:
+    """Raise `InvalidActionError` unless an action is (7,) and finite."""
+    if action.shape != (ACTION_DIM,):
+        raise InvalidActionError(f"an action has shape {action.shape}; expected ({ACTION_DIM},)")
+    if not np.isfinite(action).all():
+        raise InvalidActionError(
+            f"an action holds a value that is not finite: {action.tolist()}; check the policy's output"
+        )
+
+
 @dataclass(frozen=True)
 class Snapshot:
     """Everything that decides how a simulation goes on; see `Simulation.snapshot`."""
@@ -124,19 +142,29 @@ class Simulation:
 
         Args:
             action: (7,) pose delta (±1 is ±5 cm, ±0.5 rad) and gripper (−1 open, +1 closed); clipped to [−1, 1].
+
+        Raises:
+            InvalidActionError: it is none. Nothing has changed then.
+            UnstablePhysicsError: MuJoCo does not trust its state any more. Only `reset` helps then.
         """
         action = np.asarray(action, dtype=np.float64)
-        if action.shape != (ACTION_DIM,):
-            raise MemobenchError(f"an action has shape {action.shape}; expected ({ACTION_DIM},)")
-        if not np.isfinite(action).all():
-            raise MemobenchError(
-                f"an action holds a value that is not finite: {action.tolist()}; check the policy's output"
-            )
+        check_action(action)
+        time = self.data.time
         self._start.mark_step()
         self._controller.set_goal(self.data, action.astype(np.float64, copy=False))
         self._controller.advance(self.data, float(action[6]), SUBSTEPS)
+        self._check_physics(time)
         if self._at_home is not None and action[6] <= 0.0 and self._start.in_detent():
             self._stand_at_home(self._at_home)  # unless it is told to close: it must be able to
+
+    def _check_physics(self, time: float) -> None:
+        """Raise what MuJoCo has warned of since ``time``: it goes on from the model's initial state without a word."""
+        counts = self.data.warning.number
+        if counts.any():
+            kind = int(counts.argmax())
+            said = mujoco.mju_warningText(kind, int(self.data.warning.lastinfo[kind])).split(".")[0]
+            counts[:] = 0
+            raise UnstablePhysicsError(f"the physics broke down {time:.2f} s after the scene was set up: {said}")
 
     def _stand_at_home(self, home: Snapshot) -> None:
         """Let a strict scene's arm stand as when the scene had settled: where it has been is not in it any more."""
@@ -177,6 +205,7 @@ class Simulation:
         self.data.qpos[:] = state[1 : 1 + self.model.nq]
         self.data.qvel[:] = state[1 + self.model.nq :]
         mujoco.mj_step1(self.model, self.data)
+        self._check_physics(float(state[0]))
 
     def fixture_poses(self) -> dict[str, Array]:
         """Return position and quaternion wxyz (7,) of each fixture: they differ by seed and are not in `state()`."""

@@ -98,11 +98,13 @@ def prefix(summary: Summary) -> Table:
 # --- failures ---
 
 
-STRICT_NOTES = {
+FURTHER_NOTES = {
     "miscount": " Miscount: the event was done too seldom or too often.",
     "wrong_place": " Wrong place: the thing was looked for where it is not.",
+    "invalid_action": " Invalid action: one of another shape, or not finite, cut the rollout off.",
+    "unstable_physics": " Unstable physics: MuJoCo warned of its own state, which cut the rollout off.",
 }
-"""Classes that only strict tasks have -> what the table says of them."""
+"""Classes that not every evaluation has -> what the table says of them."""
 
 
 def failures(summary: Summary) -> Table:
@@ -123,7 +125,7 @@ def failures(summary: Summary) -> Table:
         note=(
             "A failed rollout is named after the first checkpoint that was never satisfied: Storage, Update (stale "
             "memory) or Compression; reference drift where a wrong sibling took the place; execution failure where "
-            "all checkpoints were satisfied." + "".join(STRICT_NOTES.get(name, "") for name in summary.failures)
+            "all checkpoints were satisfied." + "".join(FURTHER_NOTES.get(name, "") for name in summary.failures)
         ),
         rules=frozenset({1}),
     )

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from rich.console import RenderableType
 
-from lerobot_memobench.envs.episode_log import read_episodes, write_episodes
+from lerobot_memobench.envs.episode_log import not_run, notes_on_not_run, read_log, write_episodes
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.evaluation.documents import evaluation_tables as tables
 from lerobot_memobench.evaluation.documents import formats, sentences
@@ -25,7 +25,7 @@ from lerobot_memobench.evaluation.documents.sentences import failure_line
 from lerobot_memobench.evaluation.documents.tables import Report, Section
 from lerobot_memobench.evaluation.documents.terminal import terminal_table
 from lerobot_memobench.evaluation.documents.wide_tables import overview
-from lerobot_memobench.evaluation.metrics.rollouts import Record, mixtures
+from lerobot_memobench.evaluation.metrics.rollouts import Record, faults, mixtures
 from lerobot_memobench.evaluation.metrics.summary import Summary, report, summarise
 from lerobot_memobench.evaluation.records.runs import Run, sweeps
 from lerobot_memobench.files import write_file
@@ -67,17 +67,26 @@ def write_report(directory: str | Path, episodes: int | None = None) -> tuple[Su
             last one may hold more than were asked for.
 
     Returns:
-        The figures, and notes a reader must know: unreadable lines, mixed protocols.
+        The figures, and notes a reader must know: unreadable lines, what was not run, mixed protocols.
+
+    Raises:
+        MemobenchError: there is no rollout: nothing was run, or nothing could be.
     """
     directory = Path(directory)
     notes: list[str] = []
-    records = read_episodes(directory, notes)
+    logged = read_log(directory, notes)
     if episodes is not None:
-        records = [record for record in records if record["episode"] < episodes]
+        logged = [record for record in logged if record["episode"] < episodes]
+    write_episodes(directory, logged)
+    notes += notes_on_not_run(logged)
+    records = [record for record in logged if "not_run" not in record]
+    if logged and not records:
+        raise MemobenchError(f"no episode in {directory} could be run; {'; '.join(notes)}")
     summary = summarise(records)
-    notes += mixtures(records)
-    write_episodes(directory, records)
-    write_file(directory / REPORT_JSON, json.dumps(report(summary), indent=2) + "\n")
+    notes += faults(records) + mixtures(records)
+    unrun = {task: len(lines) for task, lines in not_run(logged).items()}
+    figures = {**report(summary), **({"not_run": unrun} if unrun else {})}
+    write_file(directory / REPORT_JSON, json.dumps(figures, indent=2) + "\n")
     write_file(directory / REPORT_MARKDOWN, markdown(summary, records, notes))
     return summary, notes
 

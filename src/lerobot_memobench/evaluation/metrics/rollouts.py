@@ -74,3 +74,16 @@ def mixtures(records: Iterable[Record]) -> list[str]:
         if len(found) > 1:
             notes.append(f"The rollouts mix {words} ({', '.join(found)}); the figures are over all of them.")
     return notes
+
+
+def faults(records: Iterable[Record]) -> list[str]:
+    """Return a sentence for each task of which rollouts were cut off, and so failed, with the first of the reasons."""
+    found: dict[str, list[Record]] = {}
+    for record in records:
+        if record.get("fault"):
+            found.setdefault(record["task"], []).append(record)
+    return [
+        f"{task}: {len(group)} rollouts were cut off and count as failed, the first in episode {group[0]['episode']}: "
+        f"{group[0]['fault']}"
+        for task, group in found.items()
+    ]

@@ -7,7 +7,15 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.envs.episode_log import read_episodes
-from lerobot_memobench.envs.protocol import EXTENT, OF_THE_POLICY, POLICY, SETTINGS, differences, read_protocol_file
+from lerobot_memobench.envs.protocol import (
+    EXTENT,
+    MOST_EPISODES,
+    OF_THE_POLICY,
+    POLICY,
+    SETTINGS,
+    differences,
+    read_protocol_file,
+)
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records.card_schema import Card, WholeCard
 from lerobot_memobench.files.reading import read_json
@@ -50,9 +58,10 @@ def read_protocol(folder: str | Path) -> dict[str, Any]:
 
 def protocol_of_log(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return what a log tells of its protocol; settings in which its episodes differ are lists."""
+    numbers = (record["episode"] + 1 for record in records)
     found: dict[str, Any] = {
         "tasks": sorted({record["task"] for record in records}),
-        "episodes": max((record["episode"] + 1 for record in records), default=0),
+        "episodes": max((number for number in numbers if number <= MOST_EPISODES), default=0),  # others have no number
     }
     if all(record.get("seed") is not None for record in records):
         _note(found, "seed_base", [record["seed"] - record["episode"] for record in records])

@@ -15,7 +15,7 @@ from typing import Any
 
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.metrics.rollouts import Record, mixtures
+from lerobot_memobench.evaluation.metrics.rollouts import Record, faults, mixtures
 from lerobot_memobench.evaluation.metrics.summary import Summary, summarise
 from lerobot_memobench.evaluation.records.protocol import POLICY, one_suite, read_protocol
 
@@ -91,7 +91,8 @@ def check_one_suite(records: Mapping[Path, Sequence[Record]]) -> None:
 
 
 def read_rollouts(folder: str | Path) -> tuple[list[dict[str, Any]], list[str]]:
-    """Return the rollouts of an evaluation, and what a reader must know: unreadable lines, mixed protocols.
+    """Return the rollouts of an evaluation, and what a reader must know: unreadable lines, what was not run or
+    was cut off, mixed protocols.
 
     Raises:
         MemobenchError: there are none.
@@ -99,8 +100,9 @@ def read_rollouts(folder: str | Path) -> tuple[list[dict[str, Any]], list[str]]:
     notes: list[str] = []
     records = read_episodes(folder, notes)
     if not records:
-        raise MemobenchError(f"{folder} holds no rollout that can be read; run an evaluation first")
-    return records, notes + mixtures(records)
+        told = "".join(f"; {note}" for note in notes)
+        raise MemobenchError(f"{folder} holds no rollout that can be read{told}; run an evaluation first")
+    return records, notes + faults(records) + mixtures(records)
 
 
 def _split(word: str | Path) -> tuple[str | None, Path]:

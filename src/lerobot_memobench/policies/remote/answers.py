@@ -18,6 +18,8 @@ ACTION_SIZE = 7
 def read_actions(answer: Mapping[str, Any], config: RemoteConfig, address: str) -> NDArray[np.float32]:
     """Return the actions (H, 7) in an answer, their gripper in the environment's terms.
 
+    One that is not finite is passed on: the environment ends the episode with it, and the others go on.
+
     Raises:
         MemobenchError: there are none, too few for a plan, or something else.
     """
@@ -27,10 +29,9 @@ def read_actions(answer: Mapping[str, Any], config: RemoteConfig, address: str) 
             f"the policy server at {address} answers {len(actions)} actions at a time, fewer than the "
             f"{config.n_action_steps} to be executed; choose replan={len(actions)} or less"
         )
-    if not np.isfinite(actions).all():
-        raise _wrong(address, "actions that are NaN or infinite")
     if (config.gripper or config.spoken.gripper) == RLDS:
-        actions[:, -1] = -np.sign(2 * actions[:, -1] - 1)
+        gripper = actions[:, -1]
+        actions[:, -1] = np.where(np.isfinite(gripper), -np.sign(2 * gripper - 1), gripper)
     return actions
 
 

@@ -78,6 +78,8 @@ const OUTCOMES = {
   },
   miscount: { words: "miscount", letter: "N", why: "The event was done too seldom or too often." },
   wrong_place: { words: "wrong place", letter: "P", why: "The thing was looked for where it is not." },
+  invalid_action: { words: "invalid action", letter: "I", why: "An action of another shape, or not finite, ended it." },
+  unstable_physics: { words: "unstable physics", letter: "B", why: "The physics broke down and ended it." },
 };
 
 const outcomeMark = (outcome) =>
