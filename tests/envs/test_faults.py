@@ -7,6 +7,7 @@ import copy
 import json
 import logging
 import pickle
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import pytest
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
+from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.engine.merging import merge_and_report
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode_log import read_episodes, read_log
@@ -177,6 +179,30 @@ def test_a_task_that_cannot_be_run_is_counted_as_not_run(folder: Path, tmp_path:
     for _ in range(2):  # and again from the merged file
         assert write_report(tmp_path / "merged")[1] == [note]
         assert json.loads((tmp_path / "merged" / "report.json").read_text())["not_run"] == {"a_shelf": 2}
+
+
+def test_a_folder_with_a_task_that_cannot_be_run_is_evaluated(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By the command: the others run, and going on stops nowhere."""
+    shutil.copytree(get_task(STOVE).folder, folder.parent / STOVE)
+    words = (
+        "env=memobench",
+        f"env.task_dir={folder.parent}",
+        "episodes=1",
+        "films=0",
+        "horizon=3",
+        f"obs_type={OBJECTS}",
+    )
+    for more in ((), ("resume=true",)):
+        assert main(["eval", *words, "eval.use_async_envs=false", f"output_dir={tmp_path / 'out'}", *more]) == 0
+        told = " ".join(capsys.readouterr().out.split())
+        assert "note: a_shelf was not run, and the figures are without that: the expert puts things" in told
+        assert [record["task"] for record in read_episodes(tmp_path / "out")] == [STOVE]
+        assert json.loads((tmp_path / "out" / "report.json").read_text())["not_run"] == {"a_shelf": 1}
+    assert [episode["task"] for episode in json.loads((tmp_path / "out" / "card.json").read_text())["episodes"]] == [
+        STOVE
+    ]
 
 
 def test_without_a_log_a_task_that_cannot_be_run_is_an_error(folder: Path) -> None:
