@@ -20,7 +20,7 @@ def demo(
     """
     from rich.markdown import Markdown
 
-    from lerobot_memobench.cli.evaluate import evaluate_here, tell
+    from lerobot_memobench.cli.evaluate import evaluate_here, tell, tell_beginning
     from lerobot_memobench.engine.demo import CONTACT_SHEET, demo_plan, make_demo
     from lerobot_memobench.engine.folder import VIDEOS
     from lerobot_memobench.engine.memory_demo import (
@@ -34,7 +34,7 @@ def demo(
     from lerobot_memobench.evaluation.documents.report import REPORT_MARKDOWN
 
     def one_of_three(name: str, folder: Path) -> int:
-        return run_evaluation(memory_plan(name, folder), tell).status
+        return run_evaluation(memory_plan(name, folder), tell, tell_beginning).status
 
     status = make_demo(
         out,

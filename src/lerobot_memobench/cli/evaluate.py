@@ -50,7 +50,7 @@ def evaluate_here(plan: EvaluationPlan, say_where: bool = True) -> int:
     Args:
         say_where: whether the report's file is named.
     """
-    ended = run_evaluation(plan, tell, lambda text: console().print(text, soft_wrap=True))
+    ended = run_evaluation(plan, tell, tell_beginning)
     if ended.report is not None:
         print_figures(ended.report)
         if say_where:
@@ -106,6 +106,11 @@ def print_figures(report: EvaluationReport) -> None:
     screen.print(failure_line(report.summary))
     for note in report.notes:
         screen.print(f"note: {note}")
+
+
+def tell_beginning(text: str) -> None:
+    """Say what is about to be run."""
+    console().print(text, soft_wrap=True)
 
 
 def tell(text: str) -> None:

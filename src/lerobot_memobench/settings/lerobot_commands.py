@@ -74,8 +74,11 @@ def without_chatter(trained: bool) -> Iterator[None]:
         trained: whether the policy has weights; that those of one without any are random is no news.
     """
     import lerobot
+    import torch
 
     home, false_alarms = os.path.dirname(lerobot.__file__), OF_NO_CONCERN + (() if trained else OF_WEIGHTS)
+    if not trained or not torch.cuda.is_available():
+        false_alarms += OF_THE_CPU
 
     def matters(record: logging.LogRecord) -> bool:
         if not record.pathname.startswith(home):
@@ -101,9 +104,11 @@ OF_NO_CONCERN = ("No job name provided",)
 OF_WEIGHTS = (
     "No pretrained path was provided",
     "You are instantiating a policy from scratch and its features are parsed from an environment",
-    "Using CPU, this will be slow",
 )
-"""How LeRobot's warnings begin that are none to who evaluates; and those that are none of a policy without weights."""
+OF_THE_CPU = ("Using CPU, this will be slow",)
+"""How LeRobot's warnings begin that are none to who evaluates; that are none of a policy without weights; and that is
+none to who has nothing but a CPU.
+"""
 
 
 def config_class(entry: Callable[[], Any]) -> type | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +36,7 @@ def best(table: str) -> dict[str, str]:
     """Metric -> the method with the highest average over its best replan interval."""
     axes = entries.average_axes()
     found = entries.best_over_replan(entries.published_entries(table), axes)
-    return {metric: max(found, key=lambda name: found[name][k] or 0.0) for k, (_, metric) in enumerate(axes)}
+    return {metric: max(found, key=lambda whose: found[whose][k] or 0.0)[0] for k, (_, metric) in enumerate(axes)}
 
 
 def test_the_papers_radar_says_what_its_text_says() -> None:
@@ -49,8 +50,63 @@ def test_axes_are_normalised_by_their_highest() -> None:
     kept, tops, shares = radar.normalised(entries.published_entries("main"), entries.average_axes())
     assert tops == [31.9, 58.1, 49.9, 32.1]
     assert len(kept) == 4
-    assert shares["MemoryVLA"] == pytest.approx([29.2 / 31.9, 55.1 / 58.1, 1.0, 14.1 / 32.1])
-    assert max(value for row in shares.values() for value in row) == 1.0
+    assert shares["MemoryVLA", True] == pytest.approx([29.2 / 31.9, 55.1 / 58.1, 1.0, 14.1 / 32.1])
+    assert max(value for row in shares.values() for value in row if value is not None) == 1.0
+
+
+def test_what_does_not_apply_is_a_gap_and_no_zero(runs: list[Run]) -> None:
+    """Our two tasks are of two memory types: the paper's other axes do not apply to them."""
+    rows = [*entries.entries_of(runs), *entries.published_entries("main")]
+    kept, _, shares = radar.normalised(rows, entries.type_axes())
+    ours = dict(zip(kept, shares["mine_$", False], strict=True))
+    assert {memory_type for (memory_type, _), share in ours.items() if share is not None} == {"temporal", "spatial"}
+    assert ours["object", "SR"] is None
+    figure = radar.draw([("both", rows)], entries.type_axes())
+    (line,) = [line for line in figure.axes[0].lines if line.get_label().startswith("mine")]
+    drawn = np.asarray(line.get_ydata(), dtype=float)
+    assert np.isnan(drawn).sum() == sum(share is None for share in [*ours.values(), next(iter(ours.values()))])
+    texts = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    assert texts[-1] == "a gap: not applicable, or not evaluated"
+    zeros = radar.normalised([replace(rows[0], average=dict.fromkeys(("SR", "MSR", "MUR"), 0.0))], radar_axes())[2]
+    assert list(zeros.values()) == [[0.0, 0.0, 0.0]], "a rate of nought is one"
+
+
+def radar_axes() -> list[entries.Axis]:
+    return entries.average_axes()[:3]
+
+
+def test_an_evaluation_called_like_a_method_of_the_papers_is_none_of_it(tmp_path: Path) -> None:
+    logs.evaluation(tmp_path / "a", 2)
+    ours = entries.entries_of(read_runs([f"π0.5={tmp_path / 'a'}"]))
+    found = entries.best_over_replan([*ours, *entries.published_entries("main")], entries.average_axes())
+    assert found["π0.5", False][0] == 50.0
+    assert found["π0.5", True][0] == pytest.approx(31.0, abs=3)
+
+
+def test_the_papers_methods_keep_their_looks(runs: list[Run]) -> None:
+    theirs = [entry.identity for entry in entries.published_entries()]
+    alone = style.looks(theirs)
+    assert len({(one.colour, one.marker, str(one.dashes)) for one in alone.values()}) == len(alone) == 11
+    for beside in ([("mine", False), *theirs], [*theirs[5:], ("mine", False), ("π0.5", False)], theirs[::-1]):
+        found = style.looks(beside)
+        assert all(found[whose] == alone[whose] for whose in beside if whose[1])
+    assert style.looks([("mine", False)])["mine", False] == style.looks([*theirs, ("mine", False)])["mine", False]
+    assert not {one.colour for one in style.looks([("a", False), ("b", False)]).values()} & {
+        alone[entry.identity].colour for entry in entries.published_entries("main")
+    }
+
+
+def test_how_much_was_run_is_said_beside_the_papers_rows(runs: list[Run]) -> None:
+    told = "(2 of 30 tasks, 8 rollouts)"
+    ours, theirs = entries.entries_of(runs), entries.published_entries("main")
+    assert entries.labels_of([*ours, *theirs])["mine_$", False] == f"mine_$\n{told}"
+    assert entries.labels_of([*ours, *theirs])["π0", True] == "paper: π0"
+    assert entries.labels_of(ours) == {("mine_$", False): "mine_$"}
+    assert entries.labels_of(theirs)["π0", True] == "π0"
+    for figure in (replan.draw(runs, paper=True), correlations.draw([*theirs, *ours])):
+        assert any("2 of 30 tasks, 8 rollouts" in text.get_text() for text in figure.legends[0].get_texts())
+    for figure in (replan.draw(runs), correlations.draw(ours)):
+        assert not any("of 30 tasks" in text.get_text() for text in figure.legends[0].get_texts())
 
 
 def test_axes_that_apply_to_nobody_are_left_out() -> None:

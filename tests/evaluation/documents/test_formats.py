@@ -79,7 +79,8 @@ def test_csv_has_one_figure_a_row(sweep: list[Run]) -> None:
         "4",
     )
     places = {r["table"] for r in rows}
-    assert places == {"tasks", "memory_types", "average", "pooled", "prefix", "ordered_prefix", "failures"}
+    assert places == {"tasks", "memory_types", "average", "pooled", "prefix", "ordered_prefix", "failures", "extent"}
+    assert [r["n"] for r in rows if r["table"] == "extent"][:2] == ["2", "8"]
     theirs = [r for r in rows if r["evaluation"] == "paper, main: MemoryVLA" and r["replan_steps"] == "20"]
     assert [r["percent"] for r in theirs if r["table"] == "average"] == ["29.2", "55.1", "49.9", "14.1"]
     assert len({r["evaluation"] for r in rows if r["evaluation"].startswith("paper")}) == 6 + 4 + 2 + 1
@@ -120,6 +121,7 @@ def test_the_paper_stands_beside_with_what_differs(sweep: list[Run]) -> None:
     assert "| paper: π0.5 + memory module | 5 | 9.8 | 92.0 | 32.2 | 10.0 |" in text
     assert text.count("| paper: ") == 43
     assert "2 of 30 tasks, 4 episodes of each instead of 50" in text
+    assert text.count("| **mine\\_&\\_co k=20 (2 of 30 tasks, 8 rollouts)** |") == 3
     assert "| stale memory first update | 63 | 42.0" in text
     assert "paper:" not in rendered(sweep, "markdown")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.documents.sentences import count_of
 from lerobot_memobench.evaluation.documents.tables import Cell, Count, Section, Table
 from lerobot_memobench.evaluation.documents.wide_tables import run_row, wide_table
 from lerobot_memobench.evaluation.metrics.rates import METRICS, Rate
@@ -40,13 +41,36 @@ def check_beside(runs: Sequence[Run], paper: bool) -> None:
 def beside_paper(runs: Sequence[Run]) -> Section:
     """Return the paper's tables of rates with these evaluations on top of each, and in what they depart from it."""
     tables = [_beside(runs, *each) for each in TABLES]
-    notes = [f"{run.name} departs from the paper's protocol: {', '.join(d)}" for run in runs if (d := departures(run))]
-    return Section("Beside the paper", (*tables, paper_failures()), notes=tuple(notes))
+    return Section("Beside the paper", (*tables, paper_failures()), notes=tuple(departure_notes(runs)))
+
+
+def departure_notes(runs: Sequence[Run]) -> list[str]:
+    """Return a sentence for each evaluation that was not run as the paper's were."""
+    return [f"{run.name} departs from the paper's protocol: {', '.join(d)}" for run in runs if (d := departures(run))]
+
+
+def beside_name(run: Run) -> str:
+    """Return what an evaluation is called beside the paper's rows of 30 tasks and 1,500 rollouts."""
+    return with_extent(run.name, [run])
+
+
+def with_extent(name: str, runs: Sequence[Run]) -> str:
+    """Return a name and behind it how much was run, where that is not what the paper ran."""
+    told = "; ".join(dict.fromkeys(filter(None, map(extent, runs))))
+    return f"{name} ({told})" if told else name
+
+
+def extent(run: Run) -> str:
+    """Return how many tasks and rollouts an evaluation is of, "" where it is as many as the paper's."""
+    summary = run.summary
+    if len(summary.tasks) == PAPER_TASKS and {row["SR"].n for row in summary.tasks.values()} == {PAPER_EPISODES}:
+        return ""
+    return f"{len(summary.tasks)} of {PAPER_TASKS} tasks, {count_of(summary.rollouts, 'rollout')}"
 
 
 def _beside(runs: Sequence[Run], key: str, title: str, sources: Sequence[str]) -> Table:
     published = published_rows(*sources)
-    rows = (*(run_row(run) for run in runs), *(_published_row(row) for row in published))
+    rows = (*((beside_name(run), *run_row(run)[1:]) for run in runs), *(_published_row(row) for row in published))
     steps = [row.replan_steps for row in published]
     changes = {len(runs) + k for k in range(1, len(steps)) if steps[k] != steps[k - 1]}
     return wide_table(key, title, rows, strong=range(len(runs)), rules={len(runs), *changes})

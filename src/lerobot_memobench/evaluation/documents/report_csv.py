@@ -11,7 +11,7 @@ from lerobot_memobench.evaluation.records.runs import Run
 from lerobot_memobench.paper import PublishedRow, published_rows
 
 HEADER = ("evaluation", "replan_steps", "table", "name", "figure", "percent", "low", "high", "n")
-"""``table`` is tasks, memory_types, average, pooled, prefix, ordered_prefix or failures."""
+"""``table`` is tasks, memory_types, average, pooled, prefix, ordered_prefix, failures, or extent beside the paper's."""
 
 CsvRow = tuple[object, ...]
 
@@ -20,6 +20,7 @@ def csv_rows(runs: Sequence[Run], paper: bool) -> list[CsvRow]:
     """Return every figure of evaluations, and the published ones where asked for."""
     rows = [row for run in runs for row in _run_rows(run)]
     if paper:
+        rows += [row for run in runs for row in _extent(run)]
         rows += [row for published in published_rows() for row in _published_rows(published)]
     return rows
 
@@ -30,6 +31,12 @@ def _run_rows(run: Run) -> Iterator[CsvRow]:
         interval = None if place == "pooled" and figure != "SR" else interval_of(rate)
         low, high = interval or (None, None)
         yield (run.name, run.replan_steps, place, name, figure, percent(rate.value), low, high, rate.n or None)
+
+
+def _extent(run: Run) -> Iterator[CsvRow]:
+    """Yield how much was run: beside rows of 30 tasks and 1,500 rollouts."""
+    for figure, count in (("tasks", len(run.summary.tasks)), ("rollouts", run.summary.rollouts)):
+        yield (run.name, run.replan_steps, "extent", "", figure, None, None, None, count)
 
 
 def _published_rows(published: PublishedRow) -> Iterator[CsvRow]:

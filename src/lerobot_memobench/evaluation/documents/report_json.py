@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from lerobot_memobench.evaluation.documents.beside_paper import departures
 from lerobot_memobench.evaluation.documents.replan_sweep import best_interval
 from lerobot_memobench.evaluation.metrics.rates import METRICS, Rate, Row, percent
 from lerobot_memobench.evaluation.metrics.summary import report
@@ -23,6 +24,7 @@ def report_data(runs: Sequence[Run], paper: bool) -> dict[str, Any]:
     if swept := sweeps(runs):
         found["replan_sweep"] = {method: _sweep_data(group) for method, group in swept.items()}
     if paper:
+        found["departs_from_paper"] = {run.name: departures(run) for run in runs}
         found["paper"] = [_published_data(row) for row in published_rows()]
     return found
 

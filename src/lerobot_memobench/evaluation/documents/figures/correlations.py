@@ -107,10 +107,20 @@ def _legend(figure: Figure, entries: Sequence[Entry], memory_types: Sequence[str
         handles[name] = Line2D([], [], ls="", color=colour, marker=marker, ms=5, mfc=fill)
     if _both(entries):
         handles["paper"] = Line2D([], [], ls="", marker="o", ms=5, mec=style.INK, mfc="none")
-        handles["here"] = Line2D([], [], ls="", marker="o", ms=5, mec=style.INK, mfc=style.INK)
+        handles["\n".join(["here", *_extents(entries)])] = Line2D(
+            [], [], ls="", marker="o", ms=5, mec=style.INK, mfc=style.INK
+        )
     if shaded:
         handles["high MSR, low SR"] = Patch(facecolor=SHADE)
-    style.legend_below(figure, list(handles.values()), list(handles), len(handles))
+    wide = sum(max(map(len, name.splitlines())) + 8 for name in handles) > 40 * figure.get_size_inches()[0] / 2.45
+    style.legend_below(figure, list(handles.values()), list(handles), 4 if wide else len(handles))
+
+
+def _extents(entries: Sequence[Entry]) -> list[str]:
+    """Return how much of ours was run, where it is less than the paper's."""
+    told = dict.fromkeys(f"{entry.method}: {entry.extent}" for entry in entries if entry.extent)
+    alone = len({entry.method for entry in entries if not entry.published}) == 1
+    return [style.words(one.partition(": ")[2] if alone else one) for one in told]
 
 
 def _scatter(place: Any, found: Sequence[Point], published: bool) -> None:

@@ -5,10 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+from lerobot_memobench.evaluation.documents.beside_paper import extent
 from lerobot_memobench.evaluation.metrics.rates import METRICS, Row
 from lerobot_memobench.evaluation.records.runs import Run
 from lerobot_memobench.paper import published_rows
 from lerobot_memobench.tasks.task import MEMORY_TYPES
+
+Identity = tuple[str, bool]
+"""(method, whether it is the paper's)."""
 
 Figures = Mapping[str, float | None]
 """Metric -> per cent; None where it does not apply."""
@@ -20,6 +24,7 @@ class Entry:
 
     Attributes:
         memory_types, tasks: name -> figures; the paper publishes none per task. published: whether it is the paper's.
+        extent: how much was run, where that is less than the paper ran, "" else.
     """
 
     method: str
@@ -29,6 +34,12 @@ class Entry:
     tasks: Mapping[str, Figures]
     memory_type_of: Mapping[str, str]
     published: bool = False
+    extent: str = ""
+
+    @property
+    def identity(self) -> Identity:
+        """Whose row it is, whatever stands beside: an evaluation may be called like one of the paper's methods."""
+        return self.method, self.published
 
 
 def entries_of(runs: Sequence[Run]) -> list[Entry]:
@@ -39,7 +50,15 @@ def entries_of(runs: Sequence[Run]) -> list[Entry]:
         types = {name: _figures(row) for name, row in summary.memory_types.items()}
         tasks = {name: _figures(row) for name, row in summary.tasks.items()}
         found.append(
-            Entry(run.method, run.replan_steps, types, _figures(summary.average), tasks, summary.memory_type_of)
+            Entry(
+                run.method,
+                run.replan_steps,
+                types,
+                _figures(summary.average),
+                tasks,
+                summary.memory_type_of,
+                extent=extent(run),
+            )
         )
     return found
 
@@ -60,11 +79,11 @@ Axis = tuple[str | None, str]
 """(memory type, metric); None for the average."""
 
 
-def best_over_replan(entries: Iterable[Entry], axes: Sequence[Axis]) -> dict[str, list[float | None]]:
-    """Return method -> per axis the highest figure over its replan intervals (the paper's rule for its radar)."""
-    found: dict[str, list[float | None]] = {}
+def best_over_replan(entries: Iterable[Entry], axes: Sequence[Axis]) -> dict[Identity, list[float | None]]:
+    """Return whose row -> per axis the highest figure over its replan intervals (the paper's rule for its radar)."""
+    found: dict[Identity, list[float | None]] = {}
     for entry in entries:
-        row = found.setdefault(entry.method, [None] * len(axes))
+        row = found.setdefault(entry.identity, [None] * len(axes))
         for k, (memory_type, metric) in enumerate(axes):
             figures = entry.average if memory_type is None else entry.memory_types.get(memory_type, {})
             value, so_far = figures.get(metric), row[k]
@@ -81,3 +100,17 @@ def average_axes() -> list[Axis]:
 def type_axes() -> list[Axis]:
     """Return the metrics of each memory type."""
     return [(memory_type, metric) for memory_type in MEMORY_TYPES for metric in METRICS]
+
+
+def labels_of(entries: Sequence[Entry]) -> dict[Identity, str]:
+    """Return what a row is called in a legend; beside one another, the paper's say so and ours how much was run."""
+    beside = len({entry.published for entry in entries}) > 1
+    extents: dict[Identity, list[str]] = {}
+    for entry in entries:
+        extents.setdefault(entry.identity, []).append(entry.extent)
+    found = {}
+    for (method, published), told in extents.items():
+        all_told = "; ".join(dict.fromkeys(filter(None, told)))
+        ours = f"{method}\n({all_told})" if beside and all_told else method
+        found[method, published] = f"paper: {method}" if published and beside else ours
+    return found

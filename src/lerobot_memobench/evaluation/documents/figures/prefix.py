@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.figures import style
+from lerobot_memobench.evaluation.documents.figures.entries import Identity
 from lerobot_memobench.evaluation.records.runs import Run
 from lerobot_memobench.paper import shuffled_control
 
@@ -27,6 +28,7 @@ class Curve:
     Attributes:
         ordered: the same, counting only what came in order; None where it is not known.
         low, high: Wilson's interval of ``plain``; None where n is not known.
+        published: whether it is the paper's.
     """
 
     name: str
@@ -34,6 +36,12 @@ class Curve:
     ordered: tuple[float, ...] | None = None
     low: tuple[float, ...] | None = None
     high: tuple[float, ...] | None = None
+    published: bool = False
+
+    @property
+    def identity(self) -> Identity:
+        """Whose curve it is."""
+        return self.name, self.published
 
 
 @dataclass(frozen=True)
@@ -72,8 +80,8 @@ def _curve(run: Run, task: str) -> Curve:
     intervals = [rate.interval or (0.0, 1.0) for rate in rates]
     return Curve(
         run.name,
-        tuple(100 * (rate.value or 0.0) for rate in rates),
-        tuple(100 * (rate.value or 0.0) for rate in run.summary.ordered_prefix[task]),
+        tuple(math.nan if rate.value is None else 100 * rate.value for rate in rates),
+        tuple(math.nan if rate.value is None else 100 * rate.value for rate in run.summary.ordered_prefix[task]),
         tuple(100 * low for low, _ in intervals),
         tuple(100 * high for _, high in intervals),
     )
@@ -85,13 +93,13 @@ def paper_panel() -> Panel:
     return Panel(
         "paper, a temporal task: subgoals in order and shuffled",
         "SUU",
-        tuple(Curve(f"paper, {name}", tuple(values)) for name, values in curves.items()),
+        tuple(Curve(name, tuple(values), published=True) for name, values in curves.items()),
     )
 
 
 def draw(found: Sequence[Panel]) -> Figure:
     """Draw the panels, at most five in a row."""
-    looks = style.lines([curve.name for panel in found for curve in panel.curves])
+    looks = style.looks(curve.identity for panel in found for curve in panel.curves)
     columns = min(COLUMNS, len(found))
     rows = math.ceil(len(found) / columns)
     with style.look():
@@ -108,20 +116,20 @@ def draw(found: Sequence[Panel]) -> Figure:
         return figure
 
 
-def _legend(figure: Figure, found: Sequence[Panel], looks: Mapping[str, style.Line], columns: int) -> None:
+def _legend(figure: Figure, found: Sequence[Panel], looks: Mapping[Identity, style.Line], columns: int) -> None:
     from matplotlib.lines import Line2D
 
     handles = [Line2D([], [], **look.drawn, ms=4, lw=1.3) for look in looks.values()]
-    labels = [style.words(name) for name in looks]
+    labels = [style.words(f"paper, {name}" if published else name) for name, published in looks]
     if any(curve.ordered not in (None, curve.plain) for panel in found for curve in panel.curves):
         handles.append(Line2D([], [], color=style.FAINT, marker="o", mfc="white", ls=":", ms=4, lw=1.0))
         labels.append("in order, where it differs")
     style.legend_below(figure, handles, labels, min(len(handles), 2 if columns < 3 else 4))
 
 
-def _draw_panel(place: Any, panel: Panel, looks: Mapping[str, style.Line]) -> None:
+def _draw_panel(place: Any, panel: Panel, looks: Mapping[Identity, style.Line]) -> None:
     for curve in panel.curves:
-        _draw_curve(place, curve, looks[curve.name], shaded=len(panel.curves) <= 3)
+        _draw_curve(place, curve, looks[curve.identity], shaded=len(panel.curves) <= 3)
     place.set_title(textwrap.fill(panel.title, 34, max_lines=3, placeholder=" …"), fontsize=6.5, fontweight="normal")
     place.set_ylim(0, 102)
     place.set_yticks(range(0, 101, 25))
@@ -142,5 +150,5 @@ def _draw_curve(place: Any, curve: Curve, look: style.Line, shaded: bool) -> Non
         place.fill_between(steps, curve.low, curve.high, color=look.colour, alpha=0.12, lw=0, zorder=1)
     place.plot(steps, curve.plain, **look.drawn, ms=4, lw=1.3, zorder=3, clip_on=False)
     if curve.ordered is not None and curve.ordered != curve.plain:
-        dotted = look.drawn | {"ls": ":"}
-        place.plot(steps, curve.ordered, **dotted, mfc="white", ms=3, lw=0.9, zorder=4, clip_on=False)
+        dotted = look.drawn | {"ls": ":", "mfc": "white"}
+        place.plot(steps, curve.ordered, **dotted, ms=3, lw=0.9, zorder=4, clip_on=False)

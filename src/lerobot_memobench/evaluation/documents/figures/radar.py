@@ -8,30 +8,33 @@ from typing import TYPE_CHECKING, Any
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.figures import style
-from lerobot_memobench.evaluation.documents.figures.entries import Axis, Entry, best_over_replan
+from lerobot_memobench.evaluation.documents.figures.entries import Axis, Entry, Identity, best_over_replan, labels_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FEWEST_AXES = 3
+LONGEST, ROW = 21, 0.2
+"""Characters of a legend's line of which two stand beside one another; inches that a line takes."""
 
 
 def normalised(
     entries: Sequence[Entry], axes: Sequence[Axis]
-) -> tuple[list[Axis], list[float], dict[str, list[float]]]:
-    """Return the axes that apply to any method, their highest values in per cent, and method -> shares of these.
+) -> tuple[list[Axis], list[float], dict[Identity, list[float | None]]]:
+    """Return the axes that apply to any method, their highest values in per cent, and whose row -> shares of these.
 
-    A method to which an axis does not apply, such as one that was not evaluated on its tasks, gets 0 there.
+    An axis that does not apply to a method, such as one whose tasks it was not evaluated on, has no share of it: None.
     """
     best = best_over_replan(entries, axes)
     highest = [max((row[k] for row in best.values() if row[k] is not None), default=None) for k in range(len(axes))]  # type: ignore[type-var]
     kept = [k for k, value in enumerate(highest) if value is not None]
     tops = [float(highest[k] or 0.0) for k in kept]
-    shares = {
-        method: [(row[k] or 0.0) / top if top else 0.0 for k, top in zip(kept, tops, strict=True)]
-        for method, row in best.items()
-    }
+    shares = {whose: [_share(row[k], top) for k, top in zip(kept, tops, strict=True)] for whose, row in best.items()}
     return [axes[k] for k in kept], tops, shares
+
+
+def _share(value: float | None, top: float) -> float | None:
+    return None if value is None else value / top if top else 0.0
 
 
 def draw(panels: Sequence[tuple[str, Sequence[Entry]]], axes: Sequence[Axis]) -> Figure:
@@ -40,18 +43,26 @@ def draw(panels: Sequence[tuple[str, Sequence[Entry]]], axes: Sequence[Axis]) ->
     Raises:
         MemobenchError: fewer than three axes apply.
     """
+    legends = [labels_of(entries).values() for _, entries in panels]
+    columns = 2 if max(len(line) for told in legends for label in told for line in label.splitlines()) <= LONGEST else 1
+    rows = max(sum(1 + label.count("\n") for label in told) + 1 for told in legends) / columns
     with style.look():
-        height = 3.7 if len(axes) <= 4 else 4.3
+        height = (3.1 if columns == 2 else 3.8) + (0 if len(axes) <= 4 else 0.6) + ROW * rows
         figure = style.new_figure(3.6 * len(panels) if len(axes) <= 4 else 4.5 * len(panels), height)
         places = figure.subplots(1, len(panels), subplot_kw={"projection": "polar"}, squeeze=False)[0]
-        looks = style.lines([entry.method for _, entries in panels for entry in entries])
+        looks = style.looks(entry.identity for _, entries in panels for entry in entries)
         for place, (title, entries) in zip(places, panels, strict=True):
-            _draw_panel(place, title, entries, axes, looks)
+            _draw_panel(place, title, entries, axes, looks, columns)
         return figure
 
 
 def _draw_panel(
-    place: Any, title: str, entries: Sequence[Entry], axes: Sequence[Axis], looks: Mapping[str, style.Line]
+    place: Any,
+    title: str,
+    entries: Sequence[Entry],
+    axes: Sequence[Axis],
+    looks: Mapping[Identity, style.Line],
+    columns: int,
 ) -> None:
     kept, tops, shares = normalised(entries, axes)
     if len(kept) < FEWEST_AXES:
@@ -61,18 +72,21 @@ def _draw_panel(
         )
     angles = [2 * math.pi * k / len(kept) for k in range(len(kept))]
     _draw_web(place, angles)
-    published = {entry.method for entry in entries if entry.published}
-    for method, values in shares.items():
-        width, label = 1.3 if method in published else 2.0, style.words(method)
-        drawn = looks[method].drawn
-        place.plot(_closed(angles), _closed(values), **drawn, ms=4, lw=width, label=label, zorder=3, clip_on=False)
+    labels = labels_of(entries)
+    for (method, published), values in shares.items():
+        width, label = 1.3 if published else 2.0, style.words(labels[method, published])
+        drawn = looks[method, published].drawn
+        gaps = [math.nan if value is None else value for value in values]
+        place.plot(_closed(angles), _closed(gaps), **drawn, ms=4, lw=width, label=label, zorder=3, clip_on=False)
+    if any(None in values for values in shares.values()):
+        place.plot([], [], ls="", label="a gap: not applicable, or not evaluated")
     for angle, axis, top in zip(angles, kept, tops, strict=True):
         _name_axis(place, angle, axis, top)
     place.set_title(title, pad=30 if len(kept) <= 4 else 34)
     place.legend(
         loc="upper center",
         bbox_to_anchor=(0.5, -0.16 if len(kept) <= 4 else -0.2),
-        ncols=2,
+        ncols=columns,
         handlelength=3.2,
         columnspacing=1.2,
     )

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.documents.beside_paper import published_rate
+from lerobot_memobench.evaluation.documents.beside_paper import published_rate, with_extent
 from lerobot_memobench.evaluation.documents.figures import style
+from lerobot_memobench.evaluation.documents.figures.entries import Identity
 from lerobot_memobench.evaluation.metrics.rates import METRICS, Rate
 from lerobot_memobench.evaluation.records.runs import Run, sweeps
 from lerobot_memobench.paper import published_rows
@@ -59,7 +61,7 @@ def draw(runs: Sequence[Run], paper: bool = False, by_type: bool = False) -> Fig
         )
     groups = [AVERAGE, *(MEMORY_TYPES if by_type else ())]
     grid = {(g, metric): curves(runs, paper, g, metric) for g in groups for metric in METRICS}
-    looks = style.lines([curve[0] for cell in grid.values() for curve in cell])
+    looks = style.looks((name, published) for cell in grid.values() for name, _, _, published in cell)
     with style.look():
         figure = style.new_figure(7.4, 1.75 * len(groups) + 0.75)
         places = figure.subplots(len(groups), len(METRICS), sharex=True, squeeze=False)
@@ -73,26 +75,31 @@ def draw(runs: Sequence[Run], paper: bool = False, by_type: bool = False) -> Fig
             if not below:
                 place.set_xlabel("replan interval, steps")
                 place.tick_params(labelbottom=True)
-        _legend(figure, [curve for cell in grid.values() for curve in cell], looks)
+        _legend(figure, looks, sweeps(runs) if paper else {})
         return figure
 
 
-def _draw_panel(place: Any, found: Sequence[Curve], looks: Mapping[str, style.Line]) -> None:
+def _draw_panel(place: Any, found: Sequence[Curve], looks: Mapping[Identity, style.Line]) -> None:
     if not found:
         place.set_visible(False)
         return
     for curve in found:
-        _draw_curve(place, curve, looks[curve[0]])
+        _draw_curve(place, curve, looks[curve[0], curve[3]])
     _frame(place, found)
 
 
-def _legend(figure: Figure, found: Sequence[Curve], looks: Mapping[str, style.Line]) -> None:
+def _legend(figure: Figure, looks: Mapping[Identity, style.Line], ours: Mapping[str, Sequence[Run]]) -> None:
+    """Name the lines; ``ours`` (method -> runs) say how much was run."""
     from matplotlib.lines import Line2D
 
-    ours = {name for name, _, _, published in found if not published}
-    handles = [Line2D([], [], **look.drawn, ms=4, lw=_width(name in ours)) for name, look in looks.items()]
-    marks = [style.words(name) if name in ours or not ours else f"paper: {style.words(name)}" for name in looks]
-    style.legend_below(figure, handles, marks, 4 if max(map(len, looks)) < 20 else 3)
+    handles = [Line2D([], [], **look.drawn, ms=4, lw=_width(not theirs)) for (_, theirs), look in looks.items()]
+    alone = all(published for _, published in looks)
+    marks = [
+        f"paper: {name}" if published and not alone else with_extent(name, ours.get(name, ())).replace(" (", "\n(")
+        for name, published in looks
+    ]
+    longest = max(len(line) for mark in marks for line in mark.splitlines())
+    style.legend_below(figure, handles, [style.words(mark) for mark in marks], 4 if longest < 27 else 3)
 
 
 def _width(ours: bool) -> float:
@@ -101,7 +108,7 @@ def _width(ours: bool) -> float:
 
 def _draw_curve(place: Any, curve: Curve, look: style.Line) -> None:
     _, steps, rates, published = curve
-    values = [100 * (rate.value or 0.0) for rate in rates]
+    values = [math.nan if rate.value is None else 100 * rate.value for rate in rates]
     if not published:
         intervals = [rate.interval or (0.0, 1.0) for rate in rates]
         low, high = ([100 * bounds[k] for bounds in intervals] for k in (0, 1))

@@ -7,14 +7,15 @@ takes others.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.files import draft_of
+from lerobot_memobench.paper import published_rows, shuffled_control
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -60,11 +61,13 @@ class Line:
     colour: str
     marker: str
     dashes: Any
+    open: bool = False
 
     @property
     def drawn(self) -> dict[str, Any]:
         """The same as matplotlib's keywords."""
-        return {"color": self.colour, "marker": self.marker, "ls": self.dashes}
+        face = "white" if self.open else self.colour
+        return {"color": self.colour, "marker": self.marker, "ls": self.dashes, "mfc": face}
 
 
 _COLOURS = (
@@ -82,12 +85,28 @@ _DASHES: tuple[Any, ...] = (
 
 def lines(names: Sequence[str]) -> dict[str, Line]:
     """Return a look for each method: no two of eleven share colour, marker or dashes, no two of a hundred all three."""
-    distinct = list(dict.fromkeys(names))
+    return {name: _line(k) for k, name in enumerate(dict.fromkeys(names))}
+
+
+def looks(identities: Iterable[tuple[str, bool]]) -> dict[tuple[str, bool], Line]:
+    """Return a look for each (method, whether it is the paper's).
+
+    A method of the paper's has the same one in every figure, from the palette's end; evaluations take theirs from its
+    beginning, as they are named. The paper's markers are open, so that they are told apart also where colours repeat.
+    """
+    distinct = list(dict.fromkeys(identities))
+    ours = lines([name for name, published in distinct if not published])
+    return {(name, published): _papers_line(name) if published else ours[name] for name, published in distinct}
+
+
+def _line(k: int) -> Line:
     count = len(_COLOURS)
-    return {
-        name: Line(_COLOURS[k % count], _MARKERS[(k + k // count) % count], _DASHES[(k + k // count) % count])
-        for k, name in enumerate(distinct)
-    }
+    return Line(_COLOURS[k % count], _MARKERS[(k + k // count) % count], _DASHES[(k + k // count) % count])
+
+
+def _papers_line(name: str) -> Line:
+    known = list(dict.fromkeys((*(row.label for row in published_rows()), *shuffled_control())))
+    return replace(_line(len(_COLOURS) - 1 - known.index(name) % len(_COLOURS)), open=True)
 
 
 @contextmanager
