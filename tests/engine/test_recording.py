@@ -7,12 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.scripts import lerobot_eval
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.memobench_random.modeling_memobench_random import MemobenchRandomPolicy
 
 TASK = "put_the_butter_into_the_bowl_from_the_prompt_video"
 STEPS = 4
@@ -62,6 +65,29 @@ def test_what_is_recorded_is_what_the_policy_did(tmp_path: Path) -> None:
     assert np.abs(np.diff(states[:STEPS], axis=0)).max() > 1e-4  # the arm moves
     hashes = [(path / "report.json").read_text() for path in (tmp_path / "recorded", tmp_path / "plain")]
     assert hashes[0] == hashes[1]
+
+
+@pytest.mark.parametrize(("bad", "step"), [(np.nan, 2), (None, 1)])
+def test_nothing_is_kept_of_an_episode_that_was_cut_off(
+    bad: float | None, step: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first batch's second action holds NaN, or its first is of another shape; the second batch goes on."""
+    draw, calls = MemobenchRandomPolicy.select_action, []
+
+    def select_action(self: MemobenchRandomPolicy, batch: dict[str, torch.Tensor]) -> torch.Tensor:
+        calls.append(draw(self, batch))
+        if len(calls) != step:
+            return calls[-1]
+        return calls[-1][:, :6] if bad is None else calls[-1] * bad
+
+    monkeypatch.setattr(MemobenchRandomPolicy, "select_action", select_action)
+    words = [*COMMAND, "batch_size=1", "episodes=2", "obs_type=environment_state_agent_pos"]
+    assert main([*words, f"output_dir={tmp_path}"]) == 0
+    (folder,) = (tmp_path / "recordings").iterdir()
+    dataset = LeRobotDataset("local/recorded", root=folder)
+    assert (dataset.num_episodes, dataset.num_frames) == (1, STEPS)
+    first, second = read_episodes(tmp_path)
+    assert (first["failure"], first["steps"], second["steps"]) == ("invalid_action", step - 1, STEPS)
 
 
 @pytest.mark.parametrize(("obs_type", "episodes"), [("both", 1), ("environment_state_agent_pos", 3)])

@@ -108,7 +108,8 @@ def _roll(env: Any, policy: Any, settings: dict[str, Any], quiet: bool) -> dict[
             done = terminated | truncated | done | (len(steps) + 1 == limit)
             ever = ever | success
             if recorder is not None:
-                recorder.add(before, action, reward, success, done, seen["task"])
+                cut = np.broadcast_to(info.get("_fault", False), done.shape)  # gymnasium's mark of a row that tells it
+                recorder.add(before, action, reward, success, done, seen["task"], cut)
             steps.append((action, reward, success, done))
             bar.set_postfix({"running_success_rate": f"{ever.mean() * 100:.1f}%"}, refresh=False)
             bar.update()
