@@ -9,3 +9,7 @@ import lerobot_memobench.policies.memobench_expert.configuration_memobench_exper
 import lerobot_memobench.policies.memobench_mem.configuration_memobench_mem
 import lerobot_memobench.policies.memobench_random.configuration_memobench_random
 import lerobot_memobench.policies.remote.configuration_remote  # noqa: F401
+from lerobot_memobench.envs.configuration_memobench import POLICY_CHECKS
+from lerobot_memobench.policies.shown import check_policy
+
+POLICY_CHECKS.append(check_policy)

@@ -19,7 +19,7 @@ from lerobot_memobench.envs.prompting import prompt_in
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.executors import ELSEWHERE
 from lerobot_memobench.policies.checkpoint import check_checkpoint
-from lerobot_memobench.settings.configurations import check_sight, env_config, policy_config
+from lerobot_memobench.settings.configurations import check_shown, check_sight, env_config, policy_config
 from lerobot_memobench.settings.flags import whole_number
 from lerobot_memobench.settings.reading import read_settings
 from lerobot_memobench.settings.translation import LerobotSettings
@@ -75,6 +75,7 @@ def make_plan(settings: LerobotSettings, orders: Orders, command: Sequence[str])
         settings = settings.default("env.prompt_in", prompt_in(policy))
     environment = cast("MemobenchEnvConfig | None", env_config(settings))
     check_sight(policy, environment)
+    check_shown(settings, policy, environment)
     if environment is None and orders.any:
         raise MemobenchError("resume=, shard= and shards= cannot go with config_path=; give its settings on the line")
     grid = None if environment is None else make_grid(settings, environment)

@@ -18,7 +18,7 @@ from lerobot_memobench.envs.episode_log import has_log, read_episodes
 from lerobot_memobench.envs.protocol import read_protocol_file
 from lerobot_memobench.evaluation.documents.sentences import count_of
 from lerobot_memobench.evaluation.records.protocol import POLICY, read_protocol
-from lerobot_memobench.policies.checkpoint import portable_path
+from lerobot_memobench.policies.checkpoint import check_weights, portable_path
 from lerobot_memobench.policies.untrained import UntrainedConfig
 from lerobot_memobench.settings.lerobot_commands import without_chatter
 
@@ -44,8 +44,10 @@ def run_evaluation(plan: EvaluationPlan, tell: Tell, begin: Tell = lambda text: 
         begin: told what is about to be run: the first episode takes a while.
 
     Raises:
-        MemobenchError: the folder holds another evaluation. Whatever LeRobot raises.
+        MemobenchError: the folder holds another evaluation, or weights are missing. Whatever LeRobot raises.
     """
+    if plan.policy is not None and plan.policy_path is not None:
+        check_weights(plan.policy_path, plan.policy)
     if not plan.orders.resume:
         check_new(plan.output)
         check_new(plan.log)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-from lerobot.configs import PolicyFeature
+from lerobot.configs import PolicyFeature, PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_memobench.envs.obs_types import OBJECTS, OBS_TYPES, PIXELS
@@ -26,11 +26,28 @@ from lerobot_memobench.envs.observations import (
     policy_features,
     policy_names,
 )
-from lerobot_memobench.envs.prompting import AUTO, PLACES, parameters_being_run, policy_being_run, prompt_in
+from lerobot_memobench.envs.prompting import (
+    AUTO,
+    PLACES,
+    checkpoint_being_run,
+    parameters_being_run,
+    policy_being_run,
+    prompt_in,
+    rename_map,
+    training_runs,
+)
 from lerobot_memobench.envs.protocol import SEED_BASE, SETTINGS, check_protocol
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.jobs.threads import ACTING, limit_torch, use_threads
 from lerobot_memobench.tasks.task import DRAWN, PUBLISHED, REFERENTS, STRICT, SUITES, referent_told
+
+PolicyCheck = Callable[[str, PreTrainedConfig, dict[str, PolicyFeature], dict[str, str]], None]
+"""Called with a checkpoint's path and configuration, what is shown by its names at the policy, and LeRobot's
+``rename_map``; raises where they do not go together."""
+
+POLICY_CHECKS: list[PolicyCheck] = []
+"""What is asked of the checkpoint that LeRobot is about to evaluate; filled by `registration`, since checkpoints are
+the business of `policies`."""
 
 
 @EnvConfig.register_subclass("memobench")
@@ -168,6 +185,7 @@ class MemobenchEnvConfig(EnvConfig):
         from lerobot_memobench.envs.memobench_env import MemobenchEnv
         from lerobot_memobench.envs.resuming import skip_logged
 
+        self.check_checkpoint()
         chosen = self.selected()  # before anything is written: a wrong name leaves nothing behind
         _check_recording(n_envs, self.obs_type)
         _use_threads()
@@ -187,6 +205,15 @@ class MemobenchEnvConfig(EnvConfig):
                 make = skip_logged(make, log_dir, self.referent, self.seed_base)
             suites.setdefault(memory_type, {})[task_id] = self._vector([make] * n_envs, use_async_envs)
         return suites
+
+    def check_checkpoint(self) -> None:
+        """Refuse the checkpoint on LeRobot's command line where it was made for something else than is shown here."""
+        from lerobot.envs.utils import env_to_policy_features
+
+        running = None if training_runs() else checkpoint_being_run()
+        if running is not None:
+            for check in POLICY_CHECKS:
+                check(*running, env_to_policy_features(self), rename_map())
 
     def _vector(self, make: list[Callable[[], gym.Env[Any, Any]]], use_async_envs: bool) -> gym.vector.VectorEnv:
         from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end

@@ -8,10 +8,14 @@ frame.
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
+
+if TYPE_CHECKING:
+    from lerobot.configs import PreTrainedConfig
 
 AUTO, STEPS, RESET = "auto", "steps", "reset"
 PLACES = (AUTO, STEPS, RESET)
@@ -35,13 +39,12 @@ def policy_being_run() -> type | None:
     """
     from lerobot.configs import PreTrainedConfig, parser
 
-    path = parser.get_path_arg("policy")
-    if path is not None:
-        overrides = [*parser.get_yaml_overrides("policy"), *(parser.get_cli_overrides("policy") or [])]
-        return type(PreTrainedConfig.from_pretrained(path, cli_overrides=overrides))
-    name = parser.get_type_arg("policy") or _type_in_file(parser.parse_arg("config_path"))
+    checkpoint = checkpoint_being_run()
+    if checkpoint is not None:
+        return type(checkpoint[1])
+    name = parser.get_type_arg("policy") or _in_file("policy", "type")
     known: dict[str, type] = PreTrainedConfig.get_known_choices()
-    return known.get(name) if name is not None else None
+    return known.get(name) if isinstance(name, str) else None
 
 
 def parameters_being_run() -> int | None:
@@ -72,13 +75,50 @@ def parameters_of(path: str) -> int | None:
     return sum(sizes) // 4 if sizes else None
 
 
-def _type_in_file(path: str | None) -> str | None:
-    """Return the policy type in a local file of LeRobot's settings, or in a checkpoint's folder; None without one."""
+def checkpoint_being_run() -> tuple[str, PreTrainedConfig] | None:
+    """Return path and configuration of the checkpoint on LeRobot's command line; None where none is told."""
+    from lerobot.configs import PreTrainedConfig, parser
+
+    path = parser.get_path_arg("policy")
+    if path is None:
+        return None
+    overrides = [*parser.get_yaml_overrides("policy"), *(parser.get_cli_overrides("policy") or [])]
+    return path, PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+
+
+def training_runs() -> bool:
+    """Return whether a dataset is on LeRobot's command line: then a policy is trained on it, whatever it saw before."""
+    return any(argument.startswith("--dataset.") for argument in sys.argv[1:]) or _in_file("dataset") is not None
+
+
+def rename_map() -> dict[str, str]:
+    """Return LeRobot's ``rename_map`` of its command line: names of the environment's -> names of the policy's."""
+    from lerobot.configs import parser
+
+    return read_rename_map(parser.parse_arg("rename_map") or _in_file("rename_map"))
+
+
+def read_rename_map(told: Any) -> dict[str, str]:
+    """Return a ``rename_map`` as it is told, as text perhaps; nothing where it is none, which LeRobot says itself."""
+    try:
+        found = yaml.safe_load(told) if isinstance(told, str) else told
+    except yaml.YAMLError:
+        return {}
+    return {str(key): str(value) for key, value in found.items()} if isinstance(found, dict) else {}
+
+
+def _in_file(*keys: str) -> Any | None:
+    """Return what a local file of LeRobot's settings, or the one in a checkpoint's folder, says; None without one."""
+    from lerobot.configs import parser
+
+    path = parser.parse_arg("config_path")
     if path is None:
         return None
     file = Path(path) / "train_config.json" if Path(path).is_dir() else Path(path)
     try:
-        name: Any = yaml.safe_load(file.read_text())["policy"]["type"]
+        found: Any = yaml.safe_load(file.read_text())
+        for key in keys:
+            found = found[key]
     except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError):
         return None
-    return name if isinstance(name, str) else None
+    return found

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import copy
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import TYPE_CHECKING, Any, TypedDict
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.files import file_name
 from lerobot_memobench.files.reading import read_json as read_json_file
+
+if TYPE_CHECKING:
+    from lerobot.configs.policies import PreTrainedConfig
 
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
@@ -97,7 +101,10 @@ def checkpoint_type(path: str) -> str | None:
         return None
     name = read_json(folder / CONFIG_FILE).get("type")
     if not isinstance(name, str):
-        raise MemobenchError(f"{folder / CONFIG_FILE} names no policy type; expected a checkpoint of LeRobot")
+        raise MemobenchError(
+            f"{folder / CONFIG_FILE} names no policy type; expected a checkpoint of today's LeRobot, which cannot read "
+            "those of its first year: train it again"
+        )
     return name
 
 
@@ -129,10 +136,126 @@ def check_checkpoint(path: str) -> None:
     checkpoint_type(path)
     if not any((folder / name).is_file() for name in (WEIGHTS_FILE, ADAPTER_FILE)):
         raise MemobenchError(f"the checkpoint {folder} holds no weights ({WEIGHTS_FILE}); copy or train it again")
+    _check_form(folder)
     for name in (PREPROCESSOR_FILE, POSTPROCESSOR_FILE):
         for step in read_json(folder / name, Processor).get("steps", []):
             if str(step.get("registry_name", "")).endswith("normalizer_processor"):
                 _check_statistics(folder, name, step)
+
+
+def _check_form(folder: Path) -> None:
+    """Refuse weights with statistics among them, which LeRobot keeps in processors since its version 0.4."""
+    weights = folder / WEIGHTS_FILE
+    if (folder / PREPROCESSOR_FILE).is_file() or not weights.is_file():
+        return
+    if any(name.startswith(("normalize_inputs.", "model.normalize_inputs.")) for name in _shapes(weights)):
+        raise MemobenchError(
+            f"the checkpoint {folder} has an earlier LeRobot's form, with its statistics among its weights; migrate "
+            f"it: python -m lerobot.processor.migrate_policy_normalization --pretrained-path {folder}"
+        )
+
+
+def check_weights(path: str, policy: PreTrainedConfig) -> None:
+    """Refuse weights that are not all there: LeRobot goes on with random numbers in their place, and warns at most.
+
+    They are compared with the policy built without memory for its weights. One that cannot be built so (its parts come
+    from the hub) and the project's own, which load exactly, are left to themselves.
+
+    Args:
+        path: a checkpoint folder; of a repository nothing is asked. policy: its configuration.
+
+    Raises:
+        MemobenchError: weights are missing, or have other shapes.
+    """
+    folder = Path(path).expanduser()
+    file = folder / WEIGHTS_FILE
+    if not file.is_file() or policy.use_peft or type(policy).__module__.partition(".")[0] == __name__.partition(".")[0]:
+        return
+    found = _shapes(file)
+    built = _built_empty(policy)
+    if built is None:
+        return
+    tensors = _as_loaded(built, found)
+    names: dict[int, list[str]] = {}  # a tensor with several names is saved by one of them
+    wanted = {
+        **dict(built.named_parameters(remove_duplicate=False)),
+        **dict(built.named_buffers(remove_duplicate=False)),
+    }
+    for name in built.state_dict():
+        names.setdefault(id(wanted[name]), []).append(name)
+    missing = [same[0] for same in names.values() if not any(name in tensors for name in same)]
+    wrong = [name for name in built.state_dict() if name in tensors and tensors[name] != tuple(wanted[name].shape)]
+    if missing or wrong:
+        raise MemobenchError(
+            f"the weights of the checkpoint {folder} are not those of its policy ({policy.type}): {len(missing)} of "
+            f"{len(names)} are missing and {len(wrong)} have another shape, the first being {(missing + wrong)[0]}; "
+            "LeRobot would go on with random numbers there: copy it whole or train it again"
+        )
+
+
+def _shapes(file: Path) -> dict[str, tuple[int, ...]]:
+    """Return the shape of every tensor in a file, of which only the head is read."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(file, framework="numpy") as tensors:
+            return {name: tuple(tensors.get_slice(name).get_shape()) for name in tensors.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise MemobenchError(f"{file} cannot be read ({error}); copy or train the checkpoint again") from None
+
+
+def _built_empty(policy: PreTrainedConfig) -> Any | None:
+    """Return LeRobot's policy without memory for its weights; None where it cannot be built so."""
+    import torch
+    from lerobot.policies.factory import get_policy_class
+
+    config = copy.deepcopy(policy)
+    config.device = "meta"
+    for loads in ("pretrained_backbone_weights", "load_vlm_weights"):  # what the checkpoint's replace
+        if hasattr(config, loads):
+            setattr(config, loads, None)
+    try:
+        with torch.device("meta"):
+            return get_policy_class(policy.type)(config)
+    except Exception:  # whatever a policy of any kind raises, LeRobot meets it again and says so
+        return None
+
+
+def _as_loaded(policy: Any, shapes: dict[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
+    """Return shapes by the names that the policy loads them under: the family of pi0 renames what it finds."""
+    import torch
+
+    renamed = getattr(policy, "_fix_pytorch_state_dict_keys", None)
+    if renamed is None:
+        return shapes
+    found = renamed({name: torch.empty(shape, device="meta") for name, shape in shapes.items()}, policy.config)
+    return {name if name.startswith("model.") else f"model.{name}": tuple(value.shape) for name, value in found.items()}
+
+
+def statistics_shapes(path: str) -> dict[str, tuple[int, ...]]:
+    """Return of which observations and actions a checkpoint holds statistics, and their shapes: what it was trained on.
+
+    A configuration that was begun from another checkpoint lists that one's features instead. Empty for a repository.
+    """
+    folder = Path(path).expanduser()
+    if not (folder / PREPROCESSOR_FILE).is_file():
+        return {}
+    return {
+        name.rpartition(".")[0]: shape
+        for file in _state_files(folder)
+        for name, shape in _shapes(file).items()
+        if not name.endswith(".count")
+    }
+
+
+def _state_files(folder: Path) -> Iterator[Path]:
+    """Yield the files of the preprocessor's statistics."""
+    for step in read_json(folder / PREPROCESSOR_FILE, Processor).get("steps", []):
+        state = step.get("state_file")
+        if str(step.get("registry_name", "")).endswith("normalizer_processor") and isinstance(state, str):
+            file = folder / file_name(state, f"state_file in {folder / PREPROCESSOR_FILE}")
+            if file.is_file():
+                yield file
 
 
 def _check_statistics(folder: Path, file: str, step: Mapping[str, Any]) -> None:
@@ -163,15 +286,9 @@ def _applies(file: str, feature_type: str) -> bool:
 
 
 def _tensor_names(path: Path) -> set[str]:
-    from safetensors import SafetensorError, safe_open
-
     if not path.is_file():
         raise MemobenchError(
             f"the checkpoint {path.parent} lacks its normalisation statistics ({path.name} is missing); "
             "copy it whole or train it again"
         )
-    try:
-        with safe_open(path, framework="numpy") as file:
-            return set(file.keys())
-    except (SafetensorError, OSError) as error:
-        raise MemobenchError(f"{path} cannot be read ({error}); copy or train the checkpoint again") from None
+    return set(_shapes(path))

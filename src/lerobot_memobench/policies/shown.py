@@ -1,12 +1,36 @@
-"""What to do about an observation that a policy misses."""
+"""What a policy sees, and what an environment shows: whether they agree, and what to do about it."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import json
+from collections.abc import Collection, Mapping
+from typing import TYPE_CHECKING, Any
 
-from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
 from lerobot_memobench.envs.obs_types import BOTH, OBJECTS, PIXELS
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.checkpoint import check_checkpoint, check_weights, statistics_shapes
+
+if TYPE_CHECKING:
+    from lerobot.configs import PolicyFeature
+    from lerobot.configs.policies import PreTrainedConfig
+
+SIZE_COUNTS = {
+    "act": None,
+    "diffusion": "resize_shape",
+    "gaussian_actor": None,
+    "multi_task_dit": "image_resize_shape",
+    "smolvla": "resize_imgs_with_padding",
+    "tdmpc": None,
+    "vla_jepa": "resize_images_to",
+    "vqbet": None,
+    "xvla": "resize_imgs_with_padding",
+}
+"""Policies of LeRobot's that see pictures in the size in which they come -> the setting by which they resize them, if
+they have one. All others bring every picture to a size of their own."""
+EMPTY_CAMERA = f"{OBS_IMAGES}.empty_camera_"
+"""What the names of the cameras begin with that LeRobot's ``policy.empty_cameras`` adds: nobody has them."""
 
 
 def cure(missing: str, observed: Collection[str]) -> str:
@@ -22,3 +46,122 @@ def cure(missing: str, observed: Collection[str]) -> str:
     if not cameras and OBS_ENV_STATE in observed:
         return f"set env.obs_type={PIXELS}, or {BOTH}."
     return f"it has {cameras or 'none'}. Map its names with --rename_map."
+
+
+def check_policy(
+    path: str, policy: PreTrainedConfig, shown: Mapping[str, PolicyFeature], renamed: Mapping[str, str]
+) -> None:
+    """Refuse a checkpoint that is not whole, or that was trained on something else than it will be shown.
+
+    Args:
+        path: its folder, or a repository. policy: its configuration, of the checkpoint's own features.
+        shown: the environment's features by their names at the policy, and its action.
+        renamed: LeRobot's ``rename_map``: names of the environment's -> names of the policy's.
+
+    Raises:
+        MemobenchError: it is refused.
+    """
+    check_checkpoint(path)
+    check_features(path, policy, shown, renamed)
+    check_weights(path, policy)
+
+
+def check_features(
+    path: str, policy: PreTrainedConfig, shown: Mapping[str, PolicyFeature], renamed: Mapping[str, str]
+) -> None:
+    """Refuse to show a checkpoint other cameras, or numbers or pictures of other sizes, than it was trained on.
+
+    LeRobot compares names of cameras alone, and those only without a ``rename_map``; policies that pad what they are
+    given, and those that take pictures of any size, would act on what they have never seen. Arguments and errors are
+    those of `check_policy`.
+    """
+    if getattr(policy, "perception", None) == "any" or not policy.input_features:
+        return
+    trained = statistics_shapes(path)
+    there = {renamed.get(name, name): feature for name, feature in shown.items()}
+    original = {renamed.get(name, name): name for name in shown}
+    _check_cameras(path, _cameras(policy, trained), there, original)
+    features = {
+        OBS_STATE: policy.robot_state_feature,
+        OBS_ENV_STATE: policy.env_state_feature if OBS_ENV_STATE in there else None,  # else see `check_obs_type`
+        ACTION: policy.action_feature,
+    }
+    for name, feature in features.items():
+        length = _length(policy, name, feature, trained)
+        if name == OBS_STATE and length is not None and name not in there:
+            raise MemobenchError(
+                f"the policy {path} sees {name} ({length} numbers), and the environment shows {_list(original)}; map "
+                "its names with --rename_map, or train on a dataset of this environment"
+            )
+        if length is not None and there[name].shape != (length,):
+            verb, what = ("acts by", "takes") if name == ACTION else ("sees", "shows")
+            raise MemobenchError(
+                f"the policy {path} {verb} {name} of {length} numbers, and the environment {what} "
+                f"{there[name].shape[0]}; it was trained for something else: train it on a dataset of this environment"
+            )
+    _check_sizes(path, policy, there)
+
+
+def _cameras(policy: Any, trained: Mapping[str, Any]) -> list[str]:
+    """Return the cameras that a policy must be shown.
+
+    One that fills missing pictures with nothing may list those of the checkpoint that it was begun from: it needs those
+    that it was trained on, which its statistics tell.
+    """
+    cameras = list(policy.image_features)
+    if not hasattr(policy, "empty_cameras"):
+        return cameras
+    return [name for name in cameras if name in trained] or [
+        name for name in cameras if not name.startswith(EMPTY_CAMERA)
+    ]
+
+
+def _check_cameras(
+    path: str, cameras: list[str], there: Mapping[str, PolicyFeature], original: Mapping[str, str]
+) -> None:
+    missing = [name for name in cameras if name not in there]
+    if not missing:
+        return
+    free = [original[name] for name in there if name.startswith(f"{OBS_IMAGES}.") and name not in cameras]
+    says = f"the policy {path} sees {', '.join(cameras)}, and the environment shows {_list(original)}"
+    if len(free) < len(missing):
+        raise MemobenchError(
+            f"{says}: it has no picture for {', '.join(missing[len(free) :])}; train without that, or on a dataset of "
+            "this environment"
+        )
+    mapped = {name: known for known, name in original.items() if known in cameras and known != name}
+    guess = json.dumps(mapped | dict(zip(free, missing, strict=False)))
+    raise MemobenchError(f"{says}; map its names, whichever means which: --rename_map='{guess}'")
+
+
+def _list(original: Mapping[str, str]) -> str:
+    return ", ".join(name for name in original.values() if name != ACTION)
+
+
+def _length(policy: Any, name: str, feature: PolicyFeature | None, trained: Mapping[str, Any]) -> int | None:
+    """Return of how many numbers a state or an action was when a policy was trained; None where that is not known.
+
+    A policy that pads them may list the padded number, or that of the checkpoint which it was begun from.
+    """
+    if feature is None:
+        return None
+    padded = getattr(policy, "max_state_dim" if name == OBS_STATE else "max_action_dim", None)
+    if name in trained and len(trained[name]) == 1:
+        return int(trained[name][0])
+    return None if padded is not None and feature.shape == (padded,) else int(feature.shape[0])
+
+
+def _check_sizes(path: str, policy: PreTrainedConfig, there: Mapping[str, PolicyFeature]) -> None:
+    if policy.type not in SIZE_COUNTS:
+        return
+    resizes = SIZE_COUNTS[policy.type]
+    if resizes is not None and getattr(policy, resizes) is not None:
+        return
+    for name, feature in policy.image_features.items():
+        if name in there and tuple(there[name].shape) != tuple(feature.shape):
+            here, seen = (" x ".join(map(str, shape[1:])) for shape in (there[name].shape, feature.shape))
+            also = "" if resizes is None else f", or with --policy.{resizes} on both"
+            raise MemobenchError(
+                f"the policy {path} was trained on pictures {name} of {seen} pixels and takes them as they come, and "
+                f"the environment shows {here}; train it on pictures of that size{also}"
+            )

@@ -5,9 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, cast
 
 from lerobot_memobench.envs.obs_types import OBJECTS, check_obs_type, obs_type_of
+from lerobot_memobench.envs.prompting import read_rename_map
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import check_checkpoint
 from lerobot_memobench.policies.freshness import REFUSAL
+from lerobot_memobench.policies.shown import check_features
 from lerobot_memobench.settings.lerobot_commands import quiet
 from lerobot_memobench.settings.translation import LerobotSettings
 
@@ -52,6 +54,21 @@ def check_sight(policy: PreTrainedConfig | None, environment: EnvConfig | None) 
     remembers_pictures = getattr(policy, "watches", False) and obs_type_of(policy) != OBJECTS
     if remembers_pictures and getattr(environment, "render_every", 1) > 1:
         raise MemobenchError(f"env.render_every is {getattr(environment, 'render_every', 1)}; {REFUSAL}")
+
+
+def check_shown(settings: LerobotSettings, policy: PreTrainedConfig | None, environment: EnvConfig | None) -> None:
+    """Refuse a checkpoint that was trained on other cameras, or numbers or pictures of other sizes, than are shown.
+
+    Raises:
+        MemobenchError: it was.
+    """
+    path = settings.get("policy.path")
+    if path is None or policy is None or environment is None:
+        return
+    from lerobot.envs.utils import env_to_policy_features
+
+    renamed = read_rename_map(settings.get("rename_map"))
+    check_features(path, policy, env_to_policy_features(environment), renamed)
 
 
 def _is_known(settings: LerobotSettings, key: str) -> bool:
