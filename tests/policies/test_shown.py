@@ -5,8 +5,10 @@ Nothing is simulated: a checkpoint is refused before LeRobot makes an environmen
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
+import shutil
 import struct
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -25,7 +27,10 @@ from lerobot_memobench.engine.lerobot_command import call_lerobot
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.prompting import read_rename_map
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.checkpoint import check_checkpoint, check_weights, shipped_policies
+from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint, check_weights, shipped_policies
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from lerobot_memobench.policies.memobench_mem.settings_memobench_mem import FIXED, OF_ACTING, OF_TRAINING
 from lerobot_memobench.policies.shown import SIZE_COUNTS, check_features, check_policy
 
 TASK = "turn_on_the_stove_and_turn_it_off"
@@ -269,3 +274,47 @@ def test_a_configuration_without_a_type_is_an_earlier_form(tmp_path: Path) -> No
     (checkpoint / "config.json").write_text(json.dumps({"input_shapes": {STATE: [8]}, "output_shapes": {ACTION: [7]}}))
     with pytest.raises(MemobenchError, match=r"names no policy type; .* train it again"):
         check_checkpoint(str(checkpoint))
+
+
+# --- fixed by training ---
+
+NAMES = [field.name for field in dataclasses.fields(MemobenchMemConfig)]
+
+
+def test_every_field_is_classified() -> None:
+    """A new field is put where it belongs: fixed by training, of training alone, or free where a checkpoint acts."""
+    fields = set(NAMES)
+    assert fields == FIXED | OF_ACTING | OF_TRAINING
+    assert len(fields) == len(FIXED) + len(OF_ACTING) + len(OF_TRAINING)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_is_fixed_by_training_stays(name: str) -> None:
+    checkpoint = shipped_policies()["memobench_small"]
+    policy = PreTrainedConfig.from_pretrained(checkpoint)
+    check_as_trained(checkpoint, policy)
+    setattr(policy, name, object() if name != "device" else "cpu")
+    if name not in FIXED:
+        check_as_trained(checkpoint, policy)
+        return
+    with pytest.raises(MemobenchError, match=rf"--policy\.{name}=.* leave {name} out"):
+        check_as_trained(checkpoint, policy)
+
+
+@pytest.mark.parametrize("word", ["memory_frames=4", "memory_stride=2", "memory_camera=observation.images.wrist_image"])
+def test_a_memory_is_not_changed_where_a_checkpoint_acts(
+    word: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    checkpoint = tmp_path / "it"
+    shutil.copytree(shipped_policies()["memobench_small"], checkpoint)
+    sight = ("--env.obs_type=environment_state_agent_pos",)
+    assert f"--policy.{word} cannot be followed" in refused_by_both(checkpoint, capsys, *sight, f"--policy.{word}")
+
+
+def test_what_is_loaded_by_hand_acts_as_it_was_trained() -> None:
+    checkpoint = shipped_policies()["memobench_small"]
+    policy = PreTrainedConfig.from_pretrained(checkpoint, cli_overrides=["--device=cpu", "--n_action_steps=2"])
+    assert MemobenchMemPolicy.from_pretrained(checkpoint, config=policy).config.n_action_steps == 2
+    policy = PreTrainedConfig.from_pretrained(checkpoint, cli_overrides=["--device=cpu", "--memory_frames=2"])
+    with pytest.raises(MemobenchError, match=r"--policy.memory_frames=2 cannot be followed: .* was trained with"):
+        MemobenchMemPolicy.from_pretrained(checkpoint, config=policy)

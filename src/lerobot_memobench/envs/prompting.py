@@ -98,6 +98,11 @@ def rename_map() -> dict[str, str]:
     return read_rename_map(parser.parse_arg("rename_map") or _in_file("rename_map"))
 
 
+def name_in_data(name: str) -> str:
+    """Return what the dataset or the environment of LeRobot's command line calls a policy's observation."""
+    return {known: given for given, known in rename_map().items()}.get(name, name)
+
+
 def read_rename_map(told: Any) -> dict[str, str]:
     """Return a ``rename_map`` as it is told, as text perhaps; nothing where it is none, which LeRobot says itself."""
     try:

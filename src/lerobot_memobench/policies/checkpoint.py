@@ -193,6 +193,31 @@ def check_weights(path: str, policy: PreTrainedConfig) -> None:
         )
 
 
+def check_as_trained(source: str | Path, policy: PreTrainedConfig, revision: str | None = None) -> None:
+    """Refuse a checkpoint that is to act under other settings than its weights were trained for.
+
+    Which these are its configuration says, by ``fixed_by_training: ClassVar[Collection[str]]`` on its class.
+
+    Args:
+        source: folder or repository. policy: what it would act under.
+
+    Raises:
+        MemobenchError: one of them is another.
+    """
+    fixed = getattr(policy, "fixed_by_training", ())
+    if not fixed:
+        return
+    device = [f"--device={policy.device}"]  # or a word would be lost on that of the training
+    trained = type(policy).from_pretrained(source, revision=revision, cli_overrides=device)
+    for name in sorted(fixed):
+        asked, held = getattr(policy, name), getattr(trained, name)
+        if asked != held:
+            raise MemobenchError(
+                f"--policy.{name}={asked} cannot be followed: '{source}' was trained with {held}, and its weights mean "
+                f"nothing else; leave {name} out, or train with it"
+            )
+
+
 def _shapes(file: Path) -> dict[str, tuple[int, ...]]:
     """Return the shape of every tensor in a file, of which only the head is read."""
     from safetensors import SafetensorError, safe_open

@@ -10,7 +10,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
 from lerobot_memobench.envs.obs_types import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.checkpoint import check_checkpoint, check_weights, statistics_shapes
+from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint, check_weights, statistics_shapes
 
 if TYPE_CHECKING:
     from lerobot.configs import PolicyFeature
@@ -62,6 +62,7 @@ def check_policy(
         MemobenchError: it is refused.
     """
     check_checkpoint(path)
+    check_as_trained(path, policy)
     check_features(path, policy, shown, renamed)
     check_weights(path, policy)
 

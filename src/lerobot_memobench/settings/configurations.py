@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, cast
 from lerobot_memobench.envs.obs_types import OBJECTS, check_obs_type, obs_type_of
 from lerobot_memobench.envs.prompting import read_rename_map
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.checkpoint import check_checkpoint
+from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint
 from lerobot_memobench.policies.freshness import REFUSAL
 from lerobot_memobench.policies.shown import check_features
 from lerobot_memobench.settings.lerobot_commands import quiet
@@ -57,13 +57,17 @@ def check_sight(policy: PreTrainedConfig | None, environment: EnvConfig | None) 
 
 
 def check_shown(settings: LerobotSettings, policy: PreTrainedConfig | None, environment: EnvConfig | None) -> None:
-    """Refuse a checkpoint that was trained on other cameras, or numbers or pictures of other sizes, than are shown.
+    """Refuse a checkpoint that is to act under other settings than it was trained for, or that sees something else.
 
     Raises:
-        MemobenchError: it was.
+        MemobenchError: it is refused.
     """
     path = settings.get("policy.path")
-    if path is None or policy is None or environment is None:
+    if path is None or policy is None:
+        return
+    with quiet():
+        check_as_trained(path, policy)
+    if environment is None:
         return
     from lerobot.envs.utils import env_to_policy_features
 

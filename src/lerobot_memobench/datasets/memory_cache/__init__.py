@@ -19,7 +19,7 @@ from lerobot_memobench.datasets.memory_cache.layout import (
 )
 from lerobot_memobench.datasets.memory_cache.lookup import FrameLookup
 from lerobot_memobench.datasets.memory_cache.reading import MemoryCache
-from lerobot_memobench.datasets.memory_cache.recorded import RecordedFrames, read_recorded
+from lerobot_memobench.datasets.memory_cache.recorded import RecordedFrames, RecordedTexts, read_recorded
 from lerobot_memobench.datasets.memory_cache.tables import TextEncoder
 
 __all__ = [
@@ -31,6 +31,7 @@ __all__ = [
     "MemoryCache",
     "Progress",
     "RecordedFrames",
+    "RecordedTexts",
     "TextEncoder",
     "build_memory_cache",
     "dataset_fingerprint",

@@ -55,6 +55,14 @@ def read_frame_table(root: Path) -> FrameTable:
     )
 
 
+def holds_texts(root: Path, column: str) -> bool:
+    """Return whether a dataset has a column of texts that is not empty throughout."""
+    for path in sorted((root / "data").rglob("*.parquet")):
+        if column in pq.read_schema(path).names and any(_texts(pq.read_table(path, columns=[column]), column)):
+            return True
+    return False
+
+
 def _read_columns(root: Path, optional: list[str]) -> pa.Table:
     """Each frame's place, and those of the optional columns that are there."""
     files = sorted((root / "data").rglob("*.parquet"))

@@ -26,7 +26,22 @@ Columns = Mapping[str, Tensor]
 """Column -> its numbers (N, ...) of every frame, in the order of the global index."""
 
 
-class RecordedFrames(FrameLookup):
+class RecordedTexts(FrameLookup):
+    """A dataset's phases and texts, for a policy that remembers nothing of its frames."""
+
+    def __init__(self, root: Path, table: FrameTable) -> None:
+        self.folder = self.root = root
+        self.episodes, self.phase = table.episodes, table.phase
+        self.texts, rows = numbered(table)
+        self.subgoal_rows = {level: resolve_subgoals(found, table.episodes) for level, found in rows.items()}
+        self.memories, self.memory_rows = ([], None) if table.memory is None else numbered_memory(table.memory)
+
+    def tokens(self, episode: int, slots: Sequence[int]) -> Tensor:
+        """Refuse: there are none."""
+        raise LookupError("nothing is remembered of these frames")
+
+
+class RecordedFrames(RecordedTexts):
     """A dataset's columns, and its texts.
 
     Args:
@@ -47,13 +62,9 @@ class RecordedFrames(FrameLookup):
         key: str,
         stride: int,
     ) -> None:
-        self.folder = self.root = root
+        super().__init__(root, table)
         self.columns, self._remember = columns, remember
-        self.episodes, self.phase = table.episodes, table.phase
-        self.texts, rows = numbered(table)
-        self.subgoal_rows = {level: resolve_subgoals(found, table.episodes) for level, found in rows.items()}
         self.text_embeddings = texts(self.texts) if self.texts else torch.zeros(0, texts.dim)
-        self.memories, self.memory_rows = ([], None) if table.memory is None else numbered_memory(table.memory)
         _, count, dim = remember(columns, [0]).shape
         self.meta = CacheMeta(
             format=FORMAT,
@@ -65,7 +76,7 @@ class RecordedFrames(FrameLookup):
             tokens_per_frame=count,
             dim=dim,
             slots=int(slot_starts(table.episodes, stride)[-1]),
-            levels=list(rows),
+            levels=list(self.subgoal_rows),
             oracle=table.memory is not None,
             complete=True,
         )

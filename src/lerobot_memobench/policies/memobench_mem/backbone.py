@@ -99,13 +99,13 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
             # Where the frozen image tower lies in pi0.5; its weights are loaded by the policy.
             tower = seeing.vision_tower = Tower(folded=True).eval().requires_grad_(False)
             seeing.multi_modal_projector = nn.Identity()
-            how = tower, [*config.image_features], config.memory_camera, config.dimensions.vlm.width
+            how = tower, [*config.image_features], config.memory_camera or "", config.dimensions.vlm.width
             if not config.finds:
                 return EyePerception(*how)
             return FindingEyes(*how, self._finding(config), config.tokens_dropped)
         if not config.sees_objects:
             return PixelPerception(
-                seeing.vision_tower, seeing.multi_modal_projector, config.image_size, config.memory_camera
+                seeing.vision_tower, seeing.multi_modal_projector, config.image_size, config.memory_camera or ""
             )
         seeing.vision_tower, seeing.multi_modal_projector = nn.Identity(), nn.Identity()
         if config.finds_objects:

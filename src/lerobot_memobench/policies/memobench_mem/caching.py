@@ -15,10 +15,13 @@ from lerobot_memobench.datasets.memory_cache import (
     MemoryCache,
     Progress,
     RecordedFrames,
+    RecordedTexts,
     build_memory_cache,
     find_cache,
     read_recorded,
 )
+from lerobot_memobench.datasets.memory_cache.frame_table import read_frame_table
+from lerobot_memobench.envs.prompting import name_in_data
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.eyes.tower import Tower
 from lerobot_memobench.eyes.weights import load_eyes, load_tower
@@ -37,7 +40,13 @@ from lerobot_memobench.policies.memobench_mem.perception.frozen import VISION_SE
 from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_PHASE, OBS_RAW_STATE
 from lerobot_memobench.policies.memobench_mem.perception.perception import Perception
 from lerobot_memobench.policies.memobench_mem.perception.pixels import PixelPerception
-from lerobot_memobench.policies.memobench_mem.seen_pictures import Busy, come_back, make_caches, open_pictures
+from lerobot_memobench.policies.memobench_mem.seen_pictures import (
+    Busy,
+    cameras_of,
+    come_back,
+    make_caches,
+    open_pictures,
+)
 from lerobot_memobench.policies.memobench_mem.weights import load_exactly, read_weights
 
 logger = logging.getLogger(__name__)
@@ -58,7 +67,7 @@ def load_sight(config: MemobenchMemConfig, weights: str | Path | None = None) ->
         tower = Tower(folded=True).eval()
         load_exactly(tower, read_weights(source, _VISION_PREFIX + "vision_tower."), source, optional=set())
     width = config.dimensions.vlm.width
-    return EyePerception(tower.to(config.device), [*config.image_features], config.memory_camera, width)
+    return EyePerception(tower.to(config.device), [*config.image_features], config.memory_camera or "", width)
 
 
 def load_perception(config: MemobenchMemConfig, weights: str | Path | None = None) -> PixelPerception:
@@ -87,7 +96,7 @@ def load_perception(config: MemobenchMemConfig, weights: str | Path | None = Non
         else:
             load_exactly(part, read_weights(source, _VISION_PREFIX + name), source, optional=set())
         part.to(config.device)
-    return PixelPerception(tower, projector, config.image_size, config.memory_camera)
+    return PixelPerception(tower, projector, config.image_size, config.memory_camera or "")
 
 
 def cache_dataset(
@@ -113,6 +122,7 @@ def cache_dataset(
         The cache's folder, ``<root>/memory_cache/<size>-stride<n>-<hash>``, or below ``config.memory_cache_dir``; with
         eyes that of the memory's, beside which those of the present lie.
     """
+    config.memory_camera = config.memory_camera or next(iter(cameras_of(root)), None)
     how: dict[str, Any] = {"batch_size": batch_size, "workers": workers, "progress": progress, "tell": tell}
     if config.finds_objects and not config.told_in_training:
         assert config.eyes is not None
@@ -120,7 +130,8 @@ def cache_dataset(
         if config.sees_objects:
             return found.folder
     if config.has_eyes:
-        return make_caches(root, config, load_sight(config, weights), _text_encoder(config), **how)[0].folder
+        memory, present = make_caches(root, config, load_sight(config, weights), _text_encoder(config), **how)
+        return (memory or next(iter(present.values()))).folder
     perception = load_perception(config, weights)
     return _build(root, config, perception, **how)
 
@@ -132,6 +143,8 @@ def open_frames(root: Path, config: MemobenchMemConfig, perception: Perception) 
         MemobenchError: the dataset lacks a column, or a cache cannot be made.
     """
     if isinstance(perception, PixelPerception):
+        if config.memory == "none":
+            return RecordedTexts(root, read_frame_table(root))
         return open_cache(root, config, perception)
     names = [name for name in RECORDED if name != OBS_ENV_STATE] if config.sees_pictures else RECORDED
     if isinstance(perception, EyePerception):
@@ -173,7 +186,7 @@ def open_cache(root: Path, config: MemobenchMemConfig, perception: PixelPercepti
         root,
         folder.name,
         frames_key=perception.key,
-        camera=perception.remembers,
+        camera=_column(root, perception),
         stride=config.memory_stride,
         texts_key=None if config.align == "none" else _text_encoder(config).key,
         place=folder.parent,
@@ -201,9 +214,14 @@ def _beside_tokens(root: Path, config: MemobenchMemConfig, eyes: FindingEyes) ->
 
 def _build(root: Path, config: MemobenchMemConfig, perception: PixelPerception, **how: Any) -> Path:
     """Make or finish the cache of what ``perception`` remembers, beside the dataset or where ``config`` says."""
-    seen: dict[str, Any] = {"camera": perception.remembers, "stride": config.memory_stride}
+    seen: dict[str, Any] = {"camera": _column(root, perception), "stride": config.memory_stride}
     folder = find_cache(root, config.cache_name, frames_key=perception.key, place=config.cache_place, **seen)
     return build_memory_cache(root, folder.name, perception, _text_encoder(config), place=folder.parent, **seen, **how)
+
+
+def _column(root: Path, perception: PixelPerception) -> str:
+    """Return the dataset's column that is remembered: its first camera, where the policy has not chosen yet."""
+    return name_in_data(perception.remembers) or next(iter(cameras_of(root)), "")
 
 
 def _text_encoder(config: MemobenchMemConfig) -> WordTextEncoder | SiglipTextEncoder:

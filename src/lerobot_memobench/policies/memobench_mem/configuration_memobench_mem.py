@@ -337,7 +337,8 @@ class MemobenchMemConfig(MemobenchMemSettings):
         A checkpoint that was trained on the environment's objects has no pictures among them; eyes look at all cameras.
 
         Raises:
-            MemobenchError: they lack the slots of objects.
+            MemobenchError: they lack the slots of objects or the camera that is remembered, or have more numbers than
+                the weights to start from.
         """
         unseen = FeatureType.ENV if self.sees_pictures else FeatureType.VISUAL
         for key in [key for key, feature in self.input_features.items() if feature.type is unseen]:
@@ -352,4 +353,31 @@ class MemobenchMemConfig(MemobenchMemSettings):
                 f"perception=objects sees by '{OBS_ENV_STATE}', which is not there; train on a dataset of this "
                 "version's `memobench generate`, and evaluate with --env.obs_type=environment_state_agent_pos."
             )
+        self._choose_memory_camera()
+        self._fit_numbers()
         super().validate_features()
+
+    def _choose_memory_camera(self) -> None:
+        cameras = [*self.image_features]
+        if self.memory_camera is None and cameras:
+            self.memory_camera = cameras[0]
+        if self.sees_pictures and not self.sees_objects and cameras and self.memory_camera not in cameras:
+            raise MemobenchError(
+                f"--policy.memory_camera={self.memory_camera} is none of the cameras that this policy sees "
+                f"({', '.join(cameras)}); name one of them, or leave it out for the first."
+            )
+
+    def _fit_numbers(self) -> None:
+        """Make room for as many numbers as a state and an action have, where no weights of another size are loaded."""
+        state, action = self.robot_state_feature, self.action_feature
+        for name, feature in (("max_state_dim", state), ("max_action_dim", action)):
+            needed = 0 if feature is None else feature.shape[0]
+            if needed <= getattr(self, name):
+                continue
+            if self.pretrained_path is not None or self.base_weights is not None:
+                raise MemobenchError(
+                    f"The {'state' if feature is state else 'action'} has {needed} numbers, and the weights to start "
+                    f"from have room for {getattr(self, name)} (policy.{name}); train from scratch, or on a dataset "
+                    "with fewer."
+                )
+            setattr(self, name, needed)

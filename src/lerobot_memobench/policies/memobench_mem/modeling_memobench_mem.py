@@ -15,6 +15,7 @@ from torch import Tensor
 from lerobot_memobench.computing.freed_memory import keep_freed_memory
 from lerobot_memobench.datasets.memory_cache import RecordedFrames
 from lerobot_memobench.eyes.weights import load_tower
+from lerobot_memobench.policies.checkpoint import check_as_trained
 from lerobot_memobench.policies.memobench_mem.acting import ActingPolicy
 from lerobot_memobench.policies.memobench_mem.adapters import trained_whole
 from lerobot_memobench.policies.memobench_mem.alignment.objectives import make_alignment
@@ -45,6 +46,7 @@ from lerobot_memobench.policies.memobench_mem.one_thread import OneThread
 from lerobot_memobench.policies.memobench_mem.perception.eyes import EyePerception
 from lerobot_memobench.policies.memobench_mem.plans import RowPlans
 from lerobot_memobench.policies.memobench_mem.precision import Precision
+from lerobot_memobench.policies.memobench_mem.processing.subgoals import require_texts
 from lerobot_memobench.policies.memobench_mem.processing.training_run import TrainingRun, begin_training
 from lerobot_memobench.policies.memobench_mem.recorded_items import read_from_memory
 from lerobot_memobench.policies.memobench_mem.saved_steps import require_agreement
@@ -80,6 +82,8 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
         """
         # As PI05Policy.__init__, which names its model class.
         PreTrainedPolicy.__init__(self, config)
+        if dataset_meta is not None:
+            require_texts(Path(dataset_meta.root), config)
         config.validate_features()
         self.init_rtc_processor()
         self.model = MemoryPI05(config, rtc_processor=self.rtc_processor)
@@ -158,6 +162,8 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
         saved, of = (config.pretrained_path, config.pretrained_revision) if config.use_peft else (source, revision)
         if saved is not None:
             require_agreement(saved, of, config, training=dataset_meta is not None)
+            if dataset_meta is None:
+                check_as_trained(saved, config, of)
         policy = cls(config, dataset_meta=dataset_meta, load_base=False)
         load_weights(policy, path, source, remembers=config.memory != "none")
         policy.to(config.device)

@@ -29,6 +29,7 @@ from lerobot_memobench.datasets.memory_cache import (
     read_recorded,
 )
 from lerobot_memobench.datasets.memory_cache.room import in_words, require_room
+from lerobot_memobench.envs.prompting import name_in_data
 from lerobot_memobench.eyes.tower import GRID, POOLED, WIDTH
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.perception.eyes import EyePerception, seen_key
@@ -53,8 +54,13 @@ class Tokens:
 
 @dataclass(frozen=True)
 class Wanted:
-    """A cache that is wanted: of which camera, at every how many frames, made how, and where."""
+    """A cache that is wanted: of which camera, at every how many frames, made how, and where.
 
+    Attributes:
+        name: the camera's at the policy. camera: in the dataset.
+    """
+
+    name: str
     camera: str
     stride: int
     tokens: FrameEncoder
@@ -74,29 +80,30 @@ def make_caches(
     *,
     tell: Callable[[str], None] = logger.info,
     **how: Any,
-) -> tuple[MemoryCache, dict[str, MemoryCache]]:
+) -> tuple[MemoryCache | None, dict[str, MemoryCache]]:
     """Make or finish what ``eyes`` see of the dataset at ``root``; how large it will be is told before.
 
     Args:
         how: of `build_memory_cache`.
 
     Returns:
-        The memory's cache, and those of the present pictures by their cameras.
+        The memory's cache, None where nothing is remembered, and those of the present pictures by their cameras' names
+        at the policy.
 
     Raises:
         MemobenchError: the dataset lacks a camera, or the disk has no room for all of them.
     """
-    info = read_info(root)
-    frames = int(info.get("total_frames", 0))
-    cameras = [name for name, feature in info["features"].items() if feature.get("dtype") in ("video", "image")]
-    *present, memory = wanted = _wanted(root, config, eyes, cameras)
+    frames = int(read_info(root).get("total_frames", 0))
+    wanted = _wanted(root, config, eyes, cameras_of(root))
+    memory = wanted[-1] if config.memory != "none" else None
+    present = wanted if memory is None else wanted[:-1]
     sizes = {cache.folder: _bytes(cache, frames) for cache in wanted}
     tell(
         f"What is seen in the {frames:,} frames of {root} takes {in_words(sum(sizes.values()))}: "
         f"{in_words(2 * GRID**2 * WIDTH)} of each of {len(present)} pictures of a frame, and "
         f"{in_words(2 * POOLED**2 * WIDTH)} of every frame that is remembered; what is not there yet is made now."
     )
-    require_room(memory.folder.parent, sizes)
+    require_room(wanted[-1].folder.parent, sizes)
     busy = []
     for cache in present:
         try:
@@ -105,9 +112,17 @@ def make_caches(
             busy.append(cache)  # whoever trains beside us is at it; the other camera's is made here meanwhile
     for cache in busy:
         _make(root, cache, texts, tell=tell, **how)
-    opened = {cache.camera: cache.open(root) for cache in present}
-    _make(root, memory, texts, read=opened[memory.camera].tokens, tell=tell, **how)
+    opened = {cache.name: cache.open(root) for cache in present}
+    if memory is None:
+        return None, opened
+    _make(root, memory, texts, read=opened[memory.name].tokens, tell=tell, **how)
     return memory.open(root), opened
+
+
+def cameras_of(root: Path) -> list[str]:
+    """Return the cameras of a dataset, in its order."""
+    features = read_info(root)["features"].items()
+    return [name for name, feature in features if feature.get("dtype") in ("video", "image")]
 
 
 class Busy(Exception):
@@ -129,16 +144,19 @@ def _make(root: Path, cache: Wanted, texts: TextEncoder, **how: Any) -> None:
 
 
 def _wanted(root: Path, config: MemobenchMemConfig, eyes: EyePerception, cameras: Sequence[str]) -> list[Wanted]:
-    """Return the caches: of the present of each camera, and last the memory's."""
+    """Return the caches: of the present of each camera, and last the memory's, where something is remembered."""
 
-    def wanted(camera: str, stride: int, name: str, tokens: Tokens) -> Wanted:
+    def wanted(name: str, stride: int, begins: str, tokens: Tokens) -> Wanted:
+        camera = name_in_data(name)
         where: dict[str, Any] = {"camera": camera, "stride": stride, "place": config.cache_place}
-        return Wanted(camera, stride, tokens, find_cache(root, name, frames_key=tokens.key, **where))
+        return Wanted(name, camera, stride, tokens, find_cache(root, begins, frames_key=tokens.key, **where))
 
     whole = Tokens(eyes.present_key, GRID**2, eyes.look)
     pooled = Tokens(eyes.pooled_key, eyes.tokens_per_frame, eyes.pooled)
-    seen = dict.fromkeys([*(eyes.cameras or cameras), eyes.remembers])
+    seen = dict.fromkeys(eyes.cameras or [*cameras, eyes.remembers])
     present = [wanted(camera, 1, f"{config.size}-present", whole) for camera in seen]
+    if config.memory == "none":
+        return present
     return [*present, wanted(eyes.remembers, config.memory_stride, config.cache_name, pooled)]
 
 
@@ -172,6 +190,8 @@ def open_pictures(
 
     def remember(_: Any, frames: Sequence[int]) -> Tensor:
         """Return what is remembered of frames of one episode, by their global numbers."""
+        if memory is None:  # training asks for none; a sample's shape is asked for all the same
+            return eyes.recall(torch.zeros(len(frames), eyes.tokens_per_frame, WIDTH), told, frames)
         episode, first = memory.locate(frames[0])
         pooled = memory.tokens(episode, [(first + frame - frames[0]) // memory.meta.stride for frame in frames])
         return eyes.recall(pooled, told, frames)

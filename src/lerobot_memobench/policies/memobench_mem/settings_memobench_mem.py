@@ -8,6 +8,42 @@ from typing import Any, ClassVar
 from lerobot.configs import NormalizationMode
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 
+
+def _names(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
+FIXED = _names(
+    """
+    size width depth perception finds object_classes word_order integration oracle_memory memory_camera memory_frames
+    tokens_per_frame memory_stride objective chunk_size normalization_mapping image_resolution tokenizer_name
+    tokenizer_max_length input_features n_obs_steps paligemma_variant action_expert_variant max_state_dim max_action_dim
+    min_period max_period use_relative_actions relative_exclude_joints action_feature_names empty_cameras
+    """
+)
+"""Fields by which a checkpoint was trained, and which are refused where it acts under another value: its weights would
+mean something else, mostly without a word."""
+OF_ACTING = _names(
+    """
+    n_action_steps whole_plan_if_still told_objects eyes num_inference_steps rtc_config device dtype use_amp
+    compile_model compile_mode pretrained_path pretrained_revision use_peft output_features
+    """
+)
+"""Fields that are free where a checkpoint acts. ``eyes`` that find objects are no part of it, and its own tower has a
+rule of its own (`checkpoints.read_config`); LeRobot makes ``output_features`` of the environment's, which
+`policies.shown` compares with the checkpoint's."""
+OF_TRAINING = _names(
+    """
+    tokens_dropped sight_errors sight_errors_share base_weights align align_weight subgoal_level shuffle_subgoals
+    shuffle_seed text_encoder memory_cache_dir prompt_loss ema_decay moments_per_episode balance_tasks prompted_weight
+    freeze_vision_encoder train_expert_only warmup_fraction final_lr gradient_checkpointing time_sampling_beta_alpha
+    time_sampling_beta_beta time_sampling_scale time_sampling_offset optimizer_lr optimizer_betas optimizer_eps
+    optimizer_weight_decay optimizer_grad_clip_norm scheduler_warmup_steps scheduler_decay_steps scheduler_decay_lr
+    push_to_hub repo_id private tags license
+    """
+)
+"""Fields that say how a policy is trained and where it goes: a checkpoint that acts reads none of them."""
+
 SIZES_OWN: Any = None
 """Default of what the size or the perception decides once the rest is known; then it is a number."""
 
@@ -17,6 +53,7 @@ class MemobenchMemSettings(PI05Config):
     """pi0.5's fields plus the memory's. Fields that are ``None`` here take the size's value after construction."""
 
     knows_phases: ClassVar[bool] = True
+    fixed_by_training: ClassVar[frozenset[str]] = FIXED
 
     size: str = "tiny"
     """``small`` (from scratch, learns from objects in minutes on a CPU), ``tiny`` (from scratch, trains on a CPU) or
@@ -76,7 +113,8 @@ class MemobenchMemSettings(PI05Config):
     oracle_memory: bool = False
     """Control of the paper: ground-truth memory text stands in the prompt, from the dataset's column ``memory`` in
     training and from the environment (``--env.oracle_memory=true``) at evaluation."""
-    memory_camera: str = "observation.images.image"
+    memory_camera: str | None = None
+    """Whose pictures are remembered; none: the first camera's that the policy sees."""
     memory_frames: int = 32
     tokens_per_frame: int = SIZES_OWN
     """Memory tokens of a remembered frame: 16 of a picture; 2, or another number, of objects."""

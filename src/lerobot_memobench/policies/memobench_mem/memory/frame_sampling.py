@@ -22,14 +22,15 @@ def sample_frames(step: int, max_frames: int) -> list[int]:
 
 
 class FrameSampling(MemoryMechanism):
-    """Keeps every frame, because which are read changes with each new one."""
+    """Keeps every frame, because which are read changes with each new one; of an episode without end the latest."""
 
     name = "frame_sampling"
-    capacity = None
+    capacity: int = 8192  # 512 MiB at size pi05, 32 MiB at tiny; with every frame remembered, seven minutes at 20 Hz
 
     def write(self, kept: list[Frame], frame: Frame) -> None:
         """Keep the frame."""
         kept.append(frame)
+        del kept[: -self.capacity]
 
     def read(self, kept: Sequence[Frame]) -> list[Frame]:
         """Return the chosen frames."""
@@ -37,4 +38,5 @@ class FrameSampling(MemoryMechanism):
 
     def recall(self, episode: EpisodeFrames, slot: int) -> list[Frame]:
         """Load the chosen frames alone."""
-        return episode.load(sample_frames(slot, self.frames))
+        first = max(0, slot + 1 - self.capacity)
+        return episode.load([first + chosen for chosen in sample_frames(slot - first, self.frames)])

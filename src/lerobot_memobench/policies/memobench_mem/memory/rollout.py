@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -9,6 +10,8 @@ from torch import Tensor
 
 from lerobot_memobench.policies.memobench_mem.memory.batch import MemoryBatch, collate_frames
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import Frame, MemoryMechanism
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass
@@ -22,6 +25,7 @@ class Row:
     clock: tuple[int, int] | None = None
     position: int = 0
     frozen: bool = False
+    told: bool = False  # that it is longer than what is kept
     kept: list[Frame] = field(default_factory=list)
 
 
@@ -67,7 +71,15 @@ class RolloutMemory:
         ]
         if wanted and self.mechanism.frames:
             for row, tokens in zip(wanted, encode(wanted).to("cpu"), strict=True):
-                self.mechanism.write(self.rows[row].kept, Frame(steps[row], tokens))
+                kept, capacity = self.rows[row].kept, self.mechanism.capacity
+                if capacity is not None and len(kept) == capacity and not self.rows[row].told:
+                    self.rows[row].told = True
+                    logger.warning(
+                        "An episode has more than %d remembered frames, of which the latest are kept; call "
+                        "policy.reset() when an episode begins.",
+                        capacity,
+                    )
+                self.mechanism.write(kept, Frame(steps[row], tokens))
         return steps, started, frozen
 
     def _tick(self, number: int, clock: tuple[int, int]) -> bool:

@@ -4,14 +4,42 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from lerobot_memobench.datasets.memory_cache import FrameLookup
+from lerobot_memobench.datasets.memory_cache.frame_table import LEVEL_COLUMNS, MEMORY_COLUMN, holds_texts
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.batch import TEXT, TEXT_MASK
+
+
+def require_texts(root: Path, config: MemobenchMemConfig) -> None:
+    """Refuse a dataset without the texts that a policy is to learn from, before anything is made of it.
+
+    Raises:
+        MemobenchError: it has no subgoals at the level that memory is aligned with, or no oracle memory.
+    """
+    column = LEVEL_COLUMNS[config.subgoal_level]
+    if config.align != "none" and not holds_texts(root, column):
+        others = [level for level, name in LEVEL_COLUMNS.items() if holds_texts(root, name)]
+        cure = (
+            f"it has {' and '.join(others)} ones: name one with --policy.subgoal_level"
+            if others
+            else ("use --policy.align=none, which needs none, or a dataset that names each frame's subgoal there")
+        )
+        raise MemobenchError(
+            f"The dataset {root} has no {config.subgoal_level} subgoals (no text in a column '{column}'), so "
+            f"--policy.align={config.align} has nothing to align memory to; {cure}."
+        )
+    if config.oracle_memory and not holds_texts(root, MEMORY_COLUMN):
+        raise MemobenchError(
+            f"The dataset {root} has no text in a column '{MEMORY_COLUMN}', which --policy.oracle_memory=true reads; "
+            "leave it out, or generate the dataset again with this version."
+        )
 
 
 def text_rows(cache: FrameLookup, level: str, align: str, shuffle_seed: int | None) -> np.ndarray:

@@ -1,0 +1,287 @@
+"""``memobench_mem`` on datasets of others: trained by `lerobot-train`, acting for a robot that knows no phases.
+
+Cameras of any name, number and size, any number of joints, any rate; no phases, no subgoals, no clock.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lerobot.common.control_utils import predict_action
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.policies import make_pre_post_processors
+from lerobot.policies.factory import get_policy_class
+
+from lerobot_memobench.engine.lerobot_command import call_lerobot
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import FrameSampling
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import Frame, MemoryMechanism
+from lerobot_memobench.policies.memobench_mem.memory.rollout import RolloutMemory
+
+IMAGES, STATE, ACTION = "observation.images.", "observation.state", "action"
+
+
+@dataclass(frozen=True)
+class Foreign:
+    """What a dataset holds; ``cameras``: name -> height and width."""
+
+    cameras: dict[str, tuple[int, int]] = field(default_factory=lambda: {IMAGES + "top": (96, 96)})
+    dtype: str = "video"
+    state: int = 6
+    action: int = 6
+    fps: int = 30
+    episodes: int = 1
+    tasks: tuple[str, ...] = ("fold the towel",)
+    extra: dict[str, Any] = field(default_factory=dict)
+
+    def write(self, root: Path, length: int = 10) -> Path:
+        picture = {"dtype": self.dtype, "names": ["height", "width", "channels"]}
+        dataset = LeRobotDataset.create(
+            "somebody/robot",
+            fps=self.fps,
+            root=root,
+            use_videos=self.dtype == "video",
+            features={
+                STATE: {"dtype": "float32", "shape": (self.state,), "names": None},
+                **{name: {**picture, "shape": (*size, 3)} for name, size in self.cameras.items()},
+                ACTION: {"dtype": "float32", "shape": (self.action,), "names": None},
+                **{name: {"dtype": "string", "shape": (1,), "names": None} for name in self.extra},
+            },
+        )
+        rng = np.random.default_rng(0)
+        for episode in range(self.episodes):
+            for _ in range(length):
+                numbers = {STATE: self.state, ACTION: self.action}
+                dataset.add_frame(
+                    {name: rng.normal(size=count).astype(np.float32) for name, count in numbers.items()}
+                    | self.pictures(rng)
+                    | self.extra
+                    | {"task": self.tasks[episode % len(self.tasks)]}
+                )
+            dataset.save_episode()
+        dataset.finalize()
+        return root
+
+    def pictures(self, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        return {name: rng.integers(0, 255, (*size, 3), np.uint8) for name, size in self.cameras.items()}
+
+    def seen_by_a_robot(self, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        return {STATE: rng.normal(size=self.state).astype(np.float32), **self.pictures(rng)}
+
+
+def train(root: Path, out: Path, *flags: str, size: str | None = "tiny") -> Path:
+    """Two updates by LeRobot's command; return the checkpoint."""
+    own = [] if size is None else ["--policy.type=memobench_mem", f"--policy.size={size}"]
+    status = call_lerobot(
+        "train",
+        [
+            *own,
+            *("--dataset.repo_id=somebody/robot", f"--dataset.root={root}", f"--output_dir={out}"),
+            *("--steps=2", "--save_freq=2", "--batch_size=2", "--num_workers=0", "--policy.device=cpu"),
+            *("--policy.push_to_hub=false", "--policy.memory_frames=4", "--policy.num_inference_steps=2"),
+            *flags,
+        ],
+    )
+    assert status == 0
+    return out / "checkpoints" / "last" / "pretrained_model"
+
+
+def loaded(checkpoint: Path, **renamed: str) -> tuple[Any, Any, Any]:
+    """Policy and processors, as LeRobot's control loop loads them."""
+    config = PreTrainedConfig.from_pretrained(checkpoint)
+    config.pretrained_path = checkpoint
+    policy = get_policy_class(config.type).from_pretrained(checkpoint, config=config)
+    overrides = {"rename_observations_processor": {"rename_map": renamed}}
+    pipelines = make_pre_post_processors(config, pretrained_path=str(checkpoint), preprocessor_overrides=overrides)
+    return policy, *pipelines
+
+
+def act(robot: Foreign, policy: Any, before: Any, after: Any, steps: int = 5) -> torch.Tensor:
+    """Let a robot act for some control steps; return its actions (steps, A)."""
+    rng, cpu = np.random.default_rng(1), torch.device("cpu")
+    policy.reset()
+    actions = [
+        predict_action(robot.seen_by_a_robot(rng), policy, cpu, before, after, False, robot.tasks[0], "arm")
+        for _ in range(steps)
+    ]
+    return torch.cat(actions)
+
+
+def trained_and_acting(robot: Foreign, size: str, tmp_path: Path) -> Any:
+    """Train on a robot's dataset and act with what comes of it; return the policy."""
+    checkpoint = train(robot.write(tmp_path / "data"), tmp_path / "run", size=size)
+    policy, *pipelines = loaded(checkpoint)
+    actions = act(robot, policy, *pipelines)
+    assert actions.shape == (5, robot.action)
+    assert actions.isfinite().all()
+    assert policy.config.memory_camera == next(iter(robot.cameras))
+    assert [frame.step for frame in policy.history.rows[0].kept] == [
+        step for step in range(5) if step % policy.config.memory_stride == 0
+    ]
+    return policy
+
+
+CAMERAS = {"left": (480, 640), "top": (240, 320), "gripper": (96, 96)}
+THREE = {IMAGES + name: size for name, size in CAMERAS.items()}
+TASKS = ("fold the towel", "fold the shirt twice", "put it away")
+
+
+@pytest.mark.parametrize(
+    ("robot", "size"),
+    [
+        (Foreign({"observation.image": (96, 96)}, state=2, action=2, fps=10), "tiny"),
+        (Foreign(THREE, "image", state=40, action=40, fps=50, episodes=3, tasks=TASKS), "tiny"),
+        (Foreign({IMAGES + "front": (240, 320), IMAGES + "phone": (120, 90)}, state=14, action=7), "small"),
+    ],
+    ids=["pusht", "humanoid", "two_cameras"],
+)
+def test_any_dataset_is_learned_from_and_acted_on(robot: Foreign, size: str, tmp_path: Path) -> None:
+    trained_and_acting(robot, size, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", ["tiny", "small"])
+@pytest.mark.parametrize("dtype", ["video", "image"])
+@pytest.mark.parametrize("cameras", [1, 2, 3])
+@pytest.mark.parametrize(("state", "action", "fps"), [(2, 40, 10), (40, 2, 25), (32, 33, 50)])
+def test_every_dataset_is(
+    size: str, dtype: str, cameras: int, state: int, action: int, fps: int, tmp_path: Path
+) -> None:
+    seen = dict(list(THREE.items())[-cameras:])
+    episodes = 1 if cameras == 1 else 2
+    trained_and_acting(Foreign(seen, dtype, state, action, fps, episodes, TASKS), size, tmp_path)
+
+
+# --- one name for dataset and observation ---
+
+
+@pytest.mark.parametrize("size", ["tiny", "small"])
+def test_names_are_mapped_in_training_and_acting(size: str, tmp_path: Path) -> None:
+    """A checkpoint goes on with data whose cameras have other names, and acts for a robot with names of its own."""
+    first = Foreign({IMAGES + "front": (96, 96), IMAGES + "wrist": (96, 96)})
+    checkpoint = train(
+        first.write(tmp_path / "first"), tmp_path / "run", "--policy.memory_camera=" + IMAGES + "wrist", size=size
+    )
+    other = Foreign({"observation.image.b": (120, 160), "observation.image.a": (120, 160)})
+    renamed = {"observation.image.a": IMAGES + "front", "observation.image.b": IMAGES + "wrist"}
+    root = other.write(tmp_path / "other")
+    flags = (f"--policy.path={checkpoint}", f"--rename_map={json.dumps(renamed)}")
+    on = train(root, tmp_path / "on", *flags, size=None)
+    shown = {json.loads(file.read_text())["camera"] for file in root.glob("memory_cache/*/meta.json")}
+    assert "observation.image.b" in shown, "what is remembered is the dataset's column of that camera"
+    assert shown <= other.cameras.keys()
+    policy, *pipelines = loaded(on, **renamed)
+    assert policy.config.memory_camera == IMAGES + "wrist"
+    assert act(other, policy, *pipelines).isfinite().all()
+    with pytest.raises(MemobenchError, match=f"has no '{IMAGES}wrist'.*Map its names with --rename_map"):
+        act(other, *loaded(on))
+
+
+def test_a_memory_camera_is_one_that_is_seen(tmp_path: Path) -> None:
+    features = {name: PolicyFeature(FeatureType.VISUAL, (3, *size)) for name, size in THREE.items()}
+    config = MemobenchMemConfig(device="cpu", input_features=features)
+    config.validate_features()
+    assert config.memory_camera == IMAGES + "left"
+    config = MemobenchMemConfig(device="cpu", input_features=features, memory_camera=IMAGES + "image")
+    with pytest.raises(MemobenchError, match=r"memory_camera=observation.images.image is none .*left, .*top, .*grip"):
+        config.validate_features()
+
+
+# --- what is not there ---
+
+
+@pytest.mark.parametrize("size", ["tiny", "small"])
+def test_no_memory_makes_no_memory_cache(size: str, tmp_path: Path) -> None:
+    robot = Foreign()
+    root = robot.write(tmp_path / "data")
+    policy, *pipelines = loaded(train(root, tmp_path / "run", "--policy.integration=none", size=size))
+    assert act(robot, policy, *pipelines).isfinite().all()
+    # Eyes keep what they see of present pictures, with or without a memory; nothing is kept to be remembered.
+    assert [file.name.split("-")[1] for file in root.glob("memory_cache/*/")] == (
+        ["present"] if size == "small" else []
+    )
+
+
+@pytest.mark.parametrize(
+    ("extra", "flag", "said"),
+    [
+        ({}, "align=contrastive", "no intermediate subgoals .* use --policy.align=none"),
+        ({"simple_subgoal": ""}, "align=framewise", "no text in a column 'simple_subgoal'"),
+        ({"coarse_subgoal": "fold"}, "align=semantic", "it has coarse ones: name one with --policy.subgoal_level"),
+        ({}, "oracle_memory=true", "no text in a column 'memory', which --policy.oracle_memory=true reads"),
+    ],
+)
+def test_texts_that_are_not_there_are_refused_before_anything_is_built(
+    extra: dict[str, str], flag: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = Foreign(extra=extra).write(tmp_path / "data")
+    monkeypatch.setattr(modeling_memobench_mem, "MemoryPI05", None)
+    with pytest.raises(MemobenchError, match=said):
+        train(root, tmp_path / "run", f"--policy.{flag}")
+    assert not (root / "memory_cache").exists()
+
+
+def test_more_numbers_than_loaded_weights_have_room_for_are_refused() -> None:
+    features = {STATE: PolicyFeature(FeatureType.STATE, (33,))}
+    config = MemobenchMemConfig(device="cpu", input_features=dict(features))
+    config.validate_features()
+    assert config.max_state_dim == 33
+    config = MemobenchMemConfig(device="cpu", input_features=dict(features), base_weights="lerobot/pi05_base")
+    with pytest.raises(
+        MemobenchError, match=r"The state has 33 numbers, and the weights to start from have room for 32"
+    ):
+        config.validate_features()
+
+
+# --- a robot that never says that an episode begins ---
+
+
+def test_history_without_reset_is_bounded(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert FrameSampling.capacity == 8192
+    monkeypatch.setattr(FrameSampling, "capacity", 16)
+    mechanism = FrameSampling(4)
+    history = RolloutMemory(mechanism, stride=1)
+    with caplog.at_level(logging.WARNING):
+        for step in range(50):
+            history.observe([(1, step)], lambda rows, step=step: torch.full((1, 1, 1), step))
+    assert [frame.step for frame in history.rows[0].kept] == list(range(34, 50))
+    assert [frame.step for frame in mechanism.read(history.rows[0].kept)] == [34, 39, 44, 49]
+    assert len(caplog.messages) == 1
+    assert "more than 16 remembered frames, of which the latest are kept; call policy.reset()" in caplog.text
+
+    class Episode:
+        def load(self, slots: Any) -> list[Frame]:
+            return [Frame(slot, torch.full((1, 1), slot)) for slot in slots]
+
+    for slot in (3, 15, 16, 49):  # as in training
+        wanted = MemoryMechanism.recall(mechanism, Episode(), slot)
+        assert [frame.step for frame in mechanism.recall(Episode(), slot)] == [frame.step for frame in wanted]
+
+
+# --- another environment of LeRobot's ---
+
+
+def test_pusht(tmp_path: Path) -> None:
+    """A rollout in LeRobot's own environment, by its own command: no clock, no phases, one instruction for all."""
+    pytest.importorskip("gym_pusht")
+    robot = Foreign({"observation.image": (384, 384)}, state=2, action=2, fps=10)
+    checkpoint = train(robot.write(tmp_path / "data"), tmp_path / "run")
+    flags = (f"--policy.path={checkpoint}", "--env.type=pusht", "--env.episode_length=12", "--policy.device=cpu")
+    flags += (
+        "--eval.n_episodes=2",
+        "--eval.batch_size=2",
+        "--eval.use_async_envs=false",
+        f"--output_dir={tmp_path / 'out'}",
+    )
+    assert call_lerobot("eval", flags) == 0
+    assert json.loads((tmp_path / "out" / "eval_info.json").read_text())["overall"]["n_episodes"] == 2
