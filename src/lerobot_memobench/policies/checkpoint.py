@@ -196,7 +196,7 @@ def check_weights(path: str, policy: PreTrainedConfig) -> None:
 def check_as_trained(source: str | Path, policy: PreTrainedConfig, revision: str | None = None) -> None:
     """Refuse a checkpoint that is to act under other settings than its weights were trained for.
 
-    Which these are its configuration says, by ``fixed_by_training: ClassVar[Collection[str]]`` on its class.
+    Which these are its configuration says, by ``fixed_by_training: ClassVar[tuple[str, ...]]`` on its class.
 
     Args:
         source: folder or repository. policy: what it would act under.
@@ -209,7 +209,7 @@ def check_as_trained(source: str | Path, policy: PreTrainedConfig, revision: str
         return
     device = [f"--device={policy.device}"]  # or a word would be lost on that of the training
     trained = type(policy).from_pretrained(source, revision=revision, cli_overrides=device)
-    for name in sorted(fixed):
+    for name in fixed:
         asked, held = getattr(policy, name), getattr(trained, name)
         if asked != held:
             raise MemobenchError(

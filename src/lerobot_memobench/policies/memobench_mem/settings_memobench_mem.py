@@ -9,20 +9,20 @@ from lerobot.configs import NormalizationMode
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 
 
-def _names(text: str) -> frozenset[str]:
-    return frozenset(text.split())
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(text.split())
 
 
 FIXED = _names(
     """
-    size width depth perception finds object_classes word_order integration oracle_memory memory_camera memory_frames
+    size perception width depth finds object_classes word_order integration oracle_memory memory_camera memory_frames
     tokens_per_frame memory_stride objective chunk_size normalization_mapping image_resolution tokenizer_name
     tokenizer_max_length input_features n_obs_steps paligemma_variant action_expert_variant max_state_dim max_action_dim
     min_period max_period use_relative_actions relative_exclude_joints action_feature_names empty_cameras
     """
 )
 """Fields by which a checkpoint was trained, and which are refused where it acts under another value: its weights would
-mean something else, mostly without a word."""
+mean something else, mostly without a word. Those that decide others stand before them."""
 OF_ACTING = _names(
     """
     n_action_steps whole_plan_if_still told_objects eyes num_inference_steps rtc_config device dtype use_amp
@@ -53,7 +53,7 @@ class MemobenchMemSettings(PI05Config):
     """pi0.5's fields plus the memory's. Fields that are ``None`` here take the size's value after construction."""
 
     knows_phases: ClassVar[bool] = True
-    fixed_by_training: ClassVar[frozenset[str]] = FIXED
+    fixed_by_training: ClassVar[tuple[str, ...]] = FIXED
 
     size: str = "tiny"
     """``small`` (from scratch, learns from objects in minutes on a CPU), ``tiny`` (from scratch, trains on a CPU) or
