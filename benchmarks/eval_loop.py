@@ -8,10 +8,10 @@ environment alone, which draws as many pictures; `over_bare` is what the loop ad
 
 import sys
 
-from lerobot_memobench.settings.lerobot_commands import wait_briefly
+from lerobot_memobench.jobs.threads import ACTING, use_threads
 
 if __name__ == "__main__":
-    wait_briefly()  # as `lerobot eval` does, before torch is loaded
+    use_threads(ACTING)  # as `lerobot eval` does, before torch is loaded
     from lerobot_memobench.bench.evaluation import eval_loop
 
     for line in eval_loop(rounds=int(sys.argv[1]) if len(sys.argv) > 1 else 5):

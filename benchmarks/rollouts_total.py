@@ -7,8 +7,8 @@ import json
 import sys
 
 from lerobot_memobench.bench.total import rollouts_total
-from lerobot_memobench.settings.lerobot_commands import wait_briefly
+from lerobot_memobench.jobs.threads import ACTING, use_threads
 
 if __name__ == "__main__":
-    wait_briefly()  # as `lerobot eval` does, before torch is loaded
+    use_threads(ACTING)  # as `lerobot eval` does, before torch is loaded
     print(json.dumps(rollouts_total(*sys.argv[1:2])))

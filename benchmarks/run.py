@@ -2,13 +2,16 @@
 
 import sys
 
-from lerobot_memobench.bench.claims import run
-from lerobot_memobench.bench.line import Line, table
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.jobs.threads import ACTING, use_threads
 
 
 def main(names: list[str]) -> int:
     """Return the exit status."""
+    use_threads(ACTING)  # as `memobench bench` does, before numpy is loaded
+    from lerobot_memobench.bench.claims import run
+    from lerobot_memobench.bench.line import Line, table
+
     lines: list[Line] = []
     try:
         for line in run(names):

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from lerobot_memobench.bench import stopwatch, total
+from lerobot_memobench.bench import evaluation, stopwatch, total
 from lerobot_memobench.bench.evaluation import evaluate_once, looking_every, step_bare
-from lerobot_memobench.bench.stopwatch import Stopwatch
+from lerobot_memobench.bench.stopwatch import Cost, Stopwatch
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.policies.memobench_random.configuration_memobench_random import MemobenchRandomConfig
 from lerobot_memobench.policies.memobench_random.modeling_memobench_random import MemobenchRandomPolicy
@@ -70,3 +70,45 @@ def test_the_documented_benchmarks_are_there() -> None:
     for name in ("eval_loop", "rollouts_total"):
         assert f"benchmarks/{name}.py" in (folder / "docs/evaluate.md").read_text()
         assert (folder / "benchmarks" / f"{name}.py").is_file()
+
+
+def test_the_rule_is_shown_as_a_ratio(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both ways in one run: what a step costs with the rule and without, alone and beside another evaluation."""
+    asked: list[tuple[Any, ...]] = []
+
+    class Side:
+        def __init__(self, opened: Any, environment: dict[str, str]) -> None:
+            self.ruled = environment.get("MEMOBENCH_THREADS") is not None
+
+        def ask(self, do: Any, *args: Any) -> None:
+            asked.append((do.__name__, *args))
+            self.cost = {
+                ("evaluate_apart", True): Cost(0.012, 0.012),
+                ("evaluate_apart", False): Cost(0.018, 0.030),
+                ("bare_apart", True): Cost(0.010, 0.010),
+                ("bare_apart", False): Cost(0.012, 0.015),
+            }[do.__name__, self.ruled]
+
+        def answer(self) -> Cost:
+            return self.cost
+
+        def close(self) -> None:
+            pass
+
+    monkeypatch.setattr(evaluation, "Apart", Side)
+    monkeypatch.setattr(evaluation, "machine", lambda: "here")
+    one, two = evaluation.thread_rule(rounds=1, steps=3)
+    assert (one.ours, one.theirs, one.ratio) == (12, 18, 1.5)
+    assert (one.detail["over_bare"], one.detail["over_bare_before"]) == (0.2, 0.5)
+    assert (one.detail["cpu_ours"], one.detail["cpu_theirs"], one.detail["cpu_ratio"]) == (12, 30, 2.5)
+    assert (two.ours, two.theirs) == (6, 9)
+    assert "over_bare" not in two.detail
+    assert len(asked) == 2 * 2 * 4  # warm-up and one round, both ways: one, bare, two of two
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("gl")
+def test_the_rule_is_measured() -> None:
+    one, two = evaluation.thread_rule(rounds=1, steps=5)
+    assert one.ours > 0
+    assert two.theirs > 0

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import time
+from pathlib import Path
 
 import numpy as np
+import pytest
 
-from lerobot_memobench.bench.sides import Ours, Times, Vectored, alternate, timed
+from lerobot_memobench.bench.sides import Apart, Ours, Times, Vectored, alternate, timed
+from lerobot_memobench.jobs.threads import by_the_libraries, by_the_rule
+
+sys.path.insert(0, str(Path(__file__).parent))  # for apart_case.py: pytest imports tests by their paths
+import apart_case
 
 
 def test_sides_take_turns_and_medians_count() -> None:
@@ -49,3 +57,24 @@ def test_our_side_steps_as_the_environment_does(gl: str) -> None:
     assert ours.progress.steps == 1
     ours.reset(3)
     assert ours.progress.steps == 0
+
+
+def test_a_side_apart_has_the_threads_that_it_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And keeps what it has opened from one turn to the next."""
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1, 2})
+    here = dict(os.environ)
+    for environment, told in ((by_the_rule(), ["1", "1"]), (by_the_libraries(), [None, "3"])):
+        side = Apart(apart_case.opened, environment)
+        try:
+            assert side.does(apart_case.remember, 1) == [1]
+            side.ask(apart_case.remember, 2)
+            assert side.answer() == [1, 2]
+            torch, renderer, chosen = side.does(apart_case.threads)
+            assert renderer == told[1]
+            assert told[0] in (None, torch)
+            assert bool(chosen) is (told[0] is not None)  # what nobody has chosen is a user's own, and stays
+            with pytest.raises(ValueError, match="no"):
+                side.does(apart_case.fail)
+        finally:
+            side.close()
+    assert dict(os.environ) == here

@@ -3,17 +3,28 @@
 Both sides take turns, and each turn of ours makes a pair with the turn of theirs that follows. What is claimed is the
 median of the pairs' ratios on the wall's clock, on a machine that does nothing else; the processors' clock stands
 beside it, and moves less where others compute too. Stock robosuite is its own PickPlace with the same arm, controller,
-cameras and sizes.
+cameras and sizes, in a process of its own: there its libraries take the threads that they take by themselves, while
+ours has those of the rule (`jobs.threads`), as in every command.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any
 
 from lerobot_memobench.bench.line import Line, line_of
 from lerobot_memobench.bench.machine import TASK
-from lerobot_memobench.bench.sides import Ours, Times, Vectored, actions, alternate, make_current, stock_open, timed
+from lerobot_memobench.bench.sides import (
+    Apart,
+    Ours,
+    Times,
+    Vectored,
+    actions,
+    alternate,
+    reset_stock,
+    step_stock,
+    stock_open,
+    timed,
+)
 from lerobot_memobench.bench.workers import workers
 from lerobot_memobench.errors import MemobenchError, nearest
 
@@ -30,18 +41,18 @@ def step_without_images(task: str = TASK, rounds: int = 12) -> Line:
 
 def _step(name: str, task: str, quality: str, rounds: int, images: bool) -> Line:
     ours = Ours(task, images, quality)
-    with stock_open(images) as env:
-        pairs = _step_pairs(ours, env, rounds)
+    with stock_open(images) as stock:
+        pairs = _step_pairs(ours, stock, rounds)
     detail = {"task": task, "quality": quality} if images else {"task": task}
     return line_of(name, pairs, detail)
 
 
-def _step_pairs(ours: Ours | Vectored, env: Any, rounds: int) -> list[tuple[Times, Times]]:
+def _step_pairs(ours: Ours | Vectored, stock: Apart, rounds: int) -> list[tuple[Times, Times]]:
     moves = actions()
 
     def their_turn() -> Times:
-        make_current(env)
-        return timed(lambda: env.step(next(moves)))
+        taken: Times = stock.does(step_stock, next(moves))
+        return taken
 
     def our_turn() -> Times:
         return timed(lambda: ours.step(next(moves)))
@@ -54,17 +65,17 @@ def _step_pairs(ours: Ours | Vectored, env: Any, rounds: int) -> list[tuple[Time
 def reset(task: str = TASK, rounds: int = 3) -> Line:
     """Reset to a new seed with both images; ours includes the ten stabilisation steps."""
     ours = Ours(task)
-    with stock_open(True) as env:
-        pairs = _reset_pairs(ours, env, rounds)
+    with stock_open(True) as stock:
+        pairs = _reset_pairs(ours, stock, rounds)
     return line_of("reset", pairs, {"task": task})
 
 
-def _reset_pairs(ours: Ours | Vectored, env: Any, rounds: int) -> list[tuple[Times, Times]]:
+def _reset_pairs(ours: Ours | Vectored, stock: Apart, rounds: int) -> list[tuple[Times, Times]]:
     seeds = iter(range(1, 10**9))
 
     def their_turn() -> Times:
-        make_current(env)
-        return timed(env.reset)
+        taken: Times = stock.does(reset_stock)
+        return taken
 
     return alternate(lambda: timed(lambda: ours.reset(next(seeds))), their_turn, rounds, 8, 1)
 
@@ -72,10 +83,17 @@ def _reset_pairs(ours: Ours | Vectored, env: Any, rounds: int) -> list[tuple[Tim
 def vector_env(task: str = TASK, rounds: int = 8) -> list[Line]:
     """Steps and resets through the vector environment that LeRobot uses, both images, beside bare stock robosuite."""
     ours = Vectored(task)
-    with stock_open(True) as env:
-        steps, resets = _step_pairs(ours, env, rounds), _reset_pairs(ours, env, max(1, rounds // 2))
+    with stock_open(True) as stock:
+        steps, resets = _step_pairs(ours, stock, rounds), _reset_pairs(ours, stock, max(1, rounds // 2))
         ours.close()
     return [line_of("vector_env_step", steps, {"task": task}), line_of("vector_env_reset", resets, {"task": task})]
+
+
+def thread_rule() -> list[Line]:
+    """`lerobot eval` with the threads of the rule beside the same with those that the libraries take."""
+    from lerobot_memobench.bench import evaluation
+
+    return evaluation.thread_rule()
 
 
 def eval_loop() -> list[Line]:
@@ -92,6 +110,7 @@ BENCHMARKS: dict[str, Callable[[], Line | list[Line]]] = {
     "vector_env": vector_env,
     "workers": workers,
     "eval_loop": eval_loop,
+    "thread_rule": thread_rule,
 }
 
 

@@ -10,8 +10,9 @@ import itertools
 import logging
 import statistics
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -22,13 +23,14 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.bench.line import Line
 from lerobot_memobench.bench.machine import TASK, machine
-from lerobot_memobench.bench.sides import stock_open
+from lerobot_memobench.bench.sides import Apart, stock_open
 from lerobot_memobench.bench.stock_env import StockEnv
 from lerobot_memobench.bench.stopwatch import Cost, stopwatch
 from lerobot_memobench.engine.defaults import FIRST_SEED
 from lerobot_memobench.engine.planning import plan_line
 from lerobot_memobench.engine.run import run_evaluation
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.jobs.threads import by_the_libraries, by_the_rule
 from lerobot_memobench.policies.memobench_random.modeling_memobench_random import MemobenchRandomPolicy
 
 NEVER, EACH, FIFTH = 0, 1, 5
@@ -90,6 +92,7 @@ def evaluate_stock(stock: Any, films: int, steps: int) -> Cost:
     from lerobot_memobench.policies.memobench_random.configuration_memobench_random import MemobenchRandomConfig
     from lerobot_memobench.policies.pass_through import pass_through
 
+    logging.disable(logging.WARNING)
     env = gym.vector.SyncVectorEnv([freeze_after_episode_end(lambda: StockEnv(stock, steps))])
     before, after = pass_through("cpu")
     with tempfile.TemporaryDirectory() as out, stopwatch() as watch:
@@ -114,23 +117,96 @@ def _same(given: Any) -> Any:
 
 def eval_loop(task: str = TASK, rounds: int = 5, steps: int = 100, their_steps: int = 20) -> list[Line]:
     """A control step of ``lerobot eval``, by how often the policy looks at pictures, and with a film."""
-    import lerobot_memobench.registration  # noqa: F401 - makes the policy known
-
-    logging.disable(logging.WARNING)
-    try:
-        with stock_open(True) as stock:
-            sides: dict[tuple[str, int], Callable[[], Cost]] = {}
-            for name, (every, films) in LINES.items():
-                sides[name, 0] = lambda every=every, films=films: evaluate_once(every, films, steps, task)  # type: ignore[misc]
-                sides["bare", every] = lambda every=every: step_bare(every, steps, task)  # type: ignore[misc]
-                sides["stock", films] = lambda films=films: evaluate_stock(stock, films, their_steps)  # type: ignore[misc]
-            costs = _turns(sides, rounds)
-    finally:
-        logging.disable(logging.NOTSET)
+    with stock_open(True) as stock, rollouts_apart(by_the_rule()) as ours:
+        sides: dict[tuple[str, int], Callable[[], Cost]] = {}
+        for name, (every, films) in LINES.items():
+            sides[name, 0] = partial(ours.does, evaluate_apart, every, films, steps, task)
+            sides["bare", every] = partial(ours.does, bare_apart, every, steps, task)
+            sides["stock", films] = partial(stock.does, evaluate_stock, films, their_steps)
+        costs = _turns(sides, rounds)
     return [
         _line(name, costs[name, 0], costs["stock", films], costs["bare", every], {"task": task})
         for name, (every, films) in LINES.items()
     ]
+
+
+def thread_rule(task: str = TASK, rounds: int = 5, steps: int = 100) -> list[Line]:
+    """What the rule of `jobs.threads` gains where every frame is looked at: one evaluation, and two at once.
+
+    ``ours`` is by the rule and ``theirs`` with the threads that the libraries take by themselves. Of two at once it is
+    what a step of either takes, over two: half of it would be twice the work done.
+    """
+    act, alone = partial(_both, evaluate_apart, EACH, 0, steps, task), partial(_both, bare_apart, EACH, steps, task)
+    with ExitStack() as opened:
+        teams = {
+            way: [opened.enter_context(rollouts_apart(environment)) for _ in range(2)]
+            for way, environment in (("rule", by_the_rule()), ("libraries", by_the_libraries()))
+        }
+        sides: dict[tuple[str, str], Callable[[], Cost]] = {}
+        for way, team in teams.items():
+            sides[way, "one"] = partial(act, team[:1])
+            sides[way, "bare"] = partial(alone, team[:1])
+            sides[way, "two"] = partial(act, team)
+        costs = _turns(sides, rounds)
+    lines = []
+    for name, kind in (("threads_one_evaluation", "one"), ("threads_two_evaluations", "two")):
+        ours, theirs = costs["rule", kind], costs["libraries", kind]
+        detail = {
+            "task": task,
+            "cpu_ours": round(1e3 * ours.cpu, 3),
+            "cpu_theirs": round(1e3 * theirs.cpu, 3),
+            "cpu_ratio": round(theirs.cpu / ours.cpu, 2),
+            "beside": "the libraries' own threads",
+        }
+        if kind == "one":
+            for way, added in (("rule", "over_bare"), ("libraries", "over_bare_before")):
+                looked, bare = costs[way, "one"], costs[way, "bare"]
+                detail |= {added: round(looked.wall / bare.wall - 1, 3)}
+                detail |= {f"{added}_cpu": round(looked.cpu / bare.cpu - 1, 3)}
+        mine, other = round(1e3 * ours.wall, 3), round(1e3 * theirs.wall, 3)
+        lines.append(Line(name, mine, other, round(theirs.wall / ours.wall, 2), "ms", machine(), detail))
+    return lines
+
+
+def _both(do: Callable[..., Cost], *args: Any) -> Cost:
+    """Return what a step costs in processes that all do a thing at once: their wall's mean, over how many they are."""
+    *what, team = args
+    for side in team:
+        side.ask(do, *what)
+    costs: list[Cost] = [side.answer() for side in team]
+    return Cost(statistics.fmean(c.wall for c in costs) / len(team), statistics.fmean(c.cpu for c in costs))
+
+
+@contextmanager
+def rollouts_apart(environment: Mapping[str, str]) -> Iterator[Apart]:
+    """Yield a process in which rollouts are measured, with the threads that its environment says."""
+    side = Apart(_ready, environment)
+    try:
+        yield side
+    finally:
+        side.close()
+
+
+@contextmanager
+def _ready() -> Iterator[None]:
+    """Make a process ready for rollouts, as `lerobot eval` does."""
+    from lerobot_memobench.settings.lerobot_commands import load_command
+
+    load_command("eval")
+    import lerobot_memobench.registration  # noqa: F401 - makes the policy known
+
+    logging.disable(logging.WARNING)
+    yield
+
+
+def evaluate_apart(_: None, every: int, films: int, steps: int, task: str) -> Cost:
+    """Return what `evaluate_once` does."""
+    return evaluate_once(every, films, steps, task)
+
+
+def bare_apart(_: None, every: int, steps: int, task: str) -> Cost:
+    """Return what `step_bare` does."""
+    return step_bare(every, steps, task)
 
 
 def _turns[Side](sides: dict[Side, Callable[[], Cost]], rounds: int) -> dict[Side, Cost]:

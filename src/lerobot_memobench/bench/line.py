@@ -55,7 +55,7 @@ def table(lines: list[Line]) -> str:
     for line in lines:
         notes = ", ".join(
             f"{key.replace('_', ' ')} {line.detail[key]}"
-            for key in ("quality", "memory_mb", "their_memory_mb", "over_bare")
+            for key in ("quality", "memory_mb", "their_memory_mb", "over_bare", "over_bare_before", "beside")
             if key in line.detail
         )
         name = line.name.replace("_", " ")

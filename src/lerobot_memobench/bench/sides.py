@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import gc
 import logging
+import multiprocessing
 import os
 import statistics
 import time
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.bench.machine import TASK, machine
-from lerobot_memobench.sim.rendering import RenderSettings, close_renderers, gl_backend
+from lerobot_memobench.jobs.threads import by_the_libraries
+from lerobot_memobench.sim.rendering import RenderSettings, gl_backend
 from lerobot_memobench.sim.scene import CONTROL_HZ
 from lerobot_memobench.sim.simulation import CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
@@ -125,18 +129,92 @@ def make_current(env: Any) -> None:
         context.gl_ctx.make_current()
 
 
+class Apart:
+    """A side in a process of its own: it does what it is asked, and waits in between, so that sides can take turns.
+
+    Args:
+        opened: opens what every function that is asked for is given first; both are pickled.
+        environment: of the process. It says how many threads its libraries have (`jobs.threads`).
+    """
+
+    def __init__(self, opened: Callable[[], AbstractContextManager[Any]], environment: Mapping[str, str]) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(target=_serve, args=(opened, theirs), daemon=True)
+        with patch.dict(os.environ, environment, clear=True):
+            self._process.start()
+        theirs.close()
+        self.answer()
+
+    def ask(self, do: Callable[..., Any], *args: Any) -> None:
+        """Have a function of a module called, with what was opened and these arguments."""
+        self._pipe.send((do, args))
+
+    def answer(self) -> Any:
+        """Return what came of it."""
+        found = self._pipe.recv()
+        if isinstance(found, BaseException):
+            raise found
+        return found
+
+    def does(self, do: Callable[..., Any], *args: Any) -> Any:
+        """Return what comes of a function."""
+        self.ask(do, *args)
+        return self.answer()
+
+    def close(self) -> None:
+        """End the process."""
+        self._pipe.close()
+        self._process.join(30)
+        if self._process.is_alive():
+            self._process.kill()
+
+
+def _serve(opened: Callable[[], AbstractContextManager[Any]], pipe: Any) -> None:
+    """Do what is asked through the pipe until it is closed."""
+    with opened() as thing:
+        pipe.send(None)
+        while True:
+            try:
+                do, args = pipe.recv()
+            except EOFError:
+                return
+            try:
+                pipe.send(do(thing, *args))
+            except Exception as error:
+                pipe.send(error)
+
+
 @contextmanager
-def stock_open(images: bool) -> Iterator[Any]:
-    """Yield stock robosuite, and close both sides' GL contexts afterwards."""
-    machine()  # asks GL now, not while both sides have contexts open
+def stock_open(images: bool) -> Iterator[Apart]:
+    """Yield stock robosuite in a process of its own, whose libraries take the threads that they take by themselves."""
+    machine()  # asks GL now, not while something is drawn
+    side = Apart(partial(_stock, images), by_the_libraries())
+    try:
+        yield side
+    finally:
+        side.close()
+
+
+@contextmanager
+def _stock(images: bool) -> Iterator[Any]:
+    """Open stock robosuite in this process."""
     env = stock_robosuite(images)
     try:
         env.reset()
         yield env
     finally:
-        # robosuite ends EGL for the whole process at exit; what is still open then could not be freed.
-        close_renderers()
-        close_stock(env)
+        close_stock(env)  # robosuite ends EGL for the whole process at exit
+
+
+def step_stock(env: Any, action: NDArray[np.float64]) -> Times:
+    """Return what one of its control steps takes."""
+    return timed(lambda: env.step(action))
+
+
+def reset_stock(env: Any) -> Times:
+    """Return what its reset takes."""
+    return timed(env.reset)
 
 
 def close_stock(env: Any) -> None:

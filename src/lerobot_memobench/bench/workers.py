@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import statistics
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +18,7 @@ from lerobot_memobench.bench.line import Line
 from lerobot_memobench.bench.machine import TASK, machine
 from lerobot_memobench.bench.sides import Ours, actions, close_stock, stock_robosuite
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.jobs.threads import by_the_libraries, by_the_rule
 
 WORKERS = (1, 2, 4)
 
@@ -59,8 +62,9 @@ def _team(stock: bool, count: int, task: str, seconds: float) -> tuple[float, fl
         context.Process(target=_worker, args=(stock, task, seconds, ready, go, results), daemon=True)
         for _ in range(count)
     ]
-    for process in team:
-        process.start()
+    with patch.dict(os.environ, by_the_libraries() if stock else by_the_rule(), clear=True):
+        for process in team:
+            process.start()
     try:
         for _ in team:
             if not ready.acquire(timeout=300):

@@ -71,6 +71,21 @@ def use_threads(role: str) -> None:
     given[CHOSEN_HERE] = ",".join(sorted(chosen))
 
 
+def by_the_libraries() -> dict[str, str]:
+    """Return this process's environment with the threads that the libraries take where nobody tells them: one on every
+    core. To measure what the rule does.
+    """
+    threads = dict.fromkeys(ONE_EACH, str(cores())) | {TORCH: str(_without_hyperthreads())}
+    return {key: value for key, value in os.environ.items() if key != CHOSEN_HERE} | SPINNING | threads
+
+
+def by_the_rule() -> dict[str, str]:
+    """Return this process's environment as the rule has it for one that acts, whatever a user says. To measure it."""
+    chosen = {**ONE_EACH, **SPINNING, TORCH: "1"}
+    kept = {key: value for key, value in os.environ.items() if key not in (BESIDE, "OMP_WAIT_POLICY")}
+    return {**kept, **chosen, CHOSEN_HERE: ",".join(chosen)}
+
+
 def limit_torch(parameters: int) -> None:
     """Let torch, in a process where a policy of so many parameters acts, use the threads that the rule gives it."""
     if is_users_own(TORCH):
