@@ -150,6 +150,8 @@ MEANINGS: dict[str, tuple[Meaning, ...]] = {
         Meaning("prompt_frames=", "false: no frame of a prompt is trained on; true: all are; left out: by the policy"),
         Meaning("episodes=", "of the dataset, those of these numbers: [0, 1, 2]"),
         Meaning("device=", "where it is trained: cpu, cuda, …"),
+        Meaning("output_dir=", "where everything goes; with resume=true, the training that is gone on with"),
+        Meaning("resume=", "true: go on with the last checkpoint in output_dir="),
         Meaning("env=, tasks=, suite=, referent=", "with env=memobench: evaluations within the training"),
     ),
 }
