@@ -16,8 +16,8 @@ import pytest
 import torch
 from lerobot.scripts import lerobot_eval
 
+from lerobot_memobench import lerobot_hooks
 from lerobot_memobench.engine.loop import rollout as our_loop
-from lerobot_memobench.engine.loop import steering
 from lerobot_memobench.engine.loop.looking import KNOWN
 from lerobot_memobench.engine.loop.rollout import KEEPS_FRAMES, RECORDS
 from lerobot_memobench.engine.loop.steering import batch_seed, steered
@@ -91,7 +91,7 @@ READ = {
 
 def test_this_is_the_lerobot_whose_loop_is_known() -> None:
     found = metadata.version("lerobot")
-    assert found == steering.LEROBOT, (
+    assert found == lerobot_hooks.LEROBOT, (
         f"lerobot {found} is installed. Read {MODULE}: does it still do what the tests below say? Compare the film and "
         "the log of one killed and resumed evaluation (tests/cli/test_killed_evaluation.py), then change LEROBOT"
     )

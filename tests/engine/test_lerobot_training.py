@@ -21,7 +21,6 @@ from lerobot.scripts import lerobot_train
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.datasets import execution_frames
-from lerobot_memobench.engine import lerobot_training
 from lerobot_memobench.engine.lerobot_training import trained_on
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
@@ -44,7 +43,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # --- what is relied on: where one of these fails, LeRobot's training is another one ---
 
 CALLS = {
-    (lerobot_train.train, f"{lerobot_training.MAKE}(cfg)"): "opens the datasets by it, looked up in its module",
+    (lerobot_train.train, "make_train_eval_datasets(cfg)"): "opens the datasets by it, looked up in its module",
     (lerobot_train.train, 'dataset.meta.episodes["dataset_from_index"]'): "draws within these bounds",
     (lerobot_train.train, "episode_indices_to_use=dataset.episodes"): "draws from the episodes that are opened",
     (StreamingLeRobotDataset.__iter__, "safe_shard(self.hf_dataset, idx"): "streams the frames that are found there",

@@ -1,9 +1,8 @@
-"""The synthetic dataset that policies are trained on, and torch as it was before each test."""
+"""The synthetic dataset that policies are trained on."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,16 +11,6 @@ import torch
 torch.set_num_threads(1)
 # For small_policy.py and synthetic_dataset.py: pytest imports tests by their paths.
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
-
-
-@pytest.fixture(autouse=True)
-def usual_products() -> Iterator[None]:
-    """Put torch's settings back: what makes no update after a training's forward pass leaves quick products on."""
-    from lerobot_memobench.computing.bfloat16 import end_quick_products
-
-    end_quick_products()
-    yield
-    end_quick_products()
 
 
 @pytest.fixture(scope="session")

@@ -84,5 +84,7 @@ def refuses_pictures_in_a_batch(root: Path, settings: dict[str, Any]) -> None:
     """As LeRobot's loader processes make them, which know nothing of what was seen."""
     policy, before, _, dataset = made_for_training(root, **settings)
     batch = before(torch.utils.data.default_collate([DatasetReader.get_item.__wrapped__(dataset.reader, 45)]))
-    with pytest.raises(MemobenchError, match=r"has pictures, and not what eyes saw.*--num_workers=0"):
+    with pytest.raises(
+        MemobenchError, match=r"has pictures, which a policy with eyes does not look at.*--num_workers=0"
+    ):
         policy.train().forward(batch)

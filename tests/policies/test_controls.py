@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,8 +21,10 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
 from lerobot_memobench.policies.memobench_mem.language.text_encoders import WordTextEncoder
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.memobench_mem.processing.subgoals import shuffle_within_episodes
+from lerobot_memobench.policies.memobench_mem.processing.subgoals import SEVERAL, shuffled_subgoals, text_rows
+from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.memory_text import with_memory
+from lerobot_memobench.tasks.task import LEVELS
 
 EPISODE_1 = 40  # first frame of the second episode, whose subgoals are:
 SUBGOALS = ("open the top drawer", "put the bowl in the drawer", "close the top drawer")
@@ -113,14 +116,60 @@ def test_subgoal_level_chooses_the_text(dataset_root: Path, align: str, level: s
 def test_shuffled_subgoals_stay_in_their_episode_and_all_move() -> None:
     rows = np.array([0, 0, 1, 2, -1, 5, 5, 7], np.int32)
     episodes = np.array([0, 5, 7, 8])
-    shuffled = shuffle_within_episodes(rows, episodes)
+    shuffled, elsewhere = shuffled_subgoals(rows, episodes)
     assert set(shuffled[:4]) == {0, 1, 2}
     assert (shuffled[:4] != rows[:4]).all()
-    assert shuffled[4:].tolist() == [-1, 5, 5, 7]
+    assert shuffled[4] == -1
+    assert elsewhere == 2, "one subgoal has none to change places with"
+    assert shuffled[5] == shuffled[6] in {0, 1, 2, 7}
+    assert shuffled[7] in {0, 1, 2, 5}
     assert shuffled[0] == shuffled[1]
-    assert np.array_equal(shuffled, shuffle_within_episodes(rows, episodes))
-    others = [shuffle_within_episodes(rows, episodes, seed)[:4].tolist() for seed in range(8)]
+    assert np.array_equal(shuffled, shuffled_subgoals(rows, episodes)[0])
+    others = [shuffled_subgoals(rows, episodes, seed)[0][:4].tolist() for seed in range(8)]
     assert len({tuple(other) for other in others}) == 2  # three subgoals can all move in two ways
+
+
+def kept_relation(rows: np.ndarray, shuffled: np.ndarray) -> dict[int, float]:
+    """How often each subgoal gets the text that it gets most often: 1 where it is renamed alike everywhere."""
+    found = {}
+    for row in np.unique(rows):
+        _, counts = np.unique(shuffled[rows == row], return_counts=True)
+        found[int(row)] = counts.max() / counts.sum()
+    return found
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_shuffled_subgoals_tell_nothing_of_what_is_seen_in_any_task(level: str) -> None:
+    """Episodes of all tasks together, and of each task alone; a subgoal is one frame of each episode."""
+    repeats = 60
+    tasks = [get_task(name) for name in task_names(suite=None)]
+    said = [[checkpoint.language[LEVELS.index(level)] for checkpoint in task.checkpoints] for task in tasks]
+    number = {text: row for row, text in enumerate(dict.fromkeys(text for texts in said for text in texts))}
+    own = [[number[text] for text in dict.fromkeys(texts)] for texts in said]
+    few = [rows for rows in own if len(rows) < SEVERAL]
+    assert few, "there are tasks whose subgoals would only be renamed"
+
+    def shuffle(tasks: list[list[int]]) -> tuple[np.ndarray, np.ndarray]:
+        rows = np.array([row for subgoals in tasks for row in subgoals * repeats])
+        lengths = [len(subgoals) for subgoals in tasks for _ in range(repeats)]
+        return rows, shuffled_subgoals(rows, np.r_[0, np.cumsum(lengths)])[0]
+
+    rows, shuffled = shuffle(own)
+    ends = np.cumsum([repeats * len(subgoals) for subgoals in own])
+    for task, end, subgoals in zip(tasks, ends, own, strict=True):
+        here = slice(end - repeats * len(subgoals), end)
+        assert max(kept_relation(rows[here], shuffled[here]).values()) < 0.7, task.name
+    for task, subgoals in zip(tasks, own, strict=True):
+        if len(subgoals) > 1:
+            assert max(kept_relation(*shuffle([subgoals])).values()) < 0.75, f"{task.name} alone"
+
+
+def test_one_subgoal_alone_cannot_be_shuffled() -> None:
+    cache: Any = SimpleNamespace(
+        texts=["put it down"], text_rows=lambda _: np.zeros(5, int), episodes=np.array([0, 5]), folder="here"
+    )
+    with pytest.raises(MemobenchError, match=r"one coarse subgoal.*several tasks"):
+        text_rows(cache, "coarse", "semantic", 7)
 
 
 @pytest.mark.parametrize("align", ["contrastive", "framewise"])

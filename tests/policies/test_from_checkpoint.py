@@ -90,7 +90,8 @@ def test_a_step_from_a_checkpoint_takes_the_new_settings(go_on: Any, dataset_roo
     dataset = LeRobotDataset(
         "memobench/synthetic", root=dataset_root, delta_timestamps=resolve_delta_timestamps(config, meta)
     )
-    fresh, _ = make_pre_post_processors(config, dataset_stats=meta.stats)
+    policy = MemobenchMemPolicy.from_pretrained(written, config=config, dataset_meta=meta)
+    fresh, _ = make_pre_post_processors(policy.config, dataset_stats=meta.stats)
     expected = fresh(batch_of(dataset, batch["index"].tolist()))
     assert {key for key in batch if key.startswith("memory.")} == {key for key in expected if key.startswith("memory.")}
     for key in (*(key for key in batch if key.startswith("memory.")), "phase", "observation.state", "action"):

@@ -13,7 +13,7 @@ from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTr
 from lerobot.datasets import EpisodeAwareSampler
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.dataset_reader import DatasetReader
-from lerobot.policies import make_pre_post_processors
+from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.constants import OBS_ENV_STATE
 from small_policy import batch_of, losses_in_training, made_for_training, small_config
 
@@ -124,9 +124,11 @@ def test_samples_from_memory_are_lerobots(root: Path, episodes: list[int] | None
     from lerobot.datasets.factory import resolve_delta_timestamps
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    policy, _, _, whole = made_for_training(root, **OBJECTS)
-    deltas = resolve_delta_timestamps(policy.config, whole.meta)
+    config, whole = small_config(**OBJECTS), LeRobotDataset("memobench/objects", root=root)
+    deltas = resolve_delta_timestamps(config, whole.meta)
     dataset = LeRobotDataset("memobench/objects", root=root, delta_timestamps=deltas, episodes=episodes)
+    policy = make_policy(config, ds_meta=dataset.meta)
+    assert policy.run.meta is dataset.meta
     of_lerobot = DatasetReader.get_item.__wrapped__
     for row in (0, 12, 38, len(dataset) - 1):
         expected, found = of_lerobot(dataset.reader, row), dataset[row]

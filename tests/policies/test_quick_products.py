@@ -24,21 +24,25 @@ def settings() -> tuple[str, bool]:
 
 
 @pytest.mark.parametrize("quick", [True, False])
-def test_they_are_on_from_a_forward_pass_to_its_update(
-    root: Path, quick: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_they_are_on_within_a_pass(root: Path, quick: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What another policy computes between a forward pass, its backward pass and its update, is computed as ever."""
     monkeypatch.setattr(bfloat16, "quicker_in_bfloat16", lambda: quick)
     policy, before, _, dataset = made_for_training(root, **OBJECTS)
     batch = before(batch_of(dataset, [10, 30, 50]))
-    usual = settings()
+    usual, during = settings(), ("bf16", False) if quick else settings()
+    seen: list[tuple[str, bool]] = []
+    policy.model.action_in_proj.register_forward_hook(lambda *_: seen.append(settings()))
+    policy.model.action_in_proj.weight.register_hook(lambda _: seen.append(settings()))
     policy.eval().forward(batch)
-    assert settings() == usual, "what measures a loss computes as everywhere"
-    for _ in range(2):  # two batches for one update
-        policy.train().forward(batch)[0].backward()
-        assert settings() == (("bf16", False) if quick else usual)
-    policy.update()
-    assert settings() == usual
-    policy.update()
+    assert seen == [usual], "what measures a loss computes as everywhere"
+    for reduction in ("mean", "none"):
+        seen.clear()
+        loss, _ = policy.train().forward(batch, reduction)
+        assert (seen, settings()) == ([during], usual)
+        loss.sum().backward()
+        assert (seen, settings()) == ([during, during], usual)
+    with pytest.raises(RuntimeError), bfloat16.quick_products():
+        raise RuntimeError
     assert settings() == usual
 
 

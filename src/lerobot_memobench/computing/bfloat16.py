@@ -1,22 +1,23 @@
 """Where a CPU is quicker in bfloat16, which eyes ask before they learn by torch's autocast, and policies by products.
 
-Between `begin_quick_products` and `end_quick_products` weights, gradients, sums and all that is no product stay
-float32. A policy with eyes does without: it is quicker by attention in one kernel (`fused_attention`). The setting is
-torch's and the process's, so it is on from a forward pass to its update only: what acts, or measures a loss, in between
-two updates computes as everywhere.
+With `quick_products` weights, gradients, sums and all that is no product stay float32. A policy with eyes does without:
+it is quicker by attention in one kernel (`fused_attention`). The setting is torch's and the process's, so it is on
+within a pass only, forward or backward: what another policy computes in between computes as everywhere.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from functools import cache
 
 import torch
+from torch import Tensor
 
 INSTRUCTIONS = ("avx512_bf16", "amx_bf16")
 CLEARLY = 0.8
 """Share of float32's time that products in bfloat16 may take at most: the same machine decides the same each time."""
-_before: tuple[str, bool] | None = None
 
 
 @cache
@@ -50,22 +51,32 @@ def _seconds() -> float:
     return time.perf_counter() - start
 
 
-def begin_quick_products() -> None:
-    """Round the factors of products from now on, if that is quicker; attention in one kernel, whose many small ones
-    suffer, is left out.
+@contextmanager
+def quick_products() -> Iterator[None]:
+    """While this lasts, round the factors of products, if that is quicker; attention in one kernel, whose many small
+    ones suffer, is left out.
     """
-    global _before
-    if _before is None and quicker_in_bfloat16():
-        products = torch.backends.mkldnn.matmul
-        _before = products.fp32_precision, torch.backends.cuda.flash_sdp_enabled()  # of the CPU's kernel, too
-        products.fp32_precision = "bf16"
-        torch.backends.cuda.enable_flash_sdp(False)
-
-
-def end_quick_products() -> None:
-    """Put everything back, if they had begun."""
-    global _before
-    if _before is not None:
-        torch.backends.mkldnn.matmul.fp32_precision, fused = _before
+    if not quicker_in_bfloat16():
+        yield
+        return
+    products = torch.backends.mkldnn.matmul
+    before = products.fp32_precision, torch.backends.cuda.flash_sdp_enabled()  # of the CPU's kernel, too
+    products.fp32_precision = "bf16"
+    torch.backends.cuda.enable_flash_sdp(False)
+    try:
+        yield
+    finally:
+        products.fp32_precision, fused = before
         torch.backends.cuda.enable_flash_sdp(fused)
-        _before = None
+
+
+def quick_gradients(loss: Tensor) -> None:
+    """Let a loss's backward pass be computed with `quick_products`."""
+
+    def begin(_: Tensor) -> None:
+        passing = ExitStack()
+        passing.enter_context(quick_products())
+        torch.autograd.Variable._execution_engine.queue_callback(passing.close)  # when the pass has ended
+
+    if loss.requires_grad:
+        loss.register_hook(begin)

@@ -1,20 +1,17 @@
 """What LeRobot's training is made to do beside its own: leave the frames of prompts out, and say what a policy sees.
 
-With `loop` and `policies.memobench_mem.execution_frames`, which draws that policy's batches, all that changes anything
-of LeRobot's; what it relies on is listed in tests/engine/test_lerobot_training.py. Whether prompt frames are wanted is
-decided where the policy is known for sure: when LeRobot, its configuration complete, has opened the datasets. So is
-what a policy sees: our datasets hold pictures and, beside them, what shows in them as objects, and LeRobot would give
-both to its own policies.
+What it relies on is listed in tests/engine/test_lerobot_training.py; how it gets there, and out again: `lerobot_hooks`.
+Whether prompt frames are wanted is decided where the policy is known for sure: when LeRobot, its configuration
+complete, has opened the datasets. So is what a policy sees: our datasets hold pictures and, beside them, what shows in
+them as objects, and LeRobot would give both to its own policies.
 """
 
 from __future__ import annotations
 
 import functools
 import logging
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from types import ModuleType
 from typing import Any
 
 from lerobot.utils.constants import OBS_STATE
@@ -22,15 +19,12 @@ from lerobot.utils.constants import OBS_STATE
 from lerobot_memobench.datasets.execution_frames import ExecutionFrames, leave_out_prompts
 from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS as INPUT
 from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
-from lerobot_memobench.engine.loop.steering import check_version
 from lerobot_memobench.envs.obs_types import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.envs.prompting import knows_phases
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.lerobot_hooks import OPEN_DATASETS, check_version, install
 
 logger = logging.getLogger(__name__)
-
-MAKE = "make_train_eval_datasets"
-"""The function by which LeRobot's training opens the datasets to train on and to measure the loss on."""
 
 
 @contextmanager
@@ -43,24 +37,17 @@ def trained_on(prompt_frames: bool | None, obs_type: str | None = None) -> Itera
     Raises:
         MemobenchError: the installed LeRobot is another than the one whose training is known here.
     """
-    before = steer(prompt_frames, obs_type)
+    undo = steer(prompt_frames, obs_type)
     try:
         yield
     finally:
-        for module, make in before.items():
-            setattr(module, MAKE, make)
+        undo()
 
 
-def steer(prompt_frames: bool | None, obs_type: str | None = None) -> dict[ModuleType, Callable[..., Any]]:
-    """As `trained_on`, for good; return what was replaced."""
+def steer(prompt_frames: bool | None, obs_type: str | None = None) -> Callable[[], None]:
+    """As `trained_on`, until the function returned is called."""
     check_version("training")
-    from lerobot.scripts import lerobot_train
-
-    modules = [module for module in (lerobot_train, sys.modules["__main__"]) if hasattr(module, MAKE)]  # `python -m`
-    before = {module: getattr(module, MAKE) for module in modules}
-    for module, make in before.items():
-        setattr(module, MAKE, _steered(make, prompt_frames, obs_type))
-    return before
+    return install(OPEN_DATASETS, lambda make: _steered(make, prompt_frames, obs_type))
 
 
 def _steered(make: Callable[..., Any], prompt_frames: bool | None, obs_type: str | None) -> Callable[..., Any]:
@@ -85,6 +72,8 @@ def _steered(make: Callable[..., Any], prompt_frames: bool | None, obs_type: str
             logger.info("%s of prompts are left out of the %d to train on", told, train.num_frames)
         # A policy that draws execution frames alone sees to what it trains on, and not to what it is tested on.
         tested = wanted and getattr(config.policy, "prompt_loss", True)
+        if held_out is not None:
+            held_out.reader.trained_with = train.meta
         if held_out is not None and not tested and leave_out_prompts(held_out):
             held_out = ExecutionFrames(held_out)
         return train, held_out

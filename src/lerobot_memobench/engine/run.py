@@ -70,12 +70,12 @@ def _what_is_run(plan: EvaluationPlan) -> str:
 
 def _run_lerobot(plan: EvaluationPlan, card: dict[str, Any], ranges: Ranges | None, tell: Tell) -> Ended:
     """Run LeRobot's evaluation on what is left, in the folder that is held meanwhile."""
-    calm_output()
     status, trained = 1, not isinstance(plan.policy, UntrainedConfig)
     try:
         with (
             nullcontext() if plan.orders.verbose else without_chatter(trained),
             held(plan),
+            calm_output(),
             steered(plan.seed, ranges),
         ):
             if card["protocol"]:

@@ -1,8 +1,7 @@
 """What LeRobot's evaluation loop is made to do beside its own: run parts of a task, seed each batch, draw what is seen.
 
-With `lerobot_training`, and `policies.memobench_mem.execution_frames` for that policy's batches, all that changes
-anything of LeRobot's. It was written against the loop of one version: what it relies on is listed in
-tests/engine/test_lerobot_loop.py, whose failures say what to look at when LeRobot moves on.
+Written against the loop of one version: what it relies on is listed in tests/engine/test_lerobot_loop.py, whose
+failures say what to look at when LeRobot moves on. How it gets there, and out again: `lerobot_hooks`.
 
 LeRobot seeds Python, NumPy and torch once per run, so what a sampling policy draws in an episode depends on all that
 ran before it. Here each batch is seeded from the run's seed, the task and the batch's first episode: an evaluation
@@ -19,45 +18,25 @@ import hashlib
 import logging
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from importlib import metadata
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 from lerobot_memobench.engine.grid import Range
-from lerobot_memobench.errors import MemobenchError
-
-LEROBOT = "0.6.1"
-"""The version whose loop is known here."""
+from lerobot_memobench.lerobot_hooks import INSIDE_SLURM, ROLLOUT, RUN_ONE, check_version, hooked
 
 KEEPS_ITS_NOISE = ("memobench_mem",)
 """Policies that seed each episode's noise themselves, from torch's initial seed: it must stay the run's."""
 
 
-def check_version(part: str = "evaluation loop") -> None:
-    """Refuse another LeRobot than the one whose loops are known: another one may run other episodes, or unseeded ones.
-
-    Args:
-        part: what is steered, for the message.
-
-    Raises:
-        MemobenchError: it is installed.
-    """
-    found = metadata.version("lerobot")
-    if found != LEROBOT:
-        raise MemobenchError(
-            f"lerobot {found} is installed, and the benchmark steers the {part} of lerobot {LEROBOT}; install "
-            f"lerobot=={LEROBOT} (make setup)"
-        )
-
-
-def calm_output() -> None:
+@contextmanager
+def calm_output() -> Iterator[None]:
     """Keep progress bars out of log files, and a library's farewell out of the end of a run."""
-    from lerobot.scripts import lerobot_eval
-
     logging.getLogger("OpenGL").setLevel(logging.WARNING)
-    if not sys.stderr.isatty():
-        # The bar is redrawn at every step. LeRobot leaves it out where it takes itself to be in a batch job.
-        lerobot_eval.inside_slurm = lambda: True
+    with ExitStack() as stack:
+        if not sys.stderr.isatty():
+            # The bar is redrawn at every step. LeRobot leaves it out where it takes itself to be in a batch job.
+            stack.enter_context(hooked(INSIDE_SLURM, lambda _: lambda: True))
+        yield
 
 
 @contextmanager
@@ -76,17 +55,15 @@ def steered(seed: int | None, ranges: Mapping[tuple[str, int], list[Range]] | No
 
     from lerobot_memobench.engine.loop.rollout import sparing
 
-    run_one, rollout = lerobot_eval.run_one, lerobot_eval.rollout
-    lerobot_eval.run_one = _unfilmed(run_one)
-    if ranges is not None:
-        lerobot_eval.run_one = _only(lerobot_eval.run_one, ranges)
-    lerobot_eval.rollout = sparing(rollout, lambda: lerobot_eval.inside_slurm())
-    if seed is not None:
-        lerobot_eval.rollout = _seeded(lerobot_eval.rollout, seed)
-    try:
+    def one(run_one: Callable[..., Any]) -> Callable[..., Any]:
+        return _unfilmed(run_one) if ranges is None else _only(_unfilmed(run_one), ranges)
+
+    def rolled(rollout: Callable[..., Any]) -> Callable[..., Any]:
+        spared = sparing(rollout, lambda: lerobot_eval.inside_slurm())
+        return spared if seed is None else _seeded(spared, seed)
+
+    with hooked(RUN_ONE, one), hooked(ROLLOUT, rolled):
         yield
-    finally:
-        lerobot_eval.run_one, lerobot_eval.rollout = run_one, rollout
 
 
 def _unfilmed(run_one: Callable[..., Any]) -> Callable[..., Any]:

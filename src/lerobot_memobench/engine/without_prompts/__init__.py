@@ -2,9 +2,10 @@
 
 For plain ``lerobot-train``, by LeRobot's own flag for plugins
 ``--dataset.discover_packages_path=lerobot_memobench.engine.without_prompts``; a package and no module, since LeRobot
-looks for more in it. ``lerobot train`` does it by ``prompt_frames=``.
+looks for more in it. ``lerobot train`` does it by ``prompt_frames=``. As the flag is the process's, so is what it does:
+it ends with the process, or where `undo` is called.
 """
 
 from lerobot_memobench.engine.lerobot_training import steer
 
-steer(prompt_frames=False)
+undo = steer(prompt_frames=False)

@@ -83,6 +83,12 @@ SENTENCE = (
     "Rollouts in which a checkpoint and all before it were satisfied, per cent, with Wilson's 95 % interval. The "
     "difference is shuffled − normal, with its bootstrap interval over paired episodes."
 )
+SEVERAL = 3
+"""Subgoals of a task that can change places in more than one way."""
+ELSEWHERE = (
+    f"Fewer than {SEVERAL} subgoals that change places are only renamed, and still tell what is seen: such a task is "
+    "taught subgoals of other episodes in their place."
+)
 
 
 def shuffled_report(
@@ -94,12 +100,15 @@ def shuffled_report(
         published: the paper's, per cent, ``normal`` and ``shuffled``.
     """
     tables = [_table(replan, curves) for replan, curves in found.items()]
+    short = {curve.task for curves in found.values() for curve in curves if len(curve.normal) <= SEVERAL}
+    said = f"{ELSEWHERE} So it was with {', '.join(sorted(short))}." if short else ""
     if published is not None:
         tables.append(_published_table(published))
     data: dict[str, Any] = {str(replan): as_percent(list(curves)) for replan, curves in found.items()}
     if published is not None:
         data[PAPER] = dict(published)
-    return Report("Shuffled memory", (Section("", tuple(tables), sentences=(SENTENCE,)),), data)
+    sentences = (SENTENCE, said) if said else (SENTENCE,)
+    return Report("Shuffled memory", (Section("", tuple(tables), sentences=sentences),), data)
 
 
 def _table(replan: int | None, curves: Sequence[PrefixCurve]) -> Table:

@@ -2,9 +2,10 @@
 
 lerobot-train draws the frames of all episodes uniformly, each once per epoch, in an order that seed and epoch decide,
 and leaves no say in where an episode begins. What it does ask the configuration for is how many frames to drop at the
-end; our answer is 0 and carries, for its sampler, where each episode's execution begins and how many of its frames
-follow one another in the order. The sampler is LeRobot's, and any other answer leaves it as it was. Histories still
-hold the prompt, because they come from the memory cache.
+end; our answer is none, and carries for its sampler where each episode's execution begins and how many of its frames
+follow one another in the order. The sampler is LeRobot's, and any other answer leaves it as it was; a sampler that
+takes ours for a number would draw prompts, and is refused. Histories still hold the prompt, because they come from the
+memory cache.
 
 Where tasks are balanced, an epoch has as many frames as otherwise, but not each of them once: tasks whose episodes are
 short would else be a small part of every batch, and they learned several times slower than the others.
@@ -13,8 +14,8 @@ short would else be a small part of every batch, and they learned several times 
 from __future__ import annotations
 
 import functools
-import inspect
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +27,13 @@ from torch import Tensor
 from lerobot_memobench.datasets.demonstration import PROMPT
 from lerobot_memobench.datasets.execution_frames import first_frames
 from lerobot_memobench.datasets.lerobot_format.reading import list_episodes
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.lerobot_hooks import DRAW_FRAMES, hooked_for
 
 
-class Drawn(int):
-    """How many frames to drop at the end of each episode, and how the others are drawn.
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """No frames to drop at the end of each episode, and how the others are drawn by LeRobot's sampler while this lives.
 
     Attributes:
         starts: from which frame on (E,) to draw; None: from the first.
@@ -39,25 +43,34 @@ class Drawn(int):
 
     starts: np.ndarray | None
     moments: int
-    tasks: np.ndarray | None
-    balance: float
-    factors: np.ndarray | None
+    tasks: np.ndarray | None = None
+    balance: float = 1.0
+    factors: np.ndarray | None = None
 
     @classmethod
-    def of(
-        cls,
-        starts: np.ndarray | None,
-        moments: int,
-        tasks: np.ndarray | None = None,
-        balance: float = 1.0,
-        factors: np.ndarray | None = None,
-    ) -> Drawn:
-        """Return 0, which LeRobot's sampler understands from now on."""
-        _teach(EpisodeAwareSampler)
-        found = cls(0)
-        found.starts, found.moments = starts, moments
-        found.tasks, found.balance, found.factors = tasks, balance, factors
-        return found
+    def of(cls, *how: Any) -> Drawn:
+        """Return one; arguments as of this class."""
+        return cls(*how)
+
+    def __post_init__(self) -> None:
+        hooked_for(self, DRAW_FRAMES, _draws)
+
+    @property
+    def ordered(self) -> bool:
+        """Whether the order is ours, too."""
+        return self.moments > 1 or self.tasks is not None
+
+    def _refuse(self, *_: Any) -> Any:
+        """Be no number."""
+        raise MemobenchError(
+            "What draws the frames of this training is not LeRobot's EpisodeAwareSampler, or something has taken its "
+            "place: it knows nothing of execution frames and would draw those of prompts; leave out what replaces it, "
+            "or train with --policy.prompt_loss=true on a dataset without prompts by a loader of your own."
+        )
+
+    __array_ufunc__ = None  # of an array minus this, numpy asks this
+    __lt__ = __le__ = __gt__ = __ge__ = __bool__ = __int__ = __index__ = __float__ = _refuse
+    __add__ = __radd__ = __sub__ = __rsub__ = __mul__ = __rmul__ = _refuse
 
 
 def execution_starts(episodes: np.ndarray, phase: np.ndarray) -> np.ndarray:
@@ -141,34 +154,33 @@ def in_turns(
     return (first[episode] + offset)[:count]
 
 
-def _teach(sampler: type[Any]) -> None:
-    """Let a sampler begin its episodes, and draw them, as its ``drop_n_last_frames`` says, if that says so."""
-    original = sampler.__init__
-    if hasattr(original, "__wrapped__"):
-        return
-    signature = inspect.signature(original)
+def _draws(begin: Callable[..., None]) -> Callable[..., None]:
+    """Wrap the beginning of LeRobot's sampler: it draws as its ``drop_n_last_frames`` says, if that says so."""
 
-    @functools.wraps(original)
+    @functools.wraps(begin)
     def init(self: Any, *args: Any, **named: Any) -> None:
-        asked = signature.bind(self, *args, **named)
-        dropped = asked.arguments.get("drop_n_last_frames", 0)
-        self.drawn = dropped if isinstance(dropped, Drawn) else None
-        if self.drawn is not None and self.drawn.starts is not None:
-            asked.arguments["dataset_from_indices"] = self.drawn.starts
-        original(*asked.args, **asked.kwargs)
+        asked = dict(zip(DRAW_FRAMES.parameters[1:], args, strict=False)) | named
+        drawn = asked.get("drop_n_last_frames")
+        if isinstance(drawn, Drawn):
+            asked["drop_n_last_frames"] = 0
+            if drawn.starts is not None:
+                asked["dataset_from_indices"] = drawn.starts
+            if drawn.ordered and type(self).__iter__ is not EpisodeAwareSampler.__iter__:
+                drawn._refuse()
+            self.drawn = drawn
+        begin(self, **asked)
+        if isinstance(drawn, Drawn) and drawn.ordered and self.shuffle:
+            self._iter_epoch = functools.partial(_one_epoch, self, drawn)
 
-    one_epoch = sampler._iter_epoch
+    return init
 
-    def draw(self: Any, epoch: int, start: int) -> Iterator[int]:
-        drawn: Drawn | None = self.drawn
-        if drawn is None or not self.shuffle or (drawn.moments == 1 and drawn.tasks is None):
-            return one_epoch(self, epoch, start)
-        chance = self._epoch_generator(epoch)
-        if drawn.tasks is None:
-            order = in_groups(self._cum_lengths, drawn.moments, chance)
-        else:
-            tasks = drawn.tasks[self._starts]
-            order = in_turns(self._cum_lengths, tasks, drawn.moments, chance, drawn.balance, drawn.factors)
-        return (self._frame_index(position) for position in order[start:].tolist())
 
-    sampler.__init__, sampler._iter_epoch = init, draw
+def _one_epoch(sampler: Any, drawn: Drawn, epoch: int, start: int) -> Iterator[int]:
+    """Yield the frames of an epoch from its place ``start`` on."""
+    chance = sampler._epoch_generator(epoch)
+    if drawn.tasks is None:
+        order = in_groups(sampler._cum_lengths, drawn.moments, chance)
+    else:
+        tasks = drawn.tasks[sampler._starts]
+        order = in_turns(sampler._cum_lengths, tasks, drawn.moments, chance, drawn.balance, drawn.factors)
+    return (sampler._frame_index(position) for position in order[start:].tolist())

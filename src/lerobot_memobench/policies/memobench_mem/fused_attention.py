@@ -8,6 +8,7 @@ takes a third of the time. It rounds otherwise, so what acts goes on with LeRobo
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -15,28 +16,32 @@ from torch import Tensor, nn
 from torch.nn.functional import scaled_dot_product_attention
 from transformers.models.gemma import modeling_gemma
 
+from lerobot_memobench.lerobot_hooks import ATTEND, hooked_for
+
 MARK = "learns_fused"
 """Attribute of the attention modules that it is for."""
 
 
 def attend_fused(model: nn.Module) -> None:
-    """Let the attention of a model's layers be computed in one kernel wherever gradients are wanted."""
+    """Let the attention of a model's layers be computed in one kernel wherever gradients are wanted, while it lives."""
     for module in model.modules():
         if isinstance(module, modeling_gemma.GemmaAttention):
             setattr(module, MARK, True)
-    original = modeling_gemma.eager_attention_forward
-    if hasattr(original, "__wrapped__"):
-        return
+    hooked_for(model, ATTEND, _fused)
 
-    @functools.wraps(original)
+
+def _fused(attend: Callable[..., Any]) -> Callable[..., Any]:
+    """Wrap transformers' attention: modules that are marked learn in one kernel."""
+
+    @functools.wraps(attend)
     def attention(
         module: nn.Module, query: Tensor, key: Tensor, value: Tensor, mask: Tensor | None, scaling: float, **more: Any
     ) -> tuple[Tensor, Tensor | None]:
         if not (hasattr(module, MARK) and torch.is_grad_enabled()):
-            weighed: tuple[Tensor, Tensor] = original(module, query, key, value, mask, scaling, **more)
+            weighed: tuple[Tensor, Tensor] = attend(module, query, key, value, mask, scaling, **more)
             return weighed
         key, value = (modeling_gemma.repeat_kv(kept, module.num_key_value_groups) for kept in (key, value))
         read = scaled_dot_product_attention(query, key, value, attn_mask=mask, scale=scaling)
         return read.transpose(1, 2).contiguous(), None
 
-    modeling_gemma.eager_attention_forward = attention
+    return attention

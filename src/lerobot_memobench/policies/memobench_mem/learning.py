@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import Any
 
 from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 from torch import Tensor, nn
 
-from lerobot_memobench.computing.bfloat16 import begin_quick_products, end_quick_products
+from lerobot_memobench.computing.bfloat16 import quick_gradients, quick_products
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.action_loss import counted_actions, mean_losses
 from lerobot_memobench.policies.memobench_mem.action_objective import losses_of, noise_and_time
@@ -15,7 +16,6 @@ from lerobot_memobench.policies.memobench_mem.alignment.loss import alignment_lo
 from lerobot_memobench.policies.memobench_mem.alignment.objectives import Alignment
 from lerobot_memobench.policies.memobench_mem.averaging import WeightAverage
 from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, PHASE, STEPS, TOKENS, MemoryBatch
-from lerobot_memobench.policies.memobench_mem.perception.eyes import SEEN
 from lerobot_memobench.policies.memobench_mem.seeing import SeeingPolicy
 from lerobot_memobench.policies.memobench_mem.training_curve import TrainingCurve
 
@@ -49,7 +49,6 @@ class LearningPolicy(SeeingPolicy):
 
     def update(self) -> None:
         """Called by lerobot-train after each optimiser step: move the average of the weights."""
-        end_quick_products()
         if self.average is not None:
             self.average.update()
 
@@ -71,9 +70,8 @@ class LearningPolicy(SeeingPolicy):
         self._require_memory(batch)
         if self._averages and self.average is None and self.training:
             self.average = self._new_average()
-        if self.training and self._device.type == "cpu" and not self.config.sees_tokens:
-            begin_quick_products()
-        with self.precision.computing(self._device):
+        quick = self.training and self._device.type == "cpu" and not self.config.sees_tokens
+        with self.precision.computing(self._device), quick_products() if quick else nullcontext():
             memory = self._read_memory(batch)
             per_sample, total, logged = self._action_loss(batch)
             if self.alignment is not None and memory is not None:
@@ -86,7 +84,10 @@ class LearningPolicy(SeeingPolicy):
             self.curve.note(logged)
         else:
             self.curve.note_held_out(logged)
-        return (per_sample, logged) if reduction == "none" else (total, logged)
+        loss = per_sample if reduction == "none" else total
+        if quick:
+            quick_gradients(loss)
+        return loss, logged
 
     def _require_memory(self, batch: dict[str, Tensor]) -> None:
         needed = TOKENS if self._remembers else PHASE
@@ -95,10 +96,12 @@ class LearningPolicy(SeeingPolicy):
                 f"The training batch has no '{needed}': the preprocessor lacks the step memobench_gather_memory; to "
                 "start from pi0.5's weights pass --policy.base_weights instead of --policy.pretrained_path."
             )
-        if self.config.has_eyes and not any(key.startswith(SEEN) for key in batch):
+        if self.config.has_eyes and self.training and any(key in batch for key in self.config.image_features):
             raise MemobenchError(
-                "The training batch has pictures, and not what eyes saw in them, because a stream or loader processes "
-                "made it: pass --num_workers=0, which is quicker too, and leave dataset.streaming out."
+                "The training batch has pictures, which a policy with eyes does not look at (it reads what was once "
+                "seen in them), because a stream or loader processes made it, or because another policy is trained on "
+                "the same dataset object: pass --num_workers=0, which is quicker too, leave dataset.streaming out, and "
+                "open the dataset once for each policy."
             )
 
     def _read_memory(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor] | None:

@@ -65,6 +65,7 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
     Attributes:
         average: moving average of the trained weights, which evaluation uses; None before training, or without one.
         history: what the rows of a rollout remember. plans: what they are about to do.
+        run: what it is trained with; None where it only acts.
     """
 
     config_class = MemobenchMemConfig
@@ -103,6 +104,7 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
             self.model.gradient_checkpointing_enable()
         self.to(config.device)
         self.average: WeightAverage | None = None
+        self.run: TrainingRun | None = None
         self.curve = TrainingCurve()
         self.history = RolloutMemory(make_mechanism(config.memory, config.memory_frames), config.memory_stride)
         self.plans, self.noise = RowPlans(self._action_dim), EpisodeNoise()
@@ -115,9 +117,10 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
     def _begin_training(self, meta: Any) -> None:
         """Make ready to train on a dataset: what the preprocessor looks up, and what LeRobot draws."""
         cache = open_frames(Path(meta.root), self.config, self.perception)
-        begin_training(TrainingRun(self.config, cache, meta))
+        self.run = TrainingRun(self.config, cache, meta)
+        begin_training(self.run)
         if isinstance(cache, RecordedFrames):
-            read_from_memory()
+            read_from_memory(self.run)
             drawn = np.ones(cache.num_frames, bool) if self.config.prompt_loss else cache.phase != 0
             count_drawn_only(meta.stats, cache, drawn)
         if self.config.sees_tokens:
@@ -128,7 +131,7 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
         balance = self.config.balance_tasks
         tasks = task_of_frames(meta, cache.episodes) if balance else None
         factors = None if tasks is None else prompted_factors(tasks, cache.phase, self.config.prompted_weight)
-        self.config.drop_n_last_frames = Drawn.of(starts, self.config.moments_per_episode, tasks, balance, factors)
+        self.config.drop_n_last_frames = Drawn(starts, self.config.moments_per_episode, tasks, balance, factors)
 
     # -- checkpoints -----------------------------------------------------------------------------------------------
 
@@ -169,7 +172,6 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
         policy.to(config.device)
         policy.eval()
         if dataset_meta is None:
-            begin_training(None)
             return policy
         if policy._averages:
             policy.average = restore_average(policy._new_average(), source, revision)

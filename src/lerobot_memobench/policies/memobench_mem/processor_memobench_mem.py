@@ -76,6 +76,9 @@ def make_memobench_mem_pre_post_processors(
         AbsoluteActionsProcessorStep(enabled=config.use_relative_actions, relative_step=relative),
         steps.to_cpu,
     ]
+    run = training_run(config)
+    if run is not None:
+        run.follow(input_steps)
     return make_policy_processor_pipelines(input_steps=input_steps, output_steps=output_steps)
 
 
@@ -89,6 +92,6 @@ def _tokenizer(config: MemobenchMemConfig, meta: Any | None) -> TokenizerProcess
                 f"The tokenizer '{config.tokenizer_name}' could not be loaded: give a folder that holds PaliGemma's "
                 "tokenizer by --policy.tokenizer_name, or log in to the hub, where it is gated."
             ) from error
-    run = training_run()
+    run = training_run(config)
     texts = prompt_texts(config, meta, None if run is None else run.cache)
     return WordTokenizerProcessorStep(vocabulary=make_vocabulary(texts, config.dimensions.vocabulary), **options)

@@ -1,40 +1,47 @@
 """Training samples out of main memory: what LeRobot would read of a dataset, without pictures and without its disk.
 
 LeRobot's reader decodes the videos of every sample, wanted or not, and takes a millisecond per row for the rest. Where
-the policy that is about to be trained sees objects, its frames are in memory already, and samples are made of these;
-where it has eyes, what they saw stands in the place of pictures. Every other reader stays as it was.
+the policies that are trained on a dataset object see objects, or what eyes saw before, the dataset's numbers are in
+memory already, and samples are made of these: they hold nothing of a policy's. Every other reader stays as it was.
 """
 
 from __future__ import annotations
 
 import functools
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import torch
-from lerobot.datasets.dataset_reader import DatasetReader
 from torch import Tensor
 
 from lerobot_memobench.datasets.memory_cache import RecordedFrames
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem.processing.training_run import training_run
+from lerobot_memobench.lerobot_hooks import READ_SAMPLE, hooked_for
+from lerobot_memobench.policies.memobench_mem.perception.eyes import SEEN
+from lerobot_memobench.policies.memobench_mem.processing.training_run import TrainingRun, trainings
 
 
-def read_from_memory() -> None:
-    """Let LeRobot's datasets give samples out of the frames of this process's training run, where they are its own."""
-    original = DatasetReader.get_item
-    if hasattr(original, "__wrapped__"):
-        return
+def read_from_memory(run: TrainingRun) -> None:
+    """Let the dataset that a run is on give samples out of its frames while it lasts."""
+    hooked_for(run, READ_SAMPLE, _reads)
 
-    @functools.wraps(original)
-    def get_item(self: Any, idx: int) -> dict[str, Any]:
-        run = training_run()
-        if run is None or not isinstance(run.cache, RecordedFrames) or Path(self.root) != Path(run.meta.root):
-            return original(self, idx)
-        check_transforms(run.config, self._image_transforms is not None)
-        return item(run.cache, run.meta, self.delta_indices or {}, _number(self, idx))
 
-    DatasetReader.get_item = get_item
+def _reads(get_item: Callable[..., Any]) -> Callable[..., Any]:
+    """Wrap what makes a sample: of a dataset on which nobody is trained who looks at its pictures, out of memory."""
+
+    @functools.wraps(get_item)
+    def read(self: Any, idx: int) -> Any:
+        runs = trainings(getattr(self, "trained_with", self._meta))  # a held-out part goes with the one trained on
+        if not runs or not all(isinstance(run.cache, RecordedFrames) for run in runs):
+            return get_item(self, idx)
+        found: dict[str, Any] = {}
+        for run in runs:
+            assert isinstance(run.cache, RecordedFrames)
+            check_transforms(run.config, self._image_transforms is not None)
+            found |= item(run.cache, self._meta, self.delta_indices or {}, _number(self, idx))
+        return found
+
+    return read
 
 
 def check_transforms(policy: Any, transformed: bool) -> None:
@@ -55,11 +62,12 @@ def item(frames: RecordedFrames, meta: Any, deltas: dict[str, list[int]], number
     """Return LeRobot's sample of a frame by its global number: its columns, those with deltas at all of their times."""
     episode, _ = frames.locate(number)
     first, end = frames.episodes[episode : episode + 2].tolist()
-    found: dict[str, Any] = {name: column[number] for name, column in frames.columns.items()}
-    for name in deltas.keys() & frames.columns.keys():
+    columns = {name: column for name, column in frames.columns.items() if not name.startswith(SEEN)}
+    found: dict[str, Any] = {name: column[number] for name, column in columns.items()}
+    for name in deltas.keys() & columns.keys():
         wanted = number + torch.tensor(deltas[name])
         found[f"{name}_is_pad"] = (wanted < first) | (wanted >= end)
-        found[name] = frames.columns[name][wanted.clamp(first, end - 1)]
+        found[name] = columns[name][wanted.clamp(first, end - 1)]
     found["task"] = meta.tasks.index[int(found["task_index"])]
     return found
 

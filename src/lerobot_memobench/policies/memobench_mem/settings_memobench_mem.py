@@ -101,7 +101,8 @@ class MemobenchMemSettings(PI05Config):
     """Weight of the alignment loss; none or 0: the paper's for this objective (``align=none`` trains without one)."""
     subgoal_level: str = "intermediate"
     shuffle_subgoals: bool = False
-    """Control of the paper: the subgoal texts of an episode change places among themselves."""
+    """Control of the paper: the subgoal texts of an episode change places among themselves, or with those of other
+    episodes where it has fewer than three."""
     shuffle_seed: int = 7
     """Which shuffle; the same for every epoch and on every machine."""
     text_encoder: str | None = None

@@ -17,7 +17,7 @@ from lerobot_memobench.datasets.memory_cache import RecordedFrames
 from lerobot_memobench.policies.memobench_mem.alignment.objectives import masked_mean
 from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, STEPS, TOKENS, MemoryBatch
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.memobench_mem.processing.training_run import TrainingRun, begin_training
+from lerobot_memobench.policies.memobench_mem.processing.training_run import TrainingRun
 from lerobot_memobench.policies.memobench_mem.recorded_items import item
 from lerobot_memobench.studies.alignment.questions import Asked, Questions
 from lerobot_memobench.studies.alignment.readouts import choose_readout, top1
@@ -38,8 +38,8 @@ class Measures:
     def of_checkpoint(self, folder: Path) -> dict[str, Any]:
         """Measure the policy of a checkpoint, by its averaged weights."""
         policy = MemobenchMemPolicy.from_pretrained(folder)
-        begin_training(TrainingRun(policy.config, self.frames, self.meta))  # what its preprocessor looks up
         before, _ = make_pre_post_processors(policy.config, pretrained_path=str(folder))
+        TrainingRun(policy.config, self.frames, self.meta).follow(before.steps)  # what it looks up
         found: dict[str, Any] = self.of_memory(policy, before) if policy.config.memory != "none" else {}
         return found | {"action_loss": self.action_loss(policy, before)}
 

@@ -56,7 +56,7 @@ class Study:
         torch.manual_seed(0)
         self.untrained = make_policy(config, ds_meta=meta)
         self.before, _ = make_pre_post_processors(config, dataset_stats=meta.stats)
-        run = training_run()
+        run = training_run(config)
         assert run is not None  # the policy has begun it
         assert isinstance(run.cache, RecordedFrames)
         self.frames = run.cache

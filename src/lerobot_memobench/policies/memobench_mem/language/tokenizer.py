@@ -22,7 +22,7 @@ from tokenizers.processors import TemplateProcessing
 from torch import Tensor
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem.processing.training_run import training_run
+from lerobot_memobench.policies.memobench_mem.processing.training_run import TrainingRun
 from lerobot_memobench.tasks.memory_text import MARK
 
 logger = logging.getLogger(__name__)
@@ -127,8 +127,8 @@ class PromptTokenizerProcessorStep(TokenizerProcessorStep):
 class WordTokenizerProcessorStep(PromptTokenizerProcessorStep):
     """LeRobot's tokenizer step with the word tokenizer; its words are saved in the checkpoint's processor file.
 
-    A step that is rebuilt from a checkpoint for training takes the length of that run's prompts, and learns the words
-    of its dataset that it does not have, behind its own, which keep their numbers.
+    A step that is told to ``follow`` a training takes the length of its prompts, and learns the words of its dataset
+    that it does not have, behind its own, which keep their numbers.
     """
 
     vocabulary: list[str] = field(default_factory=list)
@@ -139,13 +139,15 @@ class WordTokenizerProcessorStep(PromptTokenizerProcessorStep):
                 "The checkpoint's preprocessor has no 'vocabulary' for its word tokenizer; save the policy again with "
                 "its preprocessor."
             )
-        run = training_run()
-        if run is not None:
-            assert run.config.tokenizer_max_length is not None  # set by the configuration
-            self.max_length = run.config.tokenizer_max_length
-            self.vocabulary = extend(self.vocabulary, run.prompt_texts(), run.config.dimensions.vocabulary)
         self.tokenizer = make_word_tokenizer(self.vocabulary)
         super().__post_init__()
+
+    def follow(self, run: TrainingRun) -> None:
+        """Learn the words of a run's prompts, and take their length."""
+        assert run.config.tokenizer_max_length is not None  # set by the configuration
+        self.max_length = run.config.tokenizer_max_length
+        self.vocabulary = extend(self.vocabulary, run.prompt_texts(), run.config.dimensions.vocabulary)
+        self.__post_init__()
 
     def _tokenize_text(self, text: str | list[str]) -> dict[str, Tensor]:
         """Do as LeRobot does, with each of the texts once: the samples of a batch share a few instructions."""

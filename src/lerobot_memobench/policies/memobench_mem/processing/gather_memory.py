@@ -27,12 +27,13 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryMech
 from lerobot_memobench.policies.memobench_mem.memory.none import NoMemory
 from lerobot_memobench.policies.memobench_mem.memory.registry import make_mechanism
 from lerobot_memobench.policies.memobench_mem.memory.training import recall_at
+from lerobot_memobench.policies.memobench_mem.perception.eyes import SEEN
 from lerobot_memobench.policies.memobench_mem.processing.subgoals import (
     text_rows,
     texts_of_frames,
     texts_of_histories,
 )
-from lerobot_memobench.policies.memobench_mem.processing.training_run import require_cache, training_run
+from lerobot_memobench.policies.memobench_mem.processing.training_run import TrainingRun, require_cache
 
 
 def gathering(config: MemobenchMemConfig) -> dict[str, Any]:
@@ -47,13 +48,13 @@ def gathering(config: MemobenchMemConfig) -> dict[str, Any]:
 class GatherMemoryProcessorStep(ProcessorStep):
     """Add history, phase and subgoal embeddings to training samples; leave observations of a rollout alone.
 
-    Adds ``memory.tokens`` (B, F, P, D), ``memory.steps`` (B, F) int64, ``memory.mask`` (B, F) bool, ``phase``
-    (B,), and with an alignment ``memory.text`` and ``memory.text_mask``: (B, d_t) and (B,) for the frame itself, or
-    with ``framewise`` (B, F, d_t) and (B, F) for the frames of the history. With ``frames`` 0 (``integration=none``)
-    there is no history, and only ``phase`` is added.
+    Adds ``memory.tokens`` (B, F, P, D), ``memory.steps`` (B, F) int64, ``memory.mask`` (B, F) bool, ``phase`` (B,),
+    what eyes saw in the frames (``observation.seen.*``), and with an alignment ``memory.text`` and
+    ``memory.text_mask``: (B, d_t) and (B,) for the frame itself, or with ``framewise`` (B, F, d_t) and (B, F) for the
+    frames of the history. With ``frames`` 0 (``integration=none``) there is no history.
 
-    A step that is rebuilt from a checkpoint has the settings of the run that wrote it; with its first training batch it
-    takes those of the policy that is trained now. One that is given a ``cache`` keeps its own.
+    A step that is rebuilt from a checkpoint has the settings of the run that wrote it, until it is told to ``follow``
+    another one. One that is given a ``cache`` keeps its own.
     """
 
     frames: int = 32
@@ -63,17 +64,22 @@ class GatherMemoryProcessorStep(ProcessorStep):
     shuffle_seed: int = 7
     memory: str = FrameSampling.name
     cache: FrameLookup | None = field(default=None, repr=False)
+    _run: TrainingRun | None = field(default=None, init=False, repr=False)
     _texts: np.ndarray | None = field(default=None, init=False, repr=False)
 
-    def __post_init__(self) -> None:
-        self._run = None if self.cache is not None else training_run()
+    def follow(self, run: TrainingRun) -> None:
+        """Look up in a run's cache from now on, by its settings, unless there is a cache of its own."""
+        if self.cache is not None:
+            return
+        self._run, self._texts = run, None
+        for name, value in gathering(run.config).items():
+            setattr(self, name, value)
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         """Return the transition with what was looked up."""
         extra = transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}
         if "index" not in extra or transition.get(TransitionKey.ACTION) is None:
             return transition
-        self._follow_run()
         cache = require_cache(self.cache, self._run)
         indices = extra["index"].reshape(-1).tolist()
         transition = transition.copy()
@@ -84,10 +90,6 @@ class GatherMemoryProcessorStep(ProcessorStep):
             transition[TransitionKey.OBSERVATION] = {**told, OBS_ENV_STATE: cache.columns[OBS_ENV_STATE][indices]}
         return transition
 
-    def _follow_run(self) -> None:
-        for name, value in gathering(self._run.config).items() if self._run is not None else ():
-            setattr(self, name, value)
-
     @property
     def mechanism(self) -> MemoryMechanism:
         """How samples remember; with no frames, not at all."""
@@ -97,6 +99,9 @@ class GatherMemoryProcessorStep(ProcessorStep):
         """Look up frames of the dataset by their global indices."""
         places = [cache.locate(index) for index in indices]  # refuses frames that the cache does not know
         phase = {PHASE: torch.from_numpy(cache.phase[np.asarray(indices)].astype(np.int64))}
+        if isinstance(cache, RecordedFrames):
+            seen = [name for name in cache.columns if name.startswith(SEEN)]
+            phase |= {name: cache.columns[name][torch.tensor(indices)] for name in seen}
         mechanism = self.mechanism
         if mechanism.frames == 0:
             return phase

@@ -11,7 +11,7 @@ from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 
 from lerobot_memobench.datasets.memory_cache import FrameLookup
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem.processing.training_run import require_cache, training_run
+from lerobot_memobench.policies.memobench_mem.processing.training_run import TrainingRun, require_cache
 from lerobot_memobench.tasks.memory_text import MARK, with_memory
 
 
@@ -22,17 +22,19 @@ class OracleMemoryProcessorStep(ProcessorStep):
 
     Training samples take it from the dataset's column ``memory``. In a rollout the environment, which alone knows what
     has been done, writes the same words into its instruction; one that does not is refused, because the policy would
-    be scored without the memory it was trained on. A step that is not ``enabled`` does nothing; one that is rebuilt
-    from a checkpoint does as the policy says that is about to be trained, if there is one.
+    be scored without the memory it was trained on. A step that is not ``enabled`` does nothing; one that is told to
+    ``follow`` a training does as its policy says.
     """
 
     enabled: bool = True
     cache: FrameLookup | None = field(default=None, repr=False)
 
-    def __post_init__(self) -> None:
-        self._run = None if self.cache is not None else training_run()
-        if self._run is not None:
-            self.enabled = self._run.config.oracle_memory
+    _run: TrainingRun | None = field(default=None, init=False, repr=False)
+
+    def follow(self, run: TrainingRun) -> None:
+        """Read memory texts out of a run's cache, if its policy does, unless there is a cache of its own."""
+        if self.cache is None:
+            self._run, self.enabled = run, run.config.oracle_memory
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         """Return the transition with memory text in its tasks.

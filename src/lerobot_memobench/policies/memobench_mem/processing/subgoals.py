@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,6 +16,11 @@ from lerobot_memobench.datasets.memory_cache.frame_table import LEVEL_COLUMNS, M
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.batch import TEXT, TEXT_MASK
+
+logger = logging.getLogger(__name__)
+
+SEVERAL = 3
+"""Subgoals of an episode that can change places in more than one way."""
 
 
 def require_texts(root: Path, config: MemobenchMemConfig) -> None:
@@ -47,10 +53,10 @@ def text_rows(cache: FrameLookup, level: str, align: str, shuffle_seed: int | No
 
     Args:
         level: subgoal level. align: the objective, for the message.
-        shuffle_seed: shuffle subgoals within episodes by this seed; None leaves them in place.
+        shuffle_seed: shuffle subgoals by this seed (`shuffled_subgoals`), and say how; None leaves them in place.
 
     Raises:
-        MemobenchError: the dataset has no texts.
+        MemobenchError: the dataset has no texts, or one only, which cannot be shuffled.
     """
     rows = cache.text_rows(level)
     if len(cache.texts) == 0:
@@ -58,7 +64,24 @@ def text_rows(cache: FrameLookup, level: str, align: str, shuffle_seed: int | No
             f"The dataset of {cache.folder} has no subgoal text, so --policy.align={align} has nothing to "
             "align to; use --policy.align=none, or a dataset with subgoals."
         )
-    return rows if shuffle_seed is None else shuffle_within_episodes(rows, cache.episodes, shuffle_seed)
+    if shuffle_seed is None:
+        return rows
+    if len(np.unique(rows[rows >= 0])) < 2:
+        raise MemobenchError(
+            f"The dataset of {cache.folder} has one {level} subgoal, and --policy.shuffle_subgoals=true needs another "
+            "one to put in its place; use a dataset of several tasks, or another --policy.subgoal_level."
+        )
+    shuffled, elsewhere = shuffled_subgoals(rows, cache.episodes, shuffle_seed)
+    logger.info(
+        "%s subgoals are shuffled: in %d of %d episodes among themselves; %d have fewer than %d, which would only be "
+        "renamed, and get texts of other episodes",
+        level,
+        len(cache.episodes) - 1 - elsewhere,
+        len(cache.episodes) - 1,
+        elsewhere,
+        SEVERAL,
+    )
+    return shuffled
 
 
 def texts_of_frames(cache: FrameLookup, rows: np.ndarray, frames: Sequence[int]) -> dict[str, Tensor]:
@@ -81,23 +104,34 @@ def _embed(cache: FrameLookup, rows: np.ndarray) -> dict[str, Tensor]:
     return {TEXT_MASK: numbers >= 0, TEXT: cache.text_embeddings[numbers.clamp(min=0)]}
 
 
-def shuffle_within_episodes(rows: np.ndarray, episodes: np.ndarray, seed: int = 7) -> np.ndarray:
+def shuffled_subgoals(rows: np.ndarray, episodes: np.ndarray, seed: int = 7) -> tuple[np.ndarray, int]:
     """The paper's control: the subgoals of each episode change places, each keeping its number of frames or not.
+
+    Two that change places do so alike in every episode of their task, and one cannot: texts would be renamed and tell
+    what they told before. Episodes with fewer than `SEVERAL` take, each for itself, texts of other episodes instead:
+    of other tasks where there are enough, else any of the dataset.
 
     Args:
         rows: (N,) text number per frame, -1 for none. episodes: (E + 1,) first frame of each episode.
         seed: which shuffle.
 
     Returns:
-        (N,) text numbers. Every subgoal of an episode with several is replaced by another one of the same episode; the
-        same in every run with this seed.
+        (N,) text numbers, the same in every run with this seed, and the number of episodes that took texts of others.
     """
-    shuffled = rows.copy()
+    shuffled, every, elsewhere = rows.copy(), np.unique(rows[rows >= 0]), 0
     for episode, (start, end) in enumerate(itertools.pairwise(episodes)):
         present = np.unique(rows[start:end])
         present = present[present >= 0]
-        # A rotation of a random order moves every subgoal; a plain permutation could leave them where they were.
-        order = np.random.default_rng([seed, episode]).permutation(present)
-        replace = dict(zip(order.tolist(), np.roll(order, 1).tolist(), strict=True))
+        chance = np.random.default_rng([seed, episode])
+        if len(present) >= SEVERAL:
+            # A rotation of a random order moves every subgoal; a plain permutation could leave them where they were.
+            order = chance.permutation(present)
+            replaced, by = order, np.roll(order, 1)
+        else:
+            others = np.setdiff1d(every, present)
+            pool = others if len(others) >= SEVERAL * len(present) else every
+            replaced, by = present, chance.choice(pool, len(present), replace=False)
+            elsewhere += 1
+        replace = dict(zip(replaced.tolist(), by.tolist(), strict=True))
         shuffled[start:end] = [replace.get(row, -1) for row in rows[start:end].tolist()]
-    return shuffled
+    return shuffled, elsewhere

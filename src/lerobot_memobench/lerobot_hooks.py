@@ -1,0 +1,254 @@
+"""All that LeRobot and transformers are made to do beside their own: one list, one way in, one way out.
+
+A hook stands in the place of a function of theirs for as long as somebody needs it, an evaluation or a training, and
+calls that function with layers of ours around it. It goes with the last of those. A decorator that somebody else puts
+around it, before or after, stays and is called too: whether a hook stands is told by the function itself, which is kept
+here, and by no attribute that a decorator could copy. What a layer does is beside the code that needs it.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import inspect
+import sys
+import threading
+import weakref
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import metadata
+from typing import Any
+
+from lerobot_memobench.errors import MemobenchError
+
+LEROBOT = "0.6.1"
+"""The version of LeRobot whose functions were read."""
+
+Function = Callable[..., Any]
+Layer = Callable[[Function], Function]
+"""Makes of a function the one that is called in its place."""
+
+
+@dataclass(frozen=True)
+class Hook:
+    """A function of theirs that something of ours is laid around.
+
+    Attributes:
+        module: that holds it. name: its name there; of a method, behind that of its class.
+        parameters: what it must take, in this order where they are handed over by place.
+        does: what it is made to do. why: what it would do otherwise.
+        everywhere: whether it is replaced in each module that imported it by its name too.
+        version: of the package, that was read.
+    """
+
+    module: str
+    name: str
+    parameters: tuple[str, ...]
+    does: str
+    why: str
+    everywhere: bool = False
+    version: str = f"lerobot {LEROBOT}"
+
+
+RUN_ONE = Hook(
+    "lerobot.scripts.lerobot_eval",
+    "run_one",
+    ("policy", "n_episodes", "max_episodes_rendered", "videos_dir", "start_seed", "recording_dir"),
+    "run given episodes of a task, and render none",
+    "LeRobot runs a task's episodes from the first on, and renders ten of them a second time",
+)
+ROLLOUT = Hook(
+    "lerobot.scripts.lerobot_eval",
+    "rollout",
+    ("env", "policy", "seeds"),
+    "seed each batch of episodes by itself, and draw only what a policy looks at",
+    "LeRobot seeds once per run, so a resumed run would draw other numbers, and draws pictures that nobody sees",
+)
+INSIDE_SLURM = Hook(
+    "lerobot.scripts.lerobot_eval",
+    "inside_slurm",
+    (),
+    "leave progress bars out where the output is no terminal",
+    "LeRobot draws them into log files",
+)
+OPEN_DATASETS = Hook(
+    "lerobot.datasets.factory",
+    "make_train_eval_datasets",
+    ("cfg",),
+    "leave prompt frames out, choose what a policy sees, tell of which training a held-out part is",
+    "LeRobot trains on prompts, whose actions have no effect, and gives a policy pictures and object state alike",
+    everywhere=True,
+)
+MAKE_PROCESSORS = Hook(
+    "lerobot.policies.factory",
+    "make_pre_post_processors",
+    ("policy_cfg", "pretrained_path", "pretrained_revision"),
+    "hand a training to the steps of its policy that are rebuilt from a checkpoint",
+    "LeRobot rebuilds saved steps without telling them the policy or the dataset",
+    everywhere=True,
+)
+DRAW_FRAMES = Hook(
+    "lerobot.datasets.sampler",
+    "EpisodeAwareSampler.__init__",
+    (
+        *("self", "dataset_from_indices", "dataset_to_indices", "episode_indices_to_use", "drop_n_first_frames"),
+        *("drop_n_last_frames", "shuffle", "seed", "absolute_to_relative_idx"),
+    ),
+    "begin episodes at their execution, and draw frames in groups and tasks in turns, where a policy asks for it",
+    "LeRobot draws all frames of all episodes, each once",
+)
+READ_SAMPLE = Hook(
+    "lerobot.datasets.dataset_reader",
+    "DatasetReader.get_item",
+    ("self", "idx"),
+    "give samples without pictures out of main memory, of the dataset object that such a policy is trained on",
+    "LeRobot decodes the videos of every sample, wanted or not",
+)
+ATTEND = Hook(
+    "transformers.models.gemma.modeling_gemma",
+    "eager_attention_forward",
+    ("module", "query", "key", "value", "attention_mask", "scaling"),
+    "compute attention in one kernel where a policy with eyes learns",
+    "LeRobot's pi0.5 calls this function by its name, whatever `attn_implementation` says",
+    version="transformers 5.5.4",
+)
+HOOKS = (RUN_ONE, ROLLOUT, INSIDE_SLURM, OPEN_DATASETS, MAKE_PROCESSORS, DRAW_FRAMES, READ_SAMPLE, ATTEND)
+
+
+class _Standing:
+    """A hook in one place: the function that was there, the one that is, and the layers that are needed now."""
+
+    def __init__(self, hook: Hook, holder: Any, theirs: Function) -> None:
+        _check_parameters(hook, theirs)
+        self.hook, self.holder, self.name, self.theirs = hook, holder, hook.name.rpartition(".")[2], theirs
+        self.layers: list[Layer] = []
+        self.called = theirs
+
+        @functools.wraps(theirs)
+        def ours(*args: Any, **named: Any) -> Any:
+            return self.called(*args, **named)
+
+        self.ours: Function = ours
+
+    def set(self, layers: list[Layer]) -> None:
+        """Lay these around the function, each once; with none of them, put it back."""
+        self.layers, self.called = layers, self.theirs
+        for layer in dict.fromkeys(layers):
+            self.called = layer(self.called)
+        if layers:
+            if getattr(self.holder, self.name) is self.theirs:
+                setattr(self.holder, self.name, self.ours)
+            return
+        others = [holder for holder, found in _importers(self.hook) if found is self.ours]  # while it stood
+        for holder in [self.holder, *others]:
+            if getattr(holder, self.name) is self.ours:
+                setattr(holder, self.name, self.theirs)
+
+
+_LOCK = threading.RLock()
+_made: dict[Function, _Standing] = {}
+"""Each function of ours that was ever put in a place: its own marker."""
+
+
+def _importers(hook: Hook) -> list[tuple[Any, Function]]:
+    """Return the modules that hold a function by its name because they imported it, with what they hold."""
+    name, known = hook.name.rpartition(".")[2], (hook.module, hook.name)
+    modules = list(sys.modules.values()) if hook.everywhere else []
+    held = [(module, getattr(module, "__dict__", {}).get(name)) for module in modules]
+    return [
+        (module, found)
+        for module, found in held
+        if (getattr(found, "__module__", None), getattr(found, "__qualname__", None)) == known
+    ]
+
+
+def _places(hook: Hook) -> list[_Standing]:
+    """Return the hook in its places; made where no call comes to it, directly or through decorators that say so."""
+    module = importlib.import_module(hook.module)
+    owner, _, name = hook.name.rpartition(".")
+    first = getattr(module, owner) if owner else module
+    places: dict[_Standing, None] = {}
+    for holder, found in [(first, getattr(first, name)), *_importers(hook)]:
+        before = (there for there in _made.values() if there.holder is holder and there.theirs is found)
+        place, inner = next(before, None), found
+        while place is None and inner is not None:
+            place, inner = _made.get(inner), getattr(inner, "__wrapped__", None)
+        if place is None:
+            place = _Standing(hook, holder, found)
+            _made[place.ours] = place
+        places[place] = None
+    return [*places]
+
+
+def install(hook: Hook, layer: Layer) -> Callable[[], None]:
+    """Lay something around a function of theirs, outside of what lies there; return what takes it away again.
+
+    Raises:
+        MemobenchError: the function does not take what the one that was read takes.
+    """
+    with _LOCK:
+        places = _places(hook)
+        for place in places:
+            place.set([*place.layers, layer])
+
+    def undo() -> None:
+        with _LOCK:
+            while places:
+                place = places.pop()
+                layers = [*place.layers]
+                layers.remove(layer)
+                place.set(layers)
+
+    return undo
+
+
+@contextmanager
+def hooked(hook: Hook, layer: Layer) -> Iterator[None]:
+    """While this lasts, something lies around a function of theirs; errors as of `install`."""
+    undo = install(hook, layer)
+    try:
+        yield
+    finally:
+        undo()
+
+
+def hooked_for(owner: object, hook: Hook, layer: Layer) -> None:
+    """Do as `hooked` for as long as ``owner`` lives."""
+    weakref.finalize(owner, install(hook, layer)).atexit = False
+
+
+def installed() -> list[Hook]:
+    """Return the hooks that stand now."""
+    return [hook for hook in HOOKS if any(there.layers for there in _made.values() if there.hook is hook)]
+
+
+def check_version(part: str = "evaluation loop") -> None:
+    """Refuse another LeRobot than the one whose loops are known: another one may run other episodes, or unseeded ones.
+
+    Args:
+        part: what is steered, for the message.
+
+    Raises:
+        MemobenchError: it is installed.
+    """
+    found = metadata.version("lerobot")
+    if found != LEROBOT:
+        raise MemobenchError(
+            f"lerobot {found} is installed, and the benchmark steers the {part} of lerobot {LEROBOT}; install "
+            f"lerobot=={LEROBOT} (make setup)"
+        )
+
+
+def _check_parameters(hook: Hook, function: Function) -> None:
+    """Refuse to lay anything around a function that does not take what is handed to it."""
+    found = inspect.signature(function).parameters
+    open_ended = any(parameter.kind is parameter.VAR_KEYWORD for parameter in found.values())
+    if open_ended or set(hook.parameters) <= set(found):
+        return
+    package, version = hook.version.split()
+    raise MemobenchError(
+        f"{hook.module}.{hook.name} takes ({', '.join(found)}) and not ({', '.join(hook.parameters)}), as in "
+        f"{hook.version}, where it is made to {hook.does}: {package} {metadata.version(package)} is installed, or "
+        f"something has replaced it; install {package}=={version} (make setup), or leave out what replaces it"
+    )
