@@ -255,12 +255,12 @@ def test_gymnasium_has_nothing_to_say_against_it(obs_type: str) -> None:
 
 def test_calls_out_of_order_get_gymnasiums_own_errors() -> None:
     env = make()
-    for call in (lambda: env.step(REST), env.render, env.record):
+    for call in (lambda: env.step(REST), env.render, env.record, env.scene_hash):
         with pytest.raises(ResetNeeded):
             call()
     env.close()
     env.close()
-    for call in (lambda: env.step(REST), env.render, env.record):
+    for call in (lambda: env.step(REST), env.render, env.record, env.scene_hash):
         with pytest.raises(ClosedEnvironmentError):
             call()
     env.reset(seed=20_000)  # LeRobot closes environments between the evaluations of a training

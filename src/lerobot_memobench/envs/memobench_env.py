@@ -269,6 +269,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     def scene_hash(self) -> str:
         """Return the hash of the present scene: equal in two environments when all of their physics is."""
+        self._check_began("scene_hash")
         return self.episode.sim.scene_hash()
 
     def record(self) -> dict[str, Any]:
