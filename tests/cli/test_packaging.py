@@ -114,6 +114,34 @@ def test_setup_compiles_once_and_goes_on_where_that_fails(tmp_path: Path) -> Non
     assert (tmp_path / "calls").read_text() == "scripts/compile_imports.py src\n"
 
 
+@pytest.mark.parametrize("may", [True, False])
+def test_setup_says_which_system_packages_it_installs_before_it_does(tmp_path: Path, may: bool) -> None:
+    for name in ("requirements.lock", "pyproject.toml", ".python-version", "scripts/setup", *LOCKS[1:]):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        shutil.copy(ROOT / name, tmp_path / name)
+    executable(tmp_path / ".uv/bin/uv", "echo uv >&2")
+    executable(tmp_path / ".venv/bin/memobench", "exit 0")
+    executable(tmp_path / ".venv/bin/python", "exit 0")
+    executable(tmp_path / "bin/ldconfig", "echo libGLESv2.so.2 libOpenGL.so.0 libOSMesa.so")
+    executable(tmp_path / "bin/id", f"echo {0 if may else 1000}")
+    executable(tmp_path / "bin/sudo", "exit 1")
+    executable(tmp_path / "bin/ffmpeg", "exit 0")
+    executable(tmp_path / "bin/dpkg", '[ "$2" = libgles2 ] || [ "$2" = ffmpeg ]')
+    executable(tmp_path / "bin/apt-get", 'echo "apt-get $*" >&2')
+    environment = {**os.environ, "PATH": f"{tmp_path / 'bin'}:{os.environ['PATH']}"}
+    done = subprocess.run([tmp_path / "scripts/setup"], env=environment, capture_output=True, text=True, check=True)
+    said = done.stderr.splitlines()
+    installed = [line.split()[-1] for line in said if line.startswith("apt-get install")]
+    if not may:
+        assert not installed
+        assert "will be installed" not in done.stderr
+        assert "ask for: apt-get install" in done.stderr
+        return
+    assert said[0].startswith("setup: these system packages"), "before uv, Python and everything else"
+    assert said[0].split("as root: ")[1].split() == installed
+    assert installed == ["libegl1", "libgl1-mesa-dri", "libopengl0", "libosmesa6"], "what is there is left alone"
+
+
 def test_no_file_names_a_package_registry() -> None:
     """Where packages come from is the machine's affair."""
     names = re.compile(r"pypi\.org|pythonhosted\.org|--index-url|--extra-index-url|download\.pytorch\.org")
