@@ -1,17 +1,20 @@
-"""A random referent is fair, and cannot be told from the seed by a rule. No physics."""
+"""A random referent is fair, cannot be told from the seed by a rule (no physics), and a mistaken one is told apart."""
 
 from __future__ import annotations
 
 from functools import cache
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy import stats
 
 from lerobot_memobench.datasets.generation import FIRST_SEED as DEMONSTRATION_SEEDS
-from lerobot_memobench.envs.episode import referent_of
+from lerobot_memobench.envs.episode import Episode, referent_of
+from lerobot_memobench.envs.episode_record import episode_record
 from lerobot_memobench.envs.protocol import SEED_BASE as EVALUATION_SEEDS
+from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 
 SEEDS = 400
@@ -91,3 +94,38 @@ def test_the_first_fifty_episodes_show_every_variant_of_small_tasks(name: str) -
     """The protocol's 50 episodes hold every goal, so that a table of 50 means what it says."""
     admissible = get_task(name).random_variants
     assert set(drawn(name, EVALUATION_SEEDS, 50)) == set(admissible)
+
+
+# --- what an answer to another prompt counts as ---
+
+
+def acted(name: str, asked: int, answered: int, horizon: int = 1200) -> dict[str, Any]:
+    """The record of an episode that asks for one variant, under the expert of another."""
+    base = get_task(name)
+    episode = Episode(base.variant(asked), prompt_video=False, horizon=horizon)
+    episode.reset(20_000)
+    expert = Expert(base.variant(answered), episode.sim, np.random.default_rng(3))
+    while not (episode.done or expert.done):
+        episode.step(expert.act())
+    return episode_record(episode, seed_base=20_000, replan_steps=None, wall_s=0.0)
+
+
+PROCEDURES = task_names("procedural")
+QUICK = "execute_the_assembly_procedure_demonstrated_in_the_prompt_video"
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n == QUICK else [pytest.mark.slow]) for n in PROCEDURES])
+def test_a_procedure_of_another_prompt_is_a_memorys_failure_and_a_short_horizon_none(name: str) -> None:
+    first, second, *_ = get_task(name).random_variants
+    right = acted(name, first, first)
+    assert (right["success"], right["failure"]) == (True, None)
+    assert acted(name, first, second)["failure"] == ("wrong_order" if name == QUICK else "reference_drift")
+    assert acted(name, first, first, horizon=right["steps"] // 2)["failure"] == "cut_off"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", task_names("object"))
+def test_the_object_of_another_prompt_is_a_drift(name: str) -> None:
+    first, second, *_ = get_task(name).random_variants
+    assert acted(name, first, first)["failure"] is None
+    assert acted(name, first, second)["failure"] == "reference_drift"

@@ -99,7 +99,7 @@ class Episode:
         self.applied_action: NDArray[np.float32] = np.zeros(ACTION_DIM, dtype=np.float32)
         self.prompt_shown: bool | None = None
         self.drifted = False
-        self._siblings = list(_wrong_atoms(task))
+        self._wrong: list[Atom] = []
         self._expert: Expert | None = None
         self._blind: BlindRoutine | None = None
         self._demonstrator: Iterator[NDArray[np.float32]] | None = None
@@ -130,6 +130,8 @@ class Episode:
         self._demonstrator = None
         self.exec_start = self.step_index
         self.progress.reset()
+        # What holds already, such as a thing on the plate that it is to leave, is nobody's mistake.
+        self._wrong = [atom for atom in _wrong_atoms(self.task) if not self.sim.holds(atom)]
 
     @property
     def phase(self) -> int:
@@ -157,6 +159,11 @@ class Episode:
         return self.task.suite == STRICT and self.phase == EXECUTION and self.progress.lost
 
     @property
+    def cut_off(self) -> bool:
+        """The horizon ended it, and is shorter than the protocol's: what was missing might have come."""
+        return self.horizon < HORIZON and self.exec_steps >= self.horizon and not (self.success or self.lost)
+
+    @property
     def done(self) -> bool:
         """Ended by success, horizon, loss or fault; satisfied checkpoints alone end nothing."""
         return self.success or self.exec_steps >= self.horizon or self.lost or self.fault is not None
@@ -179,7 +186,7 @@ class Episode:
             return
         self.step_index += 1
         self.progress.step(self.sim.holds)
-        self.drifted = self.drifted or any(self.sim.holds(atom) for atom in self._siblings)
+        self.drifted = self.drifted or any(self.sim.holds(atom) for atom in self._wrong)
 
     def _act(self, action: NDArray[np.float32]) -> Fault | None:
         """Carry out what the policy says; return what went wrong."""
@@ -253,18 +260,25 @@ def generator(task: Task, seed: int, stream: int) -> np.random.Generator:
 
 
 def _wrong_atoms(task: Task) -> Iterator[Atom]:
-    """Atoms that say the referent was mistaken: a sibling of an object or of its target satisfies a checkpoint.
+    """Yield atoms that say that another answer was given than the prompt's: an object's, a target's or a place's.
 
-    Only object tasks have referents; a sibling is another instance of the same class.
+    Of object and procedural tasks: a checkpoint in which another instance of the same class stands for an object or for
+    its target, and those of the answers that another prompt would have shown. What this task's own checkpoints ask for
+    is none, in whatever order.
     """
-    if task.memory_type != "object":
+    if task.memory_type not in ("object", "procedural"):
         return
-    for checkpoint in task.checkpoints:
-        for atom in atoms(checkpoint.goal):
-            if atom.predicate not in ("on", "in"):
-                continue
-            for position, name in enumerate(atom.args):
-                class_name = task.objects.get(name)
-                for other, other_class in task.objects.items():
-                    if class_name is not None and other_class == class_name and other not in atom.args:
-                        yield Atom(atom.predicate, (*atom.args[:position], other, *atom.args[position + 1 :]))
+    asked = list(dict.fromkeys(atom for checkpoint in task.checkpoints for atom in atoms(checkpoint.goal)))
+    others = [atom for k in range(task.num_variants) for one in task.variant(k).checkpoints for atom in atoms(one.goal)]
+    for atom in dict.fromkeys([*(sibling for one in asked for sibling in _siblings(task, one)), *others]):
+        if atom.predicate in ("on", "in") and atom not in asked:
+            yield atom
+
+
+def _siblings(task: Task, atom: Atom) -> Iterator[Atom]:
+    """Yield an atom with another instance of the same class in one place."""
+    for position, name in enumerate(atom.args):
+        class_name = task.objects.get(name)
+        for other, other_class in task.objects.items():
+            if class_name is not None and other_class == class_name and other not in atom.args:
+                yield Atom(atom.predicate, (*atom.args[:position], other, *atom.args[position + 1 :]))

@@ -18,7 +18,14 @@ def episode_record(episode: Episode, *, seed_base: int, replan_steps: int | None
         wall_s: seconds that the episode took.
     """
     progress, task, fault = episode.progress, episode.task, episode.fault
-    failure = classify_failure(task, progress.first_step, episode.success, episode.drifted, episode.lost)
+    failure = classify_failure(
+        task,
+        progress.first_step,
+        episode.success,
+        drift=episode.drifted,
+        lost=episode.lost,
+        cut_off=episode.cut_off,
+    )
     return {
         "task": task.name,
         "memory_type": task.memory_type,

@@ -14,7 +14,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.figures import correlations, entries, failures, prefix, radar, replan, style
 from lerobot_memobench.evaluation.records.runs import Run, read_runs
 from lerobot_memobench.paper import published_rows
-from lerobot_memobench.tasks.failures import FAILURES, FAULTS
+from lerobot_memobench.tasks.failures import FAILURES, FAULTS, REFINED_FAILURES
 from lerobot_memobench.tasks.task import STRICT_FAILURES
 
 from .. import logs
@@ -202,7 +202,7 @@ def test_replan_curves(runs: list[Run]) -> None:
 
 def test_operations_have_the_colours_of_the_videos() -> None:
     assert {key: "#" + bytes(colour).hex() for key, colour in OPERATION_COLOURS.items()} == style.OPERATION_COLOURS
-    assert list(style.OUTCOMES) == ["success", *FAILURES, *STRICT_FAILURES, *FAULTS]
+    assert list(style.OUTCOMES) == ["success", *FAILURES, *REFINED_FAILURES, *STRICT_FAILURES, *FAULTS]
     assert len({look.hatch for look in style.OUTCOMES.values()}) == len(style.OUTCOMES)
 
 

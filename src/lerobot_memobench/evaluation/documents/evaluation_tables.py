@@ -99,6 +99,8 @@ def prefix(summary: Summary) -> Table:
 
 
 FURTHER_NOTES = {
+    "wrong_order": " Wrong order: the steps of a procedure were done in another order than its prompt's.",
+    "cut_off": " Cut off: the horizon is shorter than the protocol's 1,200 steps, so nobody knows what was remembered.",
     "miscount": " Miscount: the event was done too seldom or too often.",
     "wrong_place": " Wrong place: the thing was looked for where it is not.",
     "invalid_action": " Invalid action: one of another shape, or not finite, cut the rollout off.",
@@ -124,8 +126,9 @@ def failures(summary: Summary) -> Table:
         tuple(rows),
         note=(
             "A failed rollout is named after the first checkpoint that was never satisfied: Storage, Update (stale "
-            "memory) or Compression; reference drift where a wrong sibling took the place; execution failure where "
-            "all checkpoints were satisfied." + "".join(FURTHER_NOTES.get(name, "") for name in summary.failures)
+            "memory) or Compression; reference drift where another answer than the prompt's took the place; execution "
+            "failure where all checkpoints were satisfied."
+            + "".join(FURTHER_NOTES.get(name, "") for name in summary.failures)
         ),
         rules=frozenset({1}),
     )

@@ -7,10 +7,10 @@ from collections.abc import Iterable
 
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.evaluation.metrics.rollouts import Record
-from lerobot_memobench.tasks.failures import FAILURES, FAULTS, classify
+from lerobot_memobench.tasks.failures import FAILURES, FAULTS, REFINED_FAILURES, classify
 from lerobot_memobench.tasks.task import STRICT_FAILURES
 
-_ALL = (*FAILURES, *STRICT_FAILURES, *FAULTS)
+_ALL = (*FAILURES, *REFINED_FAILURES, *STRICT_FAILURES, *FAULTS)
 
 
 def failure_of(record: Record) -> str | None:
@@ -33,6 +33,6 @@ def failure_of(record: Record) -> str | None:
 
 
 def failure_counts(records: Iterable[Record]) -> dict[str, int]:
-    """Return class -> number of failed rollouts, in the report's order: every published class, others as found."""
+    """Return class -> number of failed rollouts, in the report's order: the paper's classes, others as found."""
     found = Counter(failure_of(record) for record in records)
     return {name: found[name] for name in _ALL if name in FAILURES or found[name]}

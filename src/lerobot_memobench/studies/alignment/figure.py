@@ -47,7 +47,7 @@ def _draw_solved(axis: Any, arms: dict[str, Any]) -> None:
     """Success with its interval, what was wrong above it."""
     for place, found in enumerate(arms.values()):
         solved, (low, high) = 100 * found["success"], found["interval"]
-        label = "failed at a wrong referent, place or count" if place == 0 else None
+        label = "failed at a wrong referent, order, place or count" if place == 0 else None
         _draw_bar(axis, place, solved, [100 * value for value in found["of_seeds"]])
         axis.bar(place, 100 * found["wrong_share"], 0.7, bottom=solved, color=WRONG, alpha=0.35, label=label)
         axis.plot([place + 0.25] * 2, [100 * low, 100 * high], color="black", linewidth=1.2)

@@ -39,7 +39,7 @@ def draw(arms: Mapping[str, Mapping[str, Outcome]], path: Path) -> Path:
     axis.spines[["top", "right"]].set_visible(False)
     handles = [plt.Rectangle((0, 0), 1, 1, color=COLOURS[place % len(COLOURS)]) for place in range(len(arms))]
     handles.append(plt.Rectangle((0, 0), 1, 1, color=WRONG, alpha=0.35))
-    labels = [*arms, "failed at a wrong referent, place or count"]
+    labels = [*arms, "failed at a wrong referent, order, place or count"]
     columns = len(labels) if sum(map(len, labels)) < 72 else 2  # what the figure is wide enough for
     figure.legend(handles, labels, loc="outside upper center", ncols=columns, fontsize=9, frameon=False)
     with draft_of(path) as draft:

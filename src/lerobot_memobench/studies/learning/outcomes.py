@@ -9,11 +9,11 @@ from typing import Any
 from lerobot_memobench.evaluation.metrics.rates import Rate, mean_rate, success_rate
 from lerobot_memobench.evaluation.metrics.rollouts import Record, by_task
 from lerobot_memobench.studies.learning.contrasts import Runs
-from lerobot_memobench.tasks.failures import REFERENCE_DRIFT
+from lerobot_memobench.tasks.failures import REFERENCE_DRIFT, WRONG_ORDER
 from lerobot_memobench.tasks.task import MEMORY_TYPES, STRICT_FAILURES
 
-WRONG = (REFERENCE_DRIFT, *STRICT_FAILURES)
-"""Failures that are a memory's and no hand's: a wrong referent, place or count."""
+WRONG = (REFERENCE_DRIFT, WRONG_ORDER, *STRICT_FAILURES)
+"""Failures that are a memory's and no hand's: a wrong referent, order, place or count."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Outcome:
     Attributes:
         success: over all rollouts, or the mean of tasks.
         of_seeds: the same of each training seed.
-        wrong: rollouts that failed with a wrong referent, place or count. others: that failed otherwise.
+        wrong: rollouts that failed with a wrong referent, order, place or count. others: that failed otherwise.
     """
 
     success: Rate

@@ -10,7 +10,7 @@ from lerobot_memobench.studies.learning.figure import SCOPES
 from lerobot_memobench.studies.learning.outcomes import Outcome
 from lerobot_memobench.studies.learning.running import Costs
 
-COLUMNS = ("", "success", "95 % interval", "training seeds", "wrong referent, place or count", "other failures")
+COLUMNS = ("", "success", "95 % interval", "training seeds", "wrong referent, order, place or count", "other failures")
 
 
 def outcomes_table(arms: Mapping[str, Mapping[str, Outcome]]) -> str:

@@ -46,6 +46,8 @@ OUTCOMES: dict[str, Look] = {
     "compression_collapse": Look(OPERATION_COLOURS["C"], "...."),
     "reference_drift": Look("#f0e442", "||||"),
     "execution_failure": Look("#d55e00", "xxxx"),
+    "wrong_order": Look("#882255", "\\\\||"),
+    "cut_off": Look("#bdbdbd", "--"),
     "miscount": Look("#cc79a7", "++++"),
     "wrong_place": Look("#8a8a8a", "oooo"),
     "invalid_action": Look("#b39ddb", "OO"),

@@ -69,12 +69,18 @@ const OUTCOMES = {
   reference_drift: {
     words: "reference drift",
     letter: "R",
-    why: "A wrong sibling of the referent or of its target took its place.",
+    why: "Another answer than the prompt's took its place: a wrong referent, target or item.",
   },
   execution_failure: {
     words: "execution failure",
     letter: "X",
     why: "Every checkpoint held at some step, the goal did not at the end.",
+  },
+  wrong_order: { words: "wrong order", letter: "O", why: "The steps were done in another order than the prompt's." },
+  cut_off: {
+    words: "cut off",
+    letter: "H",
+    why: "The horizon is shorter than the protocol's: what is missing might have come.",
   },
   miscount: { words: "miscount", letter: "N", why: "The event was done too seldom or too often." },
   wrong_place: { words: "wrong place", letter: "P", why: "The thing was looked for where it is not." },
