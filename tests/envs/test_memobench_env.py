@@ -326,7 +326,7 @@ def test_log_holds_the_finished_episodes(tmp_path: Path) -> None:
     assert record["replan_steps"] == 20
     assert record["prompt_steps"] == 0
     assert [checkpoint["first_step"] for checkpoint in record["checkpoints"]] == [None] * 3
-    assert record["failure"] == "storage_failure"
+    assert record["failure"] == "cut_off"
 
 
 def test_render_is_annotated() -> None:
