@@ -121,6 +121,18 @@ def test_rollouts_carry_what_the_timeline_needs(tmp_path: Path) -> None:
     assert episode["video"] == "videos/a.mp4"
 
 
+def test_what_cut_a_rollout_off_is_told(tmp_path: Path) -> None:
+    evaluation(
+        tmp_path, [record(success=False, failure="unstable_physics", fault="the physics broke down"), record(episode=1)]
+    )
+    data = page_data(read_runs([tmp_path]), [{}], task_source(None))
+    found = [(episode["outcome"], episode["fault"]) for episode in data["runs"][0]["episodes"]]
+    assert found[0] == ("unstable_physics", "the physics broke down")
+    assert found[1][1] is None
+    assert data["failures"][-1] == "unstable_physics"
+    assert "the physics broke down" in data["runs"][0]["notes"][0]
+
+
 def test_texts_are_the_tasks_own(tmp_path: Path) -> None:
     evaluation(tmp_path, [record(), record("task_of_mine")])
     data = page_data(read_runs([tmp_path]), [{}], task_source(None))

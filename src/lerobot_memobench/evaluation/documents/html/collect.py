@@ -195,6 +195,7 @@ def episode_data(record: Record, video: str | None) -> dict[str, Any]:
         "steps": int(record.get("steps") or _last_step(record)),
         "checkpoints": [[c["operation"], c["first_step"], c.get("ordered_step")] for c in record["checkpoints"]],
         "outcome": failure_of(record) or "success",
+        "fault": record.get("fault"),
         "scene": record.get("scene_hash"),
         "video": video,
     }

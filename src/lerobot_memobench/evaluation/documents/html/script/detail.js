@@ -34,7 +34,7 @@ const detail = {
         { class: "hint why" },
         episode.outcome === "success"
           ? null
-          : el("b", {}, `${capital(OUTCOMES[episode.outcome].words)}. ${OUTCOMES[episode.outcome].why}`),
+          : el("b", {}, `${capital(OUTCOMES[episode.outcome].words)}. ${episode.fault ?? OUTCOMES[episode.outcome].why}`),
         markLegend(),
       ),
       (this.others = el("nav", { class: "others", "aria-label": "The same episode in other runs" })),
