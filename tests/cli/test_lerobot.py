@@ -340,17 +340,21 @@ def test_a_training_goes_on_by_its_folder(training: Called, capsys: pytest.Captu
     assert main(words) == 0
     assert training.flags == [
         "--config_path=run/checkpoints/last/pretrained_model/train_config.json",
+        "--resume=true",
         "--dataset.repo_id=a/b",
         "--output_dir=run",
         "--steps=100",
-        "--resume=true",
     ]
     assert capsys.readouterr().err == ""
-    assert main(["train", "config=train_contrastive", "output_dir=run", "--resume=true"]) == 0
-    assert training.value("config_path") == "run/checkpoints/last/pretrained_model/train_config.json"
-    training.flags = None
-    assert main(["train", "config_path=run/checkpoints/000040/pretrained_model/train_config.json", "resume=true"]) == 0
-    assert training.value("config_path") == "run/checkpoints/000040/pretrained_model/train_config.json"
+    for flag in ("--resume=True", "--resume"):
+        training.flags = None
+        assert main(["train", "config=train_contrastive", "output_dir=run", flag]) == 0
+        assert training.value("config_path") == "run/checkpoints/last/pretrained_model/train_config.json"
+        assert training.value("resume") == "true"
+    for stated in ("run/checkpoints/000040/pretrained_model/train_config.json", "somebody/repository"):
+        training.flags = None
+        assert main(["train", f"config_path={stated}", "resume=true"]) == 0  # LeRobot's own form
+        assert training.value("config_path") == stated
 
 
 def test_a_copy_of_a_run_has_no_link(training: Called) -> None:

@@ -14,7 +14,7 @@ from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.policies.checkpoint import checkpoint_folder, checkpoint_type, read_json
 from lerobot_memobench.settings.configurations import check_sight, env_config, policy_config
 from lerobot_memobench.settings.fields import checked_value
-from lerobot_memobench.settings.flags import whole_number, without_flag
+from lerobot_memobench.settings.flags import has_flag, whole_number, without_flag
 from lerobot_memobench.settings.lerobot_commands import quiet
 from lerobot_memobench.settings.short_forms import TRAINING_WORDS
 from lerobot_memobench.settings.translation import LerobotSettings
@@ -58,24 +58,25 @@ def going_on(words: Words) -> Words:
     Raises:
         MemobenchError: there is nothing to go on with, or another policy is named than that of the run.
     """
-    wanted = words.value("resume")
+    bare = words.value("resume") is None and has_flag(words.flags, "resume")
+    wanted = "true" if bare else words.value("resume")
     if wanted is None or checked_value("resume", bool, wanted) != "true":
         return words
     stated = words.value("config_path")
-    if stated is not None and Path(stated).name in (TRAIN_CONFIG, "pretrained_model"):
-        return words  # LeRobot's own form
+    if stated is not None and not (Path(stated).is_file() and Path(stated).name != TRAIN_CONFIG):
+        return words  # LeRobot's own form, by a checkpoint or a repository; another file is the recipe that it began by
     folder = words.value("output_dir")
     if folder is None:
         raise MemobenchError("resume=true needs the folder of the training to go on with: output_dir=<folder>")
     checkpoint = last_checkpoint(Path(folder).expanduser())
     _check_same_policy(words, checkpoint, folder)
-    begun = ("config_path", "config", "policy")
+    known = ("config_path", "config", "policy", "policy.path", "policy.type", "resume")
     flags = list(words.flags)
-    for key in ("config_path", "policy.path", "policy.type"):
+    for key in known:
         flags = without_flag(flags, key)
-    chosen = ("policy.path", "policy.type")
-    settings = [(key, value) for key, value in words.settings if key not in (*begun, *chosen)]
-    return replace(words, settings=[("config_path", str(checkpoint / TRAIN_CONFIG)), *settings], flags=flags)
+    settings = [(key, value) for key, value in words.settings if key not in known]
+    begun = [("config_path", str(checkpoint / TRAIN_CONFIG)), ("resume", "true")]
+    return replace(words, settings=[*begun, *settings], flags=flags)
 
 
 def last_checkpoint(run: Path) -> Path:
