@@ -191,14 +191,15 @@ def test_the_commands_follow_it_before_the_libraries_load(
     code = ASK.format(module=module, begin=begin, call=call)
     if found is None:  # a worker of a pool
         (tmp_path / "asked.py").write_text(
-            "def ask():\n    import torch, os\n    return torch.get_num_threads(), os.environ['LP_NUM_THREADS']\n"
+            "def ask():\n    import torch, os\n"
+            "    return torch.get_num_threads(), os.environ['LP_NUM_THREADS'], os.environ['MEMOBENCH_WORKER']\n"
         )
         code = (
             f"import sys\nsys.path.insert(0, {str(tmp_path)!r})\nfrom asked import ask\n"
             "from lerobot_memobench.jobs.processes import process_pool\n"
             "if __name__ == '__main__':\n    with process_pool(1) as pool:\n        print(*pool.submit(ask).result())\n"
         )
-        found = "1 1"
+        found = "1 1 1"
     (tmp_path / "here.py").write_text(code)
     done = subprocess.run(
         [sys.executable, str(tmp_path / "here.py")], env=clean, capture_output=True, text=True, check=True, timeout=300

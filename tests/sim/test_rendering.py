@@ -60,6 +60,7 @@ GPUS = {0: 2, 1: 0, 2: 3, 3: 1}
         ({"SLURM_LOCALID": "3"}, 1),
         ({"SLURM_LOCALID": "5"}, 0),
         ({"LOCAL_RANK": "2", "SLURM_LOCALID": "0"}, 3),
+        ({"MEMOBENCH_WORKER": "6", "CUDA_VISIBLE_DEVICES": "1,3,2"}, 0),  # the sixth of a pool
         ({"CUDA_VISIBLE_DEVICES": "GPU-1f0c,GPU-2f0c", "LOCAL_RANK": "1"}, None),
         ({"CUDA_VISIBLE_DEVICES": ""}, None),
         ({"CUDA_VISIBLE_DEVICES": "7"}, None),

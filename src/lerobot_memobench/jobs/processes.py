@@ -56,6 +56,8 @@ def _begin_worker() -> None:
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     use_threads(ACTING)  # one of as many as there are cores
+    name = multiprocessing.current_process().name  # SpawnProcess-3
+    os.environ["MEMOBENCH_WORKER"] = name.rpartition("-")[2]  # workers draw on several GPUs in turn, where there are
     parent = multiprocessing.parent_process()
     assert parent is not None
 
