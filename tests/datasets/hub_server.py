@@ -93,8 +93,12 @@ class Handler(BaseHTTPRequestHandler):
         def mode(name: str) -> str:
             return "lfs" if name.endswith((".parquet", ".mp4", ".hdf5")) else "regular"
 
-        files = json.loads(body)["files"]
-        known = [{"path": f["path"], "uploadMode": mode(f["path"]), "shouldIgnore": False} for f in files]
+        asked = json.loads(body)
+        ignored = tuple(line.strip("/") + "/" for line in asked.get("gitIgnore", "").split())  # of folders at the top
+        known = [
+            {"path": f["path"], "uploadMode": mode(f["path"]), "shouldIgnore": f["path"].startswith(ignored)}
+            for f in asked["files"]
+        ]
         self.answer(200, {"files": known})
 
     def batch(self, body: bytes, repo: str) -> None:
@@ -121,6 +125,9 @@ class Handler(BaseHTTPRequestHandler):
             elif operation["key"] == "lfsFile":
                 self.server.repos[repo][value["path"]] = self.server.blobs[value["oid"]]
                 self.server.large[repo].add(value["path"])
+            elif operation["key"] == "deletedFile":
+                del self.server.repos[repo][value["path"]]
+                self.server.large[repo].discard(value["path"])
         oid = self.server.commit_of(repo)
         self.answer(200, {"commitUrl": f"{self.server.address}/datasets/{repo}/commit/{oid}", "commitOid": oid})
 
@@ -129,8 +136,9 @@ class Handler(BaseHTTPRequestHandler):
         self.answer(200, {})
 
     def delete_tag(self, body: bytes, repo: str, revision: str) -> None:
-        del self.server.tags[repo][revision]
-        self.answer(200, {})
+        if self.server.tags[repo].pop(revision, None) is None:
+            return self.answer(404, {"error": "no such tag"}, {"X-Error-Code": "RevisionNotFound"})
+        return self.answer(200, {})
 
     # --- reading ---
 

@@ -40,23 +40,15 @@ SIZE = 32
 HAND = Path(__file__).with_name("published_by_hand.py")
 
 
-def with_images(demo: Demonstration) -> Demonstration:
-    """Give it small pictures, each another."""
-    x = np.arange(SIZE) * 2
-    frames = np.stack([np.stack([np.add.outer(x, x) + c + t for c in (0, 40, 80)], -1) for t in range(len(demo))])
-    frames = (frames % 256).astype(np.uint8)
-    return replace(demo, images={"image": frames, "wrist_image": 255 - frames})
-
-
 @pytest.fixture(scope="module")
 def stove() -> Demonstration:
-    demo = record_demonstration(get_task(STOVE), 10_000, images=False)
-    return with_images(replace(demo, model_xml=model_file(demo.task, demo.fixture_poses)))
+    demo = record_demonstration(get_task(STOVE), 10_000, image_size=SIZE)
+    return replace(demo, model_xml=model_file(demo.task, demo.fixture_poses))
 
 
 @pytest.fixture(scope="module")
 def butter() -> Demonstration:
-    return with_images(record_demonstration(get_task(BUTTER), 10_000, images=False))
+    return record_demonstration(get_task(BUTTER), 10_000, image_size=SIZE)
 
 
 @pytest.fixture(scope="module")

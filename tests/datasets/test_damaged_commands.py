@@ -15,11 +15,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import av
 import h5py
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from lerobot.datasets.io_utils import load_tasks, write_tasks
 
 from lerobot_memobench.cli import data as commands
 from lerobot_memobench.datasets.demonstration import Demonstration
@@ -28,7 +30,12 @@ from lerobot_memobench.datasets.hdf5.writing import write_task_file
 from lerobot_memobench.datasets.lerobot_format import write_dataset
 from lerobot_memobench.datasets.replay import resimulate
 from lerobot_memobench.datasets.staging.stage import stage_demonstration
+from lerobot_memobench.datasets.validate import validate as validation
+from lerobot_memobench.datasets.video import encode_video
+from lerobot_memobench.envs.observations import IMAGE_KEYS
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.sim.rendering import RenderSettings
+from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks import get_task
 
 from .. import mutations
@@ -40,14 +47,20 @@ DATASET, FILES = "dataset", "published"
 Damage = Callable[[Path, random.Random], None]
 
 
-def demonstration() -> Demonstration:
+def demonstration(seed: int = 10_000) -> Demonstration:
     """Six steps of a task with a prompt, and small pictures."""
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(seed)
     actions = rng.uniform(-1, 1, (FRAMES, 7)).astype(np.float32)
-    demo = resimulate(get_task(TASK), 10_000, actions, EXEC_START)
-    images = rng.integers(0, 255, (FRAMES, SIZE, SIZE, 3), dtype=np.uint8)
+    demo = resimulate(get_task(TASK), seed, actions, EXEC_START)
+    sim = Simulation(demo.task, RenderSettings(SIZE, SIZE))
+    sim.reset(seed)
+    images: dict[str, list[np.ndarray]] = {name: [] for name in IMAGE_KEYS}
+    for state in demo.states:
+        sim.set_state(state, demo.fixture_poses)
+        for name, camera in IMAGE_KEYS.items():
+            images[name].append(sim.render(camera))
     xml = model_file(demo.task, demo.fixture_poses)
-    return replace(demo, images={"image": images, "wrist_image": 255 - images}, model_xml=xml)
+    return replace(demo, images={name: np.stack(frames) for name, frames in images.items()}, model_xml=xml)
 
 
 @pytest.fixture(scope="module")
@@ -210,6 +223,167 @@ def test_what_is_whole_gives_a_result(source: Path, tmp_path: Path) -> None:
 def test_much_damaged_data(source: Path, tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     found = check(source, tmp_path, kind, True, monkeypatch)
     print(f"{kind}: {found['result']} results, {found['refused']} refused")
+
+
+# --- each damage alone, in the second of two episodes ---
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    demos = [demonstration(10_000), demonstration(10_001)]
+    moved = replace(demos[1], executed=demos[1].actions, actions=demos[1].actions * np.float32(0.5))
+    return write_dataset([demos[0], moved], tmp_path_factory.mktemp("two") / DATASET)
+
+
+def other(value: Any) -> Any:
+    """Return another value of the same type."""
+    if isinstance(value, list):
+        return [*value[:-1], other(value[-1])]
+    if isinstance(value, bool):
+        return not value
+    return value + ("x" if isinstance(value, str) else 1)
+
+
+def change(path: Path, name: str, row: int) -> None:
+    """Change one value of a parquet file."""
+    table = pq.read_table(path)
+    place, field = table.schema.get_field_index(name), table.schema.field(name)
+    if name == "language_persistent":  # of types that Python's values do not become
+        changed = table.column(name).take([None if each == row else each for each in range(len(table))])
+    else:
+        values = table.column(name).to_pylist()
+        values[row] = other(values[row])
+        changed = pa.array(values, field.type)
+    pq.write_table(table.set_column(place, field, changed), path)
+
+
+def found(folder: Path) -> str:
+    """Return what is said of the second episode; the first one agrees."""
+    first, second = validation(folder)
+    assert first.disagreement is None, first
+    assert second.episode == "episode 1"
+    return str(second.disagreement)
+
+
+FRAME = 3
+COLUMNS = {
+    "action": "action (it alone is in the episode's hash",
+    "executed_action": "states at frame 4",  # where it leads
+    "checkpoint.index": "",
+    "checkpoint.operation": "",
+    "checkpoint.completed": "",
+    "checkpoint.event": "",
+    "coarse_subgoal": "",
+    "episode_index": "meta/episodes says length=6, but it has 5 frames",
+    "episode_info": "",
+    "frame_index": "",
+    "grounded_subgoal": "",
+    "index": "",
+    "language_persistent": "",
+    "memory": "",
+    "observation.state": "",
+    "phase": "",
+    "simple_subgoal": "",
+    "task_index": "task at frame 3",
+    "timestamp": "",
+}
+"""Column -> how the sentence begins that names it, where that is not the column and the frame."""
+
+
+def test_every_column_of_frames_is_compared(two: Path, tmp_path: Path) -> None:
+    (path,) = (two / "data").rglob("*.parquet")
+    names = pq.read_schema(path).names
+    objects = {name for name in names if name.endswith("environment_state")}
+    assert set(names) == set(COLUMNS) | objects
+    assert len(objects) == 1
+    for name, begins in {**COLUMNS, **dict.fromkeys(objects, "")}.items():
+        folder = Path(shutil.copytree(two, tmp_path / name))
+        change(folder / path.relative_to(two), name, FRAMES + FRAME)
+        assert found(folder).startswith(begins or f"{name} at frame {FRAME}"), name
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "task_name",
+        "memory_type",
+        "family",
+        "operations",
+        "seed",
+        "referent",
+        "variant",
+        "success",
+        "exec_start_index",
+        "key_frames",
+        "scene_hash",
+        "digest",
+        "length",
+    ],
+)
+def test_every_column_of_episodes_is_compared(two: Path, tmp_path: Path, name: str) -> None:
+    folder = Path(shutil.copytree(two, tmp_path / "ds"))
+    (path,) = (folder / "meta" / "episodes").rglob("*.parquet")
+    change(path, name, 1)
+    assert found(folder).startswith(f"meta/episodes says {name}=")
+
+
+def test_states_and_instruction_are_compared(two: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(two, tmp_path / "states"))
+    (path,) = (folder / "states").rglob("*.parquet")
+    change(path, "state", FRAMES + FRAME)
+    assert found(folder).startswith(f"states at frame {FRAME}")
+    folder = Path(shutil.copytree(two, tmp_path / "tasks"))
+    tasks = load_tasks(folder)
+    write_tasks(tasks.rename(index={tasks.index[0]: "put the milk into the bowl"}), folder)
+    told = [str(verdict.disagreement) for verdict in validation(folder)]
+    assert all(
+        each.startswith("task at frame 0: recorded 'put the milk into the bowl', replayed 'put") for each in told
+    )
+
+
+def decoded(path: Path) -> np.ndarray:
+    with av.open(str(path)) as container:
+        return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
+
+
+@pytest.mark.parametrize("camera", ["image", "wrist_image"])
+@pytest.mark.parametrize(
+    ("frames", "first"),
+    [(slice(FRAMES, None), 0), (slice(-1, None), FRAMES - 1), (slice(FRAMES, FRAMES + 1), 0)],
+    ids=["all", "last", "first"],
+)
+def test_a_video_of_something_else_is_named(two: Path, tmp_path: Path, camera: str, frames: slice, first: int) -> None:
+    folder = Path(shutil.copytree(two, tmp_path / "ds"))
+    (path,) = (folder / "videos" / f"observation.images.{camera}").rglob("*.mp4")
+    pictures = decoded(path)
+    assert len(pictures) == 2 * FRAMES
+    pictures[frames] = 0
+    encode_video(pictures, path)
+    assert found(folder).startswith(f"observation.images.{camera} at frame {first}: recorded 'a picture")
+
+
+def test_exchanged_cameras_and_episodes_are_named(two: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(two, tmp_path / "cameras"))
+    one, another = sorted((folder / "videos").iterdir())
+    one.rename(folder / "aside")
+    another.rename(one)
+    (folder / "aside").rename(another)
+    told = [str(verdict.disagreement) for verdict in validation(folder)]
+    assert all(each.startswith("observation.images.image at frame 0: recorded 'a picture 1") for each in told)
+    folder = Path(shutil.copytree(two, tmp_path / "episodes"))
+    (path,) = (folder / "videos" / "observation.images.image").rglob("*.mp4")
+    encode_video(np.roll(decoded(path), FRAMES, axis=0), path)
+    assert all(str(v.disagreement).startswith("observation.images.image at frame 0") for v in validation(folder))
+
+
+def test_pictures_in_hdf5_are_compared(source: Path, tmp_path: Path) -> None:
+    files = Path(shutil.copytree(source / FILES, tmp_path / "files"))
+    (path,) = files.glob("*.hdf5")
+    with h5py.File(path, "r+") as file:
+        file["data/demo_1/obs/robot0_eye_in_hand_image"][-1] = 0
+    first, second = validation(files)
+    assert first.disagreement is None
+    assert str(second.disagreement).startswith(f"observation.images.wrist_image at frame {FRAMES - 1}: recorded")
 
 
 def test_a_feature_larger_than_memory_is_told_before_it_is_taken(source: Path, tmp_path: Path) -> None:

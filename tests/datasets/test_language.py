@@ -1,10 +1,15 @@
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
 from lerobot_memobench.datasets.labels import labels
 from lerobot_memobench.datasets.language import persistent_rows
+from lerobot_memobench.tasks import get_task
+from lerobot_memobench.tasks.catalogue import task_names
+from lerobot_memobench.tasks.memory_text import IMPERATIVES, memory_text, subtask_texts
 
 
 def rows_of(demo, style):
@@ -59,3 +64,89 @@ def test_lerobots_resolvers_never_find_two_rows(make_demo):
                 render.emitted_at(t, persistent=rows, events=[], style=style)
                 active = render.active_at(t, persistent=rows, style=style)
                 assert style == "memory" or active is not None
+
+
+VERBS = "|".join(set(IMPERATIVES) - set(IMPERATIVES.values()))
+PAST = re.compile(rf"(?:^|; |\band |\bthen |^.*, and )({VERBS})\b")
+
+
+def variants(suite):
+    return [task.variant(k) for task in map(get_task, task_names(suite=suite)) for k in range(task.num_variants)]
+
+
+@pytest.mark.parametrize(("suite", "count"), [("published", 30), ("strict", 30)])
+def test_subtasks_are_instructions_and_memories_are_not(suite, count):
+    """Of every checkpoint of every variant: no past tense, nothing that is done already, nothing said twice."""
+    assert len(task_names(suite=suite)) == count
+    for task in variants(suite):
+        told = subtask_texts(task)
+        assert len(told) == len(task.checkpoints)
+        for k, (text, checkpoint) in enumerate(zip(told, task.checkpoints, strict=True)):
+            assert text.split()[0] in IMPERATIVES.values(), text
+            assert not PAST.search(text), text
+            assert not re.search(r"by now|in all|each once|the one time", text), text
+            assert text not in told[:k], "each asks for something else"
+            assert checkpoint.language[1].split()[0] in IMPERATIVES, "the memory says it in the past tense"
+        assert memory_text(task, len(told)).startswith(task.checkpoints[0].language[1])
+
+
+@pytest.mark.parametrize(
+    ("name", "variant", "told"),
+    [
+        ("turn_on_the_stove_and_turn_it_off", 0, ["switch the stove on", "switch the stove off again"]),
+        (
+            "open_and_close_the_microwave",
+            0,
+            ["swing the microwave's door open", "shut the microwave's door again"],
+        ),
+        (
+            "check_the_middle_drawer_a_given_number_of_times",
+            0,
+            [
+                "pull the middle drawer out for the first time",
+                "push the middle drawer shut again",
+                "bring the hand home",
+                "come to rest",
+            ],
+        ),
+        (
+            "turn_the_stove_on_and_off_a_given_number_of_times",
+            2,
+            [
+                "switch the stove on and off again for the first time",
+                "switch the stove on and off again for the second time",
+                "switch the stove on and off again for the third time",
+                "come to rest",
+            ],
+        ),
+        (
+            "check_all_three_drawers_once_each_in_the_given_order",
+            3,
+            [
+                "pull out and shut the middle drawer",
+                "pull out and shut the bottom drawer after the middle one",
+                "pull out and shut the top drawer",
+            ],
+        ),
+        (
+            "find_the_tomato_hidden_in_one_of_the_drawers",
+            2,
+            [
+                "pull out the bottom drawer, where the tomato was hidden",
+                "take the tomato out of the bottom drawer",
+                "put the tomato from the bottom drawer on the table",
+            ],
+        ),
+        (
+            "check_the_middle_drawer_and_put_the_black_bowl_in_the_top_drawer_and_close_it",
+            0,
+            [
+                "pull the middle drawer out and push it shut",
+                "pull the top drawer out",
+                "stow the black bowl in the top drawer and shut it",
+            ],
+        ),
+    ],
+)
+def test_what_a_subtask_says(name, variant, told):
+    assert subtask_texts(get_task(name).variant(variant)) == told

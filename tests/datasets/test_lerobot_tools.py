@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -51,16 +50,11 @@ def ours(demos, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def filmed(demos, tmp_path_factory) -> Path:
+def filmed(tmp_path_factory) -> Path:
     """The first two, with small pictures."""
-
-    def pictures(demo: Demonstration) -> Demonstration:
-        x = np.arange(SIZE) * 4
-        frames = np.stack([np.stack([np.add.outer(x, x) + c + t for c in (0, 40, 80)], -1) for t in range(len(demo))])
-        images = {"image": frames.astype(np.uint8), "wrist_image": 255 - frames.astype(np.uint8)}
-        return replace(demo, images=images)
-
-    return write_dataset(map(pictures, demos[:2]), tmp_path_factory.mktemp("filmed") / "ds", repo_id=REPO)
+    kinds = ((STOVE, 10_000), (BUTTER, 10_000))
+    shown = [record_demonstration(get_task(task), seed, image_size=SIZE) for task, seed in kinds]
+    return write_dataset(shown, tmp_path_factory.mktemp("filmed") / "ds", repo_id=REPO)
 
 
 def edit(root: Path | None, out: Path, operation: Any) -> Path:
@@ -104,7 +98,12 @@ def test_deleted_episodes(ours, demos, tmp_path):
     edited = delete(ours, tmp_path / "edited", 0)
     said = check(edited, demos[1:], tmp_path / "out")
     assert len(said) == 1
-    assert "Lost are the card, which seeds had failed, and the simulator's states" in said[0]
+    assert "Lost are which seeds had failed, and the simulator's states" in said[0]
+    card = (edited / "README.md").read_text()
+    assert "2 demonstrations of 2 robot manipulation tasks" in card
+    assert card.count(said[0]) == 1
+    assert describe(edited, tmp_path / "again_out", said.append)
+    assert len(said) == 1, "it has its card now"
     assert episodes_where(delete(edited, tmp_path / "again", 0), seed=10_001) == [0]
 
 
@@ -125,7 +124,6 @@ def test_merged(ours, demos, tmp_path):
 @pytest.mark.parametrize(
     "operation",
     [
-        tool.ModifyTasksConfig(new_task="do what must be done"),
         tool.RecomputeStatsConfig(),
         tool.RemoveFeatureConfig(feature_names=["coarse_subgoal", "observation.state"]),
     ],
@@ -133,6 +131,15 @@ def test_merged(ours, demos, tmp_path):
 )
 def test_the_other_operations(ours, demos, tmp_path, operation):
     check(edit(ours, tmp_path / "edited", operation), demos, tmp_path / "out")
+
+
+def test_another_instruction_is_named(ours, tmp_path):
+    """LeRobot's tool may give all episodes one; the card is of the same episodes and stays."""
+    edited = edit(ours, tmp_path / "edited", tool.ModifyTasksConfig(new_task="do what must be done"))
+    assert describe(edited, tmp_path / "out")
+    found = [str(verdict.disagreement) for verdict in validate(edited)]
+    assert len(found) == 3
+    assert all(each.startswith("task at frame 0: recorded 'do what must be done', replayed") for each in found)
 
 
 def test_with_images_it_caches_and_trains(filmed, demos, tmp_path):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_memobench.datasets.lerobot_format import write_dataset
+from lerobot_memobench.datasets.memory_cache.building import keep_from_the_hub
 from lerobot_memobench.datasets.push import push
 from lerobot_memobench.errors import MemobenchError
 
@@ -30,7 +33,10 @@ def hub():
 @pytest.fixture
 def folder(make_demo, make_task, tmp_path):
     other = make_task("SU", name="other_task", memory_type="object")
-    demos = [make_demo(["000111", "000011"], size=64), make_demo(["000111", "000011"], task=other, size=64, seed=9)]
+    demos = [
+        make_demo(["000111", "000011"], size=64),
+        make_demo(["000111", "000011"], task=other, size=64, seed=9, exec_start=2),
+    ]
     return write_dataset(demos, tmp_path / "ds", repo_id=REPO)
 
 
@@ -55,7 +61,7 @@ PUSH = """
 from lerobot_memobench.datasets.push import push
 from lerobot_memobench.errors import MemobenchError
 try:
-    print(push({folder!r}, {repo!r}))
+    print(push({folder!r}, {repo!r}, tell=lambda said: print("told:", said)))
 except MemobenchError as error:
     print("refused:", error)
 """
@@ -82,11 +88,14 @@ def test_push_load_and_stream(hub, folder, tmp_path):
     (folder / "memory_cache" / "big.bin").write_bytes(b"0" * 100)
     code = PUSH.format(folder=str(folder), repo=REPO)
     pushed = python(code, hub, tmp_path / "home")
-    assert pushed.stdout.strip() == f"{hub.address}/datasets/{REPO}", pushed.stderr
+    told, address = pushed.stdout.splitlines()
+    assert told == f"told: the memory caches in {folder} stay here: they are made anew where the dataset is trained on"
+    assert address == f"{hub.address}/datasets/{REPO}", pushed.stderr
     there = hub.repos[REPO]
     ours = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
     assert set(there) - {".gitattributes"} == {n for n in ours if not n.startswith((".cache", "memory_cache"))}
-    assert all(there[name] == (folder / name).read_bytes() for name in there if name != ".gitattributes")
+    same = {name for name in there if name not in (".gitattributes", "README.md")}
+    assert all(there[name] == (folder / name).read_bytes() for name in same)
     assert list(hub.tags[REPO]) == ["v3.0"]
 
     hub.requests.clear()
@@ -106,6 +115,94 @@ def test_push_load_and_stream(hub, folder, tmp_path):
         "streamed": list(range(12)),
         "streamed_image": [3, 64, 64],
     }
+
+
+COUNT = """
+from pathlib import Path
+from lerobot.datasets import LeRobotDataset
+dataset = LeRobotDataset({repo!r})
+frames = sum(1 for _ in dataset.hf_dataset)
+print(dataset.num_episodes, len(dataset), frames)
+"""
+
+
+def test_an_earlier_larger_dataset_leaves_nothing(hub, folder, make_demo, tmp_path):
+    """Its further files would load as frames: LeRobot reads every table below data/."""
+    earlier = Path(shutil.copytree(folder, tmp_path / "earlier"))
+    table = next((earlier / "data").rglob("*.parquet"))
+    shutil.copy(table, table.with_name("file-001.parquet"))  # as of a dataset of two files
+    for extra in ("hdf5/old_demo.hdf5", "memory_cache/old/tokens.bin", "states/chunk-000/file-001.parquet"):
+        (earlier / extra).parent.mkdir(parents=True, exist_ok=True)
+        (earlier / extra).write_bytes(b"old")
+    assert python(PUSH.format(folder=str(earlier), repo=REPO), hub, tmp_path / "home").returncode == 0
+    hub.repos[REPO] |= {"memory_cache/old/tokens.bin": b"old", "hdf5/old_demo.hdf5": b"old", "notes.md": b"mine"}
+    hub.requests.clear()
+    pushed = python(PUSH.format(folder=str(folder), repo=REPO), hub, tmp_path / "home")
+    assert (
+        "told: 4 files that this dataset does not have, such as data/chunk-000/file-001.parquet, are" in pushed.stdout
+    )
+    ours = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
+    assert set(hub.repos[REPO]) - {".gitattributes"} == ours | {"notes.md"}
+    loaded = python(COUNT.format(repo=REPO), hub, tmp_path / "elsewhere", token=None)
+    assert loaded.stdout.split() == ["2", "12", "12"], loaded.stderr
+    again = python(PUSH.format(folder=str(folder), repo=REPO), hub, tmp_path / "home")
+    assert "told" not in again.stdout
+
+
+LEROBOTS_PUSH = """
+from huggingface_hub.repocard import RepoCard
+from lerobot.datasets import LeRobotDataset
+RepoCard.validate = lambda *_, **__: None  # it asks huggingface.co, whatever the endpoint is
+LeRobotDataset({repo!r}, root={folder!r}).push_to_hub()
+"""
+
+
+def test_lerobots_own_push_leaves_memory_caches_here(hub, folder, tmp_path):
+    keep_from_the_hub(folder)
+    (folder / "memory_cache" / "tiny").mkdir(parents=True)
+    (folder / "memory_cache" / "tiny" / "tokens.bin").write_bytes(b"0" * 100)
+    pushed = python(LEROBOTS_PUSH.format(folder=str(folder), repo=REPO), hub, tmp_path / "home")
+    assert pushed.returncode == 0, pushed.stderr
+    assert "meta/info.json" in hub.repos[REPO]
+    assert [name for name in hub.repos[REPO] if name.startswith("memory_cache")] == []
+    (folder / ".gitignore").write_text("mine\n")
+    keep_from_the_hub(folder)
+    keep_from_the_hub(folder)
+    assert (folder / ".gitignore").read_text() == "mine\n/memory_cache/\n"
+
+
+def test_the_card_on_the_hub_loads_from_there(hub, folder, tmp_path):
+    """Its example is run as it stands; the card in the folder says how to load that."""
+    assert python(PUSH.format(folder=str(folder), repo="somebody/else"), hub, tmp_path / "home").returncode == 0
+    card = hub.repos["somebody/else"]["README.md"].decode()
+    assert 'root="<this folder>"' in (folder / "README.md").read_text()
+    (example,) = re.findall(r"```python\n(.*?)```", card, re.DOTALL)
+    assert 'LeRobotDataset("somebody/else")' in example
+    ran = python(example + "print(len(dataset), len(execution))", hub, tmp_path / "elsewhere", token=None)
+    assert ran.stdout.split() == ["12", "10"], ran.stderr
+    assert card.startswith("---\nlicense: apache-2.0\n")
+    for part in (
+        "## Limitations",
+        "name what only the prompt shows",
+        "## Licence\n\nApache-2.0",
+        "leaves out the frames",
+    ):
+        assert part in card, part
+
+
+def test_a_dataset_without_a_card_is_pushed_with_one(hub, folder, tmp_path):
+    for lost in ("README.md", "manifest.json"):
+        (folder / lost).unlink()
+    shutil.rmtree(folder / "states")
+    assert python(PUSH.format(folder=str(folder), repo=REPO), hub, tmp_path / "home").returncode == 0
+    card = hub.repos[REPO]["README.md"].decode()
+    for part in (
+        "2 demonstrations of 2 robot",
+        "has edited this dataset",
+        f'LeRobotDataset("{REPO}")',
+        "other_task | SU",
+    ):
+        assert part in card, part
 
 
 def test_a_broken_off_upload_goes_on(hub, folder, tmp_path):

@@ -83,12 +83,15 @@ def push(
     hdf5: Annotated[bool, typer.Option("--hdf5", help="Upload the HDF5 files as well.")] = False,
 ) -> int:
     """Upload a dataset to the Hugging Face hub (token: `hf auth login` or HF_TOKEN). The same command continues a
-    broken upload.
+    broken upload. Files of an earlier dataset there are deleted.
     """
     from lerobot_memobench.datasets.push import push as run
 
-    address = run(folder, repo_id, private=private, hdf5=hdf5)
-    console().print(f"dataset: {address}", soft_wrap=True)
+    screen = console()
+    address = run(
+        folder, repo_id, private=private, hdf5=hdf5, tell=lambda said: screen.print(said, soft_wrap=True, markup=False)
+    )
+    screen.print(f"dataset: {address}", soft_wrap=True)
     return 0
 
 

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lerobot_memobench.datasets.demonstration import CAMERAS
-from lerobot_memobench.datasets.lerobot_format.card import statistics_section
-from lerobot_memobench.datasets.lerobot_format.card_tables import ordered_types, storage_by_frames
+from lerobot_memobench.datasets.lerobot_format.card import CARD_FILE, EDITED, MADE_BY, card_from_frames, own_card
+from lerobot_memobench.datasets.lerobot_format.card_tables import ordered_types
 from lerobot_memobench.datasets.lerobot_format.info import read_info, undamaged
 from lerobot_memobench.datasets.lerobot_format.layout import MANIFEST_FILE, image_key
 from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, list_episodes
@@ -35,16 +35,6 @@ FRAME = 160
 """Height and width of a storyboard's pictures, pixels."""
 MOST_FRAMES = 6
 
-MADE_BY = "## How it was made"
-"""Heading of a card of ours; LeRobot's has none."""
-
-EDITED = (
-    "A tool that knows nothing of this benchmark, such as `lerobot-edit-dataset`, has edited this dataset: its tables "
-    "and hashes are read from its frames. Lost are the card, which seeds had failed, and the simulator's states: "
-    "`memobench validate` makes those again from seed and actions and compares their hash, but cannot where an episode "
-    "has no seed."
-)
-
 Say = Callable[[str], None]
 
 
@@ -60,12 +50,13 @@ def describe(folder: Path, out: Path, say: Say = lambda _: None) -> list[Path]:
     rows, hashes = _known(folder, say), folder / MANIFEST_FILE
     read_info(folder)
     with undamaged(folder):
-        card = _card_tables(folder)
-        tables = card or _tables_of(folder, rows)
+        card = own_card(folder, read_info(folder)["total_episodes"])
+        tables = card_tables(card or card_from_frames(folder, rows))
         board = storyboard(folder, rows) if (folder / "videos").is_dir() else None
         manifest = read_manifest(folder) if hashes.is_file() else _manifest_of(rows)
     if card is None:
         say(EDITED)
+        _put_card(folder, rows, say)
     out.mkdir(parents=True, exist_ok=True)
     found = [draw_lengths(rows, out / LENGTHS_FIGURE)]
     if board is not None:
@@ -95,21 +86,14 @@ def _known(folder: Path, say: Say) -> list[dict[str, Any]]:
     return rows
 
 
-def _card_tables(folder: Path) -> str | None:
-    """Return the tables of the dataset's card, None where it has none of ours."""
+def _put_card(folder: Path, rows: Sequence[Mapping[str, Any]], say: Say) -> None:
+    """Give a dataset without a card one, where there may be written."""
+    if (folder / CARD_FILE).exists():
+        return
     try:
-        card = (folder / "README.md").read_text(encoding="utf-8")
-    except FileNotFoundError:
-        return None
-    return card_tables(card) if MADE_BY in card else None
-
-
-def _tables_of(folder: Path, rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return what the card would say, from the rows alone."""
-    infos = [{**row, "frames": row["length"]} for row in rows]
-    parts = [MADE_BY, f"{EDITED} Storage is shared out by frames."]
-    parts += statistics_section(infos, [], storage_by_frames(folder, infos))
-    return "\n\n".join(part for part in parts if part) + "\n"
+        write_file(folder / CARD_FILE, card_from_frames(folder, rows))
+    except OSError as error:
+        say(f"its card could not be written to {folder} ({error.strerror})")
 
 
 def _manifest_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

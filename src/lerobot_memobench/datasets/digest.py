@@ -17,8 +17,8 @@ def digest(demo: Demonstration) -> str:
     """Return the sha256 (hex) of an episode: identity, states, actions and the label columns.
 
     Images are left out: they follow from the states, and a renderer may differ in a pixel where physics does
-    not. So are the objects that could be seen, and ``coarse_subgoal``, which the other columns and the task decide:
-    they came later than the first datasets, and their hashes stay what they are.
+    not. So are the objects that could be seen, and ``coarse_subgoal`` and ``subtask``, which the other columns and the
+    task decide: they came later than the first datasets, and their hashes stay what they are.
     """
     found = labels(demo)
     identity = {
@@ -32,7 +32,7 @@ def digest(demo: Demonstration) -> str:
     columns: dict[str, NDArray | list[str]] = {"states": demo.states, "actions": demo.actions}
     if demo.executed is not None:
         columns["executed"] = demo.executed
-    columns |= {f.name: getattr(found, f.name) for f in fields(found) if f.name != "coarse_subgoal"}
+    columns |= {f.name: getattr(found, f.name) for f in fields(found) if f.name not in ("coarse_subgoal", "subtask")}
     return digest_columns(identity, columns)
 
 

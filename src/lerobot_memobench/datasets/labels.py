@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.demonstration import EXECUTION, PROMPT, Demonstration
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.tasks.memory_text import memory_text
+from lerobot_memobench.tasks.memory_text import memory_text, subtask_texts
 from lerobot_memobench.tasks.task import LEVELS, OPERATIONS, Task
 
 MAX_CHECKPOINTS = 6
@@ -35,6 +35,8 @@ class Labels:
         grounded_subgoal, coarse_subgoal: the same at the fine and at the coarse level.
         memory: T strings, intermediate-level texts of the checkpoints completed in order before t, joined by
             "; "; empty at the start. The oracle memory of the paper (:mod:`lerobot_memobench.tasks.memory_text`).
+        subtask: T strings, what is to be done for the checkpoint worked on, as an instruction: in LeRobot's language
+            rows, and no column of its own.
         key_frames: (K,) int64, the frame at which checkpoint k was completed in order, -1 if it never was.
     """
 
@@ -47,6 +49,7 @@ class Labels:
     grounded_subgoal: list[str]
     coarse_subgoal: list[str]
     memory: list[str]
+    subtask: list[str]
     key_frames: NDArray[np.int64]
 
     def columns(self) -> dict[str, NDArray | list[str]]:
@@ -80,6 +83,8 @@ def labels(demo: Demonstration) -> Labels:
     # One entry per value of index, 0 ... K; the last stands for "none left". A code is a position in "SUC".
     codes = [OPERATIONS.index(checkpoint.operation) for checkpoint in task.checkpoints] + [-1]
     texts = {level: _subgoals(task, number) for number, level in enumerate(LEVELS)}
+    subtasks = subtask_texts(task)
+    subtasks.append(subtasks[-1])
     memories = [memory_text(task, k) for k in range(len(task.checkpoints) + 1)]
     return Labels(
         phase=np.where(np.arange(length) < demo.exec_start, PROMPT, EXECUTION).astype(np.int64),
@@ -91,6 +96,7 @@ def labels(demo: Demonstration) -> Labels:
         grounded_subgoal=[texts["fine"][k] for k in index],
         coarse_subgoal=[texts["coarse"][k] for k in index],
         memory=[memories[k] for k in index],
+        subtask=[subtasks[k] for k in index],
         key_frames=key_frames,
     )
 

@@ -3,7 +3,8 @@
 LeRobot 0.6 keeps language beside the frames in the column ``language_persistent``: one list of rows per
 episode, repeated on every frame, each row active from its timestamp until the next of its style
 (``lerobot.datasets.language``). The styles written here are those its annotation pipeline writes: ``subtask``
-(what is being worked on) and ``memory`` (what has been done; none before the first completion).
+(what to do, as an instruction) and ``memory`` (what has been done, in the past tense; none before the first
+completion).
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ def persistent_rows(found: Labels, fps: int = FPS) -> list[LanguageRow]:
     the text before it stays active until the one after it begins, so a row never claims something too early.
     The per-frame string columns keep every change.
     """
-    rows = [_row("subtask", text, frame, fps) for frame, text in _changes(found.simple_subgoal)]
+    rows = [_row("subtask", text, frame, fps) for frame, text in _changes(found.subtask)]
     rows += [_row("memory", text, frame, fps) for frame, text in _changes(found.memory) if text]
     return sorted(rows, key=lambda row: (row["timestamp"], row["style"], row["role"]))
 

@@ -2,25 +2,31 @@
 
 huggingface_hub's ``upload_folder`` does the work (its ``upload_large_folder`` is deprecated in favour of it): it
 commits a large folder in parts, and the same call continues an upload that was broken off, since what the hub has
-already is known by its hash. When it is over the hub is asked what it holds.
+already is known by its hash. What an earlier dataset has left there is deleted by the same upload: LeRobot would load
+its frames too. When it is over the hub is asked what it holds.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lerobot_memobench.datasets.lerobot_format.card import CARD_FILE, hub_card
 from lerobot_memobench.datasets.lerobot_format.info import read_info
-from lerobot_memobench.datasets.lerobot_format.layout import HDF5_FOLDER, is_dataset
+from lerobot_memobench.datasets.lerobot_format.layout import HDF5_FOLDER, MANIFEST_FILE, is_dataset
 from lerobot_memobench.errors import MemobenchError
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
 
-PARTS = ("README.md", "manifest.json", "data/**", "meta/**", "states/**", "videos/**")
-"""What is uploaded: the dataset, and nothing that was later put beside it, such as a memory cache."""
+PARTS = (MANIFEST_FILE, "data/**", "meta/**", "states/**", "videos/**")
+"""What is uploaded beside the card: the dataset, and nothing that was later put beside it, such as a memory cache."""
+HDF5 = f"{HDF5_FOLDER}/**"
+DERIVED = "memory_cache/**"
+"""Made from a dataset's frames on the machine that trains; one on the hub is of frames that are replaced."""
 
 
 def push(
@@ -30,8 +36,13 @@ def push(
     token: str | None = None,
     private: bool | None = None,
     hdf5: bool = False,
+    tell: Callable[[str], None] = lambda _: None,
 ) -> str:
     """Upload a finished dataset; return its address. The same call continues an upload that was broken off.
+
+    The repository then holds this dataset and no file of an earlier one: what it had in the dataset's folders, HDF5
+    files and memory caches, and what is not uploaded now, is deleted (its history keeps it). The card says how to load
+    it from there.
 
     Args:
         folder: the dataset.
@@ -39,6 +50,7 @@ def push(
         token: a token that may write; by default the one of ``hf auth login`` or HF_TOKEN.
         private: whether a repository that has to be made is private; None leaves it to the account's setting.
         hdf5: upload the HDF5 files beside the dataset as well.
+        tell: told, in a sentence, what is deleted there and what stays here.
 
     Raises:
         MemobenchError: no dataset, no token, a token that may not write there, or a hub that cannot be reached.
@@ -55,17 +67,35 @@ def push(
         raise MemobenchError(
             f"there is no token to write to {repo_id}: run `hf auth login`, set HF_TOKEN, or pass one that may write"
         )
+    card = hub_card(folder, repo_id)
+    parts = [*PARTS, *([HDF5] if hdf5 else [])]
+    if (folder / DERIVED.removesuffix("/**")).is_dir():
+        tell(f"the memory caches in {folder} stay here: they are made anew where the dataset is trained on")
     api = HfApi(token=token)
     with _told(repo_id):
         repo_id = api.create_repo(repo_id, repo_type="dataset", private=private, exist_ok=True).repo_id
+        stale = _stale(api, _sizes(folder, parts), repo_id)
+        if stale:
+            tell(
+                f"{len(stale)} files that this dataset does not have, such as {stale[0]}, are deleted from {repo_id}; "
+                "its history keeps them"
+            )
         api.upload_folder(
             repo_id=repo_id,
             folder_path=folder,
             repo_type="dataset",
-            allow_patterns=[*PARTS, *([f"{HDF5_FOLDER}/**"] if hdf5 else [])],
+            allow_patterns=parts,
+            delete_patterns=stale or None,
             commit_message="Upload MEMOBench demonstrations",
         )
-        missing = _missing(api, folder, repo_id, hdf5)
+        api.upload_file(
+            repo_id=repo_id,
+            path_or_fileobj=card.encode(),
+            path_in_repo=CARD_FILE,
+            repo_type="dataset",
+            commit_message="Upload the card",
+        )
+        missing = _missing(api, _sizes(folder, parts) | {CARD_FILE: len(card.encode())}, repo_id)
         if missing:
             raise MemobenchError(
                 f"{len(missing)} files, such as {missing[0]}, did not arrive at {repo_id}; run the same command again"
@@ -99,16 +129,27 @@ def _told(repo_id: str) -> Iterator[None]:
         ) from None
 
 
-def _missing(api: HfApi, folder: Path, repo_id: str, hdf5: bool) -> list[str]:
+def _sizes(folder: Path, parts: list[str]) -> dict[str, int]:
+    """Return the files that are uploaded and their sizes."""
+    tops = [folder / pattern.removesuffix("/**") for pattern in parts]
+    files = [path for top in tops for path in [top, *top.rglob("*")] if path.is_file()]
+    return {path.relative_to(folder).as_posix(): path.stat().st_size for path in files}
+
+
+def _on_the_hub(api: HfApi, repo_id: str) -> dict[str, int]:
+    entries = api.list_repo_tree(repo_id, repo_type="dataset", recursive=True)
+    return {entry.path: entry.size for entry in entries if hasattr(entry, "size")}
+
+
+def _stale(api: HfApi, sizes: dict[str, int], repo_id: str) -> list[str]:
+    """Return what the hub holds in the places of a dataset and is not uploaded."""
+    there = [name for name in _on_the_hub(api, repo_id) if name not in sizes]
+    return sorted(name for name in there if any(fnmatch(name, part) for part in (*PARTS, HDF5, DERIVED)))
+
+
+def _missing(api: HfApi, sizes: dict[str, int], repo_id: str) -> list[str]:
     """Return what the hub does not hold in the size that it has here."""
-    there = {
-        entry.path: entry.size
-        for entry in api.list_repo_tree(repo_id, repo_type="dataset", recursive=True)
-        if hasattr(entry, "size")
-    }
-    wanted = [pattern.removesuffix("/**") for pattern in PARTS] + ([HDF5_FOLDER] if hdf5 else [])
-    files = [path for top in wanted for path in [folder / top, *(folder / top).rglob("*")] if path.is_file()]
-    sizes = {path.relative_to(folder).as_posix(): path.stat().st_size for path in files}
+    there = _on_the_hub(api, repo_id)
     return sorted(name for name, size in sizes.items() if there.get(name) != size)
 
 

@@ -8,16 +8,22 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.datasets.demonstration import CAMERAS
 from lerobot_memobench.datasets.hdf5.layout import Unusable, usable_or_named
 from lerobot_memobench.datasets.hdf5.published_task import task_of
 from lerobot_memobench.datasets.hdf5.reading import PublishedFile, find_files
 from lerobot_memobench.datasets.hdf5.restore import restore
-from lerobot_memobench.datasets.lerobot_format.info import episode_count
-from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
+from lerobot_memobench.datasets.lerobot_format.info import episode_count, read_info
+from lerobot_memobench.datasets.lerobot_format.layout import image_key, is_dataset
 from lerobot_memobench.datasets.lerobot_format.reading import read_episode
-from lerobot_memobench.datasets.replay import replay
+from lerobot_memobench.datasets.memory_cache.decoding import FrameReader, frame_reader
+from lerobot_memobench.datasets.replay import Pictures, replay
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.files.reading import refusing
 from lerobot_memobench.jobs.processes import process_pool
@@ -62,13 +68,15 @@ class _Check:
             episode = read_episode(self.path, self.index)
             if episode.seed < 0:
                 return "it has no seed, so its scene cannot be made again"
-            found = replay(episode, task=(self.tasks or {}).get(episode.task_name))
+            task, pictures = (self.tasks or {}).get(episode.task_name), _pictures(self.path, self.index)
+            found = replay(episode, task=task, pictures=pictures)
             return None if found is None else str(found)
         with PublishedFile(self.path) as file:
             published = file.read(self.group)
             if "seed" not in published.extras or int(published.extras["seed"]) < 0:
                 return "it has no seed, so its scene cannot be made again"
-            found = replay(restore(task_of(file, published), published))
+            restored = restore(task_of(file, published), published)
+            found = replay(restored, pictures=lambda frames: file.pictures(self.group, frames))
             return None if found is None else str(found)
 
 
@@ -85,8 +93,8 @@ def validate(
 ) -> list[Verdict]:
     """Replay the episodes of a folder (or of an HDF5 file) and return a verdict for each, in their order.
 
-    States, success, every checkpoint column, subgoal texts, language rows, key frames and the scene must come out
-    exactly; images are not compared.
+    States, success, instruction, numbering, every checkpoint column, subgoal texts, language rows, key frames and the
+    scene must come out exactly; some frames of each camera must be near to what the simulator draws.
 
     Args:
         folder: what to check.
@@ -117,6 +125,25 @@ def validate(
             for future in as_completed(futures):
                 note(futures[future], future.result())
     return [verdicts[number] for number in range(len(checks))]
+
+
+def _pictures(folder: Path, episode: int) -> Pictures | None:
+    """Return what reads the pictures of an episode of a dataset; None where it has none of ours."""
+    cameras = [camera for camera in CAMERAS if image_key(camera) in read_info(folder)["features"]]
+
+    def read(frames: Sequence[int]) -> dict[str, NDArray[np.uint8]]:
+        found = {camera: _reader(folder, image_key(camera))(episode, list(frames)) for camera in cameras}
+        return {
+            camera: (shown * 255).round().clamp(0, 255).byte().permute(0, 2, 3, 1).numpy()
+            for camera, shown in found.items()
+        }
+
+    return read if cameras else None
+
+
+@lru_cache(maxsize=len(CAMERAS))
+def _reader(folder: Path, camera: str) -> FrameReader:
+    return frame_reader(folder, camera)
 
 
 def exit_status(verdicts: Sequence[Verdict]) -> int:

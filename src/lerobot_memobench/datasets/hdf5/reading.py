@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -161,6 +161,11 @@ class PublishedFile:
                 if upside_down:
                     frame = {camera: np.ascontiguousarray(picture[::-1]) for camera, picture in frame.items()}
                 yield frame
+
+    def pictures(self, group: str, frames: Sequence[int]) -> dict[str, Image]:
+        """Return both cameras' pictures at ``frames``, ascending numbers (n,): (n, H, W, 3) uint8 each."""
+        obs = self._data[group]["obs"]
+        return {camera: obs[name][list(frames)] for camera, name in IMAGE_NAMES.items()}
 
 
 def _check_length(group: h5py.Group, arrays: Mapping[str, h5py.Dataset]) -> None:

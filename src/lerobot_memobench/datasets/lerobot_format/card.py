@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,17 +14,40 @@ from lerobot_memobench.datasets.lerobot_format.card_tables import (
     lengths_table,
     markdown,
     ordered_types,
+    storage_by_frames,
     storage_of,
     tasks_table,
 )
+from lerobot_memobench.datasets.lerobot_format.info import read_info, undamaged
+from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, list_episodes
 from lerobot_memobench.datasets.staging.episode import StagedEpisode
+from lerobot_memobench.errors import MemobenchError
 
+CARD_FILE = "README.md"
 LICENSE = "apache-2.0"
+
+MADE_BY = "## How it was made"
+"""Heading of a card of ours; LeRobot's has none."""
+
+EDITED = (
+    "A tool that knows nothing of this benchmark, such as `lerobot-edit-dataset`, has edited this dataset: its card, "
+    "tables and hashes are made from its frames. Lost are which seeds had failed, and the simulator's states: "
+    "`memobench validate` makes those again from seed and actions and compares their hash, but cannot where an episode "
+    "has no seed."
+)
 
 SCRIPTED = (
     "Scripted experts act in a MuJoCo simulation; nothing was collected from people or robots. Actions were recorded "
     "as applied (`executed_action`), so that replaying them from the seed gives the same states."
 )
+
+LIMITATIONS = """\
+- It is one simulated kitchen with one Panda arm and one scripted expert: each task is done in one way, by one
+  instruction, and nothing is known of real pictures.
+- In tasks with a prompt video the texts of subgoals, memory and language rows name what only the prompt shows: which
+  carton, which bowl, which drawer, which order. A policy that reads them where it acts is not tested for memory.
+- Visible objects, states, seeds and checkpoint columns are the simulator's: no camera tells them.
+- Frames of prompt videos are demonstrations of what to remember, not of what to do."""
 
 COLUMNS = {
     "observation.images.image": "third-person camera",
@@ -43,7 +67,8 @@ COLUMNS = {
     "grounded_subgoal": "the same at the fine level; once all are done, the last one's text stays",
     "coarse_subgoal": "the same at the coarse level",
     "memory": "the checkpoints completed in order before this frame, as text (oracle memory); empty at the start",
-    "language_persistent": "LeRobot's language rows, styles `subtask` and `memory`, for its training recipes",
+    "language_persistent": "LeRobot's language rows for its training recipes: style `subtask`, what to do next, as an "
+    "instruction; style `memory`, what has been done",
     "episode_info": "JSON at an episode's first frame, else empty: all of the table below, and versions, because "
     "LeRobot's dataset tools keep the columns of frames alone",
 }
@@ -77,23 +102,80 @@ def write_card(
     """Write ``folder``/README.md: what the dataset is, its columns, how it was made, statistics, licence."""
     solved = [episode for episode in episodes if episode.failure is None]
     failed = [episode for episode in episodes if episode.failure is not None]
-    written = [episode.info for episode in solved]
-    parts = [
-        _front_matter(len(written)),
-        "# MEMOBench demonstrations",
-        *_introduction(written, repo_id),
-        "## How it was made",
+    made = [
         (made_by or f"Written by `lerobot_memobench`. {SCRIPTED}") + " `manifest.json` holds a hash of every episode's "
         "states, actions and labels; `states/` holds the simulator's states (1 + nq + nv numbers per frame).",
         _failures(failed, len(episodes)),
         _left_out(left_out),
-        *statistics_section(written, failed, storage_of(folder, solved)),
+    ]
+    infos = [episode.info for episode in solved]
+    text = _card(infos, failed, features, storage_of(folder, solved), made, _loading(repo_id, "<this folder>"))
+    (folder / CARD_FILE).write_text(text, encoding="utf-8")
+
+
+def own_card(folder: Path, count: int) -> str | None:
+    """Return the card of a dataset of ``count`` episodes; None where it is not this package's, or of other episodes."""
+    try:
+        card = (folder / CARD_FILE).read_text(encoding="utf-8")
+    except FileNotFoundError:
+        return None
+    return card if MADE_BY in card and f"\n{count} demonstrations of " in card else None
+
+
+def card_from_frames(folder: Path, rows: Sequence[Mapping[str, Any]], repo_id: str | None = None) -> str:
+    """Return a card for a dataset that has lost its own.
+
+    Args:
+        folder: the dataset.
+        rows: the records of its episodes, each with its ``length``.
+        repo_id: its address on the hub; None where it is loaded from a folder.
+    """
+    infos = [{**row, "frames": row["length"]} for row in rows]
+    loading = _loading(repo_id or "local/demonstrations", None if repo_id else "<this folder>")
+    made = [f"{EDITED} Storage is shared out by frames."]
+    return _card(infos, [], read_info(folder)["features"], storage_by_frames(folder, infos), made, loading)
+
+
+def hub_card(folder: Path, repo_id: str) -> str:
+    """Return the card of a dataset as it is to stand at ``repo_id`` on the hub, by which its examples load it.
+
+    Raises:
+        MemobenchError: the dataset is damaged, or none of its episodes is one of this benchmark.
+    """
+    with undamaged(folder):
+        places = list_episodes(folder)
+        card = own_card(folder, len(places))
+    if card is not None:
+        return re.sub(r'LeRobotDataset\("[^"\n]*", root="[^"\n]*"\)', f'LeRobotDataset("{repo_id}")', card)
+    rows = [{**place.record.model_dump(), "length": place.length} for place in places if place.record is not None]
+    if not rows:
+        raise MemobenchError(f"{folder} has no episode of this benchmark: of each, {STRANGER}")
+    return card_from_frames(folder, rows, repo_id)
+
+
+def _card(
+    infos: Sequence[dict[str, Any]],
+    failed: Sequence[StagedEpisode],
+    features: Mapping[str, dict[str, Any]],
+    storage: dict[str, float],
+    made: Sequence[str],
+    loading: str,
+) -> str:
+    parts = [
+        _front_matter(len(infos)),
+        "# MEMOBench demonstrations",
+        *_introduction(infos, loading),
+        MADE_BY,
+        *made,
+        *statistics_section(infos, failed, storage),
         "## Columns",
         *_columns(features),
+        "## Limitations",
+        LIMITATIONS,
         "## Licence",
-        "Apache-2.0.",
+        "Apache-2.0: the demonstrations, and `lerobot_memobench`, which made them.",
     ]
-    (folder / "README.md").write_text("\n\n".join(part for part in parts if part) + "\n", encoding="utf-8")
+    return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def _front_matter(count: int) -> str:
@@ -118,20 +200,32 @@ def _front_matter(count: int) -> str:
     )
 
 
-def _introduction(written: Sequence[dict[str, Any]], repo_id: str) -> list[str]:
-    tasks = {info["task_name"] for info in written}
+def _loading(repo_id: str, root: str | None) -> str:
+    """Return the example that loads the dataset: from a folder, or from the hub."""
+    where = f'"{repo_id}"' if root is None else f'"{repo_id}", root="{root}"'
+    return f"""\
+```python
+from torch.utils.data import Subset
+from lerobot.datasets import LeRobotDataset
+
+dataset = LeRobotDataset({where})
+execution = Subset(dataset, [i for i, phase in enumerate(dataset.hf_dataset["phase"]) if phase == 1])
+```"""
+
+
+def _introduction(infos: Sequence[Mapping[str, Any]], loading: str) -> list[str]:
+    tasks = {info["task_name"] for info in infos}
     return [
-        f"{len(written)} demonstrations of {len(tasks)} robot manipulation tasks that need memory "
-        f"({', '.join(ordered_types(written))}), as a LeRobotDataset v3.0 at 20 frames per second. Each task names the "
+        f"{len(infos)} demonstrations of {len(tasks)} robot manipulation tasks that need memory "
+        f"({', '.join(ordered_types(infos))}), as a LeRobotDataset v3.0 at 20 frames per second. Each task names the "
         "checkpoints a memory has to keep (Storage), revise (Update) or summarise (Compression); every frame says "
         "which of them are done, because the simulator wrote the labels. Benchmark and metrics: MEMOBench; generator, "
         "environment and policies: `lerobot_memobench`.",
-        f'```python\nfrom lerobot.datasets import LeRobotDataset\n\ndataset = LeRobotDataset("{repo_id}", '
-        'root="<this folder>")\n'
-        'one_type = LeRobotDataset(..., episode_filter=lambda episode: episode["memory_type"] == "spatial")\n'
-        "```",
-        "Pass `collate_fn=lerobot.utils.collate.lerobot_collate_fn` to a DataLoader of your own: language rows differ "
-        "in number between episodes. `lerobot-train` does so by itself.",
+        loading,
+        "`execution` leaves out the frames of prompt videos, in which the policy does not act; `lerobot train` of "
+        "`lerobot_memobench` leaves them out by itself. One memory type alone: `episode_filter=lambda episode: "
+        'episode["memory_type"] == "spatial"`. Pass `collate_fn=lerobot.utils.collate.lerobot_collate_fn` to a '
+        "DataLoader of your own: language rows differ in number between episodes. `lerobot-train` does so by itself.",
     ]
 
 
@@ -161,7 +255,7 @@ def _prompts(infos: Sequence[dict[str, Any]]) -> str:
     return f"Of these steps the prompt video takes, on average, {' and '.join(parts)}." if parts else ""
 
 
-def _columns(features: dict[str, dict[str, Any]]) -> list[str]:
+def _columns(features: Mapping[str, dict[str, Any]]) -> list[str]:
     return [
         markdown(
             ["column", "type", "meaning"],

@@ -80,7 +80,10 @@ def episodes_where(folder: Path | str, **wanted: Any) -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class RecordedEpisode:
-    """An episode of a dataset on disk: ``columns`` per frame and what the dataset says of the whole."""
+    """An episode of a dataset on disk: ``columns`` per frame and what the dataset says of the whole.
+
+    The instruction of each frame is the column ``task``; ``start`` is the first frame in the dataset's global index.
+    """
 
     task_name: str
     variant: int
@@ -89,6 +92,7 @@ class RecordedEpisode:
     exec_start: int
     columns: Columns
     whole: dict[str, Any]
+    start: int = 0
 
 
 def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
@@ -103,16 +107,66 @@ def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
     if len(rows) != 1:
         raise MemobenchError(f"{root} has no episode {episode_index}; see total_episodes in its meta/info.json")
     columns = _read_columns(root, episode_index)
-    record = _place(root, rows[0], columns.pop(EPISODE_INFO, [None])[0]).record
+    texts = columns.pop(EPISODE_INFO, [None])
+    place = _place(root, rows[0], texts[0])
+    record = place.record
     if record is None:
         raise MemobenchError(STRANGER)
-    told = record.model_dump(include={"success", "key_frames", "scene_hash", "fixture_poses", "digest"})
-    whole = {key: value for key, value in told.items() if value is not None}
+    _check_record(rows[0], record, texts, len(columns["frame_index"]))
+    told = record.model_dump(include=WHOLE)
+    whole = {key: value for key, value in told.items() if value not in (None, "")}
     if LANGUAGE in columns:
         whole[LANGUAGE] = columns[LANGUAGE][0]
+        changed = next((frame for frame, rows in enumerate(columns[LANGUAGE]) if rows != whole[LANGUAGE]), None)
+        if changed is not None:
+            raise MemobenchError(f"{LANGUAGE} at frame {changed} is another than at frame 0, expected one per episode")
+    _name_tasks(root, columns)
     return RecordedEpisode(
-        record.task_name, record.variant, record.seed, record.referent, record.exec_start_index, columns, whole
+        record.task_name,
+        record.variant,
+        record.seed,
+        record.referent,
+        record.exec_start_index,
+        columns,
+        whole,
+        place.start,
     )
+
+
+WHOLE = {
+    "memory_type",
+    "family",
+    "operations",
+    "success",
+    "key_frames",
+    "scene_hash",
+    "fixture_poses",
+    "digest",
+}
+"""What of a record follows from task, seed and actions."""
+
+
+def _check_record(row: dict[str, Any], record: EpisodeRecord, texts: list[str | None], length: int) -> None:
+    """Raise where the two places that tell of an episode, or its frames, contradict each other."""
+    in_meta = from_meta(row)
+    for key in EpisodeRecord.model_fields if in_meta is not None else ():
+        here, there = getattr(record, key), getattr(in_meta, key)
+        if key != "versions" and here != there:
+            raise MemobenchError(f"meta/episodes says {key}={there!r}, the frames' column {EPISODE_INFO} {here!r}")
+    again = next((frame for frame, text in enumerate(texts) if frame and text), None)
+    if again is not None:
+        raise MemobenchError(f"{EPISODE_INFO} at frame {again} says {texts[again]!r}, expected nothing but at frame 0")
+    if row["length"] != length:
+        raise MemobenchError(f"meta/episodes says length={row['length']}, but it has {length} frames")
+
+
+def _name_tasks(root: Path, columns: Columns) -> None:
+    """Put each frame's instruction, as ``task``, in the place of its number."""
+    from lerobot.datasets.io_utils import load_tasks
+
+    tasks = load_tasks(root)
+    names = {int(number): str(text) for text, number in zip(tasks.index, tasks["task_index"].tolist(), strict=True)}
+    columns["task"] = [names.get(int(number), "") for number in columns.pop("task_index")]
 
 
 def _check(folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import shutil
 from collections.abc import Callable
@@ -24,7 +25,7 @@ from lerobot_memobench.datasets.memory_cache.layout import (
 )
 from lerobot_memobench.datasets.memory_cache.room import free_bytes, in_words, reserve, telling_of_the_disk
 from lerobot_memobench.datasets.memory_cache.tables import TextEncoder, add_embeddings, write_meta, write_tables
-from lerobot_memobench.files import remove_drafts
+from lerobot_memobench.files import remove_drafts, write_file
 from lerobot_memobench.jobs.locking import taking_turns
 from lerobot_memobench.jobs.threads import cores
 
@@ -90,6 +91,8 @@ def build_memory_cache(
     read = read or frame_reader(root, camera)
     with telling_of_the_disk(work.folder):
         work.folder.parent.mkdir(parents=True, exist_ok=True)
+        if place is None:
+            keep_from_the_hub(root)
         with taking_turns(work.folder.parent / f"{name}.lock", partial(wait, work.folder)):
             begun = work.begin()
             encoding = Encoding(work.folder, begun, table, batch_size, workers or min(cores(), MOST_THREADS))
@@ -116,6 +119,18 @@ def _describe(
         oracle=table.memory is not None,
         complete=False,
     )
+
+
+def keep_from_the_hub(root: Path) -> None:
+    """Let no upload of the dataset's folder, LeRobot's `push_to_hub` among them, take its caches along.
+
+    The hub's own way: it ignores what a ``.gitignore`` at the top of what is uploaded names.
+    """
+    path, line = root / ".gitignore", f"/{FOLDER}/"
+    with contextlib.suppress(OSError):  # the caches may lie behind a link in a folder that takes nothing
+        there = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+        if line not in there:
+            write_file(path, "\n".join([*there, line]) + "\n")
 
 
 @dataclass(frozen=True)
