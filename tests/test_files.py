@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 
 import pytest
@@ -9,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files import draft_of, file_name, remove_drafts, write_file
+from lerobot_memobench.files import disk_refusal, draft_of, file_name, remove_drafts, telling_of_the_disk, write_file
 from lerobot_memobench.tasks.catalogue import task_names
 
 
@@ -71,3 +73,26 @@ def test_an_accepted_name_stays_in_its_folder(name: str) -> None:
         return
     assert (base / accepted).parent == base
     assert (base / accepted).name == name
+
+
+def test_what_a_disk_answers_is_found_however_it_is_told() -> None:
+    """As the system's number, in a library's words, or behind another error; and nothing else is taken for it."""
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    behind = RuntimeError("could not save")
+    behind.__cause__ = full
+    in_c = RuntimeError("write failed: errno = 28, error message = 'No space left on device'")
+    assert [disk_refusal(error) for error in (full, behind, in_c)] == ["No space left on device"] * 3
+    assert disk_refusal(PermissionError(errno.EACCES, "denied", "/a")) == "Permission denied"
+    assert disk_refusal(FileNotFoundError(errno.ENOENT, "gone", "/a")) is None
+    assert disk_refusal(ValueError("5 is no number")) is None
+    assert disk_refusal(MemobenchError("No space left on device is what it said")) is None
+
+
+def test_what_cannot_be_read_is_not_said_to_be_unwritable(tmp_path: Path) -> None:
+    elsewhere = PermissionError(errno.EACCES, "Permission denied", "/source/a.hdf5")
+    with pytest.raises(PermissionError), telling_of_the_disk(tmp_path / "out"):
+        raise elsewhere
+    here = PermissionError(errno.EACCES, "Permission denied", str(tmp_path / "out" / "a"))
+    told = pytest.raises(MemobenchError, match=r"out cannot be written \(Permission denied; .*; b")
+    with told, telling_of_the_disk(tmp_path / "out", "b"):
+        raise here

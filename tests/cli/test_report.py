@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -102,3 +104,37 @@ def test_a_figure_to_a_file(tmp_path: Path) -> None:
     a = evaluation(tmp_path / "a")
     assert main(["figures", "failures", a, "--by", "tasks", "--out", str(tmp_path / "f.pdf")]) == 0
     assert (tmp_path / "f.pdf").read_bytes().startswith(b"%PDF")
+
+
+@pytest.mark.parametrize("words", [["report", "--format", "json"], ["html"]], ids=lambda words: words[0])
+@pytest.mark.parametrize("refusal", ["full", "closed"])
+def test_a_disk_that_takes_nothing_is_one_sentence(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    words: list[str],
+    refusal: str,
+) -> None:
+    """Whatever command writes; and what was there before is whole."""
+    a, out = evaluation(tmp_path / "a"), tmp_path / "out"
+    assert main([words[0], a, *words[1:], "--out", str(out)]) == 0
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    assert before
+    number = {"full": errno.ENOSPC, "closed": errno.EROFS}[refusal]
+
+    inner = Path.write_bytes
+
+    def refuse(path: Path, content: bytes) -> int:
+        if out in path.parents:
+            raise OSError(number, os.strerror(number), str(path))
+        return inner(path, content)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", refuse)
+        capsys.readouterr()
+        assert main([words[0], a, *words[1:], "--out", str(out)]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("memobench: the disk does not take ")
+    assert f"({os.strerror(number)}): make room, or name another folder" in err
+    assert err.count("\n") == 1
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before

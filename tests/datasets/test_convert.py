@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -15,6 +17,7 @@ import h5py
 import numpy as np
 import pytest
 
+from lerobot_memobench.cli.data import convert as command
 from lerobot_memobench.datasets import convert as convert_module
 from lerobot_memobench.datasets.convert import convert
 from lerobot_memobench.datasets.demonstration import Demonstration
@@ -29,7 +32,7 @@ from lerobot_memobench.datasets.lerobot_format import is_dataset, write_dataset
 from lerobot_memobench.datasets.lerobot_format.reading import read_episode
 from lerobot_memobench.datasets.recording import record_demonstration
 from lerobot_memobench.datasets.replay import replay
-from lerobot_memobench.datasets.staging.stage import stage_demonstration
+from lerobot_memobench.datasets.staging.stage import EpisodeStage, stage_demonstration
 from lerobot_memobench.datasets.validate import validate
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks import get_task
@@ -374,6 +377,62 @@ def test_images_that_cannot_be_read_are_a_problem_of_their_group(source, tmp_pat
     assert "its images cannot be read from frame 32 on" in problem.reason
 
 
+def test_a_task_that_is_not_the_catalogues_of_its_name_is_told(written, stove, tmp_path, capsys):
+    """The dataset holds the file's; what finds tasks by name finds another, and everybody is told."""
+    assert convert(written, tmp_path / "same").notes == ()
+    folder = tmp_path / "by hand"
+    folder.mkdir()
+    path = by_hand(folder, stove, "stove.hdf5")
+    assert convert(path, tmp_path / "hand").notes == ()
+    with h5py.File(path, "a") as file:
+        text = file["data"].attrs["bddl_file_content"]
+        file["data"].attrs["bddl_file_content"] = text.replace(stove.task.language, "switch the stove on and off")
+        file.copy("data/demo_0", "data/demo_1")
+    summary = convert(path, tmp_path / "ds")
+    (note,) = summary.notes
+    assert str(note) == (
+        f"stove.hdf5: not as the catalogue's {STOVE}: instruction; the dataset holds the file's, but `lerobot eval` "
+        "and `memobench validate` know the catalogue's by that name"
+    )
+    assert (summary.episodes, summary.problems, summary.exit_status) == (2, (), 0)
+    assert convert(path, tmp_path / "ds") == summary
+    assert str(note) in (tmp_path / "ds" / "README.md").read_text()
+    assert read_episode(tmp_path / "ds", 0).columns["task"][0] == "switch the stove on and off"
+    command(path, tmp_path / "ds")
+    assert f"note: {note}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("layout", "attributes", "cameras"),
+    [
+        ("LIBERO's", ["bddl_file_name", "bddl_file_content", "problem_info"], ["agentview_rgb", "eye_in_hand_rgb"]),
+        ("robomimic's", ["env_args"], ["agentview_image", "robot0_eye_in_hand_image"]),
+        ("robomimic's", ["env_args"], []),
+    ],
+)
+def test_neighbouring_layouts_are_recognised(written, tmp_path, layout, attributes, cameras):
+    """In one sentence for the file, not one for each demonstration; what is sound beside it is converted."""
+    source = Path(shutil.copytree(written, tmp_path / "source"))
+    with h5py.File(source / "a.hdf5", "w") as file:
+        for key in attributes:
+            file.require_group("data").attrs[key] = "{}"
+        for number in range(3):
+            group = file.create_group(f"data/demo_{number}")
+            group.attrs["num_samples"] = 4
+            group["states"], group["actions"] = np.zeros((4, 9)), np.zeros((4, 7))
+            group.create_group("obs")
+            for camera in cameras:
+                group[f"obs/{camera}"] = np.zeros((4, 8, 8, 3), np.uint8)
+    summary = convert(source, tmp_path / "ds")
+    (problem,) = summary.problems
+    assert problem.reason.startswith(f"it is in {layout} layout, which lacks the checkpoints (meta_data)")
+    assert problem.reason.endswith("describe its task as docs/develop/add_a_task.md says")
+    lacks = [] if layout == "LIBERO's" else ["bddl_file_name", "bddl_file_content"]
+    lacks += [] if "agentview_image" in cameras else ["obs/agentview_image", "obs/robot0_eye_in_hand_image"]
+    assert all(f"'{each}'" in problem.reason for each in lacks)
+    assert summary.episodes == 4
+
+
 def test_nothing_usable_leaves_nothing(tmp_path):
     (tmp_path / "a.hdf5").write_text("no HDF5")
     summary = convert(tmp_path / "a.hdf5", tmp_path / "ds")
@@ -385,6 +444,24 @@ def test_nothing_usable_leaves_nothing(tmp_path):
         with pytest.raises(MemobenchError, match=r"does not exist|found no HDF5 file"):
             convert(tmp_path / "empty" / missing, tmp_path / "ds")
         assert not (tmp_path / "ds").exists()
+
+
+def test_a_full_disk_ends_a_conversion_in_a_sentence(written, tmp_path, monkeypatch):
+    """The episode that met it is not one that cannot be used, and the next run makes it."""
+    path, told = written / f"{STOVE}_demo.hdf5", []
+    with monkeypatch.context() as patch:
+        full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        patch.setattr(EpisodeStage, "publish", lambda *_: (_ for _ in ()).throw(full))
+        with pytest.raises(MemobenchError, match=r"ds cannot be written \(No space left on device.*finished stays"):
+            convert(path, tmp_path / "ds", tell=told.append)
+    assert re.match(r"2 demonstrations: about [\d.]+ KiB in .*ds, [\d.]+ [KM]iB until it is finished", told[0])
+    assert not is_dataset(tmp_path / "ds")
+    summary = convert(path, tmp_path / "ds")
+    assert (summary.episodes, summary.problems) == (2, ())
+    (video,) = (tmp_path / "ds" / "videos" / "observation.images.image").rglob("*.mp4")
+    video.write_bytes(video.read_bytes()[:-50])
+    with pytest.raises(MemobenchError, match=r"file-000\.mp4 is cut off or damaged at byte"):
+        convert(path, tmp_path / "ds")
 
 
 def test_a_broken_off_conversion_goes_on(written, tmp_path, monkeypatch):

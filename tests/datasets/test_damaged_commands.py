@@ -24,6 +24,7 @@ import pytest
 from lerobot.datasets.io_utils import load_tasks, write_tasks
 
 from lerobot_memobench.cli import data as commands
+from lerobot_memobench.cli.lerobot import main as lerobot
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.hdf5.mjcf import model_file
 from lerobot_memobench.datasets.hdf5.writing import write_task_file
@@ -302,24 +303,11 @@ def test_every_column_of_frames_is_compared(two: Path, tmp_path: Path) -> None:
         assert found(folder).startswith(begins or f"{name} at frame {FRAME}"), name
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "task_name",
-        "memory_type",
-        "family",
-        "operations",
-        "seed",
-        "referent",
-        "variant",
-        "success",
-        "exec_start_index",
-        "key_frames",
-        "scene_hash",
-        "digest",
-        "length",
-    ],
-)
+EPISODES = """task_name memory_type family operations seed referent variant success exec_start_index key_frames
+scene_hash digest length"""
+
+
+@pytest.mark.parametrize("name", EPISODES.split())
 def test_every_column_of_episodes_is_compared(two: Path, tmp_path: Path, name: str) -> None:
     folder = Path(shutil.copytree(two, tmp_path / "ds"))
     (path,) = (folder / "meta" / "episodes").rglob("*.parquet")
@@ -386,12 +374,64 @@ def test_pictures_in_hdf5_are_compared(source: Path, tmp_path: Path) -> None:
     assert str(second.disagreement).startswith(f"observation.images.wrist_image at frame {FRAMES - 1}: recorded")
 
 
+# --- what trains ---
+
+SMALL = {
+    "pretrained_backbone_weights": "null",
+    "push_to_hub": "false",
+    "device": "cpu",
+    "dim_model": 16,
+    "n_heads": 2,
+    "dim_feedforward": 16,
+    "n_encoder_layers": 1,
+    "use_vae": "false",
+    "chunk_size": 2,
+    "n_action_steps": 2,
+}
+TRAIN = ["train", "policy=act", *(f"policy.{key}={value}" for key, value in SMALL.items()), "batch_size=4"]
+
+
+def zeroed(path: Path) -> None:
+    """Leave a table's end, which tells what is in it, and none of its values."""
+    data = path.read_bytes()
+    path.write_bytes(data[:4] + bytes(len(data) * 3 // 4) + data[4 + len(data) * 3 // 4 :])
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+
+
+@pytest.mark.parametrize(
+    ("pattern", "damage"),
+    [
+        ("data/**/*.parquet", cut),
+        ("data/**/*.parquet", zeroed),
+        ("meta/episodes/**/*.parquet", cut),
+        ("videos/*wrist_image/**/*.mp4", cut),
+        ("videos/*wrist_image/**/*.mp4", Path.unlink),
+    ],
+    ids=["table cut", "table zeroed", "episodes cut", "video cut", "video gone"],
+)
+@pytest.mark.parametrize("workers", [0, 1])
+def test_training_names_the_damaged_file(
+    two: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], pattern: str, damage: Any, workers: int
+) -> None:
+    folder = Path(shutil.copytree(two, tmp_path / "ds"))
+    (path,) = folder.glob(pattern)
+    damage(path)
+    run = tmp_path / "run"
+    assert lerobot([*TRAIN, f"dataset={folder}", f"output_dir={run}", "steps=3", f"num_workers={workers}"]) == 2
+    last = capsys.readouterr().err.strip().splitlines()[-1]
+    assert last.startswith(f"lerobot: {path} "), last
+    assert last.endswith("generate it or take it from its source again"), last
+
+
 def test_a_feature_larger_than_memory_is_told_before_it_is_taken(source: Path, tmp_path: Path) -> None:
     """LeRobot would take memory for all that it tells of: 23 GB of six frames, and the kernel ended the process."""
     folder = shutil.copytree(source / DATASET, tmp_path / "dataset")
     info = json.loads((folder / "meta" / "info.json").read_text())
-    info["features"]["observation.environment_state"]["shape"][0] *= 10**6
+    info["features"]["privileged.environment_state"]["shape"][0] *= 10**6
     (folder / "meta" / "info.json").write_text(json.dumps(info))
-    with pytest.raises(MemobenchError, match=r"more than 50,000,000 numbers of observation\.environment_state"):
+    with pytest.raises(MemobenchError, match=r"more than 50,000,000 numbers of privileged\.environment_state"):
         commands.describe(folder, tmp_path / "out")
     assert not (tmp_path / "out").exists()

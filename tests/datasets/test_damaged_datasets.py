@@ -12,6 +12,8 @@ from typing import Any
 
 import h5py
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from lerobot_memobench.datasets.convert import convert
@@ -72,6 +74,9 @@ LEROBOT_INFO = {"codebase_version": "v3.0", "total_episodes": 2, "total_frames":
 def manifests(folder: Path) -> None:
     write(folder / "manifest.json", MANIFEST)
     write(folder / "meta" / "info.json", LEROBOT_INFO)
+    for part, rows in (("data", 10), ("meta/episodes", 2)):
+        (folder / part).mkdir(parents=True)
+        pq.write_table(pa.table({"index": range(rows)}), folder / part / "file-000.parquet")
 
 
 def use_manifest(folder: Path) -> None:
@@ -110,9 +115,6 @@ def use_request(folder: Path) -> None:
 
 
 def infos(folder: Path) -> None:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     write(folder / "meta" / "info.json", LEROBOT_INFO)
     (folder / "meta" / "episodes").mkdir()
     pq.write_table(pa.table({"episode_index": [0, 1]}), folder / "meta" / "episodes" / "file-000.parquet")

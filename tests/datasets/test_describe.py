@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -75,6 +77,20 @@ def test_an_interrupted_drawing_leaves_the_earlier_one_whole(dataset, tmp_path, 
         describe(dataset, tmp_path / "out")
     assert [file.read_bytes() for file in files] == earlier
     assert sorted((tmp_path / "out").iterdir()) == sorted(files)
+
+
+def test_a_full_disk_is_one_sentence(dataset, tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", full)
+    with pytest.raises(MemobenchError, match=r"out cannot be written \(No space left on device; .* free there\): make"):
+        describe(dataset, tmp_path / "out")
+    assert list((tmp_path / "out").iterdir()) == []
+    monkeypatch.undo()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(MemobenchError, match=r"out cannot be written \(Not a directory"):
+        describe(dataset, tmp_path / "file" / "out")
 
 
 def test_without_images_there_is_no_storyboard(make_demo, tmp_path):

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
 import pathlib
+import re
+import resource
 import shutil
 import signal
+import subprocess
 import sys
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
+from pkgutil import resolve_name
 from types import SimpleNamespace
 
 import dill
@@ -54,7 +59,7 @@ def recorded(make_demo, monkeypatch):
 
     def episode(task, settings):
         progress = SimpleNamespace(index=1, steps=1200)
-        told = {"prompt_shown": None, "horizon": 1200, "referent": "fixed", "lost": False}
+        told = {"prompt_shown": None, "horizon": 1200, "referent": "fixed", "lost": False, "fault": None}
         return SimpleNamespace(task=task, progress=progress, **told)
 
     monkeypatch.setattr(recording, "compiled_episode", episode)
@@ -330,6 +335,164 @@ def test_ray_is_asked_for_without_being_there(tasks, recorded, tmp_path, monkeyp
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(MemobenchError, match="executor 'ray' needs ray, which is not installed"):
         run(tasks, tmp_path / "ds", executor="ray")
+
+
+# --- disks ---
+
+KEPT = r"ds cannot be written \(.*are free there\): make room, or name another folder; what is finished stays"
+FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+IN_C = RuntimeError("Can't write data (file write failed: errno = 28, error message = 'No space left on device')")
+"""As HDF5 tells of it, in an error of its own."""
+
+
+@pytest.mark.parametrize("error", [FULL, IN_C], ids=["OSError", "in C"])
+@pytest.mark.parametrize(
+    "place",
+    [
+        "lerobot_memobench.datasets.staging.stage.np.savez_compressed",
+        "lerobot_memobench.datasets.video.VideoWriter.close",
+        "lerobot_memobench.datasets.staging.stage.flush_to_disk",
+        "lerobot_memobench.datasets.lerobot_format.tables.ParquetFiles.write",
+        "lerobot_memobench.datasets.lerobot_format.assembling.write_card",
+    ],
+)
+def test_a_full_disk_is_one_sentence_and_loses_nothing(tasks, recorded, tmp_path, monkeypatch, place, error):
+    """It fills up at the third episode, or when the dataset is made of them; with room the same command goes on."""
+    reference = tree_hash_of_run(tasks, tmp_path / "undisturbed")
+    calls = []
+
+    def full(*args, **kwargs):
+        calls.append(place)
+        if len(calls) > (2 if "savez" in place else 4) or "lerobot_format" in place:
+            raise error
+        return inner(*args, **kwargs)
+
+    module, name = place.rsplit(".", 1)
+    holder = resolve_name(module)
+    inner = getattr(holder, name)
+    recorded.clear()
+    with monkeypatch.context() as patch:
+        patch.setattr(holder, name, full)
+        with pytest.raises(MemobenchError, match=KEPT) as told:
+            run(tasks, tmp_path / "ds")
+    assert "\n" not in str(told.value)
+    assert not is_dataset(tmp_path / "ds")
+    staged = sorted(path.name for path in (tmp_path / "ds" / ".staging" / "episodes").iterdir())
+    assert staged == [f"{number:06d}" for number in range(len(staged))], "and nothing half-made"
+    assert len(staged) >= 2
+    made = len(recorded)
+    run(tasks, tmp_path / "ds")
+    assert len(recorded) - made == 4 - len(staged)
+    assert tree_hash(tmp_path / "ds") == reference
+
+
+def test_a_file_that_may_grow_no_further(tasks, recorded, tmp_path):
+    """The system's own refusal (EFBIG), in the middle of a write."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
+    try:
+        with pytest.raises(MemobenchError, match=r"ds cannot be written \(File too large"):
+            run(tasks, tmp_path / "ds")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert list((tmp_path / "ds" / ".staging" / "episodes").iterdir()) == []
+    assert run(tasks, tmp_path / "ds").exit_status == 0
+
+
+@pytest.fixture
+def disk(tmp_path):
+    """A disk of its own, of half a MiB."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=512k", "tmpfs", folder], capture_output=True)
+    if mounted.returncode:
+        pytest.skip("nothing may be mounted here")
+    yield folder
+    subprocess.run(["umount", folder], check=True)
+
+
+def test_a_real_disk_that_fills_up_and_one_that_is_closed(tasks, recorded, disk, monkeypatch):
+    monkeypatch.setattr(generation, "FRAMES", {"published": {}})
+    monkeypatch.setattr(generation, "check_room", lambda *_: None)  # it would be refused before
+    with pytest.raises(MemobenchError, match=r"ds cannot be written \(No space left on device; .* are free there"):
+        run(tasks, disk / "ds", episodes=40, image_size=64)
+    assert not is_dataset(disk / "ds")
+    subprocess.run(["mount", "-o", "remount,ro", disk], check=True)
+    with pytest.raises(MemobenchError, match=r"ds cannot be written \(Read-only file system"):
+        run(tasks, disk / "ds", episodes=40, image_size=64)
+    subprocess.run(["mount", "-o", "remount,rw,size=64m", disk], check=True)
+    made = len(recorded)
+    run(tasks, disk / "ds", episodes=40, image_size=64)
+    assert 0 < len(recorded) - made < 80, "what was finished is not made again"
+
+
+def test_a_folder_that_cannot_be(tasks, recorded, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(MemobenchError, match=r"ds cannot be written \(Not a directory"):
+        run(tasks, tmp_path / "file" / "ds")
+    assert recorded == []
+
+
+def test_size_and_time_are_told_before_the_first_episode(tasks, recorded, tmp_path, monkeypatch):
+    told = []
+    run(tasks, tmp_path / "ds", tell=lambda said: told.append((len(recorded), said)))
+    ((before, said),) = told
+    assert before == 0
+    assert said.startswith("4 demonstrations of some 1,420 frames, in about 1 min with 1 at a time: about 1.2 MiB in ")
+    assert "2.4 MiB until it is finished" in said
+    assert "MAY NOT" not in said
+    run(tasks, tmp_path / "ds", tell=lambda said: told.append((len(recorded), said)))
+    assert len(told) == 1, "a finished one is only reported"
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1_500_000))
+    run(tasks, tmp_path / "near", tell=lambda said: told.append((len(recorded), said)))
+    assert "1.4 MiB are free there; THAT MAY NOT BE ENOUGH" in told[1][1]
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=500_000))
+    made = len(recorded)
+    with pytest.raises(MemobenchError, match=r"would take about 1\.2 MiB in .*488\.3 KiB are free there: make room"):
+        run(tasks, tmp_path / "far")
+    assert len(recorded) == made
+
+
+def test_the_estimates_are_those_of_the_full_runs():
+    """docs/full_run, with_images and strict_run: the tables of the runs themselves."""
+    docs = Path(__file__).parents[2] / "docs"
+    for suite, run_of in (("published", "full_run"), ("strict", "strict_run")):
+        text = (docs / run_of / "tables.md").read_text()
+        for kind, frames in generation.FRAMES[suite].items():
+            mean = float(re.search(rf"\| {kind} \| here \| \d+ \| \d+ \| [\d,]+ \| ([\d.]+)", text)[1])
+            assert frames == pytest.approx(mean, rel=0.02)
+        each = int(re.search(r"([\d,]+) bytes per frame", text)[1].replace(",", ""))
+        assert generation.run_size(1, ("lerobot",), None) == pytest.approx(each, rel=0.05)
+    each = re.search(r"([\d,]+) bytes per frame", (docs / "with_images" / "tables.md").read_text())[1]
+    assert generation.run_size(1, ("lerobot",), 256) == pytest.approx(int(each.replace(",", "")), rel=0.05)
+
+
+# --- damage ---
+
+
+@pytest.mark.parametrize(
+    ("pattern", "said"),
+    [
+        ("data/**/*.parquet", r"data/chunk-000/file-000\.parquet cannot be read"),
+        ("meta/episodes/**/*.parquet", r"meta/episodes/chunk-000/file-000\.parquet cannot be read"),
+        ("states/**/*.parquet", r"states/chunk-000/file-000\.parquet cannot be read"),
+        ("videos/*wrist_image/**/*.mp4", r"wrist_image/chunk-000/file-000\.mp4 is cut off or damaged at byte"),
+        ("hdf5/task_b*", r"task_b_demo\.hdf5: it is no HDF5 file, or was cut off"),
+    ],
+)
+@pytest.mark.parametrize("how", ["cut", "gone"])
+def test_a_damaged_dataset_is_not_called_finished(tasks, recorded, tmp_path, pattern, said, how):
+    out = tmp_path / "ds"
+    run(tasks, out, formats=("lerobot", "hdf5"))
+    (path,) = out.glob(pattern)
+    if how == "gone":
+        path.unlink()
+        said = "tells of|cannot be read|there is no such file"
+    else:
+        path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(MemobenchError, match=said):
+        run(tasks, out, formats=("lerobot", "hdf5"))
 
 
 SBATCH = """#!/bin/sh

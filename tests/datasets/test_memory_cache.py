@@ -417,3 +417,12 @@ def test_where_nothing_may_be_written_it_says_so(root: Path, monkeypatch: pytest
     with monkeypatch.context() as patched:  # a finished one is read all the same
         patched.setattr("lerobot_memobench.datasets.memory_cache.building.taking_turns", refuse)
         build_memory_cache(root, "test", _Frames(), _Texts())
+
+
+@pytest.mark.parametrize("pattern", ["data/**/*.parquet", "videos/observation.images.image/**/*.mp4"])
+def test_a_damaged_file_of_the_dataset_is_named(root: Path, pattern: str) -> None:
+    path = next(root.glob(pattern))
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(MemobenchError, match=f"{path.name} cannot be read .*the dataset is damaged") as told:
+        build_memory_cache(root, "test", _Frames(), _Texts())
+    assert str(told.value).startswith(f"{path} ")

@@ -41,10 +41,13 @@ def convert(
             upside_down=upside_down,
             workers=workers,
             progress=advance,
+            tell=lambda said: screen.print(said, soft_wrap=True, markup=False),
             **({} if repo_id is None else {"repo_id": repo_id}),
         )
     for problem in summary.problems:
         screen.print(f"left out: {problem}", soft_wrap=True)
+    for note in summary.notes:
+        screen.print(f"note: {note}", soft_wrap=True, markup=False)
     if summary.folder is None:
         screen.print("no dataset was written: nothing could be used")
     else:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import traceback
 from collections.abc import Iterator
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files import disk_refusal
 
 
 def chain(error: BaseException) -> Iterator[BaseException]:
@@ -33,6 +35,11 @@ def one_sentence(error: BaseException) -> str | None:
         return _line(errors[0])  # LeRobot's own words for a missing extra
     if isinstance(errors[0], FileExistsError):
         return _line(errors[0])
+    refusal = disk_refusal(error)
+    if refusal is not None:
+        named = next((found.filename for found in errors if isinstance(found, OSError) and found.filename), None)
+        where = f" {os.fsdecode(named)}" if isinstance(named, str | bytes) else ""
+        return f"the disk does not take{where or ' what is written'} ({refusal}): make room, or name another folder"
     hub = next((found for found in errors if _is_hub_error(found)), None)
     if hub is not None and any(_came_through(found, "lerobot.datasets.") for found in errors):
         return (

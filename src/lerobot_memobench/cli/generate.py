@@ -116,6 +116,7 @@ def generate(
             executor=executor.value,
             executor_options=options,
             progress=advance,
+            tell=lambda said: screen.print(said, soft_wrap=True, markup=False),
             **named,
         )
     _print_summary(summary, out)

@@ -11,11 +11,13 @@ import shlex
 import sys
 import time
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 from lerobot_memobench.cli.errors import one_sentence
 from lerobot_memobench.engine.lerobot_command import call_lerobot
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.jobs.processes import saying_how_to_go_on
+from lerobot_memobench.settings.flags import flag_value
 from lerobot_memobench.settings.lerobot_commands import lerobot_commands
 from lerobot_memobench.settings.reading import check_task_names, read_settings
 from lerobot_memobench.settings.recipes import resolve_recipe
@@ -85,9 +87,11 @@ def train(words: Words, line: Sequence[str]) -> int:
     settings = read_settings("train", words)
     if words.wants_help:
         return call_lerobot("train", settings.flags)
+    from lerobot_memobench.datasets.lerobot_format.info import naming_damage
     from lerobot_memobench.engine.lerobot_training import trained_on
 
     settings = complete_training(settings)
+    root = flag_value(settings.flags, "dataset.root")
     note, left = told_of_going_on(settings)
     if note is not None:
         print(note, file=sys.stderr)
@@ -96,6 +100,7 @@ def train(words: Words, line: Sequence[str]) -> int:
     with (
         saying_how_to_go_on(lambda: f"lerobot: {how_to_go_on(settings, line, begun)}"),
         trained_on(prompt_frames, obs_type),
+        naming_damage(Path(root) if root else None),
     ):
         return call_lerobot("train", settings.flags)
 

@@ -19,6 +19,7 @@ from lerobot_memobench.cli import controls, data, eyes, figures
 from lerobot_memobench.cli.cache import cache
 from lerobot_memobench.cli.demo import demo
 from lerobot_memobench.cli.doctor import doctor
+from lerobot_memobench.cli.errors import one_sentence
 from lerobot_memobench.cli.generate import generate
 from lerobot_memobench.cli.html import html
 from lerobot_memobench.cli.learn import learn
@@ -136,7 +137,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     except Exception as error:
         message: Callable[[], str] | None = getattr(error, "format_message", None)  # click's usage errors
         if message is None:
-            raise
+            sentence = one_sentence(error)
+            if sentence is None:
+                raise
+            print(f"memobench: {sentence}", file=sys.stderr)
+            return USAGE_ERROR
         if type(error).__name__ == "NoArgsIsHelpError":  # a group without a command: its help
             print(message())
             return 0

@@ -7,18 +7,21 @@ dataset to anybody.
 
 from __future__ import annotations
 
+import math
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.generation import check_room, run_size
 from lerobot_memobench.datasets.hdf5.layout import Problem, Unusable, usable_or_named
-from lerobot_memobench.datasets.hdf5.published_task import task_of
-from lerobot_memobench.datasets.hdf5.reading import PublishedFile, find_files
+from lerobot_memobench.datasets.hdf5.published_task import task_of, unlike_the_catalogue
+from lerobot_memobench.datasets.hdf5.reading import PublishedDemo, PublishedFile, find_files
 from lerobot_memobench.datasets.hdf5.restore import NO_SEED, restore
 from lerobot_memobench.datasets.lerobot_format.assembling import assemble
+from lerobot_memobench.datasets.lerobot_format.info import check_whole
 from lerobot_memobench.datasets.lerobot_format.layout import (
     DEFAULT_REPO_ID,
     check_destination,
@@ -26,11 +29,12 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
 )
 from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
 from lerobot_memobench.datasets.manifest import read_manifest
-from lerobot_memobench.datasets.staging.episode import StagedEpisode, StagedJob, staged
+from lerobot_memobench.datasets.staging.episode import LEROBOT, StagedEpisode, StagedJob, staged
 from lerobot_memobench.datasets.staging.folders import STAGING
 from lerobot_memobench.datasets.staging.request import compare_requests, episodes_folder
 from lerobot_memobench.datasets.staging.stage import EpisodeStage, episode_info, stage_failure
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files import telling_of_the_disk
 from lerobot_memobench.jobs.job import ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
 
@@ -43,11 +47,13 @@ class ConversionSummary:
         folder: the dataset, or None when nothing could be converted.
         episodes: how many episodes it has.
         problems: what was left out, and why.
+        notes: what was converted and is another task than the catalogue's of its name.
     """
 
     folder: Path | None
     episodes: int
     problems: tuple[Problem, ...]
+    notes: tuple[Problem, ...] = ()
 
     @property
     def exit_status(self) -> int:
@@ -63,6 +69,7 @@ class ConversionJob(StagedJob):
     group: str
     folder: Path
     image_size: tuple[int, int]
+    frames: int
     upside_down: bool = False
 
     @property
@@ -112,6 +119,7 @@ def convert(
     upside_down: bool = False,
     workers: int = 1,
     progress: ProgressCallback | None = None,
+    tell: Callable[[str], None] = lambda _: None,
 ) -> ConversionSummary:
     """Convert a file in the published layout, or all in a folder, to a LeRobotDataset in the folder ``out``.
 
@@ -122,9 +130,11 @@ def convert(
         upside_down: the images are stored as robosuite's renderer gives them, bottom row first: turn them up.
         workers: processes.
         progress: called after each episode; its ``task_name`` is the file's name, its ``seed`` the group's number.
+        tell: told, before the first episode, about how large the dataset will be.
 
     Raises:
-        MemobenchError: there is nothing to convert, or ``out`` holds something else.
+        MemobenchError: there is nothing to convert, ``out`` holds something else, or its disk has no room (what is
+            finished stays).
     """
     source, out = Path(source).absolute(), Path(out)
     if not source.exists():
@@ -138,49 +148,82 @@ def convert(
         return _finished(out, request)
     check_destination(out)
     staging = out / STAGING
-    with episodes_folder(out, request, f"delete {staging} to start anew or name another folder") as folder:
-        jobs, problems = _plan(files, folder, upside_down)
+    with (
+        telling_of_the_disk(out, "what is finished stays, and the same command goes on from there"),
+        episodes_folder(out, request, f"delete {staging} to start anew or name another folder") as folder,
+    ):
+        jobs, problems, notes = _plan(files, folder, upside_down)
+        _tell_of_the_run(jobs, out, tell)
         run_jobs(jobs, workers=workers, progress=progress, logs=staging / "logs")
         episodes = [staged(job) for job in jobs]
         good = [episode for episode in episodes if episode.failure is None]
         problems += _failures(jobs, episodes)
         problems = _told(problems, files, source)
+        notes = _told(notes, files, source)
         if good:
             assemble(
                 good,
                 out,
                 repo_id=repo_id,
                 made_by=f"Converted by `memobench convert` from {len(files)} HDF5 files in the published layout; "
-                "what they do not hold was read off their states in the simulator.",
-                manifest={"request": request, "left_out": [asdict(problem) for problem in problems]},
+                "what they do not hold was read off their states in the simulator."
+                + "".join(f" {note}." for note in notes),
+                manifest={
+                    "request": request,
+                    "left_out": [asdict(problem) for problem in problems],
+                    **({"notes": [asdict(note) for note in notes]} if notes else {}),
+                },
                 left_out=[str(problem) for problem in problems],
             )
     shutil.rmtree(staging, ignore_errors=True)
     if not any(out.iterdir()):
         out.rmdir()
-    return ConversionSummary(out if good else None, len(good), tuple(problems))
+    return ConversionSummary(out if good else None, len(good), tuple(problems), tuple(notes))
 
 
-def _plan(files: Sequence[Path], folder: Path, upside_down: bool) -> tuple[list[ConversionJob], list[Problem]]:
-    """Return a job per group that looks as it should, and what does not."""
-    usable: list[tuple[Path, str, tuple[int, int]]] = []
+def _plan(
+    files: Sequence[Path], folder: Path, upside_down: bool
+) -> tuple[list[ConversionJob], list[Problem], list[Problem]]:
+    """Return a job per group that looks as it should, what does not, and which tasks are not the catalogue's."""
+    usable: list[tuple[Path, str, tuple[int, int], int]] = []
     problems: list[Problem] = []
+    notes: list[Problem] = []
     for path in files:
         try:
             with PublishedFile(path) as file, usable_or_named():
                 problems += _miscounted(file)
                 for group in file.groups():
                     try:
-                        usable.append((path, group, file.read(group).image_size))
+                        demo = file.read(group)
+                        usable.append((path, group, demo.image_size, len(demo.states)))
+                        notes += _note(file, demo)
                     except Unusable as error:
                         problems.append(Problem(str(path), f"data/{group}", str(error)))
         except Unusable as error:
             problems.append(Problem(str(path), "", str(error)))
     jobs = [
-        ConversionJob(path, group, folder / f"{number:06d}", usable[0][2], upside_down)
-        for number, (path, group, _) in enumerate(usable)
+        ConversionJob(path, group, folder / f"{number:06d}", usable[0][2], frames, upside_down)
+        for number, (path, group, _, frames) in enumerate(usable)
     ]
-    return jobs, problems
+    return jobs, problems, list({(note.file, note.reason): note for note in notes}.values())
+
+
+def _tell_of_the_run(jobs: Sequence[ConversionJob], out: Path, tell: Callable[[str], None]) -> None:
+    """Tell the size of what is to be made, before it is."""
+    missing = [job for job in jobs if not job.folder.exists()]
+    if missing:
+        side = round(math.sqrt(math.prod(jobs[0].image_size)))
+        size, left = (run_size(sum(job.frames for job in some), (LEROBOT,), side) for some in (jobs, missing))
+        check_room(out, size, size - left, tell, f"{len(missing)} demonstrations")
+
+
+def _note(file: PublishedFile, demo: PublishedDemo) -> list[Problem]:
+    """Return in what a demonstration's task is not the catalogue's of its name; nothing where it makes no task."""
+    try:
+        reason = unlike_the_catalogue(task_of(file, demo).variant(0))
+    except MemobenchError:  # named when it is converted
+        return []
+    return [Problem(str(file.path), "", reason)] if reason else []
 
 
 def _miscounted(file: PublishedFile) -> list[Problem]:
@@ -218,13 +261,13 @@ def _finished(out: Path, request: dict[str, Any]) -> ConversionSummary:
     try:
         manifest = read_manifest(out)
         earlier, left_out = manifest["request"], manifest["left_out"]
-        count = len(manifest["episodes"])
+        count, notes = len(manifest["episodes"]), manifest.get("notes", [])
     except (FileNotFoundError, KeyError):
         raise MemobenchError(
             f"{out} already holds a dataset that this command did not make; name another folder"
         ) from None
     compare_requests(earlier, request, f"{out} already holds a finished conversion", "name another folder")
+    check_whole(out)
     shutil.rmtree(out / STAGING, ignore_errors=True)
-    return ConversionSummary(
-        out, count, tuple(Problem(problem["file"], problem["group"], problem["reason"]) for problem in left_out)
-    )
+    told = [tuple(Problem(each["file"], each["group"], each["reason"]) for each in part) for part in (left_out, notes)]
+    return ConversionSummary(out, count, *told)

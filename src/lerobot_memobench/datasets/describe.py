@@ -22,7 +22,7 @@ from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, list_epi
 from lerobot_memobench.datasets.manifest import read_manifest
 from lerobot_memobench.datasets.paper_figures import FAMILIES, LENGTH_BUCKETS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files import draft_of, write_file
+from lerobot_memobench.files import draft_of, telling_of_the_disk, write_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -57,14 +57,15 @@ def describe(folder: Path, out: Path, say: Say = lambda _: None) -> list[Path]:
     if card is None:
         say(EDITED)
         _put_card(folder, rows, say)
-    out.mkdir(parents=True, exist_ok=True)
-    found = [draw_lengths(rows, out / LENGTHS_FIGURE)]
-    if board is not None:
-        found.append(out / STORYBOARD_FIGURE)
-        with draft_of(found[-1]) as draft:
-            board.save(draft, quality=88, optimize=True)
-    found.append(write_file(out / TABLES_FILE, tables))
-    found.append(write_file(out / MANIFEST_FILE, short_manifest(manifest)))
+    with telling_of_the_disk(out):
+        out.mkdir(parents=True, exist_ok=True)
+        found = [draw_lengths(rows, out / LENGTHS_FIGURE)]
+        if board is not None:
+            found.append(out / STORYBOARD_FIGURE)
+            with draft_of(found[-1]) as draft:
+                board.save(draft, quality=88, optimize=True)
+        found.append(write_file(out / TABLES_FILE, tables))
+        found.append(write_file(out / MANIFEST_FILE, short_manifest(manifest)))
     return found
 
 

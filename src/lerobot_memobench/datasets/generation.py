@@ -10,7 +10,8 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Collection, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
@@ -20,8 +21,11 @@ from typing import Any
 from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR
 
 from lerobot_memobench.datasets.generation_summary import GenerationSummary, summarise
+from lerobot_memobench.datasets.hdf5.layout import SUFFIX, Unusable
+from lerobot_memobench.datasets.hdf5.reading import PublishedFile
 from lerobot_memobench.datasets.lerobot_format.assembling import assemble
 from lerobot_memobench.datasets.lerobot_format.card import SCRIPTED
+from lerobot_memobench.datasets.lerobot_format.info import check_whole
 from lerobot_memobench.datasets.lerobot_format.layout import (
     DEFAULT_REPO_ID,
     HDF5_FOLDER,
@@ -34,10 +38,11 @@ from lerobot_memobench.datasets.staging.episode import FORMATS, HDF5, LEROBOT, s
 from lerobot_memobench.datasets.staging.folders import STAGING
 from lerobot_memobench.datasets.staging.request import compare_requests, episodes_folder
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.files import file_hash
+from lerobot_memobench.files import file_hash, file_name, free_bytes, in_words, telling_of_the_disk
 from lerobot_memobench.jobs.executors import Needs, check_executor, options_told
 from lerobot_memobench.jobs.job import ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
+from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.tasks.task import Task, referent_told
 
 WEIGHTS = "model.safetensors"
@@ -68,6 +73,7 @@ def generate(
     resume: bool = True,
     repo_id: str = DEFAULT_REPO_ID,
     progress: ProgressCallback | None = None,
+    tell: Callable[[str], None] = lambda _: None,
 ) -> GenerationSummary:
     """Make ``episodes`` demonstrations of each task (with a prompt: ``prompted_episodes``) into the folder ``out``.
 
@@ -81,9 +87,12 @@ def generate(
     ``executor`` says where ``workers`` episodes at a time are made (`jobs.executors`); it changes nothing of
     the result. On Slurm the call returns when the jobs are submitted, the last of which writes the dataset.
 
+    ``tell`` is told, before the first episode, about how large the dataset will be and how long it will take.
+
     Raises:
-        MemobenchError: nothing to do, ``out`` holds something else, another run is writing there, or an
-            episode could not be run at all (which no later run would change).
+        MemobenchError: nothing to do, ``out`` holds something else or a damaged dataset, another run is writing there,
+            its disk has no room (what is finished stays), or an episode could not be run at all (which no later run
+            would change).
     """
     out = Path(out)
     most = episodes if prompted_episodes is None else prompted_episodes
@@ -103,8 +112,12 @@ def generate(
         return _finished(out, plan)
     check_destination(out)
     advice = "pass resume=false to start anew or name another folder"
-    with episodes_folder(out, plan.request, advice, anew=not resume) as folder:
+    with (
+        telling_of_the_disk(out, "what is finished stays, and the same command goes on from there"),
+        episodes_folder(out, plan.request, advice, anew=not resume) as folder,
+    ):
         jobs = plan.jobs(folder)
+        _tell_of_the_run(plan, jobs, out, workers, tell)
         complete = run_jobs(
             jobs,
             workers=workers,
@@ -117,6 +130,64 @@ def generate(
         if not complete:
             return GenerationSummary(None, summarise([], tasks, out).tasks, submitted=True)
         return _assemble(plan, jobs, out, repo_id)
+
+
+FRAMES = {
+    "published": {"temporal": 390, "spatial": 570, "object": 320, "procedural": 730},
+    "strict": {"temporal": 530, "spatial": 860, "object": 330, "procedural": 750},
+}
+"""Frames of a demonstration, prompt included, on average over the full runs (docs/demonstrations.md)."""
+FRAME_BYTES, PICTURES_BYTES, HDF5_BYTES = 800, 5_400, 130_000
+"""Of a frame in a LeRobotDataset without pictures; of both cameras' videos and of lossless pictures, at 256 × 256."""
+FRAME_SECONDS, PICTURES_SECONDS = 0.0045, 0.011
+"""Of one core: to make a frame, and to draw and encode both cameras at 256 × 256."""
+
+
+def run_size(frames: int, formats: Collection[str], image_size: int | None) -> int:
+    """Return about how many bytes so many frames take; ``image_size`` is None without pictures."""
+    area = 0.0 if image_size is None else (image_size / 256) ** 2
+    lerobot = (FRAME_BYTES + PICTURES_BYTES * area) * (LEROBOT in formats)
+    return round(frames * (lerobot + HDF5_BYTES * area * (HDF5 in formats)))
+
+
+def check_room(out: Path, size: int, there: int, tell: Callable[[str], None], what: str) -> None:
+    """Tell what a run will take of the disk, and refuse one that cannot fit.
+
+    Finished episodes stand beside the dataset that is made of them until it is whole, so at its end a run needs twice
+    its size.
+
+    Args:
+        out: its destination. size: of the dataset, about. there: bytes of it that are staged already.
+        what: begins the sentence: how much will be made.
+
+    Raises:
+        MemobenchError: not even one copy has room.
+    """
+    free, most = free_bytes(out), max(2 * size - there, 0)
+    told = f"about {in_words(size)} in {out}, {in_words(most)} until it is finished; {in_words(free)} are free there"
+    if free < size - there:
+        raise MemobenchError(f"{what} would take {told}: make room, name a folder on another disk, or ask for less")
+    warning = "; THAT MAY NOT BE ENOUGH: a full disk ends the run, and the same command then goes on" * (free < most)
+    tell(f"{what}: {told}{warning}")
+
+
+def _tell_of_the_run(
+    plan: _Plan, jobs: Sequence[RecordingJob], out: Path, workers: int, tell: Callable[[str], None]
+) -> None:
+    """Tell size and time of what is to be made, before it is."""
+    missing = [job for job in jobs if not job.folder.exists()]
+    if not missing:
+        return
+    pictures = plan.settings.image_size if plan.settings.images else None
+    frames, left = (
+        sum(FRAMES[job.task.suite].get(job.task.memory_type, 600) for job in some) for some in (jobs, missing)
+    )
+    seconds = left * (FRAME_SECONDS + PICTURES_SECONDS * ((pictures or 0) / 256) ** 2)
+    minutes = seconds / 60 / max(min(workers, cores()), 1)
+    time = f"{minutes / 60:.1f} hours" if minutes > 90 else f"{max(round(minutes), 1)} min"
+    size = run_size(frames, plan.formats, pictures)
+    what = f"{len(missing)} demonstrations of some {left:,} frames, in about {time} with {workers} at a time"
+    check_room(out, size, size - run_size(left, plan.formats, pictures), tell, what)
 
 
 def episodes_of(task: Task, episodes: int, prompted_episodes: int | None) -> int:
@@ -261,8 +332,28 @@ def _finished(out: Path, plan: _Plan) -> GenerationSummary:
     request = plan.request
     earlier = {**earlier, "versions": request["versions"]}  # a finished dataset stays valid under newer versions
     compare_requests(earlier, request, f"{out} already holds a finished dataset", "name another folder")
+    _check_finished(out, plan, manifest)
     shutil.rmtree(out / STAGING, ignore_errors=True)
     return summarise(manifest["episodes"], plan.tasks, out)
+
+
+def _check_finished(out: Path, plan: _Plan, manifest: dict[str, Any]) -> None:
+    """Raise where a finished dataset has been damaged since, as far as can be told without reading all of it."""
+    if LEROBOT in plan.formats:
+        check_whole(out)
+    if HDF5 in plan.formats:
+        made = Counter(row["task_name"] for row in manifest["episodes"] if row["failure"] is None)
+        for name, count in made.items():
+            path = out / HDF5_FOLDER / f"{file_name(name, 'a task in the manifest')}{SUFFIX}"
+            try:
+                with PublishedFile(path) as file:
+                    there = len(file.groups())
+            except Unusable as error:
+                raise MemobenchError(f"{path}: {error}; delete {out} and generate again") from None
+            if there != count:
+                raise MemobenchError(
+                    f"{path} has {there} demonstrations, the manifest {count}; delete {out} and generate again"
+                )
 
 
 def policy_told(checkpoint: str) -> str:

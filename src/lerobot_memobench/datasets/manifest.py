@@ -46,6 +46,7 @@ class Manifest(TypedDict):
     episodes: list[Made | Failed]
     request: NotRequired[dict[str, Any]]
     left_out: NotRequired[list[LeftOut]]
+    notes: NotRequired[list[LeftOut]]
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:

@@ -45,6 +45,31 @@ def task_of(file: PublishedFile, demo: PublishedDemo) -> Task:
     return task.variant(int(demo.extras.get("variant", 0))) if ours is not None else task
 
 
+def unlike_the_catalogue(task: Task) -> str | None:
+    """Return in what a task differs from the catalogue's of its name, which everything else finds by that name.
+
+    None where it is the same, or the catalogue has none.
+    """
+    if task.name not in task_names(suite=None):
+        return None
+    known = get_task(task.name)
+    parts = {
+        "memory type": task.memory_type == known.memory_type,
+        "instruction": task.language == known.language,
+        "objects": (task.objects, task.fixtures) == (known.objects, known.fixtures),
+        "placement": (task.regions, set(task.init)) == (known.regions, set(known.init)),
+        "goal": task.goal == known.goal,
+        "checkpoints": task.checkpoints == known.checkpoints,
+    }
+    differs = [name for name, same in parts.items() if not same]
+    if not differs:
+        return None
+    return (
+        f"not as the catalogue's {task.name}: {', '.join(differs)}; the dataset holds the file's, but `lerobot eval` "
+        "and `memobench validate` know the catalogue's by that name"
+    )
+
+
 def task_name(file: PublishedFile) -> str:
     """Return the task's name: the folder of ``bddl_file_name``, or its stem, or the HDF5 file's."""
     path = PurePosixPath(file.bddl_name.replace("\\", "/"))

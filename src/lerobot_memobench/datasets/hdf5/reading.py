@@ -68,6 +68,7 @@ class PublishedFile:
             if not isinstance(data, h5py.Group):
                 raise Unusable(f"it has no group 'data' (found {', '.join(self._file) or 'nothing'})")
             self._data: h5py.Group = data
+            _check_layout(data)
             self.bddl_name = text_attribute(data, "bddl_file_name", required=True)
             self.bddl_text = text_attribute(data, "bddl_file_content", required=True)
         except Unusable:
@@ -166,6 +167,25 @@ class PublishedFile:
         """Return both cameras' pictures at ``frames``, ascending numbers (n,): (n, H, W, 3) uint8 each."""
         obs = self._data[group]["obs"]
         return {camera: obs[name][list(frames)] for camera, name in IMAGE_NAMES.items()}
+
+
+def _check_layout(data: h5py.Group) -> None:
+    """Say of a file of LIBERO or robomimic, whose layouts are near to the published one, what it lacks."""
+    import h5py
+
+    first = next((data[name] for name in data if demo_number(name) is not None), None)
+    obs = first.get("obs") if isinstance(first, h5py.Group) else None
+    if first is None or not isinstance(obs, h5py.Group) or "meta_data" in first.attrs:
+        return
+    lacks = [f"the attribute {key!r}" for key in ("bddl_file_name", "bddl_file_content") if key not in data.attrs]
+    lacks += [f"the array 'obs/{name}'" for name in IMAGE_NAMES.values() if name not in obs]
+    layout = "LIBERO's" if "agentview_rgb" in obs else "robomimic's" if "env_args" in data.attrs else None
+    if layout is not None:
+        raise Unusable(
+            f"it is in {layout} layout, which lacks {', '.join(['the checkpoints (meta_data)', *lacks])}: nothing says "
+            "what has to be remembered; train on it by LeRobot's own datasets, or describe its task as "
+            "docs/develop/add_a_task.md says"
+        )
 
 
 def _check_length(group: h5py.Group, arrays: Mapping[str, h5py.Dataset]) -> None:

@@ -6,11 +6,13 @@ LeRobot's dataset tools may have edited it since; what they leave is read from t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from operator import index
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lerobot_memobench.datasets.lerobot_format.info import undamaged
 from lerobot_memobench.datasets.lerobot_format.layout import EXECUTED_ACTION, OBJECTS, PRIVILEGED, is_dataset
 from lerobot_memobench.datasets.lerobot_format.record import EPISODE_INFO, EpisodeRecord, from_frames, from_meta
 from lerobot_memobench.datasets.lerobot_format.tables import LANGUAGE
@@ -165,7 +167,7 @@ def _name_tasks(root: Path, columns: Columns) -> None:
     from lerobot.datasets.io_utils import load_tasks
 
     tasks = load_tasks(root)
-    names = {int(number): str(text) for text, number in zip(tasks.index, tasks["task_index"].tolist(), strict=True)}
+    names = {index(number): str(text) for text, number in zip(tasks.index, tasks["task_index"].tolist(), strict=True)}
     columns["task"] = [names.get(int(number), "") for number in columns.pop("task_index")]
 
 
@@ -194,8 +196,9 @@ def _read(folder: Path, names: tuple[str, ...], chosen: list[tuple[str, str, int
 
     tables = []
     for path in sorted(folder.rglob("*.parquet")):
-        there = set(pq.read_schema(path).names)
-        tables.append(pq.read_table(path, columns=[name for name in names if name in there], filters=chosen))
+        with undamaged(path):
+            there = set(pq.read_schema(path).names)
+            tables.append(pq.read_table(path, columns=[name for name in names if name in there], filters=chosen))
     if not tables:
         raise MemobenchError(f"{folder} holds no parquet file: the dataset is not whole; fetch or generate it again")
     return pa.concat_tables(tables, promote_options="permissive")

@@ -23,9 +23,9 @@ from lerobot_memobench.datasets.memory_cache.layout import (
     slot_starts,
     texts_file,
 )
-from lerobot_memobench.datasets.memory_cache.room import free_bytes, in_words, reserve, telling_of_the_disk
+from lerobot_memobench.datasets.memory_cache.room import reserve, telling_of_the_disk
 from lerobot_memobench.datasets.memory_cache.tables import TextEncoder, add_embeddings, write_meta, write_tables
-from lerobot_memobench.files import remove_drafts, write_file
+from lerobot_memobench.files import free_bytes, in_words, remove_drafts, write_file
 from lerobot_memobench.jobs.locking import taking_turns
 from lerobot_memobench.jobs.threads import cores
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from lerobot_memobench.datasets.lerobot_format.info import undamaged
 from lerobot_memobench.errors import MemobenchError
 
 if TYPE_CHECKING:
@@ -49,8 +50,9 @@ def _video_reader(root: Path, camera: str, meta: LeRobotDatasetMetadata) -> Fram
             row = meta.episodes[episode]
             path = root / meta.get_video_file_path(episode, camera)
         start = row[f"videos/{camera}/from_timestamp"]
-        images = decode(path, [start + number / meta.fps for number in numbers])
-        return images.reshape(len(numbers), channels, height, width)
+        with undamaged(path):
+            images = decode(path, [start + number / meta.fps for number in numbers])
+            return images.reshape(len(numbers), channels, height, width)
 
     return read
 

@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from lerobot_memobench.datasets.lerobot_format.info import undamaged
 from lerobot_memobench.errors import MemobenchError
 
 LEVEL_COLUMNS = {"coarse": "coarse_subgoal", "intermediate": "simple_subgoal", "fine": "grounded_subgoal"}
@@ -68,9 +69,13 @@ def _read_columns(root: Path, optional: list[str]) -> pa.Table:
     files = sorted((root / "data").rglob("*.parquet"))
     if not files:
         raise MemobenchError(f"{root} holds no frames: there is no parquet file below {root / 'data'}.")
-    present = pq.read_schema(files[0]).names
+    with undamaged(files[0]):
+        present = pq.read_schema(files[0]).names
     columns = [*_PLACE, *(name for name in optional if name in present)]
-    tables = [pq.read_table(path, columns=columns) for path in files]
+    tables = []
+    for path in files:
+        with undamaged(path):
+            tables.append(pq.read_table(path, columns=columns))
     return pa.concat_tables(tables, promote_options="permissive").sort_by("index")
 
 

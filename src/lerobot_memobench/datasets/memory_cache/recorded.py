@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
+from lerobot_memobench.datasets.lerobot_format.info import undamaged
 from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS, objects_column
 from lerobot_memobench.datasets.memory_cache.frame_table import FrameTable, read_frame_table, resolve_subgoals
 from lerobot_memobench.datasets.memory_cache.layout import FORMAT, CacheMeta, slot_starts
@@ -99,10 +100,12 @@ def read_recorded(root: Path, names: Sequence[str]) -> tuple[dict[str, Tensor], 
     frames = int(table.episodes[-1])
     columns: dict[str, np.ndarray] = {}
     for path in sorted((root / "data").rglob("*.parquet")):
-        there = pq.read_schema(path).names
+        with undamaged(path):
+            there = pq.read_schema(path).names
         column_of = {name: objects_column(there) if name == OBJECTS else name for name in names}
         _require(root, list(column_of.values()), there)
-        part = pq.read_table(path, columns=sorted({"index", *column_of.values()}))
+        with undamaged(path):
+            part = pq.read_table(path, columns=sorted({"index", *column_of.values()}))
         places = part.column("index").to_numpy()
         for name in names:
             numbers = _numbers(part.column(column_of[name]))

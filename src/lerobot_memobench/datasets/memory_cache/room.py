@@ -5,32 +5,15 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
-import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from lerobot_memobench.datasets.memory_cache.layout import TOKENS_FILE
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files import FULL, free_bytes, in_words
 
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _CLOSED = (errno.EACCES, errno.EPERM, errno.EROFS)
 _ELSEWHERE = "put it elsewhere (`memobench cache --out`, --policy.memory_cache_dir)"
-
-
-def in_words(size: int) -> str:
-    """Return bytes as people say them: ``45.8 GiB``."""
-    number, units = float(size), ["B", "KiB", "MiB", "GiB", "TiB"]
-    while number >= 1024 and len(units) > 1:
-        number /= 1024
-        del units[0]
-    return f"{number:.1f} {units[0]}" if units[0] != "B" else f"{size} B"
-
-
-def free_bytes(folder: Path) -> int:
-    """Return how much may still be written to a folder, or to what it will lie in."""
-    while not folder.exists():
-        folder = folder.parent
-    return shutil.disk_usage(folder).free
 
 
 def reserve(path: Path, size: int) -> None:
@@ -85,7 +68,7 @@ def telling_of_the_disk(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno in _FULL:
+        if error.errno in FULL:
             raise no_room(folder, f"it is full ({error.strerror})") from error
         if error.errno in _CLOSED and error.filename is not None and _is_of(Path(error.filename), folder):
             raise MemobenchError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 from collections.abc import Collection, Mapping
@@ -83,10 +84,10 @@ class EpisodeStage:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for video in self._videos.values():
-            video.abandon()
-        if self._hdf5 is not None:
-            self._hdf5.abandon()
+        abandoned = [*self._videos.values(), *([] if self._hdf5 is None else [self._hdf5])]
+        for file in abandoned:
+            with contextlib.suppress(Exception):  # on a full disk closing fails as well, and all of it is deleted
+                file.abandon()
         shutil.rmtree(self._temporary, ignore_errors=True)
 
     def add_images(self, images: Mapping[str, NDArray[np.uint8]]) -> None:
@@ -162,7 +163,11 @@ def stage_demonstration(demo: Demonstration, folder: Path, formats: Collection[s
 def stage_failure(info: dict[str, Any], reason: str, folder: Path) -> StagedEpisode:
     """Remember that a seed has no demonstration, so that a resumed run reports it as well."""
     record = {"failure": reason, "info": info, "language_persistent": [], "image_stats": {}}
-    return _publish(temporary_folder(folder), folder, record)
+    temporary = temporary_folder(folder)
+    try:
+        return _publish(temporary, folder, record)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _publish(temporary: Path, folder: Path, record: dict[str, Any]) -> StagedEpisode:

@@ -28,9 +28,10 @@ from lerobot_memobench.datasets.memory_cache import (
     find_cache,
     read_recorded,
 )
-from lerobot_memobench.datasets.memory_cache.room import in_words, require_room
+from lerobot_memobench.datasets.memory_cache.room import require_room
 from lerobot_memobench.envs.prompting import name_in_data
 from lerobot_memobench.eyes.tower import GRID, POOLED, WIDTH
+from lerobot_memobench.files import in_words
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.perception.eyes import EyePerception, seen_key
 from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_PHASE, OBS_RAW_STATE
