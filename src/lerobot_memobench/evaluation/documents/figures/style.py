@@ -46,7 +46,7 @@ OUTCOMES: dict[str, Look] = {
     "compression_collapse": Look(OPERATION_COLOURS["C"], "...."),
     "reference_drift": Look("#f0e442", "||||"),
     "execution_failure": Look("#d55e00", "xxxx"),
-    "wrong_order": Look("#882255", "\\\\||"),
+    "wrong_order": Look("#c2a878", "\\\\||"),
     "cut_off": Look("#bdbdbd", "--"),
     "miscount": Look("#cc79a7", "++++"),
     "wrong_place": Look("#8a8a8a", "oooo"),
