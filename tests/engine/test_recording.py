@@ -68,7 +68,7 @@ def test_what_is_recorded_is_what_the_policy_did(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("bad", "step"), [(np.nan, 2), (None, 1)])
-def test_nothing_is_kept_of_an_episode_that_was_cut_off(
+def test_nothing_is_kept_of_an_episode_that_was_broken_off(
     bad: float | None, step: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The first batch's second action holds NaN, or its first is of another shape; the second batch goes on."""

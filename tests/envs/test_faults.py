@@ -96,7 +96,7 @@ def test_an_action_that_is_none_ends_its_episode_alone(
     assert [failure_of(record) == "invalid_action" for record in records] == cut
     notes = read_rollouts(tmp_path)[1]
     assert len(notes) == 1
-    assert f"{sum(cut)} rollouts were cut off and count as failed" in notes[0]
+    assert f"{sum(cut)} rollouts were broken off and count as failed" in notes[0]
     assert words in notes[0]
     assert json.loads(json.dumps(write_report(tmp_path)[0].failures))["invalid_action"] == sum(cut)
     assert words.replace("(", "") in (tmp_path / "report.md").read_text().replace("(", "")

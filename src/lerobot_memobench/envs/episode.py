@@ -35,7 +35,7 @@ one of them grasped at the fifth try in more than 1000."""
 
 
 class Fault(NamedTuple):
-    """What cut an execution off: one of `tasks.failures.FAULTS`, and why in a sentence."""
+    """What broke an execution off: one of `tasks.failures.FAULTS`, and why in a sentence."""
 
     failure: str
     why: str
@@ -59,7 +59,7 @@ class Episode:
         exec_start: the frame at which execution began; None during the prompt.
         progress: checkpoints and goal, counted in execution steps.
         applied_action: the action (7,) float32 that really moved the arm in the last step.
-        fault: what cut the execution off; None as long as nothing has.
+        fault: what broke the execution off; None as long as nothing has.
     """
 
     def __init__(

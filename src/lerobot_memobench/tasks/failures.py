@@ -32,7 +32,7 @@ REFINED_FAILURES = (WRONG_ORDER, CUT_OFF)
 
 INVALID_ACTION, UNSTABLE_PHYSICS = "invalid_action", "unstable_physics"
 FAULTS = (INVALID_ACTION, UNSTABLE_PHYSICS)
-"""What cuts a rollout off that tells nothing of a memory: an action that is none, and physics that broke down."""
+"""What breaks a rollout off and tells nothing of a memory: an action that is none, and physics that broke down."""
 
 _BY_OPERATION = {"S": "storage_failure", "U": "stale_memory", "C": "compression_collapse"}
 

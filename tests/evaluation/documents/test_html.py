@@ -121,7 +121,7 @@ def test_rollouts_carry_what_the_timeline_needs(tmp_path: Path) -> None:
     assert episode["video"] == "videos/a.mp4"
 
 
-def test_what_cut_a_rollout_off_is_told(tmp_path: Path) -> None:
+def test_what_broke_a_rollout_off_is_told(tmp_path: Path) -> None:
     evaluation(
         tmp_path, [record(success=False, failure="unstable_physics", fault="the physics broke down"), record(episode=1)]
     )

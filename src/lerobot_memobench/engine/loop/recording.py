@@ -71,7 +71,7 @@ class Recorder:
         success: NDArray[np.bool_],
         done: NDArray[np.bool_],
         tasks: Sequence[str],
-        cut: NDArray[np.bool_],
+        broken: NDArray[np.bool_],
     ) -> None:
         """Append one control step of each row whose episode runs; all arrays have the rows first.
 
@@ -79,7 +79,7 @@ class Recorder:
             observation: the environment's, before the action.
             done: whether the row's episode ends by this step.
             tasks: instruction of each row.
-            cut: whether this step cut the row's episode off: of such an episode nothing is kept.
+            broken: whether this step broke the row's episode off: of such an episode nothing is kept.
         """
         for row, dataset in enumerate(self._datasets):
             if self._over[row]:
@@ -87,7 +87,7 @@ class Recorder:
             if not dataset.has_pending_frames() and done[row]:
                 self._over[row] = True  # an episode that the log held already: it rests, and ends at its first step
                 continue
-            if cut[row]:
+            if broken[row]:
                 dataset.clear_episode_buffer()
                 self._over[row] = True
                 continue

@@ -108,8 +108,8 @@ def _roll(env: Any, policy: Any, settings: dict[str, Any], quiet: bool) -> dict[
             done = terminated | truncated | done | (len(steps) + 1 == limit)
             ever = ever | success
             if recorder is not None:
-                cut = np.broadcast_to(info.get("_fault", False), done.shape)  # gymnasium's mark of a row that tells it
-                recorder.add(before, action, reward, success, done, seen["task"], cut)
+                broken = np.broadcast_to(info.get("_fault", False), done.shape)  # gymnasium's mark of rows that tell it
+                recorder.add(before, action, reward, success, done, seen["task"], broken)
             steps.append((action, reward, success, done))
             bar.set_postfix({"running_success_rate": f"{ever.mean() * 100:.1f}%"}, refresh=False)
             bar.update()

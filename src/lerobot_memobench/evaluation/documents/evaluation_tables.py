@@ -103,8 +103,8 @@ FURTHER_NOTES = {
     "cut_off": " Cut off: the horizon is shorter than the protocol's 1,200 steps, so nobody knows what was remembered.",
     "miscount": " Miscount: the event was done too seldom or too often.",
     "wrong_place": " Wrong place: the thing was looked for where it is not.",
-    "invalid_action": " Invalid action: one of another shape, or not finite, cut the rollout off.",
-    "unstable_physics": " Unstable physics: MuJoCo warned of its own state, which cut the rollout off.",
+    "invalid_action": " Invalid action: one of another shape, or not finite, broke the rollout off.",
+    "unstable_physics": " Unstable physics: MuJoCo warned of its own state, which broke the rollout off.",
 }
 """Classes that not every evaluation has -> what the table says of them."""
 

@@ -77,13 +77,13 @@ def mixtures(records: Iterable[Record]) -> list[str]:
 
 
 def faults(records: Iterable[Record]) -> list[str]:
-    """Return a sentence for each task of which rollouts were cut off, and so failed, with the first of the reasons."""
+    """Return a sentence for each task of which rollouts were broken off, and so failed, with the first reason."""
     found: dict[str, list[Record]] = {}
     for record in records:
         if record.get("fault"):
             found.setdefault(record["task"], []).append(record)
     return [
-        f"{task}: {len(group)} rollouts were cut off and count as failed, the first in episode {group[0]['episode']}: "
-        f"{group[0]['fault']}"
+        f"{task}: {len(group)} rollouts were broken off and count as failed, the first in episode "
+        f"{group[0]['episode']}: {group[0]['fault']}"
         for task, group in found.items()
     ]

@@ -92,7 +92,7 @@ def check_one_suite(records: Mapping[Path, Sequence[Record]]) -> None:
 
 def read_rollouts(folder: str | Path) -> tuple[list[dict[str, Any]], list[str]]:
     """Return the rollouts of an evaluation, and what a reader must know: unreadable lines, what was not run or
-    was cut off, mixed protocols.
+    was broken off, mixed protocols.
 
     Raises:
         MemobenchError: there are none.
