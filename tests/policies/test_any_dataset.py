@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
 
+from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.engine.lerobot_command import call_lerobot
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem
@@ -266,6 +268,26 @@ def test_history_without_reset_is_bounded(caplog: pytest.LogCaptureFixture, monk
     for slot in (3, 15, 16, 49):  # as in training
         wanted = MemoryMechanism.recall(mechanism, Episode(), slot)
         assert [frame.step for frame in mechanism.recall(Episode(), slot)] == [frame.step for frame in wanted]
+
+
+# --- the benchmark between updates ---
+
+
+@pytest.mark.parametrize(
+    ("robot", "said"),
+    [
+        (Foreign({IMAGES + "image": (128, 128)}, state=8, action=7), "of 128 x 128 pixels .* shows 256 x 256"),
+        (Foreign({IMAGES + "image": (256, 256)}, state=8, action=6), "acts by action of 6 numbers"),
+        (Foreign({IMAGES + "front": (256, 256)}, state=8, action=7), "sees observation.images.front, and the"),
+    ],
+)
+def test_what_is_trained_on_something_else_is_not_evaluated_here_between_updates(
+    robot: Foreign, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = robot.write(tmp_path / "data", length=3)
+    words = ("policy=act", "policy.pretrained_backbone_weights=null", "env=memobench", "steps=1", "device=cpu")
+    assert main(["train", *words, f"dataset={root}", f"output_dir={tmp_path / 'run'}"]) == 2
+    assert re.search(f"the policy that learns from {root} .*{said}", capsys.readouterr().err)
 
 
 # --- another environment of LeRobot's ---

@@ -256,6 +256,13 @@ def head_of(file: Path, shapes: Mapping[str, tuple[int, ...]]) -> None:
         out.truncate(out.tell() + end)
 
 
+def test_weights_of_a_repository_are_asked_for_where_lerobot_goes_on_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    with pytest.raises(MemobenchError, match=r"nobody/pi holds no weights .* pi05 would go on with random ones"):
+        check_weights("nobody/pi", config("pi05"))
+    check_weights("nobody/act", config())  # LeRobot refuses it by itself
+
+
 # --- forms of earlier versions ---
 
 

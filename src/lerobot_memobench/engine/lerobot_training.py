@@ -8,12 +8,14 @@ them as objects, and LeRobot would give both to its own policies.
 
 from __future__ import annotations
 
+import copy
 import functools
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from lerobot.configs import FeatureType
 from lerobot.utils.constants import OBS_STATE
 
 from lerobot_memobench.datasets.execution_frames import ExecutionFrames, leave_out_prompts
@@ -23,6 +25,7 @@ from lerobot_memobench.envs.obs_types import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.envs.prompting import knows_phases
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.lerobot_hooks import OPEN_DATASETS, check_version, install
+from lerobot_memobench.policies.shown import check_features
 
 logger = logging.getLogger(__name__)
 
@@ -65,6 +68,7 @@ def _steered(make: Callable[..., Any], prompt_frames: bool | None, obs_type: str
             for dataset in (train, held_out):
                 _take_for_input(dataset)
         _choose_inputs(config.policy, train.meta.features, obs_type)
+        _check_environment(config, train)
         wanted = config.policy is None or knows_phases(config.policy) if prompt_frames is None else prompt_frames
         if not wanted:
             count = leave_out_prompts(train)
@@ -116,9 +120,26 @@ def _take_for_input(dataset: Any) -> None:
             setattr(holder, name, {**deltas, INPUT: deltas[OBS_STATE]})
 
 
+def _check_environment(config: Any, dataset: Any) -> None:
+    """Refuse to evaluate between updates on the benchmark what is trained on other cameras, numbers or sizes."""
+    from lerobot.envs.utils import env_to_policy_features
+    from lerobot.utils.feature_utils import dataset_to_policy_features
+
+    environment = getattr(config, "env", None)
+    if config.policy is None or getattr(environment, "type", None) != "memobench":
+        return
+    unseen = None if getattr(config.policy, "sees_pictures", True) else FeatureType.VISUAL
+    features = dataset_to_policy_features(dataset.meta.features)
+    policy = copy.copy(config.policy)
+    policy.output_features = {key: one for key, one in features.items() if one.type is FeatureType.ACTION}
+    policy.input_features = policy.input_features or {
+        key: one for key, one in features.items() if one.type not in (FeatureType.ACTION, unseen)
+    }
+    check_features(f"that learns from {dataset.root}", policy, env_to_policy_features(environment), config.rename_map)
+
+
 def _choose_inputs(policy: Any, features: dict[str, Any], obs_type: str | None) -> None:
     """Tell a policy's configuration what it sees, as LeRobot would from all that a dataset holds."""
-    from lerobot.configs import FeatureType
     from lerobot.utils.feature_utils import dataset_to_policy_features
 
     if policy is None or policy.input_features or knows_phases(policy):

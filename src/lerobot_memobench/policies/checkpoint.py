@@ -19,6 +19,8 @@ WEIGHTS_FILE = "model.safetensors"
 ADAPTER_FILE = "adapter_model.safetensors"
 PREPROCESSOR_FILE = "policy_preprocessor.json"
 POSTPROCESSOR_FILE = "policy_postprocessor.json"
+GO_ON_WITHOUT = ("pi0", "pi05", "pi0_fast")
+"""Policies of LeRobot's that act with random weights where they find none."""
 ADVICE = "copy or train the checkpoint again"
 SHIPPED = Path(__file__).parent / "shipped"
 """Folder of the trained policies that come with the package, each in a folder of its name."""
@@ -162,14 +164,20 @@ def check_weights(path: str, policy: PreTrainedConfig) -> None:
     from the hub) and the project's own, which load exactly, are left to themselves.
 
     Args:
-        path: a checkpoint folder; of a repository nothing is asked. policy: its configuration.
+        path: a checkpoint folder, or a repository, whose weights are fetched now. policy: its configuration.
 
     Raises:
         MemobenchError: weights are missing, or have other shapes.
     """
-    folder = Path(path).expanduser()
-    file = folder / WEIGHTS_FILE
-    if not file.is_file() or policy.use_peft or type(policy).__module__.partition(".")[0] == __name__.partition(".")[0]:
+    if policy.use_peft or type(policy).__module__.partition(".")[0] == __name__.partition(".")[0]:
+        return
+    file = _file_of(path, WEIGHTS_FILE)
+    if file is None:
+        if policy.type in GO_ON_WITHOUT:
+            raise MemobenchError(
+                f"the checkpoint {path} holds no weights ({WEIGHTS_FILE}), or they cannot be fetched, and LeRobot's "
+                f"{policy.type} would go on with random ones; copy or train it again"
+            )
         return
     found = _shapes(file)
     built = _built_empty(policy)
@@ -187,7 +195,7 @@ def check_weights(path: str, policy: PreTrainedConfig) -> None:
     wrong = [name for name in built.state_dict() if name in tensors and tensors[name] != tuple(wanted[name].shape)]
     if missing or wrong:
         raise MemobenchError(
-            f"the weights of the checkpoint {folder} are not those of its policy ({policy.type}): {len(missing)} of "
+            f"the weights of the checkpoint {path} are not those of its policy ({policy.type}): {len(missing)} of "
             f"{len(names)} are missing and {len(wrong)} have another shape, the first being {(missing + wrong)[0]}; "
             "LeRobot would go on with random numbers there: copy it whole or train it again"
         )
@@ -260,27 +268,41 @@ def _as_loaded(policy: Any, shapes: dict[str, tuple[int, ...]]) -> dict[str, tup
 def statistics_shapes(path: str) -> dict[str, tuple[int, ...]]:
     """Return of which observations and actions a checkpoint holds statistics, and their shapes: what it was trained on.
 
-    A configuration that was begun from another checkpoint lists that one's features instead. Empty for a repository.
+    A configuration that was begun from another checkpoint lists that one's features instead. Empty without statistics.
     """
-    folder = Path(path).expanduser()
-    if not (folder / PREPROCESSOR_FILE).is_file():
+    file = _file_of(path, PREPROCESSOR_FILE)
+    if file is None:
         return {}
+    states = [_file_of(path, file_name(name, f"state_file in {file}")) for name in _state_files(file)]
     return {
         name.rpartition(".")[0]: shape
-        for file in _state_files(folder)
-        for name, shape in _shapes(file).items()
+        for state in states
+        if state is not None
+        for name, shape in _shapes(state).items()
         if not name.endswith(".count")
     }
 
 
-def _state_files(folder: Path) -> Iterator[Path]:
-    """Yield the files of the preprocessor's statistics."""
-    for step in read_json(folder / PREPROCESSOR_FILE, Processor).get("steps", []):
+def _state_files(preprocessor: Path) -> Iterator[str]:
+    """Yield the names of the files of a preprocessor's statistics."""
+    for step in read_json(preprocessor, Processor).get("steps", []):
         state = step.get("state_file")
         if str(step.get("registry_name", "")).endswith("normalizer_processor") and isinstance(state, str):
-            file = folder / file_name(state, f"state_file in {folder / PREPROCESSOR_FILE}")
-            if file.is_file():
-                yield file
+            yield state
+
+
+def _file_of(path: str, name: str) -> Path | None:
+    """Return a file of a checkpoint folder, or of a repository, from which LeRobot would fetch it too; None without."""
+    folder = Path(path).expanduser()
+    if folder.is_dir() or looks_local(path):
+        return folder / name if (folder / name).is_file() else None
+    from huggingface_hub import hf_hub_download
+    from huggingface_hub.errors import HfHubHTTPError
+
+    try:
+        return Path(hf_hub_download(path, name))
+    except (HfHubHTTPError, OSError, ValueError):  # no such file, no such repository, no network: LeRobot says it
+        return None
 
 
 def _check_statistics(folder: Path, file: str, step: Mapping[str, Any]) -> None:
