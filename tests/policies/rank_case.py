@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from lerobot_memobench.policies.memobench_mem.action_loss import mean_losses
 from lerobot_memobench.policies.memobench_mem.alignment.loss import alignment_loss
 from lerobot_memobench.policies.memobench_mem.alignment.objectives import make_alignment
+from lerobot_memobench.policies.memobench_mem.ranks import means_over_ranks
 
 ROWS, FRAMES, TOKENS, DIM = 7, 2, 2, 5
 RANKS = (slice(0, 4), slice(4, ROWS))
@@ -37,14 +38,14 @@ class Learner(nn.Module):
         memory = self.encoder(seen)
         if self.alignment is None:
             found = mean_losses(memory, has_text[:, None] * torch.tensor([1.0, 1.0, 1.0, 0.0]))
-            return found.mean, torch.tensor(0.0)
+            return found.mean, torch.tensor([0.0, 0.0])
         frames = self.alignment.__class__.__name__.startswith("Framewise")
         batch = {"memory.text": text, "memory.text_mask": has_text[:, None].expand(-1, FRAMES) if frames else has_text}
         if not frames:
             batch["memory.text"] = text[:, 0]
         mask = torch.ones(memory.shape[:2], dtype=torch.bool)
         loss, logged = alignment_loss(self.alignment, 0.3, batch, memory, mask, list(self.encoder.parameters()))
-        return loss, torch.tensor(logged.get("align_top1", -1.0))
+        return loss, torch.tensor([logged.get(name, -1.0) for name in ("align_top1", "align_grad_norm")])
 
 
 def step(align: str, has_text: tuple[int, ...], rows: slice, wrap: type[nn.Module] | None = None) -> dict[str, Tensor]:
@@ -54,10 +55,10 @@ def step(align: str, has_text: tuple[int, ...], rows: slice, wrap: type[nn.Modul
     seen, text = torch.randn(ROWS, FRAMES * TOKENS, DIM), torch.randn(ROWS, FRAMES, DIM)
     text[3] = text[0]  # the same subgoal on two samples
     module = learner if wrap is None else wrap(learner)
-    loss, top1 = module(seen[rows], text[rows], torch.tensor(has_text[rows], dtype=torch.bool))
+    loss, (top1, norm) = module(seen[rows], text[rows], torch.tensor(has_text[rows], dtype=torch.bool))
     loss.backward()
     gradients = {name: p.grad for name, p in learner.named_parameters() if p.grad is not None}
-    return {"loss": loss.detach(), "top1": top1} | gradients
+    return {"loss": loss.detach(), "top1": top1, "norm": norm} | gradients
 
 
 if __name__ == "__main__":
@@ -71,5 +72,6 @@ if __name__ == "__main__":
         """As LeRobot wraps it."""
         return DistributedDataParallel(module, find_unused_parameters=True)
 
-    torch.save([step(*case, RANKS[rank], parallel) for case in CASES], folder / f"{rank}.pt")  # type: ignore[arg-type]
+    found = [step(*case, RANKS[rank], parallel) for case in CASES]  # type: ignore[arg-type]
+    torch.save([*found, means_over_ranks({"loss": 1.0 + rank, "per_dim": [rank]})], folder / f"{rank}.pt")
     dist.destroy_process_group()

@@ -12,6 +12,14 @@ from lerobot.configs import PreTrainedConfig
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+
+
+def test_a_compiled_model_is_refused() -> None:
+    precision = torch.get_float32_matmul_precision()
+    with pytest.raises(MemobenchError, match=r"compile_model=true.*leave it out"):
+        MemobenchMemPolicy(MemobenchMemConfig(device="cpu", compile_model=True))
+    assert torch.get_float32_matmul_precision() == precision
 
 
 def test_defaults_are_the_papers() -> None:

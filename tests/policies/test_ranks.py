@@ -10,6 +10,8 @@ import pytest
 import rank_case
 import torch
 
+from lerobot_memobench.policies.memobench_mem.ranks import means_over_ranks
+
 
 @pytest.fixture(scope="module")
 def ranks(tmp_path_factory: pytest.TempPathFactory) -> Any:
@@ -33,3 +35,8 @@ def test_two_ranks_are_one_batch(ranks: Any, number: int) -> None:
     if rank_case.CASES[number][0] == "contrastive":
         torch.testing.assert_close(first["loss"], joint["loss"], **close)
         assert "alignment.log_temperature" in joint
+
+
+def test_what_a_curve_keeps_is_of_all_ranks(ranks: Any) -> None:
+    assert [rank[-1] for rank in ranks] == [{"loss": 1.5, "per_dim": [0]}, {"loss": 1.5, "per_dim": [1]}]
+    assert means_over_ranks({"loss": 2.0}) == {"loss": 2.0}

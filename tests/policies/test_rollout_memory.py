@@ -44,6 +44,17 @@ def test_stride_and_sampling_of_a_long_history() -> None:
     assert memory.rows == []
 
 
+def test_a_frame_that_was_not_offered_is_noticed() -> None:
+    memory = RolloutMemory(FrameSampling(4), stride=4)
+    for step in (0, 3, 4, 4, 6, 8):  # what lies between two frames that are written may be left out
+        memory.observe(acting(step, 1), _encode([1.0, 1.0]))
+    assert memory.missed([0, 1]) is None
+    memory.observe(acting(13, 6), _encode([1.0, 1.0]))
+    assert (memory.missed([0]), memory.missed([1]), memory.missed([0, 1])) == (12, 4, 4)
+    memory.observe(acting(14, 0), _encode([1.0, 1.0]))
+    assert (memory.missed([0]), memory.missed([1])) == (12, None), "a new episode has missed nothing"
+
+
 def test_the_clock_starts_again_with_the_execution() -> None:
     """The prompt's frames stay in the history, whose own time goes on; a clock that counts through tells the same."""
     for first in (0, 3):

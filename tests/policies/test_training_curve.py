@@ -5,9 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import torch
 from PIL import Image
+from small_policy import batch_of, made_for_training
 
+from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.training_curve import NUMBERS, PICTURE, WINDOW, TrainingCurve
+from object_dataset import make_object_dataset
 
 
 def test_points_are_means_and_go_on(tmp_path: Path) -> None:
@@ -44,3 +48,27 @@ def test_looks_at_held_out_episodes_lie_between_updates(tmp_path: Path) -> None:
         {"updates": WINDOW + 4, "action_loss": 0.25},
     ]
     assert TrainingCurve.read(tmp_path).held_out == curve.held_out
+
+
+def test_a_loss_that_is_measured_is_that_of_what_a_checkpoint_holds(tmp_path: Path) -> None:
+    """`eval_loss` of lerobot-train, beside rollouts of the averaged weights."""
+    policy, before, after, dataset = made_for_training(
+        make_object_dataset(tmp_path / "data"), perception="objects", size="small", align="semantic"
+    )
+    batch = before(batch_of(dataset, [10, 30, 50]))
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=1e-2)
+    for _ in range(3):
+        policy.train().forward(batch)[0].backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        policy.update()
+    for part in (policy, before, after):
+        part.save_pretrained(tmp_path / "checkpoint")
+    acting = MemobenchMemPolicy.from_pretrained(tmp_path / "checkpoint")
+    with torch.no_grad():
+        measured, held = (one.eval().forward(batch)[0].item() for one in (policy, acting))
+    assert measured == held
+    trained = policy.eval().forward(batch)[0]
+    trained.backward()  # gradients are of the weights that learn
+    assert abs(trained.item() - measured) > 1e-3
+    assert policy.curve.held_out == []

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
 from typing import Any
 
 import torch
@@ -41,7 +39,7 @@ class ActingPolicy(SeeingPolicy):
         super().reset()
         for part in (self.history, self.plans, self.noise):
             part.reset()
-        self._calls = 0
+        self._calls = self._planned = 0
         self.thread.begin()
         self._acting_rows: list[int] = []
 
@@ -89,18 +87,20 @@ class ActingPolicy(SeeingPolicy):
         words = part[OBS_LANGUAGE_TOKENS], part[OBS_LANGUAGE_ATTENTION_MASK]
         with self._acting():
             if self._remembers:
+                self._require_history(rows)
                 self.model.set_memory(*self.history.gather(rows).to(self._device))
             noise = noise.to(self._device)
             actions = self.model.sample_actions(images, image_masks, *words, noise=noise, **kwargs)
         return actions[:, :, : self._action_dim]
 
-    @contextlib.contextmanager
-    def _acting(self) -> Iterator[None]:
-        """Act as the checkpoint of this moment would: by the average, in the precision that it is loaded in."""
-        wide = self.precision.narrowed()
-        average = contextlib.nullcontext() if self.average is None else self.average.applied(wide)
-        with average, self.precision.computing(self._device):
-            yield
+    def _require_history(self, rows: list[int]) -> None:
+        missed = self.history.missed(rows)
+        if missed is not None:
+            raise MemobenchError(
+                f"This policy remembers every {self.history.stride} control steps, and was not shown step {missed} of "
+                "this episode: its memory would be another one than in training; offer it the observation of every "
+                "control step, by select_action or by observe."
+            )
 
     def _noise(self, rows: list[int], steps: list[int]) -> Tensor:
         shape = self.config.chunk_size, self.config.max_action_dim
@@ -108,18 +108,53 @@ class ActingPolicy(SeeingPolicy):
             return torch.zeros(len(rows), *shape)
         return self.noise.draw(rows, steps, shape)
 
+    def supports_rtc(self) -> bool:
+        """Whether LeRobot's real-time chunking may ask this policy for its plans.
+
+        It guides the denoising of a plan, which regression lacks, and offers one observation per plan, of which no
+        history can be made.
+        """
+        denoises = self.config.objective != REGRESSION
+        return bool(super().supports_rtc()) and denoises and not self._remembers
+
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Take in one observation per row and plan for all rows: (B, chunk, A), normalised.
 
-        Call it at every control step, or pass ``observation.step``, for the history to be complete. ``noise``
+        A policy that remembers must be offered the observation of every control step by `observe`, this one included,
+        unless it tells its step (``observation.step``); or let `select_action` see to it. ``noise``
         (B, chunk, max_action_dim) replaces the episodes' own; other keywords are LeRobot's real-time chunking ones.
+
+        Raises:
+            MemobenchError: observations were left out between two plans; or real-time chunking, by regression.
         """
         self.eval()
-        steps, _, _ = self.observe(batch)
+        if self._rtc_enabled() and self.config.objective == REGRESSION:
+            raise MemobenchError(
+                "Real-time chunking guides the denoising of a plan, which a policy of objective=regression lacks: its "
+                "plans would not continue the last one; use --inference.type=sync, or train with "
+                "--policy.objective=flow_matching."
+            )
+        steps = self._offered(batch)
         rows = list(range(len(steps)))
         noise = kwargs.pop("noise", None)
         return self.plan(batch, rows, self._noise(rows, steps) if noise is None else noise, **kwargs)
+
+    def _offered(self, batch: dict[str, Tensor]) -> list[int]:
+        """Take in the observation of a plan, unless it was offered before; return each row's control step."""
+        if OBS_STEP in batch or not self._remembers or not self._calls:
+            steps, _, _ = self.observe(batch)
+        elif self._calls > self._planned:
+            steps = [row.position for row in self.history.rows]
+        else:
+            raise MemobenchError(
+                "This policy remembers what it saw at every control step, and was asked for two plans with no "
+                "observation between them: its memory would be another one than in training; let select_action see "
+                "every observation (--inference.type=sync), offer each to observe before planning, or train with "
+                "--policy.integration=none."
+            )
+        self._planned = self._calls
+        return steps
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import nullcontext
 from typing import Any
 
+import torch
 from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 from torch import Tensor, nn
 
@@ -16,6 +17,7 @@ from lerobot_memobench.policies.memobench_mem.alignment.loss import alignment_lo
 from lerobot_memobench.policies.memobench_mem.alignment.objectives import Alignment
 from lerobot_memobench.policies.memobench_mem.averaging import WeightAverage
 from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, PHASE, STEPS, TOKENS, MemoryBatch
+from lerobot_memobench.policies.memobench_mem.ranks import means_over_ranks
 from lerobot_memobench.policies.memobench_mem.seeing import SeeingPolicy
 from lerobot_memobench.policies.memobench_mem.training_curve import TrainingCurve
 
@@ -55,6 +57,9 @@ class LearningPolicy(SeeingPolicy):
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, Any]]:
         """Loss of the actions (`action_objective`) plus weighted alignment on a preprocessed training batch.
 
+        A loss that is only measured (lerobot-train's ``eval_loss``: not training, no gradients) is that of the averaged
+        weights, which a checkpoint holds and rollouts act by.
+
         Args:
             batch: what LeRobot's pi0.5 needs, and ``memory.*`` and ``phase`` as the preprocessor adds them.
             reduction: ``mean`` for a scalar, ``none`` for one loss per sample (B,).
@@ -70,8 +75,10 @@ class LearningPolicy(SeeingPolicy):
         self._require_memory(batch)
         if self._averages and self.average is None and self.training:
             self.average = self._new_average()
+        measures = not self.training and not torch.is_grad_enabled()
         quick = self.training and self._device.type == "cpu" and not self.config.sees_tokens
-        with self.precision.computing(self._device), quick_products() if quick else nullcontext():
+        computing = self._acting() if measures else self.precision.computing(self._device)
+        with computing, quick_products() if quick else nullcontext():
             memory = self._read_memory(batch)
             per_sample, total, logged = self._action_loss(batch)
             if self.alignment is not None and memory is not None:
@@ -81,7 +88,7 @@ class LearningPolicy(SeeingPolicy):
                 per_sample, total, logged = per_sample + weighted, total + weighted, logged | numbers
         logged["loss"] = total.item()
         if self.training:
-            self.curve.note(logged)
+            self.curve.note(means_over_ranks(logged, self._device))
         else:
             self.curve.note_held_out(logged)
         loss = per_sample if reduction == "none" else total

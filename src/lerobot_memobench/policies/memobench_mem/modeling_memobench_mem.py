@@ -14,6 +14,7 @@ from torch import Tensor
 
 from lerobot_memobench.computing.freed_memory import keep_freed_memory
 from lerobot_memobench.datasets.memory_cache import RecordedFrames
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.eyes.weights import load_tower
 from lerobot_memobench.policies.checkpoint import check_as_trained
 from lerobot_memobench.policies.memobench_mem.acting import ActingPolicy
@@ -83,6 +84,12 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
         """
         # As PI05Policy.__init__, which names its model class.
         PreTrainedPolicy.__init__(self, config)
+        if config.compile_model:
+            raise MemobenchError(
+                "--policy.compile_model=true would compile pi0.5's forward pass, and set torch's precision of products "
+                "for the whole process, while this policy hands its memory to the pass from outside; leave it out "
+                "(--use_torch_compile too)."
+            )
         if dataset_meta is not None:
             require_texts(Path(dataset_meta.root), config)
         config.validate_features()

@@ -7,6 +7,7 @@ time; with one process nothing is done.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -29,6 +30,15 @@ def mean_over_ranks(value: Tensor) -> Tensor:
     if world_size() > 1:
         dist.all_reduce(value)
     return value / world_size()
+
+
+def means_over_ranks(numbers: Mapping[str, Any], device: torch.device | str = "cpu") -> dict[str, Any]:
+    """Return the same with each float's mean over the ranks, all of which name the same ones."""
+    if world_size() == 1:
+        return dict(numbers)
+    floats = [name for name, value in numbers.items() if isinstance(value, float)]
+    means = mean_over_ranks(torch.tensor([numbers[name] for name in floats], device=device))
+    return {**numbers, **dict(zip(floats, means.tolist(), strict=True))}
 
 
 def joint(rows: Tensor) -> Tensor:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
+
 import torch
 from lerobot.policies.common.vla_utils import pad_vector
 from lerobot.policies.pi05.modeling_pi05 import PI05Policy
@@ -64,3 +67,11 @@ class SeeingPolicy(PI05Policy):
             state = pad_vector(batch[OBS_STATE], self.config.max_state_dim)
             parts, masks = [*parts, state], [*masks, torch.ones(len(state), dtype=torch.bool)]
         return [part.to(self._device) for part in parts], [mask.to(self._device) for mask in masks]
+
+    @contextlib.contextmanager
+    def _acting(self) -> Iterator[None]:
+        """Compute as the checkpoint of this moment would: by the average, in the precision that it is loaded in."""
+        wide = self.precision.narrowed()
+        average = contextlib.nullcontext() if self.average is None else self.average.applied(wide)
+        with average, self.precision.computing(self._device):
+            yield

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
+from torch.nn.utils import parameters_to_vector
 
 from lerobot_memobench.policies.memobench_mem.alignment.objectives import Alignment, retrieval_accuracy
 from lerobot_memobench.policies.memobench_mem.memory.batch import TEXT, TEXT_MASK
@@ -44,7 +45,8 @@ def alignment_loss(
         # Two matrix products: cheap, and comparable with the gradient norm that LeRobot logs. What had no part in this
         # batch's memory gets zeros.
         gradients = torch.autograd.grad(weighted, list(encoder), retain_graph=True, materialize_grads=True)
-        logged["align_grad_norm"] = torch.stack([gradient.norm() for gradient in gradients]).norm().item()
+        # A rank's gradient is its own rows' share; DDP averages them.
+        logged["align_grad_norm"] = mean_over_ranks(parameters_to_vector(gradients)).norm().item()
     with torch.no_grad():
         logged["align_top1"] = retrieval_accuracy(*map(joint, alignment.pairs(*usable)))
     return weighted, logged | alignment.numbers()

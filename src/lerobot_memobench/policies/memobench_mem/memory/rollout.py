@@ -20,6 +20,7 @@ class Row:
 
     Attributes:
         clock: phase and control step since the phase began. position: control step since the episode began.
+        missed: the first step of a frame that was to be written and was not offered; None where all were.
     """
 
     clock: tuple[int, int] | None = None
@@ -27,6 +28,7 @@ class Row:
     frozen: bool = False
     told: bool = False  # that it is longer than what is kept
     kept: list[Frame] = field(default_factory=list)
+    missed: int | None = None
 
 
 class RolloutMemory:
@@ -64,7 +66,12 @@ class RolloutMemory:
         """
         if len(self.rows) != len(clocks):
             self.rows = [Row() for _ in clocks]
+        before = [row.position for row in self.rows]
         started = [self._tick(row, clock) for row, clock in enumerate(clocks)]
+        for row, begins, last in zip(self.rows, started, before, strict=True):
+            due = (last // self.stride + 1) * self.stride  # the next one that is written
+            if not begins and due < row.position and row.missed is None:
+                row.missed = due
         steps, frozen = [row.position for row in self.rows], [row.frozen for row in self.rows]
         wanted = [
             row for row, step in enumerate(steps) if not frozen[row] and (started[row] or step % self.stride == 0)
@@ -98,6 +105,10 @@ class RolloutMemory:
         """Whether the frame after a row's present one is written."""
         moving = [row.position for row in self.rows if row.clock is not None and not row.frozen]
         return self.mechanism.frames > 0 and any((step + 1) % self.stride == 0 for step in moving)
+
+    def missed(self, rows: Sequence[int]) -> int | None:
+        """Return the first step of some rows' frames that were to be written and were not offered; None: all were."""
+        return min((row.missed for row in map(self.rows.__getitem__, rows) if row.missed is not None), default=None)
 
     def gather(self, rows: Sequence[int]) -> MemoryBatch:
         """Return what plans of some rows read."""

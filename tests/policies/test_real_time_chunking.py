@@ -1,0 +1,109 @@
+"""Plans asked for chunk by chunk: LeRobot's real-time chunking, and callers that act several steps on one plan."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lerobot.policies.rtc.configuration_rtc import RTCConfig
+from lerobot.rollout.inference.rtc import supports_rtc_inference
+from small_policy import made_for_training
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.memobench_mem.memory.batch import MASK, STEPS
+from object_dataset import make_object_dataset
+
+OBJECTS: dict[str, Any] = {"perception": "objects", "size": "small", "n_action_steps": 3, "memory_stride": 2}
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_object_dataset(tmp_path_factory.mktemp("objects") / "data")
+
+
+def observation(dataset: Any, index: int, **clock: float) -> dict[str, Any]:
+    """What a robot without a clock shows, or one with it."""
+    names = ("observation.state", "observation.environment_state")
+    told = {f"observation.{name}": torch.tensor([[value]]) for name, value in clock.items()}
+    return {name: dataset[index][name][None] for name in names} | told | {"task": [dataset[index]["task"]]}
+
+
+def chunking(policy: Any) -> Any:
+    """As lerobot/rollout/context.py turns it on, after loading."""
+    policy.config.rtc_config = RTCConfig(enabled=True, execution_horizon=3)
+    policy.init_rtc_processor()
+    policy.reset()
+    return policy
+
+
+@pytest.mark.parametrize(
+    ("objective", "integration", "supported"),
+    [("regression", "none", False), ("flow_matching", "modulation", False), ("flow_matching", "none", True)],
+)
+def test_what_is_supported_is_said(root: Path, objective: str, integration: str, supported: bool) -> None:
+    policy = made_for_training(root, **OBJECTS, objective=objective, integration=integration)[0]
+    assert policy.supports_rtc() == supports_rtc_inference(policy) == supported
+
+
+def test_a_guided_plan_continues_the_last_one(root: Path) -> None:
+    fields = OBJECTS | {"objective": "flow_matching", "integration": "none", "num_inference_steps": 10}
+    policy, before, _, dataset = made_for_training(root, **fields)
+    policy.reset()
+    batch = before(observation(dataset, 0))
+    noise = torch.randn(1, policy.config.chunk_size, 32, generator=torch.Generator().manual_seed(0))
+    free = policy.predict_action_chunk(batch, noise=noise)
+    left_over = free[0] + 0.5
+    chunking(policy)
+    guided = policy.predict_action_chunk(batch, noise=noise, inference_delay=3, prev_chunk_left_over=left_over)
+    apart = [float((plan[0, :3] - left_over[:3]).abs().mean()) for plan in (free, guided)]
+    assert apart[0] == pytest.approx(0.5)
+    assert apart[1] < 0.1
+
+
+def test_regression_refuses_to_be_guided(root: Path) -> None:
+    policy, before, _, dataset = made_for_training(root, **OBJECTS, integration="none")
+    with pytest.raises(MemobenchError, match=r"denoising.*inference\.type=sync.*flow_matching"):
+        chunking(policy).predict_action_chunk(before(observation(dataset, 0)), inference_delay=3)
+
+
+def test_a_memory_that_is_offered_one_frame_per_plan_is_refused(root: Path) -> None:
+    """By LeRobot's real-time chunking, its policy server, or anybody: two plans and nothing in between."""
+    policy, before, _, dataset = made_for_training(root, **OBJECTS)
+    policy.reset()
+    policy.predict_action_chunk(before(observation(dataset, 0)))
+    with pytest.raises(MemobenchError, match=r"two plans with no observation between.*inference\.type=sync.*observe"):
+        policy.predict_action_chunk(before(observation(dataset, 6)))
+    policy.reset()
+    policy.predict_action_chunk(before(observation(dataset, 0, step=0.0)))
+    with pytest.raises(MemobenchError, match=r"every 2 control steps, and was not shown step 2 of this episode"):
+        policy.predict_action_chunk(before(observation(dataset, 6, step=6.0)))
+    without = made_for_training(root, **OBJECTS, integration="none")[0]
+    without.reset()
+    for index in (0, 6):
+        without.predict_action_chunk(before(observation(dataset, index)))
+
+
+@pytest.mark.parametrize("clock", [True, False])
+def test_a_memory_that_is_offered_every_frame_is_that_of_training(root: Path, clock: bool) -> None:
+    policy, before, _, dataset = made_for_training(root, **OBJECTS)
+    policy.reset()
+    plans = []
+    for step in range(13):
+        batch = before(observation(dataset, step, **({"step": float(step)} if clock else {})))
+        policy.observe(batch)
+        if step % 6 == 0:
+            plans.append(policy.predict_action_chunk(batch))
+    trained = before(torch.utils.data.default_collate([dataset[12]]))
+    _, steps, mask = policy.history.gather([0])
+    assert torch.equal(steps, trained[STEPS])
+    assert torch.equal(mask, trained[MASK])
+    policy.reset()
+    stepwise = []
+    for step in range(13):  # as LeRobot's synchronous rollout
+        policy.plans.queues = []
+        action = policy.select_action(before(observation(dataset, step)))
+        if step % 6 == 0:
+            stepwise.append(action)
+    assert all(torch.allclose(plan[:, 0], action, atol=1e-5) for plan, action in zip(plans, stepwise, strict=True))
