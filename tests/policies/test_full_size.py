@@ -106,7 +106,7 @@ def _plan(policy: MemobenchMemPolicy, batch: dict[str, Tensor]) -> Tensor:
     tokens, steps, _ = _memory(batch)
     kept = [Frame(int(step), seen) for step, seen in zip(steps[0], tokens[0], strict=True)]
     policy.reset()
-    policy.history.rows = [Row(last_step=kept[-1].step, kept=kept)]
+    policy.history.rows = [Row(clock=(1, kept[-1].step), position=kept[-1].step, kept=kept)]
     keys = (CAMERA, "observation.state", OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK)
     observation = {key: batch[key] for key in keys} | {"observation.step": torch.tensor([[kept[-1].step + 1.0]])}
     planned = policy.predict_action_chunk(observation)

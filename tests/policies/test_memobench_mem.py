@@ -32,7 +32,6 @@ from lerobot_memobench.policies.memobench_mem.language.tokenizer import (
 from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import sample_frames
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.processing.gather_memory import GatherMemoryProcessorStep
-from lerobot_memobench.policies.memobench_mem.processing.training_run import begin_training
 
 
 @pytest.fixture(scope="module")
@@ -494,7 +493,6 @@ def test_word_tokenizer() -> None:
 
 
 def step_of(texts: list[str], length: int = 24) -> WordTokenizerProcessorStep:
-    begin_training(None)  # a step takes the length of prompts of a training that other tests have begun
     return WordTokenizerProcessorStep(vocabulary=make_vocabulary(texts, 1024), max_length=length, padding="max_length")
 
 

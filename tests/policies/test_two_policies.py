@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import functools
 import gc
 import inspect
@@ -34,7 +35,8 @@ from lerobot_memobench.policies.memobench_mem.execution_frames import Drawn
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 
 INDICES = [10, 30, 50, 80]
-SEEING: dict[str, Any] = {"size": "small", "n_action_steps": 3, "memory_stride": 2, "align": "semantic"}
+SEEING: dict[str, Any] = {"size": "small", "width": 64, "depth": 2, "n_action_steps": 3, "memory_stride": 2}
+SEEING |= {"align": "semantic"}
 
 
 @pytest.fixture(scope="module")
@@ -266,6 +268,35 @@ def test_a_foreign_reader_and_foreign_attention_are_kept(
         policy.eval().forward(before(batch))
     assert calls.count("eager_attention_forward") == policy.config.dimensions.vlm.depth
     assert "get_item" not in calls, "what ours makes out of memory reads nothing"
+
+
+def replaced_in(tree: ast.AST) -> list[str]:
+    """What a file puts in the place of something of LeRobot's or transformers'."""
+    theirs = {
+        (alias.asname or alias.name).partition(".")[0]
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        for alias in node.names
+        if (getattr(node, "module", None) or alias.name).partition(".")[0] in ("lerobot", "transformers")
+    }
+    found = []
+    for node in ast.walk(tree):
+        targets = node.targets if isinstance(node, ast.Assign) else []
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "setattr":
+            targets = [ast.Attribute(node.args[0], "any")]
+        parts = [part for target in targets for part in ast.walk(target) if isinstance(part, ast.Attribute)]
+        found += [ast.unparse(part) for part in parts if ast.unparse(part).partition(".")[0] in theirs]
+    return found
+
+
+def test_nothing_else_of_lerobots_is_replaced() -> None:
+    assert replaced_in(ast.parse("from lerobot.scripts import x\nx.y, a = 1, 2\nsetattr(x, 'b', 1)")) == [
+        "x.y",
+        "x.any",
+    ]
+    source = Path(lerobot_hooks.__file__).parent
+    found = {path.name: replaced_in(ast.parse(path.read_text())) for path in source.rglob("*.py")}
+    assert {name: replaced for name, replaced in found.items() if replaced} == {}
 
 
 def test_every_hook_is_listed_in_the_docs() -> None:
