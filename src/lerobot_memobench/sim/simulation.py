@@ -241,15 +241,20 @@ class Simulation:
         """
         self.highlights = ()
         hidden = () if self.task.prompt is None else self.task.prompt.places
-        lies = [self.data.body(thing).xpos - self.data.site(drawer).xpos for thing, drawer in hidden]
+        lies = [self.data.body(thing).xpos - self._moves_with(place) for thing, place in hidden]
         turned = [self.data.body(thing).xquat.copy() for thing, _ in hidden]
         self.restore(start)
-        for (thing, drawer), place, quaternion in zip(hidden, lies, turned, strict=True):
+        for (thing, place), lay, quaternion in zip(hidden, lies, turned, strict=True):
             joint = self.model.joint(int(self.model.body(thing).jntadr[0]))
             where, speed = int(joint.qposadr[0]), int(joint.dofadr[0])
-            self.data.qpos[where : where + 7] = np.concatenate([self.data.site(drawer).xpos + place, quaternion])
+            self.data.qpos[where : where + 7] = np.concatenate([self._moves_with(place) + lay, quaternion])
             self.data.qvel[speed : speed + 6] = 0.0
         mujoco.mj_step1(self.model, self.data)
+
+    def _moves_with(self, place: str) -> Array:
+        """Return where a drawer's region (3,) is now; the origin for a region of the table, which does not move."""
+        site = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_SITE, place)
+        return self.data.site_xpos[site].copy() if site >= 0 else np.zeros(3)
 
     def restore_arm(self, snapshot: Snapshot) -> None:
         """Put arm, fingers and controller back as in a snapshot, to the bit; all other things stay as they are.
