@@ -22,7 +22,8 @@ from safetensors.torch import load_file, save_file
 
 from lerobot_memobench.datasets.manifest import read_manifest
 from lerobot_memobench.engine.machine import git
-from lerobot_memobench.engine.policy_identity import ELSEWHERE, encoded, training_facts
+from lerobot_memobench.engine.policy_identity import encoded, training_facts
+from lerobot_memobench.envs.acting import ELSEWHERE
 from lerobot_memobench.envs.episode_log import MERGED_FILE
 from lerobot_memobench.evaluation.documents.report import REPORT_JSON
 from lerobot_memobench.files import file_hash, write_file

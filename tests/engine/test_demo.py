@@ -71,7 +71,8 @@ def test_the_html_report_finds_the_demos_films(tmp_path: Path) -> None:
         return 0
 
     demo.make_demo(tmp_path / "demo", evaluate, fake_comparison)
-    (tmp_path / "demo" / "card.json").unlink()  # of a fake evaluation, no card
+    for name in ("card.json", "protocol.json"):  # of a fake evaluation: none
+        (tmp_path / "demo" / name).unlink()
     written = write_html([tmp_path / "demo"], tmp_path / "html")
     assert written.videos == len(demo.TASKS)
     assert not written.notes

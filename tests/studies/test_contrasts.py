@@ -39,7 +39,8 @@ def test_a_steady_difference_shows_and_none_does_not() -> None:
     assert found["better"].low > 0
     assert found["better"].p < 0.01
     same = found["same"]
-    assert (same.value, same.low, same.high, same.p) == (0, 0, 0, 1)
+    assert (same.value, same.p, same.episodes) == (0, 1, 60)
+    assert -0.1 < same.low < 0 < same.high < 0.1, "sixty equal pairs are no certainty"
     assert same.detectable is not None
     assert 0 < same.detectable < 0.2
 
@@ -52,6 +53,17 @@ def test_a_difference_of_one_training_is_none_of_arms() -> None:
     assert found.value == pytest.approx(1 / 6)
     assert found.low == 0
     assert found.high > 0.3
+
+
+@pytest.mark.parametrize("ends", [(0, 0), (1, 1), (0, 1), (1, 0)])
+def test_two_rollouts_leave_much_open(ends: tuple[int, int]) -> None:
+    """All that a bootstrap draws from outcomes that are equal is equal."""
+    arms = {name: [records([[end, end]])] for name, end in zip("ab", ends, strict=True)}
+    (found,) = contrasts(arms, "a").values()
+    assert found.value == ends[1] - ends[0]
+    assert found.episodes == 2
+    assert found.high - found.low > 0.6
+    assert -1 <= found.low <= found.value <= found.high <= 1
 
 
 def test_other_episodes_are_refused() -> None:

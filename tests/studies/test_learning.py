@@ -103,14 +103,14 @@ def test_the_figure_of_two_evaluations_tells_differences_on_what_both_have(
     monkeypatch.setattr(sys, "argv", ["learned_figure.py", *arms, "--out", str(tmp_path / "figure.png")])
     load_script("learned_figure").main()
     told = capsys.readouterr().out
-    assert "| all, with | 75.0 |" in told, "of what both have done"
-    assert "| object, with | 75.0 |" in told
+    assert "| all, with | 20 | 75.0 |" in told, "of what both have done"
+    assert "| object, with | 20 | 75.0 |" in told
     assert "temporal" not in told
     monkeypatch.setattr(sys, "argv", ["learned_figure.py", arms[1], f"other={tmp_path / 'other'}", "--out", "none.png"])
     with pytest.raises(SystemExit, match="no task in common"):
         load_script("learned_figure").main()
     assert "prompted tasks, 10 shared episodes" in told
-    assert "| without less with | -60.0 |" in told
+    assert "| without less with | 10 | -60.0 |" in told
     assert (tmp_path / "figure.png").is_file()
 
 
@@ -133,10 +133,11 @@ def test_an_experiment_runs_its_parts_in_order(tmp_path: Path, monkeypatch: pyte
     memoryless = [word for word in ran[2] if word not in ran[1]]
     assert "policy.integration=none" in memoryless
     assert all("seed=7" in words and "referent=random" in words for words in ran[5:])
-    assert f"| {BOWL}, {MEMORY} | 90.0 |" in text
-    assert f"| {BOWL}, {MEMORYLESS} | 30.0 |" in text
-    assert f"| {MEMORYLESS} less {MEMORY} | -60.0 | " in text
+    assert f"| {BOWL}, {MEMORY} | 20 | 90.0 |" in text
+    assert f"| {BOWL}, {MEMORYLESS} | 20 | 30.0 |" in text
+    assert f"| {MEMORYLESS} less {MEMORY} | 10 | -60.0 | " in text
     assert "| training | 4 | 1.0 | 6.0 |" in text
+    assert f"{MEMORY}: what the policy saw is not recorded" in text
     assert (tmp_path / "out" / "learning.md").read_text() == text
     assert json.loads((tmp_path / "out" / "learning.json").read_text())[MEMORYLESS][BOWL]["wrong"] == 12
     with Image.open(tmp_path / "out" / "learning.png") as picture:

@@ -47,4 +47,4 @@ def test_only_allowed_candidates_are_answered() -> None:
 
 def test_mean_and_deviation() -> None:
     assert mean_and_deviation([1.0, 2.0, 3.0]) == (pytest.approx(2.0), pytest.approx(1.0))
-    assert mean_and_deviation([4.0]) == (4.0, 0.0)
+    assert mean_and_deviation([4.0]) == (4.0, None)

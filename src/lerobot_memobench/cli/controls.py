@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -95,14 +96,22 @@ def _show(report: Report, notes: Sequence[str], name: str, out: Path | None) -> 
     """Print a report, and write it where asked; return the exit status."""
     from lerobot_memobench.evaluation.documents.formats import latex, markdown, terminal
 
+    noted = replace(report, sections=tuple(replace(each, notes=(*each.notes, *notes)) for each in report.sections))
+    told = " ".join(f"{note}." for note in notes)
+    captioned = [
+        replace(each, tables=tuple(replace(t, note=f"{t.note} {told}") for t in each.tables))
+        for each in report.sections
+    ]
     screen = console()
-    screen.print(terminal(report), crop=False)
-    for note in notes:
-        screen.print(f"note: {note}")
+    screen.print(terminal(noted), crop=False)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         data = {"title": report.title, "notes": list(notes), **report.data}
-        contents = {"md": markdown(report), "tex": latex(report), "json": json.dumps(data, indent=1) + "\n"}
+        contents = {
+            "md": markdown(noted),
+            "tex": latex(replace(report, sections=tuple(captioned))),
+            "json": json.dumps(data, indent=1) + "\n",
+        }
         for ending, content in contents.items():
             screen.print(str(write_file(out / f"{name}.{ending}", content)), soft_wrap=True)
     return 0

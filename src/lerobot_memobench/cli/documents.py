@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable, Sequence
 from enum import StrEnum
 from pathlib import Path
@@ -60,13 +61,15 @@ ENDINGS = {
 def given_runs(folders: list[str] | None, with_: Beside | None) -> tuple[list[Run], bool]:
     """Return the evaluations and whether the paper's figures are drawn; one of both is needed."""
     from lerobot_memobench.evaluation.documents.beside_paper import check_beside
-    from lerobot_memobench.evaluation.records.runs import read_runs
+    from lerobot_memobench.evaluation.records.runs import read_runs, unlike
 
     paper = with_ is Beside.PAPER
     if not folders and not paper:
         raise MemobenchError("there is nothing to draw; name folders of evaluations, or --with paper, or both")
     runs = read_runs(folders) if folders else []
     check_beside(runs, paper)
+    for note in unlike({run.name: run.protocol for run in runs}) if runs else ():
+        print(f"memobench: note: {note}", file=sys.stderr)
     return runs, paper
 
 

@@ -17,6 +17,7 @@ from lerobot_memobench.engine.reporting import EvaluationReport
 from lerobot_memobench.engine.run import run_evaluation
 from lerobot_memobench.engine.shards import executor_options, plan_shards, run_shards
 from lerobot_memobench.evaluation.documents.report import failure_line, table
+from lerobot_memobench.evaluation.documents.sentences import saw_phrase
 from lerobot_memobench.jobs.executors import asked_for
 from lerobot_memobench.jobs.processes import saying_how_to_go_on
 from lerobot_memobench.settings.reading import read_settings
@@ -104,6 +105,7 @@ def print_figures(report: EvaluationReport) -> None:
     screen.print()
     screen.print(table(report.summary), crop=False)
     screen.print(failure_line(report.summary))
+    screen.print(saw_phrase(report.summary.saw))
     for note in report.notes:
         screen.print(f"note: {note}")
 

@@ -17,7 +17,6 @@ from lerobot_memobench.envs.protocol import EXTENT, read_protocol_file, write_pr
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records.protocol import (
     CARD_FILE,
-    POLICY,
     differences,
     read_card,
     read_protocol,
@@ -59,7 +58,7 @@ def merge(out: Path, folders: Sequence[Path]) -> list[tuple[str, int]]:
 
     out.mkdir(parents=True, exist_ok=True)
     if all(read_protocol_file(source) for source in sources):
-        write_protocol(out, _joined_settings(list(protocols.values())))
+        write_protocol(out, _joined_settings([*map(read_protocol_file, sources), *protocols.values()]))
     for source in folders:
         if source != out:
             _share_films(source / VIDEOS, out / VIDEOS)
@@ -77,7 +76,7 @@ def _joined_settings(protocols: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     joined: dict[str, Any] = {}
     for protocol in protocols:
         joined = {**protocol, **joined}
-    return {key: value for key, value in joined.items() if key not in (*EXTENT, POLICY)}
+    return {key: value for key, value in joined.items() if key not in EXTENT}
 
 
 def _wanted(card: Mapping[str, Any]) -> list[tuple[str, int]]:

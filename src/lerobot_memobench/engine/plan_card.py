@@ -15,6 +15,8 @@ from lerobot_memobench.engine.policy_identity import (
     training_facts,
     tree_hash,
 )
+from lerobot_memobench.envs.obs_types import what_is_seen
+from lerobot_memobench.envs.protocol import SAW
 from lerobot_memobench.policies.checkpoint import ADAPTER_FILE, WEIGHTS_FILE, local_folder, portable_path
 
 
@@ -50,7 +52,11 @@ def _protocol(plan: EvaluationPlan) -> dict[str, Any]:
     if plan.grid is None or plan.environment is None:
         return {}
     names = sorted(place.task.name for place in plan.grid.places)
-    return {"tasks": names, "episodes": plan.grid.runs, **plan.environment.protocol}
+    environment = plan.environment
+    seen = (
+        {} if plan.policy is None else {SAW: what_is_seen(plan.policy, environment.obs_type, environment.oracle_memory)}
+    )
+    return {"tasks": names, "episodes": plan.grid.runs, **environment.protocol, **seen}
 
 
 def _task_files(plan: EvaluationPlan) -> dict[str, str]:

@@ -2,31 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NotRequired, TypedDict
+from typing import Any, NotRequired, TypedDict
 
+from lerobot_memobench.envs.acting import ELSEWHERE, checkpoint_files, encoded, tree_hash
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.files import file_hash
 from lerobot_memobench.files.reading import Count, read_json
 
-if TYPE_CHECKING:
-    from lerobot.configs.policies import PreTrainedConfig
-
-NOT_THE_CHECKPOINT = (
-    *("train_config.json", "README.md", "training_weights.safetensors", ".gitattributes"),
-    *("training_curve.png", "training_curve.json"),
-)
-"""Files of a checkpoint folder on which what the policy does at evaluation does not depend."""
-
-ELSEWHERE = (
-    *("device", "pretrained_path", "repo_id", "private", "tags", "license", "push_to_hub", "use_peft"),
-    *("host", "port", "servers", "connect_timeout", "timeout", "retry"),
-)
-"""Settings of a policy that say where it runs or where it goes, not what it does."""
+__all__ = ["checkpoint_files", "encoded", "eyes_hash", "policy_facts", "training_facts", "tree_hash"]
 
 
 class TrainedOn(TypedDict, total=False):
@@ -43,15 +29,6 @@ class TrainConfig(TypedDict):
 
     dataset: TrainedOn
     steps: NotRequired[Count | None]
-
-
-def encoded(policy: PreTrainedConfig) -> dict[str, Any]:
-    """Return a policy's configuration as plain JSON values."""
-    import draccus
-
-    found = json.loads(json.dumps(draccus.encode(policy), default=str))
-    assert isinstance(found, dict)
-    return {**found, "type": policy.type}
 
 
 def policy_facts(settings: Mapping[str, Any], seed: int | None) -> dict[str, Any]:
@@ -86,12 +63,6 @@ def eyes_hash(settings: Mapping[str, Any]) -> str | None:
     return file_hash(eyes_file(settings["eyes"]))
 
 
-def checkpoint_files(folder: Path) -> dict[str, str]:
-    """Return name -> sha256 of the files that a checkpoint consists of."""
-    files = sorted(path for path in folder.iterdir() if path.is_file() and path.name not in NOT_THE_CHECKPOINT)
-    return {path.name: file_hash(path) for path in files}
-
-
 def training_facts(folder: Path) -> dict[str, Any] | None:
     """Return what a checkpoint says about the dataset it was trained on, None where it says nothing.
 
@@ -110,9 +81,3 @@ def training_facts(folder: Path) -> dict[str, Any] | None:
         files = sorted(path for path in [*(root / "meta").rglob("*"), root / "manifest.json"] if path.is_file())
         found["sha256"] = tree_hash({str(path.relative_to(root)): file_hash(path) for path in files})
     return found
-
-
-def tree_hash(files: Mapping[str, str]) -> str:
-    """Return one sha256 for many: of the lines ``<sha256>  <name>`` in the order of names, as sha256sum prints them."""
-    lines = "".join(f"{files[name]}  {name}\n" for name in sorted(files))
-    return hashlib.sha256(lines.encode()).hexdigest()

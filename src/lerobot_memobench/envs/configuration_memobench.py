@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import count
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ import gymnasium as gym
 from lerobot.configs import PolicyFeature, PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 
+from lerobot_memobench.envs.acting import acting
 from lerobot_memobench.envs.obs_types import OBJECTS, OBS_TYPES, PIXELS
 from lerobot_memobench.envs.observations import (
     METADATA,
@@ -194,8 +196,8 @@ class MemobenchEnvConfig(EnvConfig):
             # LeRobot's workers are forked from a server: it imports torch and the simulator once for all of them.
             get_context("forkserver").set_forkserver_preload([MemobenchEnv.__module__])
         log_dir = self.resolved_log_dir()
-        settings = self.gym_kwargs
-        protocol = {**self.protocol, "prompt_in": settings["prompt_in"]}
+        settings = {**self.gym_kwargs, "acting": acting(self.obs_type, self.oracle_memory)}
+        protocol = {**self.protocol, "prompt_in": settings["prompt_in"], **settings["acting"].protocol}
         check_protocol(log_dir, protocol)  # now, not when the first episode has been simulated
         suites: dict[str, dict[int, gym.vector.VectorEnv]] = {}
         for memory_type, task_id, folder in chosen:
@@ -232,7 +234,17 @@ class MemobenchEnvConfig(EnvConfig):
         return prompt_in(policy_being_run()) if self.prompt_in == AUTO else self.prompt_in
 
     def resolved_log_dir(self) -> Path:
-        """Return the folder of the episode log: given, else the run's output folder, else a dated one."""
+        """Return the folder of the episode log: given, else the run's output folder, else a dated one.
+
+        Each evaluation within a training has its own in there, ``evaluation-1`` and so on: a policy that has learned
+        on is another.
+        """
+        folder = self._log_folder()
+        if not training_runs():
+            return folder
+        return next(place for k in count(1) if not (place := folder / f"evaluation-{k}").exists())
+
+    def _log_folder(self) -> Path:
         if self.log_dir is not None:
             return Path(self.log_dir)
         from datetime import datetime

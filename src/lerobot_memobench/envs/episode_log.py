@@ -64,6 +64,9 @@ class EpisodeRecord(Outcome):
     prompt_shown: NotRequired[bool | None]
     wall_s: NotRequired[Number | None]
     not_run: NotRequired[str]
+    policy: NotRequired[Name | None]
+    run: NotRequired[Name | None]
+    saw: NotRequired[Name | None]
     written_at: NotRequired[Number]
 
 
@@ -157,7 +160,7 @@ def read_log(directory: str | Path, problems: list[str] | None = None) -> list[d
     named in ``problems`` (file, line, reason) and logged as warnings.
 
     Raises:
-        MemobenchError: there is no such folder, or no log in it.
+        MemobenchError: there is no such folder, no log in it, or one of several policies.
     """
     directory = Path(directory)
     if not directory.is_dir():
@@ -169,18 +172,32 @@ def read_log(directory: str | Path, problems: list[str] | None = None) -> list[d
             "evaluation writes them"
         )
     found: list[str] = []
+    policies: dict[str | None, tuple[Path, dict[str, Any]]] = {}
     newest: dict[tuple[str, int, str], tuple[float, dict[str, Any]]] = {}
     for file in files:
         for record in _read_lines(file, found):
+            policies.setdefault(record.get("policy"), (file, record))
             written = float(record.pop(WRITTEN_AT, 0.0))
             key = (record["task"], record["episode"], record.get("referent", "fixed"))
             if key not in newest or written >= newest[key][0]:
                 newest[key] = (written, record)
+    _check_one_policy(directory, policies)
     for problem in found:
         logger.warning("%s", problem)
     if problems is not None:
         problems += found
     return [newest[key][1] for key in sorted(newest)]
+
+
+def _check_one_policy(directory: Path, policies: Mapping[str | None, tuple[Path, Mapping[str, Any]]]) -> None:
+    """Refuse a log of several policies (identity -> a line of it and its file): its rates would be nobody's."""
+    known = [(name, *place) for name, place in policies.items() if name is not None]
+    if len(known) > 1:
+        told = " and ".join(f"{name} ({record['task']}, in {file.name})" for name, file, record in known[:2])
+        raise MemobenchError(
+            f"{directory} holds episodes of {len(known)} policies: {told}; they are not one evaluation. Evaluate each "
+            "into a folder of its own, or sort the lines by their `policy` into such folders"
+        )
 
 
 def has_log(directory: Path) -> bool:

@@ -14,6 +14,7 @@ import numpy as np
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from numpy.typing import NDArray
 
+from lerobot_memobench.envs.acting import NOBODY, Acting
 from lerobot_memobench.envs.annotate import BAND
 from lerobot_memobench.envs.episode import HORIZON, PROMPT_LIMIT, Episode
 from lerobot_memobench.envs.episode_log import EpisodeLog
@@ -63,6 +64,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     Args:
         folder: the task's folder.
         log_dir: where finished episodes are logged; nowhere when None.
+        acting: whose episodes they are; one that it does not count is neither logged nor filmed.
         others: see `MemobenchEnvConfig`.
     """
 
@@ -88,6 +90,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         films: int | None = None,
         videos: bool = False,
         seed_base: int = SEED_BASE,
+        acting: Acting = NOBODY,
     ) -> None:
         self.render_mode = "rgb_array"
         self._task = load_task(folder)
@@ -111,7 +114,9 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             "render": render,
             "render_every": render_every,
             "oracle_memory": oracle_memory,
+            **acting.protocol,
         }
+        self._acting = acting
         self._log = EpisodeLog(log_dir, protocol) if log_dir is not None else None
         self._videos = Path(log_dir) / "videos" if log_dir is not None else None
         self._filmed = range(films or 0)
@@ -168,7 +173,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._describe(0)
         self._sight.begin(self.episode)
         number = seed - self._seed_base
-        if self._videos is not None and (self._films_all or number in self._filmed):
+        filmed = (self._films_all or number in self._filmed) and self._acting.counts(seed)
+        if self._videos is not None and filmed:
             self._film = Film(self._videos / f"{self.task}.{number}.mp4", METADATA["render_fps"])
             self._film.add(self.render())
         with self._noting():
@@ -257,7 +263,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             self._film.finish()
             self._film = None
         self._discard_film()
-        if self._log is not None:
+        if self._log is not None and self._acting.counts(self._seed):
             self._log.append(self.record())
 
     def _describe(self, completed: int) -> None:
@@ -276,15 +282,17 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         """Return the episode's line for the log."""
         self._check_began("record")
         if self._not_run is not None:
-            return not_run_record(
+            found = not_run_record(
                 self._task, self._seed, seed_base=self._seed_base, referent=self._referent, why=self._not_run
             )
-        return episode_record(
+            return found | self._acting.line
+        found = episode_record(
             self.episode,
             seed_base=self._seed_base,
             replan_steps=self._replan_steps,
             wall_s=time.monotonic() - self._started,
         )
+        return found | self._acting.line
 
     def _observation(self) -> dict[str, Any]:
         if self._not_run is not None:

@@ -13,7 +13,7 @@ PIXELS, OBJECTS, BOTH = "pixels_agent_pos", "environment_state_agent_pos", "both
 OBS_TYPES = (PIXELS, OBJECTS, BOTH)
 """Values of ``env.obs_type``; the first two by LeRobot's names."""
 
-READ_OBJECTS = ("act", "diffusion", "tdmpc")
+READ_OBJECTS = ("act", "diffusion", "tdmpc", "gaussian_actor")
 """Policies of LeRobot's that read `observation.environment_state` where they were trained on it; others ignore it."""
 
 
@@ -34,6 +34,36 @@ def obs_type_of(policy: Any) -> str | None:
     return OBJECTS if objects else None
 
 
+SEEN_PIXELS, DETECTIONS, PRIVILEGED, SIMULATOR, MEMORY_TEXT = (
+    *("pixels", "detections", "privileged object state", "privileged simulator state", "oracle memory text"),
+)
+"""What a policy may have seen, as reports say it. Detections: objects that a detector finds in pixels."""
+NOTHING = "nothing"
+
+
+def what_is_seen(policy: Any, shown: str, oracle_memory: bool = False) -> str:
+    """Return in words what a policy sees beside the arm's state; where that is not known, all that it is shown.
+
+    Args:
+        policy: its configuration, or the class of it. One that says by ``sees`` what it sees is taken at its word.
+        shown: what the environment observes.
+        oracle_memory: whether the instruction tells what was done so far.
+    """
+    own = getattr(policy, "sees", None)
+    if isinstance(own, tuple):
+        found = own
+    else:
+        inputs = getattr(policy, "input_features", None) or {}
+        types = {getattr(feature.type, "value", feature.type) for feature in inputs.values()}
+        all_shown = not types & {"VISUAL", "ENV"}
+        ignores = type(policy).__module__.startswith("lerobot.") and policy.type not in READ_OBJECTS
+        pixels = shown != OBJECTS and (all_shown or "VISUAL" in types)
+        objects = shown != PIXELS and not ignores and (all_shown or "ENV" in types)
+        found = (SEEN_PIXELS,) * pixels + (PRIVILEGED,) * objects
+    found += (MEMORY_TEXT,) * oracle_memory
+    return ", ".join(found) or NOTHING
+
+
 def check_obs_type(policy: Any, shown: str) -> None:
     """Refuse to show a policy something else than it sees.
 
@@ -47,4 +77,7 @@ def check_obs_type(policy: Any, shown: str) -> None:
     needed = obs_type_of(policy)
     if needed is not None and shown not in (needed, BOTH):
         wanted = BOTH if needed == BOTH else f"{needed} or {BOTH}"
-        raise MemobenchError(f"env.obs_type is {shown}, which does not show what the policy sees; set it to {wanted}")
+        told = "" if needed == PIXELS else f" ({PRIVILEGED} among it)"
+        raise MemobenchError(
+            f"env.obs_type is {shown}, which does not show what the policy sees{told}; set it to {wanted}"
+        )

@@ -42,7 +42,7 @@ def policy_being_run() -> type | None:
     checkpoint = checkpoint_being_run()
     if checkpoint is not None:
         return type(checkpoint[1])
-    name = parser.get_type_arg("policy") or _in_file("policy", "type")
+    name = parser.get_type_arg("policy") or in_file("policy", "type")
     known: dict[str, type] = PreTrainedConfig.get_known_choices()
     return known.get(name) if isinstance(name, str) else None
 
@@ -88,14 +88,14 @@ def checkpoint_being_run() -> tuple[str, PreTrainedConfig] | None:
 
 def training_runs() -> bool:
     """Return whether a dataset is on LeRobot's command line: then a policy is trained on it, whatever it saw before."""
-    return any(argument.startswith("--dataset.") for argument in sys.argv[1:]) or _in_file("dataset") is not None
+    return any(argument.startswith("--dataset.") for argument in sys.argv[1:]) or in_file("dataset") is not None
 
 
 def rename_map() -> dict[str, str]:
     """Return LeRobot's ``rename_map`` of its command line: names of the environment's -> names of the policy's."""
     from lerobot.configs import parser
 
-    return read_rename_map(parser.parse_arg("rename_map") or _in_file("rename_map"))
+    return read_rename_map(parser.parse_arg("rename_map") or in_file("rename_map"))
 
 
 def name_in_data(name: str) -> str:
@@ -112,7 +112,7 @@ def read_rename_map(told: Any) -> dict[str, str]:
     return {str(key): str(value) for key, value in found.items()} if isinstance(found, dict) else {}
 
 
-def _in_file(*keys: str) -> Any | None:
+def in_file(*keys: str) -> Any | None:
     """Return what a local file of LeRobot's settings, or the one in a checkpoint's folder, says; None without one."""
     from lerobot.configs import parser
 

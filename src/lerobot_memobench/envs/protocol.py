@@ -42,9 +42,12 @@ SETTINGS = (
 )
 """What must agree for two evaluations to be one, or to be compared."""
 
-OF_THE_POLICY = ("prompt_in",)
-"""Those of them that follow from what a policy can take in: evaluations of two policies may differ in them, which is
-told, the parts of one may not."""
+SAW = "saw"
+"""What the policy saw, in the words of `obs_types.what_is_seen`; absent where nobody wrote it down."""
+
+OF_THE_POLICY = ("prompt_in", SAW)
+"""What follows from what a policy can take in: evaluations of two policies may differ in it, which is told, the parts
+of one may not."""
 
 EXTENT = ("tasks", "episodes")
 """How much was run: it may differ, the episodes in common still compare."""
@@ -71,6 +74,15 @@ class Settings(TypedDict, total=False):
     render: Name | None
     render_every: Count | None
     oracle_memory: bool | None
+    saw: Name | None
+
+
+class PolicyIdentity(TypedDict, total=False):
+    """Whose episodes they are, of evaluations without a card: see `acting.Acting`."""
+
+    type: Name | None
+    identity: Name
+    sha256: str | None
 
 
 class Protocol(Settings, total=False):
@@ -78,6 +90,7 @@ class Protocol(Settings, total=False):
 
     tasks: list[Name]
     episodes: Episodes
+    policy: PolicyIdentity
 
 
 class WholeProtocol(Settings):
@@ -151,10 +164,11 @@ def read_protocol_file(directory: Path) -> dict[str, Any]:
 def check_protocol(directory: Path, settings: Mapping[str, Any]) -> bool:
     """Return whether the folder holds this protocol already; raise where it holds another one."""
     earlier = read_protocol_file(directory)
-    found = differences(earlier, settings) if earlier else []
+    found = differences(earlier, settings, policy=True) if earlier else []
     if found:
+        what = "policy" if all(each.startswith(f"{POLICY}.") for each in found) else "protocol"
         raise MemobenchError(
-            f"{directory} holds episodes of another protocol ({'; '.join(found)}, the first value being that of the "
+            f"{directory} holds episodes of another {what} ({'; '.join(found)}, the first value being that of the "
             "episodes there); evaluate into another folder"
         )
     return bool(earlier)

@@ -118,7 +118,7 @@ def test_markdown_escapes_what_would_break_a_table() -> None:
 
 def test_the_paper_stands_beside_with_what_differs(sweep: list[Run]) -> None:
     text = rendered(sweep, "markdown", paper=True)
-    assert "| paper: π0.5 + memory module | 5 | 9.8 | 92.0 | 32.2 | 10.0 |" in text
+    assert "| paper: π0.5 + memory module | pixels | 5 | 9.8 | 92.0 | 32.2 | 10.0 |" in text
     assert text.count("| paper: ") == 43
     assert "2 of 30 tasks, 4 episodes of each instead of 50" in text
     assert text.count("| **mine\\_&\\_co k=20 (2 of 30 tasks, 8 rollouts)** |") == 3
@@ -145,7 +145,7 @@ def test_the_terminal_keeps_every_rate_in_one_piece(sweep: list[Run]) -> None:
     assert max(map(len, text.splitlines())) <= WIDTH
     assert "75.0 [30.1–95.4]" in text
     (line,) = [line for line in text.splitlines() if "paper: MemER" in line and "62.4" in line]
-    assert line.split()[3:] == [
+    assert line.split()[4:] == [
         "62.4",
         "63.8",
         "61.7",

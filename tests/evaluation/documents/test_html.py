@@ -98,7 +98,13 @@ def test_figures_are_those_of_the_report(tmp_path: Path) -> None:
         "reference_drift": 0,
         "execution_failure": 0,
     }
-    assert run["facts"] == ["4 rollouts", "1 task", "seeds 7 to 10", "referent fixed"]
+    assert run["facts"] == [
+        "4 rollouts",
+        "1 task",
+        "seeds 7 to 10",
+        "referent fixed",
+        "what the policy saw is not recorded",
+    ]
     assert run["commands"] == []
 
 

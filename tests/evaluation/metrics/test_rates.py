@@ -82,6 +82,7 @@ def test_report_of_the_hand_made_log() -> None:
             "execution_failure": 0,
         },
         "prefix": {"t1": [75.0, 50.0, 25.0], "t2": [100.0, 50.0], "s1": [50.0, 50.0], "o1": [50.0]},
+        "saw": "not recorded",
     }
 
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
 
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.comparison.granularity import relabelled
 from lerobot_memobench.evaluation.comparison.pairing import by_replan, paired
-from lerobot_memobench.evaluation.metrics.rollouts import Record
-from lerobot_memobench.evaluation.records.protocol import differences, read_protocol
+from lerobot_memobench.evaluation.documents.sentences import saw_phrase
+from lerobot_memobench.evaluation.metrics.rollouts import Record, saw
+from lerobot_memobench.evaluation.records.protocol import POLICY, differences, read_protocol
+from lerobot_memobench.evaluation.records.runs import asked_for
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import LEVELS
 
@@ -28,8 +31,9 @@ def pairs_by_replan(
     """
     check_alike(first, second, ignore)
     notes: list[str] = []
+    seen: list[str] = []
     a, b = (
-        by_replan([record for folder in folders for record in read_episodes(folder, notes)])
+        by_replan([record for folder in folders for record in _rollouts(folder, notes, seen)])
         for folders in (first, second)
     )
     common = [replan for replan in a if replan in b]
@@ -46,7 +50,7 @@ def pairs_by_replan(
         found[replan] = (left, right)
         if partnerless:
             notes.append(f"replan interval {replan}: {partnerless} rollouts have no partner and are left out")
-    return found, notes
+    return found, notes + seen
 
 
 def check_alike(first: Sequence[Path], second: Sequence[Path], ignore: Sequence[str] = ()) -> None:
@@ -55,6 +59,8 @@ def check_alike(first: Sequence[Path], second: Sequence[Path], ignore: Sequence[
     Raises:
         MemobenchError: naming the first two of them.
     """
+    for folders in (first, second):
+        check_one_policy(folders)
     reference = read_protocol(first[0])
     for folder in [*first[1:], *second]:
         found = differences(reference, read_protocol(folder), ignore=("replan_steps", *ignore))
@@ -63,6 +69,30 @@ def check_alike(first: Sequence[Path], second: Sequence[Path], ignore: Sequence[
                 f"{first[0]} and {folder} were evaluated under different protocols ({'; '.join(found)}); evaluate both "
                 "under the same one"
             )
+
+
+def check_one_policy(folders: Sequence[Path]) -> None:
+    """Refuse evaluations of two policies where those of one, at several replan intervals, were expected.
+
+    Raises:
+        MemobenchError: naming the first two.
+    """
+    told = {folder: read_protocol(folder)[POLICY] for folder in folders}
+    for key in ("type", "sha256"):
+        known = {folder: policy[key] for folder, policy in told.items() if policy.get(key)}
+        if len(set(known.values())) > 1:
+            (a, mine), (b, other) = next(pair for pair in combinations(known.items(), 2) if pair[0][1] != pair[1][1])
+            raise MemobenchError(
+                f"{a} and {b} are of two policies ({key} {str(mine)[:12]} and {str(other)[:12]}); expected one policy "
+                "at several replan intervals, so leave one of them out"
+            )
+
+
+def _rollouts(folder: Path, notes: list[str], seen: list[str]) -> list[Record]:
+    """Return the rollouts of an evaluation that were asked for; what its policy saw is told in ``seen``."""
+    found: list[Record] = [*asked_for(folder, read_episodes(folder, notes), notes)]
+    seen.append(f"{folder}: {saw_phrase(saw(found))}")
+    return found
 
 
 def rollouts_by_level(*folders: Path) -> tuple[dict[str, list[Record]], list[str]]:
@@ -77,8 +107,9 @@ def rollouts_by_level(*folders: Path) -> tuple[dict[str, list[Record]], list[str
     for folder in folders[1:]:
         check_alike(folders[:1], [folder])
     notes: list[str] = []
+    seen: list[str] = []
     levels: dict[str, list[Record]] = {
-        level: [*read_episodes(folder, notes)] for level, folder in zip(LEVELS, folders, strict=True)
+        level: _rollouts(folder, notes, seen) for level, folder in zip(LEVELS, folders, strict=True)
     }
     intervals = {level: list(by_replan(records)) for level, records in levels.items()}
     if len({tuple(found) for found in intervals.values()}) > 1:
@@ -86,7 +117,7 @@ def rollouts_by_level(*folders: Path) -> tuple[dict[str, list[Record]], list[str
         raise MemobenchError(f"the levels were evaluated at different replan intervals ({told}); use the same replan=")
     if len(intervals[LEVELS[0]]) > 1:
         notes.append("the evaluations mix replan intervals; the figures are over all of them")
-    return levels, notes
+    return levels, notes + seen
 
 
 def with_labels_of_level(levels: Mapping[str, Sequence[Record]]) -> dict[str, list[Record]]:

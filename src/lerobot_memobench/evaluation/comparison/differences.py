@@ -13,6 +13,7 @@ from lerobot_memobench.evaluation.comparison.pairing import ALLOWED, Pair, commo
 from lerobot_memobench.evaluation.documents.evaluation_tables import AVERAGE
 from lerobot_memobench.evaluation.documents.sentences import count_of
 from lerobot_memobench.evaluation.metrics.rates import METRICS, value_of
+from lerobot_memobench.evaluation.metrics.rollouts import saw
 from lerobot_memobench.evaluation.records.protocol import OF_THE_POLICY, differences
 from lerobot_memobench.evaluation.records.runs import Run
 from lerobot_memobench.tasks.task import MEMORY_TYPES
@@ -55,13 +56,14 @@ class Difference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Both evaluations' names, how many pairs there are, all differences, and what a reader must know."""
+    """Both evaluations' names, how many pairs there are, all differences, what a reader must know, what each saw."""
 
     a: str
     b: str
     pairs: int
     differences: tuple[Difference, ...]
     notes: tuple[str, ...]
+    saw: tuple[str, str]
 
 
 def compare(
@@ -89,7 +91,11 @@ def compare(
         for metric in METRICS
         if (row := _difference(scope, metric, members, rng, permutations)) is not None
     ]
-    return Comparison(a.name, b.name, len(pairs), tuple(_adjusted(rows)), tuple(_notes(a, b, len(pairs))))
+    notes, seen = (
+        tuple(_notes(a, b, len(pairs))),
+        (saw([mine for mine, _ in pairs]), saw([other for _, other in pairs])),
+    )
+    return Comparison(a.name, b.name, len(pairs), tuple(_adjusted(rows)), notes, seen)
 
 
 def _like_pairs(a: Run, b: Run, allow: Collection[str]) -> list[Pair]:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from lerobot_memobench.evaluation.comparison.differences import Comparison, Difference
-from lerobot_memobench.evaluation.documents.sentences import count_of
+from lerobot_memobench.evaluation.documents.sentences import count_of, saw_phrase
 from lerobot_memobench.evaluation.documents.tables import Cell, Count, Name, Numbers, Report, Section, Table
 from lerobot_memobench.evaluation.metrics.rates import percent
 
@@ -36,7 +36,8 @@ def _table(key: str, title: str, found: Comparison, rows: Sequence[Difference], 
     header += ["p (Holm)"] * tasks + ["detectable"]
     starts = [k for k, row in enumerate(rows) if k == 0 or rows[k - 1].scope != row.scope]
     cells = tuple(_row(row, tasks, k in starts) for k, row in enumerate(rows))
-    return Table(key, title, tuple(header), cells, rules=frozenset(starts) - {0})
+    seen = "; ".join(f"{name}: {saw_phrase(words)}" for name, words in zip((found.a, found.b), found.saw, strict=True))
+    return Table(key, title, tuple(header), cells, note=f"{seen}.", rules=frozenset(starts) - {0})
 
 
 def _row(row: Difference, tasks: bool, first: bool) -> tuple[Cell, ...]:
@@ -72,6 +73,7 @@ def data(found: Comparison) -> dict[str, Any]:
     return {
         "a": found.a,
         "b": found.b,
+        "saw": {found.a: found.saw[0], found.b: found.saw[1]},
         "pairs": found.pairs,
         "differences": [_entry(row) for row in found.differences],
         "notes": list(found.notes),

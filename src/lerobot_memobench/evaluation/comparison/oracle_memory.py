@@ -18,7 +18,9 @@ from lerobot_memobench.evaluation.comparison.estimates import (
     Array,
     Estimate,
     as_percent,
+    difference_interval,
     estimate,
+    newcombe,
     number,
     percentiles,
 )
@@ -69,15 +71,43 @@ def contrasts(standard: Sequence[Record], other: Sequence[Record], draws: int = 
     clouds = [_rates(records, np.random.default_rng(seed), draws) for records in (standard, other)]
     return {
         name: {
-            metric: _contrast(*(point[name][metric] for point in points), *(cloud[name][metric] for cloud in clouds))
+            metric: _contrast(
+                *(point[name][metric] for point in points),
+                *(cloud[name][metric] for cloud in clouds),
+                _pairs(standard, other, name, metric),
+            )
             for metric in metrics
         }
         for name, metrics in points[0].items()
     }
 
 
-def _contrast(a: Array | None, b: Array | None, many_a: Array | None, many_b: Array | None) -> Contrast:
-    """Return what rates, (1,), and their bootstrap draws, (draws,), say of two evaluations."""
+def _pairs(standard: Sequence[Record], other: Sequence[Record], scope: str, metric: str) -> tuple[Array, Array, Array]:
+    """Return each pair's two values and its weight in the mean of a scope, (n,) each, where the metric applies."""
+    groups: dict[str, list[tuple[Array, Array]]] = {}
+    others = by_task(other)
+    for task, group in by_task(standard).items():
+        kind = str(group[0]["memory_type"])
+        a, b = _values(group)[metric], _values(others[task])[metric]
+        if scope in (kind, AVERAGE) and a is not None and b is not None:
+            groups.setdefault(kind, []).append((a, b))
+    parts = [
+        (a, b, np.full(len(a), 1 / (len(groups) * len(tasks) * len(a)))) for tasks in groups.values() for a, b in tasks
+    ]
+    if not parts:
+        return np.empty(0), np.empty(0), np.empty(0)
+    a, b, weights = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return a, b, weights
+
+
+def _contrast(
+    a: Array | None,
+    b: Array | None,
+    many_a: Array | None,
+    many_b: Array | None,
+    pairs: tuple[Array, Array, Array],
+) -> Contrast:
+    """Return what rates, (1,), their bootstrap draws, (draws,), and the pairs behind them say of two evaluations."""
     if a is None or b is None or many_a is None or many_b is None:
         return Contrast(None, None, Estimate(None), Estimate(None))
     gap = 1.0 - many_a
@@ -85,8 +115,10 @@ def _contrast(a: Array | None, b: Array | None, many_a: Array | None, many_b: Ar
     closed = Estimate(gap_closed(float(a[0]), float(b[0])))
     # Where the gap vanishes in many draws, the share has no interval worth the name.
     if closed.value is not None and len(shares) > 0.9 * len(gap):
-        closed = Estimate(closed.value, *percentiles(shares))
-    difference = Estimate(float(b[0]) - float(a[0]), *percentiles(many_b - many_a))
+        least, most = (bound / (1.0 - float(a[0])) for bound in newcombe(*pairs))
+        low, high = percentiles(shares)
+        closed = Estimate(closed.value, min(low, least), min(max(high, most), 1.0))
+    difference = Estimate(float(b[0]) - float(a[0]), *difference_interval(many_b - many_a, *pairs))
     return Contrast(float(a[0]), float(b[0]), difference, closed)
 
 
@@ -147,8 +179,8 @@ def _published(standard: float | None, oracle: float | None) -> Contrast:
 
 SENTENCE = (
     "Cells are standard/oracle in per cent. Gap closed is (oracle − standard)/(100 − standard), with "
-    "the 95 % interval of a bootstrap over paired episodes; – where an operation does not occur, or "
-    "the gap is under one point."
+    "the 95 % interval of a bootstrap over paired episodes, at least Newcombe's of so many; – where an operation "
+    "does not occur, or the gap is under one point."
 )
 
 

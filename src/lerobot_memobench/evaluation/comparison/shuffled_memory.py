@@ -20,9 +20,9 @@ from lerobot_memobench.evaluation.comparison.estimates import (
     Array,
     Estimate,
     as_percent,
+    difference_interval,
     estimate,
     number,
-    percentiles,
 )
 from lerobot_memobench.evaluation.documents.tables import Cell, Name, Report, Section, Table
 from lerobot_memobench.evaluation.metrics.rates import Rate
@@ -61,12 +61,16 @@ def prefix_curves(
         chosen = np.random.default_rng(seed).integers(len(group), size=(draws, len(group)))
         step = (b - a)[chosen].mean(axis=1)
         difference = (b - a).mean(axis=0)
+        weights = np.full(len(group), 1 / len(group))
         curves.append(
             PrefixCurve(
                 task,
                 tuple(a.mean(axis=0).tolist()),
                 tuple(b.mean(axis=0).tolist()),
-                tuple(Estimate(float(d), *percentiles(step[:, k])) for k, d in enumerate(difference)),
+                tuple(
+                    Estimate(float(d), *difference_interval(step[:, k], a[:, k], b[:, k], weights))
+                    for k, d in enumerate(difference)
+                ),
                 len(group),
             )
         )
@@ -81,7 +85,8 @@ def _prefixes(group: Sequence[Record]) -> Array:
 
 SENTENCE = (
     "Rollouts in which a checkpoint and all before it were satisfied, per cent, with Wilson's 95 % interval. The "
-    "difference is shuffled − normal, with its bootstrap interval over paired episodes."
+    "difference is shuffled − normal, with its bootstrap interval over paired episodes, "
+    "at least Newcombe's of so many pairs."
 )
 SEVERAL = 3
 """Subgoals of a task that can change places in more than one way."""

@@ -14,6 +14,7 @@ from lerobot_memobench.paper import PublishedRow, failure_taxonomy, published_ro
 from lerobot_memobench.tasks.task import MEMORY_TYPES, PUBLISHED
 
 PAPER_PROTOCOL = {"referent": "fixed", "prompt_video": True, "horizon": 1200, "seed_base": 7}
+PAPER_SAW = "pixels"
 PAPER_TASKS, PAPER_EPISODES = 30, 50
 
 TABLES = (
@@ -78,7 +79,12 @@ def _beside(runs: Sequence[Run], key: str, title: str, sources: Sequence[str]) -
 
 def _published_row(row: PublishedRow) -> tuple[Cell, ...]:
     columns = [*(row.memory_types[name] for name in MEMORY_TYPES), row.average]
-    return (f"paper: {row.label}", row.replan_steps, *(published_rate(c[m]) for c in columns for m in METRICS))
+    return (
+        f"paper: {row.label}",
+        PAPER_SAW,
+        row.replan_steps,
+        *(published_rate(c[m]) for c in columns for m in METRICS),
+    )
 
 
 def published_rate(value: float | None) -> Rate:

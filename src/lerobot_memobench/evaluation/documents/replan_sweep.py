@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from lerobot_memobench.evaluation.documents.evaluation_tables import HOW_TO_READ, rate_row
+from lerobot_memobench.evaluation.documents.sentences import saw_sentence
 from lerobot_memobench.evaluation.documents.tables import Section, Table, best_in_columns, figure
 from lerobot_memobench.evaluation.documents.wide_tables import all_rates, wide_table
 from lerobot_memobench.evaluation.metrics.rates import METRICS, Rate, percent
+from lerobot_memobench.evaluation.metrics.rollouts import saw
 from lerobot_memobench.evaluation.records.runs import Run
 
 
@@ -31,7 +33,7 @@ def _averages(method: str, runs: Sequence[Run]) -> Table:
         f"Average by replan interval: {method}",
         ("replan interval", "n", *METRICS),
         rows,
-        note=HOW_TO_READ,
+        note=f"{HOW_TO_READ} {_seen(runs)}",
         best=best_in_columns(rows),
     )
 
@@ -43,9 +45,13 @@ def _memory_types(method: str, runs: Sequence[Run]) -> Table:
         f"Memory types by replan interval: {method}",
         rows,
         leading=("replan interval",),
-        note="",
+        note=_seen(runs),
         best=best_in_columns(rows),
     )
+
+
+def _seen(runs: Sequence[Run]) -> str:
+    return saw_sentence(saw([record for run in runs for record in run.records]))
 
 
 def _best(runs: Sequence[Run]) -> list[str]:

@@ -27,7 +27,7 @@ from lerobot_memobench.evaluation.documents.terminal import terminal_table
 from lerobot_memobench.evaluation.documents.wide_tables import overview
 from lerobot_memobench.evaluation.metrics.rollouts import Record, faults, mixtures
 from lerobot_memobench.evaluation.metrics.summary import Summary, report, summarise
-from lerobot_memobench.evaluation.records.runs import Run, sweeps
+from lerobot_memobench.evaluation.records.runs import Run, asked_for, sweeps, unlike
 from lerobot_memobench.files import write_file
 
 __all__ = [
@@ -74,7 +74,7 @@ def write_report(directory: str | Path, episodes: int | None = None) -> tuple[Su
     """
     directory = Path(directory)
     notes: list[str] = []
-    logged = read_log(directory, notes)
+    logged = asked_for(directory, read_log(directory, notes), notes)
     if episodes is not None:
         logged = [record for record in logged if record["episode"] < episodes]
     write_episodes(directory, logged)
@@ -116,7 +116,8 @@ def build(runs: Sequence[Run], paper: bool = False) -> Report:
     check_beside(runs, paper)
     found = []
     if len(runs) > 1:
-        found.append(Section("Evaluations", (overview(runs),)))
+        notes = unlike({run.name: run.protocol for run in runs})
+        found.append(Section("Evaluations", (overview(runs),), notes=tuple(notes)))
     found += [sweep(method, group) for method, group in sweeps(runs).items()]
     for run in runs:
         section = _section(run.summary, run.records, run.notes)
@@ -131,9 +132,11 @@ def build(runs: Sequence[Run], paper: bool = False) -> Report:
 
 def _section(summary: Summary, records: Sequence[Record], notes: Sequence[str]) -> Section:
     """Return the section of one evaluation, without a title."""
+    seen = sentences.saw_sentence(summary.saw)
+    made = (tables.memory_types(summary), tables.tasks(summary), tables.prefix(summary), tables.failures(summary))
     return Section(
         "",
-        (tables.memory_types(summary), tables.tasks(summary), tables.prefix(summary), tables.failures(summary)),
+        tuple(replace(each, note=f"{each.note} {seen}".strip()) for each in made),
         (sentences.protocol_sentence(records), sentences.pooled_sentence(summary)),
         tuple(notes),
     )

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 
+from lerobot_memobench.evaluation.documents.beside_paper import PAPER_SAW
 from lerobot_memobench.evaluation.documents.report_json import interval_of
 from lerobot_memobench.evaluation.metrics.rates import METRICS, Rate, Row, percent
 from lerobot_memobench.evaluation.metrics.summary import Summary
 from lerobot_memobench.evaluation.records.runs import Run
 from lerobot_memobench.paper import PublishedRow, published_rows
 
-HEADER = ("evaluation", "replan_steps", "table", "name", "figure", "percent", "low", "high", "n")
+HEADER = ("evaluation", "replan_steps", "table", "name", "figure", "percent", "low", "high", "n", "saw")
 """``table`` is tasks, memory_types, average, pooled, prefix, ordered_prefix, failures, or extent beside the paper's."""
 
 CsvRow = tuple[object, ...]
@@ -30,13 +31,24 @@ def _run_rows(run: Run) -> Iterator[CsvRow]:
         # Records of one rollout are not independent: an interval over them would be too narrow.
         interval = None if place == "pooled" and figure != "SR" else interval_of(rate)
         low, high = interval or (None, None)
-        yield (run.name, run.replan_steps, place, name, figure, percent(rate.value), low, high, rate.n or None)
+        yield (
+            run.name,
+            run.replan_steps,
+            place,
+            name,
+            figure,
+            percent(rate.value),
+            low,
+            high,
+            rate.n or None,
+            run.summary.saw,
+        )
 
 
 def _extent(run: Run) -> Iterator[CsvRow]:
     """Yield how much was run: beside rows of 30 tasks and 1,500 rollouts."""
     for figure, count in (("tasks", len(run.summary.tasks)), ("rollouts", run.summary.rollouts)):
-        yield (run.name, run.replan_steps, "extent", "", figure, None, None, None, count)
+        yield (run.name, run.replan_steps, "extent", "", figure, None, None, None, count, run.summary.saw)
 
 
 def _published_rows(published: PublishedRow) -> Iterator[CsvRow]:
@@ -47,7 +59,7 @@ def _published_rows(published: PublishedRow) -> Iterator[CsvRow]:
     ]
     for place, name, figures in groups:
         for metric in METRICS:
-            yield (method, published.replan_steps, place, name, metric, figures[metric], None, None, None)
+            yield (method, published.replan_steps, place, name, metric, figures[metric], None, None, None, PAPER_SAW)
 
 
 def _figures(summary: Summary) -> Iterator[tuple[str, str, str, Rate]]:

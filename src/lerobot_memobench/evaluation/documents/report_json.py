@@ -10,7 +10,7 @@ from lerobot_memobench.evaluation.documents.replan_sweep import best_interval
 from lerobot_memobench.evaluation.metrics.rates import METRICS, Rate, Row, percent
 from lerobot_memobench.evaluation.metrics.summary import report
 from lerobot_memobench.evaluation.records.protocol import POLICY
-from lerobot_memobench.evaluation.records.runs import Run, sweeps
+from lerobot_memobench.evaluation.records.runs import Run, sweeps, unlike
 from lerobot_memobench.paper import PublishedRow, published_rows
 
 
@@ -20,7 +20,10 @@ def report_data(runs: Sequence[Run], paper: bool) -> dict[str, Any]:
     if len(runs) == 1:
         found = run_data(runs[0])
     else:
-        found = {"evaluations": {run.name: run_data(run) for run in runs}}
+        found = {
+            "evaluations": {run.name: run_data(run) for run in runs},
+            "notes": unlike({run.name: run.protocol for run in runs}),
+        }
     if swept := sweeps(runs):
         found["replan_sweep"] = {method: _sweep_data(group) for method, group in swept.items()}
     if paper:

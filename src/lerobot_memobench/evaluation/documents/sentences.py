@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from lerobot_memobench.evaluation.documents.tables import figure
-from lerobot_memobench.evaluation.metrics.rollouts import Record
+from lerobot_memobench.evaluation.metrics.rollouts import NOT_RECORDED, Record, saw
 from lerobot_memobench.evaluation.metrics.summary import Summary
 
 
@@ -21,7 +21,7 @@ def protocol_sentence(records: Sequence[Record]) -> str:
 
 
 def settings_phrases(records: Sequence[Record]) -> list[str]:
-    """Return under which seeds, referent and replan interval rollouts were made, each as a phrase."""
+    """Return under which seeds, referent and replan interval rollouts were made, and what was seen, as phrases."""
     seeds = sorted({record["seed"] for record in records if record.get("seed") is not None})
     referents = sorted({str(record.get("referent", "fixed")) for record in records})
     replans = sorted({record["replan_steps"] for record in records if record.get("replan_steps") is not None})
@@ -31,7 +31,18 @@ def settings_phrases(records: Sequence[Record]) -> list[str]:
     phrases.append(f"referent {', '.join(referents)}")
     if replans:
         phrases.append(f"replan interval {', '.join(map(str, replans))}")
-    return phrases
+    return [*phrases, saw_phrase(saw(records))]
+
+
+def saw_phrase(words: str) -> str:
+    """Return what a policy saw as a phrase, of `rollouts.saw`."""
+    return "what the policy saw is not recorded" if words == NOT_RECORDED else f"the policy saw {words}"
+
+
+def saw_sentence(words: str) -> str:
+    """Return what a policy saw as a sentence, of `rollouts.saw`."""
+    phrase = saw_phrase(words)
+    return f"{phrase[0].upper()}{phrase[1:]}."
 
 
 def pooled_sentence(summary: Summary) -> str:

@@ -18,7 +18,7 @@ from lerobot_memobench.evaluation.metrics.rates import Rate
 WIDTH = 140
 """Columns of a report that is written to a file."""
 
-MOST_COLUMNS = 14
+MOST_COLUMNS = 15
 """Columns of a table with groups that fit beside one another in a terminal."""
 
 

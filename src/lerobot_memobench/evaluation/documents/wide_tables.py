@@ -7,22 +7,24 @@ from collections.abc import Iterable, Sequence
 from lerobot_memobench.evaluation.documents.tables import Cell, Table, best_in_columns
 from lerobot_memobench.evaluation.metrics.rates import METRICS, Rate
 from lerobot_memobench.evaluation.metrics.summary import Summary
-from lerobot_memobench.evaluation.records.runs import Run
+from lerobot_memobench.evaluation.records.runs import Run, unlike
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 
-LEADING = ("evaluation", "k")
+LEADING = ("evaluation", "saw", "k")
 """Columns before the rates."""
+NOTE = "saw: what the policy saw; k: the replan interval."
 
 
 def overview(runs: Sequence[Run]) -> Table:
-    """Return one row per evaluation."""
+    """Return one row per evaluation, and under the table in what they were not run alike."""
     rows = tuple(run_row(run) for run in runs)
-    return wide_table("overview", "Evaluations", rows, best=best_in_columns(rows))
+    notes = unlike({run.name: run.protocol for run in runs})
+    return wide_table("overview", "Evaluations", rows, note=" ".join([NOTE, *notes]), best=best_in_columns(rows))
 
 
 def run_row(run: Run) -> tuple[Cell, ...]:
     """Return the row of an evaluation."""
-    return (run.name, run.replan_steps, *all_rates(run.summary))
+    return (run.name, run.summary.saw, run.replan_steps, *all_rates(run.summary))
 
 
 def all_rates(summary: Summary) -> list[Rate]:
@@ -37,7 +39,7 @@ def wide_table(
     title: str,
     rows: tuple[tuple[Cell, ...], ...],
     leading: tuple[str, ...] = LEADING,
-    note: str = "k is the replan interval.",
+    note: str = NOTE,
     strong: Iterable[int] = (),
     rules: Iterable[int] = (),
     best: frozenset[tuple[int, int]] = frozenset(),

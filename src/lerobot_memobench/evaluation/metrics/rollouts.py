@@ -61,6 +61,15 @@ def _check_one_version(name: str, group: Sequence[Record]) -> None:
         )
 
 
+NOT_RECORDED = "not recorded"
+"""What is said of a policy of which nobody wrote down what it saw."""
+
+
+def saw(records: Iterable[Record]) -> str:
+    """Return what the policy saw, by the rollouts' own words; several of them where they differ."""
+    return "; ".join(sorted({str(record.get("saw") or NOT_RECORDED) for record in records}))
+
+
 PROTOCOL = {"referent": "referent settings", "replan_steps": "replan intervals"}
 """Fields of a record that should agree within one report, and what they are called."""
 

@@ -26,6 +26,7 @@ from lerobot_memobench.evaluation.metrics.rollouts import (
     operations,
     prefix,
     satisfied,
+    saw,
 )
 from lerobot_memobench.tasks.task import MEMORY_TYPES, OPERATIONS
 
@@ -45,6 +46,7 @@ class Summary:
         failures_of: the same by task.
         memory_type_of: task -> memory type.
         operations_of: task -> its checkpoints' labels, such as "SUU".
+        saw: what the policy saw.
     """
 
     tasks: dict[str, Row]
@@ -58,6 +60,7 @@ class Summary:
     failures_of: dict[str, dict[str, int]]
     memory_type_of: dict[str, str]
     operations_of: dict[str, str]
+    saw: str
 
     @property
     def rollouts(self) -> int:
@@ -92,6 +95,7 @@ def summarise(records: Iterable[Record]) -> Summary:
         failures_of={name: failure_counts(group) for name, group in groups.items()},
         memory_type_of=memory_type_of,
         operations_of={name: operations(group[0]) for name, group in groups.items()},
+        saw=saw(records),
     )
 
 
@@ -103,6 +107,7 @@ def report(summary: Summary) -> dict[str, Any]:
         "average": _percentages(summary.average),
         "failures": dict(summary.failures),
         "prefix": {name: [percent(rate.value) for rate in rates] for name, rates in summary.prefix.items()},
+        "saw": summary.saw,
     }
 
 

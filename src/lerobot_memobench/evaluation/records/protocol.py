@@ -43,7 +43,7 @@ def read_protocol(folder: str | Path) -> dict[str, Any]:
     Keys: ``tasks`` (names, sorted) and ``episodes`` (per task; the largest number where they differ) as asked for, or
     as found in the log where nobody wrote down what was asked for; ``suite``; ``seed_base``, ``referent``,
     ``prompt_video``, ``prompt_in``, ``horizon``, ``replan_steps``, ``render``, ``render_every`` as far as they are
-    known; ``policy``, what is known of the policy ({} for plain ``lerobot-eval``).
+    known; ``saw``, what the policy saw; ``policy``, what is known of the policy ({} where nobody wrote it down).
 
     Raises:
         MemobenchError: there is no evaluation in the folder.
@@ -53,7 +53,7 @@ def read_protocol(folder: str | Path) -> dict[str, Any]:
     told: dict[str, Any] = {**card.get("protocol", {}), **read_protocol_file(folder)}
     if not {*EXTENT, *SETTINGS} - {"suite"} <= set(told):  # without a suite it is of the time when there was one
         told = {**protocol_of_log(read_episodes(folder)), **told}
-    return {**told, POLICY: card.get(POLICY, {})}
+    return {**told, POLICY: card.get(POLICY) or told.get(POLICY) or {}}
 
 
 def protocol_of_log(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

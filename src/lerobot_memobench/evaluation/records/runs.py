@@ -17,7 +17,14 @@ from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics.rollouts import Record, faults, mixtures
 from lerobot_memobench.evaluation.metrics.summary import Summary, summarise
-from lerobot_memobench.evaluation.records.protocol import POLICY, one_suite, read_protocol
+from lerobot_memobench.evaluation.records.protocol import (
+    CARD_FILE,
+    POLICY,
+    differences,
+    one_suite,
+    read_card,
+    read_protocol,
+)
 
 HASH_DIGITS = 8
 
@@ -90,6 +97,21 @@ def check_one_suite(records: Mapping[Path, Sequence[Record]]) -> None:
             )
 
 
+def unlike(protocols: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return a sentence for each of several evaluations (name -> protocol) that was not run as the first one was.
+
+    Replan intervals may differ: they are compared on purpose.
+    """
+    (first, reference), *others = protocols.items()
+    found = {name: differences(reference, protocol, extent=True, ignore=("replan_steps",)) for name, protocol in others}
+    return [
+        f"{name} was not run as {first} was ({'; '.join(settings)}, the first value being that of {first}): their "
+        "figures do not compare; `memobench compare` does so over the episodes in common, where it can"
+        for name, settings in found.items()
+        if settings
+    ]
+
+
 def read_rollouts(folder: str | Path) -> tuple[list[dict[str, Any]], list[str]]:
     """Return the rollouts of an evaluation, and what a reader must know: unreadable lines, what was not run or
     was broken off, mixed protocols.
@@ -98,11 +120,30 @@ def read_rollouts(folder: str | Path) -> tuple[list[dict[str, Any]], list[str]]:
         MemobenchError: there are none.
     """
     notes: list[str] = []
-    records = read_episodes(folder, notes)
+    records = asked_for(Path(folder), read_episodes(folder, notes), notes)
     if not records:
         told = "".join(f"; {note}" for note in notes)
         raise MemobenchError(f"{folder} holds no rollout that can be read{told}; run an evaluation first")
     return records, notes + faults(records) + mixtures(records)
+
+
+def asked_for(folder: Path, records: list[dict[str, Any]], notes: list[str]) -> list[dict[str, Any]]:
+    """Return the rollouts without those that LeRobot's last batch held beyond what was asked for, by the card.
+
+    Logs of today hold none. Of others that are left out, ``notes`` gets a sentence.
+    """
+    card = read_card(folder / CARD_FILE) if (folder / CARD_FILE).is_file() else {}
+    count, base = (card.get("protocol", {}).get(key) for key in ("episodes", "seed_base"))
+    if count is None:
+        return records
+    seed = (card.get(POLICY) or {}).get("seed")
+    first = seed - base if isinstance(seed, int) and isinstance(base, int) else 0
+    kept = [record for record in records if record["episode"] < first + count]
+    if len(kept) < len(records):
+        notes.append(
+            f"{len(records) - len(kept)} rollouts beyond the {count} of each task that were asked for left out"
+        )
+    return kept
 
 
 def _split(word: str | Path) -> tuple[str | None, Path]:
@@ -143,9 +184,9 @@ def _with_methods(runs: Sequence[Run]) -> list[Run]:
 
 def _methods(runs: Sequence[Run]) -> list[str]:
     """Return whose result each run is: the name that it was given, else its policy's, else its folder's."""
-    policies = dict.fromkeys(_policy(run) for run in runs if not run.method)
+    policies = dict.fromkeys(_policy(run) for run in runs if not run.method and run.protocol.get(POLICY))
     kinds = Counter(kind for kind, _ in policies)
-    chosen = [run.method or _policy_name(run, kinds) for run in runs]
+    chosen = [run.method or (_policy_name(run, kinds) if run.protocol.get(POLICY) else run.name) for run in runs]
     # Where policies are not told, or several results of one stand at the same interval, folders are what is known.
     places = Counter((method, run.replan_steps) for run, method in zip(runs, chosen, strict=True))
     repeated = {method for (method, _), count in places.items() if count > 1}

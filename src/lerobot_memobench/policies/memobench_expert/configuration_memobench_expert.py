@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from lerobot.configs import PreTrainedConfig
 
+from lerobot_memobench.envs.obs_types import SIMULATOR
 from lerobot_memobench.policies.untrained import UntrainedConfig
 
 
@@ -16,3 +17,4 @@ class MemobenchExpertConfig(UntrainedConfig):
     """Nothing to choose: the action comes from the environment's expert (``--env.expert_action=true``)."""
 
     knows_phases: ClassVar[bool] = True
+    sees: ClassVar[tuple[str, ...]] = (SIMULATOR,)

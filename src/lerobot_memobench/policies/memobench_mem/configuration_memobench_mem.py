@@ -11,6 +11,8 @@ from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTr
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
 
 from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
+from lerobot_memobench.envs.obs_types import DETECTIONS, SEEN_PIXELS
+from lerobot_memobench.envs.obs_types import PRIVILEGED as SEEN_OBJECTS
 from lerobot_memobench.envs.observations import IMAGE_KEYS, IMAGE_SIZE
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.eyes.tower import SIDE
@@ -263,6 +265,12 @@ class MemobenchMemConfig(MemobenchMemSettings):
     def finds_objects(self) -> bool:
         """Whether the objects that are seen, alone or beside tokens, are those that eyes find in pictures."""
         return self.has_eyes and self.sees_slots
+
+    @property
+    def sees(self) -> tuple[str, ...]:
+        """What it sees in a rollout, in the words of `envs.obs_types`."""
+        told = self.sees_slots and (not self.finds_objects or self.told_objects != "nothing")
+        return (SEEN_PIXELS,) * (not self.sees_objects) + (DETECTIONS,) * self.finds_objects + (SEEN_OBJECTS,) * told
 
     @property
     def told_in_training(self) -> bool:

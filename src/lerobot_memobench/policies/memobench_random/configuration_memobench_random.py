@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from lerobot.configs import PreTrainedConfig
 
@@ -20,6 +21,8 @@ class MemobenchRandomConfig(UntrainedConfig):
         smoothing: share of the last action kept in the next one, in [0, 1). At 0 draws are independent and the
             arm trembles about one place; towards 1 it wanders.
     """
+
+    sees: ClassVar[tuple[str, ...]] = ()
 
     seed: int = 0
     smoothing: float = 0.0

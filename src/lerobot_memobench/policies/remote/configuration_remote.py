@@ -7,8 +7,9 @@ from typing import ClassVar
 
 from lerobot.configs import PreTrainedConfig
 
+from lerobot_memobench.envs.obs_types import PRIVILEGED, SEEN_PIXELS, SIMULATOR
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.policies.remote.dialects import DIALECTS, GRIPPERS, Dialect
+from lerobot_memobench.policies.remote.dialects import DIALECTS, GRIPPERS, IMAGE, WRIST_IMAGE, Dialect
 from lerobot_memobench.policies.untrained import UntrainedConfig
 
 
@@ -74,6 +75,14 @@ class RemoteConfig(UntrainedConfig):
             raise MemobenchError(f"policy.image_size is {self.image_size}; expected pixels, or 0 for as rendered")
         self.addresses()
         self.sent()
+
+    @property
+    def sees(self) -> tuple[str, ...]:
+        """What its server is sent, in the words of `envs.obs_types`."""
+        sent = set(self.sent().values())
+        told = {"environment_state": PRIVILEGED, "expert_action": SIMULATOR, "blind_action": SIMULATOR}
+        pixels = (SEEN_PIXELS,) * bool(sent & {IMAGE, WRIST_IMAGE})
+        return pixels + tuple(dict.fromkeys(words for name, words in told.items() if name in sent))
 
     @property
     def spoken(self) -> Dialect:

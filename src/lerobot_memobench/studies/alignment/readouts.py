@@ -81,7 +81,7 @@ def top1(embeddings: Tensor, labels: Tensor, candidates: Tensor, allowed: Tensor
     return float((nearest(embeddings, candidates, allowed) == labels).double().mean())
 
 
-def mean_and_deviation(values: Sequence[float]) -> tuple[float, float]:
-    """Mean, and sample standard deviation (0 for a single value)."""
+def mean_and_deviation(values: Sequence[float]) -> tuple[float, float | None]:
+    """Mean, and sample standard deviation; None for a single value, which has none."""
     tensor = torch.tensor(values, dtype=torch.float64)
-    return float(tensor.mean()), float(tensor.std()) if len(values) > 1 else 0.0
+    return float(tensor.mean()), float(tensor.std()) if len(values) > 1 else None

@@ -58,6 +58,6 @@ def measures_table(arms: Mapping[str, dict[str, Any]], baselines: Mapping[str, A
 def _cell(name: str, measure: dict[str, Any] | None) -> str:
     if measure is None:
         return "–"
-    if name == "action loss":
-        return f"{measure['mean']:.4f} ± {measure['deviation']:.4f}"
-    return f"{100 * measure['mean']:.1f} ± {100 * measure['deviation']:.1f}"
+    unit, digits = (1, 4) if name == "action loss" else (100, 1)
+    told = [unit * measure[key] for key in ("mean", "deviation") if measure[key] is not None]
+    return " ± ".join(f"{number:.{digits}f}" for number in told)

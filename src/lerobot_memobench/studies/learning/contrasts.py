@@ -1,8 +1,9 @@
 """Does one arm solve more than another? The same episodes paired, over all training seeds.
 
 The interval is of a bootstrap that draws training seeds and, within each task, episodes: a difference that depends on
-how a training began is not a difference of arms. With few training seeds it is still too narrow, and the test holds
-for these trainings only; the table says how many there were.
+how a training began is not a difference of arms. It is at least as wide as so few episodes allow (`estimates`). With
+few training seeds it is still too narrow, and the test holds for these trainings only; the table says how many there
+were.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.comparison.estimates import DRAWS, Array, percentiles
+from lerobot_memobench.evaluation.comparison.estimates import DRAWS, Array, difference_interval
 from lerobot_memobench.evaluation.comparison.paired_tests import detectable, holm, sign_flip
 from lerobot_memobench.evaluation.metrics.rollouts import Record
 
@@ -29,6 +30,7 @@ class Contrast:
         low, high: 95 % interval over training seeds and episodes.
         p: of sign flips of the episodes' differences, each the mean over training seeds; adjusted for the number of
             arms (Holm).
+        episodes: how many were paired.
         detectable: smallest true difference that so many episodes show with 80 % power at 5 %; None above 1.
     """
 
@@ -36,6 +38,7 @@ class Contrast:
     low: float
     high: float
     p: float
+    episodes: int
     detectable: float | None
 
 
@@ -55,8 +58,9 @@ def contrasts(arms: Mapping[str, Runs], reference: str) -> dict[str, Contrast]:
     return {
         name: Contrast(
             float((gap @ weights).mean()),
-            *_interval(gap, weights, tasks, rng),
+            *_interval(gap, weights, tasks, rng, base),
             adjusted,
+            len(episodes),
             detectable(gap.mean(axis=0), weights),
         )
         for (name, gap), adjusted in zip(gaps.items(), p, strict=True)
@@ -94,12 +98,13 @@ def _weights(records: Sequence[Record], episodes: Sequence[Key]) -> tuple[Array,
 
 
 def _interval(
-    gap: Array, weights: Array, tasks: Sequence[Sequence[int]], rng: np.random.Generator
+    gap: Array, weights: Array, tasks: Sequence[Sequence[int]], rng: np.random.Generator, base: Array
 ) -> tuple[float, float]:
-    """Return the 95 % interval of the weighted mean of differences (training seeds, episodes)."""
+    """Return the 95 % interval of the weighted mean of differences from ``base`` (training seeds, episodes)."""
     draws = np.empty(DRAWS)
     for draw in range(DRAWS):
         seeds = rng.integers(0, len(gap), len(gap))
         chosen = np.concatenate([rng.choice(places, len(places)) for places in tasks])
         draws[draw] = float(gap[seeds].mean(axis=0)[chosen] @ weights[chosen])
-    return percentiles(draws)
+    before = base.mean(axis=0)  # an episode counts once, however many policies were trained
+    return difference_interval(draws, before, before + gap.mean(axis=0), weights)

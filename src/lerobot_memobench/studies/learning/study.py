@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from lerobot_memobench.evaluation.documents.sentences import saw_phrase
+from lerobot_memobench.evaluation.metrics.rollouts import saw
 from lerobot_memobench.files import write_file
 from lerobot_memobench.studies.learning.contrasts import contrasts
 from lerobot_memobench.studies.learning.experiments import MEMORY, Experiment
@@ -33,6 +35,9 @@ def learn(experiment: Experiment, out: Path, say: Say, *, dataset: Path | None =
     write_file(out / "learning.json", json.dumps(as_json(found), indent=1))
     draw(found, out / "learning.png")
     against = contrasts_table(contrasts(rolled.rollouts, MEMORY), experiment.seeds)
-    text = f"{outcomes_table(found)}\n\n{against}\n\n{costs_table(costs | rolled.costs)}\n"
+    seen = "; ".join(
+        f"{arm}: {saw_phrase(saw([record for run in runs for record in run]))}" for arm, runs in rolled.rollouts.items()
+    )
+    text = f"{outcomes_table(found)}\n\n{seen}.\n\n{against}\n\n{costs_table(costs | rolled.costs)}\n"
     write_file(out / "learning.md", text)
     return text

@@ -10,7 +10,10 @@ from lerobot_memobench.studies.learning.figure import SCOPES
 from lerobot_memobench.studies.learning.outcomes import Outcome
 from lerobot_memobench.studies.learning.running import Costs
 
-COLUMNS = ("", "success", "95 % interval", "training seeds", "wrong referent, order, place or count", "other failures")
+COLUMNS = (
+    *("", "rollouts", "success", "95 % interval", "training seeds"),
+    *("wrong referent, order, place or count", "other failures"),
+)
 
 
 def outcomes_table(arms: Mapping[str, Mapping[str, Outcome]]) -> str:
@@ -26,7 +29,8 @@ def _cells(outcome: Outcome) -> list[str]:
     low, high = outcome.success.interval or (0.0, 0.0)
     value = outcome.success.value or 0.0
     seeds = ", ".join(f"{100 * each:.0f}" for each in outcome.of_seeds)
-    return [f"{100 * value:.1f}", f"{100 * low:.1f}–{100 * high:.1f}", seeds, str(outcome.wrong), str(outcome.others)]
+    rates = [f"{100 * value:.1f}", f"{100 * low:.1f}–{100 * high:.1f}"]
+    return [str(outcome.success.n), *rates, seeds, str(outcome.wrong), str(outcome.others)]
 
 
 def contrasts_table(found: Mapping[str, Contrast], seeds: int, reference: str = MEMORY) -> str:
@@ -34,13 +38,14 @@ def contrasts_table(found: Mapping[str, Contrast], seeds: int, reference: str = 
     rows = [
         [
             f"{name} less {reference}",
+            str(one.episodes),
             *(f"{100 * one.value:+.1f}", f"{100 * one.low:+.1f} to {100 * one.high:+.1f}", _probability(one.p)),
             "–" if one.detectable is None else f"{100 * one.detectable:.1f}",
         ]
         for name, one in found.items()
     ]
     trained = f"95 % interval, {seeds} training seed{'s' if seeds > 1 else ''}"
-    return markdown(("", "difference, points", trained, "p (Holm)", "detectable"), rows)
+    return markdown(("", "episodes", "difference, points", trained, "p (Holm)", "detectable"), rows)
 
 
 def _probability(p: float) -> str:

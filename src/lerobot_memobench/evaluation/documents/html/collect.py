@@ -21,8 +21,8 @@ from lerobot_memobench.evaluation.metrics.failures import failure_counts, failur
 from lerobot_memobench.evaluation.metrics.rates import Rate, Row, percent
 from lerobot_memobench.evaluation.metrics.rollouts import Record, operations
 from lerobot_memobench.evaluation.metrics.summary import Summary, summarise
-from lerobot_memobench.evaluation.records.protocol import CARD_FILE, read_card
-from lerobot_memobench.evaluation.records.runs import check_one_suite, folder_names, read_rollouts
+from lerobot_memobench.evaluation.records.protocol import CARD_FILE, POLICY, read_card, read_protocol
+from lerobot_memobench.evaluation.records.runs import check_one_suite, folder_names, read_rollouts, unlike
 from lerobot_memobench.tasks.catalogue import find_tasks, get_task, task_names
 from lerobot_memobench.tasks.failures import FAILURES
 from lerobot_memobench.tasks.formula import format_formula
@@ -35,14 +35,15 @@ FPS = 20
 
 @dataclass(frozen=True)
 class Run:
-    """One evaluation: its name in the report, where it lies, its rollouts, what a reader must know about them, and its
-    result card ({} where there is none).
+    """One evaluation: its name in the report, where it lies, its rollouts, what a reader must know of them, its
+    protocol, and its result card ({} where there is none).
     """
 
     name: str
     folder: Path
     records: list[dict[str, Any]]
     notes: list[str] = field(default_factory=list)
+    protocol: dict[str, Any] = field(default_factory=dict)
     card: dict[str, Any] = field(default_factory=dict)
 
 
@@ -53,7 +54,7 @@ def read_runs(folders: Sequence[str | Path]) -> list[Run]:
         records, notes = read_rollouts(folder)
         path = Path(folder) / CARD_FILE
         card = read_card(path) if path.is_file() else {}
-        runs.append(Run(name, Path(folder), records, notes, card))
+        runs.append(Run(name, Path(folder), records, notes, read_protocol(folder), card))
     check_one_suite({run.folder: run.records for run in runs})
     return runs
 
@@ -75,6 +76,7 @@ def page_data(runs: Sequence[Run], videos: Sequence[Mapping[int, str]], known: M
     """
     return {
         "version": __version__,
+        "notices": unlike({run.name: run.protocol for run in runs}),
         "fps": FPS,
         "levels": list(LEVELS),
         "memory_types": list(MEMORY_TYPES),
@@ -135,7 +137,7 @@ def run_data(run: Run, videos: Mapping[int, str]) -> dict[str, Any]:
     return {
         "name": run.name,
         "folder": str(run.folder),
-        "facts": facts(run.records, run.card),
+        "facts": facts(run.records, run.protocol),
         "commands": [shlex.join(it["command"]) for it in run.card.get("runs", []) if it.get("command")],
         "notes": run.notes,
         "average": row_data(summary.average),
@@ -145,10 +147,10 @@ def run_data(run: Run, videos: Mapping[int, str]) -> dict[str, Any]:
     }
 
 
-def facts(records: Sequence[Record], card: Mapping[str, Any]) -> list[str]:
-    """Return the protocol in words: policy, rollouts, tasks, seeds, referent, replan interval, horizon."""
-    policy = card.get("policy", {}).get("type")
-    horizon = card.get("protocol", {}).get("horizon")
+def facts(records: Sequence[Record], protocol: Mapping[str, Any]) -> list[str]:
+    """Return the protocol in words: whose rollouts, tasks, seeds, referent, replan interval, horizon, what was seen."""
+    policy = protocol.get(POLICY, {}).get("type")
+    horizon = protocol.get("horizon")
     return [
         *([f"policy {policy}"] if policy else []),
         count_of(len(records), "rollout"),

@@ -5,6 +5,7 @@ function options(select, entries) {
 }
 
 function fillControls() {
+  byId("notices").replaceChildren(...DATA.notices.map((words) => el("p", { class: "notice", role: "note" }, words)));
   for (const [key, { colour }] of Object.entries(DATA.operations))
     document.documentElement.style.setProperty(`--${key}`, colour);
   options(

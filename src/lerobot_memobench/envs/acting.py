@@ -1,0 +1,216 @@
+"""Who acts, what does it see, and which episodes were asked for? What LeRobot's command line tells an environment.
+
+An environment's configuration holds nothing of the policy, and it is the environment that writes the log: what a line
+leaves out, such as whose episode it is, nobody can tell afterwards.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import hashlib
+import json
+import logging
+import secrets
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from lerobot_memobench.envs.obs_types import what_is_seen
+from lerobot_memobench.envs.prompting import checkpoint_being_run, in_file, policy_being_run, training_runs
+from lerobot_memobench.envs.protocol import POLICY, SAW
+from lerobot_memobench.files import file_hash
+
+NOT_THE_CHECKPOINT = (
+    *("train_config.json", "README.md", "training_weights.safetensors", ".gitattributes"),
+    *("training_curve.png", "training_curve.json"),
+)
+"""Files of a checkpoint folder on which what the policy does at evaluation does not depend."""
+
+ELSEWHERE = (
+    *("device", "pretrained_path", "repo_id", "private", "tags", "license", "push_to_hub", "use_peft"),
+    *("host", "port", "servers", "connect_timeout", "timeout", "retry"),
+)
+"""Settings of a policy that say where it runs or where it goes, not what it does."""
+
+DIGITS = 12
+"""Of a hash that tells policies apart."""
+
+
+@dataclass(frozen=True)
+class Acting:
+    """Whose episodes are being run.
+
+    Attributes:
+        policy: ``type``, ``identity`` and, of a checkpoint in a folder, ``sha256``; {} where nobody knows.
+        saw: what it sees, in words; None where nobody knows.
+        run: names this run of LeRobot's evaluation; a log may hold several, of one policy.
+        seeds: of the episodes that were asked for; None where nobody knows. LeRobot runs whole batches, and what it
+            runs beyond these is no part of the evaluation.
+    """
+
+    policy: Mapping[str, Any] = field(default_factory=dict)
+    saw: str | None = None
+    run: str | None = None
+    seeds: range | None = None
+
+    def counts(self, seed: int) -> bool:
+        """Return whether the episode of a seed was asked for."""
+        return self.seeds is None or seed in self.seeds
+
+    @property
+    def protocol(self) -> dict[str, Any]:
+        """What goes beside the log, as far as it is known."""
+        return _known({SAW: self.saw, POLICY: dict(self.policy) or None})
+
+    @property
+    def line(self) -> dict[str, Any]:
+        """What goes on every line of the log, as far as it is known."""
+        return _known({POLICY: self.policy.get("identity"), "run": self.run, SAW: self.saw})
+
+
+NOBODY = Acting()
+"""Nothing is known of who acts."""
+
+
+def _known(facts: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in facts.items() if value is not None}
+
+
+def acting(obs_type: str, oracle_memory: bool) -> Acting:
+    """Return who acts in environments that observe this, by the command line of the process."""
+    policy = _policy()
+    if policy is None:
+        return NOBODY
+    run = f"{dt.datetime.now():%Y%m%dT%H%M%S}-{secrets.token_hex(3)}"
+    saw = what_is_seen(policy, obs_type, oracle_memory)
+    return Acting(_identity(policy, run), saw, run, _seeds())
+
+
+# --- the command line ---
+
+
+def _policy() -> Any | None:
+    """Return the configuration of the policy that is run; where only its type is told, in a file, the class of it."""
+    import draccus
+    from lerobot.configs import parser
+
+    with _calm():
+        checkpoint = checkpoint_being_run()
+        if checkpoint is not None:
+            return checkpoint[1]
+        kind = policy_being_run()
+        if kind is None or parser.get_type_arg("policy") is None:
+            return kind
+        return draccus.parse(kind, args=parser.get_cli_overrides("policy") or [])
+
+
+@contextmanager
+def _calm() -> Iterator[None]:
+    """Leave out what LeRobot logs of a configuration, the device say: it does so itself when it makes the policy."""
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        yield
+    finally:
+        logging.disable(before)
+
+
+def _seeds() -> range | None:
+    """Return the seeds of the episodes of each task that were asked for, None where LeRobot draws without seeds."""
+    from lerobot.configs.default import EvalConfig
+    from lerobot.configs.eval import EvalPipelineConfig
+
+    count = _number("eval.n_episodes", EvalConfig.n_episodes)
+    first = _number("seed", EvalPipelineConfig.seed)
+    return range(first, first + count) if isinstance(first, int) and isinstance(count, int) else None
+
+
+def _number(name: str, default: int | None) -> Any:
+    from lerobot.configs import parser
+
+    told = parser.parse_arg(name)
+    if told is not None:
+        return yaml.safe_load(told)
+    found = in_file(*name.split("."))
+    return default if found is None else found
+
+
+# --- identity ---
+
+
+def _identity(policy: Any, run: str) -> dict[str, Any]:
+    """Return what tells a policy from others: its type, its checkpoint, and what was set otherwise than there.
+
+    Of a policy in training, whose weights are nowhere else yet, the run is all there is to tell.
+    """
+    from lerobot.configs import PreTrainedConfig, parser
+
+    kind = PreTrainedConfig.get_choice_name(policy if isinstance(policy, type) else type(policy))
+    if training_runs():
+        return {"type": kind, "identity": f"{kind} in training {run}"}
+    path = parser.get_path_arg("policy")
+    weights = None if path is None else checkpoint_hash(path)
+    with _calm():
+        plain = _unchanged(policy, path)
+    facts = json.dumps([kind, weights, _changes(policy, plain)], sort_keys=True, default=str)
+    found = {"type": kind, "identity": f"{kind} {hashlib.sha256(facts.encode()).hexdigest()[:DIGITS]}"}
+    return found | ({"sha256": weights} if path is not None and Path(path).is_dir() else {})
+
+
+def _unchanged(policy: Any, path: str | None) -> Any:
+    """Return the configuration that a policy would have if nothing were said of it."""
+    from lerobot.configs import PreTrainedConfig
+
+    if path is not None:
+        return PreTrainedConfig.from_pretrained(path)
+    if isinstance(policy, type):
+        return policy
+    try:
+        return type(policy)()
+    except TypeError:  # somebody's that asks for a setting
+        return policy
+
+
+def _changes(policy: Any, plain: Any) -> dict[str, Any]:
+    """Return the settings of a policy that are not as they would be unasked; a file counts by its content."""
+    before, now = ({}, in_file(POLICY) or {}) if isinstance(policy, type) else (encoded(plain), encoded(policy))
+    return {k: _content(v) for k, v in now.items() if k not in (*ELSEWHERE, "type") and before.get(k) != v}
+
+
+def _content(value: Any) -> Any:
+    return file_hash(Path(value)) if isinstance(value, str) and Path(value).is_file() else value
+
+
+def encoded(policy: Any) -> dict[str, Any]:
+    """Return a policy's configuration as plain JSON values."""
+    import draccus
+
+    found = json.loads(json.dumps(draccus.encode(policy), default=str))
+    assert isinstance(found, dict)
+    return {**found, "type": policy.type}
+
+
+def checkpoint_hash(path: str) -> str:
+    """Return one hash for a checkpoint's folder; of a repository, its name and the commit that is here."""
+    if Path(path).is_dir():
+        return tree_hash(checkpoint_files(Path(path)))
+    from huggingface_hub import try_to_load_from_cache
+
+    found = try_to_load_from_cache(path, "config.json")
+    return f"{path}@{Path(found).parent.name}" if isinstance(found, str) else path
+
+
+def checkpoint_files(folder: Path) -> dict[str, str]:
+    """Return name -> sha256 of the files that a checkpoint consists of."""
+    files = sorted(path for path in folder.iterdir() if path.is_file() and path.name not in NOT_THE_CHECKPOINT)
+    return {path.name: file_hash(path) for path in files}
+
+
+def tree_hash(files: Mapping[str, str]) -> str:
+    """Return one sha256 for many: of the lines ``<sha256>  <name>`` in the order of names, as sha256sum prints them."""
+    lines = "".join(f"{files[name]}  {name}\n" for name in sorted(files))
+    return hashlib.sha256(lines.encode()).hexdigest()
