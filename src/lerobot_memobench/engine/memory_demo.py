@@ -20,6 +20,7 @@ from lerobot_memobench.engine.side_by_side import side_by_side, strip
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.envs.obs_types import OBJECTS
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.metrics.rollouts import saw
 from lerobot_memobench.files import write_file
 from lerobot_memobench.policies.checkpoint import shipped_policies
 from lerobot_memobench.tasks.catalogue import BOWL
@@ -38,10 +39,11 @@ MEMORY_FILM, MEMORY_STRIP, MEMORY_TABLE = "memory.mp4", "memory.png", "memory.md
 
 @dataclass(frozen=True)
 class Told:
-    """How somebody's episodes ended: whether each was solved, and how many failed at a wrong referent."""
+    """How somebody's episodes ended: whether each was solved, how many failed at a wrong referent; and what it saw."""
 
     solved: tuple[bool, ...]
     wrong: int
+    saw: str
 
 
 def has_policies() -> bool:
@@ -88,11 +90,12 @@ def _told(folder: Path) -> Told:
     return Told(
         solved=tuple(bool(record["success"]) for record in sorted(records, key=itemgetter("episode"))),
         wrong=sum(not record["success"] and record.get("failure") == REFERENCE_DRIFT for record in records),
+        saw=saw(records),
     )
 
 
 def table(told: dict[str, Told]) -> str:
     """Return who solved how many of the episodes, and how many failed at a wrong bowl, as Markdown."""
-    rows = [f"| {name} | {sum(one.solved)}/{len(one.solved)} | {one.wrong} |" for name, one in told.items()]
-    head = "| butter into the bowl that the prompt showed, of three | solved | wrong bowl |"
-    return "\n".join([head, "|---|---|---|", *rows]) + "\n"
+    rows = [f"| {name} | {sum(one.solved)}/{len(one.solved)} | {one.wrong} | {one.saw} |" for name, one in told.items()]
+    head = "| butter into the bowl that the prompt showed, of three | solved | wrong bowl | saw |"
+    return "\n".join([head, "|---|---|---|---|", *rows]) + "\n"

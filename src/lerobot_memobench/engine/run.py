@@ -95,7 +95,7 @@ def _run_lerobot(plan: EvaluationPlan, card: dict[str, Any], ranges: Ranges | No
 def _finish(plan: EvaluationPlan, card: dict[str, Any]) -> EvaluationReport:
     """Write the report of the log, and what was found onto the card."""
     protocol = {**(card["protocol"] or read_protocol(plan.log)), **read_protocol_file(plan.log)}
-    del protocol[POLICY]  # a card says more of it; the file has what `auto` came to in LeRobot's process
+    protocol.pop(POLICY, None)  # a card says more of it; the file has what `auto` came to in LeRobot's process
     # LeRobot runs whole batches: episodes beyond those asked for are no part of the report.
     limit = None if plan.grid is None else plan.grid.first + max(plan.grid.runs, protocol["episodes"])
     report = report_on(plan.log, limit)

@@ -20,7 +20,7 @@ from lerobot.configs import PolicyFeature, PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_memobench.envs.acting import acting
-from lerobot_memobench.envs.obs_types import OBJECTS, OBS_TYPES, PIXELS
+from lerobot_memobench.envs.obs_types import OBJECTS, OBS_TYPES, PIXELS, check_obs_type
 from lerobot_memobench.envs.observations import (
     METADATA,
     action_space,
@@ -214,6 +214,7 @@ class MemobenchEnvConfig(EnvConfig):
 
         running = None if training_runs() else checkpoint_being_run()
         if running is not None:
+            check_obs_type(running[1], self.obs_type)
             for check in POLICY_CHECKS:
                 check(*running, env_to_policy_features(self), rename_map())
 

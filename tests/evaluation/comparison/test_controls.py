@@ -211,6 +211,15 @@ def folder(path: Path, records: list[dict[str, Any]]) -> str:
     return str(path)
 
 
+def test_two_policies_are_no_sweep_of_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = []
+    for name, digest in (("a", "aaaa"), ("b", "bbbb")):
+        words.append(folder(tmp_path / name, rollouts([1, 1, 0, 0])))
+        (tmp_path / name / "protocol.json").write_text(json.dumps({"policy": {"type": "act", "sha256": digest}}))
+    assert main(["controls", "oracle", *words, "--oracle", words[0]]) == 2
+    assert "are of two policies (sha256 aaaa and bbbb)" in " ".join(capsys.readouterr().err.split())
+
+
 def test_oracle_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     standard = folder(tmp_path / "standard", rollouts([1, 1, 0, 0]))
     oracle = folder(tmp_path / "oracle", rollouts([3, 1, 1, 0, 2]))

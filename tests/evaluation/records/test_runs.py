@@ -7,8 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from lerobot_memobench.cli.documents import given_runs
+from lerobot_memobench.envs.protocol import write_protocol
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.records.runs import by_method, read_runs, sweeps
+from lerobot_memobench.evaluation.documents.html import write_html
+from lerobot_memobench.evaluation.documents.report import build, render, write_report
+from lerobot_memobench.evaluation.records.runs import by_method, read_rollouts, read_runs, sweeps
 
 from .. import logs
 
@@ -51,6 +55,46 @@ def test_results_that_cannot_be_told_apart_are_named_after_folders(tmp_path: Pat
     assert [run.method for run in read_runs([tmp_path / "a", tmp_path / "b"])] == ["a", "b"]
     with pytest.raises(MemobenchError, match="two evaluations named 'x'"):
         read_runs([f"x={tmp_path}/a", f"x={tmp_path}/b"])
+
+
+def test_policies_that_nobody_knows_are_not_one_method(tmp_path: Path) -> None:
+    for k in (5, 20):
+        logs.evaluation(tmp_path / f"k{k}", replan_steps=k)
+    assert [run.method for run in read_runs([tmp_path / "k5", tmp_path / "k20"])] == ["k5", "k20"]
+
+
+def test_rollouts_beyond_those_asked_for_are_not_counted(tmp_path: Path) -> None:
+    """LeRobot runs whole batches; earlier versions logged what its last one held beyond."""
+    folder = logs.evaluation(tmp_path / "a")
+    told = {"protocol": {"tasks": ["one", "two_of_them"], "episodes": 3, "seed_base": 7}, "policy": {"seed": 7}}
+    (folder / "card.json").write_text(json.dumps(told))
+    (run,) = read_runs([folder])
+    assert [row["SR"].n for row in run.summary.tasks.values()] == [3, 3]
+    assert run.notes == ["2 rollouts beyond the 3 of each task that were asked for left out"]
+    assert write_report(folder)[0].tasks["one"]["SR"].n == 3
+    assert read_rollouts(folder)[1] == [], "and now they are gone"
+    (folder / "card.json").write_text(json.dumps({**told, "policy": {"seed": 9}}))
+    logs.evaluation(folder)
+    assert len(read_rollouts(folder)[0]) == 8, "episodes 2, 3 and 4 were asked for"
+
+
+def test_evaluations_that_were_not_run_alike_are_shown_with_a_notice(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = {"horizon": 1200, "referent": "fixed", "saw": "pixels"}
+    for name, changes in (("a", {}), ("b", {"horizon": 600, "saw": "privileged object state"}), ("c", {})):
+        folder = logs.evaluation(tmp_path / name, saw={**settings, **changes}["saw"])
+        write_protocol(folder, {**settings, **changes})
+    found = [f"{tmp_path}/{name}" for name in "abc"]
+    words = "b was not run as a was (horizon: 1200 and 600; saw: pixels and privileged object state"
+    for name in ("markdown", "table", "latex", "json"):
+        told = " ".join(render(build(read_runs(found)), read_runs(found), name).split())
+        assert words in told.replace("\\_", "_"), name
+        assert "c was not run" not in told, name
+    assert words in (write_html(found, tmp_path / "page").page).read_text()
+    assert '"notices":[]' in (write_html([found[0], found[2]], tmp_path / "page").page).read_text()
+    given_runs(found, None)
+    assert f"note: {words}" in capsys.readouterr().err
 
 
 def test_folders_of_the_same_name_get_longer_ones(tmp_path: Path) -> None:
