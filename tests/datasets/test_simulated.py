@@ -40,6 +40,7 @@ from lerobot_memobench.tasks.catalogue import task_names
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
 BUTTER = "put_the_butter_into_the_bowl_from_the_prompt_video"
+HIDDEN = "find_the_tomato_hidden_in_one_of_the_drawers"
 COUNTING = "turn_the_stove_on_and_off_a_given_number_of_times"
 SEED = 10_000
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -140,6 +141,11 @@ def test_ray_makes_the_same(tmp_path):
 def test_replay_agrees(stove, butter):
     assert replay(stove) is None
     assert replay(butter) is None
+
+
+def test_replay_of_a_hiding_agrees():
+    """What was hidden goes back to the bit, whether or not somebody has looked between the last step and that."""
+    assert replay(record_demonstration(get_task(HIDDEN), SEED, images=False, referent="drawn")) is None
 
 
 def test_replay_of_a_dataset_agrees(dataset_folder):

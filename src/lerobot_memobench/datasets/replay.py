@@ -169,7 +169,7 @@ def resimulate(
     success = False
     for frame, action in enumerate(actions):
         if frame == exec_start and frame > 0:
-            sim.end_prompt(start)
+            sim.end_prompt(start, () if task.prompt is None else task.prompt.places)
             sim.begin_execution()
         sim.highlights = highlights_at(task, sim, frame) if frame < exec_start else ()
         if watch is not None:

@@ -125,7 +125,7 @@ class Episode:
         """Put the scene back exactly as it was, unless something was hidden in it, and hand over to the policy."""
         if self.step_index:
             self.prompt_shown = self._prompt.shown
-            self.sim.end_prompt(self._start)
+            self.sim.end_prompt(self._start, () if self.task.prompt is None else self.task.prompt.places)
         self.sim.begin_execution()
         self._demonstrator = None
         self.exec_start = self.step_index

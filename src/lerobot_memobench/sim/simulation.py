@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import hashlib
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -233,14 +234,17 @@ class Simulation:
         self._start.mark_step(goes_on=False)
         mujoco.mj_step1(self.model, self.data)
 
-    def end_prompt(self, start: Snapshot) -> None:
+    def end_prompt(self, start: Snapshot, hidden: Sequence[tuple[str, str]] = ()) -> None:
         """Undo what a prompt video has done since ``start``, but for what it hid: that lies at rest in its drawer.
 
         Drawers and bystanders go back to the bit as well: a drawer that holds something settles a nanometre from an
         empty one, and a bottle that was brushed tells which way the hand went.
+
+        Args:
+            start: to go back to.
+            hidden: thing and place, as the episode's variant says; the scene's own task is the published variant.
         """
         self.highlights = ()
-        hidden = () if self.task.prompt is None else self.task.prompt.places
         lies = [self.data.body(thing).xpos - self._moves_with(place) for thing, place in hidden]
         turned = [self.data.body(thing).xquat.copy() for thing, _ in hidden]
         self.restore(start)

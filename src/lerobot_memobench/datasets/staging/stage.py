@@ -84,7 +84,8 @@ class EpisodeStage:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        abandoned = [*self._videos.values(), *([] if self._hdf5 is None else [self._hdf5])]
+        abandoned: list[VideoWriter | EpisodeFile] = [*self._videos.values()]
+        abandoned += [] if self._hdf5 is None else [self._hdf5]
         for file in abandoned:
             with contextlib.suppress(Exception):  # on a full disk closing fails as well, and all of it is deleted
                 file.abandon()
