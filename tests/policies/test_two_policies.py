@@ -284,8 +284,9 @@ def replaced_in(tree: ast.AST) -> list[str]:
         targets = node.targets if isinstance(node, ast.Assign) else []
         if isinstance(node, ast.Call) and ast.unparse(node.func) == "setattr":
             targets = [ast.Attribute(node.args[0], "any")]
-        parts = [part for target in targets for part in ast.walk(target) if isinstance(part, ast.Attribute)]
-        found += [ast.unparse(part) for part in parts if ast.unparse(part).partition(".")[0] in theirs]
+        parts = [part for target in targets for part in getattr(target, "elts", [target])]
+        replaced = [ast.unparse(part) for part in parts if isinstance(part, ast.Attribute)]
+        found += [name for name in replaced if name.partition(".")[0] in theirs]
     return found
 
 
