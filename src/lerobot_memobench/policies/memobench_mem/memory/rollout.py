@@ -77,16 +77,16 @@ class RolloutMemory:
             row for row, step in enumerate(steps) if not frozen[row] and (started[row] or step % self.stride == 0)
         ]
         if wanted and self.mechanism.frames:
-            for row, tokens in zip(wanted, encode(wanted).to("cpu"), strict=True):
-                kept, capacity = self.rows[row].kept, self.mechanism.capacity
-                if capacity is not None and len(kept) == capacity and not self.rows[row].told:
-                    self.rows[row].told = True
+            for number, tokens in zip(wanted, encode(wanted).to("cpu"), strict=True):
+                writing, capacity = self.rows[number], self.mechanism.capacity
+                if capacity is not None and len(writing.kept) == capacity and not writing.told:
+                    writing.told = True
                     logger.warning(
                         "An episode has more than %d remembered frames, of which the latest are kept; call "
                         "policy.reset() when an episode begins.",
                         capacity,
                     )
-                self.mechanism.write(kept, Frame(steps[row], tokens))
+                self.mechanism.write(writing.kept, Frame(steps[number], tokens))
         return steps, started, frozen
 
     def _tick(self, number: int, clock: tuple[int, int]) -> bool:
