@@ -155,7 +155,7 @@ def _importers(hook: Hook) -> list[tuple[Any, Function]]:
     """Return the modules that hold a function by its name because they imported it, with what they hold."""
     name, known = hook.name.rpartition(".")[2], (hook.module, hook.name)
     modules = list(sys.modules.values()) if hook.everywhere else []
-    held = [(module, getattr(module, "__dict__", {}).get(name)) for module in modules]
+    held: list[tuple[Any, Any]] = [(module, getattr(module, "__dict__", {}).get(name)) for module in modules]
     return [
         (module, found)
         for module, found in held

@@ -138,7 +138,8 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
         balance = self.config.balance_tasks
         tasks = task_of_frames(meta, cache.episodes) if balance else None
         factors = None if tasks is None else prompted_factors(tasks, cache.phase, self.config.prompted_weight)
-        self.config.drop_n_last_frames = Drawn(starts, self.config.moments_per_episode, tasks, balance, factors)
+        order = Drawn(starts, self.config.moments_per_episode, tasks, balance, factors)
+        self.config.drop_n_last_frames = order  # type: ignore[assignment]  # a number to nobody but LeRobot's sampler
 
     # -- checkpoints -----------------------------------------------------------------------------------------------
 

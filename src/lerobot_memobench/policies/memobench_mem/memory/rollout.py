@@ -68,10 +68,10 @@ class RolloutMemory:
             self.rows = [Row() for _ in clocks]
         before = [row.position for row in self.rows]
         started = [self._tick(row, clock) for row, clock in enumerate(clocks)]
-        for row, begins, last in zip(self.rows, started, before, strict=True):
+        for held, begins, last in zip(self.rows, started, before, strict=True):
             due = (last // self.stride + 1) * self.stride  # the next one that is written
-            if not begins and due < row.position and row.missed is None:
-                row.missed = due
+            if not begins and due < held.position and held.missed is None:
+                held.missed = due
         steps, frozen = [row.position for row in self.rows], [row.frozen for row in self.rows]
         wanted = [
             row for row, step in enumerate(steps) if not frozen[row] and (started[row] or step % self.stride == 0)
@@ -108,7 +108,8 @@ class RolloutMemory:
 
     def missed(self, rows: Sequence[int]) -> int | None:
         """Return the first step of some rows' frames that were to be written and were not offered; None: all were."""
-        return min((row.missed for row in map(self.rows.__getitem__, rows) if row.missed is not None), default=None)
+        steps = (self.rows[row].missed for row in rows)
+        return min((step for step in steps if step is not None), default=None)
 
     def gather(self, rows: Sequence[int]) -> MemoryBatch:
         """Return what plans of some rows read."""
