@@ -72,9 +72,9 @@ def contrasts(standard: Sequence[Record], other: Sequence[Record], draws: int = 
     return {
         name: {
             metric: _contrast(
+                _pairs(standard, other, name, metric),
                 *(point[name][metric] for point in points),
                 *(cloud[name][metric] for cloud in clouds),
-                _pairs(standard, other, name, metric),
             )
             for metric in metrics
         }
@@ -101,13 +101,13 @@ def _pairs(standard: Sequence[Record], other: Sequence[Record], scope: str, metr
 
 
 def _contrast(
+    pairs: tuple[Array, Array, Array],
     a: Array | None,
     b: Array | None,
     many_a: Array | None,
     many_b: Array | None,
-    pairs: tuple[Array, Array, Array],
 ) -> Contrast:
-    """Return what rates, (1,), their bootstrap draws, (draws,), and the pairs behind them say of two evaluations."""
+    """Return what pairs, their rates, (1,), and bootstrap draws of these, (draws,), say of two evaluations."""
     if a is None or b is None or many_a is None or many_b is None:
         return Contrast(None, None, Estimate(None), Estimate(None))
     gap = 1.0 - many_a
