@@ -180,6 +180,7 @@ def test_generate_tells_what_became_of_every_seed(
     words = ["generate", "--tasks", TASK, "--episodes", "2", "--out", str(out), "--no-images", "--referent", "random"]
     words += ["--format", "lerobot", "--format", "hdf5", "--executor", "local", "--executor-option", "local_tasks=4"]
     assert main(words) == (0 if solved == 2 else 1)
+    assert callable(asked.pop("tell"))
     assert asked == {
         "tasks": [TASK],
         "episodes": 2,

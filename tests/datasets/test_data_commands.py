@@ -40,6 +40,7 @@ def test_convert(call, monkeypatch):
 
     monkeypatch.setattr(convert_module, "convert", run)
     result = call("convert", "src", "--out", "ds", "--upside-down", "--repo-id", "a/b")
+    assert callable(asked.pop("tell"))
     assert asked == {
         "source": Path("src"),
         "out": Path("ds"),
@@ -74,5 +75,6 @@ def test_push(call, monkeypatch):
     asked = {}
     monkeypatch.setattr(push_module, "push", lambda *words, **more: asked.update(more, words=words) or "https://x/y")
     result = call("push", "ds", "--repo-id", "a/b", "--private")
+    assert callable(asked.pop("tell"))
     assert asked == {"words": (Path("ds"), "a/b"), "private": True, "hdf5": False}
     assert (result.return_value, result.output.strip()) == (0, "dataset: https://x/y")

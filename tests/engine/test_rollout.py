@@ -188,9 +188,7 @@ def test_a_rollout_on_objects_is_lerobots(
 
 
 def test_a_memory_of_pictures_refuses_to_be_shown_objects_alone(tmp_path: Path) -> None:
-    with pytest.raises(
-        MemobenchError, match=r"no 'observation.images.image', .* set env.obs_type=pixels_agent_pos, or"
-    ):
+    with pytest.raises(MemobenchError, match=r"no picture, .* set env.obs_type=pixels_agent_pos, or"):
         rolled(lerobot_eval.rollout, 1, tmp_path, "memobench_mem", obs_type=OBJECTS, **MEMORY)
 
 

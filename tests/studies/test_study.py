@@ -123,8 +123,8 @@ def test_a_study_is_told_and_read_back(
     told = json.loads((work.out / "study.json").read_text())
     assert told["outcomes"][MEMORYLESS]["all"]["success"] == pytest.approx(0.4)
     assert told["differences"][MEMORYLESS]["value"] == pytest.approx(-0.6)
-    assert f"| all, {MEMORYLESS} | 40.0 |" in tables
-    assert f"| {MEMORYLESS} less {MEMORY} | -60.0 | " in tables
+    assert f"| all, {MEMORYLESS} | 20 | 40.0 |" in tables
+    assert f"| {MEMORYLESS} less {MEMORY} | 20 | -60.0 | " in tables
     assert "| training | 6 | 1.0 | 9.0 |" in tables
     measures = told["measures"]
     assert list(measures) == list(ALIGNMENTS)

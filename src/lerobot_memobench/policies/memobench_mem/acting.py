@@ -59,7 +59,8 @@ class ActingPolicy(SeeingPolicy):
         """
         seen = self.perception.remembers
         if seen not in batch:
-            raise MemobenchError(f"The observation has no '{seen}', which this policy remembers; {cure(seen, batch)}")
+            what = f"'{seen}'" if seen else "picture"
+            raise MemobenchError(f"The observation has no {what}, which this policy remembers; {cure(seen, batch)}")
         count = len(batch[seen])
         steps = _column(batch, OBS_STEP) or [self._calls] * count  # without a clock one call is one step
         phases = _column(batch, OBS_PHASE) if OBS_STEP in batch else None
