@@ -224,7 +224,7 @@ def test_datasets_without_the_column_are_read_as_before(ours, tmp_path):
 def test_a_damaged_record_is_told(ours, tmp_path):
     edited = delete(ours, tmp_path / "edited", 0, 1)
     _rewrite(edited, '"variant":0', '"variant":"none"')
-    with pytest.raises(MemobenchError, match=r"episode 0: its column episode_info .*variant = 'none', expected a valid"):
+    with pytest.raises(MemobenchError, match=r"episode 0: .*episode_info .*variant = 'none', expected"):
         list_episodes(edited)
     with pytest.raises(MemobenchError, match="found 'colour', expected one of task_name, memory_type"):
         episodes_where(ours, colour="red")
