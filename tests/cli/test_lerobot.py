@@ -410,6 +410,68 @@ def test_nothing_to_go_on_with(
     assert message in refused(["train", "resume=true", *words], training, capsys)
 
 
+def test_a_training_goes_on_as_it_was_begun(training: Called, capsys: pytest.CaptureFixture[str]) -> None:
+    checkpoint = training_run(Path("run"))
+    words = ["train", "output_dir=run", "resume=true"]
+    free = ["steps=100", "save_freq=5", "num_workers=0", "device=cpu", "log_freq=1", "policy.n_action_steps=1"]
+    same = ["align=none", "size=tiny", "policy.memory_stride=1", "policy.final_lr=0.1", "policy.push_to_hub=false"]
+    assert main([*words, *free, *same, "--policy.memory_frames", "32"]) == 0
+    assert capsys.readouterr().err == ""
+    training.flags = None
+    for changed, said in {
+        "policy.memory_stride=2": "begun with memory_stride=1, and goes on with nothing else than that: found 2",
+        "align=semantic": "begun with align=none, and goes on with nothing else than that: found semantic",
+        "policy.optimizer_lr=1e-5": "leave optimizer_lr out, or train a new run from the checkpoint: policy=run/",
+        "--policy.ema_decay=0": "begun with ema_decay=0.999",
+    }.items():
+        assert said in refused([*words, changed], training, capsys)
+    lerobots = ["train", f"config_path={checkpoint}/train_config.json", "resume=true", "align=semantic"]
+    assert "begun with align=none" in refused(lerobots, training, capsys)
+
+
+def test_a_training_goes_on_with_its_dataset(training: Called, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("mine", "other"):
+        Path(name, "meta").mkdir(parents=True)
+        Path(name, "meta", "info.json").write_text("{}")
+    file = training_run(Path("run")) / "train_config.json"
+    words = ["train", "output_dir=run", "resume=true"]
+    new_run = (
+        "train a new run from the checkpoint: policy=run/checkpoints/last/pretrained_model output_dir=<new folder>"
+    )
+    for changed in ("dataset=other", "dataset=c/d", "--dataset.repo_id=c/d", "--dataset.root=other"):
+        said = refused([*words, changed], training, capsys)
+        assert "begun on the dataset a/b, and" in said
+        assert new_run in said
+    assert "begun with dataset.episodes=None" in refused([*words, "episodes=[0, 1]"], training, capsys)
+
+    config = json.loads(file.read_text())
+    config["dataset"] |= {"repo_id": "local/mine", "root": "mine", "episodes": [0, 1]}
+    file.write_text(json.dumps(config))
+    Path("link").symlink_to("mine")
+    for same in ("dataset=mine", f"dataset={Path('mine').absolute()}", "dataset=link", "episodes=[0, 1]"):
+        assert main([*words, same]) == 0
+        training.flags = None
+    for changed in ("dataset=other", "dataset=c/d", "--dataset.root=other"):
+        assert "begun on the dataset mine, and" in refused([*words, changed], training, capsys)
+    shutil.rmtree("mine")
+    said = refused([*words, "dataset=other"], training, capsys)
+    assert "if that is the same, put it or a link to it at mine; else leave that out" in said
+
+
+def test_other_settings_than_a_checkpoint_was_trained_with_are_told_of(
+    training: Called, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["train", "policy=memobench_small", "steps=1"]
+    assert main([*words, "align=contrastive", "policy.optimizer_lr=1e-4", "device=cpu"]) == 0  # what training is for
+    assert capsys.readouterr().err == ""
+    assert main([*words, "policy.memory_stride=2", "policy.memory_frames=4"]) == 0
+    assert training.value("policy.memory_stride") == "2"
+    note = capsys.readouterr().err
+    assert note.count("\n") == 1
+    assert "was trained with memory_frames=32, memory_stride=8, and its weights are now trained on with " in note
+    assert note.endswith("memory_frames=4, memory_stride=2\n")
+
+
 # --- mistakes: one sentence, status 2, LeRobot never called, nothing written ---
 
 

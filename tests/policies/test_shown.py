@@ -30,7 +30,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint, check_weights, shipped_policies
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.memobench_mem.settings_memobench_mem import FIXED, OF_ACTING, OF_TRAINING
+from lerobot_memobench.policies.memobench_mem.settings_memobench_mem import FIXED, OF_ACTING, OF_TRAINING, SINCE_BEGUN
 from lerobot_memobench.policies.shown import SIZE_COUNTS, check_features, check_policy
 
 TASK = "turn_on_the_stove_and_turn_it_off"
@@ -291,6 +291,7 @@ NAMES = [field.name for field in dataclasses.fields(MemobenchMemConfig)]
 def test_every_field_is_classified() -> None:
     """A new field is put where it belongs: fixed by training, of training alone, or free where a checkpoint acts."""
     assert sorted(NAMES) == sorted((*FIXED, *OF_ACTING, *OF_TRAINING))
+    assert set(SINCE_BEGUN) < set(OF_TRAINING)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -299,7 +300,7 @@ def test_what_is_fixed_by_training_stays(name: str) -> None:
     policy = PreTrainedConfig.from_pretrained(checkpoint)
     check_as_trained(checkpoint, policy)
     setattr(policy, name, object() if name != "device" else "cpu")
-    if name not in FIXED:
+    if name in OF_ACTING:
         check_as_trained(checkpoint, policy)
         return
     with pytest.raises(MemobenchError, match=rf"--policy\.{name}=.* leave {name} out"):
@@ -314,6 +315,17 @@ def test_a_memory_is_not_changed_where_a_checkpoint_acts(
     shutil.copytree(shipped_policies()["memobench_small"], checkpoint)
     sight = ("--env.obs_type=environment_state_agent_pos",)
     assert f"--policy.{word} cannot be followed" in refused_by_both(checkpoint, capsys, *sight, f"--policy.{word}")
+
+
+@pytest.mark.parametrize("word", ["align=contrastive", "subgoal_level=fine", "ema_decay=0.5"])
+def test_a_training_is_not_told_anew_where_a_checkpoint_acts(
+    word: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    checkpoint = tmp_path / "it"
+    shutil.copytree(shipped_policies()["memobench_small"], checkpoint)
+    said = refused_by_both(checkpoint, capsys, "--env.obs_type=environment_state_agent_pos", f"--policy.{word}")
+    assert f"--policy.{word} cannot be followed" in said
+    assert "nothing of this setting acts at evaluation" in said
 
 
 def test_what_is_loaded_by_hand_acts_as_it_was_trained() -> None:

@@ -79,6 +79,7 @@ def train(words: Words, line: Sequence[str]) -> int:
         how_to_go_on,
         take_training_words,
         told_of_going_on,
+        told_of_starting_from,
     )
 
     begun = time.time()
@@ -93,8 +94,9 @@ def train(words: Words, line: Sequence[str]) -> int:
     settings = complete_training(settings)
     root = flag_value(settings.flags, "dataset.root")
     note, left = told_of_going_on(settings)
-    if note is not None:
-        print(note, file=sys.stderr)
+    for told in (note, told_of_starting_from(settings)):
+        if told is not None:
+            print(told, file=sys.stderr)
     if not left:
         return 0
     with (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
@@ -202,9 +202,11 @@ def check_weights(path: str, policy: PreTrainedConfig) -> None:
 
 
 def check_as_trained(source: str | Path, policy: PreTrainedConfig, revision: str | None = None) -> None:
-    """Refuse a checkpoint that is to act under other settings than its weights were trained for.
+    """Refuse a checkpoint that is to act under other settings than its weights were trained for, or that is told how it
+    should have been trained.
 
-    Which these are its configuration says, by ``fixed_by_training: ClassVar[tuple[str, ...]]`` on its class.
+    Which these are its configuration says, by ``fixed_by_training`` and ``of_training_alone``, both of
+    ``ClassVar[tuple[str, ...]]``, on its class.
 
     Args:
         source: folder or repository. policy: what it would act under.
@@ -212,18 +214,32 @@ def check_as_trained(source: str | Path, policy: PreTrainedConfig, revision: str
     Raises:
         MemobenchError: one of them is another.
     """
-    fixed = getattr(policy, "fixed_by_training", ())
-    if not fixed:
+    fixed, of_training = getattr(policy, "fixed_by_training", ()), getattr(policy, "of_training_alone", ())
+    if not fixed and not of_training:
         return
+    trained = as_trained(source, policy, revision)
+    for name, asked, held in differing(policy, trained, (*fixed, *of_training)):
+        why = "its weights mean nothing else" if name in fixed else "nothing of this setting acts at evaluation"
+        raise MemobenchError(
+            f"--policy.{name}={asked} cannot be followed: '{source}' was trained with {held}, and {why}; "
+            f"leave {name} out, or train with it"
+        )
+
+
+def as_trained(source: str | Path, policy: PreTrainedConfig, revision: str | None = None) -> PreTrainedConfig:
+    """Return the configuration that a checkpoint, a folder or a repository, was trained with, on a policy's device."""
     device = [f"--device={policy.device}"]  # or a word would be lost on that of the training
-    trained = type(policy).from_pretrained(source, revision=revision, cli_overrides=device)
-    for name in fixed:
+    return type(policy).from_pretrained(source, revision=revision, cli_overrides=device)
+
+
+def differing(
+    policy: PreTrainedConfig, trained: PreTrainedConfig, names: Iterable[str]
+) -> Iterator[tuple[str, object, object]]:
+    """Yield name, value and earlier value of those settings that are not as they were."""
+    for name in names:
         asked, held = getattr(policy, name), getattr(trained, name)
         if asked != held:
-            raise MemobenchError(
-                f"--policy.{name}={asked} cannot be followed: '{source}' was trained with {held}, and its weights mean "
-                f"nothing else; leave {name} out, or train with it"
-            )
+            yield name, asked, held
 
 
 def _shapes(file: Path) -> dict[str, tuple[int, ...]]:

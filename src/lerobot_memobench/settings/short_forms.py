@@ -124,7 +124,11 @@ MEANINGS: dict[str, tuple[Meaning, ...]] = {
             "with shards=: how many jobs at once; processes, local, slurm or ray; what that one takes, key=value",
             "all at once, processes",
         ),
-        Meaning("align=, size=, perception=", "of a policy, as in lerobot train", "the checkpoint's"),
+        Meaning(
+            "align=, size=, perception=",
+            "of a policy named by its type, as in lerobot train; a checkpoint keeps its own, and others are refused",
+            "the type's",
+        ),
     ),
     "train": (
         Meaning("policy=", "a policy type, or a checkpoint to start from"),

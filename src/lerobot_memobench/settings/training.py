@@ -7,14 +7,22 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import yaml
+
 from lerobot_memobench.datasets.lerobot_format import DEFAULT_REPO_ID
 from lerobot_memobench.envs.obs_types import OBS_TYPES
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.jobs.threads import cores
-from lerobot_memobench.policies.checkpoint import checkpoint_folder, checkpoint_type, read_json
+from lerobot_memobench.policies.checkpoint import (
+    as_trained,
+    checkpoint_folder,
+    checkpoint_type,
+    differing,
+    read_json,
+)
 from lerobot_memobench.settings.configurations import check_sight, env_config, policy_config
 from lerobot_memobench.settings.fields import checked_value
-from lerobot_memobench.settings.flags import has_flag, whole_number, without_flag
+from lerobot_memobench.settings.flags import has_flag, joined_flags, whole_number, without_flag
 from lerobot_memobench.settings.lerobot_commands import quiet
 from lerobot_memobench.settings.short_forms import TRAINING_WORDS
 from lerobot_memobench.settings.translation import LerobotSettings
@@ -147,12 +155,94 @@ def schedule_told(checkpoint: Path, steps: int | None) -> str | None:
     )
 
 
-def told_of_going_on(settings: LerobotSettings) -> tuple[str | None, bool]:
-    """Return what is said of a training that goes on (None: nothing), and whether anything is left to be done."""
+def _gone_on_with(settings: LerobotSettings) -> Path | None:
+    """Return the checkpoint that a training goes on with; None where it begins, or is not on this machine."""
     path = settings.get("config_path")
     if settings.get("resume") != "true" or path is None or not Path(path).exists():
+        return None
+    return Path(path) if Path(path).is_dir() else Path(path).parent
+
+
+def check_as_begun(settings: LerobotSettings) -> None:
+    """Refuse to go on with a training under settings, or on a dataset, that it was not begun with.
+
+    Which settings these are the policy's configuration says, by ``kept_since_begun: ClassVar[tuple[str, ...]]``.
+
+    Raises:
+        MemobenchError: one of them is another.
+    """
+    checkpoint = _gone_on_with(settings)
+    if checkpoint is None:
+        return
+    _check_same_dataset(settings, checkpoint)
+    chosen = ("--policy.path", "--policy.type", "--policy.discover_packages_path")
+    given = [flag for flag in joined_flags(settings.flags) if flag.startswith("--policy.")]
+    given = [flag for flag in given if flag.partition("=")[0] not in chosen]
+    if not given:
+        return
+    from lerobot.configs.train import TrainPipelineConfig
+
+    with quiet():
+        begun = TrainPipelineConfig.from_pretrained(checkpoint).policy
+        asked = TrainPipelineConfig.from_pretrained(checkpoint, cli_args=given).policy
+    if begun is None or asked is None:
+        return
+    for name, value, held in differing(asked, begun, getattr(begun, "kept_since_begun", ())):
+        raise MemobenchError(
+            f"this training was begun with {name}={held}, and goes on with nothing else than that: found {value}; "
+            f"leave {name} out, or train a new run from the checkpoint: policy={checkpoint} policy.{name}={value} "
+            "output_dir=<new folder>"
+        )
+
+
+def _check_same_dataset(settings: LerobotSettings, checkpoint: Path) -> None:
+    """Refuse to go on with a training on another dataset, or on other episodes of it."""
+    begun = read_json(checkpoint / TRAIN_CONFIG).get("dataset") or {}
+    root, repository = settings.get("dataset.root"), settings.get("dataset.repo_id")
+    held = str(begun.get("root") or begun.get("repo_id"))
+    advice = f"leave that out, or train a new run from the checkpoint: policy={checkpoint} output_dir=<new folder>"
+    same = root is not None and begun.get("root") is not None and _place(root) == _place(begun["root"])
+    if not same and (root is not None or repository not in (None, begun.get("repo_id"))):
+        moved = begun.get("root") is not None and not Path(held).expanduser().exists()
+        raise MemobenchError(
+            f"this training was begun on the dataset {held}, and {root or repository} was asked for; "
+            + (f"if that is the same, put it or a link to it at {held}; else " if moved else "")
+            + advice
+        )
+    for name in ("episodes", "revision"):
+        told = settings.get(f"dataset.{name}")
+        if told is not None and yaml.safe_load(told) != begun.get(name):
+            raise MemobenchError(
+                f"this training was begun with dataset.{name}={begun.get(name)}, and {told} was asked for; {advice}"
+            )
+
+
+def _place(folder: str) -> Path:
+    return Path(folder).expanduser().resolve()
+
+
+def told_of_starting_from(settings: LerobotSettings) -> str | None:
+    """Return what is said of a training that begins from a checkpoint under other settings than its weights were
+    trained for, which fine-tuning may mean; None: nothing.
+    """
+    path = settings.get("policy.path")
+    policy = None if path is None else policy_config(settings)
+    if path is None or policy is None:
+        return None
+    fixed = getattr(policy, "fixed_by_training", ())
+    with quiet():
+        changed = list(differing(policy, as_trained(path, policy), fixed)) if fixed else []
+    if not changed:
+        return None
+    was, now = (", ".join(f"{item[0]}={item[part]}" for item in changed) for part in (2, 1))
+    return f"note: '{path}' was trained with {was}, and its weights are now trained on with {now}"
+
+
+def told_of_going_on(settings: LerobotSettings) -> tuple[str | None, bool]:
+    """Return what is said of a training that goes on (None: nothing), and whether anything is left to be done."""
+    checkpoint = _gone_on_with(settings)
+    if checkpoint is None:
         return None, True
-    checkpoint = Path(path).expanduser() if Path(path).is_dir() else Path(path).expanduser().parent
     steps = whole_number(settings.get("steps"))
     total, done = (
         steps or whole_number(str(read_json(checkpoint / TRAIN_CONFIG).get("steps"))),
@@ -205,6 +295,7 @@ def complete_training(settings: LerobotSettings) -> LerobotSettings:
             raise MemobenchError("name a policy: policy=memobench_mem")
         settings = with_places(settings)
     check_dataset(settings)
+    check_as_begun(settings)
     policy = policy_config(settings)
     check_sight(policy, env_config(settings))
     if settings.get("resume") != "true":

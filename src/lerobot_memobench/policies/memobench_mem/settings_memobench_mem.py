@@ -42,7 +42,17 @@ OF_TRAINING = _names(
     push_to_hub repo_id private tags license
     """
 )
-"""Fields that say how a policy is trained and where it goes: a checkpoint that acts reads none of them."""
+"""Fields that say how a policy is trained and where it goes: a checkpoint that acts reads none of them, and another
+value is refused there, or its card would tell of a training that never was."""
+SINCE_BEGUN = _names(
+    """
+    align subgoal_level shuffle_subgoals shuffle_seed text_encoder base_weights freeze_vision_encoder train_expert_only
+    ema_decay warmup_fraction final_lr optimizer_lr optimizer_betas optimizer_eps optimizer_weight_decay
+    optimizer_grad_clip_norm scheduler_warmup_steps scheduler_decay_steps scheduler_decay_lr
+    """
+)
+"""Those of `OF_TRAINING` that a training keeps where it is gone on with: they decide the model's parts and what these
+learn, or stand in the optimizer's saved state, which LeRobot makes from them once."""
 
 SIZES_OWN: Any = None
 """Default of what the size or the perception decides once the rest is known; then it is a number."""
@@ -54,6 +64,8 @@ class MemobenchMemSettings(PI05Config):
 
     knows_phases: ClassVar[bool] = True
     fixed_by_training: ClassVar[tuple[str, ...]] = FIXED
+    of_training_alone: ClassVar[tuple[str, ...]] = OF_TRAINING
+    kept_since_begun: ClassVar[tuple[str, ...]] = (*FIXED, *SINCE_BEGUN)
 
     size: str = "tiny"
     """``small`` (from scratch, learns from objects in minutes on a CPU), ``tiny`` (from scratch, trains on a CPU) or
