@@ -425,8 +425,9 @@ def test_a_training_goes_on_as_it_was_begun(training: Called, capsys: pytest.Cap
         "--policy.ema_decay=0": "begun with ema_decay=0.999",
     }.items():
         assert said in refused([*words, changed], training, capsys)
-    lerobots = ["train", f"config_path={checkpoint}/train_config.json", "resume=true", "align=semantic"]
-    assert "begun with align=none" in refused(lerobots, training, capsys)
+    for resume in ("resume=true", "--resume=True", "--resume"):
+        lerobots = ["train", f"config_path={checkpoint}/train_config.json", "align=semantic", resume]
+        assert "begun with align=none" in refused(lerobots, training, capsys)
 
 
 def test_a_training_goes_on_with_its_dataset(training: Called, capsys: pytest.CaptureFixture[str]) -> None:

@@ -157,8 +157,9 @@ def schedule_told(checkpoint: Path, steps: int | None) -> str | None:
 
 def _gone_on_with(settings: LerobotSettings) -> Path | None:
     """Return the checkpoint that a training goes on with; None where it begins, or is not on this machine."""
-    path = settings.get("config_path")
-    if settings.get("resume") != "true" or path is None or not Path(path).exists():
+    path, resume = settings.get("config_path"), settings.get("resume")
+    wanted = settings.has("resume") if resume is None else resume.lower() == "true"  # LeRobot takes a bare --resume
+    if not wanted or path is None or not Path(path).exists():
         return None
     return Path(path) if Path(path).is_dir() else Path(path).parent
 
