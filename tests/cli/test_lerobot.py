@@ -10,12 +10,16 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from pprint import pformat
 from typing import Any
+from urllib.error import URLError
 
 import lerobot.scripts.lerobot_eval
 import lerobot.scripts.lerobot_train
 import numpy as np
 import pytest
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.policies.factory import get_policy_class, make_policy_config
 from safetensors.numpy import save_file
 
 from lerobot_memobench.cli.lerobot import main
@@ -612,6 +616,78 @@ def test_other_errors_keep_their_traceback(evaluation: Called) -> None:
     evaluation.action = fail
     with pytest.raises(ZeroDivisionError):
         main(["eval", "env=memobench"])
+
+
+@pytest.mark.parametrize("kind", ["act", "diffusion"])
+@pytest.mark.parametrize("command", ["eval", "train"])
+def test_weights_of_a_backbone_that_cannot_be_fetched_are_one_sentence(
+    command: str,
+    kind: str,
+    evaluation: Called,
+    training: Called,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """LeRobot's policies ask torch for them, and torch the network."""
+
+    def no_network(*_: Any, **__: Any) -> None:
+        raise URLError(OSError(-3, "Temporary failure in name resolution"))
+
+    def make_policy(flags: list[str]) -> None:
+        policy = make_policy_config(kind, device="cpu", pretrained_backbone_weights="ResNet18_Weights.IMAGENET1K_V1")
+        policy.use_group_norm = False  # of diffusion: it goes with random weights alone
+        policy.input_features = {
+            "observation.state": PolicyFeature(FeatureType.STATE, (8,)),
+            "observation.images.image": PolicyFeature(FeatureType.VISUAL, (3, 96, 96)),
+        }
+        policy.output_features = {"action": PolicyFeature(FeatureType.ACTION, (7,))}
+        get_policy_class(kind)(policy)
+
+    monkeypatch.setenv("TORCH_HOME", str(Path.cwd()))
+    monkeypatch.setattr("torch.hub.urlopen", no_network)
+    evaluation.action = training.action = make_policy
+    assert main([command, *(["env=memobench"] if command == "eval" else []), f"policy={kind}"]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("lerobot: the pretrained weights of a backbone are not on this machine")
+    assert "name resolution" in told
+    assert "policy.pretrained_backbone_weights=null begins with random ones" in told
+    assert len(told.splitlines()) == 1
+
+
+def test_the_dump_of_a_trainings_configuration_is_no_news(training: Called, capsys: pytest.CaptureFixture[str]) -> None:
+    root = logging.getLogger()
+    handlers, level = root.handlers[:], root.level
+
+    def act(flags: list[str]) -> None:
+        from lerobot.utils.utils import init_logging
+
+        init_logging()
+        place = str(Path(lerobot.scripts.lerobot_train.__file__))
+        for message in (pformat({"batch_size": 8, "dataset": {"repo_id": "a/b"}}), "Creating dataset", "step:1 loss:2"):
+            root.handle(root.makeRecord("root", logging.INFO, place, 1, message, (), None))
+
+    training.action = act
+    try:
+        assert main(["train", "policy=act"]) == 0
+    finally:
+        root.handlers[:], filters = handlers, root.filters
+        root.setLevel(level)
+    told = capsys.readouterr().err
+    assert "batch_size" not in told
+    assert "Creating dataset" in told
+    assert "step:1 loss:2" in told
+    assert not filters
+
+
+def test_the_dump_is_still_what_it_is_taken_for() -> None:
+    assert "logging.info(pformat(cfg.to_dict()))" in Path(lerobot.scripts.lerobot_train.__file__).read_text()
+
+
+@pytest.mark.parametrize("spec", ["", ","])
+def test_no_task_is_not_all_tasks(evaluation: Called, capsys: pytest.CaptureFixture[str], spec: str) -> None:
+    assert main(["eval", "env=memobench", f"tasks={spec}"]) == 2
+    assert evaluation.flags is None
+    assert "among the tasks; expected names" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("code", "status"), [(None, 0), (0, 0), (3, 3), ("no", 1)])

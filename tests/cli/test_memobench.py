@@ -129,6 +129,14 @@ def test_help_lists_every_command_once_in_its_group(capsys: pytest.CaptureFixtur
     assert capsys.readouterr().out == out
 
 
+def test_help_cuts_no_description(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    assert main(["--help"]) == 0
+    out = capsys.readouterr().out
+    assert "..." not in out[out.index("Look around:") :]
+    assert max(len(line) for line in out.splitlines()) <= 80
+
+
 def _names() -> list[object]:
     return [one[0] if isinstance(one, tuple) else one for group in COMMANDS.values() for one in group]
 

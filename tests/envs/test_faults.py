@@ -7,6 +7,7 @@ import copy
 import json
 import logging
 import pickle
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -113,7 +114,9 @@ def test_unstable_physics_end_an_episode_with_a_word(
     env.step(REST)
     env.episode.sim.data.qvel[0] = 1e12
     if not logged:
-        with pytest.raises(MemobenchError, match=r"the physics broke down 0\.55 s after .*: Nan, Inf or huge value"):
+        with pytest.raises(MemobenchError, match=r"^the physics broke down 0\.55 s after .*: Nan, Inf or huge value"):
+            env.step(REST)
+        with pytest.raises(MemobenchError, match=r"^the episode has ended \(the physics broke down .*reset\(\)$"):
             env.step(REST)
         return
     with caplog.at_level(logging.WARNING):
@@ -132,6 +135,33 @@ def test_unstable_physics_end_an_episode_with_a_word(
     fresh.reset(seed=20_001)
     fresh.step(REST)
     assert {*hashes} == {fresh.scene_hash()}
+
+
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        ("up", r"an action is 'up'; expected 7 numbers, as an array \(7,\)"),
+        ([[0], [0, 1]], r"an action is \[\[0\], \[0, 1\]\]; expected 7 numbers"),
+        ({"arm": 0}, "an action is {'arm': 0}; expected 7 numbers"),
+        ("up" * 500, r"an action is 'upup.{,40}'; expected 7 numbers"),
+        (None, r"an action has shape \(\); expected \(7,\)"),
+    ],
+)
+def test_without_a_log_a_bad_action_ends_the_episode_until_the_next_reset(tmp_path: Path, bad: Any, words: str) -> None:
+    env = make()
+    for _ in range(2):
+        env.reset(seed=20_000)
+        env.step(REST)
+        with pytest.raises(MemobenchError, match=f"^{words}"):
+            env.step(bad)
+        with pytest.raises(MemobenchError, match=rf"^the episode has ended \({words}.*; begin another by reset\(\)$"):
+            env.step(REST)
+    logged = make(log_dir=str(tmp_path))
+    logged.reset(seed=20_000)
+    *_, truncated, info = logged.step(bad)
+    assert truncated
+    assert re.match(words, info["fault"])
+    assert [record["failure"] for record in read_episodes(tmp_path)] == ["invalid_action"]
 
 
 @pytest.fixture
@@ -207,8 +237,19 @@ def test_a_folder_with_a_task_that_cannot_be_run_is_evaluated(
 
 def test_without_a_log_a_task_that_cannot_be_run_is_an_error(folder: Path) -> None:
     env = MemobenchEnv(str(folder), obs_type=OBJECTS, expert_action=True)
-    with pytest.raises(MemobenchError, match="drawers only"):
+    said = "drawers only, and 'shelf_1_top_region' is none; the scene has no drawer, let a policy of your own"
+    with pytest.raises(MemobenchError, match=said):
         env.reset(seed=20_000)
+
+
+@pytest.mark.parametrize("key", ["task", "tasks"])
+def test_tasks_are_not_chosen_beside_a_folder_of_them(folder: Path, key: str) -> None:
+    where: dict[str, Any] = {"task_dir": str(folder)}
+    with pytest.raises(MemobenchError, match="runs every task in that folder, and tasks=object chooses among"):
+        MemobenchEnvConfig(**{**where, key: "object"})
+    with pytest.raises(MemobenchError, match=r"env\.task=temporal and tasks=object both choose the tasks"):
+        MemobenchEnvConfig(task="temporal", tasks="object")
+    assert len(MemobenchEnvConfig(**{**where, key: "all"}).selected()) == 1
 
 
 # --- seeds ---

@@ -10,9 +10,11 @@ import pytest
 import torch
 from small_policy import made_for_training, small_config
 
+from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.datasets.memory_cache import FOLDER, MemoryCache
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset, load_perception, open_cache
 from lerobot_memobench.policies.memobench_mem.perception.pixels import PixelPerception
+from object_dataset import make_object_dataset
 
 
 def _opened(root: Path, **fields: Any) -> MemoryCache:
@@ -39,6 +41,20 @@ def test_training_reads_the_cache_that_the_command_wrote(
 
     monkeypatch.setattr(PixelPerception, "__call__", refuse)
     made_for_training(root)  # the policy's own tower reads what `memobench cache` wrote
+
+
+@pytest.mark.parametrize("size", ["tiny", "small"])
+def test_without_pictures_there_is_nothing_to_encode(
+    tmp_path: Path, size: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = make_object_dataset(tmp_path / "d1")
+    capsys.readouterr()
+    assert main(["cache", str(root), "--size", size]) == 2
+    told = capsys.readouterr().err
+    assert told == (
+        f"memobench: {root} holds no pictures, so there is nothing to encode; perception=objects needs no cache\n"
+    )
+    assert not (root / FOLDER).exists()
 
 
 def test_training_finishes_a_cache_that_was_killed(

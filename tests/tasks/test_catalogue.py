@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from collections import Counter
@@ -143,13 +144,34 @@ def test_a_task_has_a_short_number_in_its_suite() -> None:
     assert task_number(COMMAS) == resolve_tasks("all").index(COMMAS) + 1
 
 
+@pytest.mark.parametrize(
+    ("spec", "said"),
+    [
+        ("", "found nothing among the tasks"),
+        (" ", "found nothing among the tasks"),
+        (",", "found an empty entry in ',' among the tasks"),
+        ("12,,3", "found an empty entry in '12,,3' among the tasks"),
+        ("object,", "found an empty entry in 'object,' among the tasks"),
+        ("4-3", "found 4-3 among the tasks; that range runs backwards"),
+        ("object,3-", "found 3- among the tasks; that is no whole range"),
+        ("-3", "found -3 among the tasks; that is no whole range"),
+        ("1-3-5", "found 1-3-5 among the tasks; that is no whole range"),
+        ("3 - 7", "found 3 - 7 among the tasks; that is no whole range"),
+        ("all,12", "found 'all' beside others among the tasks, 'all,12'; 'all' stands alone"),
+        ("object, all", "'all' stands alone"),
+        (["12", "all"], "'all' stands alone"),
+    ],
+)
+def test_a_list_of_tasks_that_is_none_says_what_is_wrong_with_it(spec: str | list[str], said: str) -> None:
+    with pytest.raises(MemobenchError, match=re.escape(said)):
+        resolve_tasks(spec)
+
+
 def test_unknown_names_tell_the_nearest() -> None:
     with pytest.raises(MemobenchError, match="did you mean 'turn_on_the_stove_and_turn_it_off'"):
         get_task("turn_on_the_stove_and_turn_of")
     with pytest.raises(MemobenchError, match="did you mean 'temporal'"):
         resolve_tasks("spatial,temporl")
-    with pytest.raises(MemobenchError, match="found '' among the tasks"):
-        resolve_tasks("")
     with pytest.raises(MemobenchError, match="memory type 'episodic'"):
         task_names("episodic")
     with pytest.raises(MemobenchError, match="no task named"):

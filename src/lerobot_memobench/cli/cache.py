@@ -40,7 +40,7 @@ def cache(
         int | None, typer.Option(min=1, help="Threads that decode videos; as many as there are cores by default.")
     ] = None,
 ) -> None:
-    """Encode a dataset's frames and subgoals once, for policies with a memory."""
+    """Encode a dataset once for policies with a memory. Its frames and its subgoals."""
     from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
     from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
     from lerobot_memobench.settings.lerobot_commands import quiet

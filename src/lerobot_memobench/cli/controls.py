@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from lerobot_memobench.evaluation.documents.tables import Report
 
 app = typer.Typer(
-    help="What the paper's controls tell: oracle memory, shuffled memory, annotation granularity.", no_args_is_help=True
+    help="Report the paper's controls. Oracle memory, shuffled memory, annotation granularity.", no_args_is_help=True
 )
 
 

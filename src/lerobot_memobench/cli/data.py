@@ -24,7 +24,7 @@ def convert(
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     repo_id: Annotated[str | None, typer.Option(help="Name of the dataset, user/name.")] = None,
 ) -> int:
-    """Turn HDF5 demonstrations into a LeRobotDataset; name what cannot be used. The same command continues a killed
+    """Turn HDF5 demonstrations into a LeRobotDataset. What cannot be used is named. The same command continues a killed
     run.
     """
     from lerobot_memobench.datasets.convert import convert as run
@@ -60,7 +60,7 @@ def validate(
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     suite: OfSuite = None,
 ) -> int:
-    """Replay every episode in the simulator; report the first disagreement of each."""
+    """Replay every episode in the simulator. The first disagreement of each is reported."""
     from lerobot_memobench.datasets.suites import check_suite_of
     from lerobot_memobench.datasets.validate import exit_status
     from lerobot_memobench.datasets.validate import validate as run
@@ -85,8 +85,8 @@ def push(
     private: Annotated[bool | None, typer.Option(help="Whether a repository that has to be made is private.")] = None,
     hdf5: Annotated[bool, typer.Option("--hdf5", help="Upload the HDF5 files as well.")] = False,
 ) -> int:
-    """Upload a dataset to the Hugging Face hub (token: `hf auth login` or HF_TOKEN). The same command continues a
-    broken upload. Files of an earlier dataset there are deleted.
+    """Upload a dataset to the Hugging Face hub. The token is that of `hf auth login` or HF_TOKEN. The same command
+    continues a broken upload. Files of an earlier dataset there are deleted.
     """
     from lerobot_memobench.datasets.push import push as run
 
@@ -103,7 +103,7 @@ def describe(
     out: Annotated[Path | None, typer.Option(help="Where to; DATASET/description when left out.")] = None,
     suite: OfSuite = None,
 ) -> int:
-    """Keep of a dataset what fits into a repository: figures, the card's tables, the hash of every episode."""
+    """Keep of a dataset what fits into a repository. Figures, the card's tables, the hash of every episode."""
     from lerobot_memobench.datasets.describe import describe as run
     from lerobot_memobench.datasets.suites import check_suite_of
 

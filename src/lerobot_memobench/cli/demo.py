@@ -15,7 +15,7 @@ def demo(
         "outputs/demo"
     ),
 ) -> int:
-    """Evaluate the scripted expert on a task of each memory type; on one of them, trained policies as well, with a
+    """Evaluate the scripted expert on a task of each memory type. On one of them, trained policies as well, with a
     memory and without.
     """
     from rich.markdown import Markdown

@@ -21,7 +21,7 @@ COLOURS: dict[Status, str] = {"ok": "green", "warning": "yellow", "failed": "red
 def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
 ) -> int:
-    """Check that this machine can run the benchmark, and say how to mend what it cannot."""
+    """Check that this machine can run the benchmark. What it cannot is told with how to mend it."""
     from lerobot_memobench.doctor.examination import examine
     from lerobot_memobench.doctor.findings import exit_status
 

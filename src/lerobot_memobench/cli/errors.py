@@ -5,9 +5,16 @@ from __future__ import annotations
 import os
 import traceback
 from collections.abc import Iterator
+from http.client import HTTPException
+from urllib.error import URLError
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.files import disk_refusal
+
+BACKBONE = "policy.pretrained_backbone_weights"
+"""Where LeRobot's policies with a backbone of torchvision's, such as act and diffusion, name its weights."""
+FETCHING = (URLError, HTTPException, ConnectionError, TimeoutError)
+"""What torch raises where it cannot fetch weights."""
 
 
 def chain(error: BaseException) -> Iterator[BaseException]:
@@ -40,6 +47,13 @@ def one_sentence(error: BaseException) -> str | None:
         named = next((found.filename for found in errors if isinstance(found, OSError) and found.filename), None)
         where = f" {os.fsdecode(named)}" if isinstance(named, str | bytes) else ""
         return f"the disk does not take{where or ' what is written'} ({refusal}): make room, or name another folder"
+    fetched = next((found for found in errors if isinstance(found, FETCHING)), None)
+    if fetched is not None and _came_through(fetched, "torch.hub"):
+        return (
+            "the pretrained weights of a backbone are not on this machine and could not be fetched "
+            f"({_line(fetched)[:200]}); "
+            f"{BACKBONE}=null begins with random ones, a checkpoint brings its own all the same"
+        )
     hub = next((found for found in errors if _is_hub_error(found)), None)
     if hub is not None and any(_came_through(found, "lerobot.datasets.") for found in errors):
         return (

@@ -13,9 +13,7 @@ from lerobot_memobench.cli.console import Count, console, counting
 if TYPE_CHECKING:
     from lerobot_memobench.jobs.job import Advance
 
-app = typer.Typer(
-    help="Eyes: train a small tower on labelled pictures of the benchmark, and test it.", no_args_is_help=True
-)
+app = typer.Typer(help="Train eyes, a small tower, on labelled pictures, and test it.", no_args_is_help=True)
 
 Tasks = Annotated[
     str | None, typer.Option(help="all, memory types or task names of the published suite; both suites by default.")

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from lerobot_memobench.evaluation.records.runs import Run
 
 app = typer.Typer(
-    help="Draw figures of evaluations (DIR, or NAME=DIR) and of the paper's tables (--with paper), as PDF and PNG.",
+    help="Draw figures of evaluations and of the paper's tables. Evaluations: DIR, or NAME=DIR; the paper's: --with "
+    "paper. As PDF and PNG.",
     no_args_is_help=True,
 )
 

@@ -82,7 +82,7 @@ def generate(
         ),
     ] = None,
 ) -> int:
-    """Let the scripted experts make demonstrations into a LeRobotDataset. The same command continues a killed
+    """Make a LeRobotDataset of the scripted experts' demonstrations. The same command continues a killed
     run.
     """
     options = executor_options(executor_option or [])

@@ -24,7 +24,7 @@ def html(
         typer.Option(help="Tasks in the published format that the evaluations ran, beside the catalogue's."),
     ] = None,
 ) -> None:
-    """Make a report for the browser: rates, failures, and each episode's video over its timeline."""
+    """Make a report for the browser. Rates, failures, and each episode's video over its timeline."""
     from lerobot_memobench.evaluation.documents.html import write_html
 
     written = write_html(folders, out, link=link, task_dir=task_dir)

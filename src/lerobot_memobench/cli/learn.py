@@ -62,7 +62,7 @@ def learn(
     dataset: Annotated[Path | None, typer.Option(help="Demonstrations that are there already.")] = None,
     workers: Annotated[int, typer.Option(min=1, help="Processes; so many policies are trained at once.")] = 1,
 ) -> int:
-    """Generate demonstrations, train policies with a memory and without, roll them out on the evaluation seeds."""
+    """Generate, train with a memory and without, and compare. The policies are rolled out on the evaluation seeds."""
     from lerobot_memobench.studies.learning.experiments import changed, experiment
     from lerobot_memobench.studies.learning.study import learn as run
     from lerobot_memobench.tasks.catalogue import resolve_tasks

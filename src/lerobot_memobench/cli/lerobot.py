@@ -18,7 +18,7 @@ from lerobot_memobench.engine.lerobot_command import call_lerobot
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.jobs.processes import saying_how_to_go_on
 from lerobot_memobench.settings.flags import flag_value
-from lerobot_memobench.settings.lerobot_commands import lerobot_commands
+from lerobot_memobench.settings.lerobot_commands import lerobot_commands, without_configuration
 from lerobot_memobench.settings.reading import check_task_names, read_settings
 from lerobot_memobench.settings.recipes import resolve_recipe
 from lerobot_memobench.settings.short_forms import MEANINGS, help_text
@@ -103,6 +103,7 @@ def train(words: Words, line: Sequence[str]) -> int:
         saying_how_to_go_on(lambda: f"lerobot: {how_to_go_on(settings, line, begun)}"),
         trained_on(prompt_frames, obs_type),
         naming_damage(Path(root) if root else None),
+        without_configuration(),
     ):
         return call_lerobot("train", settings.flags)
 

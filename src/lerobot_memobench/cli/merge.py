@@ -16,7 +16,7 @@ def merge(
         list[Path] | None, typer.Argument(help="Folders of its parts; OUT/shard-*-of-* when left out.")
     ] = None,
 ) -> int:
-    """Join the parts of an evaluation that were run with shard=i/n and report the whole. Status 1: some are missing."""
+    """Join the parts of an evaluation and report the whole. They ran with shard=i/n. Status 1: some are missing."""
     from lerobot_memobench.cli.evaluate import merge_and_print
     from lerobot_memobench.engine.merging import part_folders
 
@@ -30,7 +30,7 @@ def rerun(
         str | None, typer.Option(help="Where the card's policy server is here, host:port; 127.0.0.1 needs no saying.")
     ] = None,
 ) -> int:
-    """Repeat the evaluation that a card describes and compare every episode. Status 1: one ended differently."""
+    """Repeat the evaluation of a card and compare every episode. Status 1: one ended differently."""
     from lerobot_memobench.cli.evaluate import evaluate_here
     from lerobot_memobench.engine import rerun as again
     from lerobot_memobench.engine.outcomes import first_disagreement

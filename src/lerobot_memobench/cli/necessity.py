@@ -55,7 +55,7 @@ def necessity(
         ),
     ] = None,
 ) -> int:
-    """Find moments that look the same and need different answers; print what a policy without memory can reach."""
+    """Find moments that look the same and need different answers. They tell what a policy without memory can reach."""
     from lerobot_memobench.evaluation.necessity.pieces import PIECES, make
     from lerobot_memobench.evaluation.necessity.question import Settings
     from lerobot_memobench.evaluation.necessity.report import (

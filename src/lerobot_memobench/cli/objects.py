@@ -13,7 +13,7 @@ from lerobot_memobench.cli.console import console
 def objects(
     as_json: Annotated[bool, typer.Option("--json", help="Print slots, fields and classes as JSON.")] = False,
 ) -> None:
-    """Print the layout of object observations: slots, the fields of each, the classes by index."""
+    """Print the layout of object observations. Slots, the fields of each, the classes by index."""
     from lerobot_memobench.sim.object_slots import SLOTS, layout
 
     told = layout()

@@ -14,7 +14,7 @@ from lerobot_memobench.settings.recipes import recipe_file, recipes
 def recipe(
     name: Annotated[str | None, typer.Argument(help="A recipe; all are listed without it.")] = None,
 ) -> int:
-    """Print the file of a training recipe, for `lerobot-train --config_path=$(memobench recipe train_paper)`."""
+    """Print the file of a training recipe. As in `lerobot-train --config_path=$(memobench recipe train_paper)`."""
     if name is not None:
         print(recipe_file(name))
         return 0

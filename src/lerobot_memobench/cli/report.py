@@ -38,7 +38,7 @@ def report(
         Path | None, typer.Option(help="Folder that the report is written to, instead of being printed.")
     ] = None,
 ) -> None:
-    """Report SR, MSR, MUR and MCR, prefix completion, failures and replan sweeps of evaluations.
+    """Report SR, MSR, MUR and MCR of evaluations. Also prefix completion, failures and replan sweeps.
 
     report.json and report.md of each evaluation are written beside its log as well.
     """
@@ -94,7 +94,7 @@ def compare(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random signs.")] = 0,
     permutations: Annotated[int, typer.Option(min=100, help="Random signs where not all can be tried.")] = 10_000,
 ) -> None:
-    """Compare two evaluations of the same episodes, pair by pair: McNemar for success, sign-flip for the rates."""
+    """Compare two evaluations of the same episodes, pair by pair. McNemar for success, sign-flip for the rates."""
     from lerobot_memobench.evaluation.comparison import differences_report
     from lerobot_memobench.evaluation.comparison.differences import compare as compared
     from lerobot_memobench.evaluation.records.runs import read_runs
@@ -118,7 +118,7 @@ def agreement(
     format_: Formats = None,
     out: Annotated[Path | None, typer.Option(help="Folder for agreement.md, agreement.json and so on.")] = None,
 ) -> None:
-    """Agreement of raters with one another and with the released operation labels."""
+    """Tell how far raters agree. With one another and with the released operation labels."""
     from lerobot_memobench.evaluation.agreement.label_sheet import blank_sheet, read_labels
     from lerobot_memobench.evaluation.agreement.published import published_report
     from lerobot_memobench.evaluation.agreement.report import report as study_report

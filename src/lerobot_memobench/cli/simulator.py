@@ -17,7 +17,7 @@ def gallery(
     ),
     suite: WhichSuite = Suite.PUBLISHED,
 ) -> None:
-    """Draw every task's initial scene, every object from all sides, every fixture open and closed."""
+    """Draw every task's initial scene, every object and fixture. Objects from all sides, fixtures open and closed."""
     from lerobot_memobench.sim.gallery import write_gallery
 
     for picture in write_gallery(out, suite):
@@ -27,7 +27,7 @@ def gallery(
 def bench(
     names: Annotated[list[str] | None, typer.Argument(help="Which benchmarks; all when left out.")] = None,
 ) -> None:
-    """Time steps, resets and workers against stock robosuite, in one run; the table belongs in a bug report."""
+    """Time steps, resets and workers against stock robosuite. All in one run; the table belongs in a bug report."""
     from lerobot_memobench.bench.claims import run
     from lerobot_memobench.bench.line import table
 

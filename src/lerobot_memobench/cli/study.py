@@ -21,8 +21,9 @@ def study(
     first_seed: Annotated[int, typer.Option(help="First seed of the rollouts; choose settings by 20000.")] = 7,
     workers: Annotated[int, typer.Option(min=1, help="Processes; so many policies are trained at once.")] = 1,
 ) -> int:
-    """Does alignment help? Train with no, semantic, contrastive and framewise alignment, with oracle text and without
-    a memory, and compare success, what memories tell of the active subgoal, and action loss.
+    """Does alignment help? Train policies of each kind and compare. With no, semantic, contrastive and framewise
+    alignment, with oracle text and without a memory; by success, what memories tell of the active subgoal, and action
+    loss.
     """
     from lerobot_memobench.studies.alignment.settings import StudySettings
     from lerobot_memobench.studies.alignment.study import run_study

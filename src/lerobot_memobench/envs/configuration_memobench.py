@@ -61,7 +61,8 @@ class MemobenchEnvConfig(EnvConfig):
         suite: `published`, or `strict`: the twins of the 30 tasks that cannot be solved without a memory.
         tasks: `all`, memory types or task names, separated by commas.
         task: the same, for those used to LeRobot's field.
-        task_dir: a folder in the published format to run instead of the catalogue (one task, or a tree of them).
+        task_dir: a folder in the published format to run instead of the catalogue (one task, or a tree of them), all
+            of it.
         obs_type: what is seen beside the arm's state: `pixels_agent_pos`, pictures; `environment_state_agent_pos`, what
             they would show as object slots (`observation.environment_state`), and nothing is drawn; or `both`.
         referent: `fixed`, the published goals, or `random`: by seed another admissible referent or order. Strict tasks
@@ -129,6 +130,15 @@ class MemobenchEnvConfig(EnvConfig):
                 raise MemobenchError(f"env.{name} is {number}; expected a whole number from 1 on")
         if self.films is not None and self.films < 0:
             raise MemobenchError(f"env.films is {self.films}; expected a whole number of episodes from 0 on")
+        if self.task is not None and self.tasks != "all":
+            raise MemobenchError(
+                f"env.task={self.task} and tasks={self.tasks} both choose the tasks; leave one of them out"
+            )
+        if self.task_dir is not None and (chosen := self.task or self.tasks) != "all":
+            raise MemobenchError(
+                f"env.task_dir={self.task_dir} runs every task in that folder, and tasks={chosen} chooses among the "
+                "catalogue's; leave tasks= out, or name the folder of one task by env.task_dir="
+            )
         self.referent = referent_told(self.referent, drawn=self.suite == STRICT)
         if self.obs_type != PIXELS:
             self.features, self.features_map = policy_features(self.obs_type), policy_names(self.obs_type)

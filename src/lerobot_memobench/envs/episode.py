@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from lerobot_memobench.envs.observations import ACTION_DIM, EXECUTION, IMAGE_KEYS, PROMPT
 from lerobot_memobench.errors import MemobenchError, nearest
@@ -20,7 +20,7 @@ from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.experts.prompts import PromptDemonstrator
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.rendering import Image, RenderSettings
-from lerobot_memobench.sim.simulation import InvalidActionError, Simulation, UnstablePhysicsError, check_action
+from lerobot_memobench.sim.simulation import InvalidActionError, Simulation, UnstablePhysicsError, as_action
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.failures import INVALID_ACTION, UNSTABLE_PHYSICS
 from lerobot_memobench.tasks.formula import Atom, atoms
@@ -168,7 +168,7 @@ class Episode:
         """Ended by success, horizon, loss or fault; satisfied checkpoints alone end nothing."""
         return self.success or self.exec_steps >= self.horizon or self.lost or self.fault is not None
 
-    def step(self, action: NDArray[np.floating]) -> None:
+    def step(self, action: ArrayLike) -> None:
         """Advance by one control step; during the prompt the given action has no effect, after a fault nothing has."""
         if self.phase == PROMPT:
             assert self._demonstrator is not None
@@ -181,18 +181,18 @@ class Episode:
                 self._begin_execution()
             return
         if self.fault is None:
-            self.fault = self._act(np.asarray(action, dtype=np.float32))
+            self.fault = self._act(action)
         if self.fault is not None:
             return
         self.step_index += 1
         self.progress.step(self.sim.holds)
         self.drifted = self.drifted or any(self.sim.holds(atom) for atom in self._wrong)
 
-    def _act(self, action: NDArray[np.float32]) -> Fault | None:
+    def _act(self, action: ArrayLike) -> Fault | None:
         """Carry out what the policy says; return what went wrong."""
         try:
-            check_action(action)  # before it is clipped: infinity would become 1
-            self.applied_action = np.clip(action, -1.0, 1.0)
+            numbers = as_action(action, np.float32)  # before it is clipped: infinity would become 1
+            self.applied_action = np.clip(numbers, -1.0, 1.0)
             self.sim.step(self.applied_action)
         except InvalidActionError as error:
             return Fault(INVALID_ACTION, str(error))

@@ -12,7 +12,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from lerobot_memobench.envs.acting import NOBODY, Acting
 from lerobot_memobench.envs.annotate import BAND
@@ -190,21 +190,23 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             self._see()
         self._sight.watched = True
 
-    def step(self, action: NDArray[np.float32]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+    def step(self, action: ArrayLike) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Advance by one control step of 50 ms. The reward is 1 at success, else 0.
 
         An episode terminates by success and, of a strict task, by the loss of its goal; the horizon truncates it.
 
         Raises:
             gymnasium.error.ResetNeeded, gymnasium.error.ClosedEnvironmentError: it has not begun, or is closed.
-            MemobenchError: see the class.
+            MemobenchError: see the class; also of every step after it, up to the next reset.
         """
         self._check_began("step")
+        if self._log is None and self._not_run is None and (fault := self.episode.fault) is not None:
+            raise MemobenchError(f"the episode has ended ({fault.why}); begin another by reset()")
         if self._not_run is None:
             # A dataset's labels count what was completed before a frame; what this step completes is told one later.
             completed = self.episode.progress.index
             with self._noting():
-                self.episode.step(np.asarray(action, dtype=np.float32))
+                self.episode.step(action)
         if self._not_run is not None:
             self._end()
             return blank(self.observation_space), 0.0, False, True, self._info()

@@ -234,9 +234,8 @@ class Expert:
             if part in asset.articulations
         ]
         if region not in drawers:
-            raise MemobenchError(
-                f"the expert puts things into drawers only, and {region!r} is none; {nearest(region, drawers)}"
-            )
+            known = nearest(region, drawers) if drawers else "the scene has no drawer, let a policy of your own do it"
+            raise MemobenchError(f"the expert puts things into drawers only, and {region!r} is none; {known}")
         articulation, q = self.sim.world.articulation(region)
         if articulation.open_below is not None and q > articulation.open_below:
             yield from self._open(region)

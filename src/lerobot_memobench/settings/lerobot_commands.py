@@ -8,7 +8,7 @@ import os
 import sys
 import typing
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import cache
 from importlib import metadata
 from typing import Any
@@ -85,17 +85,38 @@ def without_chatter(trained: bool) -> Iterator[None]:
             return True
         return record.levelno >= logging.WARNING and not record.getMessage().startswith(false_alarms)
 
-    # LeRobot logs by the root's functions and by loggers of its modules' names; a filter holds for one logger alone.
-    loggers = [logging.getLogger(name) for name in (None, "lerobot.configs.eval", "lerobot.utils.device_utils")]
     named = logging.getLogger("lerobot")
     before = named.level
+    named.setLevel(logging.WARNING)
+    try:
+        # LeRobot logs by the root's functions and by loggers of its modules' names; a filter holds for one alone.
+        with _filtered(matters, None, "lerobot.configs.eval", "lerobot.utils.device_utils"):
+            yield
+    finally:
+        named.setLevel(before)
+
+
+def without_configuration() -> AbstractContextManager[None]:
+    """Keep to ourselves the configuration of a hundred lines that LeRobot's training begins with: each checkpoint holds
+    it, as `train_config.json`. All else is shown.
+    """
+
+    def matters(record: logging.LogRecord) -> bool:
+        # It is logged as a printed dictionary.
+        return record.filename != "lerobot_train.py" or not record.getMessage().startswith("{'")
+
+    return _filtered(matters, None)
+
+
+@contextmanager
+def _filtered(matters: Callable[[logging.LogRecord], bool], *names: str | None) -> Iterator[None]:
+    """Show of some loggers only the records that matter; None names the root."""
+    loggers = [logging.getLogger(name) for name in names]
     for logger in loggers:
         logger.addFilter(matters)
-    named.setLevel(logging.WARNING)
     try:
         yield
     finally:
-        named.setLevel(before)
         for logger in loggers:
             logger.removeFilter(matters)
 

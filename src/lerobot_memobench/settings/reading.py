@@ -39,7 +39,7 @@ def check_task_names(words: Words) -> None:
     suite = settings.get("suite", words.value("env.suite"))
     in_a_file = suite is None and words.value("config_path") is not None
     if environment == "memobench" and not own_folder and not in_a_file:
-        resolve_tasks(tasks or "all", check_suite(suite or PUBLISHED))
+        resolve_tasks("all" if tasks is None else tasks, check_suite(suite or PUBLISHED))
 
 
 def read_config_file(words: Words) -> dict[str, Any]:

@@ -156,7 +156,13 @@ MEANINGS: dict[str, tuple[Meaning, ...]] = {
         Meaning("device=", "where it is trained: cpu, cuda, …"),
         Meaning("output_dir=", "where everything goes; with resume=true, the training that is gone on with"),
         Meaning("resume=", "true: go on with the last checkpoint in output_dir="),
-        Meaning("env=, tasks=, suite=, referent=", "with env=memobench: evaluations within the training"),
+        Meaning("steps=", "updates of the weights, with resume=true those before included", "100000"),
+        Meaning("batch_size=", "frames per update", "8, of objects or through eyes 72"),
+        Meaning("save_freq=", "updates from one checkpoint to the next; the last update always makes one", "20000"),
+        Meaning("env=", "memobench: evaluate within the training, every env_eval_freq= updates", "no evaluation"),
+        Meaning("tasks=", "with env=: those evaluated on, as in lerobot eval", "all"),
+        Meaning("suite=", "with env=: theirs, published or strict", "published"),
+        Meaning("referent=", "with env=: fixed, the published goals; random, the seed decides", "fixed"),
     ),
 }
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import reprlib
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.sim import robot
@@ -34,21 +35,32 @@ NO_OP = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 
 
 class InvalidActionError(MemobenchError):
-    """An action that cannot be carried out: of another shape, or not finite."""
+    """An action that cannot be carried out: no numbers, of another shape, or not finite."""
 
 
 class UnstablePhysicsError(MemobenchError):
     """MuJoCo itself warns of its state: it has begun the scene anew, or left out what it had no room for."""
 
 
-def check_action(action: NDArray[np.floating]) -> None:
-    """Raise `InvalidActionError` unless an action is (7,) and finite."""
-    if action.shape != (ACTION_DIM,):
-        raise InvalidActionError(f"an action has shape {action.shape}; expected ({ACTION_DIM},)")
-    if not np.isfinite(action).all():
+def as_action[F: np.floating](action: ArrayLike, dtype: type[F]) -> NDArray[F]:
+    """Return an action as an array (7,), finite.
+
+    Raises:
+        InvalidActionError: it is none.
+    """
+    try:
+        array: NDArray[F] = np.asarray(action, dtype=dtype)
+    except (TypeError, ValueError):  # words, ragged lists, tensors of another device
         raise InvalidActionError(
-            f"an action holds a value that is not finite: {action.tolist()}; check the policy's output"
+            f"an action is {reprlib.repr(action)}; expected {ACTION_DIM} numbers, as an array ({ACTION_DIM},)"
+        ) from None
+    if array.shape != (ACTION_DIM,):
+        raise InvalidActionError(f"an action has shape {array.shape}; expected ({ACTION_DIM},)")
+    if not np.isfinite(array).all():
+        raise InvalidActionError(
+            f"an action holds a value that is not finite: {array.tolist()}; check the policy's output"
         )
+    return array
 
 
 @dataclass(frozen=True)
@@ -138,7 +150,7 @@ class Simulation:
         """Take the places of all things now for those that ``inplace`` compares with."""
         self._start.mark_things()
 
-    def step(self, action: NDArray[np.floating]) -> None:
+    def step(self, action: ArrayLike) -> None:
         """Advance by one control step of 50 ms.
 
         Args:
@@ -148,11 +160,10 @@ class Simulation:
             InvalidActionError: it is none. Nothing has changed then.
             UnstablePhysicsError: MuJoCo does not trust its state any more. Only `reset` helps then.
         """
-        action = np.asarray(action, dtype=np.float64)
-        check_action(action)
+        action = as_action(action, np.float64)
         time = self.data.time
         self._start.mark_step()
-        self._controller.set_goal(self.data, action.astype(np.float64, copy=False))
+        self._controller.set_goal(self.data, action)
         self._controller.advance(self.data, float(action[6]), SUBSTEPS)
         self._check_physics(time)
         if self._at_home is not None and action[6] <= 0.0 and self._start.in_detent():

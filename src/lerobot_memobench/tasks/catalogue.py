@@ -19,6 +19,9 @@ CATALOGUE_DIR = Path(__file__).parent / "catalogue"
 NUMBERS = re.compile(r"(\d+)(?:-(\d+))?")
 """A task's number, or a range of them, both ends included."""
 
+NUMERIC = re.compile(r"[\d -]*[\d-]")
+"""What can be meant for nothing but these."""
+
 BOWL = "put_the_butter_into_the_bowl_from_the_prompt_video"
 """The task that shows in little time what a memory is for: which of three bowls it is, the prompt alone tells."""
 
@@ -93,8 +96,11 @@ def resolve_tasks(spec: str | Iterable[str], suite: str = PUBLISHED) -> list[str
     """
     check_suite(suite)
     if not isinstance(spec, str):
+        spec = list(spec)
+        _check_all_alone(spec)
         return list(dict.fromkeys(name for part in spec for name in resolve_tasks(part, suite)))
     pieces = spec.split(",")
+    _check_all_alone(pieces)
     chosen: list[str] = []
     start = 0
     while start < len(pieces):
@@ -107,6 +113,12 @@ def resolve_tasks(spec: str | Iterable[str], suite: str = PUBLISHED) -> list[str
                 break
         else:
             word = pieces[start].strip()
+            if not word:
+                given = "nothing" if not spec.strip() else f"an empty entry in {spec!r}"
+                raise MemobenchError(
+                    f"found {given} among the tasks; expected names, numbers or memory types with one comma between "
+                    "two of them, or 'all'"
+                )
             hint = nearest(word, ["all", *MEMORY_TYPES, *task_names(suite=suite)])
             raise MemobenchError(
                 f"found {word!r} among the tasks, expected 'all', a memory type ({', '.join(MEMORY_TYPES)}), "
@@ -115,16 +127,29 @@ def resolve_tasks(spec: str | Iterable[str], suite: str = PUBLISHED) -> list[str
     return list(dict.fromkeys(chosen))
 
 
+def _check_all_alone(entries: list[str]) -> None:
+    """Refuse "all" beside others, of which one of the two cannot be meant."""
+    if len(entries) > 1 and "all" in [entry.strip() for entry in entries]:
+        raise MemobenchError(
+            f"found 'all' beside others among the tasks, {','.join(entries)!r}; 'all' stands alone: name it, or the "
+            "others"
+        )
+
+
 def _expand(word: str, suite: str) -> list[str]:
     """Return the tasks that a word means, none for an unknown one."""
     if word == "all" or word in MEMORY_TYPES:
         return task_names(None if word == "all" else word, suite)
-    if (numbers := NUMBERS.fullmatch(word)) is not None:
-        names, first, last = task_names(suite=suite), int(numbers[1]), int(numbers[2] or numbers[1])
+    if NUMERIC.fullmatch(word) is not None:
+        names, numbers = task_names(suite=suite), NUMBERS.fullmatch(word)
+        first, last = (0, 0) if numbers is None else (int(numbers[1]), int(numbers[2] or numbers[1]))
         if not 1 <= first <= last <= len(names):
+            wrong = (
+                "that is no whole range; " if numbers is None else "that range runs backwards; " if first > last else ""
+            )
             raise MemobenchError(
-                f"found {word} among the tasks; those of the {suite} suite are numbered 1 to {len(names)}, a range is "
-                "such as 3-7 (`memobench tasks` lists them)"
+                f"found {word} among the tasks; {wrong}those of the {suite} suite are numbered 1 to {len(names)}, "
+                "a range is such as 3-7 (`memobench tasks` lists them)"
             )
         return names[first - 1 : last]
     if word not in _folders():

@@ -27,14 +27,18 @@ def frame_reader(root: Path, camera: str) -> FrameReader:
     """Return the reader of a camera of the dataset in ``root``; it decodes what it is asked for in one sweep.
 
     Raises:
-        MemobenchError: the dataset has no such camera.
+        MemobenchError: the dataset has no such camera, or no pictures at all.
     """
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
     meta = LeRobotDatasetMetadata(root.name, root=root)
+    if not meta.camera_keys:
+        raise MemobenchError(
+            f"{root} holds no pictures, so there is nothing to encode; perception=objects needs no cache"
+        )
     if camera not in meta.camera_keys:
         raise MemobenchError(
-            f"The dataset {root} has no camera '{camera}'; it has {', '.join(meta.camera_keys) or 'none'}. "
+            f"The dataset {root} has no camera '{camera}'; it has {', '.join(meta.camera_keys)}. "
             "Choose one with --policy.memory_camera."
         )
     return (_video_reader if camera in meta.video_keys else _image_reader)(root, camera, meta)
