@@ -435,3 +435,23 @@ def test_a_feature_larger_than_memory_is_told_before_it_is_taken(source: Path, t
     with pytest.raises(MemobenchError, match=r"more than 50,000,000 numbers of privileged\.environment_state"):
         commands.describe(folder, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("pattern", ["data/**/*.parquet", "states/**/*.parquet", "videos/*wrist_image/**/*.mp4"])
+def test_a_file_that_is_cut_off_is_named_with_what_to_do(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], pattern: str
+) -> None:
+    """By validating as by describing, however long its name is."""
+    folder = Path(shutil.copytree(source / DATASET, tmp_path / ("long" * 60)))
+    (path,) = folder.glob(pattern)
+    for damaged in (path.read_bytes()[: path.stat().st_size * 2 // 3], bytes(path.stat().st_size)):
+        path.write_bytes(damaged)
+        assert commands.validate(folder) == 1
+        verdict = capsys.readouterr().out.splitlines()[0]
+        assert verdict.startswith(f"episode 0: {path} cannot be read ("), verdict
+        assert verdict.endswith("generate it or take it from its source again"), verdict
+        with pytest.raises(MemobenchError) as told:
+            commands.describe(folder, tmp_path / "out")
+        assert str(told.value).startswith(f"{path} "), told.value
+        assert str(told.value).endswith("generate it or take it from its source again")
+        assert not (tmp_path / "out").exists()

@@ -50,7 +50,7 @@ def test_convert(call, monkeypatch):
     }
     assert "1/2 a_demo.hdf5, demo_0" in result.output
     assert "left out: b.hdf5, data/demo_1: the array 'states' is missing" in result.output
-    assert "dataset of 1 episodes: ds" in result.output
+    assert "dataset of 1 episode: ds" in result.output
     assert result.return_value == 1
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from lerobot_memobench.engine.card import new_card, write_card
 from lerobot_memobench.engine.machine import run_facts
-from lerobot_memobench.engine.merging import merge, part_folders
+from lerobot_memobench.engine.merging import merge, merge_and_report, part_folders
 from lerobot_memobench.engine.policy_identity import policy_facts
 from lerobot_memobench.envs.episode_log import EpisodeLog, read_episodes
 from lerobot_memobench.errors import MemobenchError
@@ -85,7 +85,8 @@ def test_logs_films_protocol_and_card_are_joined(tmp_path: Path) -> None:
     before = (out / "card.json").read_bytes(), (out / "episodes.jsonl").read_bytes()
     assert merge(out, parts) == []
     assert before == ((out / "card.json").read_bytes(), (out / "episodes.jsonl").read_bytes())
-    assert merge(out, [part(tmp_path / "later", [0], task="b")]) == []
+    settings = {**SETTINGS, "policy": {"type": "act", "identity": "act 1"}}
+    assert merge(out, [part(tmp_path / "later", [0], task="b", settings=settings)]) == []
     assert len(read_episodes(out)) == 5
     assert not (out / "card.json").exists()  # it would say nothing of the part without one
 
@@ -141,6 +142,31 @@ def test_logs_alone_are_enough(tmp_path: Path) -> None:
     mixed = part(tmp_path / "z", [2], settings=None, referent="random")
     with pytest.raises(MemobenchError, match="referent: fixed and random"):
         merge(tmp_path / "out", [mixed])
+
+
+def test_episodes_of_nobody_are_not_given_to_a_policy(tmp_path: Path) -> None:
+    """Neither by a card, nor by a protocol, nor by the lines beside theirs."""
+    known = {**SETTINGS, "policy": {"type": "act", "identity": "act 1"}}
+    old, out = part(tmp_path / "old", [2], settings=None), tmp_path / "out"
+    sources = (
+        with_card(part(tmp_path / "card", [0]), "1/2"),
+        part(tmp_path / "protocol", [0], settings=known),
+        part(tmp_path / "lines", [0], policy="act 1"),
+    )
+    for source in sources:
+        for order in ([source, old], [old, source]):
+            with pytest.raises(MemobenchError, match=f"{old} does not say whose episodes it holds, and {source} does"):
+                merge(out, order)
+    partly = part(part(tmp_path / "partly", [0], policy="act 1"), [1])
+    with pytest.raises(MemobenchError, match=r"partly does not say whose .*, and some of its lines do"):
+        merge(out, [partly])
+    other = part(tmp_path / "other", [3], policy="act 2")
+    with pytest.raises(MemobenchError, match=r"lines holds episodes of act 1 and .*other ones of act 2"):
+        merge(out, [sources[2], other])
+    assert not out.exists()
+    notes = merge_and_report(out, [old, part(tmp_path / "older", [4], settings=None)]).notes
+    assert notes == [f"{out} does not say whose episodes it holds: no part of it did"]
+    assert merge_and_report(tmp_path / "whole", [sources[1]]).notes == []
 
 
 def test_copies_where_there_are_no_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -69,6 +69,23 @@ def test_the_newest_line_counts_whatever_its_file(tmp_path: Path, monkeypatch: p
     assert [item["steps"] for item in read_episodes(tmp_path)] == [3]
 
 
+def test_lines_that_contradict_each_other_are_said(tmp_path: Path) -> None:
+    log = EpisodeLog(tmp_path)
+    for success in (True, False):
+        for episode in (1, 2):
+            log.append(record("a", episode, success=success))
+    log.append(record("a", 3))
+    log.append(record("a", 3))
+    log.append({**record("a", 4, success=False), "not_run": "no such place"})
+    log.append(record("a", 4, success=True))
+    problems: list[str] = []
+    assert [item["success"] for item in read_episodes(tmp_path, problems)][:2] == [False, False]
+    assert problems == [
+        f"{tmp_path} has lines of success and of failure about 2 episodes, the first is a, episode 1; the newest line "
+        "of each counts"
+    ]
+
+
 def test_episodes_of_other_referents_are_other_episodes(tmp_path: Path) -> None:
     log = EpisodeLog(tmp_path)
     log.append(record(referent="fixed"))

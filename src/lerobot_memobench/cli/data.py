@@ -9,6 +9,7 @@ import typer
 
 from lerobot_memobench.cli.console import console, counting
 from lerobot_memobench.cli.suite import OfSuite
+from lerobot_memobench.files.reading import count_of
 
 if TYPE_CHECKING:
     from lerobot_memobench.datasets.validate import Verdict
@@ -51,7 +52,7 @@ def convert(
     if summary.folder is None:
         screen.print("no dataset was written: nothing could be used")
     else:
-        screen.print(f"dataset of {summary.episodes} episodes: {summary.folder}", soft_wrap=True)
+        screen.print(f"dataset of {count_of(summary.episodes, 'episode')}: {summary.folder}", soft_wrap=True)
     return summary.exit_status
 
 

@@ -18,6 +18,7 @@ from lerobot_memobench.engine.run import run_evaluation
 from lerobot_memobench.engine.shards import executor_options, plan_shards, run_shards
 from lerobot_memobench.evaluation.documents.report import failure_line, table
 from lerobot_memobench.evaluation.documents.sentences import saw_phrase
+from lerobot_memobench.files.reading import count_of
 from lerobot_memobench.jobs.executors import asked_for
 from lerobot_memobench.jobs.processes import saying_how_to_go_on
 from lerobot_memobench.settings.reading import read_settings
@@ -91,9 +92,10 @@ def print_merged(report: EvaluationReport) -> int:
     if not report.absent:
         return 0
     task, episode = report.absent[0]
+    was, is_ = ("was", "is") if len(report.absent) == 1 else ("were", "are")
     screen.print(
-        f"note: {len(report.absent)} episodes that were asked for are missing, the first is {task}, episode {episode}; "
-        "run their parts with resume=true and merge again",
+        f"note: {count_of(len(report.absent), 'episode')} that {was} asked for {is_} missing, the first is {task}, "
+        f"episode {episode}; run their parts with resume=true and merge again",
         soft_wrap=True,
     )
     return 1

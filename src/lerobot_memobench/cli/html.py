@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from lerobot_memobench.cli.console import console
+from lerobot_memobench.files.reading import count_of
 
 
 def html(
@@ -31,5 +32,5 @@ def html(
     screen = console()
     for note in written.notes:
         screen.print(f"note: {note}", soft_wrap=True)
-    screen.print(f"{written.rollouts} episodes, {written.videos} with a video")
+    screen.print(f"{count_of(written.rollouts, 'episode')}, {written.videos} with a video")
     screen.print(f"open {written.page}", soft_wrap=True)

@@ -15,6 +15,7 @@ from lerobot_memobench.cli.console import console
 from lerobot_memobench.cli.suite import Suite, WhichSuite
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.terminal import Unbroken
+from lerobot_memobench.files.reading import count_of
 from lerobot_memobench.tasks.catalogue import CATALOGUE_DIR, find_tasks, get_task, task_names, task_number, task_record
 from lerobot_memobench.tasks.loading import load_task
 from lerobot_memobench.tasks.task import PUBLISHED, Task
@@ -68,7 +69,7 @@ def records(found: Sequence[Task]) -> list[dict[str, Any]]:
 def task_table(found: Sequence[Task]) -> Table:
     """Return one row per task; the numbers are what ``tasks=`` and ``--tasks`` take, a user's own tasks have none."""
     suites = {task.suite for task in found}
-    title = f"{len(found)} tasks" + (f" of the {suites.pop()} suite" if len(suites) == 1 else "")
+    title = count_of(len(found), "task") + (f" of the {suites.pop()} suite" if len(suites) == 1 else "")
     table = Table(title=title, title_justify="left", header_style="bold", pad_edge=False)
     for name in ("no.", "task", "memory type", "checkpoints", "prompt video", "instruction"):
         table.add_column(name, justify="right" if name == "no." else "left")

@@ -16,7 +16,7 @@ import numpy as np
 from lerobot_memobench.datasets.demonstration import CAMERAS
 from lerobot_memobench.datasets.lerobot_format.card import CARD_FILE, EDITED, MADE_BY, card_from_frames, own_card
 from lerobot_memobench.datasets.lerobot_format.card_tables import ordered_types
-from lerobot_memobench.datasets.lerobot_format.info import read_info, undamaged
+from lerobot_memobench.datasets.lerobot_format.info import check_whole, read_info, undamaged
 from lerobot_memobench.datasets.lerobot_format.layout import MANIFEST_FILE, image_key
 from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, list_episodes
 from lerobot_memobench.datasets.manifest import read_manifest
@@ -45,10 +45,11 @@ def describe(folder: Path, out: Path, say: Say = lambda _: None) -> list[Path]:
     other tools have taken from the dataset, and which of its episodes another program made; those are left out.
 
     Raises:
-        MemobenchError: the folder is no dataset, or none of its episodes is one of this benchmark.
+        MemobenchError: the folder is no dataset, one of its files is cut off (see `check_whole`), or none of its
+            episodes is one of this benchmark.
     """
     rows, hashes = _known(folder, say), folder / MANIFEST_FILE
-    read_info(folder)
+    check_whole(folder)
     with undamaged(folder):
         card = own_card(folder, read_info(folder)["total_episodes"])
         tables = card_tables(card or card_from_frames(folder, rows))

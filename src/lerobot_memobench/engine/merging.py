@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from lerobot_memobench.engine.folder import VIDEOS
 from lerobot_memobench.engine.outcomes import disagreement, key_of
 from lerobot_memobench.engine.reporting import EvaluationReport, report_on
 from lerobot_memobench.envs.episode_log import has_log, read_log, write_episodes
-from lerobot_memobench.envs.protocol import EXTENT, read_protocol_file, write_protocol
+from lerobot_memobench.envs.protocol import EXTENT, POLICY, read_protocol_file, write_protocol
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records.protocol import (
     CARD_FILE,
@@ -30,7 +31,10 @@ SHARDS = "shard-*-of-*"
 def merge_and_report(out: Path, folders: Sequence[Path]) -> EvaluationReport:
     """Merge parts into the folder ``out`` and report the whole; see `merge`."""
     absent = merge(out, folders)
-    return report_on(out, absent=absent)
+    report = report_on(out, absent=absent)
+    if _tells_whose(read_protocol(out), read_log(out)):
+        return report
+    return replace(report, notes=[*report.notes, f"{out} does not say whose episodes it holds: no part of it did"])
 
 
 def merge(out: Path, folders: Sequence[Path]) -> list[tuple[str, int]]:
@@ -43,8 +47,8 @@ def merge(out: Path, folders: Sequence[Path]) -> list[tuple[str, int]]:
         (task, episode) of those that were asked for, as far as the cards tell, and are in none of the parts.
 
     Raises:
-        MemobenchError: nothing to merge, protocols or policies that differ, or an episode that ended differently in two
-            parts.
+        MemobenchError: nothing to merge, protocols or policies that differ, a part that does not say whose episodes it
+            holds where another does, or an episode that ended differently in two parts.
     """
     sources = list(dict.fromkeys([*([out] if has_log(out) else []), *folders]))
     if not folders:
@@ -52,6 +56,7 @@ def merge(out: Path, folders: Sequence[Path]) -> list[tuple[str, int]]:
     records = {source: read_log(source) for source in sources}
     protocols = {source: read_protocol(source) for source in sources}
     _check_protocols(protocols)
+    _check_owners(protocols, records)
     joined = join(records)
     card = _joined_card(sources)
     wanted = [] if card is None else _wanted(card)
@@ -97,6 +102,29 @@ def _check_protocols(protocols: Mapping[Path, Mapping[str, Any]]) -> None:
             raise MemobenchError(
                 f"{first} and {folder} were run under other protocols ({'; '.join(found)}); they are not one evaluation"
             )
+
+
+def _tells_whose(protocol: Mapping[str, Any], records: Sequence[Mapping[str, Any]]) -> bool:
+    """Return whether a folder says whose episodes it holds: its protocol or card does, or every line."""
+    return bool(protocol[POLICY]) or all(record.get(POLICY) for record in records)
+
+
+def _check_owners(
+    protocols: Mapping[Path, Mapping[str, Any]], records: Mapping[Path, Sequence[Mapping[str, Any]]]
+) -> None:
+    """Raise where only some parts say whose they are: the result would call all of it the policy of these."""
+    named = {record[POLICY]: folder for folder, lines in records.items() for record in lines if record.get(POLICY)}
+    if len(named) > 1:
+        (a, mine), (b, other), *_ = named.items()
+        raise MemobenchError(f"{mine} holds episodes of {a} and {other} ones of {b}; they are not one evaluation")
+    nobodys = [folder for folder in protocols if not _tells_whose(protocols[folder], records[folder])]
+    known = [folder for folder in protocols if folder not in nobodys]
+    if nobodys and (known or named):
+        does = f"{known[0]} does" if known else "some of its lines do"
+        raise MemobenchError(
+            f"{nobodys[0]} does not say whose episodes it holds, and {does}; they may be of two policies, so evaluate "
+            "the policy again there, or leave that folder out"
+        )
 
 
 def join(parts: Mapping[Path, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:

@@ -16,8 +16,8 @@ from lerobot_memobench.engine.reporting import EvaluationReport, report_on
 from lerobot_memobench.engine.resume import Ranges, Tell, missing, remainder, resumed_card
 from lerobot_memobench.envs.episode_log import has_log, read_episodes
 from lerobot_memobench.envs.protocol import read_protocol_file
-from lerobot_memobench.evaluation.documents.sentences import count_of
 from lerobot_memobench.evaluation.records.protocol import POLICY, read_protocol
+from lerobot_memobench.files.reading import count_of
 from lerobot_memobench.policies.checkpoint import check_weights, portable_path
 from lerobot_memobench.policies.untrained import UntrainedConfig
 from lerobot_memobench.settings.lerobot_commands import without_chatter

@@ -17,7 +17,7 @@ from typing import Any, Literal, NotRequired, TypedDict
 from lerobot_memobench.envs.protocol import write_protocol
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.files import file_name, write_file
-from lerobot_memobench.files.reading import Count, Malformed, Name, Number, Whole, checked, parsed
+from lerobot_memobench.files.reading import Count, Malformed, Name, Number, Whole, checked, count_of, parsed
 
 logger = logging.getLogger(__name__)
 
@@ -147,7 +147,7 @@ def notes_on_not_run(records: Sequence[Mapping[str, Any]]) -> list[str]:
     notes = []
     for task, lines in not_run(records).items():
         all_of_it = len(lines) == sum(record["task"] == task for record in records)
-        part = "was not run" if all_of_it else f"was not run in {len(lines)} episodes"
+        part = "was not run" if all_of_it else f"was not run in {count_of(len(lines), 'episode')}"
         notes.append(f"{task} {part}, and the figures are without that: {lines[0]['not_run']}")
     return notes
 
@@ -157,7 +157,7 @@ def read_log(directory: str | Path, problems: list[str] | None = None) -> list[d
 
     Reads the workers' files and a plain ``episodes.jsonl``; of several lines about the same task, episode and
     referent the newest counts. Lines that cannot be read, such as the last one of a killed run, are left out,
-    named in ``problems`` (file, line, reason) and logged as warnings.
+    named in ``problems`` (file, line, reason) and logged as warnings; so are episodes with lines of either outcome.
 
     Raises:
         MemobenchError: there is no such folder, no log in it, or one of several policies.
@@ -174,14 +174,23 @@ def read_log(directory: str | Path, problems: list[str] | None = None) -> list[d
     found: list[str] = []
     policies: dict[str | None, tuple[Path, dict[str, Any]]] = {}
     newest: dict[tuple[str, int, str], tuple[float, dict[str, Any]]] = {}
+    outcomes: dict[tuple[str, int, str], set[bool]] = {}
     for file in files:
         for record in _read_lines(file, found):
             policies.setdefault(record.get("policy"), (file, record))
             written = float(record.pop(WRITTEN_AT, 0.0))
             key = (record["task"], record["episode"], record.get("referent", "fixed"))
+            if "not_run" not in record:
+                outcomes.setdefault(key, set()).add(record["success"])
             if key not in newest or written >= newest[key][0]:
                 newest[key] = (written, record)
     _check_one_policy(directory, policies)
+    twice = sorted(key for key, told in outcomes.items() if len(told) > 1)
+    if twice:
+        found.append(
+            f"{directory} has lines of success and of failure about {count_of(len(twice), 'episode')}, the first is "
+            f"{twice[0][0]}, episode {twice[0][1]}; the newest line of each counts"
+        )
     for problem in found:
         logger.warning("%s", problem)
     if problems is not None:

@@ -33,6 +33,9 @@ Number = Annotated[float, Ge(-LARGEST), Le(LARGEST)]
 LONGEST = 80
 """Characters of what was found that a message repeats."""
 
+LONGEST_REASON = 5_000
+"""Characters of what a library says: the longest path of a system (4,096) stands in it whole."""
+
 EXPECTED = {
     "string_type": "text",
     "int_type": "an integer",
@@ -114,14 +117,15 @@ def refusing(told: Callable[[str], MemobenchError]) -> Iterator[None]:
     alone: an error in writing, such as a full disk, is not the file's.
 
     Args:
-        told: makes the error, from what was raised in at most a line.
+        told: makes the error, from what was raised, in one line. What a message needs stands before it or after it: of
+            a library that repeats a whole file there are only the first characters.
     """
     try:
         yield
     except MemobenchError:
         raise
     except Exception as error:
-        raise told(f"{type(error).__name__}: {' '.join(str(error).split())[:200]}") from error
+        raise told(f"{type(error).__name__}: {cut(' '.join(str(error).split()), LONGEST_REASON)}") from error
 
 
 @cache
@@ -172,6 +176,11 @@ def short(value: Any) -> str:
     return cut(repr(value))
 
 
-def cut(text: str) -> str:
+def cut(text: str, longest: int = LONGEST) -> str:
     """Return a text, as far as a sentence can hold it."""
-    return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"
+    return text if len(text) <= longest else text[: longest - 1] + "…"
+
+
+def count_of(number: int, word: str) -> str:
+    """Return a number of things in words, such as ``1 task`` or ``1,500 rollouts``."""
+    return f"{number:,} {word}" + ("" if number == 1 else "s")

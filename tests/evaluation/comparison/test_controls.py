@@ -228,7 +228,7 @@ def test_oracle_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     written = json.loads((out / "oracle.json").read_text())
     assert written["5"]["temporal"]["MSR"]["closed"]["value"] == 50.0
     assert written["paper"]["average"]["MUR"]["closed"]["value"] == 45.5
-    assert "1 rollouts have no partner" in written["notes"][0]
+    assert "1 rollout without a partner left out" in written["notes"][0]
     shown = capsys.readouterr().out
     assert "13.5/52.9" in shown
     assert "13.5/52.9" in (out / "oracle.md").read_text()

@@ -12,7 +12,7 @@ from typing import Annotated, Any, NotRequired, TypedDict
 from annotated_types import Ge, Le
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files.reading import Count, read_json, refusing
+from lerobot_memobench.files.reading import Count, count_of, read_json, refusing
 
 INFO_FILE = Path("meta") / "info.json"
 ADVICE = "the dataset is damaged; generate it or take it from its source again"
@@ -174,10 +174,12 @@ def episode_count(folder: Path) -> int:
     import pyarrow.parquet as pq
 
     told = int(read_info(folder)["total_episodes"])
-    with undamaged(folder):
-        rows = sum(pq.read_metadata(path).num_rows for path in (folder / "meta" / "episodes").rglob("*.parquet"))
+    rows = 0
+    for path in sorted((folder / "meta" / "episodes").rglob("*.parquet")):
+        with undamaged(path):
+            rows += pq.read_metadata(path).num_rows
     if rows != told:
         raise MemobenchError(
-            f"{folder / INFO_FILE} tells of {told} episodes, {folder}/meta/episodes of {rows}; {ADVICE}"
+            f"{folder / INFO_FILE} tells of {count_of(told, 'episode')}, {folder}/meta/episodes of {rows}; {ADVICE}"
         )
     return told

@@ -166,7 +166,8 @@ def _name_tasks(root: Path, columns: Columns) -> None:
     """Put each frame's instruction, as ``task``, in the place of its number."""
     from lerobot.datasets.io_utils import load_tasks
 
-    tasks = load_tasks(root)
+    with undamaged(root / "meta" / "tasks.parquet"):
+        tasks = load_tasks(root)
     names = {index(number): str(text) for text, number in zip(tasks.index, tasks["task_index"].tolist(), strict=True)}
     columns["task"] = [names.get(int(number), "") for number in columns.pop("task_index")]
 
@@ -189,16 +190,17 @@ def _place(folder: Path, row: dict[str, Any], told: str | None) -> EpisodePlace:
     return EpisodePlace(number, int(row["dataset_from_index"]), int(row["length"]), record)
 
 
-def _read(folder: Path, names: tuple[str, ...], chosen: list[tuple[str, str, int]] | None) -> pa.Table:
-    """Those of the columns that are there, of all files: merged ones need not have the same."""
+def _read(folder: Path, names: tuple[str, ...] | None, chosen: list[tuple[str, str, int]] | None) -> pa.Table:
+    """Those of the columns that are there (None: all), of all files: merged ones need not have the same."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     tables = []
     for path in sorted(folder.rglob("*.parquet")):
         with undamaged(path):
-            there = set(pq.read_schema(path).names)
-            tables.append(pq.read_table(path, columns=[name for name in names if name in there], filters=chosen))
+            there = pq.read_schema(path).names
+            columns = None if names is None else [name for name in names if name in there]
+            tables.append(pq.read_table(path, columns=columns, filters=chosen))
     if not tables:
         raise MemobenchError(f"{folder} holds no parquet file: the dataset is not whole; fetch or generate it again")
     return pa.concat_tables(tables, promote_options="permissive")
@@ -206,10 +208,8 @@ def _read(folder: Path, names: tuple[str, ...], chosen: list[tuple[str, str, int
 
 def _read_columns(root: Path, episode_index: int) -> Columns:
     """An episode's frames and, where they are, its states."""
-    import pyarrow.parquet as pq
-
     chosen = [("episode_index", "==", episode_index)]
-    table = pq.read_table(root / "data", filters=chosen).sort_by("frame_index")
+    table = _read(root / "data", None, chosen).sort_by("frame_index")
     columns: Columns = {}
     for name in table.column_names:
         values = table.column(name).to_pylist()
@@ -219,6 +219,6 @@ def _read_columns(root: Path, episode_index: int) -> Columns:
         if name in columns:
             columns[name] = columns[name].astype(np.float32)
     if (root / "states").is_dir():
-        states = pq.read_table(root / "states", filters=chosen).sort_by("frame_index")
+        states = _read(root / "states", None, chosen).sort_by("frame_index")
         columns["states"] = np.array(states.column("state").to_pylist(), dtype=np.float64)
     return columns

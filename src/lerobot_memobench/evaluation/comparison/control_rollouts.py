@@ -14,6 +14,7 @@ from lerobot_memobench.evaluation.documents.sentences import saw_phrase
 from lerobot_memobench.evaluation.metrics.rollouts import Record, saw
 from lerobot_memobench.evaluation.records.protocol import POLICY, differences, read_protocol
 from lerobot_memobench.evaluation.records.runs import asked_for
+from lerobot_memobench.files.reading import count_of
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import LEVELS
 
@@ -42,14 +43,18 @@ def pairs_by_replan(
             f"the evaluations have no replan interval in common ({', '.join(map(str, a))} and "
             f"{', '.join(map(str, b))}); evaluate both with the same replan="
         )
-    alone = [replan for replan in [*a, *b] if replan not in common]
-    notes += [f"replan interval {replan} is in one of them only and is left out" for replan in alone]
+    notes += [
+        f"replan interval {replan} is in one of them only and is left out"
+        for replan in [*a, *b]
+        if replan not in common
+    ]
     found: Pairs = {}
     for replan in common:
         left, right, partnerless = paired(a[replan], b[replan])
         found[replan] = (left, right)
         if partnerless:
-            notes.append(f"replan interval {replan}: {partnerless} rollouts have no partner and are left out")
+            alone = count_of(partnerless, "rollout")
+            notes.append(f"replan interval {replan}: {alone} without a partner left out")
     return found, notes + seen
 
 

@@ -11,11 +11,11 @@ from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.evaluation.comparison import paired_tests
 from lerobot_memobench.evaluation.comparison.pairing import ALLOWED, Pair, common_episodes, unlike_pairs
 from lerobot_memobench.evaluation.documents.evaluation_tables import AVERAGE
-from lerobot_memobench.evaluation.documents.sentences import count_of
 from lerobot_memobench.evaluation.metrics.rates import METRICS, value_of
 from lerobot_memobench.evaluation.metrics.rollouts import saw
 from lerobot_memobench.evaluation.records.protocol import OF_THE_POLICY, differences
 from lerobot_memobench.evaluation.records.runs import Run
+from lerobot_memobench.files.reading import count_of
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 
 

@@ -9,6 +9,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics.rollouts import Record, operations
 from lerobot_memobench.evaluation.records.protocol import SETTINGS
 from lerobot_memobench.evaluation.records.runs import Run
+from lerobot_memobench.files.reading import count_of
 
 SCENES = "scene_hash"
 ALLOWED = (*(name for name in SETTINGS if name != "suite"), SCENES)
@@ -95,8 +96,8 @@ def paired(a: Sequence[Record], b: Sequence[Record]) -> tuple[list[Record], list
     common = [key for key in tables[0] if key in tables[1]]
     if not common:
         raise MemobenchError(
-            f"the evaluations have no episode in common ({len(a)} and {len(b)} rollouts); compare evaluations of the "
-            "same tasks, seeds and referent"
+            f"the evaluations have no episode in common ({len(a)} and {count_of(len(b), 'rollout')}); compare "
+            "evaluations of the same tasks, seeds and referent"
         )
     alone = len(tables[0]) + len(tables[1]) - 2 * len(common)
     return [tables[0][key] for key in common], [tables[1][key] for key in common], alone

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.documents.sentences import count_of
 from lerobot_memobench.evaluation.documents.tables import Cell, Count, Section, Table
 from lerobot_memobench.evaluation.documents.wide_tables import run_row, wide_table
 from lerobot_memobench.evaluation.metrics.rates import METRICS, Rate
 from lerobot_memobench.evaluation.records.runs import Run
+from lerobot_memobench.files.reading import count_of
 from lerobot_memobench.paper import PublishedRow, failure_taxonomy, published_rows
 from lerobot_memobench.tasks.task import MEMORY_TYPES, PUBLISHED
 

@@ -7,11 +7,7 @@ from collections.abc import Sequence
 from lerobot_memobench.evaluation.documents.tables import figure
 from lerobot_memobench.evaluation.metrics.rollouts import NOT_RECORDED, Record, saw
 from lerobot_memobench.evaluation.metrics.summary import Summary
-
-
-def count_of(number: int, word: str) -> str:
-    """Return a number of things in words, such as ``1 task`` or ``1,500 rollouts``."""
-    return f"{number:,} {word}" + ("" if number == 1 else "s")
+from lerobot_memobench.files.reading import count_of
 
 
 def protocol_sentence(records: Sequence[Record]) -> str:
@@ -36,7 +32,9 @@ def settings_phrases(records: Sequence[Record]) -> list[str]:
 
 def saw_phrase(words: str) -> str:
     """Return what a policy saw as a phrase, of `rollouts.saw`."""
-    return "what the policy saw is not recorded" if words == NOT_RECORDED else f"the policy saw {words}"
+    if words == NOT_RECORDED:
+        return "what the policy saw is not recorded"
+    return f"what the policy saw: {words}" if words.endswith(NOT_RECORDED) else f"the policy saw {words}"
 
 
 def saw_sentence(words: str) -> str:
@@ -48,14 +46,14 @@ def saw_sentence(words: str) -> str:
 def pooled_sentence(summary: Summary) -> str:
     """Return the rates over all checkpoint records; no intervals, since records of one rollout are not independent."""
     parts = [
-        f"{metric} {figure(rate.value)} ({rate.n} records)"
+        f"{metric} {figure(rate.value)} ({count_of(rate.n, 'record')})"
         for metric, rate in summary.pooled.items()
         if metric != "SR" and rate.value is not None
     ]
     overall = summary.pooled_checkpoints
     return (
         f"Pooled over all rollouts, whatever the task: SR {figure(summary.pooled['SR'].value)}, "
-        f"checkpoints satisfied {figure(overall.value)} ({overall.n} records): {', '.join(parts)}."
+        f"checkpoints satisfied {figure(overall.value)} ({count_of(overall.n, 'record')}): {', '.join(parts)}."
     )
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.files.reading import count_of
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 
 Record = Mapping[str, Any]
@@ -66,22 +68,39 @@ NOT_RECORDED = "not recorded"
 
 
 def saw(records: Iterable[Record]) -> str:
-    """Return what the policy saw, by the rollouts' own words; several of them where they differ."""
-    return "; ".join(sorted({str(record.get("saw") or NOT_RECORDED) for record in records}))
+    """Return what the policy saw, by the rollouts' own words; of how many it is unknown where some tell it."""
+    told = Counter(str(record.get("saw") or NOT_RECORDED) for record in records)
+    unknown = told.pop(NOT_RECORDED, 0)
+    parts = [*sorted(told), *([f"of {count_of(unknown, 'rollout')} it is {NOT_RECORDED}"] if told and unknown else [])]
+    return "; ".join(parts) or NOT_RECORDED
 
 
-PROTOCOL = {"referent": "referent settings", "replan_steps": "replan intervals"}
-"""Fields of a record that should agree within one report, and what they are called."""
+PROTOCOL: dict[str, Callable[[Record], Any]] = {
+    "referent settings": lambda record: str(record.get("referent")),
+    "replan intervals": lambda record: str(record.get("replan_steps")),
+    "what the policy saw": lambda record: record.get("saw"),
+    "seeds of episode 0": lambda record: None if record.get("seed") is None else record["seed"] - record["episode"],
+}
+"""What should agree within one report -> what a record says of it, None where nothing, which is no difference."""
+
+OWNER = ("policy", "run")
+"""Fields of a record that say whose it is."""
 
 
 def mixtures(records: Iterable[Record]) -> list[str]:
     """Return a sentence for each part of the protocol in which rollouts differ: their mean mixes unlike things."""
     records = list(records)
     notes = []
-    for field, words in PROTOCOL.items():
-        found = sorted({str(record.get(field)) for record in records})
+    for words, told in PROTOCOL.items():
+        found = sorted({told(record) for record in records} - {None})
         if len(found) > 1:
-            notes.append(f"The rollouts mix {words} ({', '.join(found)}); the figures are over all of them.")
+            listed = ", ".join(map(str, found[:5])) + (", …" if len(found) > 5 else "")
+            notes.append(f"The rollouts mix {words} ({listed}); the figures are over all of them.")
+    known = [field for field in OWNER if any(record.get(field) for record in records)]
+    nobodys = sum(any(not record.get(field) for field in known) for record in records)
+    if nobodys:
+        said = "does not say whose it is" if nobodys == 1 else "do not say whose they are"
+        notes.append(f"{count_of(nobodys, 'rollout')} of {len(records)} {said}; the figures are over all of them.")
     return notes
 
 
@@ -92,7 +111,8 @@ def faults(records: Iterable[Record]) -> list[str]:
         if record.get("fault"):
             found.setdefault(record["task"], []).append(record)
     return [
-        f"{task}: {len(group)} rollouts were broken off and count as failed, the first in episode "
+        f"{task}: {count_of(len(group), 'rollout')} {'was' if len(group) == 1 else 'were'} broken off and "
+        f"{'counts' if len(group) == 1 else 'count'} as failed, the first in episode "
         f"{group[0]['episode']}: {group[0]['fault']}"
         for task, group in found.items()
     ]

@@ -25,6 +25,7 @@ from lerobot_memobench.evaluation.records.protocol import (
     read_card,
     read_protocol,
 )
+from lerobot_memobench.files.reading import count_of
 
 HASH_DIGITS = 8
 
@@ -140,9 +141,8 @@ def asked_for(folder: Path, records: list[dict[str, Any]], notes: list[str]) -> 
     first = seed - base if isinstance(seed, int) and isinstance(base, int) else 0
     kept = [record for record in records if record["episode"] < first + count]
     if len(kept) < len(records):
-        notes.append(
-            f"{len(records) - len(kept)} rollouts beyond the {count} of each task that were asked for left out"
-        )
+        beyond = count_of(len(records) - len(kept), "rollout")
+        notes.append(f"{beyond} beyond the {count} of each task that were asked for left out")
     return kept
 
 

@@ -15,7 +15,7 @@ from lerobot_memobench import __version__
 from lerobot_memobench.envs.annotate import OPERATION_COLOURS
 from lerobot_memobench.evaluation.documents.evaluation_tables import outcomes
 from lerobot_memobench.evaluation.documents.html.videos import episode_id
-from lerobot_memobench.evaluation.documents.sentences import count_of, settings_phrases
+from lerobot_memobench.evaluation.documents.sentences import settings_phrases
 from lerobot_memobench.evaluation.documents.tables import OPERATION_NAMES
 from lerobot_memobench.evaluation.metrics.failures import failure_counts, failure_of
 from lerobot_memobench.evaluation.metrics.rates import Rate, Row, percent
@@ -23,6 +23,7 @@ from lerobot_memobench.evaluation.metrics.rollouts import Record, operations
 from lerobot_memobench.evaluation.metrics.summary import Summary, summarise
 from lerobot_memobench.evaluation.records.protocol import CARD_FILE, POLICY, read_card, read_protocol
 from lerobot_memobench.evaluation.records.runs import check_one_suite, folder_names, read_rollouts, unlike
+from lerobot_memobench.files.reading import count_of
 from lerobot_memobench.tasks.catalogue import find_tasks, get_task, task_names
 from lerobot_memobench.tasks.failures import FAILURES
 from lerobot_memobench.tasks.formula import format_formula
