@@ -178,7 +178,7 @@ def convert(whole: Path) -> None:
     commands.convert(whole / FILES, whole / "out")
 
 
-COUNTS = {describe: (12, 2_000), validate: (20, 8_000), convert: (20, 5_000), validate_files: (20, 5_000)}
+COUNTS = {describe: (24, 2_000), validate: (20, 8_000), convert: (20, 5_000), validate_files: (20, 5_000)}
 """Command -> how often it meets each damage, and how often in the slow test: 10,000 times each damage."""
 
 KINDS: dict[str, tuple[Callable[[Path], None], Damage, str]] = {

@@ -19,7 +19,7 @@ from lerobot_memobench.datasets.hdf5.layout import Unusable, usable_or_named
 from lerobot_memobench.datasets.hdf5.published_task import task_of
 from lerobot_memobench.datasets.hdf5.reading import PublishedFile, find_files
 from lerobot_memobench.datasets.hdf5.restore import restore
-from lerobot_memobench.datasets.lerobot_format.info import episode_count, read_info
+from lerobot_memobench.datasets.lerobot_format.info import ADVICE, episode_count, read_info
 from lerobot_memobench.datasets.lerobot_format.layout import image_key, is_dataset
 from lerobot_memobench.datasets.lerobot_format.reading import read_episode
 from lerobot_memobench.datasets.memory_cache.decoding import FrameReader, frame_reader
@@ -58,7 +58,7 @@ class _Check:
     def run(self) -> Verdict:
         """Replay it."""
         try:
-            with refusing(lambda why: MemobenchError(f"it cannot be read ({why})")):
+            with refusing(lambda why: MemobenchError(f"it cannot be read ({why}); {ADVICE}")):
                 return Verdict(self.name, self._replay())
         except MemobenchError as error:  # whatever one episode says, the others are replayed
             return Verdict(self.name, str(error))

@@ -33,8 +33,8 @@ Number = Annotated[float, Ge(-LARGEST), Le(LARGEST)]
 LONGEST = 80
 """Characters of what was found that a message repeats."""
 
-LONGEST_REASON = 5_000
-"""Characters of what a library says: the longest path of a system (4,096) stands in it whole."""
+LONGEST_REASON = 200
+"""Characters of what a library says that a message repeats."""
 
 EXPECTED = {
     "string_type": "text",
@@ -117,8 +117,8 @@ def refusing(told: Callable[[str], MemobenchError]) -> Iterator[None]:
     alone: an error in writing, such as a full disk, is not the file's.
 
     Args:
-        told: makes the error, from what was raised, in one line. What a message needs stands before it or after it: of
-            a library that repeats a whole file there are only the first characters.
+        told: makes the error, from what was raised in at most a line. The file and what to do stand beside that: of
+            what a library says only the first characters are left.
     """
     try:
         yield
