@@ -224,6 +224,6 @@ def test_a_tree_of_tasks_lists_what_loads_and_names_what_does_not(
     (tmp_path / "temporal" / "lacking" / "task_config.meta.json").unlink()
     assert main(["tasks", "--dir", str(tmp_path)]) == 1
     printed = capsys.readouterr()
-    assert "1 tasks" in printed.out
+    assert printed.out.startswith("1 task of")
     assert printed.err.count("\n") == 1
     assert "lacking/task_config.meta.json is missing" in printed.err

@@ -338,7 +338,7 @@ def test_validation_names_each_episode_and_its_first_disagreement(dataset_folder
     (states,) = (folder / "states").rglob("*.parquet")
     states.write_bytes(states.read_bytes()[:-100])
     first, second = validate(folder)
-    assert first.disagreement.startswith("it cannot be read")
+    assert first.disagreement.startswith(f"{states} cannot be read")
     shutil.rmtree(folder / "states")
     first, second = validate(folder)
     assert first == Verdict("episode 0", "checkpoint.index at frame 11: recorded np.int64(1), replayed np.int64(0)")

@@ -67,7 +67,7 @@ def vector(log: Path, rows: int = 3, use_async: bool = False, **settings: Any) -
     ("bad", "words", "use_async"),
     [
         (np.nan, "not finite", False),
-        (np.nan, "not finite", True),
+        pytest.param(np.nan, "not finite", True, marks=pytest.mark.slow),
         (np.inf, "not finite", False),
         (None, "has shape (6,); expected (7,)", False),
     ],

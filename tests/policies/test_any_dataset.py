@@ -167,7 +167,7 @@ def test_every_dataset_is(
 # --- one name for dataset and observation ---
 
 
-@pytest.mark.parametrize("size", ["tiny", "small"])
+@pytest.mark.parametrize("size", ["tiny", pytest.param("small", marks=pytest.mark.slow)])
 def test_names_are_mapped_in_training_and_acting(size: str, tmp_path: Path) -> None:
     """A checkpoint goes on with data whose cameras have other names, and acts for a robot with names of its own."""
     first = Foreign({IMAGES + "front": (96, 96), IMAGES + "wrist": (96, 96)})

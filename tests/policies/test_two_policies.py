@@ -85,7 +85,12 @@ KINDS = {
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
+QUICK = ("tokens and pictures", "memory text in the prompt")
+
+
+@pytest.mark.parametrize(
+    "kind", [kind if kind in QUICK else pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS]
+)
 def test_two_trainings_in_turns_learn_what_each_learns_alone(root: Path, eyes: tuple[Path, Path], kind: str) -> None:
     settings = [SEEING | {"eyes": str(path)} | fields for path, fields in zip(eyes, KINDS[kind], strict=True)]
     expected = [alone(root, **fields) for fields in settings]
