@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import sys
 from pathlib import Path
 
@@ -96,8 +97,13 @@ def test_plain_lerobot_eval_is_told_what_its_recorder_cannot(
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["/bin/lerobot-eval", "--eval.recording=true", f"--eval.n_episodes={episodes}"])
     config = MemobenchEnvConfig(tasks=TASK, obs_type=obs_type, log_dir=str(tmp_path))
-    with pytest.raises(MemobenchError, match=r"lerobot eval env=memobench eval\.recording=true"):
-        config.create_envs(1)
+    theirs = lerobot_eval.rollout
+    foreign = functools.wraps(theirs)(lambda *words, **more: theirs(*words, **more))
+    for rollout in (theirs, foreign):  # somebody's decorator is no loop of ours
+        monkeypatch.setattr(lerobot_eval, "rollout", rollout)
+        with pytest.raises(MemobenchError, match=r"lerobot eval env=memobench eval\.recording=true"):
+            config.create_envs(1)
+    monkeypatch.setattr(lerobot_eval, "rollout", theirs)
     monkeypatch.setattr(sys, "argv", ["/bin/lerobot-eval", "--eval.recording=false"])
     assert config.create_envs(1)
     assert not hasattr(lerobot_eval.rollout, "__wrapped__")

@@ -9,10 +9,8 @@ from __future__ import annotations
 import datetime as dt
 import hashlib
 import json
-import logging
 import secrets
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,7 +18,7 @@ from typing import Any
 import yaml
 
 from lerobot_memobench.envs.obs_types import what_is_seen
-from lerobot_memobench.envs.prompting import checkpoint_being_run, in_file, policy_being_run, training_runs
+from lerobot_memobench.envs.prompting import checkpoint_being_run, in_file, policy_being_run, quiet, training_runs
 from lerobot_memobench.envs.protocol import POLICY, SAW
 from lerobot_memobench.files import file_hash
 
@@ -98,7 +96,7 @@ def _policy() -> Any | None:
     import draccus
     from lerobot.configs import parser
 
-    with _calm():
+    with quiet():
         checkpoint = checkpoint_being_run()
         if checkpoint is not None:
             return checkpoint[1]
@@ -106,17 +104,6 @@ def _policy() -> Any | None:
         if kind is None or parser.get_type_arg("policy") is None:
             return kind
         return draccus.parse(kind, args=parser.get_cli_overrides("policy") or [])
-
-
-@contextmanager
-def _calm() -> Iterator[None]:
-    """Leave out what LeRobot logs of a configuration, the device say: it does so itself when it makes the policy."""
-    before = logging.root.manager.disable
-    logging.disable(logging.WARNING)
-    try:
-        yield
-    finally:
-        logging.disable(before)
 
 
 def _seeds() -> range | None:
@@ -154,7 +141,7 @@ def _identity(policy: Any, run: str) -> dict[str, Any]:
         return {"type": kind, "identity": f"{kind} in training {run}"}
     path = parser.get_path_arg("policy")
     weights = None if path is None else checkpoint_hash(path)
-    with _calm():
+    with quiet():
         plain = _unchanged(policy, path)
     facts = json.dumps([kind, weights, _changes(policy, plain)], sort_keys=True, default=str)
     found = {"type": kind, "identity": f"{kind} {hashlib.sha256(facts.encode()).hexdigest()[:DIGITS]}"}

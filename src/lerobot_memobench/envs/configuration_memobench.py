@@ -41,6 +41,7 @@ from lerobot_memobench.envs.prompting import (
 from lerobot_memobench.envs.protocol import SEED_BASE, SETTINGS, check_protocol
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.jobs.threads import ACTING, limit_torch, use_threads
+from lerobot_memobench.lerobot_hooks import ROLLOUT, installed
 from lerobot_memobench.tasks.task import DRAWN, PUBLISHED, REFERENTS, STRICT, SUITES, referent_told
 
 PolicyCheck = Callable[[str, PreTrainedConfig, dict[str, PolicyFeature], dict[str, str]], None]
@@ -277,8 +278,7 @@ def _check_recording(rows: int, obs_type: str) -> None:
 
     if (parser.parse_arg("eval.recording") or "").lower() != "true":
         return
-    script = sys.modules.get("lerobot.scripts.lerobot_eval")
-    if hasattr(getattr(script, "rollout", None), "__wrapped__"):  # `lerobot eval`, which lays its loop around LeRobot's
+    if ROLLOUT in installed():  # `lerobot eval`, which lays its loop around LeRobot's
         return
     episodes = parser.parse_arg("eval.n_episodes") or "50"
     if obs_type != OBJECTS or (episodes.isdecimal() and int(episodes) > rows):

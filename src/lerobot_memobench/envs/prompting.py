@@ -8,7 +8,10 @@ frame.
 
 from __future__ import annotations
 
+import logging
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -84,6 +87,17 @@ def checkpoint_being_run() -> tuple[str, PreTrainedConfig] | None:
         return None
     overrides = [*parser.get_yaml_overrides("policy"), *(parser.get_cli_overrides("policy") or [])]
     return path, PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keep LeRobot's log lines about plugins and configurations to the run itself, which reads them again."""
+    level = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        yield
+    finally:
+        logging.disable(level)
 
 
 def training_runs() -> bool:

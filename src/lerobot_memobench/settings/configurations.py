@@ -5,12 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, cast
 
 from lerobot_memobench.envs.obs_types import OBJECTS, check_obs_type, obs_type_of
-from lerobot_memobench.envs.prompting import read_rename_map
+from lerobot_memobench.envs.prompting import quiet, read_rename_map
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint
 from lerobot_memobench.policies.freshness import REFUSAL
 from lerobot_memobench.policies.shown import check_features
-from lerobot_memobench.settings.lerobot_commands import quiet
 from lerobot_memobench.settings.translation import LerobotSettings
 
 if TYPE_CHECKING:

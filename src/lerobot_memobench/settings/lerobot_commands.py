@@ -13,6 +13,7 @@ from functools import cache
 from importlib import metadata
 from typing import Any
 
+from lerobot_memobench.envs.prompting import quiet
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.threads import ACTING, LEARNING, use_threads
 
@@ -52,17 +53,6 @@ def register_plugins() -> None:
 
     with quiet():
         register_third_party_plugins()
-
-
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Keep LeRobot's log lines about plugins and configurations to the run itself, which reads them again."""
-    level = logging.root.manager.disable
-    logging.disable(logging.WARNING)
-    try:
-        yield
-    finally:
-        logging.disable(level)
 
 
 @contextmanager

@@ -11,6 +11,7 @@ import yaml
 
 from lerobot_memobench.datasets.lerobot_format import DEFAULT_REPO_ID
 from lerobot_memobench.envs.obs_types import OBS_TYPES
+from lerobot_memobench.envs.prompting import quiet
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.policies.checkpoint import (
@@ -23,7 +24,6 @@ from lerobot_memobench.policies.checkpoint import (
 from lerobot_memobench.settings.configurations import check_sight, env_config, policy_config
 from lerobot_memobench.settings.fields import checked_value
 from lerobot_memobench.settings.flags import has_flag, joined_flags, whole_number, without_flag
-from lerobot_memobench.settings.lerobot_commands import quiet
 from lerobot_memobench.settings.short_forms import TRAINING_WORDS
 from lerobot_memobench.settings.translation import LerobotSettings
 from lerobot_memobench.settings.words import Words
