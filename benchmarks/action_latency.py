@@ -19,10 +19,10 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import torch
+from policies import SIZES, config, observation
 from turns import medians
 
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from policies import SIZES, config, observation
 
 HORIZON = 1200
 SEEN = 200

@@ -34,14 +34,15 @@ import av
 import numpy as np
 
 from lerobot_memobench.datasets.convert import convert
-from lerobot_memobench.datasets.demonstration import CAMERAS, FPS, Demonstration
-from lerobot_memobench.datasets.generation import FIRST_SEED, generate
+from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.generation import generate
 from lerobot_memobench.datasets.hdf5.reading import PublishedFile
 from lerobot_memobench.datasets.hdf5.writing import write_task_file
 from lerobot_memobench.datasets.labels import labels
 from lerobot_memobench.datasets.lerobot_format import dataset_features, image_key, write_dataset
 from lerobot_memobench.datasets.recording import record_demonstration
 from lerobot_memobench.datasets.staging.stage import stage_demonstration
+from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ, DEMONSTRATION_SEED
 from lerobot_memobench.tasks import get_task
 
 TASK = "turn_on_the_stove_and_turn_it_off"
@@ -61,9 +62,9 @@ def main() -> None:
     task = get_task(TASK)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        record_demonstration(task, FIRST_SEED, images=True)  # compiles the scene and opens the renderer
+        record_demonstration(task, DEMONSTRATION_SEED, images=True)  # compiles the scene and opens the renderer
         started = time.perf_counter()
-        demos = [record_demonstration(task, FIRST_SEED + i, images=True) for i in range(asked.episodes)]
+        demos = [record_demonstration(task, DEMONSTRATION_SEED + i, images=True) for i in range(asked.episodes)]
         recording = time.perf_counter() - started
         staged = [stage_demonstration(demo, folder / "staged" / f"{i}", ("hdf5",)) for i, demo in enumerate(demos)]
         source = folder / "task.hdf5"
@@ -117,7 +118,7 @@ def plain_loop(episodes: Iterable[tuple[Demonstration, Iterable[dict[str, np.nda
     from lerobot.datasets import LeRobotDataset
 
     features = {key: value for key, value in dataset_features((256, 256)).items() if key != "language_persistent"}
-    dataset = LeRobotDataset.create("local/plain", fps=FPS, features=features, root=out, use_videos=True)
+    dataset = LeRobotDataset.create("local/plain", fps=CONTROL_HZ, features=features, root=out, use_videos=True)
     for demo, pictures in episodes:
         columns = {"observation.state": demo.proprio, "action": demo.actions, **labels(demo).columns()}
         for t, images in enumerate(pictures):

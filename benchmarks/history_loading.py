@@ -29,7 +29,7 @@ import numpy as np
 import torch
 from turns import medians, peak, reset_peak, resident
 
-from lerobot_memobench.datasets.memory_cache import FOLDER, MemoryCache, build_memory_cache
+from lerobot_memobench.datasets.feature_cache import FOLDER, MemoryCache, build_memory_cache
 from lerobot_memobench.policies.memobench_mem.dimensions import SIZES
 from lerobot_memobench.policies.memobench_mem.language.text_encoders import WordTextEncoder
 from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import sample_frames
@@ -73,13 +73,13 @@ def main() -> None:
 
 def record(root: Path) -> Path:
     """Record two episodes and write them as a dataset."""
-    from lerobot_memobench.datasets.generation import FIRST_SEED
     from lerobot_memobench.datasets.lerobot_format import write_dataset
     from lerobot_memobench.datasets.recording import record_demonstration
+    from lerobot_memobench.protocol import DEMONSTRATION_SEED
     from lerobot_memobench.tasks import get_task
 
     task = get_task(TASK)
-    return write_dataset((record_demonstration(task, FIRST_SEED + i, images=True) for i in range(2)), root)
+    return write_dataset((record_demonstration(task, DEMONSTRATION_SEED + i, images=True) for i in range(2)), root)
 
 
 def measure(root: Path, size: str, numbers: list[int], samples: int, repeats: int) -> dict[str, object]:

@@ -11,10 +11,10 @@ from __future__ import annotations
 import json
 
 import torch
+from policies import config
 
 from lerobot_memobench.policies.memobench_mem.alignment.objectives import make_alignment
 from lerobot_memobench.policies.memobench_mem.memory_pi05 import MemoryPI05
-from policies import config
 
 
 def main() -> None:

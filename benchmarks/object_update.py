@@ -21,6 +21,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.utils.constants import OBS_ENV_STATE
+from policies import config, remembered, training_batch, updates
 from turns import medians
 
 from lerobot_memobench.computing.freed_memory import keep_freed_memory
@@ -30,7 +31,6 @@ from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, 
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_RAW_STATE, frame_row
 from lerobot_memobench.sim.object_slots import SIZE, SLOTS, WIDTH
-from policies import config, remembered, training_batch, updates
 
 REMEMBERED, THINGS = 50, 10
 """Frames that are remembered of an episode of 400 steps, and things in each."""

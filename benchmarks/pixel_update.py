@@ -18,16 +18,16 @@ from collections.abc import Callable
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import torch
+from policies import config, remembered, training_batch, updates
 from turns import medians
 
 from lerobot_memobench.computing.freed_memory import keep_freed_memory
-from lerobot_memobench.eyes.tower import GRID, POOLED, WIDTH
+from lerobot_memobench.perception.tower import GRID, POOLED, WIDTH
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.fused_attention import attend_fused
 from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, STEPS, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.perception.eyes import seen_key
-from policies import config, remembered, training_batch, updates
 
 SLOTS = 50
 """Remembered frames of an episode: its prompt, and an execution of 250 steps."""

@@ -20,10 +20,10 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import torch
+from policies import config, training_batch, updates
 from turns import medians
 
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from policies import config, training_batch, updates
 
 SIDES = {"memory": {"integration": "modulation"}, "plain": {"integration": "none"}}
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files import disk_refusal, draft_of, file_name, remove_drafts, telling_of_the_disk, write_file
+from lerobot_memobench.io import disk_refusal, draft_of, file_name, remove_drafts, telling_of_the_disk, write_file
 from lerobot_memobench.tasks.catalogue import task_names
 
 

@@ -6,7 +6,7 @@ import ast
 import re
 from collections.abc import Collection, Iterator
 
-from .scripts import load_script
+from tests.support.scripts import load_script
 
 house = load_script("house")
 PACKAGE = house.PACKAGE
@@ -74,7 +74,7 @@ def renamed(tree: ast.AST) -> Iterator[str]:
 
 def test_files_are_written_whole_in_one_place() -> None:
     """Elsewhere finished folders are moved, by the one process that holds their destination."""
-    movers = ("files", "datasets.staging.stage", "datasets.lerobot_format.assembling", "engine.demo")
+    movers = ("io", "datasets.staging.stage", "datasets.lerobot_format.assembling", "run.demo")
     allowed = {f"{PACKAGE}.{name}" for name in movers}
     assert [(name, call) for name, tree in TREES.items() for call in renamed(tree) if name not in allowed] == []
 
@@ -104,8 +104,8 @@ def test_no_private_name_crosses_modules() -> None:
 
 
 def test_a_private_name_is_found() -> None:
-    source = f"from {PACKAGE}.sim import world\nfrom {PACKAGE}.files import _to_disk\nworld._x, world.__doc__"
-    assert list(private_names(ast.parse(source), TREES)) == [f"{PACKAGE}.files._to_disk", "world._x"]
+    source = f"from {PACKAGE}.sim import world\nfrom {PACKAGE}.io import _to_disk\nworld._x, world.__doc__"
+    assert list(private_names(ast.parse(source), TREES)) == [f"{PACKAGE}.io._to_disk", "world._x"]
 
 
 def test_the_picture_shows_the_imports_of_today() -> None:

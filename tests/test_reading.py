@@ -13,7 +13,7 @@ from pydantic import AfterValidator
 
 from lerobot_memobench.datasets.lerobot_format.record import from_frames
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files.reading import Count, Malformed, Name, Number, checked, parsed, read_json, refusing
+from lerobot_memobench.io import Count, Malformed, Name, Number, checked, parsed, read_json, refusing
 
 
 class Part(TypedDict):

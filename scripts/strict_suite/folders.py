@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.files import write_file
+from lerobot_memobench.io import write_file
 from lerobot_memobench.tasks.bddl.problem import Region
 from lerobot_memobench.tasks.bddl.reading import parse_bddl
 from lerobot_memobench.tasks.bddl.writing import format_bddl

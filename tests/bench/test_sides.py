@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import os
-import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from lerobot_memobench.bench.sides import Apart, Ours, Times, Vectored, alternate, timed
 from lerobot_memobench.jobs.threads import by_the_libraries, by_the_rule
-
-sys.path.insert(0, str(Path(__file__).parent))  # for apart_case.py: pytest imports tests by their paths
-import apart_case
+from tests.support import apart_case
 
 
 def test_sides_take_turns_and_medians_count() -> None:

@@ -26,8 +26,8 @@ from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.datasets.lerobot_format import DEFAULT_REPO_ID
 from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.settings.flags import flag_value
-from lerobot_memobench.settings.short_forms import EVALUATION_WORDS, MEANINGS, SHORT_FORMS, TRAINING_WORDS
+from lerobot_memobench.run.flags import flag_value
+from lerobot_memobench.run.short_forms import EVALUATION_WORDS, MEANINGS, SHORT_FORMS, TRAINING_WORDS
 
 TASK = "turn_on_the_stove_and_turn_it_off"
 
@@ -153,7 +153,7 @@ def test_what_the_user_sets_stays(evaluation: Called) -> None:
 
 
 def test_the_batch_divides_the_episodes(evaluation: Called, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lerobot_memobench.engine.defaults.cores", lambda: 16)
+    monkeypatch.setattr("lerobot_memobench.run.defaults.cores", lambda: 16)
     evaluation.action = log_episodes
     assert main(["eval", "env=memobench", "episodes=9"]) == 0
     assert evaluation.value("eval.batch_size") == "9"
@@ -272,7 +272,7 @@ def test_help_explains_every_short_form(
 
 
 def test_train_as_the_table_says(training: Called, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lerobot_memobench.settings.training.cores", lambda: 8)
+    monkeypatch.setattr("lerobot_memobench.run.training.cores", lambda: 8)
     assert main(["train", "policy=memobench_mem", "align=contrastive"]) == 0
     assert training.program == "lerobot-train"
     assert training.flags == [
@@ -284,7 +284,7 @@ def test_train_as_the_table_says(training: Called, monkeypatch: pytest.MonkeyPat
 
 
 def test_few_cores_get_few_loaders(training: Called, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lerobot_memobench.settings.training.cores", lambda: 2)
+    monkeypatch.setattr("lerobot_memobench.run.training.cores", lambda: 2)
     assert main(["train", "policy=act"]) == 0
     assert training.value("num_workers") == "2"
 

@@ -15,8 +15,8 @@ import pytest
 from lerobot_memobench.cli.evaluate import SHARD_PROGRAM
 from lerobot_memobench.cli.lerobot import main as lerobot
 from lerobot_memobench.cli.memobench import main as memobench
-from lerobot_memobench.engine import shards
 from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.run import shards
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
 DRAWER = "check_the_top_drawer_of_the_cabinet"

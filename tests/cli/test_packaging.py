@@ -15,7 +15,7 @@ import pytest
 from packaging.markers import default_environment
 from packaging.requirements import Requirement
 
-from ..scripts import load_script
+from tests.support.scripts import load_script
 
 ROOT = Path(__file__).parents[2]
 LOCKS = ["requirements.lock", "scripts/uv-requirements.txt"]

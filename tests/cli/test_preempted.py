@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from ..object_dataset import make_object_dataset
+from tests.support.object_dataset import make_object_dataset
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are looked up in /proc")
 

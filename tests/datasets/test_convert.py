@@ -40,7 +40,7 @@ from lerobot_memobench.tasks import get_task
 STOVE = "turn_on_the_stove_and_turn_it_off"
 BUTTER = "put_the_butter_into_the_bowl_from_the_prompt_video"
 SIZE = 32
-HAND = Path(__file__).with_name("published_by_hand.py")
+HAND = Path(__file__).parents[1] / "support" / "published_by_hand.py"
 
 
 @pytest.fixture(scope="module")

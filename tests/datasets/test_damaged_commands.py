@@ -33,13 +33,12 @@ from lerobot_memobench.datasets.replay import resimulate
 from lerobot_memobench.datasets.staging.stage import stage_demonstration
 from lerobot_memobench.datasets.validate import validate as validation
 from lerobot_memobench.datasets.video import encode_video
-from lerobot_memobench.envs.observations import IMAGE_KEYS
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.protocol import CAMERAS
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks import get_task
-
-from .. import mutations
+from tests.support import mutations
 
 TASK = "put_the_butter_into_the_bowl_from_the_prompt_video"
 FRAMES, EXEC_START, SIZE = 6, 2, 32
@@ -55,10 +54,10 @@ def demonstration(seed: int = 10_000) -> Demonstration:
     demo = resimulate(get_task(TASK), seed, actions, EXEC_START)
     sim = Simulation(demo.task, RenderSettings(SIZE, SIZE))
     sim.reset(seed)
-    images: dict[str, list[np.ndarray]] = {name: [] for name in IMAGE_KEYS}
+    images: dict[str, list[np.ndarray]] = {name: [] for name in CAMERAS}
     for state in demo.states:
         sim.set_state(state, demo.fixture_poses)
-        for name, camera in IMAGE_KEYS.items():
+        for name, camera in CAMERAS.items():
             images[name].append(sim.render(camera))
     xml = model_file(demo.task, demo.fixture_poses)
     return replace(demo, images={name: np.stack(frames) for name, frames in images.items()}, model_xml=xml)

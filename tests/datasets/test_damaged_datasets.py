@@ -18,16 +18,15 @@ import pytest
 
 from lerobot_memobench.datasets.convert import convert
 from lerobot_memobench.datasets.describe import short_manifest
+from lerobot_memobench.datasets.feature_cache import MemoryCache, read_meta
+from lerobot_memobench.datasets.feature_cache.layout import FORMAT, CacheMeta
 from lerobot_memobench.datasets.generation import is_finished
 from lerobot_memobench.datasets.hdf5.attributes import read_extras
 from lerobot_memobench.datasets.lerobot_format.info import episode_count
 from lerobot_memobench.datasets.manifest import read_manifest
-from lerobot_memobench.datasets.memory_cache import MemoryCache, read_meta
-from lerobot_memobench.datasets.memory_cache.layout import FORMAT, CacheMeta
 from lerobot_memobench.datasets.staging.episode import read_staged
 from lerobot_memobench.datasets.staging.request import episodes_folder
-
-from .. import mutations
+from tests.support import mutations
 
 Prepare = Callable[[Path], None]
 Use = Callable[[Path], object]
@@ -172,7 +171,7 @@ def check(
     mutate: Callable[[bytes, random.Random], bytes] = mutations.mutated_json,
 ) -> tuple[int, int]:
     monkeypatch.setattr(
-        "lerobot_memobench.datasets.memory_cache.reading.dataset_fingerprint", lambda root, camera: "print"
+        "lerobot_memobench.datasets.feature_cache.reading.dataset_fingerprint", lambda root, camera: "print"
     )
     prepare, use, files = KINDS[kind]
     source, whole = tmp_path / "source", tmp_path / "whole"

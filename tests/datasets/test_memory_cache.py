@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_memobench.datasets.memory_cache import (
+from lerobot_memobench.datasets.feature_cache import (
     FOLDER,
     MemoryCache,
     build_memory_cache,
@@ -24,8 +24,7 @@ from lerobot_memobench.datasets.memory_cache import (
     resolve_subgoals,
 )
 from lerobot_memobench.errors import MemobenchError
-
-from .. import synthetic_dataset
+from tests.support import synthetic_dataset
 
 CAMERA = "observation.images.image"
 SUBGOALS_1 = "open the top drawer; put the bowl in the drawer"
@@ -388,7 +387,7 @@ def test_a_disk_that_fills_up_meanwhile_loses_nothing_that_was_done(
     root: Path, small_disk: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # A disk that promises room which it then has not, as file systems do that copy on write.
-    building = "lerobot_memobench.datasets.memory_cache.building"
+    building = "lerobot_memobench.datasets.feature_cache.building"
     with monkeypatch.context() as patched:
         patched.setattr(f"{building}.reserve", lambda path, size: path.open("wb").truncate(size))
         with pytest.raises(MemobenchError, match=r"is full.*make room") as told:
@@ -410,12 +409,12 @@ def test_where_nothing_may_be_written_it_says_so(root: Path, monkeypatch: pytest
         raise PermissionError(13, "Permission denied", str(path))
 
     with monkeypatch.context() as patched:
-        patched.setattr("lerobot_memobench.datasets.memory_cache.building.taking_turns", refuse)
+        patched.setattr("lerobot_memobench.datasets.feature_cache.building.taking_turns", refuse)
         with pytest.raises(MemobenchError, match=r"cannot be written \(Permission denied\).*memobench cache --out"):
             build_memory_cache(root, "test", _Frames(), _Texts())
     build_memory_cache(root, "test", _Frames(), _Texts())
     with monkeypatch.context() as patched:  # a finished one is read all the same
-        patched.setattr("lerobot_memobench.datasets.memory_cache.building.taking_turns", refuse)
+        patched.setattr("lerobot_memobench.datasets.feature_cache.building.taking_turns", refuse)
         build_memory_cache(root, "test", _Frames(), _Texts())
 
 

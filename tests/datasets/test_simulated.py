@@ -497,7 +497,7 @@ def test_decoded_frames_are_what_the_simulator_shows(tmp_path):
     """Decode an episode's video and render its recorded states anew: the same pictures, frame by frame."""
     from lerobot.datasets import LeRobotDataset
 
-    from lerobot_memobench.envs.observations import IMAGE_KEYS
+    from lerobot_memobench.protocol import CAMERAS
     from lerobot_memobench.sim.simulation import Simulation
 
     task = get_task(STOVE)
@@ -509,7 +509,7 @@ def test_decoded_frames_are_what_the_simulator_shows(tmp_path):
     sim.reset(SEED)
     for t in range(0, len(dataset), 7):
         sim.set_state(episode.columns["states"][t])
-        for name, camera in IMAGE_KEYS.items():
+        for name, camera in CAMERAS.items():
             seen = (dataset[t][f"observation.images.{name}"] * 255).permute(1, 2, 0).numpy()
             error = ((sim.render(camera).astype(np.float32) - seen) ** 2).mean()
             assert 10 * np.log10(255**2 / error) > 32, (t, name)

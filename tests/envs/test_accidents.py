@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lerobot_memobench.envs.episode import HORIZON, Episode, referent_of
-from lerobot_memobench.envs.observations import PROMPT
+from lerobot_memobench.envs.episode import Episode, referent_of
+from lerobot_memobench.protocol import HORIZON, PROMPT
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import PUBLISHED, STRICT, Task
 

@@ -17,8 +17,6 @@ from lerobot.policies.pi05.configuration_pi05 import PI05Config
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.cli.memobench import main as memobench
-from lerobot_memobench.engine.lerobot_command import call_lerobot
-from lerobot_memobench.engine.merging import merge
 from lerobot_memobench.envs.acting import acting
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode_log import read_episodes, write_episodes
@@ -32,6 +30,8 @@ from lerobot_memobench.policies.memobench_expert.configuration_memobench_expert 
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_random.configuration_memobench_random import MemobenchRandomConfig
 from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
+from lerobot_memobench.run.lerobot_command import call_lerobot
+from lerobot_memobench.run.merging import merge
 from lerobot_memobench.sim.object_layout import SIZE
 
 TASK = "turn_on_the_stove_and_turn_it_off"

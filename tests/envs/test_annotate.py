@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from lerobot_memobench.envs import annotate as annotating
 from lerobot_memobench.envs.annotate import BAND, OPERATION_COLOURS, annotate
-from lerobot_memobench.envs.observations import EXECUTION, PROMPT
+from lerobot_memobench.protocol import EXECUTION, PROMPT
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 
 BACKGROUND, TEXT, FAINT, PURPLE = (24, 26, 30), (240, 240, 240), (150, 155, 165), (204, 121, 167)

@@ -19,17 +19,18 @@ from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
 from lerobot_memobench.cli.lerobot import main
-from lerobot_memobench.engine.merging import merge_and_report
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode_log import read_episodes, read_log
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.envs.obs_types import OBJECTS, PIXELS
-from lerobot_memobench.envs.protocol import MOST_EPISODES, SEED_BASE, UNSEEDED
+from lerobot_memobench.envs.protocol import MOST_EPISODES
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.report import write_report
 from lerobot_memobench.evaluation.metrics.failures import failure_of
 from lerobot_memobench.evaluation.records.protocol import read_protocol
 from lerobot_memobench.evaluation.records.runs import read_rollouts
+from lerobot_memobench.protocol import EVALUATION_SEED, UNSEEDED
+from lerobot_memobench.run.merging import merge_and_report
 from lerobot_memobench.tasks.catalogue import get_task
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
@@ -276,7 +277,7 @@ def test_episodes_without_a_seed_are_apart_from_all_others(tmp_path: Path) -> No
     assert found[0] == found[1]
     assert read_protocol(tmp_path / "0")["episodes"] <= MOST_EPISODES  # their numbers are no extent
     assert UNSEEDED[0] > 10 * MOST_EPISODES
-    assert UNSEEDED[0] > SEED_BASE
+    assert UNSEEDED[0] > EVALUATION_SEED
     drawn = set()
     for _ in range(2):  # nor do environments that were never given a seed share theirs
         env = make()

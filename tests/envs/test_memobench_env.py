@@ -13,12 +13,11 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
-from lerobot_memobench.envs.episode import PROMPT_LIMIT
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.envs.film import Film
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.envs.observations import EXECUTION, PROMPT
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.protocol import EXECUTION, PROMPT, PROMPT_HORIZON
 from lerobot_memobench.sim.rendering import close_renderers, gl_backend
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 
@@ -150,7 +149,7 @@ def test_prompt_plays_whatever_the_policy_does() -> None:
             assert not terminated
             assert not truncated
             hashes.append(env.scene_hash())
-            assert len(hashes) <= PROMPT_LIMIT
+            assert len(hashes) <= PROMPT_HORIZON
         assert observation["step"] == [0], "how long a prompt was would tell what it showed"
         assert env.scene_hash() == start
         np.testing.assert_array_equal(observation["pixels"]["image"], first_image)

@@ -20,12 +20,12 @@ from lerobot_memobench.envs import episode as episode_module
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.envs.obs_types import BOTH
-from lerobot_memobench.envs.observations import EXECUTION
 from lerobot_memobench.envs.prompting import RESET
 from lerobot_memobench.experts.expert import Expert
+from lerobot_memobench.protocol import EXECUTION
 from lerobot_memobench.sim.object_slots import SLOTS, STARTS, WIDTH, ObjectSlots, classes
 from lerobot_memobench.sim.rendering import Image
-from lerobot_memobench.sim.simulation import CAMERAS, Simulation
+from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task
@@ -53,7 +53,7 @@ ALIKE = {
 
 
 def pictures(sim: Simulation) -> dict[str, Image]:
-    return {camera: sim.render(camera).copy() for camera in CAMERAS}
+    return {camera: sim.render(camera).copy() for camera in MJCF_CAMERAS}
 
 
 def check_same(before: dict[str, Image], after: dict[str, Image]) -> None:

@@ -17,11 +17,11 @@ from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.film import LAST_FRAMES
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.envs.obs_types import BOTH, OBJECTS, OBS_TYPES, PIXELS, check_obs_type, obs_type_of
-from lerobot_memobench.envs.observations import EXECUTION, PROMPT
 from lerobot_memobench.envs.protocol import read_protocol_file
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.html.videos import frame_count
 from lerobot_memobench.policies.untrained import UntrainedConfig
+from lerobot_memobench.protocol import EXECUTION, PROMPT
 from lerobot_memobench.sim import rendering
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lerobot_memobench.datasets.generation import FIRST_SEED as DEMONSTRATION_SEEDS
 from lerobot_memobench.envs.episode import Episode, referent_of
 from lerobot_memobench.envs.episode_record import episode_record
-from lerobot_memobench.envs.protocol import SEED_BASE as EVALUATION_SEEDS
 from lerobot_memobench.experts.expert import Expert
+from lerobot_memobench.protocol import DEMONSTRATION_SEED as DEMONSTRATION_SEEDS
+from lerobot_memobench.protocol import EVALUATION_SEED as EVALUATION_SEEDS
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 
 SEEDS = 400

@@ -20,8 +20,7 @@ from lerobot_memobench.studies.alignment.summary import measures_table, summaris
 from lerobot_memobench.studies.learning.commands import Cost
 from lerobot_memobench.studies.learning.tables import costs_table
 from lerobot_memobench.tasks.catalogue import get_task
-
-from .. import mutations
+from tests.support import mutations
 
 TASK = "turn_on_the_stove_and_turn_it_off_then_put_the_frying_pan_on_it"
 SAID = {"variant": 0, "step": 1, "answer": "(On a b)"}

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.envs.episode import Episode
-from lerobot_memobench.envs.observations import EXECUTION
 from lerobot_memobench.experts.plans import counts, plan_of
+from lerobot_memobench.protocol import EXECUTION
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.formula_parsing import parse_formula

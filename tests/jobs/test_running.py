@@ -10,14 +10,14 @@ from pathlib import Path
 import dill
 import pytest
 from filelock import lock_descriptor
-from note_job import Note
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.executors import Datatrove, Needs, asked_for, check_executor, options_told
 from lerobot_memobench.jobs.job import Advance
 from lerobot_memobench.jobs.locking import locked, taking_turns
 from lerobot_memobench.jobs.running import run_jobs
-from lerobot_memobench.settings.words import executor_options
+from lerobot_memobench.run.words import executor_options
+from tests.support.note_job import Note
 
 needs_datatrove = pytest.mark.skipif(find_spec("datatrove") is None, reason="datatrove is not installed")
 

@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 import torch
-from small_policy import batch_of, losses_in_training, made_for_training
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from object_dataset import make_object_dataset
+from tests.support.object_dataset import make_object_dataset
+from tests.support.small_policy import batch_of, losses_in_training, made_for_training
 
 REGRESSION: dict[str, Any] = {"perception": "objects", "size": "small", "objective": "regression", "n_action_steps": 3}
 INDICES = [*range(8, 38, 3)]

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from small_policy import batch_of, made_for_training
 
 from lerobot_memobench.policies.memobench_mem.adapters import trained_whole
+from tests.support.small_policy import batch_of, made_for_training
 
 
 def _whole(policy: object) -> set[str]:

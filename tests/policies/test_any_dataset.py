@@ -22,13 +22,13 @@ from lerobot.policies import make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
 
 from lerobot_memobench.cli.lerobot import main
-from lerobot_memobench.engine.lerobot_command import call_lerobot
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import FrameSampling
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import Frame, MemoryMechanism
 from lerobot_memobench.policies.memobench_mem.memory.rollout import RolloutMemory
+from lerobot_memobench.run.lerobot_command import call_lerobot
 
 IMAGES, STATE, ACTION = "observation.images.", "observation.state", "action"
 

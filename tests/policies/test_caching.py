@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 import torch
-from small_policy import made_for_training, small_config
 
 from lerobot_memobench.cli.memobench import main
-from lerobot_memobench.datasets.memory_cache import FOLDER, MemoryCache
+from lerobot_memobench.datasets.feature_cache import FOLDER, MemoryCache
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset, load_perception, open_cache
 from lerobot_memobench.policies.memobench_mem.perception.pixels import PixelPerception
-from object_dataset import make_object_dataset
+from tests.support.object_dataset import make_object_dataset
+from tests.support.small_policy import made_for_training, small_config
 
 
 def _opened(root: Path, **fields: Any) -> MemoryCache:

@@ -14,9 +14,8 @@ import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
-from small_policy import batch_of, made_for_training, small_config
 
-from lerobot_memobench.datasets.memory_cache import FOLDER, MemoryCache
+from lerobot_memobench.datasets.feature_cache import FOLDER, MemoryCache
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
 from lerobot_memobench.policies.memobench_mem.language.text_encoders import WordTextEncoder
@@ -25,6 +24,7 @@ from lerobot_memobench.policies.memobench_mem.processing.subgoals import SEVERAL
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.memory_text import with_memory
 from lerobot_memobench.tasks.task import LEVELS
+from tests.support.small_policy import batch_of, made_for_training, small_config
 
 EPISODE_1 = 40  # first frame of the second episode, whose subgoals are:
 SUBGOALS = ("open the top drawer", "put the bowl in the drawer", "close the top drawer")

@@ -10,15 +10,14 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from lerobot_memobench.engine.policy_identity import training_facts
 from lerobot_memobench.policies.checkpoint import check_checkpoint, checkpoint_type
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.saved_steps import require_agreement
 from lerobot_memobench.policies.memobench_mem.weights import require_statistics
-from lerobot_memobench.settings.reading import read_settings
-from lerobot_memobench.settings.words import split_words
-
-from .. import mutations
+from lerobot_memobench.run.policy_identity import training_facts
+from lerobot_memobench.run.reading import read_settings
+from lerobot_memobench.run.words import split_words
+from tests.support import mutations
 
 FEATURES = {"observation.state": {"type": "STATE", "shape": [8]}, "action": {"type": "ACTION", "shape": [7]}}
 STEP = {

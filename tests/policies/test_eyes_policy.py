@@ -13,22 +13,28 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.policies import make_policy, make_pre_post_processors
-from picture_rollouts import CAMERAS, acts_as_its_checkpoint, observed, refuses_pictures_in_a_batch, trained_and_acted
-from small_policy import batch_of, losses_in_training, made_for_training, small_config
 from torch.nn.functional import scaled_dot_product_attention
 from transformers.models.gemma import modeling_gemma
 
-from lerobot_memobench.datasets.memory_cache import FOLDER, building
+from lerobot_memobench.datasets.feature_cache import FOLDER, building
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.eyes.tower import GRID, POOLED, SIDE, WIDTH, Tower
-from lerobot_memobench.eyes.weights import Eyes, save_eyes
+from lerobot_memobench.perception.tower import GRID, POOLED, SIDE, WIDTH, Tower
+from lerobot_memobench.perception.weights import Eyes, save_eyes
 from lerobot_memobench.policies.memobench_mem import fused_attention
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.perception.eyes import seen_key
-from synthetic_dataset import LENGTHS
+from tests.support.picture_rollouts import (
+    CAMERAS,
+    acts_as_its_checkpoint,
+    observed,
+    refuses_pictures_in_a_batch,
+    trained_and_acted,
+)
+from tests.support.small_policy import batch_of, losses_in_training, made_for_training, small_config
+from tests.support.synthetic_dataset import LENGTHS
 
 FRAME_BYTES = 2 * GRID**2 * WIDTH
 ROUNDED = 2**-7
@@ -140,7 +146,7 @@ def test_both_are_made_once_and_their_size_is_told_before(
         raise AssertionError("a video was opened")
 
     monkeypatch.setattr("lerobot.datasets.dataset_reader.decode_video_frames", refuse)
-    monkeypatch.setattr("lerobot_memobench.datasets.memory_cache.building.frame_reader", refuse)
+    monkeypatch.setattr("lerobot_memobench.datasets.feature_cache.building.frame_reader", refuse)
     looked.clear()
     policy, before, _, dataset = made_for_training(root, **seeing)
     assert policy.forward(before(batch_of(dataset, [10, 30])))[0].isfinite()
@@ -242,7 +248,7 @@ def test_a_sample_has_tokens_in_the_place_of_pictures(root: Path, seeing: dict[s
 
 
 def test_pictures_that_are_changed_are_refused(root: Path, seeing: dict[str, Any]) -> None:
-    from lerobot_memobench.engine.lerobot_training import trained_on
+    from lerobot_memobench.run.lerobot_training import trained_on
 
     policy, _, _, dataset = made_for_training(root, **seeing)
     dataset.set_image_transforms(lambda picture: 1 - picture)

@@ -11,15 +11,13 @@ import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
-from picture_rollouts import CAMERAS, acts_as_its_checkpoint, made_eyes, trained_and_acted
-from small_policy import batch_of, made_for_training, small_config
 
 from lerobot_memobench.cli.memobench import main
+from lerobot_memobench.datasets.feature_cache import FOLDER, building
 from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
-from lerobot_memobench.datasets.memory_cache import FOLDER, building
 from lerobot_memobench.envs.obs_types import PIXELS, obs_type_of
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.eyes.tower import GRID, POOLED, WIDTH, Tower
+from lerobot_memobench.perception.tower import GRID, POOLED, WIDTH, Tower
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset, open_frames
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.batch import MASK, TOKENS
@@ -28,8 +26,10 @@ from lerobot_memobench.policies.memobench_mem.perception.finding_eyes import NUM
 from lerobot_memobench.policies.memobench_mem.perception.found import FOUND, ObjectsInPictures
 from lerobot_memobench.policies.memobench_mem.perception.slots import HAND_DIM
 from lerobot_memobench.sim.object_slots import SIZE
-from object_dataset import make_object_dataset
-from synthetic_dataset import LENGTHS
+from tests.support.object_dataset import make_object_dataset
+from tests.support.picture_rollouts import CAMERAS, acts_as_its_checkpoint, made_eyes, trained_and_acted
+from tests.support.small_policy import batch_of, made_for_training, small_config
+from tests.support.synthetic_dataset import LENGTHS
 
 ROUNDED = 2**-7
 """What bfloat16 may round off, as a share of a number."""
@@ -84,7 +84,7 @@ def test_a_sample_has_both_and_a_remembered_frame_too(
 
     with monkeypatch.context() as patched:
         patched.setattr("lerobot.datasets.dataset_reader.decode_video_frames", refuse)
-        patched.setattr("lerobot_memobench.datasets.memory_cache.building.frame_reader", refuse)
+        patched.setattr("lerobot_memobench.datasets.feature_cache.building.frame_reader", refuse)
         policy, before, _, dataset = made_for_training(root, **finding)
         assert set(policy.config.input_features) == {OBS_STATE, *CAMERAS}
         batch = before(batch_of(dataset, [45, 50]))

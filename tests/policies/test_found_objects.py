@@ -13,10 +13,8 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_pre_post_processors
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
-from picture_rollouts import made_eyes, observed, pictures_of, refuses_pictures_in_a_batch, trained_and_acted
-from small_policy import batch_of, losses_in_training, made_for_training, small_config
 
-from lerobot_memobench.datasets.memory_cache import FOLDER
+from lerobot_memobench.datasets.feature_cache import FOLDER
 from lerobot_memobench.envs.obs_types import BOTH, PIXELS, obs_type_of
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
@@ -25,8 +23,16 @@ from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, 
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.perception.found import FOUND, VIEWS
 from lerobot_memobench.sim.object_slots import SIZE, SLOTS, WIDTH
-from object_dataset import make_object_dataset
-from synthetic_dataset import LENGTHS
+from tests.support.object_dataset import make_object_dataset
+from tests.support.picture_rollouts import (
+    made_eyes,
+    observed,
+    pictures_of,
+    refuses_pictures_in_a_batch,
+    trained_and_acted,
+)
+from tests.support.small_policy import batch_of, losses_in_training, made_for_training, small_config
+from tests.support.synthetic_dataset import LENGTHS
 
 ROUNDED = 2**-15
 """What two bfloat16 numbers leave of one, as a share of it."""

@@ -17,13 +17,13 @@ from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
 from lerobot.scripts.lerobot_train import train
-from small_policy import batch_of
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.language.tokenizer import WordTokenizerProcessorStep
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.processing.gather_memory import gathering
+from tests.support.small_policy import batch_of
 
 
 @pytest.fixture(scope="module")

@@ -9,17 +9,17 @@ from typing import Any
 import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
-from policy_server import PolicyServer
-from remote_case import counting, make
-from small_policy import made_for_training
-from test_other_policies import _tiny_paligemma, tiny_smolvlm  # noqa: F401 - fixtures
 from torch import Tensor
 
-from lerobot_memobench.engine.loop.looking import looking
 from lerobot_memobench.policies.memobench_expert.configuration_memobench_expert import MemobenchExpertConfig
 from lerobot_memobench.policies.memobench_expert.modeling_memobench_expert import MemobenchExpertPolicy
 from lerobot_memobench.policies.memobench_random.configuration_memobench_random import MemobenchRandomConfig
 from lerobot_memobench.policies.memobench_random.modeling_memobench_random import MemobenchRandomPolicy
+from lerobot_memobench.run.loop.looking import looking
+from tests.policies.test_other_policies import _tiny_paligemma, tiny_smolvlm  # noqa: F401 - fixtures
+from tests.support.policy_server import PolicyServer
+from tests.support.remote_case import counting, make
+from tests.support.small_policy import made_for_training
 
 CAMERAS = ("observation.images.image", "observation.images.wrist_image")
 IMAGE = PolicyFeature(type=FeatureType.VISUAL, shape=(3, 96, 96))

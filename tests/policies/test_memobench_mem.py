@@ -17,9 +17,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
 from lerobot.processor import TokenizerProcessorStep
 from safetensors.torch import load_file, save_file
-from small_policy import CHUNK, batch_of, made_for_training, small_config
 
-from lerobot_memobench.datasets.memory_cache import MemoryCache, find_cache
+from lerobot_memobench.datasets.feature_cache import MemoryCache, find_cache
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.language import tokenizer as tokenizer_module
 from lerobot_memobench.policies.memobench_mem.language.text_encoders import WordTextEncoder
@@ -32,6 +31,7 @@ from lerobot_memobench.policies.memobench_mem.language.tokenizer import (
 from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import sample_frames
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.processing.gather_memory import GatherMemoryProcessorStep
+from tests.support.small_policy import CHUNK, batch_of, made_for_training, small_config
 
 
 @pytest.fixture(scope="module")

@@ -15,9 +15,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.constants import OBS_ENV_STATE
-from small_policy import batch_of, losses_in_training, made_for_training, small_config
 
-import object_dataset
 from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
@@ -30,7 +28,9 @@ from lerobot_memobench.policies.memobench_mem.execution_frames import (
 from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, STEPS, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.sim.object_layout import WIDTH as SLOT_WIDTH
-from object_dataset import LENGTHS, PROMPTS, make_object_dataset
+from tests.support import object_dataset
+from tests.support.object_dataset import LENGTHS, PROMPTS, make_object_dataset
+from tests.support.small_policy import batch_of, losses_in_training, made_for_training, small_config
 
 OBJECTS: dict[str, Any] = {"perception": "objects", "size": "small", "n_action_steps": 3, "memory_stride": 1}
 STARTS = np.cumsum([0, *LENGTHS])

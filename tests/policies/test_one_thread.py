@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 import torch
-from small_policy import made_for_training
 
 from lerobot_memobench.errors import MemobenchError
+from tests.support.small_policy import made_for_training
 
 
 @pytest.fixture(scope="module")

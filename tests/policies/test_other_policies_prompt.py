@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lerobot_memobench.engine.lerobot_command import call_lerobot
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.envs.observations import EXECUTION, PROMPT
 from lerobot_memobench.envs.protocol import read_protocol_file
+from lerobot_memobench.protocol import EXECUTION, PROMPT
+from lerobot_memobench.run.lerobot_command import call_lerobot
 
 MILK = "find_the_specific_milk_pointed_out_in_the_prompt_video_and_put_it_on_the_plate"
 PROMPTS = [147, 165]

@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from small_policy import batch_of, made_for_training
 
 from lerobot_memobench.policies.memobench_mem.averaging import WeightAverage
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from tests.support.small_policy import batch_of, made_for_training
 
 
 @pytest.fixture(scope="module")

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from small_policy import batch_of, made_for_training
 
 from lerobot_memobench.computing import bfloat16
-from object_dataset import make_object_dataset
+from tests.support.object_dataset import make_object_dataset
+from tests.support.small_policy import batch_of, made_for_training
 
 OBJECTS = {"perception": "objects", "size": "small", "n_action_steps": 3, "memory_stride": 1, "width": 256}
 

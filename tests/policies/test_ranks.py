@@ -7,10 +7,10 @@ import sys
 from typing import Any
 
 import pytest
-import rank_case
 import torch
 
 from lerobot_memobench.policies.memobench_mem.ranks import means_over_ranks
+from tests.support import rank_case
 
 
 @pytest.fixture(scope="module")

@@ -9,11 +9,11 @@ import pytest
 import torch
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from lerobot.rollout.inference.rtc import supports_rtc_inference
-from small_policy import made_for_training
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.memory.batch import MASK, STEPS
-from object_dataset import make_object_dataset
+from tests.support.object_dataset import make_object_dataset
+from tests.support.small_policy import made_for_training
 
 OBJECTS: dict[str, Any] = {"perception": "objects", "size": "small", "n_action_steps": 3, "memory_stride": 2}
 

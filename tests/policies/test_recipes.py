@@ -13,8 +13,8 @@ from safetensors import safe_open
 
 import lerobot_policy_memobench  # noqa: F401  (registers the policy and the environment)
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.settings.recipes import recipe_file, recipes, resolve_recipe
-from lerobot_memobench.settings.words import split_words
+from lerobot_memobench.run.recipes import recipe_file, recipes, resolve_recipe
+from lerobot_memobench.run.words import split_words
 
 CONTRASTIVE = {"policy.align": "contrastive", "policy.align_weight": 0.1}
 DIFFERENCES: dict[str, dict[str, Any]] = {

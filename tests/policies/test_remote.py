@@ -9,12 +9,12 @@ import pytest
 import torch
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
-from policy_server import PolicyServer, robomme
-from remote_case import batch, counting, frames_of, make, pictures
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
 from lerobot_memobench.policies.remote.modeling_remote import RemotePolicy
+from tests.support.policy_server import PolicyServer, robomme
+from tests.support.remote_case import batch, counting, frames_of, make, pictures
 
 # --- an episode ---
 

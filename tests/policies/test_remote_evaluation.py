@@ -9,11 +9,12 @@ import sys
 from pathlib import Path
 
 import pytest
-from policy_server import PolicyServer
-from remote_case import TASK, batch, free_port, make
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.envs.episode_log import read_episodes
+from tests.support import policy_server
+from tests.support.policy_server import PolicyServer
+from tests.support.remote_case import TASK, batch, free_port, make
 
 
 def _evaluate(port: int, out: Path, *words: str) -> int:
@@ -58,7 +59,7 @@ def test_no_server_no_evaluation(tmp_path: Path, capsys: pytest.CaptureFixture[s
 def test_a_killed_server_that_is_started_again(tmp_path: Path) -> None:
     """A process of its own that dies in the middle of an episode, of several environments in workers."""
     port, out = free_port(), tmp_path / "run"
-    script = str(Path(__file__).parent / "policy_server.py")
+    script = policy_server.__file__
     keeper = subprocess.Popen(
         ["bash", "-c", f"{sys.executable} {script} {port} 3; exec {sys.executable} {script} {port}"]
     )

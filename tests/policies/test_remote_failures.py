@@ -6,16 +6,16 @@ import socket
 import subprocess
 import sys
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from policy_server import PolicyServer, RestServer, zeros
-from remote_case import IMPATIENT, batch, counting, frames_of, free_port, make
 
 from lerobot_memobench.errors import MemobenchError
+from tests.support import policy_server
+from tests.support.policy_server import PolicyServer, RestServer, zeros
+from tests.support.remote_case import IMPATIENT, batch, counting, frames_of, free_port, make
 
 
 @pytest.mark.parametrize(
@@ -59,9 +59,7 @@ def test_a_server_that_is_not_there_is_told() -> None:
 
 def test_a_server_that_starts_late_is_waited_for() -> None:
     port = free_port()
-    late = subprocess.Popen(
-        [sys.executable, str(Path(__file__).parent / "policy_server.py"), str(port)], stdout=subprocess.DEVNULL
-    )
+    late = subprocess.Popen([sys.executable, policy_server.__file__, str(port)], stdout=subprocess.DEVNULL)
     try:
         assert not make(port, connect_timeout=60.0).select_action(batch(0)).any()
     finally:

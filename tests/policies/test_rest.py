@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from policy_server import RestServer
-from remote_case import IMPATIENT, batch, free_port, make, pictures
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.remote import wire
+from tests.support.policy_server import RestServer
+from tests.support.remote_case import IMPATIENT, batch, free_port, make, pictures
 
 
 def _act(question: dict[str, Any]) -> tuple[int, str]:

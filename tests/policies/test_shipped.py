@@ -10,16 +10,15 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from lerobot_memobench.engine import memory_demo
-from lerobot_memobench.engine.policy_identity import encoded
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies import checkpoint
 from lerobot_memobench.policies.checkpoint import SHIPPED
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.settings.choices import checkpoint_of
+from lerobot_memobench.run import memory_demo
+from lerobot_memobench.run.choices import checkpoint_of
+from lerobot_memobench.run.policy_identity import encoded
 from lerobot_memobench.tasks.catalogue import BOWL, task_names
-
-from ..scripts import load_script
+from tests.support.scripts import load_script
 
 
 @pytest.fixture
@@ -60,7 +59,7 @@ def test_the_demo_compares_only_what_is_there(shipped: Path) -> None:
 def test_a_name_that_is_nearly_one_is_told(shipped: Path) -> None:
     from lerobot.configs.eval import EvalPipelineConfig
 
-    from lerobot_memobench.settings.choices import choice_flags
+    from lerobot_memobench.run.choices import choice_flags
 
     with pytest.raises(MemobenchError, match="did you mean 'memobench_small'"):
         choice_flags(EvalPipelineConfig, "policy", "memobench_smal")

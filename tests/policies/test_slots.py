@@ -16,7 +16,7 @@ from lerobot_memobench.policies.memobench_mem.perception.objects import (
 from lerobot_memobench.policies.memobench_mem.perception.pooled_memory import PooledMemory
 from lerobot_memobench.policies.memobench_mem.perception.slots import FEATURES, SlotEncoder, rotation, slot_features
 from lerobot_memobench.sim.object_slots import SIZE, SLOTS, WIDTH, classes
-from object_dataset import slots_at, state_at
+from tests.support.object_dataset import slots_at, state_at
 
 KINDS = len(classes())
 PLACES = np.array([[0.0, 0.1, 0.9], [0.1, -0.1, 0.95], [-0.1, 0.0, 1.0]])

@@ -10,7 +10,6 @@ import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.utils import preprocess_observation
-from small_policy import small_config
 
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.errors import MemobenchError
@@ -19,6 +18,7 @@ from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
 from lerobot_memobench.policies.remote.observations import Row
 from lerobot_memobench.policies.remote.session import Session
 from lerobot_memobench.tasks.catalogue import get_task
+from tests.support.small_policy import small_config
 
 FOLDER = str(get_task("turn_on_the_stove_and_turn_it_off").folder)
 

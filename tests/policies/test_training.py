@@ -15,10 +15,10 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.scripts.lerobot_train import train
 from safetensors import safe_open
 
-from lerobot_memobench.engine.lerobot_training import trained_on
 from lerobot_memobench.policies.memobench_mem import training_curve
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from synthetic_dataset import make_dataset
+from lerobot_memobench.run.lerobot_training import trained_on
+from tests.support.synthetic_dataset import make_dataset
 
 
 def _config(root: Path, output: Path, steps: int, save_freq: int, **fields: Any) -> TrainPipelineConfig:

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 import torch
 from PIL import Image
-from small_policy import batch_of, made_for_training
 
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.training_curve import NUMBERS, PICTURE, WINDOW, TrainingCurve
-from object_dataset import make_object_dataset
+from tests.support.object_dataset import make_object_dataset
+from tests.support.small_policy import batch_of, made_for_training
 
 
 def test_points_are_means_and_go_on(tmp_path: Path) -> None:

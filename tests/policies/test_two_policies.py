@@ -21,18 +21,18 @@ from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.sampler import EpisodeAwareSampler
 from lerobot.policies import make_policy, make_pre_post_processors
-from picture_rollouts import made_eyes, observed
-from small_policy import batch_of, made_for_training, small_config
 from torch.nn.functional import scaled_dot_product_attention
 from transformers.models.gemma import modeling_gemma
 
 from lerobot_memobench import lerobot_hooks
-from lerobot_memobench.datasets.memory_cache import FOLDER
+from lerobot_memobench.datasets.feature_cache import FOLDER
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.lerobot_hooks import ATTEND, DRAW_FRAMES, MAKE_PROCESSORS, READ_SAMPLE
 from lerobot_memobench.policies.memobench_mem import fused_attention
 from lerobot_memobench.policies.memobench_mem.execution_frames import Drawn
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from tests.support.picture_rollouts import made_eyes, observed
+from tests.support.small_policy import batch_of, made_for_training, small_config
 
 INDICES = [10, 30, 50, 80]
 SEEING: dict[str, Any] = {"size": "small", "width": 64, "depth": 2, "n_action_steps": 3, "memory_stride": 2}

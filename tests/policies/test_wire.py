@@ -6,11 +6,11 @@ import hashlib
 
 import numpy as np
 import pytest
-from policy_server import PolicyServer
-from remote_case import batch, counting, make
 
 from lerobot_memobench.policies.remote import wire
 from lerobot_memobench.policies.remote.observations import fit
+from tests.support.policy_server import PolicyServer
+from tests.support.remote_case import batch, counting, make
 
 #: Packed by openpi-client 0.1.2 and json-numpy 2.1.1.
 OPENPI_FRAME = (

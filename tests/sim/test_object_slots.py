@@ -26,7 +26,7 @@ from lerobot_memobench.sim.object_slots import (
     layout,
 )
 from lerobot_memobench.sim.rendering import Highlight, RenderSettings
-from lerobot_memobench.sim.simulation import CAMERAS, Simulation
+from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 
 NINE = "put_the_butter_picked_up_in_the_prompt_video_on_the_plate"
@@ -110,7 +110,7 @@ def seen_pixels(sim: Simulation, name: str) -> int:
     """Pixels of both cameras that change when an object is taken away; nothing throws shadows."""
     pictures, state = [], sim.state()
     for _ in range(2):
-        pictures.append(np.stack([sim.render(camera) for camera in CAMERAS]))
+        pictures.append(np.stack([sim.render(camera) for camera in MJCF_CAMERAS]))
         put(sim, name, np.array([0.0, 0.0, -5.0]))
     sim.set_state(state)
     return int((pictures[0] != pictures[1]).any(axis=-1).sum())

@@ -18,7 +18,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim import rendering
 from lerobot_memobench.sim.drawing.rasterizer import HIGHLIGHTS
 from lerobot_memobench.sim.rendering import Highlight, RenderSettings, close_renderers, gl_backend
-from lerobot_memobench.sim.simulation import CAMERAS, NO_OP, Simulation
+from lerobot_memobench.sim.simulation import MJCF_CAMERAS, NO_OP, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 
 Simulate = Callable[..., Simulation]
@@ -95,7 +95,7 @@ def test_a_device_that_cannot_be_opened_is_no_reason_not_to_draw(number: int) ->
     assert done.stdout.split()[-1] == "False"
 
 
-@pytest.mark.parametrize("camera", CAMERAS)
+@pytest.mark.parametrize("camera", MJCF_CAMERAS)
 def test_frame(gl: str, simulate: Simulate, camera: str) -> None:
     frame = simulate().render(camera)
     assert frame.shape == (256, 256, 3)
@@ -113,7 +113,7 @@ def test_frame_is_upright(gl: str, simulate: Simulate) -> None:
 def test_things_are_seen_where_the_camera_maths_says(gl: str, simulate: Simulate) -> None:
     """The tomato's red pixels are around the projection of its origin, in both cameras."""
     sim = simulate()
-    for name, camera in CAMERAS.items():
+    for name, camera in MJCF_CAMERAS.items():
         frame = sim.render(name).astype(int)
         red = (frame[..., 0] > 110) & (frame[..., 1] < 70) & (frame[..., 2] < 70)
         position = sim.body_pose("beefsteak_tomato__1_1")[0]
@@ -130,15 +130,15 @@ def test_things_are_seen_where_the_camera_maths_says(gl: str, simulate: Simulate
 
 def test_frame_depends_on_the_state_alone(gl: str, simulate: Simulate) -> None:
     sim = simulate()
-    first = {camera: sim.render(camera) for camera in CAMERAS}
+    first = {camera: sim.render(camera) for camera in MJCF_CAMERAS}
     other = simulate(BOWLS)
     for _ in range(3):
         sim.step(np.array([0.5, 0.5, -0.5, 0, 0, 0.5, -1]))
         other.step(NO_OP)
         sim.render("wrist"), other.render("agentview")
     sim.reset(7)
-    again = {camera: sim.render(camera) for camera in reversed(CAMERAS)}
-    for camera in CAMERAS:
+    again = {camera: sim.render(camera) for camera in reversed(MJCF_CAMERAS)}
+    for camera in MJCF_CAMERAS:
         np.testing.assert_array_equal(first[camera], again[camera])
 
 

@@ -26,10 +26,8 @@ from lerobot_memobench.studies.learning.outcomes import outcomes_of
 from lerobot_memobench.studies.learning.stages import Stages
 from lerobot_memobench.studies.learning.study import learn
 from lerobot_memobench.tasks.catalogue import BOWL, get_task, task_names
+from tests.support.scripts import load_script
 
-from ..scripts import load_script
-
-sys.path[:0] = [str(Path(__file__).parents[1] / "evaluation")]
 TWIN = "open_and_close_the_microwave_a_given_number_of_times"
 
 
@@ -60,7 +58,7 @@ def test_a_command_that_fails_is_told_and_gone_on_with(tmp_path: Path) -> None:
 
 
 def write_rollouts(folder: Path, solved: int, wrong: int, episodes: int = 10, task: str = BOWL) -> None:
-    from logs import rollout
+    from tests.support.logs import rollout
 
     kinds = ("reference_drift", "wrong_place", "miscount")
     failures = [kinds[k % len(kinds)] for k in range(wrong)] + ["storage_failure"] * (episodes - solved - wrong)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -31,9 +30,7 @@ from lerobot_memobench.studies.learning import stages as stages_module
 from lerobot_memobench.studies.learning.commands import Cost
 from lerobot_memobench.studies.learning.experiments import MEMORY, MEMORYLESS
 from lerobot_memobench.studies.learning.figure import COLOURS
-from object_dataset import NAMES, TASKS
-
-sys.path[:0] = [str(Path(__file__).parents[1] / "evaluation")]
+from tests.support.object_dataset import NAMES, TASKS
 
 SETTINGS = StudySettings(steps=2, seeds=1, held_out=1, rollouts=10, frames_per_episode=6)
 BOWL, MILK = NAMES[:2]
@@ -66,7 +63,7 @@ def weights_of(work: Study, arm: str) -> dict[str, torch.Tensor]:
 
 def fake_evaluation(words: Sequence[str]) -> None:
     """Log that a memory is always right, and that without one the referent is wrong in six of ten."""
-    from logs import rollout
+    from tests.support.logs import rollout
 
     solved = 4 if "no_memory" in str(said(words, "policy")) else 10
     write_episodes(
@@ -168,7 +165,7 @@ def test_another_study_in_the_same_folder_is_refused(work: Study, twice_root: Pa
 
 
 def test_a_dataset_of_nobody_knows_what_is_refused(twice_root: Path, tmp_path: Path) -> None:
-    from object_dataset import make_object_dataset
+    from tests.support.object_dataset import make_object_dataset
 
     with pytest.raises(MemobenchError, match=r"of the episode 0 of .*, it tells neither task nor seed"):
         Study(make_object_dataset(tmp_path / "strange"), tmp_path / "out", SETTINGS)

@@ -26,12 +26,12 @@ from lerobot_memobench.bench.machine import TASK, machine
 from lerobot_memobench.bench.sides import Apart, stock_open
 from lerobot_memobench.bench.stock_env import StockEnv
 from lerobot_memobench.bench.stopwatch import Cost, stopwatch
-from lerobot_memobench.engine.defaults import FIRST_SEED
-from lerobot_memobench.engine.planning import plan_line
-from lerobot_memobench.engine.run import run_evaluation
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.jobs.threads import by_the_libraries, by_the_rule
 from lerobot_memobench.policies.memobench_random.modeling_memobench_random import MemobenchRandomPolicy
+from lerobot_memobench.protocol import EVALUATION_SEED
+from lerobot_memobench.run.planning import plan_line
+from lerobot_memobench.run.run import run_evaluation
 
 NEVER, EACH, FIFTH = 0, 1, 5
 """Steps from one look at the pictures to the next."""
@@ -67,7 +67,7 @@ def step_bare(every: int, steps: int, task: str = TASK) -> Cost:
     with tempfile.TemporaryDirectory() as out, stopwatch() as watch:
         config = MemobenchEnvConfig(tasks=task, prompt_video=False, horizon=steps, log_dir=out)
         ((env,),) = (suite.values() for suite in config.create_envs(1).values())
-        env.reset(seed=[FIRST_SEED])
+        env.reset(seed=[EVALUATION_SEED])
         for number, action in enumerate(_moves(steps), start=1):
             looks = bool(every) and number % every == 0
             if looks != watched:
@@ -190,7 +190,7 @@ def rollouts_apart(environment: Mapping[str, str]) -> Iterator[Apart]:
 @contextmanager
 def _ready() -> Iterator[None]:
     """Make a process ready for rollouts, as `lerobot eval` does."""
-    from lerobot_memobench.settings.lerobot_commands import load_command
+    from lerobot_memobench.run.lerobot_commands import load_command
 
     load_command("eval")
     import lerobot_memobench.registration  # noqa: F401 - makes the policy known

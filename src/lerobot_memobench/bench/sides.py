@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.bench.machine import TASK, machine
 from lerobot_memobench.jobs.threads import by_the_libraries
+from lerobot_memobench.protocol import CONTROL_HZ
 from lerobot_memobench.sim.rendering import RenderSettings, gl_backend
-from lerobot_memobench.sim.scene import CONTROL_HZ
-from lerobot_memobench.sim.simulation import CAMERAS, Simulation
+from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.progress import Progress
 
@@ -53,7 +53,7 @@ class Ours:
 
     def look(self) -> list[NDArray[np.uint8]]:
         """Return both images, if wanted."""
-        return [self.sim.render(camera) for camera in CAMERAS] if self.images else []
+        return [self.sim.render(camera) for camera in MJCF_CAMERAS] if self.images else []
 
     def reset(self, seed: int) -> None:
         """Start the scene of a seed, stabilisation steps included."""

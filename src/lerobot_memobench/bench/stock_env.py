@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.bench.sides import STOCK_CAMERAS, make_current
-from lerobot_memobench.envs.observations import IMAGE_KEYS, METADATA, action_space, observation_space
+from lerobot_memobench.envs.observations import METADATA, action_space, observation_space
+from lerobot_memobench.protocol import CAMERAS
 
 
 class StockEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
@@ -39,7 +40,7 @@ class StockEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         return self._observed(found), float(reward), False, self._step >= self._max_episode_steps, {"is_success": False}
 
     def _observed(self, found: dict[str, Any]) -> dict[str, Any]:
-        self._pictures = {key: found[f"{camera}_image"] for key, camera in zip(IMAGE_KEYS, STOCK_CAMERAS, strict=True)}
+        self._pictures = {key: found[f"{camera}_image"] for key, camera in zip(CAMERAS, STOCK_CAMERAS, strict=True)}
         hand = (found["robot0_eef_pos"], found["robot0_eef_quat"][:3], found["robot0_gripper_qpos"])
         still = np.ones(1, np.float32)
         return {"pixels": self._pictures, "agent_pos": np.concatenate(hand, dtype=np.float32), "phase": still} | {

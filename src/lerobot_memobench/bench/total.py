@@ -15,12 +15,11 @@ from typing import Any
 
 from lerobot_memobench.bench.evaluation import FIFTH, looking_every
 from lerobot_memobench.bench.machine import machine
-from lerobot_memobench.engine.defaults import EPISODES
-from lerobot_memobench.engine.planning import plan_line
-from lerobot_memobench.engine.run import run_evaluation
-from lerobot_memobench.envs.episode import HORIZON
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.jobs.threads import cores
+from lerobot_memobench.protocol import EVALUATION_EPISODES, HORIZON
+from lerobot_memobench.run.planning import plan_line
+from lerobot_memobench.run.run import run_evaluation
 from lerobot_memobench.tasks.catalogue import task_names
 
 SHORT, LONG = 10, 60
@@ -74,7 +73,7 @@ def rollouts_total(tasks: str = "all", processes: int | None = None, every: int 
     more = len(short) * (LONG - SHORT)
     step = sum(long[task] - short[task] for task in short) / more
     before = sum(short.values()) / len(short) - SHORT * step
-    rollouts = len(task_names()) * EPISODES
+    rollouts = len(task_names()) * EVALUATION_EPISODES
     return {
         "name": "rollouts_total",
         "rollouts": rollouts,

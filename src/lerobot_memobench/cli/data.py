@@ -9,7 +9,7 @@ import typer
 
 from lerobot_memobench.cli.console import console, counting
 from lerobot_memobench.cli.suite import OfSuite
-from lerobot_memobench.files.reading import count_of
+from lerobot_memobench.io import count_of
 
 if TYPE_CHECKING:
     from lerobot_memobench.datasets.validate import Verdict

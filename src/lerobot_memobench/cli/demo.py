@@ -21,17 +21,17 @@ def demo(
     from rich.markdown import Markdown
 
     from lerobot_memobench.cli.evaluate import evaluate_here, tell, tell_beginning
-    from lerobot_memobench.engine.demo import CONTACT_SHEET, demo_plan, make_demo
-    from lerobot_memobench.engine.folder import VIDEOS
-    from lerobot_memobench.engine.memory_demo import (
+    from lerobot_memobench.evaluation.documents.report import REPORT_MARKDOWN
+    from lerobot_memobench.run.demo import CONTACT_SHEET, demo_plan, make_demo
+    from lerobot_memobench.run.folder import VIDEOS
+    from lerobot_memobench.run.memory_demo import (
         MEMORY_FILM,
         MEMORY_TABLE,
         compare_memories,
         has_policies,
         memory_plan,
     )
-    from lerobot_memobench.engine.run import run_evaluation
-    from lerobot_memobench.evaluation.documents.report import REPORT_MARKDOWN
+    from lerobot_memobench.run.run import run_evaluation
 
     def one_of_three(name: str, folder: Path) -> int:
         return run_evaluation(memory_plan(name, folder), tell, tell_beginning).status

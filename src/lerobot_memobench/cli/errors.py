@@ -9,7 +9,7 @@ from http.client import HTTPException
 from urllib.error import URLError
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files import disk_refusal
+from lerobot_memobench.io import disk_refusal
 
 BACKBONE = "policy.pretrained_backbone_weights"
 """Where LeRobot's policies with a backbone of torchvision's, such as act and diffusion, name its weights."""

@@ -36,8 +36,8 @@ def train(
     workers: Workers = 1,
 ) -> int:
     """Make labelled pictures of the benchmark and train a tower on them: tokens, pooled tokens and heads."""
-    from lerobot_memobench.eyes.school import Lessons, learn
-    from lerobot_memobench.eyes.training import Training
+    from lerobot_memobench.perception.school import Lessons, learn
+    from lerobot_memobench.perception.training import Training
 
     screen = console()
     lessons = Lessons(_names(tasks), first_seed, episodes, moments, workers)
@@ -59,8 +59,8 @@ def examine(
     workers: Workers = 1,
 ) -> int:
     """Tell how far off eyes are, by class and camera, in pictures of seeds that nothing is trained on."""
-    from lerobot_memobench.eyes.school import Lessons
-    from lerobot_memobench.eyes.school import examine as run
+    from lerobot_memobench.perception.school import Lessons
+    from lerobot_memobench.perception.school import examine as run
 
     screen = console()
     with counting(screen, "episodes") as count:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from lerobot_memobench.cli.console import console
-from lerobot_memobench.files.reading import count_of
+from lerobot_memobench.io import count_of
 
 
 def html(

@@ -18,7 +18,7 @@ def merge(
 ) -> int:
     """Join the parts of an evaluation and report the whole. They ran with shard=i/n. Status 1: some are missing."""
     from lerobot_memobench.cli.evaluate import merge_and_print
-    from lerobot_memobench.engine.merging import part_folders
+    from lerobot_memobench.run.merging import part_folders
 
     return merge_and_print(out, folders or part_folders(out))
 
@@ -32,9 +32,9 @@ def rerun(
 ) -> int:
     """Repeat the evaluation of a card and compare every episode. Status 1: one ended differently."""
     from lerobot_memobench.cli.evaluate import evaluate_here
-    from lerobot_memobench.engine import rerun as again
-    from lerobot_memobench.engine.outcomes import first_disagreement
     from lerobot_memobench.envs.episode_log import read_episodes
+    from lerobot_memobench.run import rerun as again
+    from lerobot_memobench.run.outcomes import first_disagreement
 
     told = again.repeatable_card(card, server)
     again.check_policy(told)

@@ -12,7 +12,7 @@ import typer
 from lerobot_memobench.cli.console import console
 from lerobot_memobench.cli.documents import Beside, Formats, ReportFormat, With, show_report
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files import write_file
+from lerobot_memobench.io import write_file
 
 if TYPE_CHECKING:
     from lerobot_memobench.evaluation.records.runs import Run

@@ -13,17 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, PROPRIO_DIM
 from lerobot_memobench.tasks.task import Task
-
-FPS = 20
-"""Control steps, and therefore frames, per second (paper, section 5.1)."""
-
-ACTION_DIM = 7
-PROPRIO_DIM = 8
-CAMERAS = ("image", "wrist_image")
-
-PROMPT, EXECUTION = 0, 1
-"""Values of ``phase``."""
 
 
 @dataclass(frozen=True, eq=False)

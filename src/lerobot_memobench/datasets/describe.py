@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lerobot_memobench.datasets.demonstration import CAMERAS
 from lerobot_memobench.datasets.lerobot_format.card import CARD_FILE, EDITED, MADE_BY, card_from_frames, own_card
 from lerobot_memobench.datasets.lerobot_format.card_tables import ordered_types
 from lerobot_memobench.datasets.lerobot_format.info import check_whole, read_info, undamaged
@@ -22,7 +21,8 @@ from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, list_epi
 from lerobot_memobench.datasets.manifest import read_manifest
 from lerobot_memobench.datasets.paper_figures import FAMILIES, LENGTH_BUCKETS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files import draft_of, telling_of_the_disk, write_file
+from lerobot_memobench.io import draft_of, telling_of_the_disk, write_file
+from lerobot_memobench.protocol import CAMERAS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

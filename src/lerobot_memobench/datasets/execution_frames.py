@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch.utils.data import Dataset, Subset
 
-from lerobot_memobench.datasets.demonstration import EXECUTION
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.protocol import EXECUTION
 
 PHASE = "phase"
 COLUMNS = {PHASE, "simple_subgoal"}

@@ -38,18 +38,17 @@ from lerobot_memobench.datasets.staging.episode import FORMATS, HDF5, LEROBOT, s
 from lerobot_memobench.datasets.staging.folders import STAGING
 from lerobot_memobench.datasets.staging.request import compare_requests, episodes_folder
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.files import file_hash, file_name, free_bytes, in_words, telling_of_the_disk
+from lerobot_memobench.io import file_hash, file_name, free_bytes, in_words, telling_of_the_disk
 from lerobot_memobench.jobs.executors import Needs, check_executor, options_told
 from lerobot_memobench.jobs.job import ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.jobs.threads import cores
+from lerobot_memobench.protocol import DEMONSTRATION_SEED
 from lerobot_memobench.tasks.task import Task, referent_told
 
 WEIGHTS = "model.safetensors"
 NEEDS = Needs(cores=1, memory_gb=4)
 """Of one job on Slurm, which makes one episode after another."""
-FIRST_SEED = 10_000
-"""Demonstrations use the seeds 10,000 + i; evaluation uses 7 + i (paper, section 5.1)."""
 
 
 def generate(
@@ -58,7 +57,7 @@ def generate(
     out: Path | str,
     *,
     prompted_episodes: int | None = None,
-    seed_base: int = FIRST_SEED,
+    seed_base: int = DEMONSTRATION_SEED,
     referent: str = "fixed",
     images: bool = True,
     image_size: int = 256,

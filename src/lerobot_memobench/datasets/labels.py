@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.datasets.demonstration import EXECUTION, PROMPT, Demonstration
+from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.protocol import EXECUTION, PROMPT
 from lerobot_memobench.tasks.memory_text import memory_text, subtask_texts
 from lerobot_memobench.tasks.task import LEVELS, OPERATIONS, Task
 

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_memobench.datasets.demonstration import FPS
 from lerobot_memobench.datasets.labels import Labels
+from lerobot_memobench.protocol import CONTROL_HZ
 
 MIN_FRAMES_BETWEEN_ROWS = 5
 """LeRobot's ``emitted_at`` looks 0.1 s to either side and raises when it finds two rows of a style, so rows
@@ -23,7 +23,7 @@ of one style must be more than 0.2 s apart: at 20 frames/s, at least 5 frames.""
 LanguageRow = dict[str, Any]
 
 
-def persistent_rows(found: Labels, fps: int = FPS) -> list[LanguageRow]:
+def persistent_rows(found: Labels, fps: int = CONTROL_HZ) -> list[LanguageRow]:
     """Return an episode's rows, sorted as LeRobot's own writer sorts them (timestamp, style, role).
 
     A text that is replaced again within 0.2 s (checkpoints completed at nearly the same time) gets no row;

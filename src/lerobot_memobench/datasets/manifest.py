@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
 from lerobot_memobench.datasets.lerobot_format.layout import MANIFEST_FILE
-from lerobot_memobench.files.reading import Count, Whole, read_json
+from lerobot_memobench.io import Count, Whole, read_json
 
 ADVICE = "it is no manifest that this package wrote; take the dataset from its source again"
 

@@ -18,8 +18,8 @@ from lerobot_memobench.datasets.perturbation import Perturbation
 from lerobot_memobench.datasets.staging.episode import HDF5, LEROBOT, StagedJob
 from lerobot_memobench.datasets.staging.stage import EpisodeStage, stage_failure
 from lerobot_memobench.envs.episode import Episode, generator
-from lerobot_memobench.envs.observations import EXECUTION
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.protocol import EXECUTION
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.tasks.task import Task
 

@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.datasets.demonstration import FPS, Demonstration
+from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.digest import digest
 from lerobot_memobench.datasets.labels import labels
 from lerobot_memobench.datasets.language import persistent_rows
 from lerobot_memobench.datasets.lerobot_format.layout import EXECUTED_ACTION, OBJECTS, image_key, objects_column
 from lerobot_memobench.datasets.lerobot_format.reading import Columns, RecordedEpisode
-from lerobot_memobench.envs.observations import IMAGE_KEYS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.prompts import highlights_at
+from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import Simulation
@@ -103,7 +103,7 @@ def _numbering(task: Task, length: int, start: int) -> Columns:
         "task": [task.language] * length,
         "frame_index": frames,
         "index": start + frames,
-        "timestamp": (frames / FPS).astype(np.float32),
+        "timestamp": (frames / CONTROL_HZ).astype(np.float32),
     }
 
 
@@ -132,7 +132,7 @@ class _Watch:
         if frame not in self._frames or self.difference is not None:
             return
         for camera, frames in self._recorded.items():
-            drawn, seen = sim.render(IMAGE_KEYS[camera]), frames[self._frames.index(frame)]
+            drawn, seen = sim.render(CAMERAS[camera]), frames[self._frames.index(frame)]
             told = _unlike(drawn, seen)
             if told:
                 self.difference = Disagreement(image_key(camera), frame, told, "what the simulator draws")

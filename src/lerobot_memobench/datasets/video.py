@@ -27,8 +27,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.datasets.demonstration import FPS
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.protocol import CONTROL_HZ
 
 if TYPE_CHECKING:
     from lerobot.configs import RGBEncoderConfig
@@ -47,7 +47,7 @@ class VideoWriter:
     One thread, so that the bytes do not depend on the machine's cores or on what runs beside.
     """
 
-    def __init__(self, path: Path, encoder: RGBEncoderConfig | None = None, fps: int = FPS) -> None:
+    def __init__(self, path: Path, encoder: RGBEncoderConfig | None = None, fps: int = CONTROL_HZ) -> None:
         self._path, self._encoder, self._fps = path, encoder or default_encoder(), fps
         self._container: Any = None
         self._stream: Any = None
@@ -80,7 +80,7 @@ class VideoWriter:
 
 
 def encode_video(
-    frames: NDArray[np.uint8], path: Path, encoder: RGBEncoderConfig | None = None, fps: int = FPS
+    frames: NDArray[np.uint8], path: Path, encoder: RGBEncoderConfig | None = None, fps: int = CONTROL_HZ
 ) -> None:
     """Encode (T, H, W, 3) uint8 frames to ``path``."""
     writer = VideoWriter(path, encoder, fps)
@@ -89,7 +89,7 @@ def encode_video(
     writer.close()
 
 
-def join_videos(videos: Sequence[tuple[Path, int]], path: Path, fps: int = FPS) -> None:
+def join_videos(videos: Sequence[tuple[Path, int]], path: Path, fps: int = CONTROL_HZ) -> None:
     """Join videos of one encoder, given with their number of frames, without encoding them again.
 
     Frame i of the whole is at i / ``fps`` s to the tick: the places follow from the frame counts, not from

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files import draft_of
+from lerobot_memobench.io import draft_of
 
 Frame = NDArray[np.uint8]
 

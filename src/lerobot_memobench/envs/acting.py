@@ -20,7 +20,7 @@ import yaml
 from lerobot_memobench.envs.obs_types import what_is_seen
 from lerobot_memobench.envs.prompting import checkpoint_being_run, in_file, policy_being_run, quiet, training_runs
 from lerobot_memobench.envs.protocol import POLICY, SAW
-from lerobot_memobench.files import file_hash
+from lerobot_memobench.io import file_hash
 
 NOT_THE_CHECKPOINT = (
     *("train_config.json", "README.md", "training_weights.safetensors", ".gitattributes"),

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from lerobot_memobench.envs.episode import Episode
-from lerobot_memobench.envs.observations import PROMPT
+from lerobot_memobench.protocol import PROMPT
 
 BAND = 64
 """Height of the text over the pictures, pixels."""

@@ -38,10 +38,11 @@ from lerobot_memobench.envs.prompting import (
     rename_map,
     training_runs,
 )
-from lerobot_memobench.envs.protocol import SEED_BASE, SETTINGS, check_protocol
+from lerobot_memobench.envs.protocol import SETTINGS, check_protocol
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.jobs.threads import ACTING, limit_torch, use_threads
 from lerobot_memobench.lerobot_hooks import ROLLOUT, installed
+from lerobot_memobench.protocol import EVALUATION_SEED
 from lerobot_memobench.tasks.task import DRAWN, PUBLISHED, REFERENTS, STRICT, SUITES, referent_told
 
 PolicyCheck = Callable[[str, PreTrainedConfig, dict[str, PolicyFeature], dict[str, str]], None]
@@ -109,7 +110,7 @@ class MemobenchEnvConfig(EnvConfig):
     log_dir: str | None = None
     films: int | None = None
     videos: bool = False
-    seed_base: int = SEED_BASE
+    seed_base: int = EVALUATION_SEED
     resume: bool = False
     features: dict[str, PolicyFeature] = field(default_factory=policy_features)
     features_map: dict[str, str] = field(default_factory=policy_names)

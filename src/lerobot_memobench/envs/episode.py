@@ -13,11 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lerobot_memobench.envs.observations import ACTION_DIM, EXECUTION, IMAGE_KEYS, PROMPT
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.experts.blind import BlindRoutine
 from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.experts.prompts import PromptDemonstrator
+from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EXECUTION, HORIZON, PROMPT, PROMPT_HORIZON
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.rendering import Image, RenderSettings
 from lerobot_memobench.sim.simulation import InvalidActionError, Simulation, UnstablePhysicsError, as_action
@@ -26,12 +26,6 @@ from lerobot_memobench.tasks.failures import INVALID_ACTION, UNSTABLE_PHYSICS
 from lerobot_memobench.tasks.formula import Atom, atoms
 from lerobot_memobench.tasks.progress import Progress
 from lerobot_memobench.tasks.task import DRAWN, REFERENTS, STRICT, Task, referent_told
-
-HORIZON = 1200
-"""Execution steps before an episode is cut off (paper, section 5.1)."""
-PROMPT_LIMIT = 1500
-"""Control steps after which a prompt video ends, whatever it still had to show. Two things are hidden in some 750; with
-one of them grasped at the fifth try in more than 1000."""
 
 
 class Fault(NamedTuple):
@@ -177,7 +171,7 @@ class Episode:
             self.sim.step(self.applied_action)
             self.step_index += 1
             self._next_prompt_action = next(self._demonstrator, None)
-            if self._next_prompt_action is None or self.step_index >= PROMPT_LIMIT:
+            if self._next_prompt_action is None or self.step_index >= PROMPT_HORIZON:
                 self._begin_execution()
             return
         if self.fault is None:
@@ -233,7 +227,7 @@ class Episode:
 
     def images(self) -> dict[str, Image]:
         """Return what both cameras see now, (256, 256, 3) uint8 each, upright."""
-        return {key: self.sim.render(camera) for key, camera in IMAGE_KEYS.items()}
+        return {key: self.sim.render(camera) for key, camera in CAMERAS.items()}
 
     def subgoal(self, level: int = 1) -> str:
         """Return the text of the checkpoint being worked on, at a language level (0 coarse, 1 intermediate, 2 fine)."""

@@ -16,8 +16,7 @@ from typing import Any, Literal, NotRequired, TypedDict
 
 from lerobot_memobench.envs.protocol import write_protocol
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files import file_name, write_file
-from lerobot_memobench.files.reading import Count, Malformed, Name, Number, Whole, checked, count_of, parsed
+from lerobot_memobench.io import Count, Malformed, Name, Number, Whole, checked, count_of, file_name, parsed, write_file
 
 logger = logging.getLogger(__name__)
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files import draft_of
+from lerobot_memobench.io import draft_of
 
 if TYPE_CHECKING:
     from av import VideoFrame

@@ -16,26 +16,26 @@ from numpy.typing import ArrayLike, NDArray
 
 from lerobot_memobench.envs.acting import NOBODY, Acting
 from lerobot_memobench.envs.annotate import BAND
-from lerobot_memobench.envs.episode import HORIZON, PROMPT_LIMIT, Episode
+from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.envs.episode_record import episode_record, not_run_record
 from lerobot_memobench.envs.film import Film
 from lerobot_memobench.envs.obs_types import PIXELS
-from lerobot_memobench.envs.observations import (
-    ACTION_DIM,
-    EXECUTION,
-    IMAGE_SIZE,
-    METADATA,
-    PROMPT,
-    action_space,
-    blank,
-    observation_space,
-)
+from lerobot_memobench.envs.observations import METADATA, action_space, blank, observation_space
 from lerobot_memobench.envs.prompting import RESET, STEPS
-from lerobot_memobench.envs.protocol import SEED_BASE, UNSEEDED
 from lerobot_memobench.envs.sight import Sight
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files import file_name
+from lerobot_memobench.io import file_name
+from lerobot_memobench.protocol import (
+    ACTION_DIM,
+    EVALUATION_SEED,
+    EXECUTION,
+    HORIZON,
+    IMAGE_SIZE,
+    PROMPT,
+    PROMPT_HORIZON,
+    UNSEEDED,
+)
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.tasks.loading import load_task
 from lerobot_memobench.tasks.memory_text import memory_text, with_memory
@@ -89,7 +89,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         oracle_memory: bool = False,
         films: int | None = None,
         videos: bool = False,
-        seed_base: int = SEED_BASE,
+        seed_base: int = EVALUATION_SEED,
         acting: Acting = NOBODY,
     ) -> None:
         self.render_mode = "rgb_array"
@@ -152,7 +152,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     def _max_episode_steps(self) -> int:
         """Upper bound for LeRobot's loop: what it steps through. The horizon itself counts execution steps."""
         prompt = self._settings["prompt_video"] and self._task.prompt is not None and self._prompt_in == STEPS
-        return int(self._settings["horizon"]) + (PROMPT_LIMIT if prompt else 0)
+        return int(self._settings["horizon"]) + (PROMPT_HORIZON if prompt else 0)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -13,18 +13,8 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
 from lerobot_memobench.envs.obs_types import OBJECTS, PIXELS
+from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EXECUTION, IMAGE_SIZE, PROMPT, PROPRIO_DIM
 from lerobot_memobench.sim.object_layout import SIZE
-
-IMAGE_SIZE = 256
-"""Height and width of a picture, pixels."""
-IMAGE_KEYS = {"image": "agentview", "wrist_image": "wrist"}
-"""Observation name → camera; `observation.images.<name>` in datasets and at the policy."""
-PROPRIO_DIM = 8
-"""End-effector position (3, m), axis-angle (3, rad), fingers (2, m)."""
-ACTION_DIM = 7
-"""End-effector displacement (6; ±5 cm, ±0.5 rad per unit), gripper (−1 opens, 1 closes)."""
-PROMPT, EXECUTION = 0, 1
-"""Values of `phase`: a prompt video plays and actions have no effect; the policy acts."""
 
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}
 
@@ -53,7 +43,7 @@ def policy_names(obs_type: str = PIXELS) -> dict[str, str]:
 
 def _pictures(obs_type: str) -> dict[str, str]:
     """Return the pictures' names, here and at the policy."""
-    return {} if obs_type == OBJECTS else {f"pixels/{name}": f"{OBS_IMAGES}.{name}" for name in IMAGE_KEYS}
+    return {} if obs_type == OBJECTS else {f"pixels/{name}": f"{OBS_IMAGES}.{name}" for name in CAMERAS}
 
 
 def observation_space(
@@ -72,7 +62,7 @@ def observation_space(
     }
     if obs_type != OBJECTS:
         image = spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
-        parts["pixels"] = spaces.Dict(dict.fromkeys(IMAGE_KEYS, image))
+        parts["pixels"] = spaces.Dict(dict.fromkeys(CAMERAS, image))
         if render_every > 1:
             parts["picture_step"] = spaces.Box(0, np.inf, (1,), np.float32)
     if obs_type != PIXELS:

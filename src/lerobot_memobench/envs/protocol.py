@@ -14,18 +14,11 @@ from typing import Annotated, Any, TypedDict
 from annotated_types import Ge, Le
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files import write_file
-from lerobot_memobench.files.reading import Count, Name, Whole, cut, read_json
+from lerobot_memobench.io import Count, Name, Whole, cut, read_json, write_file
 from lerobot_memobench.tasks.task import PUBLISHED
 
 PROTOCOL_FILE = "protocol.json"
 
-SEED_BASE = 7
-"""Seed of evaluation episode 0 (paper, section 5.1)."""
-
-UNSEEDED = (1_000_000_000, 2_000_000_000)
-"""Between these lie the seeds of episodes for which nobody named one: evaluations, sealed ones too, demonstrations and
-what settings are chosen on have seeds far below."""
 
 SETTINGS = (
     "suite",

@@ -12,7 +12,8 @@ import numpy as np
 
 from lerobot_memobench.envs.annotate import BAND
 from lerobot_memobench.envs.episode_log import has_log, read_log
-from lerobot_memobench.envs.observations import EXECUTION, IMAGE_SIZE, blank
+from lerobot_memobench.envs.observations import blank
+from lerobot_memobench.protocol import EXECUTION, IMAGE_SIZE
 
 
 class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):

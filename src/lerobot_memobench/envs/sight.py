@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lerobot_memobench.envs.annotate import annotate
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.obs_types import OBJECTS, PIXELS
-from lerobot_memobench.envs.observations import PROMPT
+from lerobot_memobench.protocol import PROMPT
 from lerobot_memobench.sim.rendering import Image
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files import file_name
-from lerobot_memobench.files.reading import read_json as read_json_file
+from lerobot_memobench.io import file_name
+from lerobot_memobench.io import read_json as read_json_file
 
 if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files import write_file
+from lerobot_memobench.io import write_file
 from lerobot_memobench.sim.assets.asset import Asset
 from lerobot_memobench.sim.assets.builder import COLLISION_GROUP, VISUAL_GROUP
 from lerobot_memobench.sim.assets.kitchen import TABLE_TOP, build_kitchen

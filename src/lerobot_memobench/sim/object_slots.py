@@ -23,7 +23,7 @@ from lerobot_memobench.sim.assets.builder import VISUAL_GROUP
 from lerobot_memobench.sim.assets.registry import known_classes, split_class
 from lerobot_memobench.sim.object_layout import FIELDS, SIZE, SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.rendering import Highlight
-from lerobot_memobench.sim.simulation import CAMERAS, Simulation
+from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 
 __all__ = [
     "FIELDS",
@@ -105,7 +105,7 @@ class ObjectSlots:
         self._points = np.concatenate([thing.points for thing in self._things])
         self._bodies = np.repeat([thing.body for thing in self._things], POINTS)
         self._of_point = np.repeat(np.arange(len(self._things)), POINTS)
-        self._cameras = [sim.model.camera(name).id for name in CAMERAS.values()]
+        self._cameras = [sim.model.camera(name).id for name in MJCF_CAMERAS.values()]
         self._group = np.zeros(6, np.uint8)
         self._group[VISUAL_GROUP] = 1
 

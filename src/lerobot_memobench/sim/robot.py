@@ -20,7 +20,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from lerobot_memobench.files import draft_of
+from lerobot_memobench.io import draft_of
 from lerobot_memobench.sim import thinning
 
 BASE_POSITION = (-0.66, 0.0, 0.0)

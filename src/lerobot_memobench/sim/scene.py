@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import mujoco
 
+from lerobot_memobench.protocol import CONTROL_HZ
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.assets.asset import Asset
 from lerobot_memobench.sim.assets.kitchen import build_kitchen
@@ -26,7 +27,6 @@ AGENTVIEW_ANGLE = 45.0
 """Its field of view, degrees."""
 
 PHYSICS_STEP = 0.002
-CONTROL_HZ = 20
 SUBSTEPS = round(1 / (CONTROL_HZ * PHYSICS_STEP))
 
 ARENA_BYTES = 32 * 2**20

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.protocol import ACTION_DIM
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.compiled_controller import make_controller
 from lerobot_memobench.sim.controller import CLOSING
@@ -27,8 +28,7 @@ from lerobot_memobench.tasks.task import STRICT, Task
 
 Array = NDArray[np.float64]
 
-CAMERAS = {"agentview": AGENTVIEW, "wrist": robot.WRIST_CAMERA}
-ACTION_DIM = 7
+MJCF_CAMERAS = {"agentview": AGENTVIEW, "wrist": robot.WRIST_CAMERA}
 STABILISATION_STEPS = 10
 NO_OP = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 """No motion, gripper open."""
@@ -297,15 +297,15 @@ class Simulation:
         for asset, geom in self._glow:
             lit = self.holds(Atom("turnon", (asset.name,)))
             self.model.geom_rgba[geom] = asset.glow_on if lit else asset.glow_off
-        return self._renderer(camera).render(self.model, self.data, CAMERAS[camera], self.highlights)
+        return self._renderer(camera).render(self.model, self.data, MJCF_CAMERAS[camera], self.highlights)
 
     def geoms(self, camera: str = "agentview") -> NDArray[np.int64]:
         """Return the id of the geom that each pixel of a camera's picture shows, (height, width), -1 for none."""
-        return self._renderer(camera).geoms(self.model, self.data, CAMERAS[camera])
+        return self._renderer(camera).geoms(self.model, self.data, MJCF_CAMERAS[camera])
 
     def _renderer(self, camera: str) -> Renderer:
-        if camera not in CAMERAS:
-            raise MemobenchError(f"there is no camera {camera!r}; {nearest(camera, CAMERAS)}")
+        if camera not in MJCF_CAMERAS:
+            raise MemobenchError(f"there is no camera {camera!r}; {nearest(camera, MJCF_CAMERAS)}")
         return get_renderer(self._scene.key, self._scene.model, self.render_settings)
 
     def proprio(self) -> NDArray[np.float32]:

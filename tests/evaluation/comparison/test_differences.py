@@ -16,8 +16,7 @@ from lerobot_memobench.evaluation.documents.evaluation_tables import AVERAGE
 from lerobot_memobench.evaluation.documents.formats import markdown
 from lerobot_memobench.evaluation.metrics.rates import value_of
 from lerobot_memobench.evaluation.records.runs import read_runs
-
-from .. import logs
+from tests.support import logs
 
 
 def compared(a: Path, b: Path, **options: Any) -> Comparison:

@@ -16,8 +16,7 @@ from lerobot_memobench.evaluation.records.runs import Run, read_runs
 from lerobot_memobench.paper import published_rows
 from lerobot_memobench.tasks.failures import FAILURES, FAULTS, REFINED_FAILURES
 from lerobot_memobench.tasks.task import STRICT_FAILURES
-
-from .. import logs
+from tests.support import logs
 
 MODULE = "π0.5 + memory module"
 

@@ -22,8 +22,7 @@ from lerobot_memobench.evaluation.documents.terminal import WIDTH
 from lerobot_memobench.evaluation.metrics.rates import Rate
 from lerobot_memobench.evaluation.metrics.summary import report
 from lerobot_memobench.evaluation.records.runs import Run, read_runs
-
-from .. import logs
+from tests.support import logs
 
 
 @pytest.fixture

@@ -407,7 +407,7 @@ def test_the_command(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[st
 def test_setup_looks_for_the_browsers_that_the_tests_use() -> None:
     folder = Path(__file__)
     script = (folder.parents[3] / "scripts" / "setup").read_text()
-    names = re.search(r"^NAMES = \((.*)\)$", folder.with_name("browser.py").read_text(), re.MULTILINE)
+    names = re.search(r"^NAMES = \((.*)\)$", (folder.parents[2] / "support" / "browser.py").read_text(), re.MULTILINE)
     assert names
     assert f"for name in {' '.join(re.findall('[a-z-]+', names[1]))}; do" in script
 

@@ -19,8 +19,7 @@ from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.envs.film import Film
 from lerobot_memobench.evaluation.documents.html import write_html
 from lerobot_memobench.tasks.catalogue import get_task
-
-from . import browser as chromium
+from tests.support import browser as chromium
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
 DRAWER = "check_the_top_drawer_of_the_cabinet"

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.evaluation.necessity.pictures import Picture, differences, unmatched
-
-from .drawn import scene
+from tests.support.drawn import scene
 
 
 def test_equal_pictures_have_nothing_unmatched() -> None:

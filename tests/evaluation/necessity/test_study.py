@@ -19,8 +19,7 @@ from lerobot_memobench.evaluation.necessity.scene import PIXEL_EXACT
 from lerobot_memobench.evaluation.necessity.study import pictures_path, study
 from lerobot_memobench.evaluation.necessity.verdicts import verdict
 from lerobot_memobench.tasks.catalogue import get_task
-
-from .drawn import scene
+from tests.support.drawn import scene
 
 PAN = "turn_on_the_stove_and_turn_it_off_then_put_the_frying_pan_on_it"
 STACK = "stack_the_bowls_one_by_one_in_the_exact_sequence_shown_in_the_video"

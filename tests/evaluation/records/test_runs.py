@@ -13,8 +13,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.html import write_html
 from lerobot_memobench.evaluation.documents.report import build, render, write_report
 from lerobot_memobench.evaluation.records.runs import by_method, read_rollouts, read_runs, sweeps
-
-from .. import logs
+from tests.support import logs
 
 
 def card(folder: Path, **policy: object) -> None:

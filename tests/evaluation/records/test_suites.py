@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_memobench.engine.merging import merge
 from lerobot_memobench.envs.protocol import PROTOCOL_FILE, check_protocol
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.comparison.differences import compare
@@ -18,9 +17,9 @@ from lerobot_memobench.evaluation.metrics.failures import failure_counts
 from lerobot_memobench.evaluation.metrics.summary import summarise
 from lerobot_memobench.evaluation.records.protocol import read_protocol
 from lerobot_memobench.evaluation.records.runs import read_runs
+from lerobot_memobench.run.merging import merge
 from lerobot_memobench.tasks.failures import FAILURES
-
-from ..logs import evaluation, rollout
+from tests.support.logs import evaluation, rollout
 
 
 @pytest.fixture

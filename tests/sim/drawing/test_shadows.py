@@ -12,7 +12,7 @@ import pytest
 from lerobot_memobench.sim import rendering
 from lerobot_memobench.sim.drawing.drawlist import DrawList, build_draw_list
 from lerobot_memobench.sim.rendering import QUALITIES, ROOM, Highlight, Renderer, RenderSettings
-from lerobot_memobench.sim.simulation import CAMERAS, Simulation
+from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 
 SCENES = {
@@ -60,7 +60,7 @@ def test_frames_equal_those_drawn_plainly(gl: str, monkeypatch: pytest.MonkeyPat
         reference = Renderer(sims[0].model, settings)
     for state in states(sims, *SCENES[task]):
         for sim in sims:
-            for name, camera in CAMERAS.items():
+            for name, camera in MJCF_CAMERAS.items():
                 ours = sim.render(name)
                 theirs = reference.render(sim.model, sim.data, camera, sim.highlights)
                 np.testing.assert_array_equal(ours, theirs, err_msg=f"{state}, {name}")

@@ -8,7 +8,7 @@ import numpy as np
 from annotated_types import Len
 
 from lerobot_memobench.datasets.hdf5.layout import EXTRAS, Unusable
-from lerobot_memobench.files.reading import Count, Malformed, Number, Whole, checked, parsed
+from lerobot_memobench.io import Count, Malformed, Number, Whole, checked, parsed
 
 if TYPE_CHECKING:
     import h5py

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.hdf5.layout import Unusable
-from lerobot_memobench.files.reading import Malformed, parsed
+from lerobot_memobench.io import Malformed, parsed
 
 if TYPE_CHECKING:
     import h5py

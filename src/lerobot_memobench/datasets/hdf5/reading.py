@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.datasets.demonstration import ACTION_DIM
 from lerobot_memobench.datasets.hdf5.attributes import read_extras
 from lerobot_memobench.datasets.hdf5.checks import array, demo_number, finite, first_line, json_object, text_attribute
 from lerobot_memobench.datasets.hdf5.layout import IMAGE_NAMES, Image, Unusable
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.protocol import ACTION_DIM
 
 if TYPE_CHECKING:
     import h5py

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lerobot_memobench.datasets.demonstration import FPS, Demonstration
+from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.digest import digest
 from lerobot_memobench.datasets.hdf5.layout import IMAGE_NAMES, Image, truth_to_intervals
 from lerobot_memobench.datasets.labels import labels
+from lerobot_memobench.protocol import CONTROL_HZ
 from lerobot_memobench.tasks.formula import to_lists
 from lerobot_memobench.tasks.task import BDDL_FILE, Task
 
@@ -111,7 +112,7 @@ def data_attributes(task: Task) -> dict[str, Any]:
         "env_kwargs": {
             "robots": ["Panda"],
             "controller": "OSC_POSE",
-            "control_freq": FPS,
+            "control_freq": CONTROL_HZ,
             "camera_names": ["agentview", "robot0_eye_in_hand"],
         },
     }

@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.datasets.demonstration import CAMERAS, FPS, Demonstration
+from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.hdf5.layout import SUFFIX
 from lerobot_memobench.datasets.hdf5.writing import write_task_file
 from lerobot_memobench.datasets.lerobot_format.card import write_card
@@ -31,7 +31,8 @@ from lerobot_memobench.datasets.staging.episode import HDF5, LEROBOT, StagedEpis
 from lerobot_memobench.datasets.staging.folders import STAGING, TEMPORARY, clean_temporaries, flush_to_disk
 from lerobot_memobench.datasets.staging.stage import stage_demonstration
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files import file_name, write_file
+from lerobot_memobench.io import file_name, write_file
+from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ
 
 ROBOT_TYPE = "panda"
 
@@ -112,7 +113,7 @@ def _write_lerobot(
     shutil.rmtree(part, ignore_errors=True)
     meta = LeRobotDatasetMetadata.create(
         repo_id=repo_id,
-        fps=FPS,
+        fps=CONTROL_HZ,
         features=dataset_features(_image_size(written[0]), objects=all(episode.has_objects for episode in written)),
         root=part,
         robot_type=ROBOT_TYPE,
@@ -144,7 +145,7 @@ def _image_size(episode: StagedEpisode) -> tuple[int, int] | None:
         return None
     import av
 
-    with av.open(str(episode.video(CAMERAS[0]))) as container:
+    with av.open(str(episode.video(next(iter(CAMERAS))))) as container:
         stream = container.streams.video[0]
         return stream.height, stream.width
 

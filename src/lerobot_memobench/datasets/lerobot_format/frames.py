@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.datasets.demonstration import CAMERAS, FPS
 from lerobot_memobench.datasets.lerobot_format.layout import EXECUTED_ACTION, image_key, objects_column
 from lerobot_memobench.datasets.lerobot_format.record import EPISODE_INFO, EpisodeRecord
 from lerobot_memobench.datasets.lerobot_format.tables import ParquetFiles, frames_table, states_table
 from lerobot_memobench.datasets.staging.episode import StagedEpisode
 from lerobot_memobench.datasets.statistics import Stats, numeric_stats
+from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ
 
 if TYPE_CHECKING:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -89,7 +89,7 @@ class _FrameWriter:
             "observation.state": arrays["proprio"],
             "action": arrays["actions"],
             EXECUTED_ACTION: arrays.get("executed", arrays["actions"]),
-            "timestamp": (np.arange(length) / FPS).astype(np.float32),
+            "timestamp": (np.arange(length) / CONTROL_HZ).astype(np.float32),
             "frame_index": np.arange(length),
             "episode_index": np.full(length, self._episodes),
             "index": self._frames + np.arange(length),

@@ -12,7 +12,7 @@ from typing import Annotated, Any, NotRequired, TypedDict
 from annotated_types import Ge, Le
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files.reading import Count, count_of, read_json, refusing
+from lerobot_memobench.io import Count, count_of, read_json, refusing
 
 INFO_FILE = Path("meta") / "info.json"
 ADVICE = "the dataset is damaged; generate it or take it from its source again"

@@ -6,11 +6,11 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.datasets.demonstration import ACTION_DIM, CAMERAS, PROPRIO_DIM
 from lerobot_memobench.datasets.labels import MAX_CHECKPOINTS
 from lerobot_memobench.datasets.lerobot_format.record import EPISODE_INFO
 from lerobot_memobench.datasets.staging.folders import STAGING
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, PROPRIO_DIM
 
 DEFAULT_REPO_ID = "memobench/memobench"
 HDF5_FOLDER = "hdf5"

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files.reading import Malformed, first_fault, parsed
+from lerobot_memobench.io import Malformed, first_fault, parsed
 
 EPISODE_INFO = "episode_info"
 """The frames' column; empty but at an episode's first frame."""

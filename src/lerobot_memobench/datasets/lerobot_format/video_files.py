@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from lerobot_memobench.datasets.demonstration import CAMERAS, FPS
 from lerobot_memobench.datasets.lerobot_format.layout import image_key
 from lerobot_memobench.datasets.staging.episode import StagedEpisode
 from lerobot_memobench.datasets.video import join_videos, video_info
+from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ
 
 if TYPE_CHECKING:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -43,8 +43,8 @@ def _write_camera(
             places[i] |= {
                 f"videos/{key}/chunk_index": chunk,
                 f"videos/{key}/file_index": file,
-                f"videos/{key}/from_timestamp": start / FPS,
-                f"videos/{key}/to_timestamp": frames / FPS,
+                f"videos/{key}/from_timestamp": start / CONTROL_HZ,
+                f"videos/{key}/to_timestamp": frames / CONTROL_HZ,
             }
         chunk, file = update_chunk_file_indices(chunk, file, meta.chunks_size)
         meta.features[key].setdefault("info", video_info(path))

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from lerobot_memobench.datasets.language import LanguageRow
 from lerobot_memobench.datasets.statistics import Stats
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files import file_hash, file_name
-from lerobot_memobench.files.reading import Count, Malformed, Number, Whole, checked, read_json
+from lerobot_memobench.io import Count, Malformed, Number, Whole, checked, file_hash, file_name, read_json
 
 RECORD_FILE = "episode.json"
 ARRAYS_FILE = "arrays.npz"

@@ -12,8 +12,7 @@ from typing import Any
 from lerobot_memobench.datasets.staging.episode import LEROBOT
 from lerobot_memobench.datasets.staging.folders import STAGING, clean_temporaries
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files import remove_drafts, write_file
-from lerobot_memobench.files.reading import read_json, short
+from lerobot_memobench.io import read_json, remove_drafts, short, write_file
 from lerobot_memobench.jobs.locking import locked
 
 REQUEST_FILE = "request.json"

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.datasets.demonstration import CAMERAS, Demonstration
+from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.digest import digest
 from lerobot_memobench.datasets.hdf5.writing import EpisodeFile, data_attributes
 from lerobot_memobench.datasets.labels import labels
@@ -31,7 +31,8 @@ from lerobot_memobench.datasets.staging.folders import flush_to_disk, temporary_
 from lerobot_memobench.datasets.statistics import ImageHistograms
 from lerobot_memobench.datasets.video import VideoWriter
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files import file_hash
+from lerobot_memobench.io import file_hash
+from lerobot_memobench.protocol import CAMERAS
 
 
 def episode_info(demo: Demonstration) -> dict[str, Any]:

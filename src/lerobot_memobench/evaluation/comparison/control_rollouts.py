@@ -14,7 +14,7 @@ from lerobot_memobench.evaluation.documents.sentences import saw_phrase
 from lerobot_memobench.evaluation.metrics.rollouts import Record, saw
 from lerobot_memobench.evaluation.records.protocol import POLICY, differences, read_protocol
 from lerobot_memobench.evaluation.records.runs import asked_for
-from lerobot_memobench.files.reading import count_of
+from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import LEVELS
 

@@ -15,7 +15,7 @@ from lerobot_memobench.evaluation.metrics.rates import METRICS, value_of
 from lerobot_memobench.evaluation.metrics.rollouts import saw
 from lerobot_memobench.evaluation.records.protocol import OF_THE_POLICY, differences
 from lerobot_memobench.evaluation.records.runs import Run
-from lerobot_memobench.files.reading import count_of
+from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 
 

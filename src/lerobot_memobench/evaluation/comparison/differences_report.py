@@ -9,7 +9,7 @@ from lerobot_memobench.evaluation.comparison.differences import Comparison, Diff
 from lerobot_memobench.evaluation.documents.sentences import saw_phrase
 from lerobot_memobench.evaluation.documents.tables import Cell, Count, Name, Numbers, Report, Section, Table
 from lerobot_memobench.evaluation.metrics.rates import percent
-from lerobot_memobench.files.reading import count_of
+from lerobot_memobench.io import count_of
 
 NOTE = (
     "Difference is the second less the first, in points. p: exact McNemar for SR (pairs of which only one succeeded "

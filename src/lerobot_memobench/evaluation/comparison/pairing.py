@@ -9,7 +9,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics.rollouts import Record, operations
 from lerobot_memobench.evaluation.records.protocol import SETTINGS
 from lerobot_memobench.evaluation.records.runs import Run
-from lerobot_memobench.files.reading import count_of
+from lerobot_memobench.io import count_of
 
 SCENES = "scene_hash"
 ALLOWED = (*(name for name in SETTINGS if name != "suite"), SCENES)

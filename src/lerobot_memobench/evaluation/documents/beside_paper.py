@@ -9,7 +9,7 @@ from lerobot_memobench.evaluation.documents.tables import Cell, Count, Section, 
 from lerobot_memobench.evaluation.documents.wide_tables import run_row, wide_table
 from lerobot_memobench.evaluation.metrics.rates import METRICS, Rate
 from lerobot_memobench.evaluation.records.runs import Run
-from lerobot_memobench.files.reading import count_of
+from lerobot_memobench.io import count_of
 from lerobot_memobench.paper import PublishedRow, failure_taxonomy, published_rows
 from lerobot_memobench.tasks.task import MEMORY_TYPES, PUBLISHED
 

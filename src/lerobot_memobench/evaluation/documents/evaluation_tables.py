@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from lerobot_memobench.evaluation.documents.tables import Cell, Count, Name, Numbers, Table, figure
 from lerobot_memobench.evaluation.metrics.rates import METRICS, Rate, Row
 from lerobot_memobench.evaluation.metrics.summary import Summary
-from lerobot_memobench.files.reading import count_of
+from lerobot_memobench.io import count_of
 
 AVERAGE = "average of memory types"
 

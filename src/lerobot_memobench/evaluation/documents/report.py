@@ -28,7 +28,7 @@ from lerobot_memobench.evaluation.documents.wide_tables import overview
 from lerobot_memobench.evaluation.metrics.rollouts import Record, faults, mixtures
 from lerobot_memobench.evaluation.metrics.summary import Summary, report, summarise
 from lerobot_memobench.evaluation.records.runs import Run, asked_for, sweeps, unlike
-from lerobot_memobench.files import write_file
+from lerobot_memobench.io import write_file
 
 __all__ = [
     "FILES",

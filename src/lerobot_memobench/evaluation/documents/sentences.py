@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from lerobot_memobench.evaluation.documents.tables import figure
 from lerobot_memobench.evaluation.metrics.rollouts import NOT_RECORDED, Record, saw
 from lerobot_memobench.evaluation.metrics.summary import Summary
-from lerobot_memobench.files.reading import count_of
+from lerobot_memobench.io import count_of
 
 
 def protocol_sentence(records: Sequence[Record]) -> str:

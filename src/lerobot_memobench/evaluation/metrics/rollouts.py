@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files.reading import count_of
+from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 
 Record = Mapping[str, Any]

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from lerobot_memobench.evaluation.necessity.home import Home
 from lerobot_memobench.evaluation.necessity.pictures import Picture, photograph
 from lerobot_memobench.evaluation.necessity.starts import begin
+from lerobot_memobench.protocol import HORIZON
 from lerobot_memobench.tasks.formula import LATCHES, SINCE_START, Atom, Formula, Hold, children
 from lerobot_memobench.tasks.progress import Progress
 from lerobot_memobench.tasks.task import Task
@@ -24,8 +25,6 @@ from lerobot_memobench.tasks.task import Task
 if TYPE_CHECKING:
     from lerobot_memobench.experts.expert import Doing, Expert
     from lerobot_memobench.sim.simulation import Simulation
-
-HORIZON = 1200
 
 
 @dataclass(frozen=True)

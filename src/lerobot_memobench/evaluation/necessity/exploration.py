@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from itertools import groupby
 from typing import TYPE_CHECKING
 
-from lerobot_memobench.evaluation.necessity.demonstrations import HORIZON
 from lerobot_memobench.evaluation.necessity.graph import (
     GoalWatch,
     Graph,
@@ -19,6 +18,7 @@ from lerobot_memobench.evaluation.necessity.graph import (
 from lerobot_memobench.evaluation.necessity.home import SETTLE
 from lerobot_memobench.evaluation.necessity.laboratory import Laboratory, Place
 from lerobot_memobench.evaluation.necessity.pictures import Picture, photograph
+from lerobot_memobench.protocol import HORIZON
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.progress import Progress
 from lerobot_memobench.tasks.task import Task

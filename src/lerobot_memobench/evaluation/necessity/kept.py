@@ -11,8 +11,7 @@ from typing import Annotated, Any, Literal, TypedDict
 from annotated_types import Len, MaxLen
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files import write_file
-from lerobot_memobench.files.reading import Count, Number, Whole, read_json
+from lerobot_memobench.io import Count, Number, Whole, read_json, write_file
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.evaluation.necessity.demonstrations import HORIZON, REST, answer_of, expert_of, rest_steps
+from lerobot_memobench.evaluation.necessity.demonstrations import REST, answer_of, expert_of, rest_steps
 from lerobot_memobench.evaluation.necessity.home import Home
 from lerobot_memobench.evaluation.necessity.starts import begin
+from lerobot_memobench.protocol import HORIZON
 from lerobot_memobench.tasks.formula import SINCE_START, Atom, Formula, atoms
 from lerobot_memobench.tasks.task import Task
 

@@ -7,7 +7,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
-from lerobot_memobench.evaluation.necessity.demonstrations import HORIZON
+from lerobot_memobench.protocol import HORIZON
 from lerobot_memobench.tasks.task import DRAWN, REFERENTS, Task
 
 VERSION = 2

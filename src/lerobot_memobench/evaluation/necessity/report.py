@@ -15,8 +15,7 @@ from lerobot_memobench.evaluation.necessity.kept import KeptResult
 from lerobot_memobench.evaluation.necessity.study import Result
 from lerobot_memobench.evaluation.necessity.twins import bounds, side_by_side
 from lerobot_memobench.evaluation.necessity.verdicts import VERDICTS, verdict
-from lerobot_memobench.files import write_file
-from lerobot_memobench.files.reading import read_json
+from lerobot_memobench.io import read_json, write_file
 
 JSON_FILE, MARKDOWN_FILE, FIGURE_FILE = "necessity.json", "necessity.md", "aliased_pairs.png"
 

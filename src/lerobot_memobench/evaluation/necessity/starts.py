@@ -29,7 +29,7 @@ def begin(task: Task, sim: Simulation, seed: int) -> None:
 def _after_hiding(task: Task, prompt: Prompt, seed: int) -> Snapshot:
     """Play a prompt as an episode of this seed does, and return what it leaves."""
     from lerobot_memobench.envs.episode import Episode
-    from lerobot_memobench.envs.observations import ACTION_DIM, PROMPT
+    from lerobot_memobench.protocol import ACTION_DIM, PROMPT
 
     episode = Episode(dataclasses.replace(task, prompt=prompt, drawn=False))
     episode.reset(seed)

@@ -17,7 +17,7 @@ from lerobot_memobench.evaluation.necessity.kept import Kept, KeptScene, KeptSea
 from lerobot_memobench.evaluation.necessity.laboratory import Laboratory
 from lerobot_memobench.evaluation.necessity.question import Settings, fingerprint, variants_of
 from lerobot_memobench.evaluation.necessity.scene import EXAMPLES, Scene
-from lerobot_memobench.files import draft_of, file_name
+from lerobot_memobench.io import draft_of, file_name
 from lerobot_memobench.tasks.task import Task
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from annotated_types import Ge, Le, MinLen
 
 from lerobot_memobench.envs.episode_log import CheckpointRecord, Outcome
 from lerobot_memobench.envs.protocol import Protocol, WholeProtocol
-from lerobot_memobench.files.reading import LARGEST, Count, Name, Whole
+from lerobot_memobench.io import LARGEST, Count, Name, Whole
 
 
 class PolicySettings(TypedDict, total=False):

@@ -18,7 +18,7 @@ from lerobot_memobench.envs.protocol import (
 )
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records.card_schema import Card, WholeCard
-from lerobot_memobench.files.reading import read_json
+from lerobot_memobench.io import read_json
 from lerobot_memobench.tasks.task import PUBLISHED
 
 __all__ = [

@@ -25,7 +25,7 @@ from lerobot_memobench.evaluation.records.protocol import (
     read_card,
     read_protocol,
 )
-from lerobot_memobench.files.reading import count_of
+from lerobot_memobench.io import count_of
 
 HASH_DIGITS = 8
 

@@ -8,7 +8,6 @@ import torch
 from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
 from torch import Tensor
 
-from lerobot_memobench.envs.observations import EXECUTION, PROMPT
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.freshness import PICTURE_STEP, require_fresh
 from lerobot_memobench.policies.memobench_mem.action_objective import REGRESSION
@@ -18,6 +17,7 @@ from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_PHAS
 from lerobot_memobench.policies.memobench_mem.plans import RowPlans
 from lerobot_memobench.policies.memobench_mem.seeing import SeeingPolicy
 from lerobot_memobench.policies.shown import cure
+from lerobot_memobench.protocol import EXECUTION, PROMPT
 
 OBS_STEP, OBS_PICTURE = "observation.step", f"observation.{PICTURE_STEP}"
 

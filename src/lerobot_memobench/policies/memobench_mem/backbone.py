@@ -17,8 +17,8 @@ from lerobot.policies.pi_gemma import PaliGemmaForConditionalGenerationWithPiGem
 from torch import Tensor, nn
 from torch.nn.functional import pad, rms_norm
 
-from lerobot_memobench.eyes.tower import Tower
-from lerobot_memobench.eyes.weights import load_eyes
+from lerobot_memobench.perception.tower import Tower
+from lerobot_memobench.perception.weights import load_eyes
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.dimensions import Dimensions, Gemma
 from lerobot_memobench.policies.memobench_mem.integration.integration import Prefix

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
-from lerobot_memobench.datasets.memory_cache import (
+from lerobot_memobench.datasets.feature_cache import (
     FrameLookup,
     MemoryCache,
     Progress,
@@ -20,11 +20,11 @@ from lerobot_memobench.datasets.memory_cache import (
     find_cache,
     read_recorded,
 )
-from lerobot_memobench.datasets.memory_cache.frame_table import read_frame_table
+from lerobot_memobench.datasets.feature_cache.frame_table import read_frame_table
 from lerobot_memobench.envs.prompting import name_in_data
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.eyes.tower import Tower
-from lerobot_memobench.eyes.weights import load_eyes, load_tower
+from lerobot_memobench.perception.tower import Tower
+from lerobot_memobench.perception.weights import load_eyes, load_tower
 from lerobot_memobench.policies.memobench_mem.backbone import SizedPaliGemmaWithExpert
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.found_in_pictures import found_in, make_found

@@ -13,14 +13,14 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
 from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
 from lerobot_memobench.envs.obs_types import DETECTIONS, SEEN_PIXELS
 from lerobot_memobench.envs.obs_types import PRIVILEGED as SEEN_OBJECTS
-from lerobot_memobench.envs.observations import IMAGE_KEYS, IMAGE_SIZE
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.eyes.tower import SIDE
-from lerobot_memobench.eyes.weights import PACKAGE, RANDOM
+from lerobot_memobench.perception.tower import SIDE
+from lerobot_memobench.perception.weights import PACKAGE, RANDOM
 from lerobot_memobench.policies.memobench_mem.action_objective import OBJECTIVES, REGRESSION
 from lerobot_memobench.policies.memobench_mem.dimensions import GRID, SIZES, Dimensions, resized
 from lerobot_memobench.policies.memobench_mem.schedule import WarmupFractionSchedulerConfig
 from lerobot_memobench.policies.memobench_mem.settings_memobench_mem import MemobenchMemSettings
+from lerobot_memobench.protocol import CAMERAS, IMAGE_SIZE
 
 logger = logging.getLogger(__name__)
 
@@ -253,7 +253,7 @@ class MemobenchMemConfig(MemobenchMemSettings):
 
     @property
     def has_eyes(self) -> bool:
-        """Whether pictures are seen through `lerobot_memobench.eyes`."""
+        """Whether pictures are seen through `lerobot_memobench.perception`."""
         return self.eyes not in (None, RANDOM)
 
     @property
@@ -354,7 +354,7 @@ class MemobenchMemConfig(MemobenchMemSettings):
         if self.finds_objects and not self.image_features:
             shape = (3, IMAGE_SIZE, IMAGE_SIZE)
             self.input_features |= {
-                f"{OBS_IMAGES}.{name}": PolicyFeature(FeatureType.VISUAL, shape) for name in IMAGE_KEYS
+                f"{OBS_IMAGES}.{name}": PolicyFeature(FeatureType.VISUAL, shape) for name in CAMERAS
             }
         if not self.sees_pictures and OBS_ENV_STATE not in self.input_features:
             raise MemobenchError(

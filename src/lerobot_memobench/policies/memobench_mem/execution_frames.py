@@ -24,11 +24,11 @@ import torch
 from lerobot.datasets.sampler import EpisodeAwareSampler
 from torch import Tensor
 
-from lerobot_memobench.datasets.demonstration import PROMPT
 from lerobot_memobench.datasets.execution_frames import first_frames
 from lerobot_memobench.datasets.lerobot_format.reading import list_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.lerobot_hooks import DRAW_FRAMES, hooked_for
+from lerobot_memobench.protocol import PROMPT
 
 
 @dataclass(frozen=True, eq=False)

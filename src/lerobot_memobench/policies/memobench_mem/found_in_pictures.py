@@ -16,7 +16,7 @@ import torch
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from lerobot_memobench.datasets.memory_cache import (
+from lerobot_memobench.datasets.feature_cache import (
     FrameReader,
     MemoryCache,
     TextEncoder,

@@ -13,9 +13,9 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from lerobot_memobench.computing.freed_memory import keep_freed_memory
-from lerobot_memobench.datasets.memory_cache import RecordedFrames
+from lerobot_memobench.datasets.feature_cache import RecordedFrames
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.eyes.weights import load_tower
+from lerobot_memobench.perception.weights import load_tower
 from lerobot_memobench.policies.checkpoint import check_as_trained
 from lerobot_memobench.policies.memobench_mem.acting import ActingPolicy
 from lerobot_memobench.policies.memobench_mem.adapters import trained_whole

@@ -18,8 +18,7 @@ import torch
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from lerobot_memobench.datasets.lerobot_format.info import read_info
-from lerobot_memobench.datasets.memory_cache import (
+from lerobot_memobench.datasets.feature_cache import (
     FrameEncoder,
     MemoryCache,
     RecordedFrames,
@@ -28,10 +27,11 @@ from lerobot_memobench.datasets.memory_cache import (
     find_cache,
     read_recorded,
 )
-from lerobot_memobench.datasets.memory_cache.room import require_room
+from lerobot_memobench.datasets.feature_cache.room import require_room
+from lerobot_memobench.datasets.lerobot_format.info import read_info
 from lerobot_memobench.envs.prompting import name_in_data
-from lerobot_memobench.eyes.tower import GRID, POOLED, WIDTH
-from lerobot_memobench.files import in_words
+from lerobot_memobench.io import in_words
+from lerobot_memobench.perception.tower import GRID, POOLED, WIDTH
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.perception.eyes import EyePerception, seen_key
 from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_PHASE, OBS_RAW_STATE

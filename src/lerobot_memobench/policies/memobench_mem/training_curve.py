@@ -7,9 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.files import write_file
-from lerobot_memobench.files.curve import draw_curve, mean_of
-from lerobot_memobench.files.reading import read_json
+from lerobot_memobench.io import draw_curve, mean_of, read_json, write_file
 
 PICTURE, NUMBERS = "training_curve.png", "training_curve.json"
 WINDOW = 10

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.files import draft_of
+from lerobot_memobench.io import draft_of
 from lerobot_memobench.studies.learning.figure import COLOURS, WRONG
 
 PANELS = {

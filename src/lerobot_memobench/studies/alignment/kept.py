@@ -7,8 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
-from lerobot_memobench.files import write_file
-from lerobot_memobench.files.reading import Count, Number, read_json
+from lerobot_memobench.io import Count, Number, read_json, write_file
 
 
 class Scores(TypedDict):

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_memobench.datasets.demonstration import PROMPT
-from lerobot_memobench.datasets.memory_cache import FrameLookup
+from lerobot_memobench.datasets.feature_cache import FrameLookup
+from lerobot_memobench.protocol import PROMPT
 from lerobot_memobench.studies.alignment.split import Split
 
 

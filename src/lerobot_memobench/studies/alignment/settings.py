@@ -9,11 +9,10 @@ from typing import Any
 
 from lerobot.utils.constants import OBS_IMAGES
 
-from lerobot_memobench.datasets.memory_cache import dataset_fingerprint
-from lerobot_memobench.envs.observations import IMAGE_KEYS
+from lerobot_memobench.datasets.feature_cache import dataset_fingerprint
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files import write_file
-from lerobot_memobench.files.reading import read_json
+from lerobot_memobench.io import read_json, write_file
+from lerobot_memobench.protocol import CAMERAS
 from lerobot_memobench.studies.learning.experiments import EVALUATION_SEEDS, MEMORY, MEMORYLESS
 
 ALIGNMENTS: dict[str, tuple[str, ...]] = {
@@ -53,7 +52,7 @@ def claim_folder(out: Path, root: Path, settings: StudySettings) -> None:
     Raises:
         MemobenchError: it holds a study of another dataset, or with other settings.
     """
-    wanted = {"dataset": dataset_fingerprint(root, f"{OBS_IMAGES}.{next(iter(IMAGE_KEYS))}"), **asdict(settings)}
+    wanted = {"dataset": dataset_fingerprint(root, f"{OBS_IMAGES}.{next(iter(CAMERAS))}"), **asdict(settings)}
     del wanted["seeds"]
     path = out / "settings.json"
     if path.is_file():

@@ -12,8 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files import write_file
-from lerobot_memobench.files.reading import read_json
+from lerobot_memobench.io import read_json, write_file
 from lerobot_memobench.jobs.threads import sharing
 
 MODULES = {"lerobot": "lerobot_memobench.cli.lerobot", "memobench": "lerobot_memobench.cli.memobench"}

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.files import draft_of
+from lerobot_memobench.io import draft_of
 from lerobot_memobench.studies.learning.outcomes import Outcome
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from lerobot_memobench.evaluation.documents.sentences import saw_phrase
 from lerobot_memobench.evaluation.metrics.rollouts import saw
-from lerobot_memobench.files import write_file
+from lerobot_memobench.io import write_file
 from lerobot_memobench.studies.learning.contrasts import contrasts
 from lerobot_memobench.studies.learning.experiments import MEMORY, Experiment
 from lerobot_memobench.studies.learning.figure import draw

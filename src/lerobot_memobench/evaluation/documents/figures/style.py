@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.files import draft_of
+from lerobot_memobench.io import draft_of
 from lerobot_memobench.paper import published_rows, shuffled_control
 
 if TYPE_CHECKING:

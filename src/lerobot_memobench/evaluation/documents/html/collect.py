@@ -23,15 +23,13 @@ from lerobot_memobench.evaluation.metrics.rollouts import Record, operations
 from lerobot_memobench.evaluation.metrics.summary import Summary, summarise
 from lerobot_memobench.evaluation.records.protocol import CARD_FILE, POLICY, read_card, read_protocol
 from lerobot_memobench.evaluation.records.runs import check_one_suite, folder_names, read_rollouts, unlike
-from lerobot_memobench.files.reading import count_of
+from lerobot_memobench.io import count_of
+from lerobot_memobench.protocol import CONTROL_HZ
 from lerobot_memobench.tasks.catalogue import find_tasks, get_task, task_names
 from lerobot_memobench.tasks.failures import FAILURES
 from lerobot_memobench.tasks.formula import format_formula
 from lerobot_memobench.tasks.loading import load_task
 from lerobot_memobench.tasks.task import LEVELS, MEMORY_TYPES, Task
-
-FPS = 20
-"""Control steps per second (paper, section 5.1), and frames per second of the films."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +76,7 @@ def page_data(runs: Sequence[Run], videos: Sequence[Mapping[int, str]], known: M
     return {
         "version": __version__,
         "notices": unlike({run.name: run.protocol for run in runs}),
-        "fps": FPS,
+        "fps": CONTROL_HZ,
         "levels": list(LEVELS),
         "memory_types": list(MEMORY_TYPES),
         "operations": {

@@ -18,8 +18,7 @@ from typing import Any
 from lerobot_memobench.envs.film import LAST_FRAMES
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics.rollouts import Record
-from lerobot_memobench.files import draft_of, file_name
-from lerobot_memobench.files.reading import parsed
+from lerobot_memobench.io import draft_of, file_name, parsed
 
 VIDEOS = "videos"
 LEROBOT_INFO = "eval_info.json"

@@ -11,7 +11,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.html.collect import Run, page_data, read_runs, task_source
 from lerobot_memobench.evaluation.documents.html.page import MARK, page
 from lerobot_memobench.evaluation.documents.html.videos import VIDEOS, episode_id, find_videos, place_videos
-from lerobot_memobench.files import write_file
+from lerobot_memobench.io import write_file
 
 PAGE = "index.html"
 UNFINISHED = f'''<!doctype html><meta charset="utf-8"><meta name="generator" content="{MARK}"><title>Unfinished</title>

@@ -1,4 +1,4 @@
-"""Eyes: pictures through the tower of `lerobot_memobench.eyes`, which learns no more; what is made of its tokens does.
+"""Eyes: pictures through the tower of `lerobot_memobench.perception`, which learns no more; its tokens do.
 
 All tokens of a present picture enter the prefix; of a remembered one the pooled ones are kept. In a training sample the
 tokens stand in the pictures' place, see `seen_pictures`.
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn.functional import rms_norm
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.eyes.tower import GRID, POOLED, SIDE, WIDTH, Tower, shrunk
+from lerobot_memobench.perception.tower import GRID, POOLED, SIDE, WIDTH, Tower, shrunk
 from lerobot_memobench.policies.memobench_mem.perception.frozen import fingerprint
 from lerobot_memobench.policies.memobench_mem.perception.objects import LOUD
 from lerobot_memobench.policies.memobench_mem.perception.perception import Perception, Seen

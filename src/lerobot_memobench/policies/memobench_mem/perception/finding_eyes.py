@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor, nn
 
-from lerobot_memobench.eyes.tower import POOLED, WIDTH, Tower
+from lerobot_memobench.perception.tower import POOLED, WIDTH, Tower
 from lerobot_memobench.policies.memobench_mem.perception.eyes import EyePerception, PicturePool
 from lerobot_memobench.policies.memobench_mem.perception.found import FoundObjects
 from lerobot_memobench.policies.memobench_mem.perception.objects import FramePool

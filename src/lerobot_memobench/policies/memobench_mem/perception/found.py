@@ -14,11 +14,10 @@ import torch
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
 from torch import Tensor
 
-from lerobot_memobench.envs.observations import IMAGE_KEYS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.eyes.objects import ObjectFinder
-from lerobot_memobench.eyes.tower import SIDE
-from lerobot_memobench.eyes.weights import Eyes
+from lerobot_memobench.perception.objects import ObjectFinder
+from lerobot_memobench.perception.tower import SIDE
+from lerobot_memobench.perception.weights import Eyes
 from lerobot_memobench.policies.memobench_mem.perception.eyes import SEEN
 from lerobot_memobench.policies.memobench_mem.perception.frozen import fingerprint
 from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_PHASE, OBS_RAW_STATE, ObjectPerception
@@ -26,13 +25,14 @@ from lerobot_memobench.policies.memobench_mem.perception.perception import Seen
 from lerobot_memobench.policies.memobench_mem.perception.sight_errors import TOLD, SightErrors
 from lerobot_memobench.policies.memobench_mem.perception.slots import in_order
 from lerobot_memobench.policies.shown import cure
+from lerobot_memobench.protocol import CAMERAS
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH, field
 
 FOUND = f"{SEEN}objects"
 """Name in a training sample of what was found in its pictures, (B, SIZE)."""
 AT_HAND = 0.15
 """How near to the hand ``told_objects=hand`` tells, m."""
-VIEWS = {f"{OBS_IMAGES}.{name}": camera for name, camera in IMAGE_KEYS.items()}
+VIEWS = {f"{OBS_IMAGES}.{name}": camera for name, camera in CAMERAS.items()}
 """Picture at the policy -> camera."""
 
 

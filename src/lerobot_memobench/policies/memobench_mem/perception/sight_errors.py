@@ -14,7 +14,7 @@ import mujoco
 import torch
 from torch import Tensor
 
-from lerobot_memobench.eyes.objects import set_axis, settled
+from lerobot_memobench.perception.objects import set_axis, settled
 from lerobot_memobench.policies.memobench_mem.perception.slots import in_order
 from lerobot_memobench.sim.assets.registry import build_asset, known_classes
 from lerobot_memobench.sim.object_layout import field

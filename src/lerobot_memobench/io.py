@@ -1,0 +1,418 @@
+"""How is a file written, so that nothing half-made is ever found, and where may a name from somebody's data lead?
+
+And what is told when a disk has no room, or takes nothing.
+"""
+
+from __future__ import annotations
+
+import codecs
+import contextlib
+import errno
+import hashlib
+import os
+import re
+import secrets
+import shutil
+import sys
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from functools import cache
+from itertools import chain
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Annotated, Any
+
+from annotated_types import Ge, Le, MaxLen, MinLen
+
+from lerobot_memobench.errors import MemobenchError
+
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter
+    from pydantic_core import ErrorDetails
+
+
+DRAFT = ".part."
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+CLOSED = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.EIO)
+_IN_WORDS = re.compile(
+    "|".join(os.strerror(number) for number in (*FULL, errno.EACCES, errno.EROFS, errno.EIO)), re.IGNORECASE
+)
+"""Libraries in C put what the system said into messages of errors of their own."""
+LONGEST_NAME = 255
+"""Bytes of a file's name that common file systems take."""
+
+
+@contextlib.contextmanager
+def draft_of(path: Path, *, durable: bool = False) -> Iterator[Path]:
+    """Yield a place to write to beside ``path``; it takes that name once the block has ended without an error.
+
+    Readers see the earlier file or the whole new one, and processes that write the same file do not meet. The draft
+    keeps the ending of ``path``, by which libraries choose a format.
+
+    Args:
+        durable: wait until the disk holds the content, so that a crash of the machine leaves no empty file either.
+    """
+    draft = path.with_name(f".{os.getpid()}-{secrets.token_hex(4)}{DRAFT}{path.name}")
+    try:
+        yield draft
+        if durable:
+            _to_disk(draft)
+        os.replace(draft, path)
+        if durable:
+            _to_disk(path.parent)
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def write_file(path: Path, content: str | bytes, *, durable: bool = False) -> Path:
+    """Write ``content`` (text as UTF-8) to ``path``, whole or not at all; return ``path``. See `draft_of`."""
+    with draft_of(path, durable=durable) as draft:
+        draft.write_bytes(content.encode() if isinstance(content, str) else content)
+    return path
+
+
+def remove_drafts(folder: Path) -> None:
+    """Remove what killed processes have left of `draft_of` in a folder that nobody else writes to."""
+    for draft in folder.glob(f".*-*{DRAFT}*"):
+        draft.unlink(missing_ok=True)
+
+
+def file_name(text: object, what: str) -> str:
+    """Return a name that came out of data, if it names a file in a folder and nothing anywhere else.
+
+    Args:
+        text: the name as it was read. what: what it is, for the message: ``the task's name in demo.hdf5``.
+
+    Raises:
+        MemobenchError: it is no text, is empty, begins with a dot, or holds a separator or a control character.
+    """
+    if (
+        not isinstance(text, str)
+        or not text
+        or text.startswith(".")
+        or not text.isprintable()
+        or set(text) & set('/\\:*?"<>|')
+        or len(text.encode()) > LONGEST_NAME
+    ):
+        raise MemobenchError(
+            f"{what} is {str(text)[:80]!r}, which names no file; expected letters, digits, spaces and _-,.+ alone"
+        )
+    return text
+
+
+def file_hash(path: Path) -> str:
+    """Return the sha256 (hex) of a file."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def disk_refusal(error: BaseException) -> str | None:
+    """Return what a disk answered to writing, as the system puts it, where that led to an error; None where not."""
+    current: BaseException | None = error
+    for _ in range(20):  # an error may be its own cause's cause
+        if current is None:
+            return None
+        number = getattr(current, "errno", None)
+        if number in (*FULL, *CLOSED):
+            return os.strerror(number)
+        found = _IN_WORDS.search(str(current)) if not isinstance(current, MemobenchError) else None
+        if found:
+            return found[0]
+        current = current.__cause__ or (None if current.__suppress_context__ else current.__context__)
+    return None
+
+
+@contextlib.contextmanager
+def telling_of_the_disk(out: Path, kept: str = "") -> Iterator[None]:
+    """Turn what the disk answers to writing below ``out`` into one sentence.
+
+    Args:
+        out: the folder that is written. kept: ends the sentence: what is there, and how to go on.
+
+    Raises:
+        MemobenchError: the disk is full, or takes nothing.
+    """
+    try:
+        yield
+    except MemobenchError:
+        raise
+    except Exception as error:  # OSError, and whatever libraries in C make of it
+        refusal = disk_refusal(error)
+        named = getattr(error, "filename", None)
+        if refusal is None or (named is not None and not _is_of(Path(os.fsdecode(named)), out)):
+            raise
+        raise MemobenchError(
+            f"{out} cannot be written ({refusal}; {in_words(free_bytes(out))} are free there): make room, or name "
+            f"another folder{kept and '; ' + kept}"
+        ) from error
+
+
+def _is_of(path: Path, out: Path) -> bool:
+    """Whether a path is what is written, or on the way to it; not what is read."""
+    path, out = path.absolute(), out.absolute()
+    return path.is_relative_to(out) or out.is_relative_to(path)
+
+
+def in_words(size: float) -> str:
+    """Return bytes as people say them: ``45.8 GiB``."""
+    number, units = float(size), ["B", "KiB", "MiB", "GiB", "TiB"]
+    while number >= 1024 and len(units) > 1:
+        number /= 1024
+        del units[0]
+    return f"{number:.1f} {units[0]}" if units[0] != "B" else f"{number:.0f} B"
+
+
+def free_bytes(folder: Path) -> int:
+    """Return how much may still be written to a folder, or to what it will lie in."""
+    folder = folder.absolute()
+    while not folder.exists():
+        folder = folder.parent
+    return shutil.disk_usage(folder).free
+
+
+def _to_disk(path: Path) -> None:
+    if sys.platform == "win32":
+        return  # it opens no folders, and flushes no file that is open for reading
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+# ==== reading.py
+# How is a file with JSON in it read, so that whatever it holds ends in a value of the expected shape or in a sentence?
+#
+# What a file may hold is a type: a `TypedDict`, a list of them. It is held against what was read without turning one
+# type into another: "5" is no number, true is no 1. Keys that a type does not name are let pass, since a later version
+# may write more. pydantic is imported when the first file is read, which costs as much as the rest of a short command.
+
+LARGEST = 2**53
+"""Beyond it not every integer is a double, so neither a browser nor an array of numbers would hold it."""
+
+Whole = Annotated[int, Ge(-LARGEST), Le(LARGEST)]
+Count = Annotated[int, Ge(0), Le(LARGEST)]
+Name = Annotated[str, MinLen(1), MaxLen(255)]
+Number = Annotated[float, Ge(-LARGEST), Le(LARGEST)]
+
+LONGEST = 80
+"""Characters of what was found that a message repeats."""
+
+LONGEST_REASON = 200
+"""Characters of what a library says that a message repeats."""
+
+EXPECTED = {
+    "string_type": "text",
+    "int_type": "an integer",
+    "float_type": "a number",
+    "finite_number": "a finite number",
+    "bool_type": "true or false",
+    "list_type": "a list",
+    "dict_type": "an object",
+    "none_required": "null",
+    "literal_error": "{expected}",
+    "greater_than_equal": "at least {ge}",
+    "less_than_equal": "at most {le}",
+    "too_short": "{min_length} entries at least",
+    "too_long": "{max_length} entries at most",
+}
+"""pydantic's name of an error -> what was expected."""
+
+
+class Malformed(MemobenchError):
+    """What was read is not of the expected shape; the message is the reason alone."""
+
+
+def read_json(path: Path, schema: Any, advice: str, *, nan: bool = False) -> Any:
+    """Return what a JSON file of ours holds.
+
+    Args:
+        schema: the type that it must have. advice: ends the sentence: what to do.
+        nan: whether NaN and Infinity are numbers, as of a training that diverged.
+
+    Raises:
+        FileNotFoundError: there is none, which is the caller's to judge.
+        MemobenchError: it cannot be read or is not of the schema, named with the place in it.
+    """
+    try:
+        return checked(parsed(path.read_bytes(), nan=nan), schema)
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise MemobenchError(f"{path} cannot be read ({error.strerror or error}); {advice}") from None
+    except Malformed as error:
+        raise MemobenchError(f"{path}: {error}; {advice}") from None
+
+
+def parsed(content: bytes | str, *, nan: bool = False) -> Any:
+    """Return the value that JSON text says; NaN (unless ``nan``), lone surrogates and bad UTF-8 are no JSON.
+
+    Raises:
+        Malformed: it is no JSON, or nested deeper than any file of ours.
+    """
+    from pydantic_core import from_json
+
+    data = content.encode(errors="replace") if isinstance(content, str) else content
+    try:
+        return from_json(data.removeprefix(codecs.BOM_UTF8), allow_inf_nan=nan)
+    except ValueError as error:
+        raise Malformed(f"it is not JSON ({error})") from None
+
+
+def checked(value: Any, schema: Any) -> Any:
+    """Return ``value`` itself, if it is of the type ``schema``.
+
+    Raises:
+        Malformed: with the first place that is not: what was found there, and what was expected.
+    """
+    from pydantic import ValidationError
+
+    try:
+        _adapter(schema).validate_python(value, strict=True)
+    except ValidationError as error:
+        raise Malformed(first_fault(error.errors(include_url=False), value)) from None
+    return value
+
+
+@contextlib.contextmanager
+def refusing(told: Callable[[str], MemobenchError]) -> Iterator[None]:
+    """Let nothing but a `MemobenchError` out of a block that does nothing but read what may be damaged.
+
+    LeRobot, pyarrow, PyAV, h5py and NumPy answer damaged files with errors of every type. To be kept around reading
+    alone: an error in writing, such as a full disk, is not the file's.
+
+    Args:
+        told: makes the error, from what was raised in at most a line. The file and what to do stand beside that: of
+            what a library says only the first characters are left.
+    """
+    try:
+        yield
+    except MemobenchError:
+        raise
+    except Exception as error:
+        raise told(f"{type(error).__name__}: {cut(' '.join(str(error).split()), LONGEST_REASON)}") from error
+
+
+@cache
+def _adapter(schema: Any) -> TypeAdapter[Any]:
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(schema)
+
+
+def first_fault(errors: Iterable[ErrorDetails], value: Any) -> str:
+    """Return the first error in words; those of one place are the alternatives of a union."""
+    first, *others = [(*_place(error["loc"], value), error) for error in errors]
+    place, found, error = first
+    if error["type"] == "missing":
+        missing = dict.fromkeys(
+            str(e["loc"][-1]) for p, _, e in (first, *others) if e["type"] == "missing" and p == place
+        )
+        return f"found no {', '.join(missing)}" + (f" in {place}" if place else "")
+    told = f"found {f'{place} = ' if place else ''}{short(found)}"
+    if error["type"] in ("value_error", "assertion_error"):  # a check of ours, in its own words
+        return f"{told}: {error['ctx']['error']}"
+    alternatives = dict.fromkeys(_expected(e) for p, _, e in (first, *others) if p == place)
+    return f"{told}, expected {' or '.join(alternatives)}"
+
+
+def _place(location: Iterable[int | str], value: Any) -> tuple[str, Any]:
+    """Return the path to what was found, and that. pydantic also names members of unions, and absent keys."""
+    text = ""
+    for part in location:
+        if isinstance(value, Mapping) and part in value:
+            text, value = f"{text}.{part}" if text else str(part), value[part]
+        elif isinstance(value, list) and isinstance(part, int):
+            text, value = f"{text}[{part}]", value[part]
+        else:
+            break
+    return cut(text), value
+
+
+def _expected(error: ErrorDetails) -> str:
+    known = EXPECTED.get(error["type"])
+    if known is None:
+        return error["msg"].removeprefix("Input should be ").lower()
+    return known.format(**error.get("ctx", {}))
+
+
+def short(value: Any) -> str:
+    """Return what was found, as far as a sentence can hold it."""
+    return cut(repr(value))
+
+
+def cut(text: str, longest: int = LONGEST) -> str:
+    """Return a text, as far as a sentence can hold it."""
+    return text if len(text) <= longest else text[: longest - 1] + "…"
+
+
+def count_of(number: int, word: str) -> str:
+    """Return a number of things in words, such as ``1 task`` or ``1,500 rollouts``."""
+    return f"{number:,} {word}" + ("" if number == 1 else "s")
+
+
+# ==== curve.py
+# How the losses of a training fell: means over windows of updates, and their picture.
+
+STYLES = {"fine": "-", "tokens": ":", "pooled": "--"}
+"""How a loss is drawn whose name begins with this word, in one colour with all whose names go on alike."""
+
+
+def mean_of(window: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Return the mean of each number over the updates that tell it, in the order in which they first appear."""
+    values = {name: [float(one[name]) for one in window if name in one] for name in dict.fromkeys(chain(*window))}
+    return {name: sum(found) / len(found) for name, found in values.items()}
+
+
+def draw_curve(
+    points: Sequence[Mapping[str, float]],
+    window: int,
+    path: Path,
+    *,
+    marked: Mapping[str, Sequence[tuple[float, float]]] = MappingProxyType({}),
+    hidden: Collection[str] = (),
+    shares: Collection[str] = (),
+    columns: int = 4,
+) -> None:
+    """Draw means over windows of so many updates to a PNG; nothing before the first.
+
+    Args:
+        marked: name -> losses beside these, each after so many updates.
+        hidden: names of what is left out. shares: names of what is no loss, and runs from 0 to 1.
+        columns: of the legend.
+    """
+    import matplotlib as mpl
+
+    if not points:
+        return
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axis = plt.subplots(figsize=(6, 3.4), constrained_layout=True)
+    looks = _looks(name for name in dict.fromkeys(chain(*points)) if name not in hidden)
+    right = axis.twinx() if set(looks) & set(shares) else None
+    updates = [window * (place + 1) for place in range(len(points))]
+    for name, look in looks.items():
+        own = right if right is not None and name in shares else axis
+        own.plot(updates, [point.get(name) for point in points], **look, lw=1.2, label=name)
+    for name, places in marked.items():
+        if places:
+            axis.plot(*zip(*places, strict=True), "o--", color="black", ms=3, lw=0.8, label=name)
+    axis.set(xlabel="updates", ylabel="loss", yscale="log")
+    if right is not None:
+        right.set(ylabel="share", ylim=(0, 1))
+    axis.grid(alpha=0.3, which="both", lw=0.5)
+    figure.legend(loc="outside upper center", ncols=columns, fontsize=8, frameon=False)
+    with draft_of(path) as draft:
+        figure.savefig(draft, dpi=130, format="png")
+    plt.close(figure)
+
+
+def _looks(names: Iterable[str]) -> dict[str, dict[str, str]]:
+    """Return name -> style and colour of its line."""
+    colours: dict[str, str] = {}
+    looks = {}
+    for name in names:
+        first, _, rest = name.partition(" ")
+        of = rest if first in STYLES else name
+        looks[name] = {"linestyle": STYLES.get(first, "-"), "color": colours.setdefault(of, f"C{len(colours)}")}
+    return looks

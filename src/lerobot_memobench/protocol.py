@@ -1,0 +1,42 @@
+"""Hold every constant of the benchmark, once: time, seeds, pictures, vectors (paper, section 5.1)."""
+
+from __future__ import annotations
+
+# -- time
+
+CONTROL_HZ = 20
+"""Control steps, and therefore frames, per second."""
+HORIZON = 1200
+"""Control steps of an execution before an episode is cut off."""
+PROMPT_HORIZON = 1500
+"""Control steps after which a demonstration prompt ends, whatever it still had to show. Hiding two things takes some
+750; with one of them grasped at the fifth try more than 1000."""
+PROMPT, EXECUTION = 0, 1
+"""Values of ``phase``: a demonstration prompt plays and actions have no effect; the policy acts."""
+
+# -- seeds
+
+EVALUATION_SEED = 7
+"""Episode i of an evaluation has the scene of seed 7 + i."""
+EVALUATION_EPISODES = 50
+"""Episodes of each task in an evaluation."""
+DEMONSTRATION_SEED = 10_000
+"""Demonstration i of a task has the scene of seed 10,000 + i."""
+VALIDATION_SEED = 20_000
+"""Seeds from here on are for choosing settings."""
+UNSEEDED = (1_000_000_000, 2_000_000_000)
+"""Between these lie the seeds of episodes for which nobody named one, far above all others."""
+
+# -- pictures
+
+CAMERAS = {"image": "agentview", "wrist_image": "wrist"}
+"""Name in observations and datasets (``observation.images.<name>``) → camera of the simulator."""
+IMAGE_SIZE = 256
+"""Height and width of a picture, pixels."""
+
+# -- vectors
+
+ACTION_DIM = 7
+"""End-effector displacement (6; ±5 cm, ±0.5 rad per unit), gripper (−1 opens, 1 closes)."""
+PROPRIO_DIM = 8
+"""End-effector position (3, m), axis-angle (3, rad), fingers (2, m)."""

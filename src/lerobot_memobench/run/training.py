@@ -1,0 +1,344 @@
+"""``lerobot train policy=…``: the defaults and checks before LeRobot's training."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import yaml
+
+from lerobot_memobench.datasets.lerobot_format import DEFAULT_REPO_ID
+from lerobot_memobench.envs.obs_types import OBS_TYPES
+from lerobot_memobench.envs.prompting import quiet
+from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.jobs.threads import cores
+from lerobot_memobench.policies.checkpoint import (
+    as_trained,
+    checkpoint_folder,
+    checkpoint_type,
+    differing,
+    read_json,
+)
+from lerobot_memobench.run.configurations import check_sight, env_config, policy_config
+from lerobot_memobench.run.fields import checked_value
+from lerobot_memobench.run.flags import has_flag, joined_flags, whole_number, without_flag
+from lerobot_memobench.run.short_forms import TRAINING_WORDS
+from lerobot_memobench.run.translation import LerobotSettings
+from lerobot_memobench.run.words import Words
+
+INFO_FILE = Path("meta") / "info.json"
+OBJECT_BATCH = 72
+"""Frames per update of a policy that sees objects, or through eyes: a dozen episodes, six moments of each. They lie in
+main memory, where no loader would be quicker."""
+TRAIN_CONFIG = "train_config.json"
+"""LeRobot's file of a training's whole configuration, in each of its checkpoints."""
+TRAINING_STEP = Path("training_state") / "training_step.json"
+TRAINED = ("policy.type", "policy.path", "reward_model.type", "reward_model.path")
+"""What may say what is trained."""
+
+
+def take_training_words(words: Words) -> tuple[bool | None, str | None, Words]:
+    """Return whether prompt frames are trained on, and what a policy is to see, each None where it is not said; and the
+    words without these.
+
+    Raises:
+        MemobenchError: the first is neither true nor false, or the second no kind of observation.
+    """
+    given = dict(item for item in words.settings if item[0] in TRAINING_WORDS)
+    of_env = {"obs_type"} if any(key == "env" for key, _ in words.settings) else set()  # it is a setting of it, too
+    rest = [item for item in words.settings if item[0] in of_env or item[0] not in TRAINING_WORDS]
+    known = {"true": True, "false": False}
+    prompt_frames, obs_type = given.get("prompt_frames"), given.get("obs_type")
+    if obs_type is not None and obs_type not in OBS_TYPES:
+        raise MemobenchError(f"found obs_type={obs_type}, {nearest(obs_type, OBS_TYPES)}")
+    wanted = None if prompt_frames is None else known.get(checked_value("prompt_frames", bool, prompt_frames))
+    return wanted, obs_type, replace(words, settings=rest)
+
+
+def going_on(words: Words) -> Words:
+    """Return what LeRobot goes on with a training by, where ``output_dir=<run> resume=true`` asks for that.
+
+    LeRobot wants the configuration in the run's last checkpoint named. That holds all that was set when the run began;
+    what is given again, or changed, on the line counts before it.
+
+    Raises:
+        MemobenchError: there is nothing to go on with, or another policy is named than that of the run.
+    """
+    bare = words.value("resume") is None and has_flag(words.flags, "resume")
+    wanted = "true" if bare else words.value("resume")
+    if wanted is None or checked_value("resume", bool, wanted) != "true":
+        return words
+    stated = words.value("config_path")
+    if stated is not None and not (Path(stated).is_file() and Path(stated).name != TRAIN_CONFIG):
+        return words  # LeRobot's own form, by a checkpoint or a repository; another file is the recipe that it began by
+    folder = words.value("output_dir")
+    if folder is None:
+        raise MemobenchError("resume=true needs the folder of the training to go on with: output_dir=<folder>")
+    checkpoint = last_checkpoint(Path(folder).expanduser())
+    _check_same_policy(words, checkpoint, folder)
+    known = ("config_path", "config", "policy", "policy.path", "policy.type", "resume")
+    flags = list(words.flags)
+    for key in known:
+        flags = without_flag(flags, key)
+    settings = [(key, value) for key, value in words.settings if key not in known]
+    begun = [("config_path", str(checkpoint / TRAIN_CONFIG)), ("resume", "true")]
+    return replace(words, settings=[*begun, *settings], flags=flags)
+
+
+def last_checkpoint(run: Path) -> Path:
+    """Return the folder ``pretrained_model`` of the last whole checkpoint of a training run.
+
+    Raises:
+        MemobenchError: there is none.
+    """
+    checkpoints = run / "checkpoints"
+    numbered = sorted(
+        (path for path in checkpoints.glob("*") if path.name.isdecimal()), key=lambda path: int(path.name)
+    )
+    # The link is set once a checkpoint is whole; a copy of the run may lack it.
+    for folder in (checkpoints / "last", *reversed(numbered)):
+        if (folder / "pretrained_model" / TRAIN_CONFIG).is_file() and (folder / TRAINING_STEP).is_file():
+            return folder / "pretrained_model"
+    what = "holds no whole checkpoint" if run.is_dir() else "does not exist"
+    raise MemobenchError(
+        f"output_dir={run} {what}, so there is nothing to go on with; a first one is saved after save_freq steps: "
+        "leave resume=true out and name a new folder"
+    )
+
+
+def _check_same_policy(words: Words, checkpoint: Path, folder: str) -> None:
+    """Refuse to go on with another type of policy than the run's."""
+    begun = (read_json(checkpoint / TRAIN_CONFIG).get("policy") or {}).get("type")
+    named = words.value("policy") or words.value("policy.type")
+    where = None if named is None else checkpoint_folder(named)
+    kind = named if where is None else checkpoint_type(str(where))
+    if kind is not None and begun is not None and "/" not in kind and kind != begun:
+        raise MemobenchError(f"the training in {folder} is of policy={begun}, and policy={named} was asked for")
+
+
+def schedule_told(checkpoint: Path, steps: int | None) -> str | None:
+    """Return what another number of steps does to the learning rate of a training that goes on; None: nothing.
+
+    LeRobot makes the schedule anew for the new number and goes on in it at the step that was reached.
+
+    Args:
+        checkpoint: the folder ``pretrained_model`` that is gone on with.
+        steps: those asked for; None: as many as before.
+    """
+    from lerobot.configs.train import TrainPipelineConfig
+    from torch import nn, optim
+
+    with quiet():
+        begun = TrainPipelineConfig.from_pretrained(checkpoint)
+        if steps is None or steps == begun.steps or begun.scheduler is None or begun.optimizer is None:
+            return None
+        peak = float(getattr(begun.optimizer, "lr", 1.0))
+        rates = []
+        for total in (begun.steps, steps):
+            weights = optim.SGD(nn.Linear(1, 1).parameters(), lr=peak)
+            made = begun.scheduler.build(weights, total)
+            rates.append(getattr(made, "lr_lambdas", [None])[0])
+    before, after = rates
+    done = step_reached(checkpoint)
+    if before is None or after is None:
+        return f"note: {begun.scheduler.type} is made anew for {steps} steps instead of {begun.steps}"
+    old, new, last = (peak * rate(step) for rate, step in ((before, done), (after, done), (after, steps - 1)))
+    if f"{old:.2e}" == f"{new:.2e}":
+        told = f"it stays at {new:.2e} at step {done}"
+    else:
+        told = f"at step {done} it jumps from {old:.2e} to {new:.2e}"
+    return (
+        f"note: {steps} steps instead of {begun.steps} make the schedule of the learning rate "
+        f"({begun.scheduler.type}) anew: {told} and is {last:.2e} at the end"
+    )
+
+
+def _gone_on_with(settings: LerobotSettings) -> Path | None:
+    """Return the checkpoint that a training goes on with; None where it begins, or is not on this machine."""
+    path, resume = settings.get("config_path"), settings.get("resume")
+    wanted = settings.has("resume") if resume is None else resume.lower() == "true"  # LeRobot takes a bare --resume
+    if not wanted or path is None or not Path(path).exists():
+        return None
+    return Path(path) if Path(path).is_dir() else Path(path).parent
+
+
+def check_as_begun(settings: LerobotSettings) -> None:
+    """Refuse to go on with a training under settings, or on a dataset, that it was not begun with.
+
+    Which settings these are the policy's configuration says, by ``kept_since_begun: ClassVar[tuple[str, ...]]``.
+
+    Raises:
+        MemobenchError: one of them is another.
+    """
+    checkpoint = _gone_on_with(settings)
+    if checkpoint is None:
+        return
+    _check_same_dataset(settings, checkpoint)
+    chosen = ("--policy.path", "--policy.type", "--policy.discover_packages_path")
+    given = [flag for flag in joined_flags(settings.flags) if flag.startswith("--policy.")]
+    given = [flag for flag in given if flag.partition("=")[0] not in chosen]
+    if not given:
+        return
+    from lerobot.configs.train import TrainPipelineConfig
+
+    with quiet():
+        begun = TrainPipelineConfig.from_pretrained(checkpoint).policy
+        asked = TrainPipelineConfig.from_pretrained(checkpoint, cli_args=given).policy
+    if begun is None or asked is None:
+        return
+    for name, value, held in differing(asked, begun, getattr(begun, "kept_since_begun", ())):
+        raise MemobenchError(
+            f"this training was begun with {name}={held}, and goes on with nothing else than that: found {value}; "
+            f"leave {name} out, or train a new run from the checkpoint: policy={checkpoint} policy.{name}={value} "
+            "output_dir=<new folder>"
+        )
+
+
+def _check_same_dataset(settings: LerobotSettings, checkpoint: Path) -> None:
+    """Refuse to go on with a training on another dataset, or on other episodes of it."""
+    begun = read_json(checkpoint / TRAIN_CONFIG).get("dataset") or {}
+    root, repository = settings.get("dataset.root"), settings.get("dataset.repo_id")
+    held = str(begun.get("root") or begun.get("repo_id"))
+    advice = f"leave that out, or train a new run from the checkpoint: policy={checkpoint} output_dir=<new folder>"
+    same = root is not None and begun.get("root") is not None and _place(root) == _place(begun["root"])
+    if not same and (root is not None or repository not in (None, begun.get("repo_id"))):
+        moved = begun.get("root") is not None and not Path(held).expanduser().exists()
+        raise MemobenchError(
+            f"this training was begun on the dataset {held}, and {root or repository} was asked for; "
+            + (f"if that is the same, put it or a link to it at {held}; else " if moved else "")
+            + advice
+        )
+    for name in ("episodes", "revision"):
+        told = settings.get(f"dataset.{name}")
+        if told is not None and yaml.safe_load(told) != begun.get(name):
+            raise MemobenchError(
+                f"this training was begun with dataset.{name}={begun.get(name)}, and {told} was asked for; {advice}"
+            )
+
+
+def _place(folder: str) -> Path:
+    return Path(folder).expanduser().resolve()
+
+
+def told_of_starting_from(settings: LerobotSettings) -> str | None:
+    """Return what is said of a training that begins from a checkpoint under other settings than its weights were
+    trained for, which fine-tuning may mean; None: nothing.
+    """
+    path = settings.get("policy.path")
+    policy = None if path is None else policy_config(settings)
+    if path is None or policy is None:
+        return None
+    fixed = getattr(policy, "fixed_by_training", ())
+    with quiet():
+        changed = list(differing(policy, as_trained(path, policy), fixed)) if fixed else []
+    if not changed:
+        return None
+    was, now = (", ".join(f"{item[0]}={item[part]}" for item in changed) for part in (2, 1))
+    return f"note: '{path}' was trained with {was}, and its weights are now trained on with {now}"
+
+
+def told_of_going_on(settings: LerobotSettings) -> tuple[str | None, bool]:
+    """Return what is said of a training that goes on (None: nothing), and whether anything is left to be done."""
+    checkpoint = _gone_on_with(settings)
+    if checkpoint is None:
+        return None, True
+    steps = whole_number(settings.get("steps"))
+    total, done = (
+        steps or whole_number(str(read_json(checkpoint / TRAIN_CONFIG).get("steps"))),
+        step_reached(checkpoint),
+    )
+    if total is not None and done >= total:
+        return (
+            f"the training in {checkpoint.parents[2]} has made all of its {done} steps; ask for more by steps=",
+            False,
+        )
+    return schedule_told(checkpoint, steps), True
+
+
+def how_to_go_on(settings: LerobotSettings, words: Sequence[str], begun: float) -> str:
+    """Return what is said when a training is ended from outside: the command that goes on with its last checkpoint.
+
+    Args:
+        words: of its command line, after ``lerobot train``.
+        begun: when it began, seconds since the epoch: LeRobot itself names a folder that was not named.
+    """
+    given = settings.get("output_dir")
+    runs = [Path(given)] if given is not None else list(Path("outputs/train").glob("*/*"))
+    links = [run / "checkpoints" / "last" for run in runs]
+    saved = [link for link in links if link.exists() and (given is not None or link.lstat().st_mtime >= begun)]
+    if not saved:
+        again = shlex.join(["lerobot", "train", *words])
+        return f"ended by SIGTERM before a checkpoint was saved; begin anew with: {again}"
+    run = max(saved, key=lambda link: link.lstat().st_mtime).parents[1]
+    # LeRobot's configuration has no place for these.
+    kept = [word for word in words if word.partition("=")[0] in TRAINING_WORDS]
+    return (
+        f"ended by SIGTERM; go on with: {shlex.join(['lerobot', 'train', f'output_dir={run}', 'resume=true', *kept])}"
+    )
+
+
+def step_reached(checkpoint: Path) -> int:
+    """Return after how many steps a checkpoint was saved."""
+    return int(read_json(checkpoint.parent / TRAINING_STEP)["step"])
+
+
+def complete_training(settings: LerobotSettings) -> LerobotSettings:
+    """Return a training run's settings with the benchmark's defaults; what is wrong with them is told here.
+
+    Raises:
+        MemobenchError: no policy is named, or the dataset or the checkpoint is none.
+    """
+    from_file = settings.has("config_path")
+    if not from_file:
+        if not any(settings.has(key) for key in TRAINED):
+            raise MemobenchError("name a policy: policy=memobench_mem")
+        settings = with_places(settings)
+    check_dataset(settings)
+    check_as_begun(settings)
+    policy = policy_config(settings)
+    check_sight(policy, env_config(settings))
+    if settings.get("resume") != "true":
+        settings = with_logging(settings)
+    if not from_file and getattr(policy, "decodes_nothing", False):
+        settings = settings.default("batch_size", OBJECT_BATCH).default("num_workers", 0)
+    if cores() < 4 and not from_file:  # LeRobot's default of 4 loaders would only wait for one another
+        settings = settings.default("num_workers", cores())
+    return settings
+
+
+def with_places(settings: LerobotSettings) -> LerobotSettings:
+    """Return settings that name the dataset; without a repository to push to, which LeRobot would ask for."""
+    settings = settings.default("dataset.repo_id", DEFAULT_REPO_ID)
+    if not settings.has("policy.repo_id") and (settings.has("policy.type") or settings.has("policy.path")):
+        settings = settings.default("policy.push_to_hub", False)
+    return settings
+
+
+def check_dataset(settings: LerobotSettings) -> None:
+    """Refuse a dataset folder that is none."""
+    root = settings.get("dataset.root")
+    if root is None:
+        return
+    folder = Path(root).expanduser()
+    local_only = (settings.get("dataset.repo_id") or "").startswith("local/")
+    if not folder.exists() and not local_only:
+        return  # LeRobot downloads the repository into it
+    if not folder.is_dir():
+        raise MemobenchError(
+            f"the dataset folder {root} does not exist; make one with `memobench generate --out {root}`"
+        )
+    if not (folder / INFO_FILE).is_file():
+        raise MemobenchError(
+            f"the folder {root} is not a LeRobot dataset ({INFO_FILE} is missing); make one with "
+            "`memobench generate --out <folder>`"
+        )
+
+
+def with_logging(settings: LerobotSettings) -> LerobotSettings:
+    """Return settings that log a short run often enough to see its loss: LeRobot's default is every 200 steps."""
+    steps = settings.get("steps")
+    if steps is not None and steps.isdigit() and int(steps) < 2000:
+        return settings.default("log_freq", max(1, int(steps) // 10))
+    return settings

@@ -1,1 +1,0 @@
-"""What may be said on a command line, and what does it mean to LeRobot?"""

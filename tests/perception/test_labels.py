@@ -1,0 +1,91 @@
+"""Labels are what the picture shows: held against rays, against the camera's mathematics and against colours."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+import pytest
+
+from lerobot_memobench.perception.kinds import kinds
+from lerobot_memobench.perception.labels import MASK, Labeller, projected, rays
+from lerobot_memobench.perception.tower import SIDE
+from lerobot_memobench.sim.assets.builder import VISUAL_GROUP
+from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
+
+from .conftest import BOWLS, DRAWERS
+
+Simulate = Callable[[str], Simulation]
+
+
+@pytest.mark.parametrize("camera", MJCF_CAMERAS)
+def test_geoms_are_those_that_rays_meet(gl: str, simulate: Simulate, camera: str) -> None:
+    sim = simulate(DRAWERS)
+    geoms, row = sim.geoms(camera), Labeller(sim).look(camera)
+    group, hit = np.zeros(6, np.uint8), np.zeros(1, np.int32)
+    group[VISUAL_GROUP] = 1
+    pixels = np.random.default_rng(0).integers(0, 256, (400, 2))
+    sights = rays((pixels[:, ::-1] + 0.5) / 256, row)
+    met = []
+    for sight in sights:
+        mujoco.mj_ray(sim.model, sim.data, row["eye"].astype(float), sight, group, 1, -1, hit, None)
+        met.append(int(hit[0]))
+    assert (geoms[pixels[:, 0], pixels[:, 1]] == met).mean() > 0.98  # but for some on edges
+
+
+def test_drawing_geoms_leaves_pictures_as_they_are(gl: str, simulate: Simulate) -> None:
+    sim = simulate(BOWLS)
+    before = sim.render()
+    sim.data.joint("butter_1_joint0").qpos[0] += 0.1
+    mujoco.mj_fwdPosition(sim.model, sim.data)
+    sim.geoms()
+    moved = sim.render()
+    sim.data.joint("butter_1_joint0").qpos[0] -= 0.1
+    mujoco.mj_fwdPosition(sim.model, sim.data)
+    assert (sim.render() == before).all()
+    assert (moved != before).any()
+
+
+@pytest.mark.parametrize("camera", MJCF_CAMERAS)
+def test_the_mask_covers_what_is_projected(gl: str, simulate: Simulate, camera: str) -> None:
+    """Butter is convex and lies free: its origin projects to the middle of what shows it."""
+    sim = simulate(BOWLS)
+    row = Labeller(sim).look(camera)
+    butter = kinds().index("butter")
+    (thing,) = (thing for thing in row["things"][: row["count"]] if thing["kind"] == butter)
+    place, depth = projected(sim.body_pose("butter_1")[0], row)
+    assert np.abs(place - thing["anchor"]).max() < 2 / SIDE
+    x, y = (place * MASK).astype(int)
+    assert row["mask"][y, x] == butter + 1
+    cells = (row["mask"] == butter + 1).sum() * (256 / MASK) ** 2
+    assert cells == pytest.approx(thing["pixels"], rel=0.5)
+    assert 0.05 < depth < 1.5
+
+
+def test_rays_undo_projection(gl: str, simulate: Simulate) -> None:
+    sim = simulate(BOWLS)
+    row = Labeller(sim).look("agentview")
+    points = row["things"]["position"][: row["count"]].astype(float)
+    places, depths = projected(points, row)
+    assert np.allclose(row["eye"] + rays(places, row) * depths[:, None], points, atol=1e-6)
+
+
+def test_drawers_are_told_apart_and_say_how_far_they_are_open(gl: str, simulate: Simulate) -> None:
+    sim = simulate(DRAWERS)
+    sim.data.joint("wooden_cabinet_1_middle_level").qpos[0] = -0.1
+    mujoco.mj_fwdPosition(sim.model, sim.data)
+    row = Labeller(sim).look("agentview")
+    joints = {kinds()[thing["kind"]]: thing["joint"] for thing in row["things"][: row["count"]]}
+    assert joints["middle_drawer"] == pytest.approx(-0.1)
+    assert joints["top_drawer"] == pytest.approx(0.005, abs=0.004)
+    assert np.isnan(joints["wooden_cabinet"])
+
+
+def test_what_is_out_of_sight_is_not_labelled(gl: str, simulate: Simulate) -> None:
+    sim = simulate(BOWLS)
+    sim.data.joint("butter_1_joint0").qpos[2] = -3
+    mujoco.mj_fwdPosition(sim.model, sim.data)
+    row = Labeller(sim).look("agentview")
+    assert kinds().index("butter") not in row["things"]["kind"][: row["count"]]
+    assert kinds().index("akita_black_bowl") in row["things"]["kind"][: row["count"]]

@@ -1,0 +1,67 @@
+"""Pictures on disk: made once, the same again, and refused where they are not what they should be."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.perception.pictures import NAMES, PER_MOMENT, Pictures, Shard, make_pictures
+from lerobot_memobench.perception.school import TESTED, TRAINED, Lessons
+from tests.support.made_up import made_up
+
+from .conftest import BOWLS
+
+
+def test_an_episode_is_made_once_and_the_same_again(gl: str, tmp_path: Path) -> None:
+    pictures = make_pictures(tmp_path, [BOWLS], [20_000], 2)
+    assert PER_MOMENT <= len(pictures) <= 2 * PER_MOMENT
+    (file,) = tmp_path.glob("*.npy")
+    first = file.read_bytes()
+    made = file.stat().st_mtime_ns
+    make_pictures(tmp_path, [BOWLS], [20_000], 2)
+    assert file.stat().st_mtime_ns == made
+    again = Shard(BOWLS, 20_000, tmp_path / "again.npy", 2)
+    again.run()
+    assert again.folder.read_bytes() == first
+    rows = pictures.rows([0, 1])
+    assert rows["camera"].tolist() == [0, 1]
+    assert (rows["count"] > 0).all()
+
+
+def test_files_are_read_as_one(tmp_path: Path) -> None:
+    rows = made_up(5)
+    for name, part in (("a", rows[:2]), ("b", rows[2:])):
+        np.save(tmp_path / f"{name}.npy", part)
+    pictures = Pictures([tmp_path / "a.npy", tmp_path / "b.npy"])
+    assert len(pictures) == 5
+    assert (pictures.rows([4, 1, 2])["pixels"] == rows["pixels"][[4, 1, 2]]).all()
+
+
+@pytest.mark.parametrize("content", [b"", b"not an array"])
+def test_damaged_files_are_named(tmp_path: Path, content: bytes) -> None:
+    file = tmp_path / "damaged.npy"
+    file.write_bytes(content)
+    with pytest.raises(MemobenchError, match="damaged"):
+        Pictures([file])
+
+
+def test_other_arrays_are_no_pictures(tmp_path: Path) -> None:
+    np.save(tmp_path / "other.npy", np.zeros(3))
+    with pytest.raises(MemobenchError, match="no pictures of this version"):
+        Pictures([tmp_path / "other.npy"])
+
+
+def test_a_folder_of_other_kinds_is_refused(tmp_path: Path) -> None:
+    (tmp_path / NAMES).write_text(json.dumps(["sock"]))
+    with pytest.raises(MemobenchError, match="other kinds"):
+        make_pictures(tmp_path, [BOWLS], [20_000], 1)
+
+
+@pytest.mark.parametrize(("first", "allowed"), [(7, TRAINED), (39_999, TRAINED), (20_000, TESTED)])
+def test_seeds_of_training_test_and_evaluation_are_apart(tmp_path: Path, first: int, allowed: range) -> None:
+    with pytest.raises(MemobenchError, match="seeds"):
+        Lessons([BOWLS], first, 2, 1).pictures(tmp_path, allowed, None)

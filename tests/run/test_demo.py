@@ -1,0 +1,137 @@
+"""What the demo makes of an evaluation; the evaluation itself is LeRobot's and is replaced here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+from lerobot_memobench.envs.episode_log import write_episodes
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.documents.html import write_html
+from lerobot_memobench.run import contact_sheet as sheets
+from lerobot_memobench.run import demo, memory_demo
+from lerobot_memobench.tasks.catalogue import BOWL, get_task
+from tests.support.logs import rollout
+
+
+def write_video(path: Path, frames: int = 12) -> None:
+    """A video whose brightness rises from black to white."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=20)
+        stream.width, stream.height, stream.pix_fmt = 128, 64, "yuv420p"
+        for k in range(frames):
+            image = np.full((64, 128, 3), 255 * k // (frames - 1), dtype=np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode())
+
+
+def fake_evaluation(output: Path) -> int:
+    for name in demo.TASKS:
+        write_video(output / "videos" / f"{name}.0.mp4")
+    for name in ("episodes.jsonl", "report.json", "report.md", "protocol.json", "card.json", "card.md"):
+        (output / name).write_text(name)
+    return 0
+
+
+def fake_comparison(work: Path, made: Path) -> None:
+    made.mkdir(parents=True)
+    for name in (memory_demo.MEMORY_FILM, memory_demo.MEMORY_STRIP, memory_demo.MEMORY_TABLE):
+        (made / name).write_text(name)
+
+
+def test_one_task_of_each_memory_type() -> None:
+    assert [get_task(name).memory_type for name in demo.TASKS] == ["temporal", "spatial", "object", "procedural"]
+
+
+def test_the_demo_folder(tmp_path: Path) -> None:
+    out = tmp_path / "outputs" / "demo"
+    (out / "videos").mkdir(parents=True)
+    (out / "videos" / "old.mp4").write_text("")
+    (out / "notes.txt").write_text("the user's own")
+    assert demo.make_demo(out, fake_evaluation, fake_comparison) == 0
+    assert {path.name for path in out.iterdir()} == {*demo.PRODUCTS, "notes.txt"}
+    assert {path.name for path in (out / "videos").iterdir()} == {f"{name}.0.mp4" for name in demo.TASKS}
+    with Image.open(out / "contact_sheet.png") as sheet:
+        pixels = np.asarray(sheet.convert("L")).astype(int)
+    assert pixels.shape == (4 * 160, sheets.FRAMES_PER_VIDEO * sheets.COLUMN_WIDTH)
+    means = pixels[:160].reshape(160, sheets.FRAMES_PER_VIDEO, -1).mean(axis=(0, 2))
+    assert (np.diff(means) > 20).all()  # evenly spaced in time, left to right
+
+
+def test_the_html_report_finds_the_demos_films(tmp_path: Path) -> None:
+    def evaluate(output: Path) -> int:
+        fake_evaluation(output)
+        write_episodes(output, [rollout(name, "temporal", "", [], True, 0) for name in demo.TASKS])
+        return 0
+
+    demo.make_demo(tmp_path / "demo", evaluate, fake_comparison)
+    for name in ("card.json", "protocol.json"):  # of a fake evaluation: none
+        (tmp_path / "demo" / name).unlink()
+    written = write_html([tmp_path / "demo"], tmp_path / "html")
+    assert written.videos == len(demo.TASKS)
+    assert not written.notes
+
+
+def test_a_failed_evaluation_leaves_the_earlier_demo(tmp_path: Path) -> None:
+    (tmp_path / "report.json").write_text("earlier")
+    assert demo.make_demo(tmp_path, lambda output: 3, fake_comparison) == 3
+    assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
+
+
+def test_a_failed_comparison_leaves_the_earlier_demo(tmp_path: Path) -> None:
+    (tmp_path / "report.json").write_text("earlier")
+    with pytest.raises(MemobenchError, match="the evaluation expert has failed"):
+        demo.make_demo(tmp_path, fake_evaluation, lambda *where: memory_demo.compare_memories(*where, lambda *_: 2))
+    assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
+
+
+def test_the_memories_are_compared_on_the_same_episodes(tmp_path: Path) -> None:
+    wrong, other = "reference_drift", "storage_failure"
+    failed = {"expert": {}, "with memory": {3: wrong}, "without memory": {1: wrong, 2: wrong, 3: other}}
+
+    def evaluate(name: str, folder: Path) -> int:
+        ends = [failed[name].get(k) for k in range(5)]
+        write_episodes(
+            folder, [rollout(BOWL, "object", "S", [not end], not end, k, failure=end) for k, end in enumerate(ends)]
+        )
+        write_video(folder / "videos" / f"{BOWL}.1.mp4")  # the first on which they differ
+        return 0
+
+    told = memory_demo.compare_memories(tmp_path / "work", tmp_path / "made", evaluate)
+    assert [one.solved for one in told.values()] == [
+        (True, True, True, True, True),
+        (True, True, True, False, True),
+        (True, False, False, False, True),
+    ]
+    assert "| without memory | 2/5 | 2 |" in (tmp_path / "made" / memory_demo.MEMORY_TABLE).read_text()
+    frames = sheets.read_video(tmp_path / "made" / memory_demo.MEMORY_FILM)
+    assert frames[0].shape[1] == 3 * 128, "three films side by side"
+
+
+def test_what_is_compared_differs_in_the_policy_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory_demo, "plan_line", lambda words: words)
+    told = [memory_demo.memory_plan(name, tmp_path) for name in memory_demo.WHO]
+    others = [[word for word in words if not word.startswith("policy=")] for words in told]
+    assert others[0] == others[1] == others[2]
+    assert [len(words) - len(rest) for words, rest in zip(told, others, strict=True)] == [0, 1, 1]
+
+
+def test_without_trained_policies_the_demo_is_the_experts(tmp_path: Path) -> None:
+    (tmp_path / memory_demo.MEMORY_TABLE).write_text("of an earlier demo")
+    assert demo.make_demo(tmp_path, fake_evaluation, None) == 0
+    assert not {path.name for path in tmp_path.iterdir()} & {memory_demo.MEMORY_FILM, memory_demo.MEMORY_TABLE}
+
+
+def test_a_missing_video_is_named(tmp_path: Path) -> None:
+    with pytest.raises(MemobenchError, match=demo.TASKS[0]):
+        demo.collect_videos(tmp_path, tmp_path / "videos")
+
+
+def test_even_distances_hold_both_ends() -> None:
+    frames = [np.full((1, 1, 3), k, dtype=np.uint8) for k in range(11)]
+    assert [int(frame[0, 0, 0]) for frame in sheets.evenly(frames, 3)] == [0, 5, 10]

@@ -1,0 +1,232 @@
+"""The loop over steps that spares pictures: the same episodes as LeRobot's, action for action, with fewer pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import FeatureType
+from lerobot.envs import make_env_pre_post_processors
+from lerobot.policies import make_pre_post_processors
+from lerobot.scripts import lerobot_eval
+
+from lerobot_memobench.envs import episode
+from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.envs.obs_types import BOTH, OBJECTS, PIXELS
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.run.loop.rollout import sparing
+from lerobot_memobench.sim.object_layout import SIZE
+from lerobot_memobench.sim.rendering import close_renderers, gl_backend
+
+HIGHLIGHT = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
+PROMPT, HORIZON, PLAN = 6, 9, 4
+STATISTICS = {
+    key: {"mean": torch.full((size,), 0.1), "std": torch.full((size,), 0.7), "min": -torch.ones(size)}
+    | {"max": torch.ones(size), "q01": -torch.ones(size), "q99": torch.ones(size)}
+    for key, size in (("observation.state", 8), ("observation.environment_state", SIZE), ("action", 7))
+}
+
+
+@pytest.fixture(autouse=True)
+def short_prompts(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Skip without a GL library; cut prompt videos off after some steps."""
+    try:
+        gl_backend()
+    except MemobenchError as error:
+        pytest.skip(str(error))
+    monkeypatch.setattr(episode, "PROMPT_LIMIT", PROMPT)
+    yield
+    close_renderers()
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The step of each observation whose pictures are drawn."""
+    steps: list[int] = []
+    draw = episode.Episode.images
+
+    def images(self: episode.Episode) -> Any:
+        steps.append(self.step_index)
+        return draw(self)
+
+    monkeypatch.setattr(episode.Episode, "images", images)
+    return steps
+
+
+def configured(name: str, config: MemobenchEnvConfig, **fields: Any) -> tuple[Any, Any]:
+    """A policy with random weights and its configuration, made for the environment's features."""
+    from lerobot.envs import env_to_policy_features
+    from lerobot.policies.factory import get_policy_class, make_policy_config
+
+    import lerobot_memobench.registration  # noqa: F401
+
+    features = env_to_policy_features(config)
+    settings = make_policy_config(name, device="cpu", push_to_hub=False, **fields)
+    settings.output_features = {key: part for key, part in features.items() if part.type is FeatureType.ACTION}
+    settings.input_features = {key: part for key, part in features.items() if key not in settings.output_features}
+    torch.manual_seed(0)
+    return get_policy_class(name)(settings), settings
+
+
+def rolled(
+    rollout: Any, rows: int, log: Path, name: str, films: int = 0, obs_type: str = PIXELS, **fields: Any
+) -> dict[str, torch.Tensor]:
+    """Return what a rollout of a fresh policy in fresh environments returns."""
+    torch.manual_seed(7)
+    config = MemobenchEnvConfig(
+        tasks=HIGHLIGHT,
+        horizon=HORIZON,
+        render="fast",
+        expert_action=name == "memobench_expert",
+        log_dir=str(log),
+        films=films,
+        obs_type=obs_type,
+    )
+    ((env,),) = (suite.values() for suite in config.create_envs(rows).values())
+    policy, settings = configured(name, config, **fields)
+    before, after = make_pre_post_processors(settings, dataset_stats=STATISTICS)
+    env_before, env_after = make_env_pre_post_processors(env_cfg=config, policy_cfg=settings)
+    try:
+        found: dict[str, torch.Tensor] = rollout(
+            env=env,
+            policy=policy.eval(),
+            env_preprocessor=env_before,
+            env_postprocessor=env_after,
+            preprocessor=before,
+            postprocessor=after,
+            seeds=list(range(7, 7 + rows)),
+            render_callback=None,
+        )
+    finally:
+        env.close()
+    return found
+
+
+ACT = {"dim_model": 32, "n_heads": 2, "dim_feedforward": 64, "n_encoder_layers": 1, "n_vae_encoder_layers": 1}
+ACT |= {"chunk_size": PLAN, "n_action_steps": PLAN, "latent_dim": 8, "pretrained_backbone_weights": None}
+MEMORY = {"chunk_size": PLAN, "n_action_steps": PLAN, "num_inference_steps": 1, "memory_frames": 4}
+FIRST, LAST = PROMPT, PROMPT + HORIZON
+"""Of the execution, which are always drawn."""
+
+CASES: dict[str, tuple[str, dict[str, Any], list[int]]] = {
+    "expert": ("memobench_expert", {}, [0, FIRST, LAST]),
+    "random": ("memobench_random", {}, [0, FIRST, LAST]),
+    "memory": ("memobench_mem", MEMORY, list(range(LAST + 1))),
+    "memory of every fourth": ("memobench_mem", {**MEMORY, "memory_stride": 4}, [0, 4, FIRST, 8, 10, 12, 14, LAST]),
+    "no memory": ("memobench_mem", {**MEMORY, "integration": "none"}, [0, FIRST, 10, 14, LAST]),
+}
+
+
+@pytest.mark.parametrize("rows", [1, 3])
+@pytest.mark.parametrize("case", [*CASES, "act"])
+def test_a_rollout_is_lerobots(case: str, rows: int, drawn: list[int], tmp_path: Path) -> None:
+    name, fields, looked = CASES.get(case, ("act", ACT, []))
+    theirs = rolled(lerobot_eval.rollout, rows, tmp_path / "theirs", name, **fields)
+    everything = len(drawn)
+    drawn.clear()
+    ours = rolled(sparing(lerobot_eval.rollout, lambda: True), rows, tmp_path / "ours", name, **fields)
+    assert list(ours) == list(theirs)
+    for key, values in theirs.items():
+        assert ours[key].dtype == values.dtype, key
+        assert torch.equal(ours[key], values), key
+    assert bool(theirs["action"].any())
+    assert everything == rows * (theirs["action"].shape[1] + 1)
+    if case in CASES:
+        assert sorted(drawn) == sorted(rows * looked)
+    else:  # whether it sees the prompt is the environment's to say
+        assert len(drawn) < everything
+
+
+@pytest.fixture
+def found(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The step of each observation whose objects are looked for."""
+    steps: list[int] = []
+    look = episode.Episode.objects
+
+    def objects(self: episode.Episode) -> Any:
+        steps.append(self.step_index)
+        return look(self)
+
+    monkeypatch.setattr(episode.Episode, "objects", objects)
+    return steps
+
+
+DIFFUSION = {"down_dims": (16, 32), "num_inference_steps": 2, "horizon": 8, "n_groups": 4, "n_action_steps": PLAN}
+DIFFUSION |= {"diffusion_step_embed_dim": 16, "crop_shape": (84, 84), "pretrained_backbone_weights": None}
+
+
+@pytest.mark.parametrize("obs_type", [OBJECTS, BOTH])
+@pytest.mark.parametrize(
+    ("name", "fields", "spares"),
+    [
+        ("act", ACT, True),
+        ("diffusion", DIFFUSION, False),
+        ("memobench_expert", {}, True),
+        ("memobench_random", {}, True),
+    ],
+)
+def test_a_rollout_on_objects_is_lerobots(
+    name: str, fields: dict[str, Any], spares: bool, obs_type: str, drawn: list[int], found: list[int], tmp_path: Path
+) -> None:
+    theirs = rolled(lerobot_eval.rollout, 2, tmp_path / "theirs", name, obs_type=obs_type, **fields)
+    everything = 2 * (theirs["action"].shape[1] + 1)
+    assert len(found) == everything
+    assert len(drawn) == (0 if obs_type == OBJECTS else everything)
+    found.clear()
+    ours = rolled(sparing(lerobot_eval.rollout, lambda: True), 2, tmp_path / "ours", name, obs_type=obs_type, **fields)
+    for key, values in theirs.items():
+        assert torch.equal(ours[key], values), key
+    assert bool(theirs["action"].any())
+    assert (len(found) < everything) == spares
+
+
+def test_a_memory_of_pictures_refuses_to_be_shown_objects_alone(tmp_path: Path) -> None:
+    with pytest.raises(MemobenchError, match=r"no picture, .* set env.obs_type=pixels_agent_pos, or"):
+        rolled(lerobot_eval.rollout, 1, tmp_path, "memobench_mem", obs_type=OBJECTS, **MEMORY)
+
+
+@pytest.mark.parametrize("use_async", [False, True])
+def test_what_nobody_watches_is_not_drawn(use_async: bool, tmp_path: Path) -> None:
+    """By the word of a vector environment, in this process or in workers, until the next reset."""
+    config = MemobenchEnvConfig(tasks=HIGHLIGHT, prompt_video=False, render="fast", log_dir=str(tmp_path))
+    ((env,),) = (suite.values() for suite in config.create_envs(2, use_async).values())
+    move = np.full((2, 7), 0.7, np.float32)
+    try:
+        for _ in range(2):
+            first = env.reset(seed=[7, 8], options={lerobot_eval.NEW_ROLLOUT_OPTION: True})[0]["pixels"]["wrist_image"]
+            seen = env.step(move)[0]["pixels"]["wrist_image"].copy()
+            assert (seen != first).any()
+            env.call("watch", False)
+            np.testing.assert_array_equal(env.step(move)[0]["pixels"]["wrist_image"], seen)
+            env.call("watch", True)
+            assert (env.step(move)[0]["pixels"]["wrist_image"] != seen).any()
+            env.call("watch", False)
+    finally:
+        env.close()
+
+
+def test_a_filmed_episode_is_drawn_whole(drawn: list[int], tmp_path: Path) -> None:
+    """Two of three episodes are filmed, whoever looks."""
+    from lerobot_memobench.envs.film import LAST_FRAMES
+    from lerobot_memobench.evaluation.documents.html.videos import frame_count
+
+    rolled(sparing(lerobot_eval.rollout, lambda: True), 3, tmp_path, "memobench_random", films=2)
+    films = sorted((tmp_path / "videos").iterdir())
+    assert [film.name for film in films] == [f"{HIGHLIGHT}.0.mp4", f"{HIGHLIGHT}.1.mp4"]
+    assert {frame_count(film) for film in films} == {LAST + 1 + LAST_FRAMES}
+    assert len(drawn) == 2 * (LAST + 1) + 3
+
+
+def test_the_command_draws_and_films_no_more_than_asked(drawn: list[int], tmp_path: Path) -> None:
+    from lerobot_memobench.cli.lerobot import main
+
+    words = [f"tasks={HIGHLIGHT}", "episodes=2", "batch_size=1", f"horizon={HORIZON}", "env.render=fast", "films=1"]
+    assert main(["eval", "env=memobench", *words, f"output_dir={tmp_path}"]) == 0
+    assert [path.relative_to(tmp_path / "videos") for path in (tmp_path / "videos").rglob("*")] == [
+        Path(f"{HIGHLIGHT}.0.mp4")
+    ]
+    assert len(drawn) == LAST + 1 + 3

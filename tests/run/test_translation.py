@@ -1,0 +1,200 @@
+"""key=value becomes LeRobot's flags; what is unknown is named with what is near."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from lerobot.configs.eval import EvalPipelineConfig
+from lerobot.configs.train import TrainPipelineConfig
+
+import lerobot_memobench.registration  # noqa: F401
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.run.recipes import recipe_file, recipes
+from lerobot_memobench.run.translation import LerobotSettings, translate
+from lerobot_memobench.run.words import split_words
+
+
+def evaluated(*words: str) -> list[str]:
+    return list(translate("eval", split_words(words), EvalPipelineConfig, {}).flags)
+
+
+def trained(*words: str) -> list[str]:
+    return list(translate("train", split_words(words), TrainPipelineConfig, {}).flags)
+
+
+def test_the_commands_of_the_readme() -> None:
+    assert evaluated("env=memobench") == ["--env.type=memobench"]
+    assert trained("policy=memobench_mem", "align=contrastive") == [
+        "--policy.type=memobench_mem",
+        "--policy.align=contrastive",
+    ]
+
+
+def test_short_forms_of_eval() -> None:
+    flags = evaluated(
+        "env=memobench", "policy=memobench_mem", "tasks=object,spatial", "episodes=3", "replan=20", "batch_size=2",
+        "referent=random", "seed=9", "device=cpu", "horizon=50", "prompt_video=False",
+    )  # fmt: skip
+    assert flags == [
+        "--env.type=memobench",
+        "--policy.type=memobench_mem",
+        "--env.tasks=object,spatial",
+        "--eval.n_episodes=3",
+        "--policy.n_action_steps=20",
+        "--env.replan_steps=20",
+        "--eval.batch_size=2",
+        "--env.referent=random",
+        "--seed=9",
+        "--policy.device=cpu",
+        "--env.horizon=50",
+        "--env.prompt_video=false",
+    ]
+
+
+def test_replan_is_only_told_to_whom_it_concerns() -> None:
+    assert evaluated("env=memobench", "policy=memobench_expert", "replan=5")[2:] == ["--env.replan_steps=5"]
+    assert trained("policy=memobench_mem", "replan=5")[1:] == ["--policy.n_action_steps=5"]
+
+
+def test_short_forms_of_train() -> None:
+    flags = trained("policy=act", "dataset=user/name", "steps=50", "batch_size=4", "seed=1")
+    assert flags == [
+        "--policy.type=act",
+        "--dataset.repo_id=user/name",
+        "--steps=50",
+        "--batch_size=4",
+        "--seed=1",
+    ]
+
+
+def test_dotted_keys_and_untouched_flags() -> None:
+    flags = evaluated(
+        "--env.type=memobench", "--policy.type", "act", "eval.use_async_envs=false", "policy.chunk_size=10"
+    )
+    assert flags == [
+        "--env.type=memobench",
+        "--policy.type",
+        "act",
+        "--eval.use_async_envs=false",
+        "--policy.chunk_size=10",
+    ]
+
+
+def test_the_order_of_words_does_not_matter() -> None:
+    assert "--policy.align=semantic" in trained("align=semantic", "policy=memobench_mem")
+
+
+def test_none_is_a_word_for_text_and_nothing_for_numbers() -> None:
+    assert trained("policy=memobench_mem", "align=none")[1:] == ["--policy.align=none"]
+    assert trained("policy=act", "seed=None", "job_name=null")[1:] == ["--seed=null", "--job_name=null"]
+
+
+def test_a_checkpoint_folder_is_a_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
+    folder.mkdir(parents=True)
+    (folder / "config.json").write_text(json.dumps({"type": "act"}))
+    assert evaluated("env=memobench", f"policy={folder}")[1] == f"--policy.path={folder}"
+    assert evaluated("env=memobench", f"policy={tmp_path / 'run'}")[1] == f"--policy.path={folder}"
+    monkeypatch.chdir(tmp_path / "run" / "checkpoints" / "last")
+    flags = evaluated("env=memobench", "policy=pretrained_model", "policy.chunk_size=3")
+    assert flags[1:] == ["--policy.path=pretrained_model", "--policy.chunk_size=3"]
+
+
+def test_a_name_with_a_slash_is_a_repository() -> None:
+    assert evaluated("env=memobench", "policy=lerobot/pi05_base")[1] == "--policy.path=lerobot/pi05_base"
+
+
+@pytest.mark.parametrize("holds_checkpoint", [True, False])
+def test_a_known_type_is_the_type_and_a_folder_is_a_path(
+    holds_checkpoint: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "act").mkdir()
+    if holds_checkpoint:
+        (tmp_path / "act" / "config.json").write_text(json.dumps({"type": "diffusion"}))
+    monkeypatch.chdir(tmp_path)
+    assert evaluated("env=memobench", "policy=act", "policy.chunk_size=3")[1] == "--policy.type=act"
+    notes = [record.getMessage() for record in caplog.records]
+    told = "policy=act is the policy type; the checkpoint in the folder of that name is policy=./act"
+    assert notes == [told] * holds_checkpoint
+    if holds_checkpoint:
+        assert evaluated("env=memobench", "policy=./act")[1] == "--policy.path=act"
+
+
+def test_a_recipe_is_the_recipe_and_a_file_is_a_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "train_paper").write_text("steps: 1")
+    monkeypatch.chdir(tmp_path)
+    assert recipe_file("train_paper") == recipes()["train_paper"]
+    assert "the file of that name is config=./train_paper" in caplog.text
+    assert recipe_file("./train_paper") == Path("train_paper")
+
+
+def test_a_dataset_folder_is_a_root(tmp_path: Path) -> None:
+    folder = tmp_path / "demos"
+    folder.mkdir()
+    assert trained("policy=act", f"dataset={folder}")[1:] == [
+        "--dataset.repo_id=local/demos",
+        f"--dataset.root={folder}",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["env=memobensh"], "there is no env 'memobensh', did you mean 'memobench'"),
+        (["env=memobench", "policy=memobench_men"], "'memobench_mem'"),
+        (["env=memobench", "episode=3"], "no setting 'episode', did you mean 'episodes'"),
+        (["env=memobench", "env.horizn=3"], "'env.horizon'"),
+        (["env=memobench", "policy=act", "policy.chunksize=3"], "'policy.chunk_size'"),
+        (["env=memobench", "--policy.type=atc"], "there is no policy 'atc', did you mean 'act'"),
+        (["env=memobench", "episodes=many"], "episodes=many: expected a whole number"),
+        (["env=memobench", "env.prompt_video=perhaps"], "expected true or false"),
+        (["env=memobench", "policy=act", "policy.dropout=x"], "expected a number"),
+        (["env=memobench", "policy=act", "align=semantic"], "ACTConfig"),
+        (["env=memobench", "align=semantic"], "name one with policy="),
+        (["policy=act", "env.horizon=3"], "needs env="),
+        (["env=memobench", "policy="], "policy= is empty"),
+        (["env=memobench", "policy=./nowhere"], "does not exist"),
+        (["env=memobench", "policy=/a/b/c"], "does not exist"),
+    ],
+)
+def test_what_is_unknown_is_named_with_what_is_near(words: list[str], message: str) -> None:
+    with pytest.raises(MemobenchError) as caught:
+        evaluated(*words)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_folder_that_is_no_checkpoint_is_named(tmp_path: Path) -> None:
+    with pytest.raises(MemobenchError, match=r"no checkpoint \(no config.json\)"):
+        evaluated("env=memobench", f"policy={tmp_path}")
+
+
+@pytest.mark.parametrize("name", ["./nowhere", "nowhere", "/a/b", "a/b/c"])
+def test_a_dataset_that_can_only_be_a_folder_must_be_there(name: str) -> None:
+    with pytest.raises(MemobenchError, match="no such folder"):
+        trained("policy=act", f"dataset={name}")
+
+
+def test_a_config_file_may_hold_the_choices() -> None:
+    file = {"policy": {"type": "memobench_mem"}, "env": {"type": "memobench"}}
+    settings = translate("train", split_words(["align=semantic", "env.horizon=3"]), TrainPipelineConfig, file)
+    assert list(settings.flags) == ["--policy.align=semantic", "--env.horizon=3"]
+
+
+def test_a_command_without_a_configuration_takes_any_key() -> None:
+    assert list(translate("dataset-viz", split_words(["repo-id=a/b"]), None, {}).flags) == ["--repo-id=a/b"]
+
+
+def test_what_is_added_never_overrides() -> None:
+    given = LerobotSettings(("--seed", "3"))
+    settings = given.default("seed", 7).default("env.expert_action", True)
+    assert list(settings.flags) == ["--seed", "3", "--env.expert_action=true"]
+    assert list(given.flags) == ["--seed", "3"]
+
+
+def test_what_is_changed_replaces_both_spellings() -> None:
+    assert list(LerobotSettings(("--seed", "3", "--x=1")).changed("seed", 5).flags) == ["--x=1", "--seed=5"]
