@@ -1,6 +1,6 @@
-"""The house as its imports make it: read from source, held to the order in docs/develop.md, drawn into the docs.
+"""The architecture as imports make it: read from source, held to the order in docs/develop.md, drawn into the docs.
 
-``python scripts/house.py`` draws docs/figures/house.svg anew; tests/test_house.py holds what docs/develop.md promises.
+``python scripts/architecture.py`` draws docs/figures/architecture.svg anew; tests/test_architecture.py holds what docs/develop.md promises.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src"
 PACKAGE = "lerobot_memobench"
 PLAN = ROOT / "docs" / "develop.md"
-PICTURE = ROOT / "docs" / "figures" / "house.svg"
+PICTURE = ROOT / "docs" / "figures" / "architecture.svg"
 
 Imports = Mapping[str, set[str]]
 """Module -> the modules of this project that it imports, dotted names, wherever in the file the import stands."""
@@ -169,7 +169,7 @@ def draw(picture: Path = PICTURE) -> None:
     import matplotlib
 
     matplotlib.use("Agg")
-    matplotlib.rcParams.update({"svg.hashsalt": "house", "svg.fonttype": "none", "font.family": "sans-serif"})
+    matplotlib.rcParams.update({"svg.hashsalt": "architecture", "svg.fonttype": "none", "font.family": "sans-serif"})
     from matplotlib import pyplot as plt
 
     found, questions = arrows(read_imports()), plan()

@@ -1,4 +1,4 @@
-"""What docs/develop.md promises of the house, read from the source: floors, circles, private names."""
+"""What docs/develop.md promises of the packages, read from the source: order, circles, private names."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ from collections.abc import Collection, Iterator
 
 from tests.support.scripts import load_script
 
-house = load_script("house")
-PACKAGE = house.PACKAGE
-IMPORTS = house.read_imports()
-TREES = {name: ast.parse(path.read_text()) for name, path in house.modules().items()}
+architecture = load_script("architecture")
+PACKAGE = architecture.PACKAGE
+IMPORTS = architecture.read_imports()
+TREES = {name: ast.parse(path.read_text()) for name, path in architecture.modules().items()}
 
 
 def test_the_plan_names_every_package() -> None:
-    listed = set(house.plan())
-    there = {house.package_of(name) for name in IMPORTS} - {""}
+    listed = set(architecture.plan())
+    there = {architecture.package_of(name) for name in IMPORTS} - {""}
     assert listed == there, "docs/develop.md lists the packages, lowest first"
 
 
 def test_imports_go_down_the_plan_only() -> None:
-    order = list(house.plan())
+    order = list(architecture.plan())
     upwards = [
         f"{name} imports {target}"
         for name, targets in IMPORTS.items()
         for target in targets
-        if house.package_of(name) and target != PACKAGE
-        if order.index(house.package_of(target)) > order.index(house.package_of(name))
+        if architecture.package_of(name) and target != PACKAGE
+        if order.index(architecture.package_of(target)) > order.index(architecture.package_of(name))
     ]
     assert not upwards
 
@@ -38,26 +38,26 @@ def test_what_is_imported_from_the_project_is_there() -> None:
     absent = [
         f"{name} imports {source}"
         for name, tree in TREES.items()
-        for source, _ in house.imported(tree)
+        for source, _ in architecture.imported(tree)
         if source.partition(".")[0] == PACKAGE and source not in known
     ]
     assert not absent
 
 
 def test_no_files_import_each_other_in_a_circle() -> None:
-    assert house.circle(IMPORTS) == []
+    assert architecture.circle(IMPORTS) == []
 
 
 def test_a_circle_is_found() -> None:
-    assert house.circle({"a": {"b"}, "b": {"c"}, "c": set()}) == []
-    assert set(house.circle({"a": {"b"}, "b": {"c"}, "c": {"b"}})) == {"b", "c"}
+    assert architecture.circle({"a": {"b"}, "b": {"c"}, "c": set()}) == []
+    assert set(architecture.circle({"a": {"b"}, "b": {"c"}, "c": {"b"}})) == {"b", "c"}
 
 
 def test_no_module_of_one_system_is_imported() -> None:
     """Each can be imported on Windows and macOS, whose users read reports and train without the simulator."""
     of_unix = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "syslog", "termios", "tty"}
     of_windows = {"_winapi", "msvcrt", "winreg"}
-    found = [(name, source) for name, tree in TREES.items() for source, _ in house.imported(tree)]
+    found = [(name, source) for name, tree in TREES.items() for source, _ in architecture.imported(tree)]
     assert [(name, source) for name, source in found if source in of_unix | of_windows] == []
 
 
@@ -109,15 +109,15 @@ def test_a_private_name_is_found() -> None:
 
 
 def test_the_picture_shows_the_imports_of_today() -> None:
-    wanted = {here: targets for here, targets in house.direct(house.arrows(IMPORTS)).items() if targets}
-    assert house.drawn() == wanted, "draw it anew: python scripts/house.py"
+    wanted = {here: targets for here, targets in architecture.direct(architecture.arrows(IMPORTS)).items() if targets}
+    assert architecture.drawn() == wanted, "draw it anew: python scripts/architecture.py"
 
 
 def test_the_pages_for_newcomers_name_what_is_there() -> None:
-    source, pages = house.SOURCE / PACKAGE, sorted((house.ROOT / "docs" / "develop").glob("*.md"))
+    source, pages = architecture.SOURCE / PACKAGE, sorted((architecture.ROOT / "docs" / "develop").glob("*.md"))
     assert len(pages) == 5
     for page in pages:
         assert page.name == "way_of_a_frame.md" or len(page.read_text().splitlines()) <= 40
         names = re.findall(r"`([\w/]+\.py)", page.read_text())
-        here = [house.ROOT, source, page.parent, *(path for path in source.rglob("*") if path.is_dir())]
+        here = [architecture.ROOT, source, page.parent, *(path for path in source.rglob("*") if path.is_dir())]
         assert [name for name in names if not any((base / name).is_file() for base in here)] == []
