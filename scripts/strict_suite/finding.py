@@ -8,7 +8,7 @@ from itertools import permutations
 from folders import Setting, Twin
 from words import CABINET, DRAWERS, Texts, region
 
-from lerobot_memobench.tasks.bddl.problem import Region
+from lerobot_memobench.tasks.bddl import Region
 from lerobot_memobench.tasks.formula import And, Atom, Formula, Never, Not, Or
 from lerobot_memobench.tasks.task import Prompt
 

@@ -8,9 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.io import write_file
-from lerobot_memobench.tasks.bddl.problem import Region
-from lerobot_memobench.tasks.bddl.reading import parse_bddl
-from lerobot_memobench.tasks.bddl.writing import format_bddl
+from lerobot_memobench.tasks.bddl import Region, format_bddl, parse_bddl
 from lerobot_memobench.tasks.catalogue import CATALOGUE_DIR, get_task
 from lerobot_memobench.tasks.formula import Formula, to_lists
 from lerobot_memobench.tasks.task import BDDL_FILE, METADATA_FILE, STRICT, Prompt, Task

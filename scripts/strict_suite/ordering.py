@@ -8,7 +8,7 @@ from itertools import permutations
 from folders import Setting, Twin
 from words import DRAWERS, Texts, ready, region
 
-from lerobot_memobench.tasks.bddl.problem import Region
+from lerobot_memobench.tasks.bddl import Region
 from lerobot_memobench.tasks.formula import And, Atom, Exactly, Formula, Not, Or, Round, When
 
 BOWL, PAN, WHITE = "akita_black_bowl_1", "chefmate_8_frypan_1", "white_bowl_1"

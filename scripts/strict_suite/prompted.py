@@ -8,8 +8,8 @@ from itertools import pairwise
 from folders import Setting, Twin
 
 from lerobot_memobench.tasks.catalogue import get_task
-from lerobot_memobench.tasks.evaluator import HOLD_STEPS
 from lerobot_memobench.tasks.formula import And, Atom, Formula, Hold, Never, Or, Then, When, atoms
+from lerobot_memobench.tasks.progress import HOLD_STEPS
 from lerobot_memobench.tasks.task import Task
 
 REFERENTS = (

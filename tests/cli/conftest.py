@@ -10,7 +10,7 @@ import pytest
 
 from lerobot_memobench.envs.episode_log import EpisodeLog, has_log, read_episodes
 from lerobot_memobench.run.flags import flag_value
-from lerobot_memobench.tasks.loading import load_task
+from lerobot_memobench.tasks.catalogue import load_task
 
 
 class Killed(Exception):

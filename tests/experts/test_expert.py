@@ -22,9 +22,8 @@ from lerobot_memobench.experts.travel import PRESSED
 from lerobot_memobench.protocol import EXECUTION
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.evaluator import HOLD_STEPS
-from lerobot_memobench.tasks.formula import And, Atom, Then, atoms
-from lerobot_memobench.tasks.formula_parsing import parse_formula
+from lerobot_memobench.tasks.formula import And, Atom, Then, atoms, parse_formula
+from lerobot_memobench.tasks.progress import HOLD_STEPS
 from lerobot_memobench.tasks.task import Task
 
 STOVE = "turn_on_the_stove_and_turn_it_off"

@@ -9,8 +9,7 @@ from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.experts.plans import counts, plan_of
 from lerobot_memobench.protocol import EXECUTION
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.formula import Atom
-from lerobot_memobench.tasks.formula_parsing import parse_formula
+from lerobot_memobench.tasks.formula import Atom, parse_formula
 from lerobot_memobench.tasks.progress import Progress
 from lerobot_memobench.tasks.task import Task
 

@@ -11,7 +11,7 @@ import pytest
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.scene import TABLE
 from lerobot_memobench.sim.simulation import Simulation
-from lerobot_memobench.tasks.bddl.problem import Region
+from lerobot_memobench.tasks.bddl import Region
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import Atom
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.sim.simulation import NO_OP, Simulation
-from lerobot_memobench.tasks.loading import load_task
+from lerobot_memobench.tasks.catalogue import load_task
 from lerobot_memobench.tasks.progress import Progress
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"

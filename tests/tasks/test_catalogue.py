@@ -23,7 +23,7 @@ from lerobot_memobench.tasks import (
     task_number,
     task_record,
 )
-from lerobot_memobench.tasks.bddl.reading import parse_bddl
+from lerobot_memobench.tasks.bddl import parse_bddl
 from lerobot_memobench.tasks.formula import Then, atoms
 from lerobot_memobench.tasks.task import MEMORY_TYPES, SUITES
 

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lerobot_memobench.tasks.evaluator import HOLD_STEPS, Evaluator
 from lerobot_memobench.tasks.formula import (
     And,
     Atom,
@@ -18,9 +17,10 @@ from lerobot_memobench.tasks.formula import (
     Not,
     Or,
     Then,
+    parse_formula,
     to_lists,
 )
-from lerobot_memobench.tasks.formula_parsing import parse_formula
+from lerobot_memobench.tasks.progress import HOLD_STEPS, Evaluator
 
 A, B, C = Atom("on", ("a", "p")), Atom("on", ("b", "p")), Atom("open", ("d",))
 

@@ -15,8 +15,8 @@ from lerobot_memobench.tasks.formula import (
     Or,
     Then,
     format_formula,
+    parse_formula,
 )
-from lerobot_memobench.tasks.formula_parsing import parse_formula
 
 A, B, C = Atom("on", ("a", "p")), Atom("on", ("b", "p")), Atom("open", ("d",))
 

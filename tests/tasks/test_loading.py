@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.tasks.catalogue import load_task
 from lerobot_memobench.tasks.formula import And, Atom
-from lerobot_memobench.tasks.loading import load_task
 from lerobot_memobench.tasks.task import MEMORY_TYPES, Prompt
 
 Write = Callable[..., Path]

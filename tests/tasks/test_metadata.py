@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.tasks.loading import load_task
+from lerobot_memobench.tasks.catalogue import load_task
 from lerobot_memobench.tasks.task import Prompt
 
 Write = Callable[..., Path]

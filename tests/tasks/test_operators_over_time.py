@@ -9,8 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.tasks.bddl.sexpr import Reader
-from lerobot_memobench.tasks.evaluator import Evaluator
 from lerobot_memobench.tasks.formula import (
     And,
     Atom,
@@ -25,10 +23,12 @@ from lerobot_memobench.tasks.formula import (
     When,
     atoms,
     format_formula,
+    parse_formula,
     rename,
     to_lists,
 )
-from lerobot_memobench.tasks.formula_parsing import parse_formula
+from lerobot_memobench.tasks.progress import Evaluator
+from lerobot_memobench.tasks.sexpr import Reader
 
 A, B, C = Atom("on", ("a", "p")), Atom("open", ("d",)), Atom("handhome", ())
 LATCH = Atom("wasopen", ("d",))

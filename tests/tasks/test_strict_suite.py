@@ -11,12 +11,20 @@ from pathlib import Path
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.tasks.bddl.reading import parse_bddl
-from lerobot_memobench.tasks.bddl.writing import format_bddl
+from lerobot_memobench.tasks.bddl import format_bddl, parse_bddl
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks, suite_of, task_index, task_names, task_record
 from lerobot_memobench.tasks.failures import classify_failure
-from lerobot_memobench.tasks.formula import Atom, Exactly, Formula, When, atoms, children, format_formula, to_lists
-from lerobot_memobench.tasks.formula_parsing import parse_formula
+from lerobot_memobench.tasks.formula import (
+    Atom,
+    Exactly,
+    Formula,
+    When,
+    atoms,
+    children,
+    format_formula,
+    parse_formula,
+    to_lists,
+)
 from lerobot_memobench.tasks.progress import Progress
 from lerobot_memobench.tasks.task import MEMORY_TYPES, STRICT, Task
 

@@ -10,9 +10,8 @@ from typing import Any
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.tasks.formula import Atom, format_formula
-from lerobot_memobench.tasks.formula_parsing import parse_formula
-from lerobot_memobench.tasks.loading import load_task
+from lerobot_memobench.tasks.catalogue import load_task
+from lerobot_memobench.tasks.formula import Atom, format_formula, parse_formula
 from lerobot_memobench.tasks.task import Prompt
 
 Write = Callable[..., Path]

@@ -16,8 +16,15 @@ from lerobot_memobench.cli.suite import Suite, WhichSuite
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.terminal import Unbroken
 from lerobot_memobench.io import count_of
-from lerobot_memobench.tasks.catalogue import CATALOGUE_DIR, find_tasks, get_task, task_names, task_number, task_record
-from lerobot_memobench.tasks.loading import load_task
+from lerobot_memobench.tasks.catalogue import (
+    CATALOGUE_DIR,
+    find_tasks,
+    get_task,
+    load_task,
+    task_names,
+    task_number,
+    task_record,
+)
 from lerobot_memobench.tasks.task import PUBLISHED, Task
 
 

@@ -178,8 +178,7 @@ class MemobenchEnvConfig(EnvConfig):
 
     def selected(self) -> list[tuple[str, int, Path]]:
         """Return memory type, task id and folder of each chosen task; unknown names raise `MemobenchError`."""
-        from lerobot_memobench.tasks.catalogue import find_tasks, get_task, resolve_tasks, task_index
-        from lerobot_memobench.tasks.loading import load_task
+        from lerobot_memobench.tasks.catalogue import find_tasks, get_task, load_task, resolve_tasks, task_index
 
         if self.task_dir is not None:
             loaded = [load_task(folder) for folder in find_tasks(self.task_dir)]

@@ -37,7 +37,7 @@ from lerobot_memobench.protocol import (
     UNSEEDED,
 )
 from lerobot_memobench.sim.rendering import RenderSettings
-from lerobot_memobench.tasks.loading import load_task
+from lerobot_memobench.tasks.catalogue import load_task
 from lerobot_memobench.tasks.memory_text import memory_text, with_memory
 from lerobot_memobench.tasks.task import PUBLISHED, referent_told
 

@@ -14,7 +14,6 @@ from lerobot_memobench.experts.plans import Step, counts, plan_of
 from lerobot_memobench.experts.surroundings import drawer_around, stands_out
 from lerobot_memobench.sim.scene import TABLE, TABLE_TOP
 from lerobot_memobench.sim.simulation import Simulation
-from lerobot_memobench.tasks.evaluator import HOLD_STEPS, Evaluator
 from lerobot_memobench.tasks.formula import (
     LATCHES,
     And,
@@ -30,6 +29,7 @@ from lerobot_memobench.tasks.formula import (
     When,
     children,
 )
+from lerobot_memobench.tasks.progress import HOLD_STEPS, Evaluator
 from lerobot_memobench.tasks.task import STRICT, Task
 
 Doing = Generator[NDArray[np.float32], None, None]

@@ -24,7 +24,7 @@ from lerobot_memobench.run.plan import LOG, OUTPUT, EvaluationPlan
 from lerobot_memobench.run.reading import read_settings
 from lerobot_memobench.run.translation import LerobotSettings
 from lerobot_memobench.run.words import split_words
-from lerobot_memobench.tasks.loading import load_task
+from lerobot_memobench.tasks.catalogue import load_task
 
 if TYPE_CHECKING:
     from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.assets.asset import Asset
 from lerobot_memobench.sim.scene import TABLE, TABLE_TOP
-from lerobot_memobench.tasks.bddl.problem import Region
+from lerobot_memobench.tasks.bddl import Region
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task
 

@@ -7,9 +7,11 @@ walked through and written; `tasks.formula_making` makes checked ones.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
+
+from lerobot_memobench.errors import MemobenchError, nearest
 
 #: Predicate (lower case) -> (spelling in BDDL, number of arguments).
 PREDICATES: dict[str, tuple[str, int]] = {
@@ -185,3 +187,114 @@ def head_of(formula: Formula) -> str:
     """Return what stands before an operator's formulas in BDDL, e.g. ``And`` or ``Exactly 2``."""
     word = type(formula).__name__
     return f"{word} {formula.number}" if isinstance(formula, Counted) else word
+
+
+# ==== formula_making.py
+# Make atoms and operators from their words, checked; every complaint says where.
+
+#: Operators over a fixed number of formulas; the others take one or more.
+_PARTS: dict[type[Formula], int] = {Not: 1, Never: 1, Hold: 1, Exactly: 1, When: 2}
+_WORDS = {1: "exactly one", 2: "exactly two"}
+
+
+def make_atom(predicate: str, args: Sequence[str], where: str = "formula") -> Atom:
+    """Return a checked atom; ``where`` (file and line) opens the message of a ``MemobenchError``."""
+    key = predicate.lower()
+    if key not in PREDICATES:
+        hint = nearest(key, [*PREDICATES, *OPERATORS])
+        raise MemobenchError(f"{where}: found the unknown predicate or operator {predicate!r}, {hint}")
+    spelling, arity = PREDICATES[key]
+    if len(args) != arity:
+        raise MemobenchError(
+            f"{where}: found {len(args)} argument(s) after {spelling}, expected {arity} entity name(s)"
+        )
+    if len(set(args)) != len(args):
+        raise MemobenchError(f"{where}: found {spelling} with {args[0]!r} twice, expected two different entities")
+    return Atom(key, tuple(args))
+
+
+def make_operator(
+    operator: str, parts: Sequence[Formula], where: str = "formula", number: int | str | None = None
+) -> Formula:
+    """Return ``operator`` (any case) over its parts; `Hold` and `Exactly` need a ``number`` from 1 on."""
+    key = operator.lower()
+    if key not in OPERATORS:
+        raise MemobenchError(f"{where}: found the operator {operator!r}, {nearest(key, OPERATORS)}")
+    made = OPERATORS[key]
+    counted = [check_number(number, made.__name__, where)] if takes_number(key) else []
+    if not parts:
+        raise MemobenchError(f"{where}: found {made.__name__} with nothing in it, expected at least one formula")
+    if len(parts) != _PARTS.get(made, len(parts)):
+        raise MemobenchError(
+            f"{where}: found {made.__name__} over {len(parts)} formulas, expected {_WORDS[_PARTS[made]]}"
+        )
+    make: Callable[..., Formula] = made
+    return make(*counted, tuple(parts) if made not in _PARTS or made is When else parts[0])
+
+
+def check_number(number: Any, after: str, where: str) -> int:
+    """Return the number that stands after an operator's word; raise where it is none from 1 on."""
+    if number is None:
+        raise MemobenchError(
+            f"{where}: found {after} without a number, expected a whole number from 1 to {MAX_NUMBER} before a formula"
+        )
+    if not isinstance(number, int) or isinstance(number, bool) or not 1 <= number <= MAX_NUMBER:
+        raise MemobenchError(f"{where}: found {number!r} after {after}, expected a whole number from 1 to {MAX_NUMBER}")
+    return number
+
+
+# ==== formula_parsing.py
+# Read formulas from JSON, as metadata files write them: nested lists, objects, or both.
+
+_KEYS = ", ".join(map(repr, OPERATORS))
+
+
+def parse_formula(value: Any, where: str = "formula") -> Formula:
+    """Read a formula from nested lists or JSON objects.
+
+    ``["And", ["On", "a", "b"]]`` and ``{"and": [["on", "a", "b"]]}`` are the same. Words are read in any
+    case, the two shapes may be mixed, and an operator may hold a bare atom instead of a list. A number stands before
+    the formula: ``["exactly", 2, ["open", "a"]]``, ``{"exactly": [2, ["open", "a"]]}``. Raises ``MemobenchError``
+    whose message starts with ``where``.
+    """
+    return _parse(value, where, 0)
+
+
+def _parse(value: Any, where: str, depth: int) -> Formula:
+    if depth > MAX_DEPTH:
+        raise MemobenchError(f"{where}: found a formula nested deeper than {MAX_DEPTH} levels, expected a flatter one")
+    if isinstance(value, Mapping):
+        head, items = _from_object(value, where)
+    elif isinstance(value, (list, tuple)) and value and isinstance(value[0], str):
+        head, items = value[0], value[1:]
+    else:
+        raise MemobenchError(f"{where}: found {short(value)}, expected a formula such as ['on', 'a', 'b']")
+    if is_operator(head):
+        numbered = takes_number(head) and items and not isinstance(items[0], (list, tuple, Mapping))
+        number, parts = (items[0], items[1:]) if numbered else (None, items)
+        return make_operator(head, [_parse(item, where, depth + 1) for item in parts], where, number)
+    for item in items:
+        if not isinstance(item, str) or not item:
+            raise MemobenchError(f"{where}: found {short(item)} as an argument of {head!r}, expected an entity name")
+    return make_atom(head, items, where)
+
+
+def _from_object(value: Mapping[Any, Any], where: str) -> tuple[str, Sequence[Any]]:
+    """Return the operator of a JSON object and what it holds."""
+    if len(value) != 1:
+        raise MemobenchError(f"{where}: found an object with {len(value)} keys, expected one of {_KEYS}")
+    ((head, rest),) = value.items()
+    if not isinstance(head, str) or not is_operator(head):
+        raise MemobenchError(f"{where}: found the key {head!r}, expected one of {_KEYS}")
+    # {"not": ["on", "a", "b"]} and {"not": {"and": ...}} hold one formula, not a list of them.
+    bare = isinstance(rest, Mapping) or (isinstance(rest, (list, tuple)) and rest and isinstance(rest[0], str))
+    items = [rest] if bare else rest
+    if not isinstance(items, (list, tuple)):
+        raise MemobenchError(f"{where}: found {short(rest)} under {head!r}, expected a list of formulas")
+    return head, items
+
+
+def short(value: Any) -> str:
+    """Return a value as messages show it: as Python writes it, at most 40 characters."""
+    text = repr(value)
+    return text if len(text) <= 40 else text[:37] + "..."

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.tasks.bddl.problem import Region
+from lerobot_memobench.tasks.bddl import Region
 from lerobot_memobench.tasks.formula import Atom, Formula, rename
 
 MemoryType = Literal["temporal", "spatial", "object", "procedural"]

@@ -12,8 +12,7 @@ from lerobot_memobench.datasets.hdf5.layout import SUFFIX, Unusable
 from lerobot_memobench.datasets.hdf5.reading import PublishedDemo, PublishedFile
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_name
-from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.loading import load_task
+from lerobot_memobench.tasks.catalogue import get_task, load_task, task_names
 from lerobot_memobench.tasks.task import BDDL_FILE, MEMORY_TYPES, METADATA_FILE, Task
 
 UNKNOWN = "tasks"

@@ -6,8 +6,8 @@ import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from lerobot_memobench.tasks.evaluator import Evaluator
 from lerobot_memobench.tasks.formula import Atom, Formula
+from lerobot_memobench.tasks.progress import Evaluator
 
 
 @dataclass(frozen=True)

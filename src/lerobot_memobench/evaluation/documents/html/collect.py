@@ -25,10 +25,9 @@ from lerobot_memobench.evaluation.records.protocol import CARD_FILE, POLICY, rea
 from lerobot_memobench.evaluation.records.runs import check_one_suite, folder_names, read_rollouts, unlike
 from lerobot_memobench.io import count_of
 from lerobot_memobench.protocol import CONTROL_HZ
-from lerobot_memobench.tasks.catalogue import find_tasks, get_task, task_names
+from lerobot_memobench.tasks.catalogue import find_tasks, get_task, load_task, task_names
 from lerobot_memobench.tasks.failures import FAILURES
 from lerobot_memobench.tasks.formula import format_formula
-from lerobot_memobench.tasks.loading import load_task
 from lerobot_memobench.tasks.task import LEVELS, MEMORY_TYPES, Task
 
 

@@ -7,9 +7,8 @@ import re
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.tasks.bddl.problem import Region
-from lerobot_memobench.tasks.bddl.reading import parse_bddl
-from lerobot_memobench.tasks.bddl.writing import format_bddl
+from lerobot_memobench.tasks.bddl import Region, format_bddl, parse_bddl
+from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import And, Atom, Not
 
 
@@ -172,3 +171,16 @@ def test_deep_nesting_is_an_error_not_a_crash(bddl: str) -> None:
         parse_bddl(bddl.replace("(Not (Open box_1_top_region))", deep))
     with pytest.raises(MemobenchError, match="line 1"):
         parse_bddl("(" * 50_000)
+
+
+# ==== test_writing.py
+# The writer of BDDL problems.
+
+
+def test_print_and_parse_give_the_same_problem(bddl: str) -> None:
+    problem = parse_bddl(bddl)
+    assert parse_bddl(format_bddl(problem, "a comment (with parentheses)")) == problem
+    for name in task_names():
+        task = get_task(name)
+        problem = parse_bddl(task.bddl_text, name)
+        assert parse_bddl(format_bddl(problem)) == problem

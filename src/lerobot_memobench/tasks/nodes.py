@@ -1,0 +1,353 @@
+"""What all nodes can do, and the node of an atom."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import override
+
+from lerobot_memobench.tasks.formula import (
+    LATCHES,
+    And,
+    Atom,
+    Counted,
+    Exactly,
+    Formula,
+    Hold,
+    Never,
+    Not,
+    Or,
+    Round,
+    Then,
+    When,
+    children,
+)
+
+Read = Callable[[Atom], bool]
+"""Answers atoms about the present step, latched ones included."""
+
+
+class Node:
+    """One place in a formula's tree.
+
+    Attributes:
+        settled: the value that the node has at every later step, whatever happens; None while it is open. Never
+            wrong, though not always found as early as could be.
+    """
+
+    def __init__(self, parts: Sequence[Node] = ()) -> None:
+        self.parts = parts
+
+    def reset(self) -> None:
+        """Forget earlier steps."""
+        for part in self.parts:
+            part.reset()
+
+    def value(self, read: Read) -> bool:
+        """Take one step and return what is true in it; ``read`` answers atoms."""
+        raise NotImplementedError
+
+    @property
+    def settled(self) -> bool | None:
+        """See the class."""
+        raise NotImplementedError
+
+    @property
+    def memory(self) -> tuple[int, ...]:
+        """What of earlier steps decides later values, of this node alone."""
+        return ()
+
+    def walk(self) -> Iterator[Node]:
+        """Yield this node and all below it."""
+        yield self
+        for part in self.parts:
+            yield from part.walk()
+
+
+class AtomNode(Node):
+    """What the world, or a latch, says now."""
+
+    def __init__(self, atom: Atom) -> None:
+        super().__init__()
+        self.atom = atom
+        self.latched = False
+
+    @override
+    def reset(self) -> None:
+        self.latched = False
+
+    @override
+    def value(self, read: Read) -> bool:
+        now = read(self.atom)
+        self.latched = now and self.atom.predicate in LATCHES
+        return now
+
+    @property
+    @override
+    def settled(self) -> bool | None:
+        return True if self.latched else None
+
+
+# ==== gates.py
+# And, Or, Not: nothing is remembered. Every part is asked in every step, since a nested operator must see it.
+
+
+class AndNode(Node):
+    """True when all parts are."""
+
+    @override
+    def value(self, read: Read) -> bool:
+        values = [part.value(read) for part in self.parts]
+        return all(values)
+
+    @property
+    @override
+    def settled(self) -> bool | None:
+        found = [part.settled for part in self.parts]
+        return False if False in found else None if None in found else True
+
+
+class OrNode(Node):
+    """True when some part is."""
+
+    @override
+    def value(self, read: Read) -> bool:
+        values = [part.value(read) for part in self.parts]
+        return any(values)
+
+    @property
+    @override
+    def settled(self) -> bool | None:
+        found = [part.settled for part in self.parts]
+        return True if True in found else None if None in found else False
+
+
+class NotNode(Node):
+    """True when the part is not."""
+
+    @override
+    def value(self, read: Read) -> bool:
+        return not self.parts[0].value(read)
+
+    @property
+    @override
+    def settled(self) -> bool | None:
+        found = self.parts[0].settled
+        return None if found is None else not found
+
+
+# ==== counting.py
+# Never, Hold and Exactly: how long, how often.
+
+
+class NeverNode(Node):
+    """True until the part is once true."""
+
+    broken = False
+
+    @override
+    def reset(self) -> None:
+        super().reset()
+        self.broken = False
+
+    @override
+    def value(self, read: Read) -> bool:
+        now = self.parts[0].value(read)
+        self.broken = self.broken or now
+        return not self.broken
+
+    @property
+    @override
+    def settled(self) -> bool | None:
+        return False if self.broken else True if self.parts[0].settled is False else None
+
+    @property
+    @override
+    def memory(self) -> tuple[int, ...]:
+        return (int(self.broken),)
+
+
+class HoldNode(Node):
+    """True when the part has been true for the last ``number`` steps."""
+
+    def __init__(self, parts: Sequence[Node], number: int) -> None:
+        super().__init__(parts)
+        self.number = number
+        self.held = 0
+
+    @override
+    def reset(self) -> None:
+        super().reset()
+        self.held = 0
+
+    @override
+    def value(self, read: Read) -> bool:
+        self.held = min(self.held + 1, self.number) if self.parts[0].value(read) else 0
+        return self.held == self.number
+
+    @property
+    @override
+    def settled(self) -> bool | None:
+        found = self.parts[0].settled
+        return None if found and self.held < self.number else found
+
+    @property
+    @override
+    def memory(self) -> tuple[int, ...]:
+        return (self.held,)
+
+
+class ExactlyNode(Node):
+    """True while the part has come true ``number`` times; counts to one more, all beyond is the same."""
+
+    def __init__(self, parts: Sequence[Node], number: int) -> None:
+        super().__init__(parts)
+        self.number = number
+        self.count, self.before = 0, False
+
+    @override
+    def reset(self) -> None:
+        super().reset()
+        self.count, self.before = 0, False
+
+    @override
+    def value(self, read: Read) -> bool:
+        now = self.parts[0].value(read)
+        self.count = min(self.count + (now and not self.before), self.number + 1)
+        self.before = now
+        return self.count == self.number
+
+    @property
+    @override
+    def settled(self) -> bool | None:
+        if self.count > self.number:
+            return False
+        found = self.parts[0].settled
+        return self.count == self.number if found is not None and found == self.before else None
+
+    @property
+    @override
+    def memory(self) -> tuple[int, ...]:
+        return self.count, int(self.before)
+
+
+# ==== order.py
+# Then, Round and When: what comes before what.
+
+
+class ThenNode(Node):
+    """Counts how long the current child has held; the next child is first looked at in the step after."""
+
+    def __init__(self, parts: Sequence[Node], hold_steps: int) -> None:
+        super().__init__(parts)
+        self.hold_steps = hold_steps
+        self.done = self.held = 0
+
+    @override
+    def reset(self) -> None:
+        super().reset()
+        self.done = self.held = 0
+
+    @override
+    def value(self, read: Read) -> bool:
+        if self.done < len(self.parts):
+            self.held = self.held + 1 if self.parts[self.done].value(read) else 0
+            if self.held >= self.hold_steps:
+                self.done, self.held = self.done + 1, 0
+        return self.done == len(self.parts)
+
+    @property
+    @override
+    def settled(self) -> bool | None:
+        if self.done == len(self.parts):
+            return True
+        return False if any(part.settled is False for part in self.parts[self.done :]) else None
+
+    @property
+    @override
+    def memory(self) -> tuple[int, ...]:
+        return self.done, self.held
+
+
+class RoundNode(Node):
+    """The next part is first looked at in the step after; with a new round all parts begin anew."""
+
+    done = 0
+
+    @override
+    def reset(self) -> None:
+        super().reset()
+        self.done = 0
+
+    @override
+    def value(self, read: Read) -> bool:
+        self.done += self.parts[self.done].value(read)
+        complete = self.done == len(self.parts)
+        if complete:
+            self.reset()
+        return complete
+
+    @property
+    @override
+    def settled(self) -> bool | None:
+        return False if any(part.settled is False for part in self.parts[self.done :]) else None
+
+    @property
+    @override
+    def memory(self) -> tuple[int, ...]:
+        return (self.done,)
+
+
+class WhenNode(Node):
+    """The first moment of the first part decides, by the second part's value in that step."""
+
+    decided: bool | None = None
+
+    @override
+    def reset(self) -> None:
+        super().reset()
+        self.decided = None
+
+    @override
+    def value(self, read: Read) -> bool:
+        moment, then = [part.value(read) for part in self.parts]
+        if self.decided is None and moment:
+            self.decided = then
+        return self.decided is True
+
+    @property
+    @override
+    def settled(self) -> bool | None:
+        if self.decided is not None:
+            return self.decided
+        return False if any(part.settled is False for part in self.parts) else None
+
+    @property
+    @override
+    def memory(self) -> tuple[int, ...]:
+        return (-1 if self.decided is None else int(self.decided),)
+
+
+# ==== build.py
+# From a formula to the tree of its nodes.
+
+_PLAIN: dict[type[Formula], type[Node]] = {
+    And: AndNode,
+    Or: OrNode,
+    Not: NotNode,
+    Never: NeverNode,
+    When: WhenNode,
+    Round: RoundNode,
+}
+_COUNTED: dict[type[Formula], type[HoldNode] | type[ExactlyNode]] = {Hold: HoldNode, Exactly: ExactlyNode}
+
+
+def build(formula: Formula, hold_steps: int) -> Node:
+    """Return the tree of a formula; ``hold_steps`` is what each child of `Then` has to hold."""
+    if isinstance(formula, Atom):
+        return AtomNode(formula)
+    parts = [build(child, hold_steps) for child in children(formula)]
+    if isinstance(formula, Then):
+        return ThenNode(parts, hold_steps)
+    if isinstance(formula, Counted):
+        return _COUNTED[type(formula)](parts, formula.number)
+    return _PLAIN[type(formula)](parts)
