@@ -6,7 +6,7 @@ import json
 
 from lerobot_memobench.cli.console import console
 from lerobot_memobench.cli.doctor import finding_table
-from lerobot_memobench.doctor.findings import Finding, exit_status
+from lerobot_memobench.doctor.examination import Finding, exit_status
 
 
 def test_the_exit_status_and_the_table() -> None:

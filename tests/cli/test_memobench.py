@@ -171,7 +171,7 @@ def test_generate_tells_what_became_of_every_seed(
 ) -> None:
     from lerobot_memobench.datasets import generation
     from lerobot_memobench.datasets.generation_summary import Failure, GenerationSummary, TaskSummary
-    from lerobot_memobench.jobs.job import Advance
+    from lerobot_memobench.jobs.processes import Advance
 
     asked: dict[str, object] = {}
 

@@ -1,4 +1,4 @@
-"""Each failure of a machine is found, with its fix."""
+"""Each failure of a machine is found, with its fix; this machine's pictures are the benchmark's."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ import sys
 from importlib import metadata
 from typing import Any
 
+import numpy as np
 import pytest
 from packaging.specifiers import SpecifierSet
 
-from lerobot_memobench.doctor import machine, software
-from lerobot_memobench.doctor.probe import run_probe
+from lerobot_memobench.doctor import examination
+from lerobot_memobench.doctor.probe import SIDE, TOLERANCE, difference, read_golden, render_golden, run_probe, shrink
 from lerobot_memobench.sim.rendering import BACKENDS
 
 
 def test_supported_versions_come_from_the_requirements() -> None:
-    supported = software.supported_versions()
+    supported = examination.supported_versions()
     assert supported["lerobot"] == SpecifierSet("==0.6.1")
     assert not supported["mujoco"].contains("3.17.0")
     assert not supported["torch"].contains("2.12.0")
@@ -28,7 +29,7 @@ def test_supported_versions_come_from_the_requirements() -> None:
 def test_a_version_out_of_range_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     real = metadata.version
     monkeypatch.setattr(metadata, "version", lambda name: "4.0.0" if name == "mujoco" else real(name))
-    findings = {finding.what: finding for finding in software.package_versions()}
+    findings = {finding.what: finding for finding in examination.package_versions()}
     assert findings["mujoco"].status == "failed"
     assert findings["mujoco"].fix
     assert findings["lerobot"].status == "ok"
@@ -39,16 +40,16 @@ def test_a_missing_package_fails(monkeypatch: pytest.MonkeyPatch) -> None:
         raise metadata.PackageNotFoundError(name)
 
     monkeypatch.setattr(metadata, "version", version)
-    assert {finding.status for finding in software.package_versions()} == {"failed"}
+    assert {finding.status for finding in examination.package_versions()} == {"failed"}
 
 
 def test_the_plugin_is_discovered() -> None:
-    assert software.plugin().status == "ok"
+    assert examination.plugin().status == "ok"
 
 
 def test_an_uninstalled_plugin_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(metadata, "distributions", list)
-    finding = software.plugin()
+    finding = examination.plugin()
     assert finding.status == "failed"
     assert "make setup" in finding.fix
 
@@ -57,18 +58,18 @@ def test_the_plugins_import_error_is_told(monkeypatch: pytest.MonkeyPatch) -> No
     real = builtins.__import__
 
     def broken(name: str, *args: Any) -> Any:
-        if name == software.DISTRIBUTION:
+        if name == examination.DISTRIBUTION:
             raise ImportError("no module named 'nonsense'")
         return real(name, *args)
 
     monkeypatch.setattr(builtins, "__import__", broken)
-    finding = software.plugin()
+    finding = examination.plugin()
     assert finding.status == "failed"
     assert "nonsense" in finding.detail
 
 
 def probes(monkeypatch: pytest.MonkeyPatch, answers: dict[str, dict[str, Any]]) -> None:
-    monkeypatch.setattr(machine, "run_probe", lambda *words: answers[" ".join(words)])
+    monkeypatch.setattr(examination, "run_probe", lambda *words: answers[" ".join(words)])
 
 
 SOFTWARE = {"renderer": "llvmpipe (LLVM 15)", "version": "4.5", "vendor": "Mesa", "sphere": True}
@@ -78,9 +79,9 @@ BROKEN = {"error": "the process was killed by SIGSEGV"}
 def test_the_backend_in_use_must_work_the_other_need_not(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MUJOCO_GL", "egl")
     probes(monkeypatch, {"gl egl": SOFTWARE, "gl osmesa": BROKEN})
-    assert [finding.status for finding in machine.rendering()] == ["ok", "ok", "warning"]
+    assert [finding.status for finding in examination.rendering()] == ["ok", "ok", "warning"]
     probes(monkeypatch, {"gl egl": BROKEN, "gl osmesa": SOFTWARE})
-    findings = list(machine.rendering())
+    findings = list(examination.rendering())
     assert [finding.status for finding in findings] == ["ok", "failed", "ok"]
     assert "SIGSEGV" in findings[1].detail
     assert "MUJOCO_GL=osmesa" in findings[1].fix
@@ -89,7 +90,7 @@ def test_the_backend_in_use_must_work_the_other_need_not(monkeypatch: pytest.Mon
 def test_a_backend_that_draws_nonsense_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MUJOCO_GL", "egl")
     probes(monkeypatch, {"gl egl": {**SOFTWARE, "sphere": False}, "gl osmesa": SOFTWARE})
-    assert [finding.status for finding in machine.rendering()] == ["ok", "failed", "ok"]
+    assert [finding.status for finding in examination.rendering()] == ["ok", "failed", "ok"]
 
 
 @pytest.mark.parametrize("used", ["egl", "osmesa"])
@@ -98,7 +99,7 @@ def test_the_backend_not_in_use_is_really_tried(monkeypatch: pytest.MonkeyPatch,
         pytest.skip("needs both EGL and OSMesa")
     monkeypatch.setenv("MUJOCO_GL", used)
     monkeypatch.setenv("PYOPENGL_PLATFORM", used)  # as MuJoCo leaves it behind
-    assert [finding.detail for finding in machine.rendering() if finding.status != "ok"] == []
+    assert [finding.detail for finding in examination.rendering() if finding.status != "ok"] == []
 
 
 @pytest.mark.parametrize("wanted", ["glfw", "nonsense"])
@@ -107,7 +108,7 @@ def test_a_setting_is_not_mended_by_packages(monkeypatch: pytest.MonkeyPatch, wa
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     probes(monkeypatch, {"gl egl": SOFTWARE, "gl osmesa": SOFTWARE})
-    findings = list(machine.rendering())
+    findings = list(examination.rendering())
     assert [finding.status for finding in findings] == ["failed", "ok", "ok"]
     assert "apt-get" not in findings[0].fix
     assert "MUJOCO_GL" in findings[0].fix
@@ -115,7 +116,7 @@ def test_a_setting_is_not_mended_by_packages(monkeypatch: pytest.MonkeyPatch, wa
 
 def test_a_platform_that_fits_no_backend_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     probes(monkeypatch, {"golden": {"error": "the PYOPENGL_PLATFORM environment variable is set to 'glx'"}})
-    assert machine.golden_frame().fix == "unset PYOPENGL_PLATFORM"
+    assert examination.golden_frame().fix == "unset PYOPENGL_PLATFORM"
 
 
 @pytest.mark.parametrize(
@@ -124,25 +125,25 @@ def test_a_platform_that_fits_no_backend_is_named(monkeypatch: pytest.MonkeyPatc
 def test_a_system_without_the_simulator_is_told(
     monkeypatch: pytest.MonkeyPatch, name: str, called: str, instead: str
 ) -> None:
-    assert software.system().status in ("ok", "warning")  # the tests' own
+    assert examination.system().status in ("ok", "warning")  # the tests' own
     monkeypatch.setattr(sys, "platform", name)
-    finding = software.system()
+    finding = examination.system()
     assert finding.status == "failed"
     assert called in finding.fix
     assert instead in finding.fix
-    assert list(machine.rendering()) == []  # no advice to install Debian's packages
+    assert list(examination.rendering()) == []  # no advice to install Debian's packages
 
 
 def test_an_untested_processor_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(platform, "machine", lambda: "aarch64")
-    assert software.system().status == "warning"
+    assert examination.system().status == "warning"
 
 
 def test_no_gl_library_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setattr("ctypes.util.find_library", lambda name: None)
     probes(monkeypatch, {"gl egl": BROKEN, "gl osmesa": BROKEN})
-    findings = list(machine.rendering())
+    findings = list(examination.rendering())
     assert findings[0].status == "failed"
     assert "libegl1" in findings[0].fix
 
@@ -153,20 +154,38 @@ def test_no_gl_library_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_golden_frame(monkeypatch: pytest.MonkeyPatch, answer: dict[str, Any], status: str) -> None:
     probes(monkeypatch, {"golden": answer})
-    finding = machine.golden_frame()
+    finding = examination.golden_frame()
     assert finding.status == status
     assert bool(finding.fix) == (status == "failed")
 
 
 def test_video(monkeypatch: pytest.MonkeyPatch) -> None:
     probes(monkeypatch, {"torchcodec": {"error": "no libavutil"}})
-    assert machine.torchcodec().status == "warning"
-    assert "apt-get install ffmpeg" in machine.torchcodec().fix
+    assert examination.torchcodec().status == "warning"
+    assert "apt-get install ffmpeg" in examination.torchcodec().fix
     monkeypatch.setattr(shutil, "which", lambda name: None)
-    assert machine.ffmpeg().status == "warning"
+    assert examination.ffmpeg().status == "warning"
 
 
 def test_a_probe_that_dies_is_reported() -> None:
     assert "error" in run_probe("gl", "nonsense")
     assert "status" in run_probe("nonsense")["error"] or "KeyError" in run_probe("nonsense")["error"]
     assert "no answer" in run_probe("gl", "egl", timeout_s=0.01)["error"]
+
+
+def test_this_machine_renders_the_golden_frame() -> None:
+    assert difference(render_golden(), read_golden()) < TOLERANCE / 2
+
+
+def test_wrong_pictures_are_outside_the_tolerance() -> None:
+    golden = read_golden()
+    assert golden.shape == (SIDE, SIDE, 3)
+    grey = np.repeat(golden.mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8)
+    for wrong in (golden[::-1], golden[:, ::-1], golden[..., ::-1], grey, golden // 2, np.zeros_like(golden)):
+        assert difference(wrong, golden) > TOLERANCE
+
+
+def test_shrinking_averages_blocks() -> None:
+    image = np.zeros((2 * SIDE, 2 * SIDE, 3), dtype=np.uint8)
+    image[::2] = 100
+    assert (shrink(image) == 50).all()

@@ -12,10 +12,8 @@ import pytest
 from filelock import lock_descriptor
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.jobs.executors import Datatrove, Needs, asked_for, check_executor, options_told
-from lerobot_memobench.jobs.job import Advance
-from lerobot_memobench.jobs.locking import locked, taking_turns
-from lerobot_memobench.jobs.running import run_jobs
+from lerobot_memobench.jobs.executors import Datatrove, Needs, asked_for, check_executor, options_told, run_jobs
+from lerobot_memobench.jobs.processes import Advance, locked, taking_turns
 from lerobot_memobench.run.words import executor_options
 from tests.support.note_job import Note
 
@@ -144,7 +142,7 @@ def test_a_killed_process_lets_go(tmp_path: Path, hold: str) -> None:
     path = tmp_path / "cache.lock"
     code = f"""
 import pathlib, time
-from lerobot_memobench.jobs.locking import locked, taking_turns
+from lerobot_memobench.jobs.processes import locked, taking_turns
 path = pathlib.Path({str(path)!r})
 with {hold}:
     print("held", flush=True)

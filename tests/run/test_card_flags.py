@@ -34,7 +34,7 @@ RECORD = {"task": STOVE, "memory_type": "temporal", "episode": 0, "seed": 7, "su
 def in_folder(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """An empty folder, and no look through all that is installed."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("settings.reading", "engine.card_flags"):
+        for module in ("run.reading", "run.card_flags"):
             patch.setattr(f"lerobot_memobench.{module}.register_plugins", lambda: None)
         patch.chdir(tmp_path_factory.mktemp("here"))
         Path("tasks").mkdir()

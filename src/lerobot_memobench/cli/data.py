@@ -13,7 +13,7 @@ from lerobot_memobench.io import count_of
 
 if TYPE_CHECKING:
     from lerobot_memobench.datasets.validate import Verdict
-    from lerobot_memobench.jobs.job import Advance
+    from lerobot_memobench.jobs.processes import Advance
 
 
 def convert(

@@ -13,7 +13,7 @@ from rich.text import Text
 from lerobot_memobench.cli.console import console
 
 if TYPE_CHECKING:
-    from lerobot_memobench.doctor.findings import Finding, Status
+    from lerobot_memobench.doctor.examination import Finding, Status
 
 COLOURS: dict[Status, str] = {"ok": "green", "warning": "yellow", "failed": "red"}
 
@@ -22,8 +22,7 @@ def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
 ) -> int:
     """Check that this machine can run the benchmark. What it cannot is told with how to mend it."""
-    from lerobot_memobench.doctor.examination import examine
-    from lerobot_memobench.doctor.findings import exit_status
+    from lerobot_memobench.doctor.examination import examine, exit_status
 
     findings = examine()
     if as_json:

@@ -25,7 +25,7 @@ from lerobot_memobench.run.shards import executor_options, plan_shards, run_shar
 from lerobot_memobench.run.words import Words
 
 if TYPE_CHECKING:
-    from lerobot_memobench.jobs.job import Advance
+    from lerobot_memobench.jobs.processes import Advance
 
 SHARD_PROGRAM = ("-m", "lerobot_memobench.cli.shard_process")
 """Words after Python's name that start the process of one part."""

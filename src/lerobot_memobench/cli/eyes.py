@@ -11,7 +11,7 @@ import typer
 from lerobot_memobench.cli.console import Count, console, counting
 
 if TYPE_CHECKING:
-    from lerobot_memobench.jobs.job import Advance
+    from lerobot_memobench.jobs.processes import Advance
 
 app = typer.Typer(help="Train eyes, a small tower, on labelled pictures, and test it.", no_args_is_help=True)
 

@@ -19,7 +19,7 @@ from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 
 if TYPE_CHECKING:
     from lerobot_memobench.datasets.generation_summary import GenerationSummary
-    from lerobot_memobench.jobs.job import Advance
+    from lerobot_memobench.jobs.processes import Advance
 
 
 class Referent(StrEnum):

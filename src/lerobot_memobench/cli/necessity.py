@@ -16,7 +16,7 @@ from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 if TYPE_CHECKING:
     from lerobot_memobench.evaluation.necessity.question import Settings
     from lerobot_memobench.evaluation.necessity.study import Study
-    from lerobot_memobench.jobs.job import Advance, ProgressCallback
+    from lerobot_memobench.jobs.processes import Advance, ProgressCallback
     from lerobot_memobench.tasks.task import Task
 
 

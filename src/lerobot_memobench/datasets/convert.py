@@ -35,8 +35,8 @@ from lerobot_memobench.datasets.staging.request import compare_requests, episode
 from lerobot_memobench.datasets.staging.stage import EpisodeStage, episode_info, stage_failure
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import telling_of_the_disk
-from lerobot_memobench.jobs.job import ProgressCallback
-from lerobot_memobench.jobs.running import run_jobs
+from lerobot_memobench.jobs.executors import run_jobs
+from lerobot_memobench.jobs.processes import ProgressCallback
 
 
 @dataclass(frozen=True)

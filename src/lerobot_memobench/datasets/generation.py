@@ -39,9 +39,8 @@ from lerobot_memobench.datasets.staging.folders import STAGING
 from lerobot_memobench.datasets.staging.request import compare_requests, episodes_folder
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import file_hash, file_name, free_bytes, in_words, telling_of_the_disk
-from lerobot_memobench.jobs.executors import Needs, check_executor, options_told
-from lerobot_memobench.jobs.job import ProgressCallback
-from lerobot_memobench.jobs.running import run_jobs
+from lerobot_memobench.jobs.executors import Needs, check_executor, options_told, run_jobs
+from lerobot_memobench.jobs.processes import ProgressCallback
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import DEMONSTRATION_SEED
 from lerobot_memobench.tasks.task import Task, referent_told

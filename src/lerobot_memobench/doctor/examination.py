@@ -1,10 +1,61 @@
-"""The whole examination, in the order in which it is read."""
+"""Is the right software installed, and what does this machine draw with, decode videos with and run policies on?"""
 
 from __future__ import annotations
 
-from lerobot_memobench.doctor.findings import Finding
-from lerobot_memobench.doctor.machine import device, ffmpeg, golden_frame, rendering, torchcodec
-from lerobot_memobench.doctor.software import opencv, package_versions, plugin, python_version, system
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Literal
+
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+
+from lerobot_memobench.doctor.probe import TOLERANCE, run_probe
+from lerobot_memobench.errors import MemobenchError, unsupported_system
+from lerobot_memobench.jobs.threads import cores
+from lerobot_memobench.sim.rendering import BACKENDS, gl_backend
+
+DISTRIBUTION = "lerobot_policy_memobench"
+PLUGIN = "LeRobot plugin"
+
+#: What the versions of are shown and held against the requirements of this project and of LeRobot.
+SHOWN = ("lerobot", "torch", "transformers", "mujoco", "robosuite", "numpy", "gymnasium", "torchcodec", "av")
+
+EXTRAS = ("", "dataset", "training", "evaluation", "pi", "transformers-dep", "av-dep")
+"""Parts of LeRobot that are installed with this project."""
+
+SYSTEM_PACKAGES = "apt-get install libegl1 libgl1-mesa-dri libgles2 libopengl0 libosmesa6"
+
+#: GL renderers that run on the CPU.
+SOFTWARE = ("llvmpipe", "softpipe", "swrast", "swiftshader")
+
+
+Status = Literal["ok", "warning", "failed"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing looked at.
+
+    Attributes:
+        status: ``failed`` keeps the benchmark from running, ``warning`` costs speed or a part of it.
+        fix: what to do about it; empty when there is nothing to do.
+    """
+
+    what: str
+    status: Status
+    detail: str
+    fix: str = ""
+
+    def as_dict(self) -> dict[str, str]:
+        """Return the finding for JSON."""
+        return asdict(self)
 
 
 def examine() -> list[Finding]:
@@ -21,3 +72,201 @@ def examine() -> list[Finding]:
         torchcodec(),
         device(),
     ]
+
+
+def exit_status(findings: Sequence[Finding]) -> int:
+    """Return 1 when something that is needed failed."""
+    return int(any(finding.status == "failed" for finding in findings))
+
+
+def system() -> Finding:
+    """Compare the operating system with the one that is supported."""
+    found = f"{platform.system()} {platform.machine()}"
+    if problem := unsupported_system():
+        return Finding("system", "failed", found, problem)
+    if platform.machine() != "x86_64":
+        return Finding("system", "warning", f"{found}; tested is Linux x86_64", "expect slower or missing packages")
+    return Finding("system", "ok", found)
+
+
+def python_version() -> Finding:
+    """Compare the interpreter with the one that is supported."""
+    found = ".".join(str(part) for part in sys.version_info[:3])
+    good = sys.version_info[:2] == (3, 12)
+    return Finding("Python", "ok" if good else "failed", found, "" if good else "run `make setup`, which uses 3.12")
+
+
+def package_versions() -> Iterator[Finding]:
+    """Yield installed versions against what this project and LeRobot require."""
+    requirements = supported_versions()
+    for name in SHOWN:
+        found = _installed(name)
+        wanted = requirements.get(name, SpecifierSet())
+        if found is None:
+            yield Finding(name, "failed", "not installed", "run `make setup`")
+        elif not wanted.contains(found, prereleases=True):
+            yield Finding(name, "failed", f"{found}; supported is {wanted}", "run `make setup`")
+        else:
+            yield Finding(name, "ok", found + (f" (supported {wanted})" if str(wanted) else ""))
+
+
+def supported_versions() -> dict[str, SpecifierSet]:
+    """Return package -> versions that both this project and LeRobot accept here."""
+    found: dict[str, SpecifierSet] = {}
+    for owner in ("lerobot", DISTRIBUTION):
+        for requirement in _requirements(owner):
+            name = requirement.name.lower().replace("_", "-")
+            found[name] = found.get(name, SpecifierSet()) & requirement.specifier
+    return found
+
+
+def _requirements(owner: str) -> Iterator[Requirement]:
+    """Yield what an installed distribution asks for on this machine."""
+    try:
+        lines = metadata.requires(owner) or []
+    except metadata.PackageNotFoundError:
+        return
+    for requirement in map(Requirement, lines):
+        marker = requirement.marker
+        if marker is None or any(marker.evaluate({"extra": extra}) for extra in EXTRAS):
+            yield requirement
+
+
+def opencv() -> Finding:
+    """Two distributions install the same module ``cv2``; the one with windows needs desktop libraries."""
+    names = {"opencv-python", "opencv-python-headless", "opencv-contrib-python"}
+    installed = {name: version for name in sorted(names) if (version := _installed(name)) is not None}
+    if list(installed) == ["opencv-python-headless"]:
+        return Finding("OpenCV", "ok", f"opencv-python-headless {installed['opencv-python-headless']} alone")
+    fix = "run `make setup`, or uninstall all of them and install opencv-python-headless alone"
+    return Finding("OpenCV", "warning", " and ".join(installed) or "not installed", fix)
+
+
+def plugin() -> Finding:
+    """Do what LeRobot does to find plugins; it logs an import error and goes on, this reports it."""
+    if DISTRIBUTION not in [distribution.metadata.get("Name") for distribution in metadata.distributions()]:
+        return Finding(
+            PLUGIN,
+            "failed",
+            f"no installed distribution is named {DISTRIBUTION}, so LeRobot does not look for it",
+            "install the project (`make setup`); a source folder on PYTHONPATH is not enough",
+        )
+    try:
+        missing = not_registered()
+    except Exception as error:
+        reason = f"importing it fails: {type(error).__name__}: {error}"
+        return Finding(PLUGIN, "failed", reason, "mend the import error; LeRobot only logs it")
+    if missing:
+        return Finding(PLUGIN, "failed", f"imported, but not registered: {', '.join(missing)}", "run `make setup`")
+    return Finding(PLUGIN, "ok", "discovered: env memobench, policies memobench_mem, memobench_expert")
+
+
+def not_registered() -> list[str]:
+    """Import the plugin as LeRobot does; return what LeRobot still does not know of it."""
+    __import__(DISTRIBUTION)
+    from lerobot.configs.policies import PreTrainedConfig
+    from lerobot.envs.configs import EnvConfig
+    from lerobot.policies import factory as _factory  # noqa: F401 - importing it registers policies
+
+    policies, environments = PreTrainedConfig.get_known_choices(), EnvConfig.get_known_choices()
+    missing = [f"policy {name}" for name in ("memobench_mem", "memobench_expert") if name not in policies]
+    return missing + [f"env {name}" for name in ("memobench",) if name not in environments]
+
+
+def _installed(name: str) -> str | None:
+    """Return the version of a package, None where it is not installed."""
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def rendering() -> Iterator[Finding]:
+    """Yield what each GL backend really does here; nothing where there can be none."""
+    if unsupported_system():
+        return
+    wanted = os.environ.get("MUJOCO_GL", "").lower()
+    try:
+        chosen = gl_backend()
+    except MemobenchError as error:
+        chosen = ""
+        fix = SYSTEM_PACKAGES if wanted in ("", *BACKENDS) else "unset MUJOCO_GL, or set it to egl or osmesa"
+        yield Finding("GL backend", "failed", str(error), fix)
+    else:
+        origin = "MUJOCO_GL" if wanted else "the first whose library is installed"
+        yield Finding("GL backend", "ok", f"{chosen} ({origin})")
+    for backend in BACKENDS:
+        yield _backend(backend, used=backend == chosen)
+
+
+def _backend(backend: str, used: bool) -> Finding:
+    """Let a backend draw a sphere; only the one in use must be able to."""
+    answer = run_probe("gl", backend)
+    what = f"GL {backend}" + (" (used)" if used else "")
+    if "error" not in answer and answer["sphere"]:
+        return _renderer(what, answer["renderer"], answer["version"])
+    problem = answer["error"] if "error" in answer else f"{answer['renderer']} draws a wrong picture"
+    return Finding(what, "failed" if used else "warning", problem, _gl_fix(backend, used))
+
+
+def _gl_fix(backend: str, used: bool) -> str:
+    other = next(name for name in BACKENDS if name != backend)
+    return SYSTEM_PACKAGES + (f", or set MUJOCO_GL={other}" if used else f" (only if {backend} is wanted)")
+
+
+def _renderer(what: str, renderer: str, version: str) -> Finding:
+    software = any(name in renderer.lower() for name in SOFTWARE)
+    detail = f"{renderer}, {version}" + (" (software, on the CPU)" if software else "")
+    if software and "egl" in what and Path("/dev/nvidia0").exists():
+        return Finding(
+            what,
+            "warning",
+            detail + ", though there is an NVIDIA GPU",
+            "install the driver's GL libraries (in containers: NVIDIA_DRIVER_CAPABILITIES=all)",
+        )
+    return Finding(what, "ok", detail)
+
+
+def golden_frame() -> Finding:
+    """Compare a frame of the benchmark with the one that ships."""
+    answer = run_probe("golden")
+    if "error" in answer:
+        fix = "unset PYOPENGL_PLATFORM" if "PYOPENGL_PLATFORM" in answer["error"] else "mend what failed above first"
+        return Finding("golden frame", "failed", answer["error"], fix)
+    off = answer["difference"]
+    detail = f"mean difference {off:.2f} of 255 (tolerance {TOLERANCE:g})"
+    if off > TOLERANCE:
+        fix = "the pictures here are not the benchmark's; try the other MUJOCO_GL backend or a newer driver"
+        return Finding("golden frame", "failed", detail, fix)
+    return Finding("golden frame", "ok", detail)
+
+
+def ffmpeg() -> Finding:
+    """Look for the program ffmpeg."""
+    program = shutil.which("ffmpeg")
+    if program is None:
+        return Finding("FFmpeg", "warning", "no ffmpeg on the PATH", "apt-get install ffmpeg")
+    lines = subprocess.run([program, "-version"], capture_output=True, text=True, check=False).stdout.splitlines()
+    return Finding("FFmpeg", "ok", lines[0] if lines else program)
+
+
+def torchcodec() -> Finding:
+    """Try the decoder that LeRobot prefers."""
+    answer = run_probe("torchcodec")
+    if "error" in answer:
+        return Finding(
+            "video decoding",
+            "warning",
+            f"torchcodec does not load ({answer['error']}); LeRobot falls back to PyAV, which is slower",
+            "apt-get install ffmpeg (its libraries are what torchcodec needs)",
+        )
+    return Finding("video decoding", "ok", "torchcodec loads FFmpeg's libraries")
+
+
+def device() -> Finding:
+    """Say what policies run on here."""
+    import torch
+
+    if torch.cuda.is_available():
+        return Finding("device", "ok", f"{torch.cuda.get_device_name()} ({torch.cuda.device_count()} in all)")
+    return Finding("device", "ok", f"CPU, {cores()} cores; enough for size=tiny and the expert")

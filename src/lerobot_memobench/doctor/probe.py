@@ -1,7 +1,11 @@
-"""Try one thing that may crash the process, in a process of its own.
+"""Try one thing that may crash the process, in a process of its own; among them the golden frame.
 
 A driver that is broken ends the process with a signal, which only its parent can report. The child is
 ``python -m lerobot_memobench.doctor.probe gl egl`` and prints JSON.
+
+The golden frame is what the benchmark's scene looks like when it is rendered right; one small image ships with the
+package. A machine whose own frame differs by more than the tolerance draws something else: upside down, without
+textures or lights, in other colours. ``python -m lerobot_memobench.doctor.probe --write-golden`` makes it anew.
 """
 
 from __future__ import annotations
@@ -12,7 +16,15 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.io import draft_of
 
 PROBE = "lerobot_memobench.doctor.probe"
 
@@ -20,6 +32,18 @@ SCENE = """
 <mujoco><worldbody><light pos='0 0 3'/><camera name='eye' pos='0 -1 0' xyaxes='1 0 0 0 0 1'/>
 <geom type='sphere' size='.2' rgba='.9 .2 .1 1'/></worldbody></mujoco>
 """
+
+
+Frame = NDArray[np.uint8]
+
+GOLDEN_FILE = Path(__file__).with_name("golden.png")
+TASK = "turn_on_the_stove_and_turn_it_off"
+SEED = 7
+SIDE = 64
+"""Side of the golden frame, pixels: the 256 of the benchmark, averaged 4 × 4, so that edges do not count."""
+
+TOLERANCE = 6.0
+"""Largest mean absolute difference, of 255. Drivers differ in shading and shadow edges by far less."""
 
 
 def run_probe(*words: str, timeout_s: float = 180.0) -> dict[str, Any]:
@@ -62,8 +86,6 @@ def gl(backend: str) -> dict[str, Any]:
 
 def golden() -> dict[str, Any]:
     """Render the golden scene; return how far it is from the one that ships."""
-    from lerobot_memobench.doctor.golden import difference, read_golden, render_golden
-
     return {"difference": difference(render_golden(), read_golden())}
 
 
@@ -74,11 +96,51 @@ def torchcodec() -> dict[str, Any]:
     return {"decoder": VideoDecoder.__name__}
 
 
+def render_golden() -> Frame:
+    """Render the golden scene here and now; return it as (64, 64, 3) uint8."""
+    from lerobot_memobench.sim.simulation import Simulation
+    from lerobot_memobench.tasks.catalogue import get_task
+
+    simulation = Simulation(get_task(TASK))
+    simulation.reset(SEED)
+    return shrink(simulation.render("agentview"))
+
+
+def shrink(image: Frame) -> Frame:
+    """Average an image (64 k, 64 k, 3) to (64, 64, 3)."""
+    factor = image.shape[0] // SIDE
+    blocks = image.reshape(SIDE, factor, SIDE, factor, 3).astype(np.float64)
+    return np.round(blocks.mean(axis=(1, 3))).astype(np.uint8)
+
+
+def read_golden() -> Frame:
+    """Return the frame that ships with the package, (64, 64, 3) uint8."""
+    if not GOLDEN_FILE.is_file():
+        raise MemobenchError(f"{GOLDEN_FILE} is missing; install the package again")
+    with Image.open(GOLDEN_FILE) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def difference(a: Frame, b: Frame) -> float:
+    """Return the mean absolute difference of two frames, of 255."""
+    return float(np.abs(a.astype(np.float64) - b.astype(np.float64)).mean())
+
+
+def write_golden() -> Path:
+    """Make what this machine renders the golden frame. Look at it before it is committed."""
+    with draft_of(GOLDEN_FILE) as draft:
+        Image.fromarray(render_golden()).save(draft, optimize=True)
+    return GOLDEN_FILE
+
+
 PROBES: dict[str, Callable[..., dict[str, Any]]] = {"gl": gl, "golden": golden, "torchcodec": torchcodec}
 
 
 if __name__ == "__main__":
-    try:
-        print(json.dumps(PROBES[sys.argv[1]](*sys.argv[2:])))
-    except Exception as error:
-        print(json.dumps({"error": " ".join(f"{type(error).__name__}: {error}".split())[:300]}))
+    if sys.argv[1:] == ["--write-golden"]:
+        print(write_golden())
+    else:
+        try:
+            print(json.dumps(PROBES[sys.argv[1]](*sys.argv[2:])))
+        except Exception as error:
+            print(json.dumps({"error": " ".join(f"{type(error).__name__}: {error}".split())[:300]}))

@@ -7,8 +7,7 @@ from typing import Any
 
 from datatrove.pipeline.base import PipelineStep
 
-from lerobot_memobench.jobs.job import Job
-from lerobot_memobench.jobs.processes import saying_how_to_go_on
+from lerobot_memobench.jobs.processes import Job, saying_how_to_go_on
 
 PREEMPTED = (
     "memobench: ended by SIGTERM; what is finished stays, and the job goes on when Slurm requeues it, or when the "

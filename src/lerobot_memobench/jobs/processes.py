@@ -1,4 +1,4 @@
-"""Processes of this machine: a pool of them, and how one ends that is told to."""
+"""A job, the processes of this machine that run jobs, how one ends that is told to, and who may write to a folder."""
 
 from __future__ import annotations
 
@@ -11,13 +11,59 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
 from multiprocessing.connection import wait
 from pathlib import Path
 from types import FrameType
+from typing import Protocol
 
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.jobs.job import Job
+from filelock import lock_descriptor
+
+from lerobot_memobench.errors import MemobenchError, unsupported_system
 from lerobot_memobench.jobs.threads import ACTING, use_threads
+
+
+class Job(Protocol):
+    """A piece of work. Pickled to other processes and machines, so ``folder`` is on a disk they share."""
+
+    @property
+    def folder(self) -> Path:
+        """Where the result goes; no two jobs have the same."""
+
+    @property
+    def task_name(self) -> str:
+        """What the job is called when its end is told."""
+
+    @property
+    def seed(self) -> int:
+        """Its number among those of that name."""
+
+    def run(self) -> None:
+        """Leave the result, or the reason why there is none, in ``folder``."""
+
+    def finished(self) -> bool:
+        """Whether ``folder`` holds everything that the job had to leave there."""
+
+    def failure(self) -> str | None:
+        """Why a finished job has no result, or None."""
+
+
+@dataclass(frozen=True)
+class Advance:
+    """Told to the progress callback after each job: how many are finished, and the newest one's identity.
+
+    ``found`` of those finished were so before this run began.
+    """
+
+    done: int
+    total: int
+    task_name: str
+    seed: int
+    failure: str | None
+    found: int = 0
+
+
+ProgressCallback = Callable[[Advance], None]
 
 
 def run_in_processes(jobs: Sequence[Job], workers: int, tell: Callable[[Job], None]) -> None:
@@ -137,3 +183,36 @@ def _descendants(root: int) -> set[int]:
         waiting += (new := children.get(waiting.pop(), []))
         found.update(new)
     return found
+
+
+@contextlib.contextmanager
+def locked(staging: Path, out: Path) -> Iterator[None]:
+    """Let one run at a time write to ``out``.
+
+    The lock is held on the folder ``staging`` itself and leaves nothing behind.
+
+    Raises:
+        MemobenchError: another run holds it, or the system is Windows, which locks no folders.
+    """
+    if sys.platform == "win32":
+        raise MemobenchError(unsupported_system())
+    descriptor = os.open(staging, os.O_RDONLY)
+    try:
+        if not lock_descriptor(descriptor, blocking=False):
+            raise MemobenchError(f"another run is writing to {out}; wait for it to end or name another folder")
+        yield
+    finally:
+        os.close(descriptor)
+
+
+@contextlib.contextmanager
+def taking_turns(path: Path, wait: Callable[[], None] = lambda: None) -> Iterator[None]:
+    """Hold a lock file, which stays; whoever comes next, on this machine, calls ``wait``, then waits.
+
+    A kill releases it.
+    """
+    with path.open("w") as file:
+        if not lock_descriptor(file.fileno(), blocking=False):
+            wait()
+            lock_descriptor(file.fileno())
+        yield

@@ -13,8 +13,8 @@ import numpy as np
 from lerobot_memobench.envs.episode import Episode, generator
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import draft_of, read_json, write_file
-from lerobot_memobench.jobs.job import Advance
-from lerobot_memobench.jobs.running import run_jobs
+from lerobot_memobench.jobs.executors import run_jobs
+from lerobot_memobench.jobs.processes import Advance
 from lerobot_memobench.perception.crowd import crowded, widened
 from lerobot_memobench.perception.kinds import kinds
 from lerobot_memobench.perception.labels import PICTURE, Labeller, Rows

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.jobs.job import Advance
+from lerobot_memobench.jobs.processes import Advance
 from lerobot_memobench.perception.kinds import kinds
 from lerobot_memobench.perception.pictures import Pictures, make_pictures
 from lerobot_memobench.perception.report import COLUMNS, Examined, drawn, write_report

@@ -10,7 +10,7 @@ from lerobot_memobench.envs.episode_log import has_log, read_log
 from lerobot_memobench.envs.protocol import PROTOCOL_FILE
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import remove_drafts
-from lerobot_memobench.jobs.locking import locked
+from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.run.card import remove_card
 from lerobot_memobench.run.plan import EvaluationPlan
 

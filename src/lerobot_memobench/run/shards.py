@@ -17,9 +17,8 @@ from typing import Any
 from lerobot_memobench.envs.episode_log import has_log
 from lerobot_memobench.envs.prompting import parameters_of
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.jobs.executors import ELSEWHERE, Needs, check_executor, options_told
-from lerobot_memobench.jobs.job import ProgressCallback
-from lerobot_memobench.jobs.running import run_jobs
+from lerobot_memobench.jobs.executors import ELSEWHERE, Needs, check_executor, options_told, run_jobs
+from lerobot_memobench.jobs.processes import ProgressCallback
 from lerobot_memobench.jobs.threads import LARGE, sharing
 from lerobot_memobench.run.folder import check_folder, check_new, logged
 from lerobot_memobench.run.grid import Shard

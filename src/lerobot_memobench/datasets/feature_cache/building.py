@@ -26,7 +26,7 @@ from lerobot_memobench.datasets.feature_cache.layout import (
 from lerobot_memobench.datasets.feature_cache.room import reserve, telling_of_the_disk
 from lerobot_memobench.datasets.feature_cache.tables import TextEncoder, add_embeddings, write_meta, write_tables
 from lerobot_memobench.io import free_bytes, in_words, remove_drafts, write_file
-from lerobot_memobench.jobs.locking import taking_turns
+from lerobot_memobench.jobs.processes import taking_turns
 from lerobot_memobench.jobs.threads import cores
 
 logger = logging.getLogger(__name__)

@@ -13,7 +13,7 @@ from lerobot_memobench.datasets.staging.episode import LEROBOT
 from lerobot_memobench.datasets.staging.folders import STAGING, clean_temporaries
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import read_json, remove_drafts, short, write_file
-from lerobot_memobench.jobs.locking import locked
+from lerobot_memobench.jobs.processes import locked
 
 REQUEST_FILE = "request.json"
 

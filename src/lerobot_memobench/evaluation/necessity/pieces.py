@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_memobench.evaluation.necessity.study import Piece, Study
-from lerobot_memobench.jobs.job import ProgressCallback
-from lerobot_memobench.jobs.running import run_jobs
+from lerobot_memobench.jobs.executors import run_jobs
+from lerobot_memobench.jobs.processes import ProgressCallback
 
 PIECES: dict[Piece, str] = {"scene": "scenes", "search": "searches"}
 """In the order in which they are made, and what several are called."""
