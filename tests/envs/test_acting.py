@@ -19,9 +19,8 @@ from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.cli.memobench import main as memobench
 from lerobot_memobench.envs.acting import acting
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
-from lerobot_memobench.envs.episode_log import read_episodes, write_episodes
-from lerobot_memobench.envs.obs_types import BOTH, OBJECTS, PIXELS, what_is_seen
-from lerobot_memobench.envs.protocol import read_protocol_file
+from lerobot_memobench.envs.episode_log import read_episodes, read_protocol_file, write_episodes
+from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS, what_is_seen
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records.protocol import read_protocol
 from lerobot_memobench.evaluation.records.runs import read_runs

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image, ImageDraw, ImageFont
 
-from lerobot_memobench.envs import annotate as annotating
-from lerobot_memobench.envs.annotate import BAND, OPERATION_COLOURS, annotate
+from lerobot_memobench.envs import video
+from lerobot_memobench.envs.video import BAND, OPERATION_COLOURS, annotate
 from lerobot_memobench.protocol import EXECUTION, PROMPT
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 
@@ -105,16 +105,16 @@ def test_every_clock_is_the_one_drawn() -> None:
 
 def test_what_does_not_change_is_drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[str] = []
-    draw = annotating.ImageDraw.ImageDraw.text
+    draw = video.ImageDraw.ImageDraw.text
 
     def text(self: ImageDraw.ImageDraw, place: object, words: str, *args: object, **settings: object) -> None:
         drawn.append(words)
         draw(self, place, words, *args, **settings)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(annotating.ImageDraw.ImageDraw, "text", text)
+    monkeypatch.setattr(video.ImageDraw.ImageDraw, "text", text)
     task = dataclasses.replace(get_task(task_names()[0]), language="said in this test alone")
     (*_, last), images = list(moments(task.name)), {"image": np.zeros((2, 512, 3), np.uint8)}
-    annotating._piece.cache_clear()
+    video._piece.cache_clear()
     for step in (123_456, 123_457, 123_456):
         annotate(images, SimpleNamespace(**{**vars(last), "task": task, "exec_steps": step}))
     assert drawn.count(task.language) == 1

@@ -20,10 +20,9 @@ from gymnasium.utils.env_checker import check_env
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
-from lerobot_memobench.envs.episode_log import read_episodes, read_log
+from lerobot_memobench.envs.episode_log import MOST_EPISODES, read_episodes, read_log
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.envs.obs_types import OBJECTS, PIXELS
-from lerobot_memobench.envs.protocol import MOST_EPISODES
+from lerobot_memobench.envs.observations import OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.report import write_report
 from lerobot_memobench.evaluation.metrics.failures import failure_of

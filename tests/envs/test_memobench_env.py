@@ -14,8 +14,8 @@ import pytest
 
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode_log import read_episodes
-from lerobot_memobench.envs.film import Film
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
+from lerobot_memobench.envs.video import Film
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import EXECUTION, PROMPT, PROMPT_HORIZON
 from lerobot_memobench.sim.rendering import close_renderers, gl_backend

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lerobot_memobench.envs import episode as episode_module
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.envs.obs_types import BOTH
+from lerobot_memobench.envs.observations import BOTH
 from lerobot_memobench.envs.prompting import RESET
 from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.protocol import EXECUTION

@@ -14,10 +14,10 @@ from lerobot.envs import env_to_policy_features, preprocess_observation
 
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode import Episode
-from lerobot_memobench.envs.film import LAST_FRAMES
+from lerobot_memobench.envs.episode_log import read_protocol_file
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.envs.obs_types import BOTH, OBJECTS, OBS_TYPES, PIXELS, check_obs_type, obs_type_of
-from lerobot_memobench.envs.protocol import read_protocol_file
+from lerobot_memobench.envs.observations import BOTH, OBJECTS, OBS_TYPES, PIXELS, check_obs_type, obs_type_of
+from lerobot_memobench.envs.video import LAST_FRAMES
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.html.videos import frame_count
 from lerobot_memobench.policies.untrained import UntrainedConfig

@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 
 from lerobot_memobench.envs.episode import Episode, referent_of
-from lerobot_memobench.envs.episode_record import episode_record
+from lerobot_memobench.envs.episode_log import episode_record
 from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.protocol import DEMONSTRATION_SEED as DEMONSTRATION_SEEDS
 from lerobot_memobench.protocol import EVALUATION_SEED as EVALUATION_SEEDS

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode import Episode, referent_of
-from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.envs.episode_log import differences, read_episodes, read_protocol_file
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.envs.protocol import differences, read_protocol_file
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts import motions
 from lerobot_memobench.experts.hand import OPEN, Hand

@@ -14,8 +14,7 @@ from lerobot_memobench.cli import controls, figures
 from lerobot_memobench.cli.html import html
 from lerobot_memobench.cli.merge import merge
 from lerobot_memobench.cli.report import ReportFormat, compare, report
-from lerobot_memobench.envs.episode_log import read_episodes
-from lerobot_memobench.envs.protocol import check_protocol, write_protocol
+from lerobot_memobench.envs.episode_log import check_protocol, read_episodes, write_protocol
 from lerobot_memobench.run import rerun as again
 from lerobot_memobench.run.card import new_card, with_episodes, write_card
 from lerobot_memobench.run.resume import earlier_batch_size, resumed_card

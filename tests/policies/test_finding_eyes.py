@@ -15,7 +15,7 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.datasets.feature_cache import FOLDER, building
 from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
-from lerobot_memobench.envs.obs_types import PIXELS, obs_type_of
+from lerobot_memobench.envs.observations import PIXELS, obs_type_of
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.tower import GRID, POOLED, WIDTH, Tower
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset, open_frames

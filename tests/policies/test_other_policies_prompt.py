@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.envs.episode_log import read_episodes, read_protocol_file
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.envs.protocol import read_protocol_file
 from lerobot_memobench.protocol import EXECUTION, PROMPT
 from lerobot_memobench.run.lerobot_command import call_lerobot
 

@@ -16,7 +16,7 @@ from lerobot.scripts import lerobot_eval
 
 from lerobot_memobench.envs import episode
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
-from lerobot_memobench.envs.obs_types import BOTH, OBJECTS, PIXELS
+from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.run.loop.rollout import sparing
 from lerobot_memobench.sim.object_layout import SIZE
@@ -211,7 +211,7 @@ def test_what_nobody_watches_is_not_drawn(use_async: bool, tmp_path: Path) -> No
 
 def test_a_filmed_episode_is_drawn_whole(drawn: list[int], tmp_path: Path) -> None:
     """Two of three episodes are filmed, whoever looks."""
-    from lerobot_memobench.envs.film import LAST_FRAMES
+    from lerobot_memobench.envs.video import LAST_FRAMES
     from lerobot_memobench.evaluation.documents.html.videos import frame_count
 
     rolled(sparing(lerobot_eval.rollout, lambda: True), 3, tmp_path, "memobench_random", films=2)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lerobot_memobench.envs.film import LAST_FRAMES, Film
+from lerobot_memobench.envs.video import LAST_FRAMES, Film
 from lerobot_memobench.run.contact_sheet import read_video
 from lerobot_memobench.run.side_by_side import FAILED, SOLVED, STRIP_WIDTH, TITLE, joined, side_by_side, strip
 

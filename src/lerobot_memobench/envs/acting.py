@@ -17,9 +17,9 @@ from typing import Any
 
 import yaml
 
-from lerobot_memobench.envs.obs_types import what_is_seen
+from lerobot_memobench.envs.episode_log import POLICY, SAW
+from lerobot_memobench.envs.observations import what_is_seen
 from lerobot_memobench.envs.prompting import checkpoint_being_run, in_file, policy_being_run, quiet, training_runs
-from lerobot_memobench.envs.protocol import POLICY, SAW
 from lerobot_memobench.io import file_hash
 
 NOT_THE_CHECKPOINT = (

@@ -20,10 +20,14 @@ from lerobot.configs import PolicyFeature, PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_memobench.envs.acting import acting
-from lerobot_memobench.envs.obs_types import OBJECTS, OBS_TYPES, PIXELS, check_obs_type
+from lerobot_memobench.envs.episode_log import SETTINGS, check_protocol
 from lerobot_memobench.envs.observations import (
     METADATA,
+    OBJECTS,
+    OBS_TYPES,
+    PIXELS,
     action_space,
+    check_obs_type,
     observation_space,
     policy_features,
     policy_names,
@@ -38,7 +42,6 @@ from lerobot_memobench.envs.prompting import (
     rename_map,
     training_runs,
 )
-from lerobot_memobench.envs.protocol import SETTINGS, check_protocol
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.jobs.threads import ACTING, limit_torch, use_threads
 from lerobot_memobench.lerobot_hooks import ROLLOUT, installed
@@ -195,8 +198,7 @@ class MemobenchEnvConfig(EnvConfig):
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """Return `{memory type: {task id: vector env}}`; nothing is simulated before an env's first reset."""
-        from lerobot_memobench.envs.memobench_env import MemobenchEnv
-        from lerobot_memobench.envs.resuming import skip_logged
+        from lerobot_memobench.envs.memobench_env import MemobenchEnv, skip_logged
 
         self.check_checkpoint()
         chosen = self.selected()  # before anything is written: a wrong name leaves nothing behind

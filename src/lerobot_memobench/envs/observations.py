@@ -1,49 +1,130 @@
-"""What a policy is shown and what it answers: names, shapes and units, for LeRobot's configuration and for gym.
+"""What a policy observes and what it answers: `obs_type`, names, shapes and units, and when frames are drawn.
 
-Cheap to import: no simulator, no GL.
+Cheap to import: no simulator, no GL, no LeRobot.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import spaces
-from lerobot.configs import FeatureType, PolicyFeature
-from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
+from numpy.typing import NDArray
 
-from lerobot_memobench.envs.obs_types import OBJECTS, PIXELS
-from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EXECUTION, IMAGE_SIZE, PROMPT, PROPRIO_DIM
+from lerobot_memobench.envs.video import annotate
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, CONTROL_HZ, EXECUTION, IMAGE_SIZE, PROMPT, PROPRIO_DIM
 from lerobot_memobench.sim.object_layout import SIZE
 
-METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}
+if TYPE_CHECKING:
+    from lerobot.configs import PolicyFeature
+
+    from lerobot_memobench.envs.episode import Episode
+    from lerobot_memobench.sim.rendering import Image
+
+PIXELS, OBJECTS, BOTH = "pixels_agent_pos", "environment_state_agent_pos", "both"
+OBS_TYPES = (PIXELS, OBJECTS, BOTH)
+"""Values of ``env.obs_type``, by LeRobot's names: what is observed beside the arm's state."""
+
+METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": CONTROL_HZ}
+
+# --- which of them a policy reads ---
+
+SEEN_PIXELS, DETECTIONS, PRIVILEGED, SIMULATOR, MEMORY_TEXT = (
+    *("pixels", "detections", "privileged object state", "privileged simulator state", "oracle memory text"),
+)
+"""What a policy may read, as reports say it. Detections: objects that a detector finds in pixels."""
+NOTHING = "nothing"
+
+READ_OBJECTS = ("act", "diffusion", "tdmpc", "gaussian_actor")
+"""Policies of LeRobot's that read `observation.environment_state` where they were trained on it; others ignore it."""
+
+
+def obs_type_of(policy: Any) -> str | None:
+    """Return the ``obs_type`` that a policy's configuration needs; None where that is not known, or none is needed.
+
+    A policy that says by ``perception`` what it reads (`pixels`, `objects` or `any`) is taken at its word; one that
+    ``finds_objects`` does so in pictures, and is told some all the same by ``told_objects``.
+    """
+    if getattr(policy, "finds_objects", False):
+        return PIXELS if policy.told_objects == "nothing" else BOTH
+    perception = getattr(policy, "perception", None)
+    if policy is None or perception is not None:
+        return {"objects": OBJECTS, "pixels": PIXELS}.get(str(perception))
+    objects = policy.type in READ_OBJECTS and policy.env_state_feature is not None
+    if policy.image_features:
+        return BOTH if objects else PIXELS
+    return OBJECTS if objects else None
+
+
+def check_obs_type(policy: Any, obs_type: str) -> None:
+    """Refuse an ``obs_type`` in which something is missing that a policy reads.
+
+    Args:
+        policy: its configuration.
+        obs_type: the environment's.
+
+    Raises:
+        MemobenchError: pictures or objects are missing.
+    """
+    needed = obs_type_of(policy)
+    if needed is not None and obs_type not in (needed, BOTH):
+        wanted = BOTH if needed == BOTH else f"{needed} or {BOTH}"
+        told = "" if needed == PIXELS else f" ({PRIVILEGED} among it)"
+        raise MemobenchError(
+            f"env.obs_type is {obs_type}, which does not show what the policy sees{told}; set it to {wanted}"
+        )
+
+
+def what_is_seen(policy: Any, obs_type: str, oracle_memory: bool = False) -> str:
+    """Return a policy's inputs beside the arm's state in words; all of ``obs_type`` where they are not known.
+
+    Args:
+        policy: its configuration, or the class of it. One that names its ``sees`` is taken at its word.
+        obs_type: the environment's.
+        oracle_memory: whether the instruction tells what was done so far.
+    """
+    found = getattr(policy, "sees", None)
+    if not isinstance(found, tuple):
+        features = getattr(policy, "input_features", None) or {}
+        types = {getattr(feature.type, "value", feature.type) for feature in features.values()}
+        everything = not types & {"VISUAL", "ENV"}
+        ignores = type(policy).__module__.startswith("lerobot.") and policy.type not in READ_OBJECTS
+        pixels = obs_type != OBJECTS and (everything or "VISUAL" in types)
+        objects = obs_type != PIXELS and not ignores and (everything or "ENV" in types)
+        found = (SEEN_PIXELS,) * pixels + (PRIVILEGED,) * objects
+    return ", ".join(found + (MEMORY_TEXT,) * oracle_memory) or NOTHING
+
+
+# --- shapes ---
 
 
 def policy_features(obs_type: str = PIXELS) -> dict[str, PolicyFeature]:
     """Return LeRobot's description of actions and observations, by the environment's names."""
-    image = PolicyFeature(type=FeatureType.VISUAL, shape=(IMAGE_SIZE, IMAGE_SIZE, 3))
-    objects = {"environment_state": PolicyFeature(type=FeatureType.ENV, shape=(SIZE,))}
-    return {
-        ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(ACTION_DIM,)),
-        **dict.fromkeys(_pictures(obs_type), image),
-        **(objects if obs_type != PIXELS else {}),
-        "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(PROPRIO_DIM,)),
+    from lerobot.configs import FeatureType, PolicyFeature
+
+    shapes: dict[str, tuple[FeatureType, tuple[int, ...]]] = {
+        "action": (FeatureType.ACTION, (ACTION_DIM,)),
+        **dict.fromkeys(_pictures(obs_type), (FeatureType.VISUAL, (IMAGE_SIZE, IMAGE_SIZE, 3))),
+        **({"environment_state": (FeatureType.ENV, (SIZE,))} if obs_type != PIXELS else {}),
+        "agent_pos": (FeatureType.STATE, (PROPRIO_DIM,)),
     }
+    return {name: PolicyFeature(type=kind, shape=shape) for name, (kind, shape) in shapes.items()}
 
 
 def policy_names(obs_type: str = PIXELS) -> dict[str, str]:
-    """Return what each of `policy_features` is called at the policy."""
+    """Return the policy's name for each of `policy_features`."""
     return {
-        ACTION: ACTION,
+        "action": "action",
         **_pictures(obs_type),
-        **({"environment_state": OBS_ENV_STATE} if obs_type != PIXELS else {}),
-        "agent_pos": OBS_STATE,
+        **({"environment_state": "observation.environment_state"} if obs_type != PIXELS else {}),
+        "agent_pos": "observation.state",
     }
 
 
 def _pictures(obs_type: str) -> dict[str, str]:
     """Return the pictures' names, here and at the policy."""
-    return {} if obs_type == OBJECTS else {f"pixels/{name}": f"{OBS_IMAGES}.{name}" for name in CAMERAS}
+    return {} if obs_type == OBJECTS else {f"pixels/{name}": f"observation.images.{name}" for name in CAMERAS}
 
 
 def observation_space(
@@ -84,3 +165,64 @@ def blank(space: spaces.Space[Any]) -> Any:
     if isinstance(space, spaces.Dict):
         return {key: blank(part) for key, part in space.items()}
     return np.zeros(space.shape or (), space.dtype)
+
+
+# --- contents ---
+
+
+class Sight:
+    """Pictures and objects of the observations, which take time: drawn only where they are needed.
+
+    Args:
+        obs_type: one of `OBS_TYPES`.
+        render_every: pictures are drawn every so many execution steps, and repeated in between; objects are not.
+
+    Attributes:
+        watched: whether somebody looks at the frames that follow. What nobody looks at is as it was seen last; the
+            first and the last frame of the execution always are of the present.
+    """
+
+    def __init__(self, obs_type: str, render_every: int) -> None:
+        self._sees_pictures, self._sees_objects = obs_type != OBJECTS, obs_type != PIXELS
+        self._render_every = render_every
+        self.watched = True
+
+    def begin(self, episode: Episode) -> None:
+        """Look at the first frame of an episode."""
+        self.watched = True
+        self._picture_step: int | None = None
+        self.look(episode, filmed=False)
+
+    def look(self, episode: Episode, *, filmed: bool) -> None:
+        """Take in the present frame, as far as anybody looks at it.
+
+        Args:
+            filmed: whether a film does.
+        """
+        always = episode.done or episode.step_index == episode.exec_start
+        if self._sees_objects and (always or self.watched):
+            self._objects = episode.objects()
+        due = episode.phase == PROMPT or episode.exec_steps % self._render_every == 0
+        if self._sees_pictures and (always or (due and (self.watched or filmed))):
+            self._draw(episode)
+
+    def _draw(self, episode: Episode) -> None:
+        self._images: dict[str, Image] = episode.images()
+        self._picture_step, self._picture_clock = episode.step_index, episode.clock
+
+    def observed(self) -> dict[str, Any]:
+        """Return the observation's pictures and objects, see `observation_space`."""
+        seen: dict[str, Any] = {}
+        if self._sees_pictures:
+            seen["pixels"] = dict(self._images)
+            if self._render_every > 1:
+                seen["picture_step"] = np.array([self._picture_clock], dtype=np.float32)
+        if self._sees_objects:
+            seen["environment_state"] = self._objects
+        return seen
+
+    def frame(self, episode: Episode) -> NDArray[np.uint8]:
+        """Return both cameras annotated: as they were drawn last, or now where observations hold no pictures."""
+        if not self._sees_pictures and self._picture_step != episode.step_index:
+            self._draw(episode)
+        return annotate(self._images, episode)

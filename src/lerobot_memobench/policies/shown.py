@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
-from lerobot_memobench.envs.obs_types import BOTH, OBJECTS, PIXELS
+from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint, check_weights, statistics_shapes
 

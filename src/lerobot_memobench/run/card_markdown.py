@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from lerobot_memobench.envs.protocol import EXTENT, SETTINGS
+from lerobot_memobench.envs.episode_log import EXTENT, SETTINGS
 from lerobot_memobench.evaluation.records.protocol import CARD_FILE
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, cast
 
-from lerobot_memobench.envs.obs_types import OBJECTS, check_obs_type, obs_type_of
+from lerobot_memobench.envs.observations import OBJECTS, check_obs_type, obs_type_of
 from lerobot_memobench.envs.prompting import quiet, read_rename_map
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint

@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime as dt
 from pathlib import Path
 
-from lerobot_memobench.envs.obs_types import OBJECTS
+from lerobot_memobench.envs.observations import OBJECTS
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import EVALUATION_EPISODES, EVALUATION_SEED
 from lerobot_memobench.run.flags import whole_number

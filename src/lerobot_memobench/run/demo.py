@@ -10,8 +10,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from lerobot_memobench.envs.episode_log import MERGED_FILE
-from lerobot_memobench.envs.protocol import PROTOCOL_FILE
+from lerobot_memobench.envs.episode_log import MERGED_FILE, PROTOCOL_FILE
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.report import REPORT_JSON, REPORT_MARKDOWN
 from lerobot_memobench.evaluation.records.protocol import CARD_FILE

@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from lerobot_memobench.envs.episode_log import has_log, read_log
-from lerobot_memobench.envs.protocol import PROTOCOL_FILE
+from lerobot_memobench.envs.episode_log import PROTOCOL_FILE, has_log, read_log
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import remove_drafts
 from lerobot_memobench.jobs.processes import locked

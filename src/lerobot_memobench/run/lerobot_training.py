@@ -21,7 +21,7 @@ from lerobot.utils.constants import OBS_STATE
 from lerobot_memobench.datasets.execution_frames import ExecutionFrames, leave_out_prompts
 from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS as INPUT
 from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
-from lerobot_memobench.envs.obs_types import BOTH, OBJECTS, PIXELS
+from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.envs.prompting import knows_phases
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.lerobot_hooks import OPEN_DATASETS, check_version, install
@@ -34,7 +34,7 @@ logger = logging.getLogger(__name__)
 def trained_on(prompt_frames: bool | None, obs_type: str | None = None) -> Iterator[None]:
     """While this lasts, LeRobot trains on prompt frames too, or on none; None: on none unless the policy knows phases.
 
-    ``obs_type`` is what a policy that does not know phases sees (`envs.obs_types.OBS_TYPES`); None: pictures where
+    ``obs_type`` is what a policy that does not know phases sees (`envs.observations.OBS_TYPES`); None: pictures where
     the dataset has them, else objects.
 
     Raises:

@@ -14,7 +14,7 @@ from operator import itemgetter
 from pathlib import Path
 
 from lerobot_memobench.envs.episode_log import read_episodes
-from lerobot_memobench.envs.obs_types import OBJECTS
+from lerobot_memobench.envs.observations import OBJECTS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics.rollouts import saw
 from lerobot_memobench.io import write_file

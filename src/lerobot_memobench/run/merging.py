@@ -9,8 +9,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.envs.episode_log import has_log, read_log, write_episodes
-from lerobot_memobench.envs.protocol import EXTENT, POLICY, read_protocol_file, write_protocol
+from lerobot_memobench.envs.episode_log import (
+    EXTENT,
+    POLICY,
+    has_log,
+    read_log,
+    read_protocol_file,
+    write_episodes,
+    write_protocol,
+)
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records.protocol import (
     CARD_FILE,

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.envs.obs_types import what_is_seen
-from lerobot_memobench.envs.protocol import SAW
+from lerobot_memobench.envs.episode_log import SAW
+from lerobot_memobench.envs.observations import what_is_seen
 from lerobot_memobench.policies.checkpoint import ADAPTER_FILE, WEIGHTS_FILE, local_folder, portable_path
 from lerobot_memobench.run.card import new_card
 from lerobot_memobench.run.machine import gl_facts, run_facts

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from lerobot_memobench.envs.obs_types import PIXELS, obs_type_of
+from lerobot_memobench.envs.observations import PIXELS, obs_type_of
 from lerobot_memobench.envs.prompting import prompt_in
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.executors import ELSEWHERE

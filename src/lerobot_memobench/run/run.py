@@ -6,8 +6,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
-from lerobot_memobench.envs.episode_log import has_log, read_episodes
-from lerobot_memobench.envs.protocol import read_protocol_file
+from lerobot_memobench.envs.episode_log import has_log, read_episodes, read_protocol_file
 from lerobot_memobench.evaluation.records.protocol import POLICY, read_protocol
 from lerobot_memobench.io import count_of
 from lerobot_memobench.policies.checkpoint import check_weights, portable_path

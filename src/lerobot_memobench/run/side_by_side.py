@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from lerobot_memobench.envs.film import Film
+from lerobot_memobench.envs.video import Film
 from lerobot_memobench.run.contact_sheet import Frame, evenly, read_video
 
 TITLE = 28

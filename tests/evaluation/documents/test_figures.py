@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lerobot_memobench.envs.annotate import OPERATION_COLOURS
+from lerobot_memobench.envs.video import OPERATION_COLOURS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.figures import correlations, entries, failures, prefix, radar, replan, style
 from lerobot_memobench.evaluation.records.runs import Run, read_runs

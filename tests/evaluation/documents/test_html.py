@@ -17,9 +17,8 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.cli.memobench import main
-from lerobot_memobench.envs.annotate import OPERATION_COLOURS
 from lerobot_memobench.envs.episode_log import write_episodes
-from lerobot_memobench.envs.film import Film
+from lerobot_memobench.envs.video import OPERATION_COLOURS, Film
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.html import write_html
 from lerobot_memobench.evaluation.documents.html.collect import page_data, read_runs, task_source

@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lerobot_memobench.envs.annotate import OPERATION_COLOURS
 from lerobot_memobench.envs.episode_log import write_episodes
-from lerobot_memobench.envs.film import Film
+from lerobot_memobench.envs.video import OPERATION_COLOURS, Film
 from lerobot_memobench.evaluation.documents.html import write_html
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support import browser as chromium

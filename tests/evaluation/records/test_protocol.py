@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 
-from lerobot_memobench.envs.episode_log import EpisodeLog, has_log, write_episodes
-from lerobot_memobench.envs.protocol import PROTOCOL_FILE
+from lerobot_memobench.envs.episode_log import PROTOCOL_FILE, EpisodeLog, has_log, write_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records.protocol import CARD_FILE, differences, read_protocol
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_memobench.cli.documents import given_runs
-from lerobot_memobench.envs.protocol import write_protocol
+from lerobot_memobench.envs.episode_log import write_protocol
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.html import write_html
 from lerobot_memobench.evaluation.documents.report import build, render, write_report

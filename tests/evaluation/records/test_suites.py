@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_memobench.envs.protocol import PROTOCOL_FILE, check_protocol
+from lerobot_memobench.envs.episode_log import PROTOCOL_FILE, check_protocol
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.comparison.differences import compare
 from lerobot_memobench.evaluation.documents.evaluation_tables import failures

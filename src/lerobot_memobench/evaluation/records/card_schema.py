@@ -6,8 +6,7 @@ from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
 from annotated_types import Ge, Le, MinLen
 
-from lerobot_memobench.envs.episode_log import CheckpointRecord, Outcome
-from lerobot_memobench.envs.protocol import Protocol, WholeProtocol
+from lerobot_memobench.envs.episode_log import CheckpointRecord, Outcome, Protocol, WholeProtocol
 from lerobot_memobench.io import LARGEST, Count, Name, Whole
 
 

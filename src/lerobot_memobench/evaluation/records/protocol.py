@@ -6,14 +6,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.envs.episode_log import read_episodes
-from lerobot_memobench.envs.protocol import (
+from lerobot_memobench.envs.episode_log import (
     EXTENT,
     MOST_EPISODES,
     OF_THE_POLICY,
     POLICY,
     SETTINGS,
     differences,
+    read_episodes,
     read_protocol_file,
 )
 from lerobot_memobench.errors import MemobenchError

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from lerobot.configs import PreTrainedConfig
 
-from lerobot_memobench.envs.obs_types import SIMULATOR
+from lerobot_memobench.envs.observations import SIMULATOR
 from lerobot_memobench.policies.untrained import UntrainedConfig
 
 

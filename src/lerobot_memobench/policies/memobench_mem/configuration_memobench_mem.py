@@ -11,8 +11,8 @@ from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTr
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
 
 from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
-from lerobot_memobench.envs.obs_types import DETECTIONS, SEEN_PIXELS
-from lerobot_memobench.envs.obs_types import PRIVILEGED as SEEN_OBJECTS
+from lerobot_memobench.envs.observations import DETECTIONS, SEEN_PIXELS
+from lerobot_memobench.envs.observations import PRIVILEGED as SEEN_OBJECTS
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.perception.tower import SIDE
 from lerobot_memobench.perception.weights import PACKAGE, RANDOM

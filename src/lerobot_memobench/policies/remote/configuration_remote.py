@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from lerobot.configs import PreTrainedConfig
 
-from lerobot_memobench.envs.obs_types import PRIVILEGED, SEEN_PIXELS, SIMULATOR
+from lerobot_memobench.envs.observations import PRIVILEGED, SEEN_PIXELS, SIMULATOR
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.remote.dialects import DIALECTS, GRIPPERS, IMAGE, WRIST_IMAGE, Dialect
 from lerobot_memobench.policies.untrained import UntrainedConfig

@@ -18,8 +18,7 @@ from lerobot.utils.constants import ACTION
 from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
-from lerobot_memobench.envs.obs_types import BOTH
-from lerobot_memobench.envs.observations import policy_names
+from lerobot_memobench.envs.observations import BOTH, policy_names
 
 PHASE = "phase"
 """Of an observation, and of our datasets: 0 while the prompt plays, 1 in execution. By it prompts can be left out."""

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench import __version__
-from lerobot_memobench.envs.annotate import OPERATION_COLOURS
+from lerobot_memobench.envs.video import OPERATION_COLOURS
 from lerobot_memobench.evaluation.documents.evaluation_tables import outcomes
 from lerobot_memobench.evaluation.documents.html.videos import episode_id
 from lerobot_memobench.evaluation.documents.sentences import settings_phrases

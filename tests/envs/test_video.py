@@ -11,8 +11,8 @@ import av
 import numpy as np
 import pytest
 
-from lerobot_memobench.envs import film as filming
-from lerobot_memobench.envs.film import AHEAD, LAST_FRAMES, Film
+from lerobot_memobench.envs import video
+from lerobot_memobench.envs.video import AHEAD, LAST_FRAMES, Film
 from lerobot_memobench.errors import MemobenchError
 
 
@@ -133,7 +133,7 @@ def add_often(film: Film, picture: np.ndarray) -> None:
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no full disk to offer")
 def test_what_cannot_be_written_is_told_and_nothing_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (320, 512, 3), np.uint8)  # more than is kept back for later
-    monkeypatch.setattr(filming, "draft_of", on_a_full_disk)
+    monkeypatch.setattr(video, "draft_of", on_a_full_disk)
     film = Film(tmp_path / "task.0.mp4")
     with pytest.raises(MemobenchError, match=r"task\.0\.mp4 cannot be written \(No space left on device\); make room"):
         add_often(film, noise)
