@@ -16,8 +16,9 @@ from lerobot_memobench.envs.episode import Episode, referent_of
 from lerobot_memobench.envs.episode_log import differences, read_episodes, read_protocol_file
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.experts import motions
+from lerobot_memobench.experts.fixtures import turn_knob
 from lerobot_memobench.experts.hand import OPEN, Hand
+from lerobot_memobench.experts.travel import come_home
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import Atom, Never
@@ -114,9 +115,9 @@ def rounds(episode: Episode, count: int) -> Iterator[NDArray[np.floating[Any]]]:
     """Turn the stove on and off, come home, so often; then rest."""
     hand, home = Hand(episode.sim, np.random.default_rng(0)), episode.sim.eef_pose()
     for _ in range(count):
-        yield from motions.turn_knob(hand, "flat_stove_1", on=True)
-        yield from motions.turn_knob(hand, "flat_stove_1", on=False)
-        yield from motions.come_home(hand, *home)
+        yield from turn_knob(hand, "flat_stove_1", on=True)
+        yield from turn_knob(hand, "flat_stove_1", on=False)
+        yield from come_home(hand, *home)
     while True:
         yield hand.rest(OPEN)
 

@@ -17,8 +17,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.expert import Expert, rest_of, steps_of
 from lerobot_memobench.experts.grasping import grasp_pose
 from lerobot_memobench.experts.hand import EMPTY, Hand
-from lerobot_memobench.experts.surroundings import FULLY_OPEN, stands_out
-from lerobot_memobench.experts.travel import PRESSED
+from lerobot_memobench.experts.travel import FULLY_OPEN, PRESSED, stands_out
 from lerobot_memobench.protocol import EXECUTION
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.envs.episode import Episode
-from lerobot_memobench.experts.plans import counts, plan_of
+from lerobot_memobench.experts.expert import counts, plan_of
 from lerobot_memobench.protocol import EXECUTION
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import Atom, parse_formula

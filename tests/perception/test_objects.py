@@ -9,7 +9,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from lerobot_memobench.experts.prompts import highlight_of
+from lerobot_memobench.experts.demonstration_prompt import highlight_of
 from lerobot_memobench.perception.finding import FOUND, SURE
 from lerobot_memobench.perception.kinds import PARTS, kinds
 from lerobot_memobench.perception.labels import Labeller, Rows, projected, settle

@@ -14,8 +14,7 @@ from lerobot_memobench.policies.memobench_mem.perception.sight_errors import (
     SightErrors,
     as_found,
 )
-from lerobot_memobench.sim.object_layout import field
-from lerobot_memobench.sim.object_slots import SIZE, SLOTS, WIDTH, classes, in_slots
+from lerobot_memobench.sim.object_slots import SIZE, SLOTS, WIDTH, classes, field, in_slots
 
 KIND = {name: classes().index(name) for name in ("butter", "akita_black_bowl", "drawer", "plate", "milk")}
 LEVEL = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)

@@ -17,9 +17,9 @@ from numba.core import caching
 
 import lerobot_memobench.sim
 from lerobot_memobench.envs.episode import PROMPT, Episode
-from lerobot_memobench.sim import compiled_controller, osc_kernel, robot
-from lerobot_memobench.sim.compiled_controller import CompiledController
-from lerobot_memobench.sim.controller import OSCController
+from lerobot_memobench.sim import controller as control
+from lerobot_memobench.sim import osc_kernel, robot
+from lerobot_memobench.sim.controller import CompiledController, OSCController
 from lerobot_memobench.sim.simulation import NO_OP, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 
@@ -61,7 +61,7 @@ def moved(sim: Simulation) -> bytes:
 @pytest.fixture
 def undecided(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the process not know yet whether what is compiled can be used."""
-    monkeypatch.setattr(compiled_controller._Process, "agrees", None)
+    monkeypatch.setattr(control._Process, "agrees", None)
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -80,7 +80,7 @@ def test_episodes_are_equal_bit_for_bit(task: str) -> None:
             action = MOVES[k % len(MOVES)]
         compiled.step(action), plain.step(action)
         assert bits(compiled.sim) == bits(plain.sim), f"step {k}"
-    assert compiled_controller._Process.agrees, "nothing was compared"
+    assert control._Process.agrees, "nothing was compared"
     assert k > 50
 
 
@@ -134,7 +134,7 @@ def test_threads_do_not_disturb_each_other() -> None:
 
 _WORKERS = """
 import hashlib, multiprocessing, sys
-from lerobot_memobench.sim import compiled_controller
+from lerobot_memobench.sim import controller as control
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 
@@ -142,7 +142,7 @@ def moved(_):
     sim = Simulation(get_task(sys.argv[1]))
     sim.reset(7)
     sim.step([0.3, -0.4, -0.5, 0.1, 0.2, 0.3, 1.0])
-    return hashlib.sha256(sim.state().tobytes()).hexdigest(), compiled_controller._Process.agrees
+    return hashlib.sha256(sim.state().tobytes()).hexdigest(), control._Process.agrees
 
 if __name__ == "__main__":
     here = moved(0)
@@ -201,7 +201,7 @@ def test_numpy_steps_in(
     lacking: Callable[[pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     expected = moved(simulation())
-    monkeypatch.setattr(compiled_controller._Process, "agrees", None)
+    monkeypatch.setattr(control._Process, "agrees", None)
     with monkeypatch.context() as patch:
         lacking(patch)
         sim = Simulation(get_task(TASKS[0]))
@@ -229,7 +229,7 @@ def test_the_first_step_decides(fault: str, monkeypatch: pytest.MonkeyPatch, cap
     monkeypatch.setattr(osc_kernel, "advance", other_numbers)
     sim = simulation()
     assert moved(sim) == expected
-    assert compiled_controller._Process.agrees is False
+    assert control._Process.agrees is False
     assert len(calls) == 1
     assert capfd.readouterr() == ("", "")
 
@@ -253,7 +253,7 @@ def test_scarce_memory_is_left_to_what_raises(times: float, ways: list[str], mon
     data, controller = arm_with(int(times * data.maxuse_arena))
     OSCController.advance(controller, data, -1.0, 1)
     taken: list[str] = []
-    monkeypatch.setattr(compiled_controller._Process, "agrees", True)
+    monkeypatch.setattr(control._Process, "agrees", True)
     monkeypatch.setattr(CompiledController, "_advance", lambda *_: taken.append("compiled"))
     monkeypatch.setattr(OSCController, "advance", lambda *_: taken.append("numpy"))
     controller.advance(data, -1.0, 1)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.sim.simulation import NO_OP, Simulation
-from lerobot_memobench.sim.start import DETENT_DISTANCE, PLACE_DISTANCE
+from lerobot_memobench.sim.world import DETENT_DISTANCE, PLACE_DISTANCE
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.formula import Atom
 

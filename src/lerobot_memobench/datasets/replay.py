@@ -21,7 +21,7 @@ from lerobot_memobench.datasets.language import persistent_rows
 from lerobot_memobench.datasets.lerobot_format.layout import EXECUTED_ACTION, OBJECTS, image_key, objects_column
 from lerobot_memobench.datasets.lerobot_format.reading import Columns, RecordedEpisode
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.experts.prompts import highlights_at
+from lerobot_memobench.experts.demonstration_prompt import highlights_at
 from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.rendering import RenderSettings

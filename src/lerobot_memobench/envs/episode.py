@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.experts.blind import BlindRoutine
+from lerobot_memobench.experts.demonstration_prompt import PromptDemonstrator
 from lerobot_memobench.experts.expert import Expert
-from lerobot_memobench.experts.prompts import PromptDemonstrator
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EXECUTION, HORIZON, PROMPT, PROMPT_HORIZON
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.rendering import Image, RenderSettings

@@ -7,8 +7,8 @@ from collections.abc import Generator
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.experts import motions
 from lerobot_memobench.experts.expert import Expert
+from lerobot_memobench.experts.travel import come_home
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.task import Task
 
@@ -37,4 +37,4 @@ class BlindRoutine:
             expert = Expert(self._task, self._sim, self._rng)
             while not expert.done:
                 yield expert.act()
-            yield from motions.come_home(expert.hand, *self._home)
+            yield from come_home(expert.hand, *self._home)

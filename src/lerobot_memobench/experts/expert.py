@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.experts import motions
+from lerobot_memobench.experts.fixtures import (
+    close_door,
+    close_drawer,
+    open_door,
+    open_drawer,
+    pull_open,
+    push_shut,
+    turn_knob,
+)
+from lerobot_memobench.experts.grasping import pick, put_in_drawer, put_on, put_on_region
 from lerobot_memobench.experts.hand import OPEN, UP, Hand
-from lerobot_memobench.experts.plans import Step, counts, plan_of
-from lerobot_memobench.experts.surroundings import drawer_around, stands_out
+from lerobot_memobench.experts.travel import come_home, drawer_around, outward_of, stands_out
 from lerobot_memobench.sim.scene import TABLE, TABLE_TOP
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.formula import (
@@ -46,7 +55,7 @@ REPAIRS = 3
 def steps_of(formula: Formula) -> list[Atom]:
     """Return the atoms to bring about, in order. What must not be (`Not`) is nothing to do; of an `Or` the first.
 
-    How often something is to be done is not in here: see `plans.plan_of`.
+    How often something is to be done is not in here: see `plan_of`.
     """
     match formula:
         case Atom():
@@ -157,7 +166,7 @@ class Expert:
         hand = self.hand
         if atom.predicate == "handhome":
             for _ in range(TRIES):  # the arm may be pushed on the way
-                yield from motions.come_home(hand, *self.sim.home)
+                yield from come_home(hand, *self.sim.home)
                 if self._holds(atom):
                     return
             return
@@ -169,9 +178,9 @@ class Expert:
             case "close", (name,):
                 yield from self._close(name)
             case (("turnon" | "wasturnedon"), (name,)):
-                yield from motions.turn_knob(hand, name, on=True)
+                yield from turn_knob(hand, name, on=True)
             case "turnoff", (name,):
-                yield from motions.turn_knob(hand, name, on=False)
+                yield from turn_knob(hand, name, on=False)
             case "in", (name, region):
                 yield from self._bring(atom, lambda: self._put_in(name, region))
             case "on", (name, support):
@@ -193,13 +202,13 @@ class Expert:
         drawer = drawer_around(self.hand, name)
         if drawer is not None:
             yield from self.achieve(Atom("open", (drawer,)))
-        held = yield from motions.pick(self.hand, name, place=place)
+        held = yield from pick(self.hand, name, place=place)
         if held is None:
             return
         if support in self.sim.assets:
-            yield from motions.put_on(self.hand, held, support)
+            yield from put_on(self.hand, held, support)
         else:
-            yield from motions.put_on_region(self.hand, held, self._middle_of(support))
+            yield from put_on_region(self.hand, held, self._middle_of(support))
 
     def _middle_of(self, region: str) -> NDArray[np.float64]:
         """The middle of a region's upper face, (3,), m."""
@@ -212,19 +221,19 @@ class Expert:
 
     def _open(self, name: str) -> Doing:
         if self.sim.world.articulation(name)[0].kind != "door":
-            yield from motions.open_drawer(self.hand, name)
+            yield from open_drawer(self.hand, name)
         elif self.task.suite == STRICT:
-            yield from motions.pull_open(self.hand, name)
+            yield from pull_open(self.hand, name)
         else:
-            yield from motions.open_door(self.hand, name)
+            yield from open_door(self.hand, name)
 
     def _close(self, name: str) -> Doing:
         if self.sim.world.articulation(name)[0].kind != "door":
-            yield from motions.close_drawer(self.hand, name)
+            yield from close_drawer(self.hand, name)
         elif self.task.suite == STRICT:
-            yield from motions.push_shut(self.hand, name)
+            yield from push_shut(self.hand, name)
         else:
-            yield from motions.close_door(self.hand, name)
+            yield from close_door(self.hand, name)
 
     def _put_in(self, name: str, region: str) -> Doing:
         drawers = [
@@ -239,7 +248,70 @@ class Expert:
         articulation, q = self.sim.world.articulation(region)
         if articulation.open_below is not None and q > articulation.open_below:
             yield from self._open(region)
-        out = motions.outward_of(self.hand, articulation)
-        held = yield from motions.pick(self.hand, name, avoid=out)
+        out = outward_of(self.hand, articulation)
+        held = yield from pick(self.hand, name, avoid=out)
         if held is not None:
-            yield from motions.put_in_drawer(self.hand, held, region, out)
+            yield from put_in_drawer(self.hand, held, region, out)
+
+
+# ==== plans.py
+# Read a plan off a goal that counts events or asks for their order: what to do, how often, when to come home.
+
+Step = Atom | Hold
+"""An atom to bring about, or a rest: a `Hold` whose child is so already."""
+
+_NOT_BROUGHT_ABOUT = ("inplace",)
+"""Predicates that an expert keeps true by leaving things alone."""
+
+
+def counts(formula: Formula) -> bool:
+    """Return whether a formula asks how often something has come about."""
+    return isinstance(formula, Exactly) or any(counts(child) for child in children(formula))
+
+
+def plan_of(formula: Formula) -> list[Step]:
+    """Return the steps that make a formula true, in order.
+
+    What the parts of an ``And`` have in common is done once: counting the rounds that began at home, and counting
+    all rounds, is one counting.
+    """
+    match formula:
+        case Atom():
+            return [] if formula.predicate in _NOT_BROUGHT_ABOUT else [formula]
+        case Not() | Never():
+            return []
+        case And(parts):
+            return _together([plan_of(part) for part in sorted(parts, key=_rank)])
+        case Or(parts):
+            return plan_of(parts[0])
+        case Then(parts) | Round(parts):
+            return list(chain.from_iterable(plan_of(part) for part in parts))
+        case Exactly(number, child):
+            return plan_of(child) * number
+        case Hold(child=child):
+            return [*plan_of(child), formula]
+        case When((moment, then)):
+            return [*plan_of(then), *plan_of(moment)]
+    raise TypeError(f"not a formula: {formula!r}")
+
+
+def _rank(formula: Formula) -> int:
+    """What has to be so before another thing is begun goes first; where things belong goes before what is shut."""
+    places = isinstance(formula, Atom) and formula.predicate in ("in", "on")
+    return 0 if isinstance(formula, When) else 1 if places else 2
+
+
+def _together(plans: list[list[Step]]) -> list[Step]:
+    """Return one plan that holds all of them, each step that two have in common once."""
+    whole: list[Step] = []
+    for plan in plans:
+        if not _within(plan, whole):
+            common = next(n for n in range(len(plan), -1, -1) if n == 0 or whole[-n:] == plan[:n])
+            whole += plan[common:]
+    return whole
+
+
+def _within(plan: list[Step], whole: list[Step]) -> bool:
+    """Return whether all steps of a plan occur in another, in order."""
+    left = iter(whole)
+    return all(step in left for step in plan)

@@ -8,8 +8,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.experts.hand import OPEN, UP, Array, Hand, length
-from lerobot_memobench.experts.surroundings import FINGER_REACH, clear_height, corners
+from lerobot_memobench.experts.hand import (
+    COMFORTABLE,
+    DOWN,
+    OPEN,
+    STRETCHED,
+    UP,
+    Array,
+    Hand,
+    cross,
+    frame,
+    length,
+    unit,
+)
+from lerobot_memobench.sim.assets.asset import Articulation, Asset
+from lerobot_memobench.sim.robot import BASE_POSITION
 from lerobot_memobench.sim.scene import TABLE_TOP
 from lerobot_memobench.tasks.formula import Atom
 
@@ -146,3 +159,241 @@ def come_home(hand: Hand, position: Array, rotation: Array) -> Steps:
         if hand.sim.holds(HOME):
             break
         yield hand.toward(position, rotation, OPEN)
+
+
+# ==== surroundings.py
+# What stands around: what the hand would touch at a place or on its way.
+
+FINGER_REACH = 0.0095
+"""How far the finger tips stand out under the grip site, m."""
+FINGER_THICKNESS = 0.014
+"""Of a finger's tip along the closing axis, m."""
+FULLY_OPEN = 0.079
+"""Distance between the open fingers, m."""
+BLOCKED, BLOCKED_COST = 0.010, 2.0
+"""Level distance between the middle of a finger's tip and a thing, m, under which it comes down on that, and the
+penalty: who learns from it learns a grasp that fails before the one that does not."""
+HAND_MARGIN = 0.006
+"""Room left between the hand and its neighbours, m."""
+HAND_POINTS = np.array(
+    [(x, y, -z) for x in (-0.1, -0.05, 0.0, 0.05, 0.1) for y in (-0.032, 0.0, 0.032) for z in (0.05, 0.08, 0.11)]
+    + [(x, y, -z) for x in (-0.05, 0.0, 0.05) for y in (-0.05, 0.0, 0.05) for z in (0.14, 0.18)]
+)
+"""Places on palm and wrist in the grip site's frame (N, 3), m."""
+MOST_OVER = 0.022
+"""By how much a thing may be higher than a drawer's room and still go in with it, m."""
+CLEAR = 0.025
+"""Height left over what stands on the way, m."""
+
+
+def corners(asset: Asset) -> Array:
+    """Return the corners (3, 8) of an asset's bounding box in its frame, m."""
+    return np.array(np.meshgrid(*zip(asset.low, asset.high, strict=True))).reshape(3, -1)
+
+
+def outward_of(hand: Hand, articulation: Articulation) -> Array:
+    """Return the horizontal direction (3,) in which a drawer opens."""
+    axis = hand.sim.data.joint(articulation.joint).xaxis * np.sign(articulation.open_q - articulation.closed_q)
+    outward = axis * np.array([1.0, 1.0, 0.0])
+    return outward / np.linalg.norm(outward)
+
+
+def drawer_around(hand: Hand, name: str) -> str | None:
+    """Return the region of the drawer in which a thing lies, if any."""
+    for asset in hand.sim.assets.values():
+        for region, articulation in asset.articulations.items():
+            if articulation.kind == "drawer" and hand.sim.holds(Atom("in", (name, asset.regions[region]))):
+                return asset.regions[region]
+    return None
+
+
+def stands_out(hand: Hand, name: str, region: str) -> bool:
+    """Say whether a thing in a drawer is so far above it that the drawer cannot be shut: a bowl that leans, say."""
+    position, rotation = hand.sim.body_pose(name)
+    highest = position[2] + (rotation @ corners(hand.sim.assets[name]))[2].max()
+    over: float = highest - hand.sim.site_pose(region)[0][2] - hand.sim.site_half_size(region)[2]
+    return over > MOST_OVER
+
+
+def tall_boxes(hand: Hand, name: str) -> list[tuple[Array, Array, Array]]:
+    """Return centre, rotation and half size of fixtures and of drawers with their handles, (3,), (3, 3), (3,)."""
+    boxes = []
+    for other, asset in hand.sim.assets.items():
+        if asset.kind != "fixture" or other == name:
+            continue
+        position, rotation = hand.sim.body_pose(other)
+        low, high = np.asarray(asset.low), np.asarray(asset.high)
+        boxes.append((position + rotation @ (low + high) / 2, rotation, (high - low) / 2))
+        for region, articulation in asset.articulations.items():
+            if articulation.kind == "drawer":
+                boxes.append(_drawer_box(hand, asset.regions[region], articulation.handle_site))
+    return boxes
+
+
+def _drawer_box(hand: Hand, region: str, handle_site: str) -> tuple[Array, Array, Array]:
+    centre, turned = hand.sim.site_pose(region)
+    handle, _ = hand.sim.site_pose(handle_site)
+    reach = np.abs(turned.T @ (handle - centre)) + 0.008
+    return centre, turned, np.maximum(hand.sim.site_half_size(region) + 0.012, reach)
+
+
+def in_the_way(hand: Hand, name: str, target: Array, turn: Array) -> float:
+    """Return how deep palm and wrist would stand in other objects, m, 0 where they are clear of them."""
+    points = target + HAND_POINTS @ turn.T
+    deepest = 0.0
+    for other, asset in hand.sim.assets.items():
+        if asset.kind == "fixture" or other == name:
+            continue
+        position, rotation = hand.sim.body_pose(other)
+        low, high = np.asarray(asset.low), np.asarray(asset.high)
+        local = (points - position) @ rotation - (low + high) / 2
+        depth = ((high - low) / 2 + HAND_MARGIN - np.abs(local)).min(axis=1)
+        deepest = max(deepest, float(depth.max()))
+    return deepest
+
+
+def crowding(hand: Hand, name: str, target: Array, turn: Array) -> float:
+    """Return a penalty for other things standing where the open fingers would go down."""
+    penalty = 0.0
+    apart = FULLY_OPEN / 2 + FINGER_THICKNESS / 2
+    for other, asset in hand.sim.assets.items():
+        if other == name or asset.kind == "fixture":
+            continue
+        position, rotation = hand.sim.body_pose(other)
+        if position[2] + asset.top < target[2] - FINGER_REACH:
+            continue
+        for side in (-1.0, 1.0):
+            gap = _gap(asset, rotation.T @ (target + side * apart * turn[:, 0] - position))
+            penalty += 40.0 * max(0.0, FINGER_THICKNESS - gap) + BLOCKED_COST * (gap < BLOCKED)
+    return penalty
+
+
+def _gap(asset: Asset, local: Array) -> float:
+    """Return the level distance of a place in an asset's frame from its outline, m; not above 0 inside."""
+    if asset.round:
+        return float(np.hypot(local[0], local[1])) - asset.radius
+    outside = np.maximum(np.abs(local[:2]) - np.asarray(asset.half_extents), 0.0)
+    return float(np.hypot(*outside))
+
+
+def clear_height(hand: Hand, start: Array, end: Array, *, lowest: float, wide: float, but: tuple[str, ...]) -> float:
+    """Return the height for the hand at which nothing is touched on a level way, m.
+
+    Args:
+        hand: the arm.
+        start, end: the way, (3,).
+        lowest: how far what the hand carries reaches down under the grip site, m.
+        wide: how far it reaches sideways, m.
+        but: things that are not in the way: what is carried or taken, and what it is put on.
+    """
+    way = start + np.linspace(0.0, 1.0, 16)[:, None] * (end - start)
+    height = 0.0
+    for other, asset in hand.sim.assets.items():
+        if asset.kind == "fixture" or other in but:
+            continue
+        position, rotation = hand.sim.body_pose(other)
+        gap = float(np.linalg.norm((way - position)[:, :2], axis=1).min()) - asset.radius - wide
+        if gap < 0.0:
+            height = max(height, float(position[2] + (rotation @ corners(asset))[2].max()))
+    for centre, rotation, half in tall_boxes(hand, ""):
+        local = (way - centre) @ rotation
+        outside = np.abs(local[:, :2]) - half[:2]
+        if bool(np.any(np.all(outside < wide, axis=1))):
+            height = max(height, float(centre[2] + half[2]))
+    return height + lowest + CLEAR if height > 0.0 else 0.0
+
+
+# ==== leaning.py
+# How the hand leans: away from what stands beside a thing, and towards the arm where a thing is far.
+
+BESIDE = 0.085
+"""Horizontal distance from the grip site within which something tall is in the hand's way, m."""
+MOST_LEAN = np.radians(32)
+"""How far the hand leans at most to keep clear of something or to reach a far place, rad."""
+UNDER_LEAN = np.radians(44)
+"""The same for what lies under something, rad."""
+DRAWER_LEAN = np.radians(14)
+"""How far the hand leans out of the front to reach into a drawer: clear of the handles above, and of its own front."""
+MORE_LEAN = (0.0, 0.12, -0.12, 0.24, -0.24, 0.36, -0.36, 0.48, -0.48)
+"""Leans tried, in this order, to keep the hand off its neighbours, rad."""
+
+
+def leaning(closing: Array, away: Array) -> Array:
+    """Return the rotation (3, 3) of a hand that points down, its wrist leaning along ``away`` by its length, rad."""
+    size = length(away)
+    return frame(DOWN - np.tan(min(size, UNDER_LEAN)) * unit(away), closing)
+
+
+def clear_of_objects(
+    hand: Hand, name: str, target: Array, closing: Array, away: Array, reaching: bool = False
+) -> Array:
+    """Return the hand's rotation (3, 3), leaning by ``away`` or by what else keeps it off tall things beside.
+
+    Where it is ``reaching``, a lean that stretches the arm too far is as bad as one that stands in them as deep.
+    """
+    side = cross(UP, closing)
+    best, least = leaning(closing, away), np.inf
+    for more in MORE_LEAN:
+        if abs(float(away @ side) + more) > MOST_LEAN and more != 0.0:
+            continue
+        turn = leaning(closing, away + more * side)
+        bad = in_the_way(hand, name, target, turn)
+        if reaching:
+            bad += max(0.0, hand.stretch(target, turn) - STRETCHED)
+        if bad < least - 0.002:
+            best, least = turn, bad
+        if least <= 0.0:
+            break
+    return best
+
+
+def reach_lean(hand: Hand, place: Array, stretch: float = COMFORTABLE) -> Array:
+    """Return by how much and whither the hand should lean to reach a far place with a bent elbow, (3,), rad."""
+    inward = -hand.radial(place)
+    for angle in np.linspace(0.0, MOST_LEAN, 8):
+        approach = np.cos(angle) * DOWN - np.sin(angle) * inward
+        if hand.stretch(place, frame(approach, cross(UP, inward))) < stretch:
+            break
+    return float(angle) * inward
+
+
+def pointing(hand: Hand, place: Array) -> Array:
+    """Return the rotation (3, 3) of a hand that points down at a place, leaning where it is far."""
+    lean = reach_lean(hand, place)
+    return leaning(cross(UP, hand.radial(place)), lean)
+
+
+def lean_from_fixtures(hand: Hand, name: str, target: Array) -> Array:
+    """Return by how much and whither the hand should lean to keep clear of tall fixtures beside it, (3,), rad."""
+    drawer = drawer_around(hand, name)
+    if drawer is not None:
+        return DRAWER_LEAN * outward_of(hand, hand.sim.world.articulation(drawer)[0])
+    lean = np.zeros(3)
+    for centre, rotation, half in tall_boxes(hand, name):
+        local = rotation.T @ (target - centre)
+        if local[2] + 0.03 <= half[2]:
+            lean += _lean_from_box(local, rotation, half)
+    size = length(lean)
+    return lean * min(1.0, UNDER_LEAN / size) if size > 0 else lean
+
+
+def _lean_from_box(local: Array, rotation: Array, half: Array) -> Array:
+    """Return the lean of a hand from one box, whose frame ``local`` (3,) is in."""
+    outside = local - np.clip(local, -half, half)
+    outside[2] = 0.0
+    gap = length(outside)
+    if gap >= BESIDE:
+        return np.zeros(3)
+    if gap > 1e-6:
+        return rotation @ outside / gap * MOST_LEAN * min(1.0, 1.6 * (1.0 - gap / BESIDE))
+    # Under it, as under an open drawer: in from the nearest side.
+    room = half[:2] - np.abs(local[:2])
+    side = int(np.argmin(room))
+    way = np.zeros(3)
+    way[side] = np.sign(local[side]) or 1.0
+    return rotation @ way * UNDER_LEAN
+
+
+def far(place: Array) -> float:
+    """Return how far a place is from the arm's foot, level, m."""
+    return length(place[:2] - np.asarray(BASE_POSITION[:2]))

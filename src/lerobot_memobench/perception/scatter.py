@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from lerobot_memobench.experts.demonstration_prompt import highlight_of
 from lerobot_memobench.experts.hand import downward
-from lerobot_memobench.experts.prompts import highlight_of
 from lerobot_memobench.perception import poses
 from lerobot_memobench.perception.crowd import MORE
 from lerobot_memobench.perception.labels import settle

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError, nearest, unsupported_system
-from lerobot_memobench.sim.drawing.drawlist import build_draw_list
-from lerobot_memobench.sim.drawing.rasterizer import Rasterizer
+from lerobot_memobench.sim.gl.drawlist import build_draw_list
+from lerobot_memobench.sim.gl.rasterizer import Rasterizer
 
 Image = NDArray[np.uint8]
 

@@ -16,13 +16,11 @@ from numpy.typing import ArrayLike, NDArray
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.protocol import ACTION_DIM
 from lerobot_memobench.sim import robot
-from lerobot_memobench.sim.compiled_controller import make_controller
-from lerobot_memobench.sim.controller import CLOSING
+from lerobot_memobench.sim.controller import CLOSING, make_controller
 from lerobot_memobench.sim.placement import Placement, Placer
 from lerobot_memobench.sim.rendering import Highlight, Image, Renderer, RenderSettings, get_renderer
 from lerobot_memobench.sim.scene import AGENTVIEW, SUBSTEPS, get_scene, state_size
-from lerobot_memobench.sim.start import Start
-from lerobot_memobench.sim.world import World
+from lerobot_memobench.sim.world import Start, World
 from lerobot_memobench.tasks.formula import SINCE_START, Atom
 from lerobot_memobench.tasks.task import STRICT, Task
 

@@ -20,7 +20,7 @@ from lerobot_memobench.datasets.hdf5.layout import Unusable, truth_from_interval
 from lerobot_memobench.datasets.hdf5.mjcf import Pose, read_fixture_poses
 from lerobot_memobench.datasets.hdf5.reading import PublishedDemo
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.experts.prompts import highlights_at
+from lerobot_memobench.experts.demonstration_prompt import highlights_at
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.placement import GAP
 from lerobot_memobench.sim.scene import TABLE_TOP

@@ -7,7 +7,7 @@ units see `sim.assets.asset`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Literal
 
@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.sim.assets.asset import Articulation, Asset, Grasp
-from lerobot_memobench.sim.assets.shared_parts import SharedParts, Vector
+from lerobot_memobench.sim.assets.meshes import MeshData
+from lerobot_memobench.sim.assets.paint import Pixels
 
 VISUAL_GROUP = 1
 COLLISION_GROUP = 0
@@ -29,6 +30,8 @@ FRICTION = (1.0, 0.02, 0.0005)
 ROLLING_FRICTION = 0.004
 GRIP_FRICTION = (1.8, 0.03, 0.0005)
 
+Vector = Sequence[float] | NDArray[np.float64]
+
 Primitive = Literal["box", "cylinder", "capsule", "ellipsoid", "sphere"]
 _TYPES: dict[Primitive, mujoco.mjtGeom] = {
     "box": mujoco.mjtGeom.mjGEOM_BOX,
@@ -39,7 +42,7 @@ _TYPES: dict[Primitive, mujoco.mjtGeom] = {
 }
 
 
-class Builder(SharedParts):
+class Builder:
     """Builds one instance of an asset into a shared ``MjSpec``.
 
     Bodies, geoms, joints and sites are named ``f"{name}_{suffix}"``.
@@ -49,7 +52,7 @@ class Builder(SharedParts):
         self, spec: mujoco.MjSpec, parent: mujoco.MjsBody, name: str, class_name: str, variant: int = 0
     ) -> None:
         """Add the root body ``name`` below ``parent``; the scene places it and frees objects with a joint."""
-        super().__init__(spec)
+        self.spec = spec
         self.name = name
         self.class_name = class_name
         self.variant = variant
@@ -57,7 +60,8 @@ class Builder(SharedParts):
         self._counts: dict[str, int] = {}
         self._grasps: list[Grasp] = []
 
-    # names -------------------------------------------------------------------------------------
+    # --- names
+
     def full(self, suffix: str) -> str:
         """Return the full element name of ``suffix``."""
         return f"{self.name}_{suffix}"
@@ -66,7 +70,61 @@ class Builder(SharedParts):
         self._counts[kind] = self._counts.get(kind, -1) + 1
         return self.full(f"{kind}{self._counts[kind]}")
 
-    # bodies and joints -------------------------------------------------------------------------
+    # --- textures, materials and meshes: made once per scene and shared by all that use their key
+
+    def material(
+        self,
+        key: str,
+        image: Callable[[], Pixels] | None = None,
+        rgba: Vector = (1.0, 1.0, 1.0, 1.0),
+        specular: float = 0.2,
+        shininess: float = 0.3,
+        reflectance: float = 0.0,
+        emission: float = 0.0,
+    ) -> str:
+        """Return the name of the material ``key``, made on first use; ``image`` draws its texture."""
+        name = f"memobench_{key}"
+        if self.spec.material(name) is not None:
+            return name
+        made = self.spec.add_material(name=name, rgba=list(rgba), specular=specular, shininess=shininess)
+        made.reflectance = reflectance
+        made.emission = emission
+        if image is not None:
+            self._texture(name, np.ascontiguousarray(image(), dtype=np.uint8))
+            made.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
+        return name
+
+    def _texture(self, name: str, pixels: Pixels) -> None:
+        texture = self.spec.add_texture(
+            name=name,
+            type=mujoco.mjtTexture.mjTEXTURE_2D,
+            height=pixels.shape[0],
+            width=pixels.shape[1],
+            nchannel=3,
+        )
+        texture.data = pixels.tobytes()
+
+    def mesh(self, key: str, make: Callable[[], MeshData], smooth: bool = False) -> str:
+        """Return the name of the mesh ``key``, made on first use; ``smooth`` shades sharp edges as round."""
+        name = f"memobench_{key}"
+        if self.spec.mesh(name) is not None:
+            return name
+        data = make()
+        made = self.spec.add_mesh(
+            name=name,
+            uservert=data.vertices.astype(np.float32).ravel(),
+            userface=data.faces.astype(np.int32).ravel(),
+            smoothnormal=smooth,
+        )
+        made.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+        if data.uv is not None:
+            made.usertexcoord = data.uv.astype(np.float32).ravel()
+            indices = data.faces if data.uv_faces is None else data.uv_faces
+            made.userfacetexcoord = indices.astype(np.int32).ravel()
+        return name
+
+    # --- bodies and joints
+
     def child(self, suffix: str, pos: Vector = (0.0, 0.0, 0.0), quat: Vector | None = None) -> mujoco.MjsBody:
         """Add a body below the root."""
         made = self.body.add_body(name=self.full(suffix), pos=list(pos))
@@ -108,7 +166,8 @@ class Builder(SharedParts):
         """Keep two bodies from touching each other."""
         self.spec.add_exclude(bodyname1=first.name, bodyname2=second.name)
 
-    # geoms and sites ---------------------------------------------------------------------------
+    # --- geoms and sites
+
     def visual_mesh(
         self,
         mesh: str,
@@ -231,7 +290,8 @@ class Builder(SharedParts):
             made.quat = list(quat)
         return name
 
-    # facts -------------------------------------------------------------------------------------
+    # --- facts
+
     def grasp(self, position: Vector, yaw: float, width: float, symmetric: bool = False, depth: float = 0.01) -> None:
         """Note a way to hold the object from above."""
         x, y, z = (float(v) for v in position)

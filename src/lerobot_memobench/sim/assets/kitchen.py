@@ -101,4 +101,59 @@ def _table(b: Builder) -> Asset:
     return b.fixture(low=(-x, -y, -TABLE_TOP), high=(x, y, 0.0), regions={}, clear=x)
 
 
-BUILDERS: dict[str, Callable[[Builder], Asset]] = {"kitchen_table": _table}
+# ==== shelf.py
+# The wooden shelf with two layers, open to local -y and to the back.
+
+_SHELF_HALF_X = 0.176
+_SHELF_FRONT, _SHELF_BACK = -0.075, 0.116
+_SHELF_HIGH = 0.210
+_SHELF_BOARD = 0.010
+_SHELF_MIDDLE = 0.105  # top of the board between the layers
+
+
+def _boards() -> list[Block]:
+    y, depth = (_SHELF_FRONT + _SHELF_BACK) / 2, (_SHELF_BACK - _SHELF_FRONT) / 2
+    inner = _SHELF_HALF_X - _SHELF_BOARD
+    return [
+        *(
+            Block(
+                (s * (_SHELF_HALF_X - _SHELF_BOARD / 2), y, (_SHELF_HIGH - _SHELF_BOARD) / 2),
+                (_SHELF_BOARD / 2, depth, (_SHELF_HIGH - _SHELF_BOARD) / 2),
+                2,
+            )
+            for s in (-1.0, 1.0)
+        ),
+        Block((0, y, _SHELF_HIGH - _SHELF_BOARD / 2), (_SHELF_HALF_X, depth, _SHELF_BOARD / 2), 0),
+        Block((0, y, _SHELF_MIDDLE - _SHELF_BOARD / 2), (inner, depth, _SHELF_BOARD / 2), 0),
+        Block((0, y, _SHELF_BOARD / 2), (inner, depth, _SHELF_BOARD / 2), 0),
+    ]
+
+
+def _shelf(b: Builder) -> Asset:
+    dark = b.material("shelf_wood", lambda: wood((70, 46, 32), (122, 86, 62), seed=9, waves=6), specular=0.15)
+    b.visual_mesh(b.mesh("shelf", lambda: blocks(_boards(), tile=0.25)), dark)
+    for part in _boards():
+        b.collision("box", part.half, 0.5, part.centre)
+    y, depth = (_SHELF_FRONT + _SHELF_BACK) / 2, (_SHELF_BACK - _SHELF_FRONT) / 2
+    inner = _SHELF_HALF_X - _SHELF_BOARD
+
+    def inside(low: float, high: float, name: str) -> str:
+        return b.site(name, (0, y, (low + high) / 2), (inner, depth, (high - low) / 2), box=True)
+
+    regions = {
+        "top_side": b.site("top_side", (0, y, _SHELF_HIGH - 0.001), (_SHELF_HALF_X, depth, 0.001), box=True),
+        "top_region": inside(_SHELF_MIDDLE, _SHELF_HIGH - _SHELF_BOARD, "top_region"),
+        "bottom_region": inside(_SHELF_BOARD, _SHELF_MIDDLE - _SHELF_BOARD, "bottom_region"),
+    }
+    return b.fixture(
+        low=(-_SHELF_HALF_X, _SHELF_FRONT, 0),
+        high=(_SHELF_HALF_X, _SHELF_BACK, _SHELF_HIGH),
+        regions=regions,
+        clear=depth,
+    )
+
+
+BUILDERS: dict[str, Callable[[Builder], Asset]] = {
+    "kitchen_table": _table,
+    "wooden_two_layer_shelf": _shelf,
+}

@@ -9,40 +9,21 @@ import mujoco
 
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.sim.assets import (
+    appliances,
     bottles,
-    boxes,
     cabinet,
-    cartons,
-    cookware,
-    dishes,
+    food,
     kitchen,
-    microwave,
-    shelf,
-    snacks,
-    stove,
+    packages,
+    tableware,
     trinkets,
-    vegetables,
 )
 from lerobot_memobench.sim.assets.asset import Asset
 from lerobot_memobench.sim.assets.builder import Builder
 
 Build = Callable[[Builder], Asset]
 
-_MODULES = (
-    bottles,
-    boxes,
-    cabinet,
-    cartons,
-    cookware,
-    dishes,
-    kitchen,
-    microwave,
-    shelf,
-    snacks,
-    stove,
-    trinkets,
-    vegetables,
-)
+_MODULES = (appliances, bottles, cabinet, food, kitchen, packages, tableware, trinkets)
 """Where the project's own classes are: each has ``BUILDERS``, class name -> builder."""
 
 _builders: dict[str, Build] = {name: build for module in _MODULES for name, build in module.BUILDERS.items()}

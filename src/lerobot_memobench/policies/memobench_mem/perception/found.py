@@ -26,7 +26,7 @@ from lerobot_memobench.policies.memobench_mem.perception.sight_errors import TOL
 from lerobot_memobench.policies.memobench_mem.perception.slots import in_order
 from lerobot_memobench.policies.shown import cure
 from lerobot_memobench.protocol import CAMERAS
-from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH, field
+from lerobot_memobench.sim.object_slots import SIZE, SLOTS, WIDTH, field
 
 FOUND = f"{SEEN}objects"
 """Name in a training sample of what was found in its pictures, (B, SIZE)."""

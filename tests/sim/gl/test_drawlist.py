@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.drawing.drawlist import build_draw_list
-from lerobot_memobench.sim.drawing.shapes import disc
+from lerobot_memobench.sim.gl.drawlist import build_draw_list, disc
 
 
 def test_draw_list_has_outward_faces() -> None:

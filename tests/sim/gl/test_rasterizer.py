@@ -11,8 +11,8 @@ import pytest
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim import rendering
-from lerobot_memobench.sim.drawing.rasterizer import Rasterizer
-from lerobot_memobench.sim.drawing.shaders import frame_block
+from lerobot_memobench.sim.gl.rasterizer import Rasterizer
+from lerobot_memobench.sim.gl.shaders import frame_block
 from lerobot_memobench.sim.rendering import QUALITIES, Highlight, RenderSettings
 from lerobot_memobench.sim.simulation import NO_OP, Simulation
 from lerobot_memobench.tasks.catalogue import get_task

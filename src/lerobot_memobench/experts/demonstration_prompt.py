@@ -10,10 +10,10 @@ from collections.abc import Generator, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.experts import motions
 from lerobot_memobench.experts.expert import Expert
+from lerobot_memobench.experts.grasping import pick, put_at
 from lerobot_memobench.experts.hand import CLOSED, OPEN, UP, Array, Hand
-from lerobot_memobench.experts.travel import HOME
+from lerobot_memobench.experts.travel import HOME, go_home, pointing
 from lerobot_memobench.sim.rendering import Highlight
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.formula import Atom
@@ -61,7 +61,7 @@ class PromptDemonstrator:
             case "hide":
                 yield from self._hide()
                 return
-        yield from motions.go_home(hand, position, rotation)
+        yield from go_home(hand, position, rotation)
         yield from hand.wait(PAUSE, OPEN)
 
     def _referent(self) -> str:
@@ -73,7 +73,7 @@ class PromptDemonstrator:
         while not expert.done:
             yield expert.act()
         self.shown = expert.succeeded
-        yield from motions.go_home(expert.hand, *home)
+        yield from go_home(expert.hand, *home)
 
     def _hide(self) -> Generator[NDArray[np.float32], None, None]:
         """Put each thing into its drawer and shut that, then come home; shown if all are out of sight."""
@@ -91,17 +91,17 @@ class PromptDemonstrator:
 
     def _pick(self, hand: Hand) -> Generator[NDArray[np.float32], None, None]:
         place, turned = self._sim.body_pose(self._referent())
-        held = yield from motions.pick(hand, self._referent())
+        held = yield from pick(hand, self._referent())
         if held is not None:
             self.shown = True
             yield from hand.wait(PAUSE, CLOSED)
-            yield from motions.put_at(hand, held, place, turned)
+            yield from put_at(hand, held, place, turned)
 
     def _point(self, hand: Hand) -> Generator[NDArray[np.float32], None, None]:
         asset = self._sim.assets[self._referent()]
         place, _ = self._sim.body_pose(self._referent())
         above = place + (asset.top + 0.03) * UP
-        rotation = motions.pointing(hand, above)
+        rotation = pointing(hand, above)
         yield from hand.move(above + 0.10 * UP, rotation, CLOSED, tolerance=0.015)
         for height in (0.0, 0.05, 0.0):
             yield from hand.move(above + height * UP, rotation, CLOSED, tolerance=0.008, speed=0.6, timeout=60)

@@ -8,19 +8,24 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.drawing.calls import frame_calls
-from lerobot_memobench.sim.drawing.drawlist import LAYER_SIZE, ROWS, VERTEX, DrawList
-from lerobot_memobench.sim.drawing.resources import Resources
-from lerobot_memobench.sim.drawing.shaders import ATTRIBUTES, TEXTURE_UNITS, geom_program, scene_program
-from lerobot_memobench.sim.drawing.shadows import ShadowMap
-from lerobot_memobench.sim.drawing.shapes import disc
-from lerobot_memobench.sim.drawing.views import View
+from lerobot_memobench.sim.gl.drawlist import LAYER_SIZE, ROWS, VERTEX, DrawList, Floats, disc
+from lerobot_memobench.sim.gl.resources import Resources, frame_calls
+from lerobot_memobench.sim.gl.shaders import (
+    ATTRIBUTES,
+    TEXTURE_UNITS,
+    frame_block,
+    geom_program,
+    scene_program,
+    shadow_program,
+)
 
 Image = NDArray[np.uint8]
 Disc = tuple[NDArray[np.floating], float, float, Sequence[float]]
@@ -263,3 +268,166 @@ class Rasterizer:
     def free(self) -> None:
         """Delete all GL objects; the context they were made in must be current."""
         self._resources.free()
+
+
+# ==== views.py
+# What a camera and a light see, as matrices to clip space, and all that the shaders are told of a frame.
+
+
+class View:
+    """What the shaders are told of a frame, in their layout (`shaders.frame_block`).
+
+    Args:
+        model: where lights and clipping planes are read from.
+        lights: ids of the directional lights that shine.
+        caster: which of them casts shadows, None for none.
+        height, width: size of a frame, pixels.
+    """
+
+    def __init__(self, model: mujoco.MjModel, lights: list[int], caster: int | None, height: int, width: int) -> None:
+        self._lights, self._caster, self._height, self._width = lights, caster, height, width
+        head = model.vis.headlight  # goes before the other lights
+        self.block: NDArray[Any] = np.zeros((), dtype=frame_block(1 + len(lights)))
+        self.block["light"] = np.eye(4)
+        self.block["ambient"][:3] = (head.ambient + model.light_ambient[lights].sum(axis=0)).astype(np.float32)
+        self.block["light_diffuse"][:, :3] = np.vstack([head.diffuse, model.light_diffuse[lights]])
+        self.block["light_specular"][:, :3] = np.vstack([head.specular, model.light_specular[lights]])
+        self._shining: bytes | None = None
+
+    def look(self, model: mujoco.MjModel, data: mujoco.MjData, camera: int) -> NDArray[Any]:
+        """Return the block for a camera's view of a state; it is overwritten by the next call."""
+        block = self.block
+        # The shaders keep matrices by columns.
+        block["projection"] = camera_matrix(model, data, camera, self._height, self._width).T
+        block["eye"][:3] = data.cam_xpos[camera]
+        directions = data.light_xdir[self._lights]
+        block["light_to"][0, :3] = data.cam_xmat[camera].reshape(3, 3)[:, 2]  # a headlight shines from the camera
+        block["light_to"][1:, :3] = -directions
+        shining = directions.tobytes()
+        if self._caster is not None and shining != self._shining:  # lamps hang still
+            self._shining = shining
+            block["light"] = light_matrix(model, data, self._caster).T
+        return block
+
+
+def camera_matrix(model: mujoco.MjModel, data: mujoco.MjData, camera: int, height: int, width: int) -> Floats:
+    """Return the matrix (4, 4) from the world to a camera's clip space, upside down.
+
+    So the first row that is read back is the top one; faces turn around with it.
+
+    Args:
+        model, data: the state to show.
+        camera: its id.
+        height, width: size of a frame, pixels.
+    """
+    eye, frame = data.cam_xpos[camera], data.cam_xmat[camera].reshape(3, 3)
+    near, far = (float(p * model.stat.extent) for p in (model.vis.map.znear, model.vis.map.zfar))
+    slope = 1.0 / np.tan(np.radians(float(model.cam_fovy[camera])) / 2)
+    projection = np.zeros((4, 4))
+    projection[0, 0] = slope * height / width
+    projection[1, 1] = -slope
+    projection[2, 2:] = (far + near) / (near - far), 2 * far * near / (near - far)
+    projection[3, 2] = -1.0
+    view = np.eye(4)
+    view[:3, :3] = frame.T
+    view[:3, 3] = -frame.T @ eye
+    return (projection @ view).astype(np.float32)
+
+
+def light_matrix(model: mujoco.MjModel, data: mujoco.MjData, light: int) -> Floats:
+    """Return the matrix (4, 4) from the world to the clip space of a directional light."""
+    forward = data.light_xdir[light]
+    if not forward.any():  # nothing was simulated yet
+        forward = model.light_dir[light]
+    side = np.cross(forward, [0.0, 0.0, 1.0] if abs(forward[2]) < 0.99 else [0.0, 1.0, 0.0])
+    side /= np.linalg.norm(side)
+    up = np.cross(side, forward)
+    half = float(model.vis.map.shadowclip * model.stat.extent)
+    centre = model.stat.center
+    matrix = np.zeros((4, 4), dtype=np.float32)
+    for row, axis in enumerate((side, up, forward)):
+        reach = half if row < 2 else 2.0 * half
+        matrix[row, :3] = axis / reach
+        matrix[row, 3] = -axis @ centre / reach
+    matrix[3, 3] = 1.0
+    return matrix
+
+
+# ==== shadows.py
+# What a light sees: the depths of all that casts shadows, of which only what has moved is drawn anew.
+
+
+class ShadowMap:
+    """The shadow map of one light, and the depths of the casters that cannot move, kept beside it.
+
+    Args:
+        GL: PyOpenGL's module; a context is current.
+        call: the functions of a frame.
+        resources: where GL objects are made, and freed with the rest.
+        draw_list: what there is to draw.
+        size: side of the map, pixels.
+        first: where the still casters' indices begin in the buffer of indices; the moving ones' follow them.
+    """
+
+    def __init__(
+        self, GL: Any, call: SimpleNamespace, resources: Resources, draw_list: DrawList, size: int, first: int
+    ) -> None:
+        self._gl, self._call, self._list, self._size, self._first = GL, call, draw_list, size, first
+        self._still = resources.framebuffer()
+        resources.renderbuffer(GL.GL_DEPTH_COMPONENT16, GL.GL_DEPTH_ATTACHMENT, 0, (size, size))
+        self._finish_framebuffer(resources)
+        self._all = resources.framebuffer()
+        self._make_texture(resources)
+        self._finish_framebuffer(resources)
+        self._program = resources.program(shadow_program(GL))
+        self._kept: bytes | None = None
+
+    def _make_texture(self, resources: Resources) -> None:
+        GL, size = self._gl, self._size
+        texture = resources.texture(TEXTURE_UNITS["shadows"], GL.GL_TEXTURE_2D)
+        GL.glTexImage2D(
+            GL.GL_TEXTURE_2D, 0, GL.GL_DEPTH_COMPONENT16, size, size, 0, GL.GL_DEPTH_COMPONENT,
+            GL.GL_UNSIGNED_SHORT, None,
+        )  # fmt: skip
+        resources.sample(GL.GL_TEXTURE_2D, GL.GL_LINEAR, GL.GL_CLAMP_TO_BORDER)
+        GL.glTexParameterfv(GL.GL_TEXTURE_2D, GL.GL_TEXTURE_BORDER_COLOR, (1.0, 1.0, 1.0, 1.0))
+        GL.glTexParameteri(GL.GL_TEXTURE_2D, GL.GL_TEXTURE_COMPARE_MODE, GL.GL_COMPARE_REF_TO_TEXTURE)
+        GL.glTexParameteri(GL.GL_TEXTURE_2D, GL.GL_TEXTURE_COMPARE_FUNC, GL.GL_LEQUAL)
+        GL.glFramebufferTexture2D(GL.GL_FRAMEBUFFER, GL.GL_DEPTH_ATTACHMENT, GL.GL_TEXTURE_2D, texture, 0)
+
+    def _finish_framebuffer(self, resources: Resources) -> None:
+        self._gl.glDrawBuffer(self._gl.GL_NONE)
+        self._gl.glReadBuffer(self._gl.GL_NONE)
+        resources.check_framebuffer()
+
+    def draw(self, table: Floats, light: Floats) -> None:
+        """Bring the map up to date.
+
+        Args:
+            table: poses of the geoms, (rows, ROWS, 4), as the shader was told them.
+            light: from the world to the light's clip space, (4, 4), as the shader was told it.
+        """
+        GL, call, size = self._gl, self._call, self._size
+        call.glViewport(0, 0, size, size)
+        call.glUseProgram(self._program)
+        call.glFrontFace(GL.GL_CCW)
+        # Pushed away from the light by more than a texel's slope, or surfaces would speckle themselves.
+        call.glEnable(GL.GL_POLYGON_OFFSET_FILL)
+        call.glPolygonOffset(2.0, 4.0)
+        # What cannot move in an episode still stands elsewhere after a reset, and in another simulation of the scene.
+        kept = table[self._list.still_rows, :3].tobytes() + light.tobytes()
+        if kept != self._kept:
+            self._kept = kept
+            call.glBindFramebuffer(GL.GL_FRAMEBUFFER, self._still)
+            call.glClear(GL.GL_DEPTH_BUFFER_BIT)
+            self._draw(self._first, self._list.still.size)
+        call.glBindFramebuffer(GL.GL_READ_FRAMEBUFFER, self._still)
+        call.glBindFramebuffer(GL.GL_DRAW_FRAMEBUFFER, self._all)
+        call.glBlitFramebuffer(0, 0, size, size, 0, 0, size, size, GL.GL_DEPTH_BUFFER_BIT, GL.GL_NEAREST)
+        # The nearest depth of a texel is the same whoever is drawn first.
+        self._draw(self._first + self._list.still.size, self._list.moving.size)
+        call.glDisable(GL.GL_POLYGON_OFFSET_FILL)
+
+    def _draw(self, first: int, count: int) -> None:
+        GL = self._gl
+        self._call.glDrawElements(GL.GL_TRIANGLES, count, GL.GL_UNSIGNED_INT, 4 * first)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.sim import rendering
-from lerobot_memobench.sim.drawing.drawlist import DrawList, build_draw_list
+from lerobot_memobench.sim.gl.drawlist import DrawList, build_draw_list
 from lerobot_memobench.sim.rendering import QUALITIES, ROOM, Highlight, Renderer, RenderSettings
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
