@@ -1,6 +1,7 @@
 """The architecture as imports make it: read from source, held to the order in docs/develop.md, drawn into the docs.
 
-``python scripts/architecture.py`` draws docs/figures/architecture.svg anew; tests/test_architecture.py holds what docs/develop.md promises.
+``python scripts/architecture.py`` draws docs/figures/architecture.svg anew; tests/test_architecture.py holds
+what docs/develop.md promises.
 """
 
 from __future__ import annotations
