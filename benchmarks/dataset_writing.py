@@ -39,9 +39,10 @@ from lerobot_memobench.datasets.generation import generate
 from lerobot_memobench.datasets.hdf5.reading import PublishedFile
 from lerobot_memobench.datasets.hdf5.writing import write_task_file
 from lerobot_memobench.datasets.labels import labels
-from lerobot_memobench.datasets.lerobot_format import dataset_features, image_key, write_dataset
+from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
+from lerobot_memobench.datasets.lerobot_format.layout import dataset_features, image_key
 from lerobot_memobench.datasets.recording import record_demonstration
-from lerobot_memobench.datasets.staging.stage import stage_demonstration
+from lerobot_memobench.datasets.staging import stage_demonstration
 from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ, DEMONSTRATION_SEED
 from lerobot_memobench.tasks import get_task
 

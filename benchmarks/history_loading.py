@@ -29,7 +29,9 @@ import numpy as np
 import torch
 from turns import medians, peak, reset_peak, resident
 
-from lerobot_memobench.datasets.feature_cache import FOLDER, MemoryCache, build_memory_cache
+from lerobot_memobench.datasets.feature_cache.building import build_memory_cache
+from lerobot_memobench.datasets.feature_cache.layout import FOLDER
+from lerobot_memobench.datasets.feature_cache.reading import MemoryCache
 from lerobot_memobench.policies.memobench_mem.dimensions import SIZES
 from lerobot_memobench.policies.memobench_mem.language.text_encoders import WordTextEncoder
 from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import sample_frames
@@ -73,7 +75,7 @@ def main() -> None:
 
 def record(root: Path) -> Path:
     """Record two episodes and write them as a dataset."""
-    from lerobot_memobench.datasets.lerobot_format import write_dataset
+    from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
     from lerobot_memobench.datasets.recording import record_demonstration
     from lerobot_memobench.protocol import DEMONSTRATION_SEED
     from lerobot_memobench.tasks import get_task

@@ -13,7 +13,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from lerobot_memobench.datasets.lerobot_format.card_tables import markdown
+from lerobot_memobench.datasets.lerobot_format.card import markdown
 from lerobot_memobench.evaluation.metrics.rollouts import Record, by_task
 from lerobot_memobench.evaluation.records.runs import read_runs
 from lerobot_memobench.studies.learning.contrasts import contrasts

@@ -170,7 +170,7 @@ def test_generate_tells_what_became_of_every_seed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], solved: int
 ) -> None:
     from lerobot_memobench.datasets import generation
-    from lerobot_memobench.datasets.generation_summary import Failure, GenerationSummary, TaskSummary
+    from lerobot_memobench.datasets.generation import Failure, GenerationSummary, TaskSummary
     from lerobot_memobench.jobs.processes import Advance
 
     asked: dict[str, object] = {}

@@ -21,18 +21,16 @@ from lerobot_memobench.cli.data import convert as command
 from lerobot_memobench.datasets import convert as convert_module
 from lerobot_memobench.datasets.convert import convert
 from lerobot_memobench.datasets.demonstration import Demonstration
-from lerobot_memobench.datasets.digest import digest
-from lerobot_memobench.datasets.hdf5.mjcf import model_file, read_fixture_poses
-from lerobot_memobench.datasets.hdf5.published_task import task_of
 from lerobot_memobench.datasets.hdf5.reading import PublishedFile
-from lerobot_memobench.datasets.hdf5.restore import restore
-from lerobot_memobench.datasets.hdf5.writing import write_task_file
-from lerobot_memobench.datasets.labels import labels
-from lerobot_memobench.datasets.lerobot_format import is_dataset, write_dataset
+from lerobot_memobench.datasets.hdf5.restore import restore, task_of
+from lerobot_memobench.datasets.hdf5.writing import model_file, read_fixture_poses, write_task_file
+from lerobot_memobench.datasets.labels import digest, labels
+from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
+from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
 from lerobot_memobench.datasets.lerobot_format.reading import read_episode
 from lerobot_memobench.datasets.recording import record_demonstration
 from lerobot_memobench.datasets.replay import replay
-from lerobot_memobench.datasets.staging.stage import EpisodeStage, stage_demonstration
+from lerobot_memobench.datasets.staging import EpisodeStage, stage_demonstration
 from lerobot_memobench.datasets.validate import validate
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks import get_task

@@ -26,11 +26,10 @@ from lerobot.datasets.io_utils import load_tasks, write_tasks
 from lerobot_memobench.cli import data as commands
 from lerobot_memobench.cli.lerobot import main as lerobot
 from lerobot_memobench.datasets.demonstration import Demonstration
-from lerobot_memobench.datasets.hdf5.mjcf import model_file
-from lerobot_memobench.datasets.hdf5.writing import write_task_file
-from lerobot_memobench.datasets.lerobot_format import write_dataset
+from lerobot_memobench.datasets.hdf5.writing import model_file, write_task_file
+from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.datasets.replay import resimulate
-from lerobot_memobench.datasets.staging.stage import stage_demonstration
+from lerobot_memobench.datasets.staging import stage_demonstration
 from lerobot_memobench.datasets.validate import validate as validation
 from lerobot_memobench.datasets.video import encode_video
 from lerobot_memobench.errors import MemobenchError

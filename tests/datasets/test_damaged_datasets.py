@@ -18,14 +18,12 @@ import pytest
 
 from lerobot_memobench.datasets.convert import convert
 from lerobot_memobench.datasets.describe import short_manifest
-from lerobot_memobench.datasets.feature_cache import MemoryCache, read_meta
-from lerobot_memobench.datasets.feature_cache.layout import FORMAT, CacheMeta
+from lerobot_memobench.datasets.feature_cache.layout import FORMAT, CacheMeta, read_meta
+from lerobot_memobench.datasets.feature_cache.reading import MemoryCache
 from lerobot_memobench.datasets.generation import is_finished
-from lerobot_memobench.datasets.hdf5.attributes import read_extras
-from lerobot_memobench.datasets.lerobot_format.info import episode_count
-from lerobot_memobench.datasets.manifest import read_manifest
-from lerobot_memobench.datasets.staging.episode import read_staged
-from lerobot_memobench.datasets.staging.request import episodes_folder
+from lerobot_memobench.datasets.hdf5.reading import read_extras
+from lerobot_memobench.datasets.lerobot_format.layout import episode_count, read_manifest
+from lerobot_memobench.datasets.staging import episodes_folder, read_staged
 from tests.support import mutations
 
 Prepare = Callable[[Path], None]

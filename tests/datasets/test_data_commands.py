@@ -13,7 +13,7 @@ from lerobot_memobench.datasets import convert as convert_module
 from lerobot_memobench.datasets import push as push_module
 from lerobot_memobench.datasets import validate as validate_module
 from lerobot_memobench.datasets.convert import ConversionSummary
-from lerobot_memobench.datasets.hdf5.layout import Problem
+from lerobot_memobench.datasets.hdf5.reading import Problem
 from lerobot_memobench.datasets.validate import Verdict
 from lerobot_memobench.jobs.processes import Advance
 

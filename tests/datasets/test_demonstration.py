@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lerobot_memobench.datasets.digest import digest
-from lerobot_memobench.datasets.labels import Labels, labels
+from lerobot_memobench.datasets.labels import Labels, digest, labels
 from lerobot_memobench.errors import MemobenchError
 
 

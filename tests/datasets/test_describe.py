@@ -20,7 +20,8 @@ from lerobot_memobench.datasets.describe import (
     describe,
     short_manifest,
 )
-from lerobot_memobench.datasets.lerobot_format import MANIFEST_FILE, write_dataset
+from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
+from lerobot_memobench.datasets.lerobot_format.layout import MANIFEST_FILE
 from lerobot_memobench.errors import MemobenchError
 
 

@@ -26,7 +26,7 @@ import pytest
 
 from lerobot_memobench.datasets import generation, recording
 from lerobot_memobench.datasets.generation import generate
-from lerobot_memobench.datasets.lerobot_format import is_dataset
+from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs import processes
 from lerobot_memobench.tasks.catalogue import BOWL, get_task
@@ -349,10 +349,10 @@ IN_C = RuntimeError("Can't write data (file write failed: errno = 28, error mess
 @pytest.mark.parametrize(
     "place",
     [
-        "lerobot_memobench.datasets.staging.stage.np.savez_compressed",
+        "lerobot_memobench.datasets.staging.np.savez_compressed",
         "lerobot_memobench.datasets.video.VideoWriter.close",
-        "lerobot_memobench.datasets.staging.stage.flush_to_disk",
-        "lerobot_memobench.datasets.lerobot_format.tables.ParquetFiles.write",
+        "lerobot_memobench.datasets.staging.flush_to_disk",
+        "lerobot_memobench.datasets.lerobot_format.assembling.ParquetFiles.write",
         "lerobot_memobench.datasets.lerobot_format.assembling.write_card",
     ],
 )

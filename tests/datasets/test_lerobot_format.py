@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_memobench.datasets.digest import digest
-from lerobot_memobench.datasets.labels import labels
-from lerobot_memobench.datasets.lerobot_format import dataset_features, is_dataset, write_dataset
+from lerobot_memobench.datasets.labels import digest, labels
+from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
+from lerobot_memobench.datasets.lerobot_format.layout import dataset_features, is_dataset
 from lerobot_memobench.datasets.lerobot_format.reading import read_episode
-from lerobot_memobench.datasets.staging.stage import stage_demonstration
-from lerobot_memobench.datasets.statistics import image_stats, numeric_stats
+from lerobot_memobench.datasets.staging import image_stats, numeric_stats, stage_demonstration
 from lerobot_memobench.datasets.video import encode_video
 from lerobot_memobench.errors import MemobenchError
 
@@ -345,7 +344,7 @@ def test_mixed_images_are_refused(make_demo, tmp_path):
 
 
 def test_damaged_staged_episode_is_named(make_demo, tmp_path):
-    from lerobot_memobench.datasets.lerobot_format import assemble
+    from lerobot_memobench.datasets.lerobot_format.assembling import assemble
 
     staged = stage_demonstration(make_demo(["01"]), tmp_path / "ds" / ".staging" / "episodes" / "000000")
     path = staged.folder / "arrays.npz"

@@ -20,12 +20,12 @@ from lerobot.scripts.lerobot_train import train
 
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.describe import describe
-from lerobot_memobench.datasets.digest import digest
-from lerobot_memobench.datasets.lerobot_format import MANIFEST_FILE, assemble, episodes_where, write_dataset
-from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, list_episodes, read_episode
-from lerobot_memobench.datasets.lerobot_format.record import EPISODE_INFO
+from lerobot_memobench.datasets.labels import digest
+from lerobot_memobench.datasets.lerobot_format.assembling import assemble, write_dataset
+from lerobot_memobench.datasets.lerobot_format.layout import EPISODE_INFO, MANIFEST_FILE
+from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, episodes_where, list_episodes, read_episode
 from lerobot_memobench.datasets.recording import record_demonstration
-from lerobot_memobench.datasets.staging.stage import stage_demonstration
+from lerobot_memobench.datasets.staging import stage_demonstration
 from lerobot_memobench.datasets.validate import validate
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig

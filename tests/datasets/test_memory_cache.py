@@ -14,15 +14,10 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_memobench.datasets.feature_cache import (
-    FOLDER,
-    MemoryCache,
-    build_memory_cache,
-    dataset_fingerprint,
-    find_cache,
-    read_meta,
-    resolve_subgoals,
-)
+from lerobot_memobench.datasets.feature_cache.building import build_memory_cache
+from lerobot_memobench.datasets.feature_cache.frames import resolve_subgoals
+from lerobot_memobench.datasets.feature_cache.layout import FOLDER, dataset_fingerprint, find_cache, read_meta
+from lerobot_memobench.datasets.feature_cache.reading import MemoryCache
 from lerobot_memobench.errors import MemobenchError
 from tests.support import synthetic_dataset
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_memobench.datasets.feature_cache.building import keep_from_the_hub
-from lerobot_memobench.datasets.lerobot_format import write_dataset
+from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.datasets.push import push
 from lerobot_memobench.errors import MemobenchError
 from tests.support import hub_server

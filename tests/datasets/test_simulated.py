@@ -20,13 +20,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from lerobot_memobench.datasets import driving
+from lerobot_memobench.datasets import dagger
+from lerobot_memobench.datasets.dagger import SPELL, load_driver
 from lerobot_memobench.datasets.demonstration import Demonstration
-from lerobot_memobench.datasets.digest import digest
-from lerobot_memobench.datasets.driving import SPELL, load_driver
 from lerobot_memobench.datasets.generation import generate
-from lerobot_memobench.datasets.labels import labels
-from lerobot_memobench.datasets.lerobot_format import is_dataset, write_dataset
+from lerobot_memobench.datasets.labels import digest, labels
+from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
+from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
 from lerobot_memobench.datasets.lerobot_format.reading import read_episode
 from lerobot_memobench.datasets.perturbation import Perturbation
 from lerobot_memobench.datasets.recording import HOLD_FRAMES, PATIENCE, record_demonstration
@@ -196,8 +196,8 @@ def test_a_policy_drives_for_some_steps_at_a_time(butter):
     assert (driven.applied[late, 6] > 0).all(), "fingers open as the expert says, or later"
     assert (driven.applied[np.flatnonzero(late) - 1, 6] > 0).all()
     driving = off[driven.exec_start : -HOLD_FRAMES, :6].max(axis=1) > 0
-    assert 0.2 < driving.mean() < 0.9
-    changes = int(np.abs(np.diff(driving.astype(int))).sum())
+    assert 0.2 < dagger.mean() < 0.9
+    changes = int(np.abs(np.diff(dagger.astype(int))).sum())
     assert 2 <= changes <= len(driving) // SPELL[0] + 1, "in spells"
     assert replay(driven) is None
 
@@ -211,7 +211,7 @@ def test_a_driver_that_needs_more_than_is_recorded_is_refused(tmp_path, monkeypa
     sees = SimpleNamespace(
         config=SimpleNamespace(input_features={"observation.images.image": None}), reset=lambda: None
     )
-    monkeypatch.setattr(driving, "load_driver", lambda checkpoint: driving.Loaded(sees, None, None))
+    monkeypatch.setattr(dagger, "load_driver", lambda checkpoint: dagger.Loaded(sees, None, None))
     with pytest.raises(MemobenchError, match=r"looks at observation\.images\.image, which is not recorded; leave out"):
         record_demonstration(get_task(STOVE), SEED, images=False, policy="pictures")
 
@@ -428,7 +428,7 @@ RECORD = """
 import sys
 from pathlib import Path
 from lerobot_memobench.datasets.recording import RecordingJob, RecordingSettings
-from lerobot_memobench.datasets.staging.episode import staged
+from lerobot_memobench.datasets.staging import staged
 from lerobot_memobench.tasks import get_task
 
 job = RecordingJob(get_task(sys.argv[1]), int(sys.argv[2]), RecordingSettings(images=False), Path(sys.argv[3]))

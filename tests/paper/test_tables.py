@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_memobench.datasets.paper_figures import FAMILIES, LENGTH_BUCKETS
+from lerobot_memobench.datasets.lerobot_format.card import FAMILIES, LENGTH_BUCKETS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.paper import METRICS, PublishedRow, failure_taxonomy, published_rows, raw_tables
 from lerobot_memobench.tasks.task import MEMORY_TYPES

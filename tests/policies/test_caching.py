@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from lerobot_memobench.cli.memobench import main
-from lerobot_memobench.datasets.feature_cache import FOLDER, MemoryCache
+from lerobot_memobench.datasets.feature_cache.layout import FOLDER
+from lerobot_memobench.datasets.feature_cache.reading import MemoryCache
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset, load_perception, open_cache
 from lerobot_memobench.policies.memobench_mem.perception.pixels import PixelPerception
 from tests.support.object_dataset import make_object_dataset

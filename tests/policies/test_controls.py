@@ -15,7 +15,8 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
 
-from lerobot_memobench.datasets.feature_cache import FOLDER, MemoryCache
+from lerobot_memobench.datasets.feature_cache.layout import FOLDER
+from lerobot_memobench.datasets.feature_cache.reading import MemoryCache
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
 from lerobot_memobench.policies.memobench_mem.language.text_encoders import WordTextEncoder

@@ -16,7 +16,8 @@ from lerobot.policies import make_policy, make_pre_post_processors
 from torch.nn.functional import scaled_dot_product_attention
 from transformers.models.gemma import modeling_gemma
 
-from lerobot_memobench.datasets.feature_cache import FOLDER, building
+from lerobot_memobench.datasets.feature_cache import building
+from lerobot_memobench.datasets.feature_cache.layout import FOLDER
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.tower import GRID, POOLED, SIDE, WIDTH, Tower
 from lerobot_memobench.perception.weights import Eyes, save_eyes

@@ -13,7 +13,8 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 
 from lerobot_memobench.cli.memobench import main
-from lerobot_memobench.datasets.feature_cache import FOLDER, building
+from lerobot_memobench.datasets.feature_cache import building
+from lerobot_memobench.datasets.feature_cache.layout import FOLDER
 from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
 from lerobot_memobench.envs.observations import PIXELS, obs_type_of
 from lerobot_memobench.errors import MemobenchError

@@ -14,7 +14,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_pre_post_processors
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 
-from lerobot_memobench.datasets.feature_cache import FOLDER
+from lerobot_memobench.datasets.feature_cache.layout import FOLDER
 from lerobot_memobench.envs.observations import BOTH, PIXELS, obs_type_of
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset

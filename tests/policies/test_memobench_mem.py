@@ -18,7 +18,8 @@ from lerobot.policies import make_pre_post_processors
 from lerobot.processor import TokenizerProcessorStep
 from safetensors.torch import load_file, save_file
 
-from lerobot_memobench.datasets.feature_cache import MemoryCache, find_cache
+from lerobot_memobench.datasets.feature_cache.layout import find_cache
+from lerobot_memobench.datasets.feature_cache.reading import MemoryCache
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.language import tokenizer as tokenizer_module
 from lerobot_memobench.policies.memobench_mem.language.text_encoders import WordTextEncoder

@@ -16,7 +16,7 @@ from safetensors import safe_open
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.datasets.demonstration import Demonstration
-from lerobot_memobench.datasets.lerobot_format import write_dataset
+from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.envs.episode_log import read_episodes, read_protocol_file
 from lerobot_memobench.policies.memobench_mem.language.tokenizer import make_vocabulary, make_word_tokenizer
 from lerobot_memobench.sim.object_slots import SIZE

@@ -25,7 +25,7 @@ from torch.nn.functional import scaled_dot_product_attention
 from transformers.models.gemma import modeling_gemma
 
 from lerobot_memobench import lerobot_hooks
-from lerobot_memobench.datasets.feature_cache import FOLDER
+from lerobot_memobench.datasets.feature_cache.layout import FOLDER
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.lerobot_hooks import ATTEND, DRAW_FRAMES, MAKE_PROCESSORS, READ_SAMPLE
 from lerobot_memobench.policies.memobench_mem import fused_attention

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS, PRIVILEGED
-from lerobot_memobench.datasets.lerobot_format.record import EPISODE_INFO, EpisodeRecord
+from lerobot_memobench.datasets.lerobot_format.layout import EPISODE_INFO, OBJECTS, PRIVILEGED, EpisodeRecord
 from lerobot_memobench.sim.object_slots import SLOTS, STARTS, WIDTH
 from lerobot_memobench.tasks.catalogue import BOWL
 

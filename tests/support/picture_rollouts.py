@@ -12,7 +12,7 @@ from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.policies import make_pre_post_processors
 from lerobot.utils.constants import OBS_STATE
 
-from lerobot_memobench.datasets.feature_cache.decoding import frame_reader
+from lerobot_memobench.datasets.feature_cache.frames import frame_reader
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.kinds import kinds
 from lerobot_memobench.perception.tower import Tower

@@ -62,7 +62,7 @@ def validate(
     suite: OfSuite = None,
 ) -> int:
     """Replay every episode in the simulator. The first disagreement of each is reported."""
-    from lerobot_memobench.datasets.suites import check_suite_of
+    from lerobot_memobench.datasets.lerobot_format.reading import check_suite_of
     from lerobot_memobench.datasets.validate import exit_status
     from lerobot_memobench.datasets.validate import validate as run
 
@@ -106,7 +106,7 @@ def describe(
 ) -> int:
     """Keep of a dataset what fits into a repository. Figures, the card's tables, the hash of every episode."""
     from lerobot_memobench.datasets.describe import describe as run
-    from lerobot_memobench.datasets.suites import check_suite_of
+    from lerobot_memobench.datasets.lerobot_format.reading import check_suite_of
 
     if suite is not None:
         check_suite_of(folder, suite)

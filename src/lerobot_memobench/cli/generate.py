@@ -18,7 +18,7 @@ from lerobot_memobench.run.words import executor_options
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 
 if TYPE_CHECKING:
-    from lerobot_memobench.datasets.generation_summary import GenerationSummary
+    from lerobot_memobench.datasets.generation import GenerationSummary
     from lerobot_memobench.jobs.processes import Advance
 
 

@@ -88,7 +88,7 @@ def train(words: Words, line: Sequence[str]) -> int:
     settings = read_settings("train", words)
     if words.wants_help:
         return call_lerobot("train", settings.flags)
-    from lerobot_memobench.datasets.lerobot_format.info import naming_damage
+    from lerobot_memobench.datasets.lerobot_format.layout import naming_damage
     from lerobot_memobench.run.lerobot_training import trained_on
 
     settings = complete_training(settings)

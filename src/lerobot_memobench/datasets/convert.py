@@ -16,23 +16,36 @@ from typing import Any
 
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.generation import check_room, run_size
-from lerobot_memobench.datasets.hdf5.layout import Problem, Unusable, usable_or_named
-from lerobot_memobench.datasets.hdf5.published_task import task_of, unlike_the_catalogue
-from lerobot_memobench.datasets.hdf5.reading import PublishedDemo, PublishedFile, find_files
-from lerobot_memobench.datasets.hdf5.restore import NO_SEED, restore
+from lerobot_memobench.datasets.hdf5.reading import (
+    Problem,
+    PublishedDemo,
+    PublishedFile,
+    Unusable,
+    find_files,
+    usable_or_named,
+)
+from lerobot_memobench.datasets.hdf5.restore import NO_SEED, restore, task_of, unlike_the_catalogue
 from lerobot_memobench.datasets.lerobot_format.assembling import assemble
-from lerobot_memobench.datasets.lerobot_format.info import check_whole
 from lerobot_memobench.datasets.lerobot_format.layout import (
     DEFAULT_REPO_ID,
+    EpisodeRecord,
     check_destination,
+    check_whole,
     is_dataset,
+    read_manifest,
 )
-from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
-from lerobot_memobench.datasets.manifest import read_manifest
-from lerobot_memobench.datasets.staging.episode import LEROBOT, StagedEpisode, StagedJob, staged
-from lerobot_memobench.datasets.staging.folders import STAGING
-from lerobot_memobench.datasets.staging.request import compare_requests, episodes_folder
-from lerobot_memobench.datasets.staging.stage import EpisodeStage, episode_info, stage_failure
+from lerobot_memobench.datasets.staging import (
+    LEROBOT,
+    STAGING,
+    EpisodeStage,
+    StagedEpisode,
+    StagedJob,
+    compare_requests,
+    episode_info,
+    episodes_folder,
+    stage_failure,
+    staged,
+)
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import telling_of_the_disk
 from lerobot_memobench.jobs.executors import run_jobs

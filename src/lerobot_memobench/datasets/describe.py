@@ -13,13 +13,25 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lerobot_memobench.datasets.lerobot_format.card import CARD_FILE, EDITED, MADE_BY, card_from_frames, own_card
-from lerobot_memobench.datasets.lerobot_format.card_tables import ordered_types
-from lerobot_memobench.datasets.lerobot_format.info import check_whole, read_info, undamaged
-from lerobot_memobench.datasets.lerobot_format.layout import MANIFEST_FILE, image_key
+from lerobot_memobench.datasets.lerobot_format.card import (
+    CARD_FILE,
+    EDITED,
+    FAMILIES,
+    LENGTH_BUCKETS,
+    MADE_BY,
+    card_from_frames,
+    ordered_types,
+    own_card,
+)
+from lerobot_memobench.datasets.lerobot_format.layout import (
+    MANIFEST_FILE,
+    check_whole,
+    image_key,
+    read_info,
+    read_manifest,
+    undamaged,
+)
 from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, list_episodes
-from lerobot_memobench.datasets.manifest import read_manifest
-from lerobot_memobench.datasets.paper_figures import FAMILIES, LENGTH_BUCKETS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import draft_of, telling_of_the_disk, write_file
 from lerobot_memobench.protocol import CAMERAS

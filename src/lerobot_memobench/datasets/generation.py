@@ -20,23 +20,27 @@ from typing import Any
 
 from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR
 
-from lerobot_memobench.datasets.generation_summary import GenerationSummary, summarise
-from lerobot_memobench.datasets.hdf5.layout import SUFFIX, Unusable
-from lerobot_memobench.datasets.hdf5.reading import PublishedFile
+from lerobot_memobench.datasets.hdf5.reading import SUFFIX, PublishedFile, Unusable
 from lerobot_memobench.datasets.lerobot_format.assembling import assemble
 from lerobot_memobench.datasets.lerobot_format.card import SCRIPTED
-from lerobot_memobench.datasets.lerobot_format.info import check_whole
 from lerobot_memobench.datasets.lerobot_format.layout import (
     DEFAULT_REPO_ID,
     HDF5_FOLDER,
     check_destination,
+    check_whole,
     is_dataset,
+    read_manifest,
 )
-from lerobot_memobench.datasets.manifest import read_manifest
 from lerobot_memobench.datasets.recording import HOLD_FRAMES, RecordingJob, RecordingSettings
-from lerobot_memobench.datasets.staging.episode import FORMATS, HDF5, LEROBOT, staged
-from lerobot_memobench.datasets.staging.folders import STAGING
-from lerobot_memobench.datasets.staging.request import compare_requests, episodes_folder
+from lerobot_memobench.datasets.staging import (
+    FORMATS,
+    HDF5,
+    LEROBOT,
+    STAGING,
+    compare_requests,
+    episodes_folder,
+    staged,
+)
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import file_hash, file_name, free_bytes, in_words, telling_of_the_disk
 from lerobot_memobench.jobs.executors import Needs, check_executor, options_told, run_jobs
@@ -379,3 +383,66 @@ def _versions() -> dict[str, str]:
         except PackageNotFoundError:
             found[name] = "unknown"
     return found
+
+
+# ==== generation_summary.py
+# What a run of generation made.
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A seed without a demonstration, and why."""
+
+    task_name: str
+    seed: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class TaskSummary:
+    """What became of one task: ``frames`` are those of its successful episodes, holding frames included."""
+
+    name: str
+    memory_type: str
+    episodes: int
+    solved: int
+    frames: tuple[int, ...]
+    failures: tuple[Failure, ...]
+
+
+@dataclass(frozen=True)
+class GenerationSummary:
+    """What a run made.
+
+    Attributes:
+        folder: what was made, or None when no episode succeeded, or none is there yet.
+        tasks: one entry per task, in the order asked for.
+        submitted: the episodes are being made on Slurm, whose last job will write the dataset.
+    """
+
+    folder: Path | None
+    tasks: tuple[TaskSummary, ...]
+    submitted: bool = False
+
+    @property
+    def failures(self) -> tuple[Failure, ...]:
+        """All seeds without a demonstration."""
+        return tuple(failure for task in self.tasks for failure in task.failures)
+
+    @property
+    def exit_status(self) -> int:
+        """0 when every seed asked for was solved, else 1."""
+        return 1 if self.failures else 0
+
+
+def summarise(rows: Sequence[dict[str, Any]], tasks: Sequence[Task], out: Path) -> GenerationSummary:
+    """Return what became of each task, from what is known of each episode."""
+    summaries = tuple(_summary(task, [row for row in rows if row["task_name"] == task.name]) for task in tasks)
+    made = any(summary.solved for summary in summaries)
+    return GenerationSummary(out if made else None, summaries)
+
+
+def _summary(task: Task, rows: Sequence[dict[str, Any]]) -> TaskSummary:
+    frames = tuple(int(row["frames"]) for row in rows if row["failure"] is None)
+    failures = tuple(Failure(task.name, row["seed"], row["failure"]) for row in rows if row["failure"] is not None)
+    return TaskSummary(task.name, task.memory_type, len(rows), len(frames), frames, failures)

@@ -6,14 +6,17 @@ and policies cannot disagree about what a column means.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import hashlib
+import json
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.protocol import EXECUTION, PROMPT
+from lerobot_memobench.protocol import CONTROL_HZ, EXECUTION, PROMPT
 from lerobot_memobench.tasks.memory_text import memory_text, subtask_texts
 from lerobot_memobench.tasks.task import LEVELS, OPERATIONS, Task
 
@@ -132,3 +135,101 @@ def _subgoals(task: Task, level: int) -> list[str]:
     """K + 1 texts; once all checkpoints are done the last one's stays. A task without any has its instruction."""
     texts = [checkpoint.language[level] for checkpoint in task.checkpoints] or [task.language]
     return [*texts, texts[-1]]
+
+
+# ==== language.py
+# Checkpoint texts as LeRobot's persistent language rows, for its training recipes.
+#
+# LeRobot 0.6 keeps language beside the frames in the column ``language_persistent``: one list of rows per
+# episode, repeated on every frame, each row active from its timestamp until the next of its style
+# (``lerobot.datasets.language``). The styles written here are those its annotation pipeline writes: ``subtask``
+# (what to do, as an instruction) and ``memory`` (what has been done, in the past tense; none before the first
+# completion).
+
+MIN_FRAMES_BETWEEN_ROWS = 5
+"""LeRobot's ``emitted_at`` looks 0.1 s to either side and raises when it finds two rows of a style, so rows
+of one style must be more than 0.2 s apart: at 20 frames/s, at least 5 frames."""
+
+LanguageRow = dict[str, Any]
+
+
+def persistent_rows(found: Labels, fps: int = CONTROL_HZ) -> list[LanguageRow]:
+    """Return an episode's rows, sorted as LeRobot's own writer sorts them (timestamp, style, role).
+
+    A text that is replaced again within 0.2 s (checkpoints completed at nearly the same time) gets no row;
+    the text before it stays active until the one after it begins, so a row never claims something too early.
+    The per-frame string columns keep every change.
+    """
+    rows = [_row("subtask", text, frame, fps) for frame, text in _changes(found.subtask)]
+    rows += [_row("memory", text, frame, fps) for frame, text in _changes(found.memory) if text]
+    return sorted(rows, key=lambda row: (row["timestamp"], row["style"], row["role"]))
+
+
+def _changes(texts: list[str]) -> list[tuple[int, str]]:
+    """Return (frame, text) wherever a text begins, without empty and short-lived ones."""
+    kept: list[tuple[int, str]] = []
+    for frame, text in enumerate(texts):
+        if not text or (frame > 0 and text == texts[frame - 1]):
+            continue
+        if kept and frame - kept[-1][0] < MIN_FRAMES_BETWEEN_ROWS:
+            replaced, _ = kept.pop()
+            frame = 0 if replaced == 0 else frame  # something must be active from the episode's first frame on
+        kept.append((frame, text))
+    return kept
+
+
+def _row(style: str, text: str, frame: int, fps: int) -> LanguageRow:
+    # LeRobot's frame timestamps are float32; a row must equal its frame's to the bit.
+    timestamp = float(np.float32(frame / fps))
+    return {
+        "role": "assistant",
+        "content": text,
+        "style": style,
+        "timestamp": timestamp,
+        # LeRobot's annotation writer puts None here, and then its own `lerobot-dataset-viz` cannot open the dataset:
+        # it batches frames with torch's collate function, which knows no None. Empty means the same to LeRobot's
+        # recipes: they look at a camera only when asked for one, and at tool calls if there are any.
+        "camera": "",
+        "tool_calls": [],
+    }
+
+
+# ==== digest.py
+# The hash of an episode: what manifest and HDF5 files hold to tell whether it is still the one that was written.
+
+
+def digest(demo: Demonstration) -> str:
+    """Return the sha256 (hex) of an episode: identity, states, actions and the label columns.
+
+    Images are left out: they follow from the states, and a renderer may differ in a pixel where physics does
+    not. So are the objects that could be seen, and ``coarse_subgoal`` and ``subtask``, which the other columns and the
+    task decide: they came later than the first datasets, and their hashes stay what they are.
+    """
+    found = labels(demo)
+    identity = {
+        "task": demo.task.name,
+        "seed": demo.seed,
+        "referent": demo.referent,
+        "variant": demo.variant,
+        "exec_start": demo.exec_start,
+        "success": bool(demo.success),
+    }
+    columns: dict[str, NDArray | list[str]] = {"states": demo.states, "actions": demo.actions}
+    if demo.executed is not None:
+        columns["executed"] = demo.executed
+    columns |= {f.name: getattr(found, f.name) for f in fields(found) if f.name not in ("coarse_subgoal", "subtask")}
+    return digest_columns(identity, columns)
+
+
+def digest_columns(identity: dict, columns: dict[str, NDArray | list[str]]) -> str:
+    """Hash an identity and named columns; independent of byte order, memory layout and dictionary order."""
+    sha = hashlib.sha256(json.dumps(identity, sort_keys=True).encode())
+    for name in sorted(columns):
+        column = columns[name]
+        if isinstance(column, list):
+            sha.update(json.dumps([name, column]).encode())
+            continue
+        flat = np.ascontiguousarray(column).astype(column.dtype.newbyteorder("<"), copy=False)
+        sha.update(json.dumps([name, flat.dtype.str, list(flat.shape)]).encode())
+        sha.update(flat.tobytes())
+    return sha.hexdigest()

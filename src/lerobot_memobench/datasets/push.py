@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lerobot_memobench.datasets.lerobot_format.card import CARD_FILE, hub_card
-from lerobot_memobench.datasets.lerobot_format.info import read_info
-from lerobot_memobench.datasets.lerobot_format.layout import HDF5_FOLDER, MANIFEST_FILE, is_dataset
+from lerobot_memobench.datasets.lerobot_format.layout import HDF5_FOLDER, MANIFEST_FILE, is_dataset, read_info
 from lerobot_memobench.errors import MemobenchError
 
 if TYPE_CHECKING:

@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_memobench.datasets.dagger import Driver
 from lerobot_memobench.datasets.demonstration import Demonstration
-from lerobot_memobench.datasets.driving import Driver
-from lerobot_memobench.datasets.hdf5.mjcf import model_file
+from lerobot_memobench.datasets.hdf5.writing import model_file
 from lerobot_memobench.datasets.perturbation import Perturbation
-from lerobot_memobench.datasets.staging.episode import HDF5, LEROBOT, StagedJob
-from lerobot_memobench.datasets.staging.stage import EpisodeStage, stage_failure
+from lerobot_memobench.datasets.staging import HDF5, LEROBOT, EpisodeStage, StagedJob, stage_failure
 from lerobot_memobench.envs.episode import Episode, generator
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import EXECUTION

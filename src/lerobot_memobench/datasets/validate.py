@@ -14,13 +14,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.datasets.feature_cache.decoding import FrameReader, frame_reader
-from lerobot_memobench.datasets.hdf5.layout import Unusable, usable_or_named
-from lerobot_memobench.datasets.hdf5.published_task import task_of
-from lerobot_memobench.datasets.hdf5.reading import PublishedFile, find_files
-from lerobot_memobench.datasets.hdf5.restore import restore
-from lerobot_memobench.datasets.lerobot_format.info import ADVICE, episode_count, read_info
-from lerobot_memobench.datasets.lerobot_format.layout import image_key, is_dataset
+from lerobot_memobench.datasets.feature_cache.frames import FrameReader, frame_reader
+from lerobot_memobench.datasets.hdf5.reading import PublishedFile, Unusable, find_files, usable_or_named
+from lerobot_memobench.datasets.hdf5.restore import restore, task_of
+from lerobot_memobench.datasets.lerobot_format.layout import ADVICE, episode_count, image_key, is_dataset, read_info
 from lerobot_memobench.datasets.lerobot_format.reading import read_episode
 from lerobot_memobench.datasets.replay import Pictures, replay
 from lerobot_memobench.errors import MemobenchError

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from lerobot_memobench.datasets.lerobot_format.card_tables import markdown as table
+from lerobot_memobench.datasets.lerobot_format.card import markdown as table
 from lerobot_memobench.io import draft_of, write_file
 from lerobot_memobench.perception.kinds import DRAWERS, PARTS
 from lerobot_memobench.perception.labels import SIDE, Rows, projected

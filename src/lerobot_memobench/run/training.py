@@ -9,7 +9,7 @@ from pathlib import Path
 
 import yaml
 
-from lerobot_memobench.datasets.lerobot_format import DEFAULT_REPO_ID
+from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID
 from lerobot_memobench.envs.observations import OBS_TYPES
 from lerobot_memobench.envs.prompting import quiet
 from lerobot_memobench.errors import MemobenchError, nearest

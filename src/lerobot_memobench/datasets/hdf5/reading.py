@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypedDict
 
 import numpy as np
+from annotated_types import Len
 from numpy.typing import NDArray
 
-from lerobot_memobench.datasets.hdf5.attributes import read_extras
-from lerobot_memobench.datasets.hdf5.checks import array, demo_number, finite, first_line, json_object, text_attribute
-from lerobot_memobench.datasets.hdf5.layout import IMAGE_NAMES, Image, Unusable
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.io import Count, Malformed, Number, Whole, checked, parsed, refusing
 from lerobot_memobench.protocol import ACTION_DIM
 
 if TYPE_CHECKING:
     import h5py
+
 
 SLICE = 32
 """Frames read at a time."""
@@ -224,3 +226,176 @@ def find_files(source: Path) -> list[Path]:
     if not found:
         raise MemobenchError(f"found no HDF5 file (.hdf5, .h5) at {source}; name a file or a folder of them")
     return found
+
+
+# ==== layout.py
+# Names of the published layout, and what is said of a file that does not keep to it.
+
+IMAGE_NAMES = {"image": "agentview_image", "wrist_image": "robot0_eye_in_hand_image"}
+"""Camera of this package -> dataset of the published layout."""
+
+EXTRAS = ("seed", "referent", "variant", "success", "fixture_poses", "scene_hash", "satisfied_intervals", "digest")
+"""Attributes of a demonstration that only this package writes."""
+
+SUFFIX = "_demo.hdf5"
+
+Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Something that cannot be used: ``file``, ``group`` ("" for the file as a whole) and why."""
+
+    file: str
+    group: str
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.file}{', ' + self.group if self.group else ''}: {self.reason}"
+
+
+class Unusable(MemobenchError):
+    """A file or group that is not in the layout; the message is the reason alone."""
+
+
+def usable_or_named() -> AbstractContextManager[None]:
+    """As `refusing`: whatever a file says, it ends only itself."""
+    return refusing(lambda why: Unusable(f"what it says cannot be used ({why})"))
+
+
+def truth_to_intervals(satisfied: NDArray[np.bool_]) -> list[list[list[int]]]:
+    """Return where each column of a (T, K) truth is true, as [start, stop) pairs."""
+    edges = np.diff(satisfied.astype(np.int8), axis=0, prepend=0, append=0)
+    return [np.flatnonzero(column).reshape(-1, 2).tolist() for column in edges.T]
+
+
+def truth_from_intervals(intervals: Sequence[Sequence[Sequence[int]]], length: int) -> NDArray[np.bool_]:
+    """Undo `truth_to_intervals` for K checkpoints: (T, K)."""
+    truth = np.zeros((length, len(intervals)), dtype=np.bool_)
+    for k, pairs in enumerate(intervals):
+        for start, stop in pairs:
+            truth[start:stop, k] = True
+    return truth
+
+
+# ==== checks.py
+# Parts of an HDF5 file, each of the type that the layout says, or a sentence that says what was found.
+
+LARGEST = 1e10
+"""MuJoCo takes a state with a larger number for an unstable simulation, and puts the initial one in its place."""
+
+
+def demo_number(name: str) -> int | None:
+    """Return k of a group demo_k, None for other names."""
+    found = re.fullmatch(r"demo_(\d+)", name)
+    return int(found.group(1)) if found else None
+
+
+def text_attribute(group: h5py.Group, key: str, required: bool = False) -> Any:
+    """Return a text, None where there is none and none is required."""
+    value = group.attrs.get(key)
+    if value is None:
+        if required:
+            raise Unusable(f"the attribute {key!r} is missing")
+        return None
+    if isinstance(value, np.ndarray) and value.shape == (1,):
+        value = value[0]
+    if isinstance(value, bytes):
+        value = value.decode("utf-8", errors="replace")
+    if not isinstance(value, str):
+        raise Unusable(f"the attribute {key!r} is of type {type(value).__name__}, expected text")
+    return value
+
+
+def json_object(text: str, what: str) -> dict[str, Any]:
+    """Return the JSON object that ``text`` holds; ``what`` it is goes into the message."""
+    try:
+        value = parsed(text)
+    except Malformed as error:
+        raise Unusable(f"{what} is no valid JSON: {error}") from None
+    if not isinstance(value, dict):
+        raise Unusable(f"{what} holds a {type(value).__name__}, expected a JSON object")
+    return value
+
+
+def array(group: h5py.Group, name: str, shape: tuple[int | None, ...], *dtypes: Any) -> h5py.Dataset:
+    """Return an array of one of the types and of a shape in which None stands for any length."""
+    import h5py
+
+    found = group.get(name)
+    if not isinstance(found, h5py.Dataset):
+        raise Unusable(f"the array {name!r} is missing")
+    if found.dtype not in [np.dtype(dtype) for dtype in dtypes]:
+        expected = " or ".join(str(np.dtype(dtype)) for dtype in dtypes)
+        raise Unusable(f"{name} has type {found.dtype}, expected {expected}")
+    matches = len(found.shape) == len(shape) and all(
+        want is None or have == want for have, want in zip(found.shape, shape, strict=True)
+    )
+    if not matches:
+        want = ", ".join("any" if n is None else str(n) for n in shape)
+        raise Unusable(f"{name} has shape {found.shape}, expected ({want})")
+    return found
+
+
+def finite(name: str, values: NDArray) -> NDArray:
+    """Return (T, n) numbers after checking that none is infinite, missing, or too large."""
+    bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    if bad.size:
+        raise Unusable(f"{name} holds a value that is not finite at frame {bad[0]}")
+    bad = np.flatnonzero((np.abs(values) > LARGEST).any(axis=1))
+    if bad.size:
+        raise Unusable(f"{name} holds a value beyond {LARGEST:g} at frame {bad[0]}, more than the simulator takes")
+    return values
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of an error's message, or its name."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
+# ==== attributes.py
+# The attributes of a demonstration that only this package writes, each of the type that it was written as.
+
+AS_JSON = ("fixture_poses", "satisfied_intervals")
+"""Attributes that hold JSON text."""
+
+
+class Extras(TypedDict, total=False):
+    """`EXTRAS`, with what the JSON texts among them say: fixture to pose (7,), checkpoint to [start, stop) pairs."""
+
+    seed: Whole
+    referent: str
+    variant: Count
+    success: bool
+    fixture_poses: dict[str, Annotated[list[Number], Len(7, 7)]]
+    scene_hash: str
+    satisfied_intervals: list[list[Annotated[list[Count], Len(2, 2)]]]
+    digest: str
+
+
+def read_extras(group: h5py.Group) -> dict[str, Any]:
+    """Return those of `EXTRAS` that a group has.
+
+    Raises:
+        Unusable: one of them is of another type, or no JSON.
+    """
+    found = {key: _plain(group.attrs[key]) for key in EXTRAS if key in group.attrs}
+    for key in AS_JSON:
+        if isinstance(found.get(key), str):
+            try:
+                found[key] = parsed(found[key])
+            except Malformed as error:
+                raise Unusable(f"the attribute {key!r}: {error}") from None
+    try:
+        return dict(checked(found, Extras))
+    except Malformed as error:
+        raise Unusable(f"its attributes: {error}") from None
+
+
+def _plain(value: Any) -> Any:
+    """Return an attribute as a Python value: HDF5 has numbers of many types, and texts as bytes or arrays of one."""
+    if isinstance(value, np.ndarray) and value.shape == (1,):
+        value = value[0]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return value.decode("utf-8", errors="replace") if isinstance(value, bytes) else value

@@ -9,30 +9,52 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.demonstration import Demonstration
-from lerobot_memobench.datasets.hdf5.layout import SUFFIX
+from lerobot_memobench.datasets.hdf5.reading import SUFFIX
 from lerobot_memobench.datasets.hdf5.writing import write_task_file
 from lerobot_memobench.datasets.lerobot_format.card import write_card
-from lerobot_memobench.datasets.lerobot_format.frames import write_frames
 from lerobot_memobench.datasets.lerobot_format.layout import (
     DEFAULT_REPO_ID,
+    EPISODE_INFO,
+    EXECUTED_ACTION,
     HDF5_FOLDER,
+    LANGUAGE,
     MANIFEST_FILE,
     TOP_LEVEL,
+    EpisodeRecord,
     check_destination,
     dataset_features,
+    image_key,
+    objects_column,
 )
-from lerobot_memobench.datasets.lerobot_format.video_files import write_videos
-from lerobot_memobench.datasets.staging.episode import HDF5, LEROBOT, StagedEpisode
-from lerobot_memobench.datasets.staging.folders import STAGING, TEMPORARY, clean_temporaries, flush_to_disk
-from lerobot_memobench.datasets.staging.stage import stage_demonstration
+from lerobot_memobench.datasets.staging import (
+    HDF5,
+    LEROBOT,
+    STAGING,
+    TEMPORARY,
+    StagedEpisode,
+    Stats,
+    clean_temporaries,
+    flush_to_disk,
+    numeric_stats,
+    stage_demonstration,
+)
+from lerobot_memobench.datasets.video import join_videos, video_info
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_name, write_file
 from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+
 
 ROBOT_TYPE = "panda"
 
@@ -175,3 +197,270 @@ def _move(build: Path, out: Path) -> None:
     flush_to_disk([out])
     build.rmdir()
     clean_temporaries(out / STAGING)
+
+
+# ==== frames.py
+# Frames, simulator states and LeRobot's metadata of a dataset that is being written.
+
+STATES_PATH = "states/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+EPISODES_PER_STATES_FILE = 100
+
+
+def write_frames(
+    meta: LeRobotDatasetMetadata,
+    episodes: Sequence[StagedEpisode],
+    places: Sequence[dict[str, Any]],
+    versions: Mapping[str, str] | None = None,
+) -> None:
+    """Write data/, states/ and the metadata; one row group per episode, files of LeRobot's size.
+
+    Args:
+        meta: of the dataset to be.
+        episodes: its episodes, in their order.
+        places: where each one's videos are (`write_videos`).
+        versions: of the packages that made them.
+    """
+    from lerobot.datasets.io_utils import write_stats
+
+    frames = _FrameWriter(meta, versions)
+    for episode, place in zip(episodes, places, strict=True):
+        frames.add(episode, place)
+    meta.stats = frames.finish() | _image_statistics(episodes)
+    write_stats(meta.stats, meta.root)
+
+
+class _FrameWriter:
+    """Writes episode after episode and keeps their numbers for the statistics of the whole."""
+
+    def __init__(self, meta: LeRobotDatasetMetadata, versions: Mapping[str, str] | None) -> None:
+        self._meta, self._versions = meta, versions
+        self._data = ParquetFiles(meta.root, meta.data_path)
+        self._states = ParquetFiles(meta.root, STATES_PATH)
+        self._numbers: dict[str, list[NDArray]] = {}
+        self._episodes = self._frames = 0
+
+    def add(self, episode: StagedEpisode, place: dict[str, Any]) -> None:
+        """Write an episode's rows and its metadata."""
+        meta, number, start = self._meta, self._episodes, self._frames
+        if self._data.size() >= meta.data_files_size_in_mb * 1024**2:
+            self._data.next(meta.chunks_size)
+        if number and number % EPISODES_PER_STATES_FILE == 0:
+            self._states.next(meta.chunks_size)
+        task = str(episode.info["language"])
+        meta.save_episode_tasks([task])
+        arrays = episode.arrays()
+        record = EpisodeRecord.model_validate(episode.info | {"versions": self._versions})
+        columns = self._columns(arrays, int(episode.info["frames"]), task, record)
+        self._data.write(frames_table(columns, episode, meta.features))
+        self._states.write(states_table(arrays["states"], number))
+        length = len(columns["index"])
+        self._episodes, self._frames = number + 1, start + length
+        place = {
+            "data/chunk_index": self._data.chunk,
+            "data/file_index": self._data.file,
+            "dataset_from_index": start,
+            "dataset_to_index": start + length,
+            **place,
+        }
+        meta.save_episode(number, length, [task], self._count(columns, episode), place | record.in_meta())
+
+    def _columns(self, arrays: dict[str, NDArray], length: int, task: str, record: EpisodeRecord) -> dict[str, NDArray]:
+        task_index = self._meta.get_task_index(task)
+        assert task_index is not None
+        info = np.full(length, "", dtype=object)
+        info[0] = record.in_frames()
+        columns: dict[str, NDArray] = {
+            "observation.state": arrays["proprio"],
+            "action": arrays["actions"],
+            EXECUTED_ACTION: arrays.get("executed", arrays["actions"]),
+            "timestamp": (np.arange(length) / CONTROL_HZ).astype(np.float32),
+            "frame_index": np.arange(length),
+            "episode_index": np.full(length, self._episodes),
+            "index": self._frames + np.arange(length),
+            "task_index": np.full(length, task_index),
+            EPISODE_INFO: info,
+        }
+        if "objects" in arrays:
+            columns[objects_column(self._meta.features)] = arrays["objects"]
+        return columns | {key: arrays[key] for key in self._meta.features if key in arrays}
+
+    def _count(self, columns: dict[str, NDArray], episode: StagedEpisode) -> dict[str, Stats]:
+        """Return the episode's statistics; keep its numbers."""
+        numbers = {key: value for key, value in columns.items() if value.dtype.kind in "bif"}
+        for key, value in numbers.items():
+            self._numbers.setdefault(key, []).append(value)
+        return {key: numeric_stats(value) for key, value in numbers.items()} | _camera_statistics(episode)
+
+    def finish(self) -> dict[str, Stats]:
+        """End the files; return exact statistics of all numbers."""
+        self._data.close()
+        self._states.close()
+        return {key: numeric_stats(np.concatenate(values)) for key, values in self._numbers.items()}
+
+
+def _camera_statistics(episode: StagedEpisode) -> dict[str, Stats]:
+    return {image_key(camera): episode.image_stats(camera) for camera in CAMERAS} if episode.has_images else {}
+
+
+def _image_statistics(episodes: Sequence[StagedEpisode]) -> dict[str, Stats]:
+    """Return the statistics of all pixels, over the frames that were sampled of each episode."""
+    from lerobot.datasets.compute_stats import aggregate_stats
+
+    found = [_camera_statistics(episode) for episode in episodes if episode.has_images]
+    return aggregate_stats(found) if found else {}
+
+
+# ==== tables.py
+# An episode's frames as tables, and the files that they go to.
+
+
+def frames_table(columns: dict[str, NDArray], episode: StagedEpisode, features: dict[str, Any]) -> pa.Table:
+    """Return an episode's frames as a table of exactly the type that LeRobot reads.
+
+    Args:
+        columns: name to one value or row per frame.
+        episode: where they come from; its language rows are added.
+        features: LeRobot's description of all columns.
+
+    Raises:
+        MemobenchError: a column is missing.
+    """
+    import pyarrow as pa
+    from lerobot.datasets.feature_utils import get_hf_features_from_features
+
+    typed = get_hf_features_from_features(features)
+    arrays = []
+    for field in typed.arrow_schema:
+        if field.name == LANGUAGE:
+            arrays.append(_language(episode, typed[LANGUAGE]))
+        elif field.name in columns:
+            arrays.append(_array(columns[field.name], field.type))
+        else:
+            raise MemobenchError(
+                f"{episode.folder} was staged by an older version, without the column {field.name}; delete that folder "
+                "and generate again to make this episode anew"
+            )
+    return pa.Table.from_arrays(arrays, schema=typed.arrow_schema)
+
+
+def _array(values: NDArray, kind: pa.DataType) -> pa.Array:
+    import pyarrow as pa
+
+    if values.ndim == 2:
+        return pa.FixedSizeListArray.from_arrays(pa.array(values.ravel(), type=kind.value_type), type=kind)
+    return pa.array(values.tolist() if values.dtype.kind in "UO" else values, type=kind)
+
+
+def _language(episode: StagedEpisode, feature: Any) -> pa.Array:
+    """The episode's rows, the same on every frame: built once and repeated by index."""
+    import datasets
+
+    once = datasets.Dataset.from_dict(
+        {LANGUAGE: [episode.language_rows]}, features=datasets.Features({LANGUAGE: feature})
+    ).with_format("arrow")[:]
+    return once.column(LANGUAGE).combine_chunks().take(np.zeros(int(episode.info["frames"]), dtype=np.int64))
+
+
+def states_table(states: NDArray[np.float64], number: int) -> pa.Table:
+    """Return the simulator's states, which lie beside the dataset, for replay; their width differs between tasks."""
+    import pyarrow as pa
+
+    length, width = states.shape
+    offsets = pa.array(np.arange(0, (length + 1) * width, width, dtype=np.int32))
+    return pa.table(
+        {
+            "episode_index": pa.array(np.full(length, number)),
+            "frame_index": pa.array(np.arange(length)),
+            "state": pa.ListArray.from_arrays(offsets, pa.array(states.ravel())),
+        }
+    )
+
+
+class ParquetFiles:
+    """A sequence of parquet files in LeRobot's chunk and file numbering; each write is a row group."""
+
+    def __init__(self, build: Path, template: str) -> None:
+        self.build, self.template = build, template
+        self.chunk, self.file = 0, 0
+        self._writer: Any = None
+        self._path: Path | None = None
+
+    def write(self, table: pa.Table) -> None:
+        """Append a row group to the current file."""
+        import pyarrow.parquet as pq
+
+        if self._writer is None:
+            self._path = self.build / self.template.format(chunk_index=self.chunk, file_index=self.file)
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._writer = pq.ParquetWriter(self._path, table.schema, compression="snappy", use_dictionary=True)
+        self._writer.write_table(table)
+
+    def size(self) -> int:
+        """Bytes in the current file so far."""
+        return self._path.stat().st_size if self._writer is not None and self._path is not None else 0
+
+    def next(self, chunks_size: int) -> None:
+        """Go on with the next file."""
+        from lerobot.datasets.utils import update_chunk_file_indices
+
+        self.close()
+        self.chunk, self.file = update_chunk_file_indices(self.chunk, self.file, chunks_size)
+
+    def close(self) -> None:
+        """End the current file."""
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+
+
+# ==== video_files.py
+# Episodes' videos joined into files of LeRobot's size.
+
+
+def write_videos(meta: LeRobotDatasetMetadata, episodes: Sequence[StagedEpisode]) -> list[dict[str, Any]]:
+    """Join the episodes' videos below the dataset's root; return each episode's place in them."""
+    from lerobot.datasets.io_utils import write_info
+
+    places: list[dict[str, Any]] = [{} for _ in episodes]
+    for camera in CAMERAS if meta.video_keys else ():
+        _write_camera(meta, episodes, camera, places)
+        write_info(meta.info, meta.root)
+    return places
+
+
+def _write_camera(
+    meta: LeRobotDatasetMetadata, episodes: Sequence[StagedEpisode], camera: str, places: list[dict[str, Any]]
+) -> None:
+    from lerobot.datasets.utils import update_chunk_file_indices
+
+    key, chunk, file = image_key(camera), 0, 0
+    limit = meta.video_files_size_in_mb * 1024**2
+    for group in _grouped([episode.video(camera).stat().st_size for episode in episodes], limit):
+        assert meta.video_path is not None
+        path = meta.root / meta.video_path.format(video_key=key, chunk_index=chunk, file_index=file)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        join_videos([(episodes[i].video(camera), int(episodes[i].info["frames"])) for i in group], path)
+        frames = 0
+        for i in group:
+            start, frames = frames, frames + int(episodes[i].info["frames"])
+            places[i] |= {
+                f"videos/{key}/chunk_index": chunk,
+                f"videos/{key}/file_index": file,
+                f"videos/{key}/from_timestamp": start / CONTROL_HZ,
+                f"videos/{key}/to_timestamp": frames / CONTROL_HZ,
+            }
+        chunk, file = update_chunk_file_indices(chunk, file, meta.chunks_size)
+        meta.features[key].setdefault("info", video_info(path))
+
+
+def _grouped(sizes: Sequence[int], limit: float) -> list[list[int]]:
+    """Consecutive positions whose sizes sum up to at most ``limit`` (a single larger one stands alone)."""
+    groups: list[list[int]] = []
+    total = 0
+    for position, size in enumerate(sizes):
+        if not groups or total + size > limit:
+            groups.append([])
+            total = 0
+        groups[-1].append(position)
+        total += size
+    return groups

@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import json
+import math
+import traceback
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NotRequired, TypedDict
+
+import numpy as np
+from annotated_types import Ge, Le
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from lerobot_memobench.datasets.labels import MAX_CHECKPOINTS
-from lerobot_memobench.datasets.lerobot_format.record import EPISODE_INFO
-from lerobot_memobench.datasets.staging.folders import STAGING
+from lerobot_memobench.datasets.staging import STAGING
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.io import Count, Malformed, Whole, count_of, first_fault, parsed, read_json, refusing
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, PROPRIO_DIM
 
 DEFAULT_REPO_ID = "memobench/memobench"
 HDF5_FOLDER = "hdf5"
 MANIFEST_FILE = "manifest.json"
+NO_MANIFEST = "it is no manifest that this package wrote; take the dataset from its source again"
+LANGUAGE = "language_persistent"
+"""LeRobot's column of language rows."""
 
 PROPRIO_NAMES = ["x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z", "finger_left", "finger_right"]
 ACTION_NAMES = ["x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z", "gripper"]
@@ -93,3 +104,309 @@ def check_destination(out: Path) -> None:
         raise MemobenchError(
             f"{out} holds {', '.join(sorted(strangers)[:3])}, no part of a dataset being made; name an empty folder"
         )
+
+
+# ==== record.py
+# What a dataset says of an episode as a whole: its task, seed, placement, hashes.
+#
+# It stands twice. In ``meta/episodes``, where ``LeRobotDataset(…, episode_filter=…)`` looks; and as JSON in the frames'
+# column ``episode_info``, at each episode's first frame, because LeRobot's dataset tools (``lerobot
+# the frames' columns and drop every column of ``meta/episodes`` and every file that LeRobot does not know.
+
+EPISODE_INFO = "episode_info"
+"""The frames' column; empty but at an episode's first frame."""
+
+
+class EpisodeRecord(BaseModel):
+    """An episode as a whole.
+
+    Attributes:
+        seed: of the scene; -1 where it is not known.
+        key_frames: one per checkpoint, -1 where it was not completed.
+        fixture_poses: fixture to position and quaternion wxyz.
+        digest: sha256 of states, actions and labels; None in datasets from before there was one.
+        versions: of the packages on which the numbers depend, where they are known.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    task_name: str
+    memory_type: str
+    family: str = ""
+    operations: str = ""
+    seed: int
+    referent: str = "fixed"
+    variant: int
+    success: bool | None = None
+    exec_start_index: int
+    key_frames: list[int]
+    scene_hash: str | None = None
+    fixture_poses: dict[str, list[float]] | None = None
+    digest: str | None = None
+    versions: dict[str, str] | None = None
+
+    def in_frames(self) -> str:
+        """Return the text of the first frame's column."""
+        return self.model_dump_json(exclude_none=True)
+
+    def in_meta(self) -> dict[str, Any]:
+        """Return the columns of ``meta/episodes``."""
+        return self.model_dump(exclude={"versions"}) | {
+            "key_frames": np.array(self.key_frames, dtype=np.int64),
+            "fixture_poses": json.dumps(self.fixture_poses),
+        }
+
+
+def from_frames(text: str, where: str) -> EpisodeRecord:
+    """Return the record that a first frame holds; ``where`` begins the message.
+
+    Raises:
+        MemobenchError: the text is no record.
+    """
+    try:
+        value = parsed(text)
+        try:
+            return EpisodeRecord.model_validate(value)
+        except ValidationError as error:
+            raise Malformed(first_fault(error.errors(include_url=False), value)) from None
+    except Malformed as error:
+        raise MemobenchError(
+            f"{where}: its column {EPISODE_INFO} is none that this package writes ({error}); take the dataset from its "
+            "source again"
+        ) from None
+
+
+def from_meta(row: Mapping[str, Any]) -> EpisodeRecord | None:
+    """Return the record that a row of ``meta/episodes`` holds; None where it holds none, or a part of one."""
+    values = {key: row[key] for key in EpisodeRecord.model_fields if row.get(key) is not None}
+    try:
+        return EpisodeRecord.model_validate(values | {"fixture_poses": json.loads(values.get("fixture_poses", "null"))})
+    except (ValidationError, ValueError, TypeError):
+        return None
+
+
+# ==== info.py
+# What LeRobot keeps of a dataset in ``meta/info.json``, as far as it is used here; and reading what may be damaged.
+
+INFO_FILE = Path("meta") / "info.json"
+ADVICE = "the dataset is damaged; generate it or take it from its source again"
+MOST_NUMBERS = 50_000_000
+"""Of a feature in one frame: a picture of 4096 x 4096. LeRobot takes memory for as many as a dataset tells."""
+
+
+class Info(TypedDict):
+    """A dataset as a whole. Each of its episodes is looked at, so their number is no arbitrary one."""
+
+    codebase_version: str
+    total_episodes: Annotated[int, Ge(0), Le(10_000_000)]
+    total_frames: NotRequired[Count]
+    fps: NotRequired[Annotated[int, Ge(1), Le(10_000)]]
+    features: dict[str, dict[str, Any]]
+
+
+def read_info(folder: Path) -> dict[str, Any]:
+    """Return ``meta/info.json`` of the dataset in ``folder``.
+
+    Raises:
+        MemobenchError: there is none, it is none of LeRobot's, or a feature is too large.
+    """
+    try:
+        found: dict[str, Any] = read_json(folder / INFO_FILE, Info, ADVICE)
+    except FileNotFoundError:
+        raise MemobenchError(f"{folder} is no dataset (there is no {INFO_FILE}); name one that was generated") from None
+    for name, feature in found["features"].items():
+        shape = feature.get("shape")
+        sizes = [size for size in shape if isinstance(size, int)] if isinstance(shape, list) else []
+        if abs(math.prod(sizes)) > MOST_NUMBERS:
+            raise MemobenchError(
+                f"{folder / INFO_FILE} tells of more than {MOST_NUMBERS:,} numbers of {name[:80]} a frame; {ADVICE}"
+            )
+    return found
+
+
+def undamaged(folder: Path) -> AbstractContextManager[None]:
+    """As `refusing`, for reading the dataset in ``folder``."""
+    return refusing(lambda why: MemobenchError(f"{folder} cannot be read ({why}); {ADVICE}"))
+
+
+def check_whole(folder: Path) -> None:
+    """Raise unless the dataset in ``folder`` has all of its frames, as far as that can be told without reading them.
+
+    Looked at are the ends of tables and their numbers of rows, and the boxes of videos and their numbers of frames.
+
+    Raises:
+        MemobenchError: naming the first file that is cut off or gone, or what is missing of all.
+    """
+    import pyarrow.parquet as pq
+
+    info = read_info(folder)
+    counts = {"data": info.get("total_frames"), "meta/episodes": info["total_episodes"]}
+    if (folder / "states").is_dir():
+        counts["states"] = info.get("total_frames")
+    for part, expected in counts.items():
+        rows = 0
+        for path in sorted((folder / part).rglob("*.parquet")):
+            with undamaged(path):
+                rows += pq.read_metadata(path).num_rows
+        if expected is not None and rows != expected:
+            raise MemobenchError(f"{folder / part} holds {rows} rows, {INFO_FILE} tells of {expected}; {ADVICE}")
+    cameras = [key for key, feature in info["features"].items() if feature.get("dtype") == "video"]
+    for path, frames in _video_lengths(folder, info, cameras).items():
+        with undamaged(path):
+            _check_video(path, frames)
+
+
+def _video_lengths(folder: Path, info: dict[str, Any], cameras: list[str]) -> dict[Path, int]:
+    """Return how many frames each video must have, as meta/episodes tells of its last one."""
+    import pyarrow.parquet as pq
+
+    found: dict[Path, int] = {}
+    for table in sorted((folder / "meta" / "episodes").rglob("*.parquet")):
+        for camera in cameras:
+            parts = ("chunk_index", "file_index", "to_timestamp")
+            with undamaged(table):
+                columns = pq.read_table(table, columns=[f"videos/{camera}/{part}" for part in parts]).to_pydict()
+                for chunk, file, end in zip(*columns.values(), strict=True):
+                    place = info["video_path"].format(video_key=camera, chunk_index=int(chunk), file_index=int(file))
+                    found[folder / place] = max(found.get(folder / place, 0), round(end * info["fps"]))
+    return found
+
+
+def _check_video(path: Path, frames: int) -> None:
+    """Raise unless a video's boxes fill its file, and it tells of at least so many frames."""
+    import av
+
+    size, place = path.stat().st_size, 0
+    with path.open("rb") as file:
+        while path.suffix == ".mp4" and place < size:
+            file.seek(place)
+            head = file.read(16)
+            length = int.from_bytes(head[:4]) or size - place
+            length = int.from_bytes(head[8:]) if length == 1 else length
+            if length < 8 or place + length > size:
+                raise MemobenchError(f"{path} is cut off or damaged at byte {place:,} of {size:,}; {ADVICE}")
+            place += length
+    with av.open(str(path)) as container:
+        there = container.streams.video[0].frames
+    if 0 < there < frames:
+        raise MemobenchError(f"{path} has {there} frames, meta/episodes tells of {frames}; {ADVICE}")
+
+
+def damaged_file(folder: Path) -> str | None:
+    """Read all of a dataset; return a sentence that names the first file that cannot be, None where all can."""
+    import av
+    import pyarrow.parquet as pq
+
+    for path in sorted([*folder.glob("data/**/*.parquet"), *folder.glob("meta/**/*.parquet")]):
+        try:
+            with undamaged(path):
+                pq.read_table(path)
+        except MemobenchError as error:
+            return str(error)
+    for path in sorted(folder.glob("videos/**/*.mp4")):
+        try:
+            with undamaged(path):
+                _check_video(path, 0)
+                with av.open(str(path)) as container:
+                    container.streams.video[0].codec_context.options = {"err_detect": "explode"}
+                    for _ in container.decode(video=0):
+                        pass
+        except MemobenchError as error:
+            return str(error)
+    return None
+
+
+@contextmanager
+def naming_damage(folder: Path | None) -> Iterator[None]:
+    """Name the damaged file of a dataset, where LeRobot reads it and its error does not; None: nothing is known of it.
+
+    Raises:
+        MemobenchError: in the place of such an error.
+    """
+    try:
+        yield
+    except MemobenchError:
+        raise
+    except Exception as error:
+        names = [str(frame.f_globals.get("__name__")) for frame, _ in traceback.walk_tb(error.__traceback__)]
+        reading = any(name.startswith(("lerobot.datasets.", "datasets.", "torch.utils.data.")) for name in names)
+        if folder is None or not reading or not (folder / INFO_FILE).is_file():
+            raise
+        told = damaged_file(folder)
+        if told is None:
+            check_whole(folder)
+            raise
+        raise MemobenchError(told) from error
+
+
+def episode_count(folder: Path) -> int:
+    """Return how many episodes the dataset in ``folder`` has, as ``meta/info.json`` and ``meta/episodes`` both say.
+
+    Raises:
+        MemobenchError: they cannot be read, or disagree.
+    """
+    import pyarrow.parquet as pq
+
+    told = int(read_info(folder)["total_episodes"])
+    rows = 0
+    for path in sorted((folder / "meta" / "episodes").rglob("*.parquet")):
+        with undamaged(path):
+            rows += pq.read_metadata(path).num_rows
+    if rows != told:
+        raise MemobenchError(
+            f"{folder / INFO_FILE} tells of {count_of(told, 'episode')}, {folder}/meta/episodes of {rows}; {ADVICE}"
+        )
+    return told
+
+
+# ==== manifest.py
+# What stands beside a dataset of this package, its request and the hash of every episode: checked when it is read.
+
+
+class Asked(TypedDict):
+    """An episode that was asked for."""
+
+    task_name: str
+    seed: Whole
+    digest: NotRequired[str | None]
+
+
+class Made(Asked):
+    """An episode that is there."""
+
+    failure: None
+    frames: Count
+
+
+class Failed(Asked):
+    """One that is not, and why."""
+
+    failure: str
+
+
+class LeftOut(TypedDict):
+    """A `Problem` of a conversion."""
+
+    file: str
+    group: str
+    reason: str
+
+
+class Manifest(TypedDict):
+    """What all manifests hold, and what those of `generate` and of `convert` do."""
+
+    episodes: list[Made | Failed]
+    request: NotRequired[dict[str, Any]]
+    left_out: NotRequired[list[LeftOut]]
+    notes: NotRequired[list[LeftOut]]
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """Return the manifest of the dataset in ``folder``.
+
+    Raises:
+        FileNotFoundError: there is none.
+        MemobenchError: it is none of this package's.
+    """
+    found: dict[str, Any] = read_json(folder / MANIFEST_FILE, Manifest, NO_MANIFEST)
+    return found

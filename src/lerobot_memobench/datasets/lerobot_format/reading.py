@@ -12,14 +12,24 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lerobot_memobench.datasets.lerobot_format.info import undamaged
-from lerobot_memobench.datasets.lerobot_format.layout import EXECUTED_ACTION, OBJECTS, PRIVILEGED, is_dataset
-from lerobot_memobench.datasets.lerobot_format.record import EPISODE_INFO, EpisodeRecord, from_frames, from_meta
-from lerobot_memobench.datasets.lerobot_format.tables import LANGUAGE
+from lerobot_memobench.datasets.lerobot_format.layout import (
+    EPISODE_INFO,
+    EXECUTED_ACTION,
+    LANGUAGE,
+    OBJECTS,
+    PRIVILEGED,
+    EpisodeRecord,
+    from_frames,
+    from_meta,
+    is_dataset,
+    undamaged,
+)
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.tasks.catalogue import suite_of
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
 
 Columns = dict[str, Any]
 
@@ -222,3 +232,22 @@ def _read_columns(root: Path, episode_index: int) -> Columns:
         states = _read(root / "states", None, chosen).sort_by("frame_index")
         columns["states"] = np.array(states.column("state").to_pylist(), dtype=np.float64)
     return columns
+
+
+# ==== suites.py
+# Is a dataset of the suite that is meant?
+
+
+def check_suite_of(folder: Path, suite: str) -> None:
+    """Refuse a LeRobotDataset that holds a task of another suite; tasks outside the catalogue belong to none.
+
+    Raises:
+        MemobenchError: naming the first such task.
+    """
+    for place in list_episodes(folder) if is_dataset(folder) else ():
+        name = place.record.task_name if place.record is not None else ""
+        found = suite_of(name)
+        if found not in (None, suite):
+            raise MemobenchError(
+                f"{folder} holds demonstrations of {name!r}, a task of the {found} suite; say --suite {found}"
+            )

@@ -10,17 +10,16 @@ from typing import Any
 import torch
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
-from lerobot_memobench.datasets.feature_cache import (
+from lerobot_memobench.datasets.feature_cache.building import Progress, build_memory_cache
+from lerobot_memobench.datasets.feature_cache.frames import read_frame_table
+from lerobot_memobench.datasets.feature_cache.layout import find_cache
+from lerobot_memobench.datasets.feature_cache.reading import (
     FrameLookup,
     MemoryCache,
-    Progress,
     RecordedFrames,
     RecordedTexts,
-    build_memory_cache,
-    find_cache,
     read_recorded,
 )
-from lerobot_memobench.datasets.feature_cache.frame_table import read_frame_table
 from lerobot_memobench.envs.prompting import name_in_data
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.tower import Tower

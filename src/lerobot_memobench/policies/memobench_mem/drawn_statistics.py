@@ -8,7 +8,7 @@ import numpy as np
 from lerobot.datasets.compute_stats import get_feature_stats
 from lerobot.utils.constants import ACTION, OBS_STATE
 
-from lerobot_memobench.datasets.feature_cache import RecordedFrames
+from lerobot_memobench.datasets.feature_cache.reading import RecordedFrames
 
 STILL = 0.01
 """Added to the standard deviations of actions, so that a number that hardly varies is not blown up to noise."""

@@ -16,15 +16,10 @@ import torch
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from lerobot_memobench.datasets.feature_cache import (
-    FrameReader,
-    MemoryCache,
-    TextEncoder,
-    build_memory_cache,
-    find_cache,
-    frame_reader,
-    read_recorded,
-)
+from lerobot_memobench.datasets.feature_cache.building import TextEncoder, build_memory_cache
+from lerobot_memobench.datasets.feature_cache.frames import FrameReader, frame_reader
+from lerobot_memobench.datasets.feature_cache.layout import find_cache
+from lerobot_memobench.datasets.feature_cache.reading import MemoryCache, read_recorded
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.perception.found import VIEWS, ObjectsInPictures
 from lerobot_memobench.sim.object_slots import SIZE

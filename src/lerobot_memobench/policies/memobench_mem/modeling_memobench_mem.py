@@ -13,7 +13,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from lerobot_memobench.computing.freed_memory import keep_freed_memory
-from lerobot_memobench.datasets.feature_cache import RecordedFrames
+from lerobot_memobench.datasets.feature_cache.reading import RecordedFrames
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.weights import load_tower
 from lerobot_memobench.policies.checkpoint import check_as_trained

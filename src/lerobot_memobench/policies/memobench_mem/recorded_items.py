@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lerobot_memobench.datasets.feature_cache import RecordedFrames
+from lerobot_memobench.datasets.feature_cache.reading import RecordedFrames
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.lerobot_hooks import READ_SAMPLE, hooked_for
 from lerobot_memobench.policies.memobench_mem.perception.eyes import SEEN

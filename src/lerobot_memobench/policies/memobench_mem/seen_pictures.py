@@ -18,17 +18,15 @@ import torch
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from lerobot_memobench.datasets.feature_cache import (
+from lerobot_memobench.datasets.feature_cache.building import (
     FrameEncoder,
-    MemoryCache,
-    RecordedFrames,
     TextEncoder,
     build_memory_cache,
-    find_cache,
-    read_recorded,
+    require_room,
 )
-from lerobot_memobench.datasets.feature_cache.room import require_room
-from lerobot_memobench.datasets.lerobot_format.info import read_info
+from lerobot_memobench.datasets.feature_cache.layout import find_cache
+from lerobot_memobench.datasets.feature_cache.reading import MemoryCache, RecordedFrames, read_recorded
+from lerobot_memobench.datasets.lerobot_format.layout import read_info
 from lerobot_memobench.envs.prompting import name_in_data
 from lerobot_memobench.io import in_words
 from lerobot_memobench.perception.tower import GRID, POOLED, WIDTH

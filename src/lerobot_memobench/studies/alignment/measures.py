@@ -13,7 +13,7 @@ from lerobot.policies import make_pre_post_processors
 from torch import Tensor
 from torch.utils.data import default_collate
 
-from lerobot_memobench.datasets.feature_cache import RecordedFrames
+from lerobot_memobench.datasets.feature_cache.reading import RecordedFrames
 from lerobot_memobench.policies.memobench_mem.alignment.objectives import masked_mean
 from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, STEPS, TOKENS, MemoryBatch
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy

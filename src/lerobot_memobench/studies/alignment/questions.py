@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_memobench.datasets.feature_cache import FrameLookup
+from lerobot_memobench.datasets.feature_cache.reading import FrameLookup
 from lerobot_memobench.protocol import PROMPT
 from lerobot_memobench.studies.alignment.split import Split
 

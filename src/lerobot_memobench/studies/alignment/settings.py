@@ -9,7 +9,7 @@ from typing import Any
 
 from lerobot.utils.constants import OBS_IMAGES
 
-from lerobot_memobench.datasets.feature_cache import dataset_fingerprint
+from lerobot_memobench.datasets.feature_cache.layout import dataset_fingerprint
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import read_json, write_file
 from lerobot_memobench.protocol import CAMERAS

@@ -18,8 +18,8 @@ import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies import make_policy, make_pre_post_processors
 
-from lerobot_memobench.datasets.feature_cache import RecordedFrames
-from lerobot_memobench.datasets.lerobot_format import DEFAULT_REPO_ID
+from lerobot_memobench.datasets.feature_cache.reading import RecordedFrames
+from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID
 from lerobot_memobench.io import write_file
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.processing.training_run import training_run

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from lerobot_memobench.datasets.feature_cache import FrameLookup
+from lerobot_memobench.datasets.feature_cache.reading import FrameLookup
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import Frame, MemoryMechanism
 
 

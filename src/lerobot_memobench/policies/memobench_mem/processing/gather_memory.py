@@ -19,7 +19,7 @@ from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 from lerobot.utils.constants import OBS_ENV_STATE
 from torch import Tensor
 
-from lerobot_memobench.datasets.feature_cache import FrameLookup, RecordedFrames
+from lerobot_memobench.datasets.feature_cache.reading import FrameLookup, RecordedFrames
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, PHASE, STEPS, TOKENS, collate_frames
 from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import FrameSampling

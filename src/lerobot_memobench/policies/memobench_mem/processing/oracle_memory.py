@@ -9,7 +9,7 @@ from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.lerobot_types import EnvTransition, TransitionKey
 from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 
-from lerobot_memobench.datasets.feature_cache import FrameLookup
+from lerobot_memobench.datasets.feature_cache.reading import FrameLookup
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.processing.training_run import TrainingRun, require_cache
 from lerobot_memobench.tasks.memory_text import MARK, with_memory

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_memobench.datasets.feature_cache import FrameLookup
-from lerobot_memobench.datasets.feature_cache.frame_table import LEVEL_COLUMNS, MEMORY_COLUMN, holds_texts
+from lerobot_memobench.datasets.feature_cache.frames import LEVEL_COLUMNS, MEMORY_COLUMN, holds_texts
+from lerobot_memobench.datasets.feature_cache.reading import FrameLookup
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.batch import TEXT, TEXT_MASK

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 from weakref import WeakSet
 
-from lerobot_memobench.datasets.feature_cache import FrameLookup
+from lerobot_memobench.datasets.feature_cache.reading import FrameLookup
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.lerobot_hooks import MAKE_PROCESSORS, hooked_for
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig

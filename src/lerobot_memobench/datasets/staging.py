@@ -1,0 +1,572 @@
+"""Finished episodes on disk while a dataset is being made.
+
+Each episode is one folder, complete or absent: it is written under a temporary name and renamed when every
+file has reached the disk, so a run killed at any moment leaves finished episodes and rubbish with a name of
+its own. An episode's file names and bytes depend on the episode alone, never on the worker that made it.
+
+::
+
+    <staging>/episodes/000012/episode.json        identity, digest, statistics, hash of each file
+                              arrays.npz          states, actions, proprio, label columns (no pickle)
+                              image.mp4, wrist_image.mp4
+                              demonstration.hdf5  in the published layout, when that was asked for
+
+Frames go to the encoder while the episode is being made, so a worker's memory does not grow with its length.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import shutil
+import socket
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Annotated, Any, NotRequired, TypedDict
+
+import numpy as np
+from annotated_types import Len
+from numpy.typing import NDArray
+
+from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.hdf5.writing import EpisodeFile, data_attributes
+from lerobot_memobench.datasets.labels import LanguageRow, digest, labels, persistent_rows
+from lerobot_memobench.datasets.video import VideoWriter
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.io import (
+    Count,
+    Malformed,
+    Number,
+    Whole,
+    checked,
+    file_hash,
+    file_name,
+    read_json,
+    remove_drafts,
+    short,
+    write_file,
+)
+from lerobot_memobench.jobs.processes import locked
+from lerobot_memobench.protocol import CAMERAS
+
+# ==== folders.py
+# Folders that are whole or not there, and what killed workers leave of them.
+
+STAGING = ".staging"
+"""Folder of a run within its destination."""
+TEMPORARY = ".tmp-"
+
+
+def clean_temporaries(folder: Path) -> None:
+    """Remove what this machine's killed workers left in the folder of episodes; others may still be working."""
+    for path in folder.glob(f"{TEMPORARY}{_host()}-*"):
+        pid = path.name.removeprefix(f"{TEMPORARY}{_host()}-").split("-")[0]
+        if not (pid.isdigit() and _alive(int(pid))):
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def temporary_folder(folder: Path) -> Path:
+    """Make and return an empty folder beside ``folder``, to be renamed to it when it is whole."""
+    temporary = folder.parent / f"{TEMPORARY}{_host()}-{os.getpid()}-{folder.name}"
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir(parents=True)
+    return temporary
+
+
+def flush_to_disk(paths: Iterable[Path]) -> None:
+    """Wait until the disk holds files, or the entries of folders."""
+    for path in paths:
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def _host() -> str:
+    return re.sub(r"[^A-Za-z0-9]", "_", socket.gethostname())
+
+
+def _alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return pid != os.getpid()  # what this process left behind earlier is rubbish too
+
+
+# ==== request.py
+# What keeps a run in a folder apart from later ones: the request that it answers.
+
+REQUEST_FILE = "request.json"
+
+
+@contextlib.contextmanager
+def episodes_folder(out: Path, request: dict[str, Any], advice: str, *, anew: bool = False) -> Iterator[Path]:
+    """Hold the destination ``out`` for a run that answers ``request``; yield the folder for its finished episodes.
+
+    Those of an unfinished run of the same request are there already, unless it is to begin ``anew``.
+
+    Raises:
+        MemobenchError: another run is writing there, or an unfinished one answers another request; ``advice`` ends
+            that sentence.
+    """
+    staging = out / STAGING
+    staging.mkdir(parents=True, exist_ok=True)
+    with locked(staging, out):
+        folder = staging / "episodes"
+        if anew:
+            shutil.rmtree(folder, ignore_errors=True)
+            (staging / REQUEST_FILE).unlink(missing_ok=True)
+        remove_drafts(staging)
+        _check_request(staging, request, out, advice)
+        folder.mkdir(exist_ok=True)
+        clean_temporaries(folder)
+        yield folder.absolute()
+
+
+def _check_request(staging: Path, request: dict[str, Any], out: Path, advice: str) -> None:
+    """Remember the request in an unfinished run's folder; raise where it was another one."""
+    path = staging / REQUEST_FILE
+    try:
+        earlier = read_json(path, dict[str, Any], "delete the folder that it is in to start anew")
+    except FileNotFoundError:
+        write_file(path, json.dumps(request, indent=1), durable=True)
+        return
+    compare_requests(earlier, request, f"{out} holds an unfinished run", advice)
+
+
+def compare_requests(earlier: dict[str, Any], request: dict[str, Any], what: str, advice: str) -> None:
+    """Raise with the first thing that was asked for differently."""
+    before = {"formats": [LEROBOT], "perturb": False, "policy": None, "prompted_episodes": None}
+    earlier = {**before, **earlier}  # written before there was a choice
+    for key, value in request.items():
+        if earlier.get(key) != value:
+            there = short(earlier.get(key))
+            raise MemobenchError(f"{what} with {key}={there}, now {short(value)} was asked for; {advice}")
+
+
+# ==== statistics.py
+# Statistics of images and numbers, by the names under which LeRobot keeps and uses them.
+
+QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
+
+BLOCK = 16
+"""Columns of which statistics are made at once: of all, a copy in float64 for thousands of episodes is gigabytes."""
+
+Stats = dict[str, NDArray]
+
+
+class ImageHistograms:
+    """Statistics of a video's frames, collected while they pass: a histogram of 256 bins per frame and channel.
+
+    LeRobot takes frames evenly spread over the episode, at least 100; which ones is known only at its end. A
+    frame's histograms are 3 kB, the frame itself 192 kB.
+    """
+
+    def __init__(self) -> None:
+        self._counts: list[NDArray[np.int32]] = []
+
+    def add(self, frame: NDArray[np.uint8]) -> None:
+        """Count one more frame, (H, W, 3) uint8."""
+        import cv2
+
+        counts = [cv2.calcHist([frame], [channel], None, [256], [0, 256])[:, 0] for channel in range(3)]
+        self._counts.append(np.array(counts, dtype=np.int32))
+
+    def stats(self) -> Stats:
+        """Return LeRobot's statistics: each (3, 1, 1), in [0, 1], and ``count`` (1,).
+
+        Over the frames that LeRobot samples, but exact over their pixels: eight bits need a histogram of 256
+        bins, not of 5,000 adaptive ones.
+        """
+        from lerobot.datasets.compute_stats import sample_indices
+
+        chosen = sample_indices(len(self._counts))
+        counts = np.stack([self._counts[index] for index in chosen]).sum(axis=0, dtype=np.int64)
+        levels, total = np.arange(256) / 255.0, counts[0].sum()
+        mean = counts @ levels / total
+        cumulative = counts.cumsum(axis=1)
+        stats = {
+            "min": levels[(counts > 0).argmax(axis=1)],
+            "max": levels[255 - (counts[:, ::-1] > 0).argmax(axis=1)],
+            "mean": mean,
+            "std": np.sqrt(np.maximum(counts @ levels**2 / total - mean**2, 0)),
+        }
+        for q in QUANTILES:
+            stats[f"q{int(q * 100):02d}"] = levels[(cumulative >= q * total).argmax(axis=1)]
+        return {name: value.reshape(3, 1, 1) for name, value in stats.items()} | {"count": np.array([len(chosen)])}
+
+
+def image_stats(frames: NDArray[np.uint8]) -> Stats:
+    """Return the statistics of (T, H, W, 3) uint8 frames, see :class:`ImageHistograms`."""
+    histograms = ImageHistograms()
+    for frame in frames:
+        histograms.add(frame)
+    return histograms.stats()
+
+
+def numeric_stats(values: NDArray) -> Stats:
+    """Return exact statistics of (T,) or (T, n) numbers over T: each (n,) (n = 1 for (T,)), and ``count``
+    (1,).
+
+    LeRobot averages the episodes' quantiles; over a whole dataset that is no quantile. pi0.5 normalises by
+    q01 and q99, so they are computed from all frames here.
+    """
+    flat = values.reshape(len(values), -1)
+    blocks = [_stats_of(flat[:, start : start + BLOCK].astype(np.float64)) for start in range(0, flat.shape[1], BLOCK)]
+    stats = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
+    return stats | {"count": np.array([len(values)])}
+
+
+def _stats_of(flat: NDArray[np.float64]) -> Stats:
+    stats = {"min": flat.min(0), "max": flat.max(0), "mean": flat.mean(0), "std": flat.std(0)}
+    quantiles = np.quantile(flat, QUANTILES, axis=0, overwrite_input=True)
+    return stats | {f"q{int(q * 100):02d}": row for q, row in zip(QUANTILES, quantiles, strict=True)}
+
+
+# ==== episode.py
+# A finished episode's folder, read back.
+
+RECORD_FILE = "episode.json"
+ARRAYS_FILE = "arrays.npz"
+HDF5_FILE = "demonstration.hdf5"
+
+LEROBOT, HDF5 = "lerobot", "hdf5"
+FORMATS = (LEROBOT, HDF5)
+"""What a run can make of its episodes."""
+
+ADVICE = "it is damaged; delete the folder that it is in and run the command again"
+
+
+class Info(TypedDict):
+    """What meta/episodes, manifest and card say of an episode (see ``episode_info``)."""
+
+    task_name: str
+    memory_type: str
+    family: str
+    language: str
+    operations: str
+    seed: Whole
+    referent: str
+    variant: Count
+    success: bool
+    frames: Count
+    exec_start_index: Count
+    key_frames: list[Whole]
+    scene_hash: str
+    fixture_poses: dict[str, list[Number]]
+    digest: str
+
+
+class Identity(TypedDict):
+    """What is known of an episode that could not be made."""
+
+    task_name: str
+    seed: Whole
+
+
+class Row(TypedDict, total=False):
+    """One of LeRobot's persistent language rows; `datasets.language` writes them."""
+
+    role: str
+    content: str | None
+    style: str | None
+    timestamp: Number
+
+
+Frames = Annotated[list[Count], Len(1, 1)]
+"""Over how many frames a statistic is, (1,)."""
+Pixels = Annotated[list[Annotated[list[Annotated[list[Number], Len(1, 1)]], Len(1, 1)]], Len(3, 3)]
+"""A statistic of a camera's channels, (3, 1, 1)."""
+
+
+class Record(TypedDict):
+    """``episode.json``."""
+
+    failure: str | None
+    info: Identity
+    language_persistent: list[Row]
+    image_stats: dict[str, dict[str, Pixels | Frames]]
+    files: dict[str, str]
+    hdf5: NotRequired[dict[str, Any] | None]
+
+
+@dataclass(frozen=True)
+class StagedEpisode:
+    """A finished episode's folder; ``record`` is its episode.json, the rest is read when asked for."""
+
+    folder: Path
+    record: dict[str, Any]
+
+    @property
+    def failure(self) -> str | None:
+        """Why there is no demonstration of this seed, or None."""
+        return self.record["failure"]
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """Identity and per-episode metadata (see ``episode_info``)."""
+        return self.record["info"]
+
+    @property
+    def language_rows(self) -> list[LanguageRow]:
+        """LeRobot's persistent language rows (see ``persistent_rows``)."""
+        return self.record["language_persistent"]
+
+    @property
+    def has_images(self) -> bool:
+        """Whether its cameras were recorded."""
+        return bool(self.record["image_stats"])
+
+    @property
+    def has_objects(self) -> bool:
+        """Whether what could be seen as objects was recorded."""
+        with np.load(self.folder / ARRAYS_FILE, allow_pickle=False) as data:
+            return "objects" in data
+
+    @property
+    def hdf5(self) -> Path:
+        """The demonstration in the published layout, alone at the root of a file of its own."""
+        return self.folder / HDF5_FILE
+
+    @property
+    def hdf5_attributes(self) -> dict[str, Any] | None:
+        """Attributes of its task's HDF5 file; None where HDF5 was not asked for."""
+        return self.record.get("hdf5")
+
+    @property
+    def video_bytes(self) -> int:
+        """Size of its videos."""
+        return sum(self.video(camera).stat().st_size for camera in self.record["image_stats"])
+
+    def video(self, camera: str) -> Path:
+        """Return the file of a camera's video."""
+        return self.folder / f"{camera}.mp4"
+
+    def image_stats(self, camera: str) -> Stats:
+        """Return the statistics of a camera's pixels (see ``ImageHistograms``)."""
+        return {name: np.array(value) for name, value in self.record["image_stats"][camera].items()}
+
+    def arrays(self) -> dict[str, NDArray]:
+        """Read states, actions, proprio and label columns; text columns are arrays of str."""
+        with np.load(self.folder / ARRAYS_FILE, allow_pickle=False) as data:
+            return dict(data)
+
+    def check(self) -> None:
+        """Raise a MemobenchError that names the first file whose bytes are not those that were written."""
+        for name, expected in self.record["files"].items():
+            path = self.folder / file_name(name, f"a file that {self.folder / RECORD_FILE} names")
+            found = file_hash(path) if path.is_file() else "missing"
+            if found != expected:
+                raise MemobenchError(
+                    f"{path} is damaged (sha256 {found[:12]}, written as {expected[:12]}); "
+                    f"delete the folder {self.folder} and generate again to make this episode anew"
+                )
+
+
+def read_staged(folder: Path) -> StagedEpisode | None:
+    """Return the finished episode in ``folder``, or None when there is none."""
+    try:
+        record = read_json(folder / RECORD_FILE, Record, ADVICE)
+    except FileNotFoundError:
+        return None
+    if record["failure"] is None:
+        _check_info(folder, record["info"])
+    return StagedEpisode(folder, record)
+
+
+def _check_info(folder: Path, info: dict[str, Any]) -> None:
+    """Refuse an episode of which not all is told that a dataset says of it."""
+    try:
+        checked(info, Info)
+    except Malformed as error:
+        raise MemobenchError(f"{folder / RECORD_FILE}: {error} in info; {ADVICE}") from None
+
+
+class StagedJob:
+    """What jobs have in common that make one episode, complete or absent: two workers at the same one do no harm."""
+
+    folder: Path
+
+    def finished(self) -> bool:
+        """Whether the episode, or why there is none, is in ``folder``."""
+        return read_staged(self.folder) is not None
+
+    def failure(self) -> str | None:
+        """Why a finished job has no episode, or None."""
+        return staged(self).failure
+
+
+def staged(job: StagedJob) -> StagedEpisode:
+    """Return the finished episode of a job that has been run."""
+    found = read_staged(job.folder)
+    if found is None:
+        raise MemobenchError(f"{job.folder} has vanished while the run was going on; run the command again")
+    return found
+
+
+# ==== stage.py
+# Write an episode: frame by frame while it is made, everything else at its end.
+
+
+def episode_info(demo: Demonstration) -> dict[str, Any]:
+    """Return what meta/episodes, manifest and card say about an episode."""
+    found = labels(demo)
+    return {
+        "task_name": demo.task.name,
+        "memory_type": demo.task.memory_type,
+        "family": demo.task.family,
+        "language": demo.task.language,
+        "operations": demo.task.operations,
+        "seed": int(demo.seed),
+        "referent": demo.referent,
+        "variant": int(demo.variant),
+        "success": bool(demo.success),
+        "frames": len(demo),
+        "exec_start_index": int(demo.exec_start),
+        "key_frames": found.key_frames.tolist(),
+        "scene_hash": demo.scene_hash,
+        "fixture_poses": {name: np.asarray(pose).tolist() for name, pose in demo.fixture_poses.items()},
+        "digest": digest(demo),
+    }
+
+
+class EpisodeStage:
+    """An episode on its way to the disk: images frame by frame, everything else at the end.
+
+    A context: whatever was not published when it ends leaves nothing behind.
+
+    Args:
+        folder: where the finished episode goes; the same one, if there, is kept.
+        formats: which of ``FORMATS`` to write.
+    """
+
+    def __init__(self, folder: Path, formats: Collection[str] = (LEROBOT,)) -> None:
+        self._folder = folder
+        self._formats = tuple(formats)
+        self._temporary = temporary_folder(folder)
+        self._videos: dict[str, VideoWriter] = {}
+        self._histograms: dict[str, ImageHistograms] = {}
+        self._hdf5 = EpisodeFile(self._temporary / HDF5_FILE) if HDF5 in self._formats else None
+        self._frames = 0
+        if LEROBOT in self._formats:
+            self._videos = {camera: VideoWriter(self._temporary / f"{camera}.mp4") for camera in CAMERAS}
+            self._histograms = {camera: ImageHistograms() for camera in CAMERAS}
+
+    def __enter__(self) -> EpisodeStage:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        abandoned: list[VideoWriter | EpisodeFile] = [*self._videos.values()]
+        abandoned += [] if self._hdf5 is None else [self._hdf5]
+        for file in abandoned:
+            with contextlib.suppress(Exception):  # on a full disk closing fails as well, and all of it is deleted
+                file.abandon()
+        shutil.rmtree(self._temporary, ignore_errors=True)
+
+    def add_images(self, images: Mapping[str, NDArray[np.uint8]]) -> None:
+        """Take both cameras' next frame, (H, W, 3) uint8 each."""
+        self._frames += 1
+        for camera, video in self._videos.items():
+            video.add(images[camera])
+            self._histograms[camera].add(images[camera])
+        if self._hdf5 is not None:
+            self._hdf5.add_images(images)
+
+    def publish(self, demo: Demonstration) -> StagedEpisode:
+        """Add everything but the images, which have been given, and make it a finished episode."""
+        if self._frames not in (0, len(demo)):
+            raise MemobenchError(
+                f"{demo.task.name}, seed {demo.seed}: {self._frames} images of a demonstration of {len(demo)} frames "
+                "were recorded; give one per frame and camera, or none"
+            )
+        found = labels(demo)
+        info = episode_info(demo)
+        _check_storable(info, found.columns())
+        record = {
+            "failure": None,
+            "info": info,
+            "language_persistent": persistent_rows(found),
+            "image_stats": self._close_videos(),
+        }
+        if LEROBOT in self._formats:
+            columns: dict[str, Any] = {"states": demo.states, "actions": demo.actions, "proprio": demo.proprio}
+            columns |= {} if demo.objects is None else {"objects": demo.objects}
+            columns |= {} if demo.executed is None else {"executed": demo.executed}
+            columns |= {name: np.asarray(column) for name, column in found.columns().items()}
+            np.savez_compressed(self._temporary / ARRAYS_FILE, **columns)
+        if self._hdf5 is not None:
+            self._hdf5.finish(demo)
+            record["hdf5"] = data_attributes(demo.task)
+        return _publish(self._temporary, self._folder, record)
+
+    def _close_videos(self) -> dict[str, dict[str, list[Any]]]:
+        """End the videos; return each camera's statistics, nothing where there were no frames."""
+        for video in self._videos.values():
+            video.close()
+        if not self._frames:
+            return {}
+        return {
+            camera: {name: value.tolist() for name, value in histograms.stats().items()}
+            for camera, histograms in self._histograms.items()
+        }
+
+
+def _check_storable(info: Mapping[str, Any], columns: Mapping[str, Any]) -> None:
+    """Raise unless a dataset's tables can hold the episode: one that they cannot would end the others with it."""
+    texts = [sorted(set(values)) for values in columns.values() if isinstance(values, list)]
+    try:
+        json.dumps([info, texts], ensure_ascii=False).encode()
+        np.array([info["seed"], info["variant"]], dtype=np.int64)
+    except (UnicodeEncodeError, OverflowError) as error:
+        raise MemobenchError(
+            f"{info['task_name']!r}: a text that is no Unicode, or a number of more than 64 bits, cannot be stored "
+            f"({error}); correct the task's texts or the seed"
+        ) from None
+
+
+def stage_demonstration(demo: Demonstration, folder: Path, formats: Collection[str] = (LEROBOT,)) -> StagedEpisode:
+    """Write a demonstration that is in memory, images included, to ``folder``; the same one, if there, is kept."""
+    with EpisodeStage(folder, formats) as stage:
+        if demo.images is not None:
+            for frame in range(len(demo)):
+                stage.add_images({camera: demo.images[camera][frame] for camera in CAMERAS})
+        return stage.publish(demo)
+
+
+def stage_failure(info: dict[str, Any], reason: str, folder: Path) -> StagedEpisode:
+    """Remember that a seed has no demonstration, so that a resumed run reports it as well."""
+    record = {"failure": reason, "info": info, "language_persistent": [], "image_stats": {}}
+    temporary = temporary_folder(folder)
+    try:
+        return _publish(temporary, folder, record)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _publish(temporary: Path, folder: Path, record: dict[str, Any]) -> StagedEpisode:
+    """Add the record, bring everything to the disk, then give the folder its name."""
+    record["files"] = {path.name: file_hash(path) for path in sorted(temporary.iterdir())}
+    (temporary / RECORD_FILE).write_text(json.dumps(record))
+    flush_to_disk([*temporary.iterdir(), temporary])
+    try:
+        temporary.rename(folder)
+    except OSError:
+        staged = read_staged(folder)  # another worker was first
+        shutil.rmtree(temporary, ignore_errors=True)
+        if staged is None or staged.info != record["info"]:
+            raise MemobenchError(
+                f"{folder} holds something else than the episode to be written there; delete it and run again"
+            ) from None
+        return staged
+    flush_to_disk([folder.parent])
+    return StagedEpisode(folder, record)
