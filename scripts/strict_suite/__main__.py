@@ -12,20 +12,20 @@ import counting
 import finding
 import ordering
 import prompted
-from folders import Twin, files, write
+from folders import StrictTask, files, write
 
 
-def twins() -> Iterable[Twin]:
-    """Return all twins."""
-    return [*counting.twins(), *ordering.twins(), *finding.twins(), *prompted.twins()]
+def strict_tasks() -> Iterable[StrictTask]:
+    """Return all strict tasks."""
+    return [*counting.strict_tasks(), *ordering.strict_tasks(), *finding.strict_tasks(), *prompted.strict_tasks()]
 
 
 def stale() -> list[str]:
     """Return the files that are missing or say something else than is written here."""
     return [
         str(path)
-        for twin in twins()
-        for path, text in ((twin.folder / name, text) for name, text in files(twin).items())
+        for task in strict_tasks()
+        for path, text in ((task.folder / name, text) for name, text in files(task).items())
         if not path.is_file() or path.read_text(encoding="utf-8") != text
     ]
 
@@ -33,6 +33,6 @@ def stale() -> list[str]:
 if __name__ == "__main__":
     if "--check" in sys.argv[1:]:
         sys.exit("\n".join(stale()) or 0)
-    for twin in twins():
-        write(twin)
-        print(twin.folder)
+    for task in strict_tasks():
+        write(task)
+        print(task.folder)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from folders import Setting, Twin
+from folders import Setting, StrictTask
 from words import HOME, TIMES, Texts, ready, region, times
 
 from lerobot_memobench.tasks.formula import And, Atom, Exactly, Formula, Hold, Round, When
@@ -95,10 +95,10 @@ EVENTS = (
 )
 
 
-def twins() -> list[Twin]:
+def strict_tasks() -> list[StrictTask]:
     """Return the five counting tasks."""
     return [
-        Twin(
+        StrictTask(
             event.name,
             event.published,
             "counting",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import permutations
 
-from folders import Setting, Twin
+from folders import Setting, StrictTask
 from words import CABINET, DRAWERS, Texts, region
 
 from lerobot_memobench.tasks.bddl import Region
@@ -42,7 +42,7 @@ SECONDS = (
 )
 
 
-def twins() -> list[Twin]:
+def strict_tasks() -> list[StrictTask]:
     """Return the ten finding tasks: five with one thing, five with two."""
     pairs = list(zip(SINGLES, SECONDS, strict=True))
     return [*(_single(first) for first in SINGLES), *(_pair(first, second) for first, second in pairs)]
@@ -52,10 +52,10 @@ def _underscored(words: str) -> str:
     return words.replace(" ", "_")
 
 
-def _single(thing: Thing) -> Twin:
+def _single(thing: Thing) -> StrictTask:
     name = _underscored(thing.words)
     settings = tuple(_setting(thing, drawer, ((thing, drawer),)) for drawer in DRAWERS)
-    return _twin(
+    return _strict_task(
         f"find_the_{name}_hidden_in_one_of_the_drawers",
         f"put_the_{name}_into_the_top_drawer_of_the_cabinet",
         "hidden_thing",
@@ -63,14 +63,14 @@ def _single(thing: Thing) -> Twin:
     )
 
 
-def _pair(first: Thing, second: Thing) -> Twin:
+def _pair(first: Thing, second: Thing) -> StrictTask:
     names = _underscored(first.words), _underscored(second.words)
     settings = tuple(
         _setting(asked, where, ((first, one), (second, other)))
         for one, other in permutations(DRAWERS, 2)
         for asked, where in ((first, one), (second, other))
     )
-    return _twin(
+    return _strict_task(
         f"find_the_{names[0]}_or_the_{names[1]}_hidden_in_two_of_the_drawers",
         f"put_the_{names[0]}_into_the_top_drawer_and_the_{names[1]}_into_the_middle_drawer",
         "two_hidden_things",
@@ -78,8 +78,8 @@ def _pair(first: Thing, second: Thing) -> Twin:
     )
 
 
-def _twin(name: str, published: str, family: str, settings: tuple[Setting, ...]) -> Twin:
-    return Twin(name, published, family, "SUC", settings, spoilt_as="wrong_place", regions=(*PLACES, SPOT))
+def _strict_task(name: str, published: str, family: str, settings: tuple[Setting, ...]) -> StrictTask:
+    return StrictTask(name, published, family, "SUC", settings, spoilt_as="wrong_place", regions=(*PLACES, SPOT))
 
 
 def _setting(asked: Thing, drawer: str, hidden: tuple[tuple[Thing, str], ...]) -> Setting:

@@ -1,4 +1,4 @@
-"""Write one twin as a task folder: the published task's scene, with its own instruction, goal and metadata."""
+"""Write one strict task as a task folder: the published task's scene, with its own instruction, goal and metadata."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Setting:
 
 
 @dataclass(frozen=True)
-class Twin:
+class StrictTask:
     """A strict task: the settings that a seed draws from, the first of which stands in the BDDL file.
 
     Attributes:
@@ -59,38 +59,38 @@ class Twin:
         return CATALOGUE_DIR / STRICT / self.scene.memory_type / self.name
 
 
-def files(twin: Twin) -> dict[str, str]:
-    """Return file name -> text of a twin's folder."""
-    problem = parse_bddl(twin.scene.bddl_text, twin.published)
-    first = twin.settings[0]
-    regions = problem.regions | {region.full_name: region for region in (*twin.regions, *twin.moved)}
+def files(task: StrictTask) -> dict[str, str]:
+    """Return file name -> text of a strict task's folder."""
+    problem = parse_bddl(task.scene.bddl_text, task.published)
+    first = task.settings[0]
+    regions = problem.regions | {region.full_name: region for region in (*task.regions, *task.moved)}
     problem = replace(problem, language=first.language, goal=first.goal, regions=regions)
-    comment = f"Strict twin, family {twin.family}, in the scene of\n{twin.published}."
-    return {BDDL_FILE: format_bddl(problem, comment), METADATA_FILE: _json(_metadata(twin)) + "\n"}
+    comment = f"Strict task, family {task.family}, in the scene of\n{task.published}."
+    return {BDDL_FILE: format_bddl(problem, comment), METADATA_FILE: _json(_metadata(task)) + "\n"}
 
 
-def write(twin: Twin) -> None:
-    """Write a twin's folder, whatever is there."""
-    twin.folder.mkdir(parents=True, exist_ok=True)
-    for name, text in files(twin).items():
-        write_file(twin.folder / name, text)
+def write(task: StrictTask) -> None:
+    """Write a strict task's folder, whatever is there."""
+    task.folder.mkdir(parents=True, exist_ok=True)
+    for name, text in files(task).items():
+        write_file(task.folder / name, text)
 
 
-def _metadata(twin: Twin) -> dict[str, Any]:
-    first, *others = twin.settings
-    count = len(twin.operations)
-    assert all(len(one.checkpoints) == len(one.memory) == count for one in twin.settings), twin.name
+def _metadata(task: StrictTask) -> dict[str, Any]:
+    first, *others = task.settings
+    count = len(task.operations)
+    assert all(len(one.checkpoints) == len(one.memory) == count for one in task.settings), task.name
     return {
         "suite": STRICT,
-        "twin_of": twin.published,
+        "derived_from": task.published,
         "drawn": True,
-        **({"spoilt_as": twin.spoilt_as} if twin.spoilt_as else {}),
-        "memory_type": twin.scene.memory_type,
-        "family": twin.family,
+        **({"spoilt_as": task.spoilt_as} if task.spoilt_as else {}),
+        "memory_type": task.scene.memory_type,
+        "family": task.family,
         "demo_summary": first.demo_summary,
         "prompt": _prompt(first.prompt),
         "key_frame": [-1] * count,
-        "operating_type": [["SUC".index(operation)] * 3 for operation in twin.operations],
+        "operating_type": [["SUC".index(operation)] * 3 for operation in task.operations],
         "subtask_goals": [to_lists(goal) for goal in first.checkpoints],
         "memory": [list(texts) for texts in first.memory],
         "variants": [_variant(one, first) for one in others],

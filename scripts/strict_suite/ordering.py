@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import permutations
 
-from folders import Setting, Twin
+from folders import Setting, StrictTask
 from words import DRAWERS, Texts, ready, region
 
 from lerobot_memobench.tasks.bddl import Region
@@ -21,7 +21,7 @@ Event = tuple[Atom, Atom]
 """Atoms between which something is under way."""
 
 
-def twins() -> list[Twin]:
+def strict_tasks() -> list[StrictTask]:
     """Return the five ordering tasks."""
     return [_three_drawers(), _bowl_in_drawer(), _bowl_on_plate(), *_pans()]
 
@@ -47,8 +47,8 @@ def _done(event: Event, scene: Formula) -> Formula:
 # --- drawers ---
 
 
-def _three_drawers() -> Twin:
-    return Twin(
+def _three_drawers() -> StrictTask:
+    return StrictTask(
         "check_all_three_drawers_once_each_in_the_given_order",
         "check_all_three_drawers_of_the_cabinet",
         "ordering",
@@ -98,7 +98,7 @@ def _checked(order: Sequence[str]) -> tuple[Texts, Texts, Texts]:
     )
 
 
-def _bowl_in_drawer() -> Twin:
+def _bowl_in_drawer() -> StrictTask:
     scene, middle, top = ready(BOWL), _drawer("middle"), _drawer("top")
     begun = Or((top[0], Not(Atom("inplace", (BOWL,)))))
     stowed = Atom("in", (BOWL, region("top")))
@@ -126,7 +126,7 @@ def _bowl_in_drawer() -> Twin:
         ),
         "Look into the middle drawer, come home, then stow the black bowl in the top drawer and shut it.",
     )
-    return Twin(
+    return StrictTask(
         "check_the_middle_drawer_once_then_put_the_black_bowl_in_the_top_drawer",
         "check_the_middle_drawer_and_put_the_black_bowl_in_the_top_drawer_and_close_it",
         "ordering",
@@ -148,7 +148,7 @@ def _carried(
     return Setting(asked, goal, (begun, _done(event, scene), goal), tuple(texts), summary)
 
 
-def _bowl_on_plate() -> Twin:
+def _bowl_on_plate() -> StrictTask:
     setting = _carried(
         "open and close the microwave exactly once, then put the white bowl on the plate",
         "Swing the microwave's door open and shut, come home, then move the white bowl from its top onto the plate.",
@@ -173,7 +173,7 @@ def _bowl_on_plate() -> Twin:
             ),
         ),
     )
-    return Twin(
+    return StrictTask(
         "open_and_close_the_microwave_once_then_put_the_white_bowl_on_the_plate",
         "open_and_close_the_microwave_and_put_the_white_bowl_on_the_plate",
         "ordering",
@@ -182,7 +182,7 @@ def _bowl_on_plate() -> Twin:
     )
 
 
-def _pans() -> list[Twin]:
+def _pans() -> list[StrictTask]:
     return [
         _pan("on_it", "on it", "stove", f"{STOVE}_cook_region", "moka_pot_1", "onto the stove's cooking plate"),
         _pan(
@@ -196,7 +196,7 @@ def _pans() -> list[Twin]:
     ]
 
 
-def _pan(suffix: str, where: str, support: str, place: str, other: str, onto: str) -> Twin:
+def _pan(suffix: str, where: str, support: str, place: str, other: str, onto: str) -> StrictTask:
     setting = _carried(
         f"turn the stove on and off exactly once, then put the frying pan {where}",
         f"Switch the stove on and off, come home, then set the frying pan on the {support}.",
@@ -217,7 +217,7 @@ def _pan(suffix: str, where: str, support: str, place: str, other: str, onto: st
             ),
         ),
     )
-    return Twin(
+    return StrictTask(
         f"turn_the_stove_on_and_off_once_then_put_the_frying_pan_{suffix}",
         f"turn_on_the_stove_and_turn_it_off_then_put_the_frying_pan_{suffix}",
         "ordering",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import pairwise
 
-from folders import Setting, Twin
+from folders import Setting, StrictTask
 
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.formula import And, Atom, Formula, Hold, Never, Or, Then, When, atoms
@@ -68,19 +68,19 @@ PROCEDURES = (
 )
 
 
-def twins() -> list[Twin]:
+def strict_tasks() -> list[StrictTask]:
     """Return the five tasks of a referent and the five of a procedure."""
     return [
-        *(_twin(*names, "only_referent") for names in REFERENTS),
-        *(_twin(*names, "strict_procedure") for names in PROCEDURES),
+        *(_strict_task(*names, "only_referent") for names in REFERENTS),
+        *(_strict_task(*names, "strict_procedure") for names in PROCEDURES),
     ]
 
 
-def _twin(name: str, published: str, language: str, family: str) -> Twin:
+def _strict_task(name: str, published: str, language: str, family: str) -> StrictTask:
     task = get_task(published)
     shown = [task.variant(k) for k in task.random_variants]
     settings = tuple(_setting(one, shown, language) for one in shown)
-    return Twin(name, published, family, task.operations, settings)
+    return StrictTask(name, published, family, task.operations, settings)
 
 
 def _setting(one: Task, shown: Sequence[Task], language: str) -> Setting:

@@ -180,7 +180,7 @@ def test_the_expert_finds_back_and_says_how(moved):
 
 
 def test_an_arm_that_was_pushed_comes_to_rest_at_home():
-    """Or no round of a counting twin would begin there, and none would end."""
+    """Or no round of a counting task would begin there, and none would end."""
     counted = record_demonstration(get_task(COUNTING), SEED + 1, images=False, referent="random", perturb=True)
     assert counted.success
     assert np.abs(counted.applied - counted.actions)[:, :6].max(axis=1).any(), "it was pushed"

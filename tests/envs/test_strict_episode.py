@@ -52,7 +52,7 @@ def test_a_configuration_tells_what_is_true_of_its_suite(referent: str) -> None:
 
 
 def test_published_tasks_are_not_drawn() -> None:
-    published = get_task(str(get_task(STOVE).twin_of))
+    published = get_task(str(get_task(STOVE).derived_from))
     with pytest.raises(MemobenchError, match="referent is 'drawn'; did you mean"):
         Episode(published, referent="drawn")
     with pytest.raises(MemobenchError, match=r"env\.referent is 'drawn'"):

@@ -26,7 +26,7 @@ def test_the_published_task_is_done_and_begun_again() -> None:
     assert np.count_nonzero(np.diff(np.array(lit, dtype=int)) == 1) > 1, "it goes on after the goal has come true"
 
 
-def test_who_cannot_count_fails_the_twin() -> None:
+def test_who_cannot_count_fails_the_strict_task() -> None:
     episode = Episode(get_task(COUNTED))
     for seed in (20_001, 20_002, 20_003):
         episode.reset(seed)

@@ -112,7 +112,7 @@ def play(task: Task, seed: int) -> Episode:
 
 
 @pytest.mark.parametrize(("name", "variant"), [(MICROWAVE, 2), (DRAWERS, 5), (STOVE, 0), (CHARGER, 2)])
-def test_solves_a_twin_of_each_family(name: str, variant: int) -> None:
+def test_solves_a_task_of_each_family(name: str, variant: int) -> None:
     play(get_task(name).variant(variant), 20_000)
 
 

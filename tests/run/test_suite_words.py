@@ -8,17 +8,17 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.run.reading import check_task_names
 from lerobot_memobench.run.words import split_words
 
-TWIN, PUBLISHED = "open_and_close_the_microwave_a_given_number_of_times", "open_and_close_the_microwave"
+STRICT, PUBLISHED = "open_and_close_the_microwave_a_given_number_of_times", "open_and_close_the_microwave"
 
 
 @pytest.mark.parametrize(
     "words",
     [
         ["env=memobench", "suite=strict"],
-        ["env=memobench", "suite=strict", f"tasks={TWIN},spatial"],
-        ["--env.type=memobench", "--env.suite=strict", f"--env.tasks={TWIN}"],
+        ["env=memobench", "suite=strict", f"tasks={STRICT},spatial"],
+        ["--env.type=memobench", "--env.suite=strict", f"--env.tasks={STRICT}"],
         ["env=memobench", f"tasks={PUBLISHED}"],
-        ["env=memobench", "--config_path=settings.yaml", f"tasks={TWIN}"],
+        ["env=memobench", "--config_path=settings.yaml", f"tasks={STRICT}"],
     ],
 )
 def test_tasks_of_the_suite_are_known(words: list[str]) -> None:
@@ -28,7 +28,7 @@ def test_tasks_of_the_suite_are_known(words: list[str]) -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["env=memobench", f"tasks={TWIN}"], "task of the strict suite; say suite=strict"),
+        (["env=memobench", f"tasks={STRICT}"], "task of the strict suite; say suite=strict"),
         (["env=memobench", "suite=strict", f"tasks={PUBLISHED}"], "task of the published suite"),
         (["env=memobench", "suite=strikt"], "suite is 'strikt'; did you mean 'strict'"),
     ],

@@ -130,12 +130,12 @@ def test_places_are_those_at_the_beginning_of_the_execution(sim: Simulation) -> 
     assert sim.holds(HOME)
 
 
-def test_a_twin_begins_as_its_published_task_does() -> None:
-    twin, published = Simulation(get_task(TASK)), Simulation(get_task("open_and_close_the_microwave"))
+def test_a_strict_task_begins_as_its_published_task_does() -> None:
+    strict, published = Simulation(get_task(TASK)), Simulation(get_task("open_and_close_the_microwave"))
     for seed in (7, 20_000):
-        twin.reset(seed)
+        strict.reset(seed)
         published.reset(seed)
-        assert set(twin.assets) == set(published.assets)
-        for name in twin.assets:
-            for ours, theirs in zip(twin.body_pose(name), published.body_pose(name), strict=True):
+        assert set(strict.assets) == set(published.assets)
+        for name in strict.assets:
+            for ours, theirs in zip(strict.body_pose(name), published.body_pose(name), strict=True):
                 np.testing.assert_allclose(ours, theirs, atol=1e-4)

@@ -263,7 +263,7 @@ def test_the_command_takes_the_strict_twins(tmp_path: Path, monkeypatch: pytest.
     for told in ([], ["--suite", "strict"], ["--suite", "strict", "--tasks", TWIN]):
         assert main(["learn", name, "--out", str(tmp_path / "out"), *told]) == 0
     published, twins, one = (which.tasks for which in asked)
-    assert sorted(get_task(twin).twin_of for twin in twins) == sorted(published)
+    assert sorted(get_task(twin).derived_from for twin in twins) == sorted(published)
     assert one == (TWIN,)
     assert main(["learn", name, "--out", str(tmp_path / "out"), "--tasks", TWIN]) == 2
 

@@ -1,4 +1,4 @@
-"""The thirty strict twins: whole, in the published scenes, and each goal reached by its own routine only."""
+"""The thirty strict tasks: whole, in the published scenes, and each goal reached by its own routine only."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ def of_family(*families: str) -> list[str]:
 # --- the catalogue ---
 
 
-def test_thirty_twins_of_the_thirty_published_tasks() -> None:
+def test_a_strict_task_for_each_published_one() -> None:
     assert Counter(get_task(name).memory_type for name in NAMES) == dict(zip(MEMORY_TYPES, (10, 10, 5, 5), strict=True))
-    assert sorted(str(get_task(name).twin_of) for name in NAMES) == sorted(task_names())
+    assert sorted(str(get_task(name).derived_from) for name in NAMES) == sorted(task_names())
     assert task_names(suite=None) == task_names() + NAMES
     assert len(set(task_names(suite=None))) == 60
     assert [task_index(name) for name in NAMES] == list(range(30, 60))
@@ -60,9 +60,9 @@ def test_thirty_twins_of_the_thirty_published_tasks() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_twin_stands_in_the_published_scene(name: str) -> None:
+def test_a_strict_task_stands_in_the_published_scene(name: str) -> None:
     task = get_task(name)
-    published = get_task(str(task.twin_of))
+    published = get_task(str(task.derived_from))
     assert (task.suite, suite_of(name), task.drawn) == (STRICT, STRICT, True)
     assert (task.objects, task.fixtures, task.init) == (published.objects, published.fixtures, published.init)
     other = {key for key, region in published.regions.items() if task.regions[key] != region}
@@ -111,10 +111,10 @@ def test_a_suite_knows_its_own_tasks_only() -> None:
     assert suite_of("a_task_of_mine") is None
 
 
-def test_a_record_tells_suite_and_twin() -> None:
+def test_a_record_tells_suite_and_origin() -> None:
     told = task_record(get_task(NAMES[0]), 71)
-    assert (told["suite"], told["twin_of"]) == (STRICT, get_task(NAMES[0]).twin_of)
-    assert not {"suite", "twin_of"} & set(task_record(get_task(task_names()[0]), 71))
+    assert (told["suite"], told["derived_from"]) == (STRICT, get_task(NAMES[0]).derived_from)
+    assert not {"suite", "derived_from"} & set(task_record(get_task(task_names()[0]), 71))
 
 
 # --- the instruction names the draw ---

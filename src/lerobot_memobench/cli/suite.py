@@ -20,7 +20,7 @@ class Suite(StrEnum):
 WhichSuite = Annotated[
     Suite,
     typer.Option(
-        help="published: the thirty tasks as published; strict: their twins, whose answer pictures do not show."
+        help="published: the thirty tasks as published; strict: their memory-necessary variants, whose answer pictures do not show."
     ),
 ]
 OfSuite = Annotated[

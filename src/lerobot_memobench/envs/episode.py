@@ -210,7 +210,7 @@ class Episode:
         if self.phase == PROMPT:
             return np.zeros(ACTION_DIM, dtype=np.float32)
         if self._blind is None:
-            routine = get_task(self.published.twin_of) if self.published.twin_of else self.published
+            routine = get_task(self.published.derived_from) if self.published.derived_from else self.published
             self._blind = BlindRoutine(routine, self.sim, self._rng(3))
         return self._blind.act()
 

@@ -18,7 +18,7 @@ class BlindRoutine:
     next, so it cannot count, and it knows neither what was hidden nor what was pointed at.
 
     Args:
-        task: the published task; of a strict one the task whose twin it is.
+        task: the published task; of a strict one the task it is derived from.
         sim: the running scene, at the start of the execution.
         rng: source of small variation.
     """

@@ -67,7 +67,7 @@ MEANINGS: dict[str, tuple[Meaning, ...]] = {
             "with policy=remote: the policy server that acts",
             "127.0.0.1, by dialect, openpi",
         ),
-        Meaning("suite=", "published, or strict: the thirty twins made to need a memory", "published"),
+        Meaning("suite=", "published, or strict: thirty tasks made to need a memory", "published"),
         Meaning(
             "tasks=",
             "of that suite all, memory types (temporal, spatial, object, procedural), task names, or numbers and "

@@ -1,4 +1,11 @@
-"""What a BDDL file says, as data, and the check that a formula's names are declared and fit."""
+"""BDDL problems in LIBERO's dialect: how a task's scene, instruction and goal are written down.
+
+A file holds ``(define (problem NAME) (:domain ..) (:language ..) (:regions ..) (:fixtures ..) (:objects ..)
+(:obj_of_interest ..) (:init ..) (:goal ..))``. Keywords and predicates are read in any case; names keep theirs, and a
+reference that differs from the declared name only in case means that name. Anything unknown is an error that tells
+file and line; but a region on an undeclared target is let pass until it is used. `format_bddl` writes a problem that
+`parse_bddl` reads back.
+"""
 
 from __future__ import annotations
 
@@ -26,6 +33,14 @@ from lerobot_memobench.tasks.formula import (
     takes_number,
 )
 from lerobot_memobench.tasks.sexpr import Node, Reader
+
+_SECTIONS = (":domain", ":language", ":regions", ":fixtures", ":objects", ":obj_of_interest", ":init", ":goal")
+_REQUIRED = (":language", ":fixtures", ":init", ":goal")
+_REGION = "a region such as (NAME (:target FIXTURE) (:ranges ((x1 y1 x2 y2))) (:yaw_rotation ((low high))))"
+_REGION_CLAUSES = (":target", ":ranges", ":yaw_rotation")
+_NOT_IN_INIT = {*LATCHES, *SINCE_START}
+LONGEST_ROW = 110
+"""Columns from which a formula gets a line per child."""
 
 _THING = ("object", "fixture")
 _JOINTED = ("fixture", "region")
@@ -116,11 +131,134 @@ class Problem:
             raise MemobenchError(f"{where}: found the {kind} {name!r} in {atom}, expected {' or '.join(allowed)} there")
 
 
-# ==== names.py
-# The names that a BDDL file declares.
+# --- reading ---
 
 
-class Names:
+def parse_bddl(text: str, path: object = "<text>") -> Problem:
+    """Read a BDDL problem; ``path`` is only named in errors.
+
+    Raises ``MemobenchError`` with file, line, what was found and what was expected.
+    """
+    # Comments become spaces, so that offsets and line numbers stay those of the file.
+    blanked = re.sub(r";[^\n]*", lambda match: " " * len(match.group()), text)
+    reader = Reader(str(path), blanked)
+    root = reader.read()
+    name, nodes = _problem(reader, root)
+    sections = _sections(reader, root, nodes)
+    problem = _declared(reader, name, sections)
+    # Goal and starting state are read last, against what is declared.
+    goals = _items(sections, ":goal")
+    if len(goals) != 1:
+        raise reader.error(sections[":goal"], f"{len(goals)} formulas in :goal", "exactly one")
+    return replace(problem, goal=_formula(reader, problem, goals[0]), init=_init(reader, problem, sections[":init"]))
+
+
+def _problem(reader: Reader, root: Node) -> tuple[str, list[Node]]:
+    """Return the problem's name and the nodes of its sections."""
+    expected = "(define (problem NAME) ...)"
+    head, rest = reader.head(root, expected)
+    if head != "define" or not rest:
+        raise reader.error(root, f"({head} ...)", expected)
+    head, words = reader.head(rest[0], "(problem NAME)")
+    if head != "problem" or len(words) != 1:
+        raise reader.error(rest[0], str(rest[0]), "(problem NAME)")
+    return reader.word(words[0], "(problem NAME)"), rest[1:]
+
+
+def _sections(reader: Reader, root: Node, nodes: list[Node]) -> dict[str, Node]:
+    sections: dict[str, Node] = {}
+    for node in nodes:
+        key, _ = reader.head(node, "a section such as (:objects ...)")
+        if key not in _SECTIONS:
+            raise reader.error(node, f"the unknown section {key!r}", f"one of {', '.join(_SECTIONS)}")
+        if key in sections:
+            raise reader.error(node, f"a second {key}", f"one, as on line {sections[key].line}")
+        sections[key] = node
+    missing = [key for key in _REQUIRED if key not in sections]
+    if missing:
+        raise reader.error(root, f"no {' or '.join(missing)} section", f"all of {', '.join(_REQUIRED)}")
+    return sections
+
+
+def _items(sections: dict[str, Node], key: str) -> list[Node]:
+    return (sections[key].items or [])[1:] if key in sections else []
+
+
+def _declared(reader: Reader, name: str, sections: dict[str, Node]) -> Problem:
+    """Return the problem with all that it declares; starting state and goal are still empty."""
+    names = _Names(reader)
+    fixtures = _declarations(reader, _items(sections, ":fixtures"), names)
+    objects = _declarations(reader, _items(sections, ":objects"), names)
+    regions, unplaced = _regions(reader, _items(sections, ":regions"), names)
+    return Problem(
+        name=name,
+        domain=_domain(reader, sections.get(":domain")),
+        language=_language(reader, sections[":language"]),
+        objects=objects,
+        fixtures=fixtures,
+        regions=regions,
+        objects_of_interest=_of_interest(reader, _items(sections, ":obj_of_interest"), names),
+        init=(),
+        goal=And(()),
+        unplaced=unplaced,
+    )
+
+
+def _domain(reader: Reader, node: Node | None) -> str:
+    if node is None:
+        return ""
+    items = reader.sequence(node, "(:domain NAME)")[1:]
+    if len(items) != 1:
+        raise reader.error(node, f"{len(items)} words in :domain", "one name")
+    return reader.word(items[0], "a domain name")
+
+
+def _language(reader: Reader, node: Node) -> str:
+    """The free text as written, white space joined; it may hold commas, dots and balanced parentheses."""
+    assert node.items is not None
+    language = " ".join(reader.text[node.items[0].end : node.end - 1].split())
+    if not language:
+        raise reader.error(node, "an empty :language", "the instruction of the task in words")
+    return language
+
+
+def _declarations(reader: Reader, nodes: list[Node], names: _Names) -> dict[str, str]:
+    """Read ``a b - class c - class`` into {instance: class}."""
+    expected = "names, '-' and a class, such as 'bowl_1 bowl_2 - akita_black_bowl'"
+    declared: dict[str, str] = {}
+    waiting: list[Node] = []
+    following = iter(nodes)
+    for node in following:
+        if reader.word(node, expected) != "-":
+            waiting.append(node)
+            continue
+        class_node = next(following, None)
+        class_name = class_node.word if class_node else ""
+        if not waiting or class_name in ("", "-"):
+            lacking = "a class after it" if waiting else "a name before it"
+            raise reader.error(node, f"a '-' without {lacking}", expected)
+        for name in waiting:
+            names.declare(name, name.word, f"the {class_name}")
+            declared[name.word] = class_name
+        waiting = []
+    if waiting:
+        raise reader.error(waiting[0], f"{waiting[0].word!r} without a class", expected)
+    return declared
+
+
+def _of_interest(reader: Reader, nodes: list[Node], names: _Names) -> tuple[str, ...]:
+    known = names.spelling()
+    found = []
+    for node in nodes:
+        name = reader.word(node, "a declared name")
+        if name.lower() not in known:
+            hint = nearest(name, known.values())
+            raise reader.error(node, f"{name!r} in :obj_of_interest", f"a declared name, {hint}")
+        found.append(known[name.lower()])
+    return tuple(found)
+
+
+class _Names:
     """Declared names, found again in any case; no two may differ in case alone."""
 
     def __init__(self, reader: Reader) -> None:
@@ -140,14 +278,10 @@ class Names:
         return {key: name for key, (_, name) in self._declared.items()}
 
 
-# ==== regions.py
-# Read the regions of a BDDL file.
-
-_EXPECTED = "a region such as (NAME (:target FIXTURE) (:ranges ((x1 y1 x2 y2))) (:yaw_rotation ((low high))))"
-_CLAUSES = (":target", ":ranges", ":yaw_rotation")
+# --- regions ---
 
 
-def read_regions(reader: Reader, nodes: list[Node], names: Names) -> tuple[dict[str, Region], dict[Region, str]]:
+def _regions(reader: Reader, nodes: list[Node], names: _Names) -> tuple[dict[str, Region], dict[Region, str]]:
     """Return full name -> region, and declare these names; and the regions on what is not declared.
 
     LIBERO's files hold some of those, which nothing uses. Each comes with the sentence for who does.
@@ -167,10 +301,10 @@ def read_regions(reader: Reader, nodes: list[Node], names: Names) -> tuple[dict[
 
 def _region(reader: Reader, node: Node, targets: Mapping[str, str]) -> tuple[Region, str | None]:
     """Return a region, and what is wrong with its target."""
-    items = reader.sequence(node, _EXPECTED)
+    items = reader.sequence(node, _REGION)
     if not items:
-        raise reader.error(node, "an empty list ()", _EXPECTED)
-    name = reader.word(items[0], _EXPECTED)
+        raise reader.error(node, "an empty list ()", _REGION)
+    name = reader.word(items[0], _REGION)
     target = problem = None
     ranges: list[tuple[float, float, float, float]] = []
     yaw = (0.0, 0.0)
@@ -184,7 +318,7 @@ def _region(reader: Reader, node: Node, targets: Mapping[str, str]) -> tuple[Reg
         else:
             yaw = _yaw(reader, clause, value, name)
     if target is None:
-        raise reader.error(node, f"region {name!r} without (:target ...)", _EXPECTED)
+        raise reader.error(node, f"region {name!r} without (:target ...)", _REGION)
     return Region(name, target, tuple(ranges), yaw), problem
 
 
@@ -193,7 +327,7 @@ def _clause(reader: Reader, clause: Node, name: str, seen: set[str]) -> tuple[st
     key, values = reader.head(clause, "(:target ...), (:ranges ...) or (:yaw_rotation ...)")
     if key in seen:
         raise reader.error(clause, f"a second {key} in region {name!r}", "one")
-    if key not in _CLAUSES:
+    if key not in _REGION_CLAUSES:
         found = f"the unknown clause {key!r} in region {name!r}"
         raise reader.error(clause, found, ":target, :ranges or :yaw_rotation")
     seen.add(key)
@@ -234,17 +368,7 @@ def _yaw(reader: Reader, clause: Node, value: Node, name: str) -> tuple[float, f
     return low, high
 
 
-# ==== statements.py
-# Read what a BDDL file says of its things: the goal, and where everything starts.
-
-_NOT_IN_INIT = {*LATCHES, *SINCE_START}
-
-
-def read_goal(reader: Reader, problem: Problem, section: Node, nodes: list[Node]) -> Formula:
-    """Return the one formula of the goal, its names resolved against what ``problem`` declares."""
-    if len(nodes) != 1:
-        raise reader.error(section, f"{len(nodes)} formulas in :goal", "exactly one")
-    return _formula(reader, problem, nodes[0])
+# --- goal and starting state ---
 
 
 def _formula(reader: Reader, problem: Problem, node: Node, depth: int = 0) -> Formula:
@@ -266,11 +390,11 @@ def _number(word: str) -> int | str:
     return int(word) if word.isascii() and word.isdigit() and len(word) < 10 else word
 
 
-def read_init(reader: Reader, problem: Problem, section: Node, nodes: list[Node]) -> tuple[Atom, ...]:
+def _init(reader: Reader, problem: Problem, section: Node) -> tuple[Atom, ...]:
     """Return the starting state: atoms only, every object placed once, nothing resting on itself."""
     found: list[Atom] = []
     support: dict[str, str] = {}
-    for node in nodes:
+    for node in (section.items or [])[1:]:
         atom = _init_atom(reader, problem, node)
         found.append(atom)
         if atom.predicate in ("on", "in"):
@@ -317,148 +441,7 @@ def _check_bottom(reader: Reader, section: Node, support: Mapping[str, str]) -> 
             below = support.get(below)
 
 
-# ==== reading.py
-# Read a BDDL problem in LIBERO's dialect.
-#
-# A file holds ``(define (problem NAME) (:domain ..) (:language ..) (:regions ..) (:fixtures ..) (:objects ..)
-# (:obj_of_interest ..) (:init ..) (:goal ..))``. Keywords and predicates are read in any case; names keep
-# theirs, and a reference that differs from the declared name only in case means that name. Anything unknown is
-# an error that tells file and line, never dropped; but a region on what is not declared is let pass until it is used.
-
-_SECTIONS = (":domain", ":language", ":regions", ":fixtures", ":objects", ":obj_of_interest", ":init", ":goal")
-_REQUIRED = (":language", ":fixtures", ":init", ":goal")
-
-Sections = dict[str, Node]
-
-
-def parse_bddl(text: str, path: object = "<text>") -> Problem:
-    """Read a BDDL problem; ``path`` is only named in errors.
-
-    Raises ``MemobenchError`` with file, line, what was found and what was expected.
-    """
-    # Comments become spaces, so that offsets and line numbers stay those of the file.
-    blanked = re.sub(r";[^\n]*", lambda match: " " * len(match.group()), text)
-    reader = Reader(str(path), blanked)
-    root = reader.read()
-    name, nodes = _problem(reader, root)
-    sections = _sections(reader, root, nodes)
-    problem = _declared(reader, name, sections)
-    # Goal and starting state are read last, against what is declared.
-    goal = read_goal(reader, problem, sections[":goal"], _items(sections, ":goal"))
-    init = read_init(reader, problem, sections[":init"], _items(sections, ":init"))
-    return replace(problem, init=init, goal=goal)
-
-
-def _problem(reader: Reader, root: Node) -> tuple[str, list[Node]]:
-    """Return the problem's name and the nodes of its sections."""
-    expected = "(define (problem NAME) ...)"
-    head, rest = reader.head(root, expected)
-    if head != "define" or not rest:
-        raise reader.error(root, f"({head} ...)", expected)
-    head, words = reader.head(rest[0], "(problem NAME)")
-    if head != "problem" or len(words) != 1:
-        raise reader.error(rest[0], str(rest[0]), "(problem NAME)")
-    return reader.word(words[0], "(problem NAME)"), rest[1:]
-
-
-def _sections(reader: Reader, root: Node, nodes: list[Node]) -> Sections:
-    sections: Sections = {}
-    for node in nodes:
-        key, _ = reader.head(node, "a section such as (:objects ...)")
-        if key not in _SECTIONS:
-            raise reader.error(node, f"the unknown section {key!r}", f"one of {', '.join(_SECTIONS)}")
-        if key in sections:
-            raise reader.error(node, f"a second {key}", f"one, as on line {sections[key].line}")
-        sections[key] = node
-    missing = [key for key in _REQUIRED if key not in sections]
-    if missing:
-        raise reader.error(root, f"no {' or '.join(missing)} section", f"all of {', '.join(_REQUIRED)}")
-    return sections
-
-
-def _items(sections: Sections, key: str) -> list[Node]:
-    return (sections[key].items or [])[1:] if key in sections else []
-
-
-def _declared(reader: Reader, name: str, sections: Sections) -> Problem:
-    """Return the problem with all that it declares; starting state and goal are still empty."""
-    names = Names(reader)
-    fixtures = _declarations(reader, _items(sections, ":fixtures"), names)
-    objects = _declarations(reader, _items(sections, ":objects"), names)
-    regions, unplaced = read_regions(reader, _items(sections, ":regions"), names)
-    return Problem(
-        name=name,
-        domain=_domain(reader, sections.get(":domain")),
-        language=_language(reader, sections[":language"]),
-        objects=objects,
-        fixtures=fixtures,
-        regions=regions,
-        objects_of_interest=_of_interest(reader, _items(sections, ":obj_of_interest"), names),
-        init=(),
-        goal=And(()),
-        unplaced=unplaced,
-    )
-
-
-def _domain(reader: Reader, node: Node | None) -> str:
-    if node is None:
-        return ""
-    items = reader.sequence(node, "(:domain NAME)")[1:]
-    if len(items) != 1:
-        raise reader.error(node, f"{len(items)} words in :domain", "one name")
-    return reader.word(items[0], "a domain name")
-
-
-def _language(reader: Reader, node: Node) -> str:
-    """The free text as written, white space joined; it may hold commas, dots and balanced parentheses."""
-    assert node.items is not None
-    language = " ".join(reader.text[node.items[0].end : node.end - 1].split())
-    if not language:
-        raise reader.error(node, "an empty :language", "the instruction of the task in words")
-    return language
-
-
-def _declarations(reader: Reader, nodes: list[Node], names: Names) -> dict[str, str]:
-    """Read ``a b - class c - class`` into {instance: class}."""
-    expected = "names, '-' and a class, such as 'bowl_1 bowl_2 - akita_black_bowl'"
-    declared: dict[str, str] = {}
-    waiting: list[Node] = []
-    following = iter(nodes)
-    for node in following:
-        if reader.word(node, expected) != "-":
-            waiting.append(node)
-            continue
-        class_node = next(following, None)
-        class_name = class_node.word if class_node else ""
-        if not waiting or class_name in ("", "-"):
-            lacking = "a class after it" if waiting else "a name before it"
-            raise reader.error(node, f"a '-' without {lacking}", expected)
-        for name in waiting:
-            names.declare(name, name.word, f"the {class_name}")
-            declared[name.word] = class_name
-        waiting = []
-    if waiting:
-        raise reader.error(waiting[0], f"{waiting[0].word!r} without a class", expected)
-    return declared
-
-
-def _of_interest(reader: Reader, nodes: list[Node], names: Names) -> tuple[str, ...]:
-    known = names.spelling()
-    found = []
-    for node in nodes:
-        name = reader.word(node, "a declared name")
-        if name.lower() not in known:
-            hint = nearest(name, known.values())
-            raise reader.error(node, f"{name!r} in :obj_of_interest", f"a declared name, {hint}")
-        found.append(known[name.lower()])
-    return tuple(found)
-
-
-# ==== writing.py
-# Write a problem as a BDDL file in this project's layout; `tasks.bddl.reading` reads it back.
-
-LONGEST_ROW = 110
-"""Columns from which a formula gets a line per child."""
+# --- writing ---
 
 
 def format_bddl(problem: Problem, comment: str = "") -> str:

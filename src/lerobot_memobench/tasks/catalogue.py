@@ -1,4 +1,8 @@
-"""The catalogue: the benchmark's 30 published tasks and their 30 strict twins, as folders beside this module."""
+"""The catalogue: the benchmark's 30 published and 30 strict tasks, as folders beside this module; loading a folder.
+
+A folder holds ``task_config.bddl`` and ``task_config.meta.json``. The project's own and folders in the published format
+are read alike; what the published metadata does not say is told from the folder and the instruction.
+"""
 
 from __future__ import annotations
 
@@ -37,6 +41,16 @@ NUMERIC = re.compile(r"[\d -]*[\d-]")
 
 BOWL = "put_the_butter_into_the_bowl_from_the_prompt_video"
 """The task that shows in little time what a memory is for: which of three bowls it is, the prompt alone tells."""
+
+_PROMPT_WORDS: tuple[tuple[str, PromptKind], ...] = (
+    ("picked up", "pick"),
+    ("pointed", "point"),
+    ("highlighted", "highlight"),
+)
+_ROUTINE_WORDS = ("procedure", "sequence", "routine", "follow", "step", "order")
+
+
+# --- the catalogue ---
 
 
 @lru_cache(maxsize=1)
@@ -177,7 +191,7 @@ def task_record(task: Task, state_dim: int) -> dict[str, Any]:
     return {
         "name": task.name,
         "memory_type": task.memory_type,
-        **({} if task.suite == PUBLISHED else {"suite": task.suite, "twin_of": task.twin_of}),
+        **({} if task.suite == PUBLISHED else {"suite": task.suite, "derived_from": task.derived_from}),
         "family": task.family,
         "language": task.language,
         "objects": _by_class(task.objects),
@@ -202,6 +216,9 @@ def _by_class(instances: dict[str, str]) -> dict[str, list[str]]:
     return grouped
 
 
+# --- task folders, of the catalogue or in the published format ---
+
+
 def find_tasks(folder: str | Path) -> list[Path]:
     """Return the task folders in a tree: the folder itself, or all below it that hold a task file, sorted.
 
@@ -215,20 +232,6 @@ def find_tasks(folder: str | Path) -> list[Path]:
     if not found:
         raise MemobenchError(f"found no {BDDL_FILE} in {root} or below it; expected a task in the published format")
     return found
-
-
-# ==== loading.py
-# Load a task from its folder: ``task_config.bddl`` and ``task_config.meta.json``.
-#
-# The project's own catalogue and folders in the published format are read alike; what the published metadata does not
-# say is told from the folder and the instruction.
-
-_PROMPT_WORDS: tuple[tuple[str, PromptKind], ...] = (
-    ("picked up", "pick"),
-    ("pointed", "point"),
-    ("highlighted", "highlight"),
-)
-_ROUTINE_WORDS = ("procedure", "sequence", "routine", "follow", "step", "order")
 
 
 def load_task(folder: str | Path, require_metadata: bool = True) -> Task:
@@ -272,7 +275,7 @@ def load_task(folder: str | Path, require_metadata: bool = True) -> Task:
         bddl_text=text,
         metadata=metadata.data,
         suite=metadata.suite(),
-        twin_of=metadata.text("twin_of") or None,
+        derived_from=metadata.text("derived_from") or None,
         drawn=metadata.flag("drawn"),
         spoilt_as=metadata.failure_class("spoilt_as"),
     )

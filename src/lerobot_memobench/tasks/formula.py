@@ -1,8 +1,8 @@
 """Formulas of goals and checkpoints: trees of atoms under operators, the published four and the strict suite's five.
 
 What an atom means is the world's business; what operators and latches (``wasopen``, ``wasturnedon``) mean over time
-is `tasks.nodes`'s (the table is in ``docs/formulas.md``). Here stand the words of the language, how formulas are
-walked through and written; `tasks.formula_making` makes checked ones.
+is `tasks.nodes`'s (the table is in ``docs/formulas.md``). Here stand the words of the language; formulas are made,
+checked, from words or from JSON, walked through and written.
 """
 
 from __future__ import annotations
@@ -189,8 +189,7 @@ def head_of(formula: Formula) -> str:
     return f"{word} {formula.number}" if isinstance(formula, Counted) else word
 
 
-# ==== formula_making.py
-# Make atoms and operators from their words, checked; every complaint says where.
+# --- making: every complaint says where ---
 
 #: Operators over a fixed number of formulas; the others take one or more.
 _PARTS: dict[type[Formula], int] = {Not: 1, Never: 1, Hold: 1, Exactly: 1, When: 2}
@@ -243,8 +242,7 @@ def check_number(number: Any, after: str, where: str) -> int:
     return number
 
 
-# ==== formula_parsing.py
-# Read formulas from JSON, as metadata files write them: nested lists, objects, or both.
+# --- reading JSON, as metadata files write formulas: nested lists, objects, or both ---
 
 _KEYS = ", ".join(map(repr, OPERATORS))
 

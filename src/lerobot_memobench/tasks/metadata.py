@@ -5,7 +5,7 @@ three labels, 0 Storage, 1 Update, 2 Compression, per text level), ``subtask_goa
 ``key_frame`` (K integers), ``timestep_exec_start_idx`` (integer or list of integers), ``demo_summary`` (text). Of this
 project, optional too: ``memory_type``, ``family``, ``prompt`` ({"kind", "target"}), ``variants`` (list of {"memory",
 and optionally "substitute", "order", "subtask_goals", "goal", "demo_summary", "language", "prompt",
-"replaces_published"}), and of the strict suite ``suite``, ``twin_of``, ``drawn``, ``spoilt_as`` (see `Task`). A hiding
+"replaces_published"}), and of the strict suite ``suite``, ``derived_from``, ``drawn``, ``spoilt_as`` (see `Task`). A hiding
 is the prompt {"kind": "hide", "places": [[thing, drawer], ...]}. Other keys are kept in ``Task.metadata`` untouched.
 """
 
@@ -47,17 +47,12 @@ _VARIANT_KEYS = {
     "prompt",
     "replaces_published",
 }
-
-
-def _is_int(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
-
-
-def _text(data: Mapping[str, Any], key: str, where: str) -> str:
-    value = data.get(key, "")
-    if not isinstance(value, str):
-        raise MemobenchError(f"{where}: found {key} = {short(value)}, expected text")
-    return value
+HOLDS = (
+    "'memory' (three texts per checkpoint: coarse, intermediate, fine), 'operating_type' (three labels per checkpoint: "
+    "0 Storage, 1 Update, 2 Compression), 'subtask_goals' (one formula per checkpoint) and 'key_frame' (-1 per "
+    "checkpoint)"
+)
+"""What a metadata file holds, for messages."""
 
 
 class Metadata:
@@ -258,15 +253,7 @@ class Metadata:
             self.problem.resolve(rename(goal, substitute), f"{self.path}, {place} ({which})")
 
 
-# ==== metadata_file.py
-# Read the files of a task's folder; every complaint names the file and says what should be in it.
-
-HOLDS = (
-    "'memory' (three texts per checkpoint: coarse, intermediate, fine), 'operating_type' (three labels per checkpoint: "
-    "0 Storage, 1 Update, 2 Compression), 'subtask_goals' (one formula per checkpoint) and 'key_frame' (-1 per "
-    "checkpoint)"
-)
-"""What a metadata file holds, for messages."""
+# --- files: every complaint names the file and says what should be in it ---
 
 
 def read_text(path: Path, holds: str) -> str:
@@ -307,3 +294,14 @@ def json_object(path: Path) -> dict[str, Any]:
     if not isinstance(data, dict):
         raise MemobenchError(f"{path}: found {short(data)}, expected a JSON object that holds {HOLDS}")
     return data
+
+
+def _is_int(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def _text(data: Mapping[str, Any], key: str, where: str) -> str:
+    value = data.get(key, "")
+    if not isinstance(value, str):
+        raise MemobenchError(f"{where}: found {key} = {short(value)}, expected text")
+    return value

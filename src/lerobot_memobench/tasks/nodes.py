@@ -1,9 +1,12 @@
-"""What all nodes can do, and the node of an atom."""
+"""Operators over time: one node per place in a formula's tree, with what it remembers of earlier steps.
+
+``docs/formulas.md`` has the same on one page.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import override
+from typing import ClassVar, override
 
 from lerobot_memobench.tasks.formula import (
     LATCHES,
@@ -26,21 +29,41 @@ Read = Callable[[Atom], bool]
 """Answers atoms about the present step, latched ones included."""
 
 
+def build(formula: Formula, hold_steps: int) -> Node:
+    """Return the tree of a formula; ``hold_steps`` is what each child of `Then` has to hold."""
+    if isinstance(formula, Atom):
+        return AtomNode(formula)
+    parts = [build(child, hold_steps) for child in children(formula)]
+    number = hold_steps if isinstance(formula, Then) else formula.number if isinstance(formula, Counted) else 0
+    return _NODES[type(formula)](parts, number)
+
+
 class Node:
     """One place in a formula's tree.
 
-    Attributes:
-        settled: the value that the node has at every later step, whatever happens; None while it is open. Never
-            wrong, though not always found as early as could be.
+    Args:
+        parts: nodes of the formula's children.
+        number: of `Hold` and `Exactly`; of `Then` the steps for which a child has to hold.
     """
 
-    def __init__(self, parts: Sequence[Node] = ()) -> None:
-        self.parts = parts
+    remembers: ClassVar[tuple[str, ...]] = ()
+    """Attributes that carry something from step to step; their class has them as they are at first."""
+
+    def __init__(self, parts: Sequence[Node] = (), number: int = 0) -> None:
+        self.parts, self.number = parts, number
 
     def reset(self) -> None:
         """Forget earlier steps."""
+        for name in self.remembers:
+            setattr(self, name, getattr(type(self), name))
         for part in self.parts:
             part.reset()
+
+    @property
+    def memory(self) -> tuple[int, ...]:
+        """What of earlier steps decides later values, of this node alone; -1 for what is open."""
+        values = [getattr(self, name) for name in self.remembers]
+        return tuple(-1 if value is None else int(value) for value in values)
 
     def value(self, read: Read) -> bool:
         """Take one step and return what is true in it; ``read`` answers atoms."""
@@ -48,13 +71,11 @@ class Node:
 
     @property
     def settled(self) -> bool | None:
-        """See the class."""
-        raise NotImplementedError
+        """The value that the node has at every later step, whatever happens; None while it is open.
 
-    @property
-    def memory(self) -> tuple[int, ...]:
-        """What of earlier steps decides later values, of this node alone."""
-        return ()
+        Never wrong, though not always found as early as could be.
+        """
+        raise NotImplementedError
 
     def walk(self) -> Iterator[Node]:
         """Yield this node and all below it."""
@@ -87,8 +108,7 @@ class AtomNode(Node):
         return True if self.latched else None
 
 
-# ==== gates.py
-# And, Or, Not: nothing is remembered. Every part is asked in every step, since a nested operator must see it.
+# --- And, Or, Not: nothing is remembered. Every part is asked in every step, since a nested operator must see it ---
 
 
 class AndNode(Node):
@@ -135,19 +155,14 @@ class NotNode(Node):
         return None if found is None else not found
 
 
-# ==== counting.py
-# Never, Hold and Exactly: how long, how often.
+# --- Never, Hold, Exactly: how long, how often ---
 
 
 class NeverNode(Node):
     """True until the part is once true."""
 
+    remembers = ("broken",)
     broken = False
-
-    @override
-    def reset(self) -> None:
-        super().reset()
-        self.broken = False
 
     @override
     def value(self, read: Read) -> bool:
@@ -160,24 +175,12 @@ class NeverNode(Node):
     def settled(self) -> bool | None:
         return False if self.broken else True if self.parts[0].settled is False else None
 
-    @property
-    @override
-    def memory(self) -> tuple[int, ...]:
-        return (int(self.broken),)
-
 
 class HoldNode(Node):
     """True when the part has been true for the last ``number`` steps."""
 
-    def __init__(self, parts: Sequence[Node], number: int) -> None:
-        super().__init__(parts)
-        self.number = number
-        self.held = 0
-
-    @override
-    def reset(self) -> None:
-        super().reset()
-        self.held = 0
+    remembers = ("held",)
+    held = 0
 
     @override
     def value(self, read: Read) -> bool:
@@ -190,24 +193,12 @@ class HoldNode(Node):
         found = self.parts[0].settled
         return None if found and self.held < self.number else found
 
-    @property
-    @override
-    def memory(self) -> tuple[int, ...]:
-        return (self.held,)
-
 
 class ExactlyNode(Node):
     """True while the part has come true ``number`` times; counts to one more, all beyond is the same."""
 
-    def __init__(self, parts: Sequence[Node], number: int) -> None:
-        super().__init__(parts)
-        self.number = number
-        self.count, self.before = 0, False
-
-    @override
-    def reset(self) -> None:
-        super().reset()
-        self.count, self.before = 0, False
+    remembers = ("count", "before")
+    count, before = 0, False
 
     @override
     def value(self, read: Read) -> bool:
@@ -224,34 +215,21 @@ class ExactlyNode(Node):
         found = self.parts[0].settled
         return self.count == self.number if found is not None and found == self.before else None
 
-    @property
-    @override
-    def memory(self) -> tuple[int, ...]:
-        return self.count, int(self.before)
 
-
-# ==== order.py
-# Then, Round and When: what comes before what.
+# --- Then, Round, When: what comes before what ---
 
 
 class ThenNode(Node):
     """Counts how long the current child has held; the next child is first looked at in the step after."""
 
-    def __init__(self, parts: Sequence[Node], hold_steps: int) -> None:
-        super().__init__(parts)
-        self.hold_steps = hold_steps
-        self.done = self.held = 0
-
-    @override
-    def reset(self) -> None:
-        super().reset()
-        self.done = self.held = 0
+    remembers = ("done", "held")
+    done, held = 0, 0
 
     @override
     def value(self, read: Read) -> bool:
         if self.done < len(self.parts):
             self.held = self.held + 1 if self.parts[self.done].value(read) else 0
-            if self.held >= self.hold_steps:
+            if self.held >= self.number:
                 self.done, self.held = self.done + 1, 0
         return self.done == len(self.parts)
 
@@ -262,21 +240,12 @@ class ThenNode(Node):
             return True
         return False if any(part.settled is False for part in self.parts[self.done :]) else None
 
-    @property
-    @override
-    def memory(self) -> tuple[int, ...]:
-        return self.done, self.held
-
 
 class RoundNode(Node):
     """The next part is first looked at in the step after; with a new round all parts begin anew."""
 
+    remembers = ("done",)
     done = 0
-
-    @override
-    def reset(self) -> None:
-        super().reset()
-        self.done = 0
 
     @override
     def value(self, read: Read) -> bool:
@@ -291,21 +260,12 @@ class RoundNode(Node):
     def settled(self) -> bool | None:
         return False if any(part.settled is False for part in self.parts[self.done :]) else None
 
-    @property
-    @override
-    def memory(self) -> tuple[int, ...]:
-        return (self.done,)
-
 
 class WhenNode(Node):
     """The first moment of the first part decides, by the second part's value in that step."""
 
+    remembers = ("decided",)
     decided: bool | None = None
-
-    @override
-    def reset(self) -> None:
-        super().reset()
-        self.decided = None
 
     @override
     def value(self, read: Read) -> bool:
@@ -321,33 +281,15 @@ class WhenNode(Node):
             return self.decided
         return False if any(part.settled is False for part in self.parts) else None
 
-    @property
-    @override
-    def memory(self) -> tuple[int, ...]:
-        return (-1 if self.decided is None else int(self.decided),)
 
-
-# ==== build.py
-# From a formula to the tree of its nodes.
-
-_PLAIN: dict[type[Formula], type[Node]] = {
+_NODES: dict[type[Formula], type[Node]] = {
     And: AndNode,
     Or: OrNode,
     Not: NotNode,
     Never: NeverNode,
+    Hold: HoldNode,
+    Exactly: ExactlyNode,
+    Then: ThenNode,
     When: WhenNode,
     Round: RoundNode,
 }
-_COUNTED: dict[type[Formula], type[HoldNode] | type[ExactlyNode]] = {Hold: HoldNode, Exactly: ExactlyNode}
-
-
-def build(formula: Formula, hold_steps: int) -> Node:
-    """Return the tree of a formula; ``hold_steps`` is what each child of `Then` has to hold."""
-    if isinstance(formula, Atom):
-        return AtomNode(formula)
-    parts = [build(child, hold_steps) for child in children(formula)]
-    if isinstance(formula, Then):
-        return ThenNode(parts, hold_steps)
-    if isinstance(formula, Counted):
-        return _COUNTED[type(formula)](parts, formula.number)
-    return _PLAIN[type(formula)](parts)

@@ -1,4 +1,8 @@
-"""How far an execution has come: which checkpoints were satisfied when, and whether the goal holds."""
+"""Follow an episode step by step: which checkpoints were satisfied when, and whether the goal holds.
+
+Nothing of a simulator: `Evaluator.step` asks ``holds(atom)``. `tasks.nodes` says what operators mean over time.
+Semantics: the benchmark's task files (BDDL goals and metadata goals), paper section on executable checkpoints.
+"""
 
 from __future__ import annotations
 
@@ -7,61 +11,6 @@ from collections.abc import Callable, Iterable
 from lerobot_memobench.tasks.formula import LATCHES, Atom, Formula, atoms
 from lerobot_memobench.tasks.nodes import build
 from lerobot_memobench.tasks.task import Task
-
-
-class Progress:
-    """Follows one episode's execution phase; call ``step`` exactly once per control step.
-
-    Attributes (steps are counted from 1; None until it happens; K checkpoints):
-        steps: control steps taken since ``reset``.
-        success: the goal holds now.
-        satisfied: (K,) the checkpoint's predicate holds now.
-        first_step: (K,) first step at which the predicate held.
-        ordered_step: (K,) first step at which it held with all earlier checkpoints complete in order; several
-            may complete in one step.
-        index: number of checkpoints completed in order so far.
-    """
-
-    def __init__(self, task: Task) -> None:
-        self.task = task
-        self._evaluator = Evaluator([task.goal, *(checkpoint.goal for checkpoint in task.checkpoints)])
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget everything: the execution starts anew."""
-        self._evaluator.reset()
-        count = len(self.task.checkpoints)
-        self.steps = 0
-        self.success = False
-        self.satisfied: tuple[bool, ...] = (False,) * count
-        self.first_step: list[int | None] = [None] * count
-        self.ordered_step: list[int | None] = [None] * count
-        self.index = 0
-
-    @property
-    def lost(self) -> bool:
-        """The goal can no longer be reached, whatever is done."""
-        return self._evaluator.settled[0] is False
-
-    def step(self, holds: Callable[[Atom], bool]) -> bool:
-        """Take in the state after one control step, answered by ``holds``; return ``success``."""
-        self.steps += 1
-        self.success, *satisfied = self._evaluator.step(holds)
-        self.satisfied = tuple(satisfied)
-        for k, now in enumerate(satisfied):
-            if now and self.first_step[k] is None:
-                self.first_step[k] = self.steps
-        while self.index < len(satisfied) and satisfied[self.index]:
-            self.ordered_step[self.index] = self.steps
-            self.index += 1
-        return self.success
-
-
-# ==== evaluator.py
-# Formulas evaluated step by step, with latches; what the operators mean over time is `tasks.nodes`'s.
-#
-# Nothing of a simulator: `Evaluator.step` asks ``holds(atom)``. Semantics: the benchmark's task files (BDDL goals and
-# metadata goals), paper section on executable checkpoints.
 
 #: Consecutive control steps for which a child of ``Then`` must hold before it counts as done.
 HOLD_STEPS = 10
@@ -125,3 +74,51 @@ class Evaluator:
             return atom in self._latched if atom.predicate in LATCHES else world(atom)
 
         return tuple(node.value(read) for node in self._nodes)
+
+
+class Progress:
+    """Follows one episode's execution phase; call ``step`` exactly once per control step.
+
+    Attributes (steps are counted from 1; None until it happens; K checkpoints):
+        steps: control steps taken since ``reset``.
+        success: the goal holds now.
+        satisfied: (K,) the checkpoint's predicate holds now.
+        first_step: (K,) first step at which the predicate held.
+        ordered_step: (K,) first step at which it held with all earlier checkpoints complete in order; several
+            may complete in one step.
+        index: number of checkpoints completed in order so far.
+    """
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+        self._evaluator = Evaluator([task.goal, *(checkpoint.goal for checkpoint in task.checkpoints)])
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: the execution starts anew."""
+        self._evaluator.reset()
+        count = len(self.task.checkpoints)
+        self.steps = 0
+        self.success = False
+        self.satisfied: tuple[bool, ...] = (False,) * count
+        self.first_step: list[int | None] = [None] * count
+        self.ordered_step: list[int | None] = [None] * count
+        self.index = 0
+
+    @property
+    def lost(self) -> bool:
+        """The goal can no longer be reached, whatever is done."""
+        return self._evaluator.settled[0] is False
+
+    def step(self, holds: Callable[[Atom], bool]) -> bool:
+        """Take in the state after one control step, answered by ``holds``; return ``success``."""
+        self.steps += 1
+        self.success, *satisfied = self._evaluator.step(holds)
+        self.satisfied = tuple(satisfied)
+        for k, now in enumerate(satisfied):
+            if now and self.first_step[k] is None:
+                self.first_step[k] = self.steps
+        while self.index < len(satisfied) and satisfied[self.index]:
+            self.ordered_step[self.index] = self.steps
+            self.index += 1
+        return self.success

@@ -1,6 +1,6 @@
 """A task of the benchmark, as data: scene, instruction, goal, checkpoints, and its variants.
 
-`tasks.loading` reads tasks from folders.
+`catalogue.load_task` reads tasks from folders.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ class Task:
         variant_index: which variant this is.
         bddl_text, metadata: the files as read.
         suite: what it belongs to; an episode of the strict suite ends when its goal can no longer be reached.
-        twin_of: the published task in whose scene it takes place; None for a task of its own.
+        derived_from: the published task in whose scene it takes place; None for a task of its own.
         drawn: every episode draws its variant by seed, whatever referent is asked for; a variant is not drawn again.
         spoilt_as: failure class of an episode whose goal could no longer be reached; None for that of its checkpoints.
     """
@@ -150,7 +150,7 @@ class Task:
     variant_index: int = 0
     published: Task | None = field(default=None, repr=False)
     suite: Suite = "published"
-    twin_of: str | None = None
+    derived_from: str | None = None
     drawn: bool = False
     spoilt_as: str | None = None
 
@@ -167,8 +167,8 @@ class Task:
 
     @property
     def scene_name(self) -> str:
-        """The name by which seeds draw the scene: a twin's is its published task's, seed for seed."""
-        return self.twin_of or self.name
+        """The name by which seeds draw the scene: a strict task's is its published task's, seed for seed."""
+        return self.derived_from or self.name
 
     @property
     def title(self) -> str:

@@ -21,7 +21,7 @@ def side_by_side(published: Sequence[Result], strict: Sequence[Result]) -> str:
     fixed = {result["task"]: result for result in published if result["referent"] == REFERENTS[0]}
     lines = ["| " + " | ".join(HEADINGS) + " |", "|---" * len(HEADINGS) + "|"]
     for result in strict:
-        name = get_task(result["task"]).twin_of or ""
+        name = get_task(result["task"]).derived_from or ""
         row = [f"`{name}`", *_published(fixed.get(name)), f"`{result['task']}`", *_strict(result)]
         lines.append("| " + " | ".join(row) + " |")
     lines += ["", bounds(strict)]
