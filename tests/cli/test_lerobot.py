@@ -352,7 +352,7 @@ def test_a_training_goes_on_by_its_folder(training: Called, capsys: pytest.Captu
     assert capsys.readouterr().err == ""
     for flag in ("--resume=True", "--resume"):
         training.flags = None
-        assert main(["train", "config=train_contrastive", "output_dir=run", flag]) == 0
+        assert main(["train", "config=train_paper", "output_dir=run", flag]) == 0
         assert training.value("config_path") == "run/checkpoints/last/pretrained_model/train_config.json"
         assert training.value("resume") == "true"
     for stated in ("run/checkpoints/000040/pretrained_model/train_config.json", "somebody/repository"):

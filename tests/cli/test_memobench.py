@@ -87,7 +87,6 @@ def test_report_prints_and_writes(tmp_path: Path, capsys: pytest.CaptureFixture[
         (["generate", "--referent", "rnd", "--out", "x"], "random"),
         (["cache", "nowhere"], "nowhere"),
         (["cache", ".", "--size", "huge"], "tiny"),
-        (["cache", ".", "--finds"], "leave it out"),
         (["frobnicate"], "No such command"),
         (["demo", "--out", "file"], "is a file"),
     ],

@@ -83,14 +83,8 @@ def lerobot_eval(policy: Path, out: Path, *more: str, episodes: int = 1, batch: 
         (PI05Config(device="cpu", input_features=STATE | PICTURE | OBJECT_POSES), BOTH, "pixels"),  # it ignores poses
         (MemobenchMemConfig(device="cpu"), PIXELS, "pixels"),
         (MemobenchMemConfig(device="cpu", size="small"), PIXELS, "pixels"),
-        (MemobenchMemConfig(device="cpu", size="small", finds=True), PIXELS, "pixels, detections"),
         (MemobenchMemConfig(device="cpu", size="small", perception="objects"), OBJECTS, POSES),
         (MemobenchMemConfig(device="cpu", size="small", perception="objects", eyes="package"), PIXELS, "detections"),
-        (
-            MemobenchMemConfig(device="cpu", size="small", perception="objects", eyes="package", told_objects="hand"),
-            BOTH,
-            f"detections, {POSES}",
-        ),
         (MemobenchExpertConfig(), PIXELS, "privileged simulator state"),
         (MemobenchExpertConfig, PIXELS, "privileged simulator state"),
         (MemobenchBlindConfig(), PIXELS, "privileged simulator state"),

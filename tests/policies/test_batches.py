@@ -52,16 +52,15 @@ def test_lerobot_train_draws_every_execution_frame_once_and_no_prompt(
     assert drawn != sorted(drawn)
 
 
-@pytest.mark.parametrize("prompt_loss", [False, True])
-def test_the_sampler_begins_where_the_configuration_says(dataset_root: Path, prompt_loss: bool) -> None:
-    policy, _, _, dataset = made_for_training(dataset_root, prompt_loss=prompt_loss)
+def test_the_sampler_begins_where_the_configuration_says(dataset_root: Path) -> None:
+    policy, _, _, dataset = made_for_training(dataset_root)
     ranges = [list(dataset.meta.episodes[f"dataset_{end}_index"]) for end in ("from", "to")]
 
     def drawn(drop: int, **options: bool) -> list[int]:
         return list(EpisodeAwareSampler(*ranges, drop_n_last_frames=drop, **options))
 
     asked = policy.config.drop_n_last_frames
-    assert drawn(asked) == (list(range(94)) if prompt_loss else EXECUTION)
+    assert drawn(asked) == EXECUTION
     assert drawn(asked, shuffle=True) == drawn(asked, shuffle=True)
     # Other policies draw as ever; so does a configuration that is made for no dataset.
     assert drawn(0) == list(range(94))
@@ -87,7 +86,7 @@ def test_padded_actions_do_not_count(dataset_root: Path, monkeypatch: pytest.Mon
 
 def test_mean_losses_without_padding_is_the_mean() -> None:
     losses = torch.rand(4, 5, 3)
-    found = mean_losses(losses, counted_actions({}, losses, prompt_loss=False))
+    found = mean_losses(losses, counted_actions({}, losses))
     torch.testing.assert_close(found.mean, losses.mean())
     torch.testing.assert_close(found.per_sample, losses.mean(dim=(1, 2)))
     nothing = mean_losses(losses, torch.zeros(4, 5))

@@ -49,7 +49,6 @@ def test_defaults_are_the_papers() -> None:
         ({"memory_stride": 0}, "memory_stride"),
         ({"tokens_per_frame": 8}, "16"),
         ({"ema_decay": 1.0}, "ema_decay"),
-        ({"freeze_vision_encoder": False}, "cached"),
         ({"image_resolution": (100, 100)}, "multiple of 48"),
     ],
 )

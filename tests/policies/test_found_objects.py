@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import shutil
 from pathlib import Path
 from typing import Any
@@ -15,14 +14,14 @@ from lerobot.policies import make_pre_post_processors
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 
 from lerobot_memobench.datasets.feature_cache.layout import FOLDER
-from lerobot_memobench.envs.observations import BOTH, PIXELS, obs_type_of
+from lerobot_memobench.envs.observations import PIXELS, obs_type_of
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.perception.found import FOUND, VIEWS
-from lerobot_memobench.sim.object_slots import SIZE, SLOTS, WIDTH
+from lerobot_memobench.sim.object_slots import SIZE
 from tests.support.object_dataset import make_object_dataset
 from tests.support.picture_rollouts import (
     made_eyes,
@@ -179,35 +178,6 @@ def test_what_the_environment_tells_is_not_looked_at(blind: Path, eyes: Path, ro
         finds.reset()
         found.append(finds.select_action(before(batch | {OBS_ENV_STATE: slots})))
     assert torch.equal(*found)
-
-
-@pytest.mark.parametrize("told", ["present", "memory", "hand"])
-def test_what_a_failure_is_from_is_found_by_telling(told: str, blind: Path, eyes: Path, root: Path) -> None:
-    """What is told stands in the place of what is found, in the present or in memory, and nowhere else."""
-    slots = torch.zeros(1, SLOTS, WIDTH)
-    slots[0, :2] = torch.tensor([[1.0, 3.0, 0.1, 0.2, 0.9, 1, 0, 0, 0, 1, 0, 0, 0], [1.0, 4, 0.5, 0, 0.9] + [0.0] * 8])
-    batch = pictures_of(root, 3) | {OBS_STATE: torch.zeros(1, 8), OBS_ENV_STATE: slots.flatten(1), "task": ["put"]}
-    batch[OBS_STATE][0, :3] = torch.tensor([0.1, 0.2, 1.0])  # above the first
-    finds, before = loaded(blind, f"--eyes={eyes}")
-    tells, _ = loaded(blind, f"--eyes={eyes}", f"--told_objects={told}")
-    assert obs_type_of(tells.config) == BOTH
-    batch = before(batch | {"observation.step": torch.zeros(1), "observation.phase": torch.ones(1)})
-    found, shown = (policy.perception.present(batch)[0][0][:, :SIZE] for policy in (finds, tells))
-    kept, remembered = (policy.perception.remember(batch, [0])[:, 0, :SIZE] for policy in (finds, tells))
-    assert torch.equal(remembered, slots.flatten(1) if told == "memory" else kept)
-    if told == "hand":
-        near = shown.unflatten(1, (SLOTS, WIDTH))[0]
-        assert slots[0, 0].tolist() in near.tolist()
-        assert slots[0, 1].tolist() not in near.tolist()
-        far = [
-            row for row in found.unflatten(1, (SLOTS, WIDTH))[0].tolist() if math.dist(row[2:5], (0.1, 0.2, 1.0)) > 0.15
-        ]
-        assert all(row in near.tolist() for row in far[: SLOTS - 1])
-    else:
-        assert torch.equal(shown, slots.flatten(1) if told == "present" else found)
-    del batch[OBS_ENV_STATE]
-    with pytest.raises(MemobenchError, match=f"told_objects={told} tells; evaluate with --env.obs_type=both"):
-        (tells.perception.remember(batch, [0]), tells.perception.present(batch))
 
 
 def test_a_checkpoint_names_its_eyes_and_takes_others(

@@ -102,7 +102,7 @@ def test_half_precision_and_both_integrations_train_and_act(dataset_root: Path, 
     assert torch.isfinite(actions).all()
 
 
-def test_prompt_frames_do_not_count_unless_asked(dataset_root: Path) -> None:
+def test_prompt_frames_do_not_count(dataset_root: Path) -> None:
     policy, before, _, dataset = made_for_training(dataset_root)
     batch = before(batch_of(dataset, [41, 43, 60, 5]))
     assert batch["phase"].tolist() == [0, 0, 1, 1]
@@ -114,10 +114,6 @@ def test_prompt_frames_do_not_count_unless_asked(dataset_root: Path) -> None:
     assert loss.item() == pytest.approx(per_sample[2:].mean().item(), rel=1e-5)
     prompts, _ = policy.forward(before(batch_of(dataset, [41, 42])))
     assert prompts.item() == 0.0
-    policy.config.prompt_loss = True
-    torch.manual_seed(3)
-    per_sample, _ = policy.forward(batch, reduction="none")
-    assert (per_sample > 0).all()
 
 
 def test_training_moves_memory_expert_and_vlm_and_not_the_tower(trained: Any, dataset_root: Path) -> None:

@@ -117,12 +117,6 @@ def test_slots_stay_in_order_and_empty_ones_empty() -> None:
     assert as_found(torch.zeros(2, SLOTS, WIDTH), FAR.expand(2, -1), 1.0).eq(0).all(), "of nothing, nothing"
 
 
-def test_a_share_of_the_frames_is_seen_with_errors() -> None:
-    torch.manual_seed(3)
-    seen = SightErrors(1.0, share=0.25).seen(TABLE.expand(2000, -1, -1), FAR.expand(2000, -1))
-    assert (seen != TABLE).flatten(1).any(dim=1).float().mean() == pytest.approx(0.25, abs=0.04)
-
-
 def test_only_what_learns_sees_errors() -> None:
     perception = ObjectPerception(classes(), 2, 32, SightErrors(1.0))
     batch = {"observation.environment_state": TABLE.reshape(1, SIZE), OBS_RAW_STATE: FAR}

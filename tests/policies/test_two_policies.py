@@ -230,7 +230,7 @@ def test_a_sampler_that_is_not_ours_is_refused(monkeypatch: pytest.MonkeyPatch) 
         Own([0, 10], [10, 20], drop_n_last_frames=Drawn(np.array([5, 15]), 2))
     lerobots, drawn = inspect.unwrap(EpisodeAwareSampler.__init__), Drawn.of(np.array([5, 15]), 1)
     monkeypatch.setattr(EpisodeAwareSampler, "__init__", lerobots)  # somebody puts it back
-    with pytest.raises(MemobenchError, match=r"something has taken its place.*prompt_loss=true"):
+    with pytest.raises(MemobenchError, match=r"something has taken its place"):
         EpisodeAwareSampler([0, 10], [10, 20], drop_n_last_frames=drawn)
     with pytest.raises(MemobenchError, match="not LeRobot's"):
         np.array([10, 20]) - drawn

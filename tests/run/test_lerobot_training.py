@@ -140,14 +140,13 @@ def test_the_held_out_part_has_no_prompt_either(tmp_path: Path) -> None:
     assert tasks.tolist() == [held_out.dataset.hf_dataset[k]["task_index"].item() for k in held_out.indices]
 
 
-@pytest.mark.parametrize("prompt_loss", [False, True])
-def test_a_policy_with_phases_is_tested_on_what_it_learns(tmp_path: Path, prompt_loss: bool) -> None:
+def test_a_policy_with_phases_is_tested_on_what_it_learns(tmp_path: Path) -> None:
     from tests.support.synthetic_dataset import make_dataset
 
-    policy = MemobenchMemConfig(device="cpu", push_to_hub=False, prompt_loss=prompt_loss)
+    policy = MemobenchMemConfig(device="cpu", push_to_hub=False)
     train, held_out = opened(make_dataset(tmp_path / "two", repeats=2), policy, eval_split=0.5)
     assert len(drawn(train)) == sum(LENGTHS)
-    assert len(held_out) == sum(LENGTHS) - (0 if prompt_loss else PROMPTS[1])
+    assert len(held_out) == sum(LENGTHS) - PROMPTS[1]
 
 
 def test_what_is_no_dataset_of_ours_stays_as_it_is(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -179,12 +178,10 @@ def test_what_cannot_be_streamed_without_prompts_is_refused_in_one_sentence(root
         opened(root, looks_back, streaming=True)
     opened(root, looks_back, prompt_frames=True, streaming=True)
     ours = MemobenchMemConfig(device="cpu", push_to_hub=False)
-    with pytest.raises(MemobenchError, match=r"memobench_mem draws execution frames alone.*policy.prompt_loss=true"):
+    with pytest.raises(MemobenchError, match=r"memobench_mem draws execution frames alone.*prompt_frames=false"):
         opened(root, ours, streaming=True)
     train, _ = opened(root, ours, prompt_frames=False, streaming=True)
     assert {int(frame["phase"]) for frame in train} == {1}
-    ours.prompt_loss = True
-    opened(root, ours, streaming=True)
 
 
 # --- by the commands ---

@@ -144,7 +144,7 @@ def test_an_experiment_runs_its_parts_in_order(tmp_path: Path, monkeypatch: pyte
     assert memory / memoryless == pytest.approx(3, rel=0.15), "bars are as long as their rates"
 
 
-@pytest.mark.parametrize("word", ["policy.nothing=1", "policy.width=broad"])
+@pytest.mark.parametrize("word", ["policy.nothing=1", "policy.chunk_size=broad"])
 def test_what_training_would_refuse_is_told_before_anything_is_made(tmp_path: Path, word: str) -> None:
     with pytest.raises(MemobenchError, match=word.partition("=")[0]):
         learn(changed(experiment("bowl"), settings=(word,)), tmp_path / "out", print)
@@ -184,7 +184,6 @@ def test_what_is_told_in_training_is_told_in_rollouts(tmp_path: Path, monkeypatc
         ("objects", {"perception=objects", "steps=1600"}, set()),
         ("found", {"perception=objects", "policy.sight_errors=1", "steps=1600"}, {"eyes=package"}),
         ("pixels", {"perception=pixels", "steps=2000"}, set()),
-        ("both", {"perception=pixels", "policy.finds=true", "policy.sight_errors=1", "steps=2000"}, set()),
     ],
 )
 def test_policies_learn_and_act_by_what_they_see(

@@ -22,9 +22,6 @@ def cache(
     eyes: Annotated[
         str | None, typer.Option(help="Eyes (policy.eyes): package or a file; at size small the package's by default.")
     ] = None,
-    finds: Annotated[
-        bool, typer.Option("--finds", help="What eyes find in the pictures, too (policy.finds); at size small.")
-    ] = False,
     weights: Annotated[
         str | None, typer.Option(help="Folder or repository whose image tower is used (size pi05).")
     ] = None,
@@ -49,7 +46,7 @@ def cache(
         place = None if out is None else str(out)
         given: dict[str, Any] = {} if stride is None else {"memory_stride": stride}
         config = MemobenchMemConfig(
-            size=size, perception=perception, eyes=eyes, finds=finds, memory_cache_dir=place, device=device, **given
+            size=size, perception=perception, eyes=eyes, memory_cache_dir=place, device=device, **given
         )
     screen = console()
     with counting(screen, "episodes") as count:

@@ -117,7 +117,7 @@ def overview(commands: Iterable[str]) -> str:
             "  lerobot eval env=memobench                                   the scripted expert on all tasks",
             "  lerobot eval env=memobench policy=<checkpoint> tasks=object  a trained policy",
             "  lerobot train policy=memobench_mem align=contrastive dataset=<folder>",
-            "  lerobot train config=train_contrastive dataset=<folder>      the paper's recipe (memobench recipe)",
+            "  lerobot train config=train_paper dataset=<folder>            the paper's recipe (memobench recipe)",
             "",
             "`lerobot eval --help` and `lerobot train --help` explain these short forms; any other setting goes by its",
             "full name (policy.optimizer_lr=1e-4), as listed there.",

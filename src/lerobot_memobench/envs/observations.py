@@ -44,10 +44,10 @@ def obs_type_of(policy: Any) -> str | None:
     """Return the ``obs_type`` that a policy's configuration needs; None where that is not known, or none is needed.
 
     A policy that says by ``perception`` what it reads (`pixels`, `objects` or `any`) is taken at its word; one that
-    ``finds_objects`` does so in pictures, and is told some all the same by ``told_objects``.
+    ``finds_objects`` does so in pictures.
     """
     if getattr(policy, "finds_objects", False):
-        return PIXELS if policy.told_objects == "nothing" else BOTH
+        return PIXELS
     perception = getattr(policy, "perception", None)
     if policy is None or perception is not None:
         return {"objects": OBJECTS, "pixels": PIXELS}.get(str(perception))

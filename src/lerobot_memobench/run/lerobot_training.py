@@ -75,7 +75,7 @@ def _steered(make: Callable[..., Any], prompt_frames: bool | None, obs_type: str
             told = "the frames" if count is None else f"{count} frames"
             logger.info("%s of prompts are left out of the %d to train on", told, train.num_frames)
         # A policy that draws execution frames alone sees to what it trains on, and not to what it is tested on.
-        tested = wanted and getattr(config.policy, "prompt_loss", True)
+        tested = wanted and not getattr(config.policy, "execution_only", False)
         if held_out is not None:
             held_out.reader.trained_with = train.meta
         if held_out is not None and not tested and leave_out_prompts(held_out):
@@ -87,11 +87,10 @@ def _steered(make: Callable[..., Any], prompt_frames: bool | None, obs_type: str
 
 def _check_streaming(config: Any) -> None:
     """Refuse to stream to a policy that draws its own execution frames: it would get prompts, which do not count."""
-    if config.dataset.streaming and getattr(config.policy, "prompt_loss", True) is False:
+    if config.dataset.streaming and getattr(config.policy, "execution_only", False):
         raise MemobenchError(
             f"policy={config.policy.type} draws execution frames alone, and dataset.streaming=true leaves no choice of "
-            "frames; use dataset.streaming=false, prompt_frames=false to take execution frames as they come, or "
-            "policy.prompt_loss=true to train on prompts as well"
+            "frames; use dataset.streaming=false, or prompt_frames=false to take execution frames as they come"
         )
 
 

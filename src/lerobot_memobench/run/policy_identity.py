@@ -54,8 +54,7 @@ def eyes_hash(settings: Mapping[str, Any]) -> str | None:
     Raises:
         MemobenchError: there are no such eyes.
     """
-    finds = settings.get("perception") == "objects" or settings.get("finds")
-    if not finds or settings.get("eyes") is None:
+    if settings.get("perception") != "objects" or settings.get("eyes") is None:
         return None
     from lerobot_memobench.perception.weights import eyes_file
 

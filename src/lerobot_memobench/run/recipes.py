@@ -1,4 +1,4 @@
-"""The shipped training recipes: ``lerobot train config=train_contrastive`` and ``memobench recipe``."""
+"""The shipped training recipes: ``lerobot train config=train_paper`` and ``memobench recipe``."""
 
 from __future__ import annotations
 

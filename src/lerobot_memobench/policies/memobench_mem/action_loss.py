@@ -25,15 +25,15 @@ class ActionLoss(NamedTuple):
     per_dim: Tensor
 
 
-def counted_actions(batch: Mapping[str, Tensor], losses: Tensor, *, prompt_loss: bool) -> Tensor:
-    """Return (B, T) 1 for actions of a batch that count: of the execution, unless ``prompt_loss``, and no padding.
+def counted_actions(batch: Mapping[str, Tensor], losses: Tensor) -> Tensor:
+    """Return (B, T) 1 for actions of a batch that count: of the execution, and no padding.
 
     LeRobot pads chunks that reach beyond the end of their episode, and says so by ``action_is_pad`` (B, T).
     """
     counted = torch.ones(losses.shape[:2], device=losses.device)
     if ACTION_IS_PAD in batch:
         counted = counted * ~batch[ACTION_IS_PAD].to(losses.device)
-    if PHASE in batch and not prompt_loss:
+    if PHASE in batch:
         counted = counted * rearrange(batch[PHASE].reshape(-1).to(losses.device) != 0, "b -> b 1")
     return counted
 

@@ -15,7 +15,6 @@ from einops import rearrange, repeat
 from lerobot.policies.pi05.modeling_pi05 import GemmaConfig, PaliGemmaWithExpertModel, PI05Pytorch
 from lerobot.policies.pi_gemma import PaliGemmaForConditionalGenerationWithPiGemma, PiGemmaForCausalLM
 from torch import Tensor, nn
-from torch.nn.functional import pad, rms_norm
 
 from lerobot_memobench.perception.tower import Tower
 from lerobot_memobench.perception.weights import load_eyes
@@ -23,13 +22,12 @@ from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import
 from lerobot_memobench.policies.memobench_mem.dimensions import Dimensions, Gemma
 from lerobot_memobench.policies.memobench_mem.integration.integration import Prefix
 from lerobot_memobench.policies.memobench_mem.perception.eyes import EyePerception
-from lerobot_memobench.policies.memobench_mem.perception.finding_eyes import FindingEyes
 from lerobot_memobench.policies.memobench_mem.perception.found import FoundObjects, ObjectsInPictures
 from lerobot_memobench.policies.memobench_mem.perception.frozen import VISION_SEED, seed_parameters
 from lerobot_memobench.policies.memobench_mem.perception.objects import LOUD, ObjectPerception
 from lerobot_memobench.policies.memobench_mem.perception.perception import Perception
 from lerobot_memobench.policies.memobench_mem.perception.pixels import PixelPerception
-from lerobot_memobench.policies.memobench_mem.perception.sight_errors import TOLD, SightErrors
+from lerobot_memobench.policies.memobench_mem.perception.sight_errors import SightErrors
 from lerobot_memobench.sim.object_slots import classes
 
 
@@ -51,16 +49,6 @@ def _resize(vlm: Any, dims: Dimensions, image_size: int) -> Any:
     return config
 
 
-def _slots(config: MemobenchMemConfig) -> tuple[list[str], int, int]:
-    """Return the classes of slots, a frame's memory tokens, and their width."""
-    config.object_classes = config.object_classes or list(classes())
-    return config.object_classes, config.tokens_per_frame, config.dimensions.vlm.width
-
-
-def _errors(config: MemobenchMemConfig) -> SightErrors:
-    return SightErrors(config.sight_errors, config.sight_errors_share)
-
-
 class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
     """LeRobot's pair of transformers at this policy's dimensions, image tower and unused heads frozen."""
 
@@ -75,7 +63,7 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
                 use_adarms=[False, True],
                 precision=config.dtype,
                 image_size=image_size,
-                freeze_vision_encoder=config.freeze_vision_encoder,
+                freeze_vision_encoder=True,
                 train_expert_only=config.train_expert_only,
             )
             lerobots: Any = self
@@ -99,31 +87,25 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
             # Where the frozen image tower lies in pi0.5; its weights are loaded by the policy.
             tower = seeing.vision_tower = Tower(folded=True).eval().requires_grad_(False)
             seeing.multi_modal_projector = nn.Identity()
-            how = tower, [*config.image_features], config.memory_camera or "", config.dimensions.vlm.width
-            if not config.finds:
-                return EyePerception(*how)
-            return FindingEyes(*how, self._finding(config), config.tokens_dropped)
+            return EyePerception(
+                tower, [*config.image_features], config.memory_camera or "", config.dimensions.vlm.width
+            )
         if not config.sees_objects:
             return PixelPerception(
                 seeing.vision_tower, seeing.multi_modal_projector, config.image_size, config.memory_camera or ""
             )
         seeing.vision_tower, seeing.multi_modal_projector = nn.Identity(), nn.Identity()
-        if config.finds_objects:
-            return self._finding(config)
-        return ObjectPerception(*_slots(config), _errors(config))
-
-    @staticmethod
-    def _finding(config: MemobenchMemConfig) -> FoundObjects:
-        assert config.eyes is not None
-        # A policy of finds alone that learned of told objects goes on, if it does, by what eyes find.
-        errors = _errors(config) if config.told_in_training else TOLD
-        return FoundObjects(ObjectsInPictures(load_eyes(config.eyes)), *_slots(config), config.told_objects, errors)
+        config.object_classes = config.object_classes or list(classes())
+        slots = config.object_classes, config.tokens_per_frame, config.dimensions.vlm.width
+        if config.eyes is not None:
+            # A policy that learned of told objects with errors goes on, if it does, by what eyes find.
+            return FoundObjects(ObjectsInPictures(load_eyes(config.eyes)), *slots)
+        return ObjectPerception(*slots, SightErrors(config.sight_errors))
 
     def _set_requires_grad(self) -> None:
         super()._set_requires_grad()
-        if self.freeze_vision_encoder:
-            # Cached tokens are projected ones, so the projection is frozen with the tower.
-            self.paligemma.model.multi_modal_projector.requires_grad_(False)
+        # Cached tokens are projected ones, so the projection is frozen with the tower.
+        self.paligemma.model.multi_modal_projector.requires_grad_(False)
         # pi0.5 never asks its language heads; training state for them would only fill memory.
         self.paligemma.lm_head.requires_grad_(False)
         self.gemma_expert.lm_head.requires_grad_(False)
@@ -151,25 +133,17 @@ class InstructionCondition(nn.Module):
     Attention alone has to find the one word that tells two tasks apart. On six tasks of one cabinet, one microwave and
     one stove, 2,000 updates, the loss was 2 % lower with it and 28 of 30 rollouts were solved, not 24 (one training
     seed, and seeds that settings may be chosen by).
-
-    Args:
-        places: of how many words, from the first, the order counts: each place weighs the numbers of its word, so that
-            "the top, then the middle" has another mean than "the middle, then the top". 0: order is not told.
     """
 
-    def __init__(self, words_dim: int, width: int, places: int) -> None:
+    def __init__(self, words_dim: int, width: int) -> None:
         super().__init__()
         self.mlp = nn.Sequential(nn.Linear(words_dim, width), nn.SiLU(), nn.Linear(width, width))
-        self.places = nn.Parameter(torch.randn(places, words_dim)) if places else None
         self.said: Tensor | None = None
 
     def read(self, words: Tensor, real: Tensor) -> None:
         """Begin a pass with these words (B, n, D), of which ``real`` (B, n) are no padding."""
-        if self.places is not None:
-            words = words * (1 + pad(self.places, (0, 0, 0, words.shape[1] - len(self.places))))  # or cropped
         weights = real.unsqueeze(-1).to(words.dtype)
-        said = (words * weights).sum(dim=1) / weights.sum(dim=1).clamp(min=1)
-        self.said = said if self.places is None else rms_norm(said, said.shape[-1:])
+        self.said = (words * weights).sum(dim=1) / weights.sum(dim=1).clamp(min=1)
 
     def forward(self) -> Tensor:
         """Return what is added to the condition (B, width)."""
@@ -194,8 +168,7 @@ class SizedPI05(PI05Pytorch):
         self.time_mlp_out = nn.Linear(width, width)
         seen = config.dimensions.vlm.width
         self.state_token = StateToken(config.max_state_dim, seen) if config.state_token else None
-        places = config.dimensions.tokenizer_max_length if config.word_order else 0
-        self.instruction = InstructionCondition(seen, width, places) if config.state_token else None
+        self.instruction = InstructionCondition(seen, width) if config.state_token else None
 
     def embed_suffix(self, noisy_actions: Tensor, timestep: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """LeRobot's action tokens, their masks, and the condition of the expert's norms."""

@@ -33,19 +33,12 @@ from lerobot_memobench.policies.memobench_mem.language.text_encoders import (
     make_text_encoder,
 )
 from lerobot_memobench.policies.memobench_mem.perception.eyes import EyePerception
-from lerobot_memobench.policies.memobench_mem.perception.finding_eyes import FindingEyes
 from lerobot_memobench.policies.memobench_mem.perception.found import FOUND, FoundObjects, ObjectsInPictures
 from lerobot_memobench.policies.memobench_mem.perception.frozen import VISION_SEED, seed_parameters
 from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_PHASE, OBS_RAW_STATE
 from lerobot_memobench.policies.memobench_mem.perception.perception import Perception
 from lerobot_memobench.policies.memobench_mem.perception.pixels import PixelPerception
-from lerobot_memobench.policies.memobench_mem.seen_pictures import (
-    Busy,
-    cameras_of,
-    come_back,
-    make_caches,
-    open_pictures,
-)
+from lerobot_memobench.policies.memobench_mem.seen_pictures import cameras_of, make_caches, open_pictures
 from lerobot_memobench.policies.memobench_mem.weights import load_exactly, read_weights
 
 logger = logging.getLogger(__name__)
@@ -123,11 +116,9 @@ def cache_dataset(
     """
     config.memory_camera = config.memory_camera or next(iter(cameras_of(root)), None)
     how: dict[str, Any] = {"batch_size": batch_size, "workers": workers, "progress": progress, "tell": tell}
-    if config.finds_objects and not config.told_in_training:
+    if config.finds_objects:
         assert config.eyes is not None
-        found = make_found(root, config, ObjectsInPictures(load_eyes(config.eyes)), _text_encoder(config), **how)
-        if config.sees_objects:
-            return found.folder
+        return make_found(root, config, ObjectsInPictures(load_eyes(config.eyes)), _text_encoder(config), **how).folder
     if config.has_eyes:
         memory, present = make_caches(root, config, load_sight(config, weights), _text_encoder(config), **how)
         return (memory or next(iter(present.values()))).folder
@@ -147,11 +138,10 @@ def open_frames(root: Path, config: MemobenchMemConfig, perception: Perception) 
         return open_cache(root, config, perception)
     names = [name for name in RECORDED if name != OBS_ENV_STATE] if config.sees_pictures else RECORDED
     if isinstance(perception, EyePerception):
-        found = _beside_tokens(root, config, perception) if isinstance(perception, FindingEyes) else {}
-        return open_pictures(root, config, perception, _text_encoder(config), names, found)
+        return open_pictures(root, config, perception, _text_encoder(config), names)
     columns, table = read_recorded(root, names)
     if isinstance(perception, FoundObjects):
-        columns |= _found_in(root, config, perception)
+        columns[FOUND] = found_in(root, config, perception.look, _text_encoder(config))
     phase = torch.from_numpy(table.phase)
     logger.info("%d frames of %s are read into memory", table.episodes[-1], root)
     return RecordedFrames(
@@ -190,25 +180,6 @@ def open_cache(root: Path, config: MemobenchMemConfig, perception: PixelPercepti
         texts_key=None if config.align == "none" else _text_encoder(config).key,
         place=folder.parent,
     )
-
-
-def _found_in(root: Path, config: MemobenchMemConfig, perception: FoundObjects, **how: Any) -> dict[str, torch.Tensor]:
-    """Return what is found at every frame of a dataset, as a column; ``how`` as of `build_memory_cache`."""
-    return {FOUND: found_in(root, config, perception.look, _text_encoder(config), **how)}
-
-
-def _beside_tokens(root: Path, config: MemobenchMemConfig, eyes: FindingEyes) -> dict[str, torch.Tensor]:
-    """Return what `_found_in` does, or told objects where the policy learns of these.
-
-    Where another process is at it, tokens are made here meanwhile.
-    """
-    if config.told_in_training:
-        return {FOUND: read_recorded(root, [OBS_ENV_STATE])[0][OBS_ENV_STATE]}
-    try:
-        return _found_in(root, config, eyes.finds, wait=come_back)
-    except Busy:
-        make_caches(root, config, eyes, _text_encoder(config))
-        return _found_in(root, config, eyes.finds)
 
 
 def _build(root: Path, config: MemobenchMemConfig, perception: PixelPerception, **how: Any) -> Path:

@@ -17,7 +17,7 @@ from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.perception.tower import SIDE
 from lerobot_memobench.perception.weights import PACKAGE, RANDOM
 from lerobot_memobench.policies.memobench_mem.action_objective import OBJECTIVES, REGRESSION
-from lerobot_memobench.policies.memobench_mem.dimensions import GRID, SIZES, Dimensions, resized
+from lerobot_memobench.policies.memobench_mem.dimensions import GRID, SIZES, Dimensions
 from lerobot_memobench.policies.memobench_mem.schedule import WarmupFractionSchedulerConfig
 from lerobot_memobench.policies.memobench_mem.settings_memobench_mem import MemobenchMemSettings
 from lerobot_memobench.protocol import CAMERAS, IMAGE_SIZE
@@ -28,7 +28,6 @@ ALIGN_WEIGHTS = {"none": 0.0, "semantic": 0.1, "contrastive": 0.1, "framewise": 
 INTEGRATIONS = ("modulation", "context", "none")
 PERCEPTIONS = ("pixels", "objects")
 SUBGOAL_LEVELS = ("coarse", "intermediate", "fine")
-TOLD_OBJECTS = ("nothing", "hand", "present", "memory")
 TOKENS_PER_FRAME = {"pixels": GRID**2, "objects": 2}
 MEMORY_STRIDE, MOMENTS_PER_EPISODE = 8, 6
 """Where samples are made of what was read before training; 1 elsewhere."""
@@ -64,8 +63,6 @@ class MemobenchMemConfig(MemobenchMemSettings):
         _choose("perception", self.perception, PERCEPTIONS)
         _choose("integration", self.integration, INTEGRATIONS)
         _choose("subgoal_level", self.subgoal_level, SUBGOAL_LEVELS)
-        _choose("told_objects", self.told_objects, TOLD_OBJECTS)
-        self._check_dimensions()
         self._choose_eyes()
         dims = self.dimensions
         for name, value in self._defaults().items():
@@ -89,10 +86,10 @@ class MemobenchMemConfig(MemobenchMemSettings):
             self.align_weight = ALIGN_WEIGHTS[self.align]
         if self.objective == REGRESSION:
             self.num_inference_steps = 1
+        self.freeze_vision_encoder = True  # memory tokens are cached from the tower, and must stay what they are
         super().__post_init__()
         self._check_numbers()
         self._check_perception()
-        self._check_word_order()
         self._check_objective()
         self._check_alignment()
 
@@ -127,24 +124,6 @@ class MemobenchMemConfig(MemobenchMemSettings):
                 "leave it out: then objects are told by the environment."
             )
 
-    def _check_dimensions(self) -> None:
-        if self.size == "pi05" and (self.width, self.depth) != (None, None):
-            raise MemobenchError(
-                "--policy.width and --policy.depth change the sizes that are trained from scratch, and size=pi05 is "
-                "pi0.5's own; leave them out, or use --policy.size=small."
-            )
-        if self.width is not None and (self.width < 16 or self.width % 16):
-            raise MemobenchError(f"--policy.width={self.width} must be a multiple of 16, for 8 heads of even width.")
-        if self.depth is not None and self.depth < 1:
-            raise MemobenchError(f"--policy.depth={self.depth} must be at least 1.")
-
-    def _check_word_order(self) -> None:
-        if self.word_order and not self.state_token:
-            raise MemobenchError(
-                f"--policy.word_order=true is for policies whose state enters as numbers, and not for size={self.size} "
-                f"perception={self.perception}; leave it out, or use --policy.size=small."
-            )
-
     def _check_numbers(self) -> None:
         counts = ("memory_frames", "memory_stride", "n_action_steps", "tokens_per_frame", "moments_per_episode")
         for name in counts:
@@ -165,45 +144,20 @@ class MemobenchMemConfig(MemobenchMemSettings):
             raise MemobenchError(f"--policy.align_weight={self.align_weight} must not be negative.")
 
     def _check_perception(self) -> None:
-        if self.sight_errors < 0 or (self.sight_errors and not self.sees_slots):
+        if self.sight_errors < 0 or (self.sight_errors and not self.sees_objects):
             raise MemobenchError(
-                f"--policy.sight_errors={self.sight_errors} must not be negative, and are errors of slots: leave it "
-                "out, or use --policy.perception=objects or --policy.finds=true."
+                f"--policy.sight_errors={self.sight_errors} must not be negative, and are errors of objects: leave it "
+                "out, or use --policy.perception=objects."
             )
-        if not 0 < self.sight_errors_share <= 1 or (self.sight_errors_share < 1 and not self.sight_errors):
-            raise MemobenchError(
-                f"--policy.sight_errors_share={self.sight_errors_share} must be above 0 and at most 1, and is a share "
-                "of the frames, seen with --policy.sight_errors; leave it out, or set these too."
-            )
-        if self.finds and not self.sees_tokens:
-            raise MemobenchError(
-                f"--policy.finds=true is for pictures that are seen through eyes, and not for size={self.size} "
-                f"perception={self.perception} eyes={self.eyes}; leave it out."
-            )
-        if not 0.0 <= self.tokens_dropped <= 1.0 or (self.tokens_dropped and not self.finds):
-            raise MemobenchError(
-                f"--policy.tokens_dropped={self.tokens_dropped} must be in [0, 1], and is for policies that are shown "
-                "what eyes find too: leave it out, or set --policy.finds=true."
-            )
-        if self.whole_plan_if_still and not self.sees_slots:
+        if self.whole_plan_if_still and not self.sees_objects:
             raise MemobenchError(
                 "--policy.whole_plan_if_still=true is for policies that see objects, which are told where the hand is; "
-                "leave it out, or use --policy.perception=objects or --policy.finds=true."
+                "leave it out, or use --policy.perception=objects."
             )
         if self.perception == "pixels" and self.tokens_per_frame != GRID**2:
             raise MemobenchError(
                 f"--policy.tokens_per_frame={self.tokens_per_frame} is not supported: frames are pooled to a "
                 f"4x4 grid, so leave it at {GRID**2}."
-            )
-        if self.told_objects != "nothing" and not self.finds_objects:
-            raise MemobenchError(
-                f"--policy.told_objects={self.told_objects} is for objects that eyes find: leave it out, or name "
-                "--policy.eyes too."
-            )
-        if not self.freeze_vision_encoder:
-            raise MemobenchError(
-                "--policy.freeze_vision_encoder=false cannot be used: memory tokens are cached from the frozen "
-                "vision tower, and would no longer match a tower that learns."
             )
         if self.sees_tokens:
             if self.image_size != (SIDE, SIDE):
@@ -244,7 +198,7 @@ class MemobenchMemConfig(MemobenchMemSettings):
     @property
     def dimensions(self) -> Dimensions:
         """Dimensions of this size."""
-        return resized(SIZES[self.size], self.width, self.depth)
+        return SIZES[self.size]
 
     @property
     def sees_objects(self) -> bool:
@@ -263,24 +217,15 @@ class MemobenchMemConfig(MemobenchMemSettings):
 
     @property
     def finds_objects(self) -> bool:
-        """Whether the objects that are seen, alone or beside tokens, are those that eyes find in pictures."""
-        return self.has_eyes and self.sees_slots
+        """Whether the objects that are seen are those that eyes find in pictures."""
+        return self.has_eyes and self.sees_objects
 
     @property
     def sees(self) -> tuple[str, ...]:
         """What it sees in a rollout, in the words of `envs.obs_types`."""
-        told = self.sees_slots and (not self.finds_objects or self.told_objects != "nothing")
-        return (SEEN_PIXELS,) * (not self.sees_objects) + (DETECTIONS,) * self.finds_objects + (SEEN_OBJECTS,) * told
-
-    @property
-    def told_in_training(self) -> bool:
-        """Whether told objects, with errors, stand in training for those that eyes find."""
-        return self.finds and self.sight_errors > 0
-
-    @property
-    def sees_slots(self) -> bool:
-        """Whether things are seen as slots, with where they are from the hand."""
-        return self.sees_objects or self.finds
+        if not self.sees_objects:
+            return (SEEN_PIXELS,)
+        return (DETECTIONS,) if self.finds_objects else (SEEN_OBJECTS,)
 
     @property
     def sees_pictures(self) -> bool:

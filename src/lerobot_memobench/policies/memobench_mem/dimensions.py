@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 GRID = 4
 """A remembered picture is pooled to GRID x GRID tokens."""
@@ -114,20 +114,3 @@ SIZES = {
         learning_rate=5e-5,
     ),
 }
-
-
-def resized(dims: Dimensions, width: int | None, depth: int | None) -> Dimensions:
-    """Return dimensions with both transformers ``width`` wide and ``depth`` layers deep; None leaves them."""
-    return replace(dims, vlm=_resized(dims.vlm, width, depth), expert=_resized(dims.expert, width, depth))
-
-
-def _resized(size: Gemma, width: int | None, depth: int | None) -> Gemma:
-    wide, deep = width or size.width, depth or size.depth
-    return Gemma(
-        wide,
-        deep,
-        size.mlp_dim * wide // size.width,
-        size.num_heads,
-        size.num_kv_heads,
-        size.head_dim * wide // size.width,
-    )

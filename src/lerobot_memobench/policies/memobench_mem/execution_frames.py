@@ -36,12 +36,12 @@ class Drawn:
     """No frames to drop at the end of each episode, and how the others are drawn by LeRobot's sampler while this lives.
 
     Attributes:
-        starts: from which frame on (E,) to draw; None: from the first.
+        starts: from which frame on (E,) to draw.
         moments: how many frames of an episode to draw in a row.
         tasks: (N,) number of each frame's task; None: each frame is drawn once. balance, factors: see `in_turns`.
     """
 
-    starts: np.ndarray | None
+    starts: np.ndarray
     moments: int
     tasks: np.ndarray | None = None
     balance: float = 1.0
@@ -64,8 +64,7 @@ class Drawn:
         """Be no number."""
         raise MemobenchError(
             "What draws the frames of this training is not LeRobot's EpisodeAwareSampler, or something has taken its "
-            "place: it knows nothing of execution frames and would draw those of prompts; leave out what replaces it, "
-            "or train with --policy.prompt_loss=true on a dataset without prompts by a loader of your own."
+            "place: it knows nothing of execution frames and would draw those of prompts; leave out what replaces it."
         )
 
     __array_ufunc__ = None  # of an array minus this, numpy asks this
@@ -162,9 +161,7 @@ def _draws(begin: Callable[..., None]) -> Callable[..., None]:
         asked = dict(zip(DRAW_FRAMES.parameters[1:], args, strict=False)) | named
         drawn = asked.get("drop_n_last_frames")
         if isinstance(drawn, Drawn):
-            asked["drop_n_last_frames"] = 0
-            if drawn.starts is not None:
-                asked["dataset_from_indices"] = drawn.starts
+            asked |= {"drop_n_last_frames": 0, "dataset_from_indices": drawn.starts}
             if drawn.ordered and type(self).__iter__ is not EpisodeAwareSampler.__iter__:
                 drawn._refuse()
             self.drawn = drawn

@@ -127,6 +127,6 @@ class LearningPolicy(SeeingPolicy):
         drawn = noise_and_time(self.config.objective, self.model, actions)
         squared = self.model.forward(images, image_masks, *words, actions, *drawn)[:, :, : self._action_dim]
         losses = losses_of(self.config.objective, squared)
-        found = mean_losses(losses, counted_actions(batch, losses, prompt_loss=self.config.prompt_loss))
+        found = mean_losses(losses, counted_actions(batch, losses))
         logged = {"action_loss": found.mean.item(), "loss_per_dim": found.per_dim.cpu().tolist()}
         return found.per_sample, found.mean, logged

@@ -6,7 +6,6 @@ import logging
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
 from safetensors.torch import load_file
@@ -128,13 +127,12 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
         begin_training(self.run)
         if isinstance(cache, RecordedFrames):
             read_from_memory(self.run)
-            drawn = np.ones(cache.num_frames, bool) if self.config.prompt_loss else cache.phase != 0
-            count_drawn_only(meta.stats, cache, drawn)
+            count_drawn_only(meta.stats, cache, cache.phase != 0)
         if self.config.sees_tokens:
             attend_fused(self.model)
         if self._device.type == "cpu":
             keep_freed_memory()
-        starts = None if self.config.prompt_loss else execution_starts(cache.episodes, cache.phase)
+        starts = execution_starts(cache.episodes, cache.phase)
         balance = self.config.balance_tasks
         tasks = task_of_frames(meta, cache.episodes) if balance else None
         factors = None if tasks is None else prompted_factors(tasks, cache.phase, self.config.prompted_weight)

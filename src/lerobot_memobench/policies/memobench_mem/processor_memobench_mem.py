@@ -65,7 +65,7 @@ def make_memobench_mem_pre_post_processors(
         GatherMemoryProcessorStep(**gathering(config)),
         OracleMemoryProcessorStep(enabled=config.oracle_memory),
         relative,
-        *([RawStateProcessorStep()] if config.sees_slots else []),
+        *([RawStateProcessorStep()] if config.sees_objects else []),
         steps.normalize,  # before the prompt, which may spell the normalised state out
         *([] if config.state_token else [Pi05PrepareStateTokenizerProcessorStep(max_state_dim=config.max_state_dim)]),
         _tokenizer(config, meta),

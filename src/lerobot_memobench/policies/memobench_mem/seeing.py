@@ -57,7 +57,7 @@ class SeeingPolicy(PI05Policy):
     def _seen(self) -> list[str]:
         """Observations of the present that the model is given, if they are there."""
         seen = [*self.config.image_features] if self.config.sees_pictures else []
-        own = [OBS_ENV_STATE, OBS_RAW_STATE] if self.config.sees_slots else []
+        own = [OBS_ENV_STATE, OBS_RAW_STATE] if self.config.sees_objects else []
         return [*seen, *own, OBS_STATE, OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK]
 
     def _preprocess_images(self, batch: dict[str, Tensor]) -> Seen:

@@ -9,13 +9,12 @@ they lie (`recorded_items`).
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
 from lerobot_memobench.datasets.feature_cache.building import (
@@ -32,7 +31,6 @@ from lerobot_memobench.io import in_words
 from lerobot_memobench.perception.tower import GRID, POOLED, WIDTH
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.perception.eyes import EyePerception, seen_key
-from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_PHASE, OBS_RAW_STATE
 
 logger = logging.getLogger(__name__)
 
@@ -151,7 +149,7 @@ def _wanted(root: Path, config: MemobenchMemConfig, eyes: EyePerception, cameras
         return Wanted(name, camera, stride, tokens, find_cache(root, begins, frames_key=tokens.key, **where))
 
     whole = Tokens(eyes.present_key, GRID**2, eyes.look)
-    pooled = Tokens(eyes.pooled_key, eyes.tokens_per_frame, eyes.pooled)
+    pooled = Tokens(eyes.key, eyes.tokens_per_frame, eyes.pooled)
     seen = dict.fromkeys(eyes.cameras or [*cameras, eyes.remembers])
     present = [wanted(camera, 1, f"{config.size}-present", whole) for camera in seen]
     if config.memory == "none":
@@ -170,12 +168,8 @@ def open_pictures(
     eyes: EyePerception,
     texts: TextEncoder,
     names: Sequence[str],
-    found: Mapping[str, Tensor],
 ) -> RecordedFrames:
     """Open what training looks up of the dataset at ``root``: its columns ``names``, and what ``eyes`` see.
-
-    Args:
-        found: more columns, of what they find.
 
     Raises:
         MemobenchError: the dataset lacks a column, or a cache cannot be made.
@@ -184,15 +178,13 @@ def open_pictures(
         root, config, eyes, texts, progress=lambda done, count: logger.info("seen: %d of %d episodes", done, count)
     )
     columns, table = read_recorded(root, names)
-    columns |= {**found, **{seen_key(camera): cache.all_tokens() for camera, cache in present.items()}}
-    told = {**columns, OBS_RAW_STATE: columns[OBS_STATE], OBS_PHASE: torch.from_numpy(table.phase)}
+    columns |= {seen_key(camera): cache.all_tokens() for camera, cache in present.items()}
 
     def remember(_: Any, frames: Sequence[int]) -> Tensor:
         """Return what is remembered of frames of one episode, by their global numbers."""
         if memory is None:  # training asks for none; a sample's shape is asked for all the same
-            return eyes.recall(torch.zeros(len(frames), eyes.tokens_per_frame, WIDTH), told, frames)
+            return torch.zeros(len(frames), eyes.tokens_per_frame, WIDTH)
         episode, first = memory.locate(frames[0])
-        pooled = memory.tokens(episode, [(first + frame - frames[0]) // memory.meta.stride for frame in frames])
-        return eyes.recall(pooled, told, frames)
+        return memory.tokens(episode, [(first + frame - frames[0]) // memory.meta.stride for frame in frames])
 
     return RecordedFrames(root, columns, table, texts, remember=remember, key=eyes.key, stride=config.memory_stride)

@@ -15,7 +15,7 @@ def _names(text: str) -> tuple[str, ...]:
 
 FIXED = _names(
     """
-    size perception width depth finds object_classes word_order integration oracle_memory memory_camera memory_frames
+    size perception object_classes integration oracle_memory memory_camera memory_frames
     tokens_per_frame memory_stride objective chunk_size normalization_mapping image_resolution tokenizer_name
     tokenizer_max_length input_features n_obs_steps paligemma_variant action_expert_variant max_state_dim max_action_dim
     min_period max_period use_relative_actions relative_exclude_joints action_feature_names empty_cameras
@@ -25,7 +25,7 @@ FIXED = _names(
 mean something else, mostly without a word. Those that decide others stand before them."""
 OF_ACTING = _names(
     """
-    n_action_steps whole_plan_if_still told_objects eyes num_inference_steps rtc_config device dtype use_amp
+    n_action_steps whole_plan_if_still eyes num_inference_steps rtc_config device dtype use_amp
     compile_model compile_mode pretrained_path pretrained_revision use_peft output_features
     """
 )
@@ -34,9 +34,9 @@ rule of its own (`checkpoints.read_config`); LeRobot makes ``output_features`` o
 `policies.shown` compares with the checkpoint's."""
 OF_TRAINING = _names(
     """
-    tokens_dropped sight_errors sight_errors_share base_weights align align_weight subgoal_level shuffle_subgoals
-    shuffle_seed text_encoder memory_cache_dir prompt_loss ema_decay moments_per_episode balance_tasks prompted_weight
-    freeze_vision_encoder train_expert_only warmup_fraction final_lr gradient_checkpointing time_sampling_beta_alpha
+    sight_errors base_weights align align_weight subgoal_level shuffle_subgoals
+    shuffle_seed text_encoder memory_cache_dir ema_decay moments_per_episode balance_tasks prompted_weight
+    train_expert_only warmup_fraction final_lr gradient_checkpointing time_sampling_beta_alpha
     time_sampling_beta_beta time_sampling_scale time_sampling_offset optimizer_lr optimizer_betas optimizer_eps
     optimizer_weight_decay optimizer_grad_clip_norm scheduler_warmup_steps scheduler_decay_steps scheduler_decay_lr
     push_to_hub repo_id private tags license
@@ -46,7 +46,7 @@ OF_TRAINING = _names(
 value is refused there, or its card would tell of a training that never was."""
 SINCE_BEGUN = _names(
     """
-    align subgoal_level shuffle_subgoals shuffle_seed text_encoder base_weights freeze_vision_encoder train_expert_only
+    align subgoal_level shuffle_subgoals shuffle_seed text_encoder base_weights train_expert_only
     ema_decay warmup_fraction final_lr optimizer_lr optimizer_betas optimizer_eps optimizer_weight_decay
     optimizer_grad_clip_norm scheduler_warmup_steps scheduler_decay_steps scheduler_decay_lr
     """
@@ -63,6 +63,7 @@ class MemobenchMemSettings(PI05Config):
     """pi0.5's fields plus the memory's. Fields that are ``None`` here take the size's value after construction."""
 
     knows_phases: ClassVar[bool] = True
+    execution_only: ClassVar[bool] = True
     fixed_by_training: ClassVar[tuple[str, ...]] = FIXED
     of_training_alone: ClassVar[tuple[str, ...]] = OF_TRAINING
     kept_since_begun: ClassVar[tuple[str, ...]] = (*FIXED, *SINCE_BEGUN)
@@ -70,10 +71,6 @@ class MemobenchMemSettings(PI05Config):
     size: str = "tiny"
     """``small`` (from scratch, learns from objects in minutes on a CPU), ``tiny`` (from scratch, trains on a CPU) or
     ``pi05`` (3.2 B)."""
-    width: int | None = None
-    """Width of both transformers, a multiple of 16; none: the size's. Not at ``size=pi05``."""
-    depth: int | None = None
-    """Layers of both transformers; none: the size's. Not at ``size=pi05``."""
 
     perception: str = "pixels"
     """How a moment is seen: ``pixels``, by the image tower, or ``objects``, by the slots of
@@ -83,26 +80,11 @@ class MemobenchMemSettings(PI05Config):
     package, or ``random``: pi0.5's image tower with random weights. With ``perception=objects``, the eyes that find
     them in pictures; none: the environment tells them. With pixels at ``size=small``, whose tower's tokens are seen;
     none: ``package``. A checkpoint of pixels holds its tower; there this only says where it was from."""
-    finds: bool = False
-    """Whether what ``eyes`` find in pictures stands beside their tokens, now and in memory; with pixels at
-    ``size=small``."""
-    tokens_dropped: float = 0.0
-    """With ``finds``, which share of the training batches has no tokens of pictures, drawn for the present and for the
-    memory apart: of finds alone it is learned sooner. A rollout has them all."""
-    told_objects: str = "nothing"
-    """What rollouts through ``eyes`` are told by the environment all the same (``--env.obs_type=both``), to know what a
-    failure is from: ``nothing``, ``hand`` (what stands near the hand now), ``present`` or ``memory``."""
     sight_errors: float = 0.0
     """With which errors told objects are seen in training, so that the policy acts through ``eyes`` afterwards; 1: as
-    large as those of the package's eyes, 0: none. With ``finds``, told objects stand then for found ones in training,
-    and nothing is sought in a dataset's pictures."""
-    sight_errors_share: float = 1.0
-    """Which share of the frames is seen so; the others as they are told: a policy for both."""
+    large as those of the package's eyes, 0: none."""
     object_classes: list[str] | None = None
     """Names of the classes that slots were trained with, in order of their indices; none: those of this version."""
-    word_order: bool = False
-    """Whether the action expert's norms are told in which order an instruction's words stand, and not only which words
-    (`backbone.InstructionCondition`): for tasks whose instruction says one. Not where the state enters as words."""
 
     base_weights: str | None = None
     """Folder or repository of pi0.5 weights to start from (e.g. ``lerobot/pi05_base``); none: from scratch."""
@@ -141,8 +123,6 @@ class MemobenchMemSettings(PI05Config):
     objective: str = SIZES_OWN
     """How actions are learned: ``flow_matching``, as in pi0.5, or ``regression``, whose plan is one pass of the model
     instead of ten (`action_objective`). None: the size's, ``regression`` at ``small``."""
-    prompt_loss: bool = False
-    """Whether prompt frames (``phase == 0``), whose actions have no effect, count in the action loss."""
     ema_decay: float = SIZES_OWN
     """Decay of the weights' moving average, which evaluation uses; 0 turns it off. None: the size's, the paper's
     0.999 or 0.995 at ``small``."""
@@ -155,7 +135,6 @@ class MemobenchMemSettings(PI05Config):
     prompted_weight: float = 1.0
     """How many times as often as another a task that begins with a prompt is drawn, where tasks are balanced: to read a
     prompt takes more updates than to act."""
-    freeze_vision_encoder: bool = True
     warmup_fraction: float = 0.05
     final_lr: float = SIZES_OWN
     """Learning rate at the end, as a fraction of the highest, to which it falls as a cosine; 1: it stays constant.

@@ -14,7 +14,7 @@ ARMS: dict[str, tuple[str, ...]] = {MEMORY: (), MEMORYLESS: ("policy.integration
 ALIGNED = {**ARMS, MEMORY: ("align=semantic",)}
 """The same, with a memory aligned with checkpoint language, which learns referents in fewer updates."""
 
-OBJECTS, FOUND, PIXELS, BOTH = "objects", "found", "pixels", "both"
+OBJECTS, FOUND, PIXELS = "objects", "found", "pixels"
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,6 @@ PERCEPTIONS = {
     OBJECTS: Sight(("perception=objects",)),
     FOUND: Sight(("perception=objects", "policy.sight_errors=1"), ("eyes=package",)),
     PIXELS: Sight(("perception=pixels",), pictures=True),
-    BOTH: Sight(
-        ("perception=pixels", "policy.finds=true", "policy.sight_errors=1", "policy.tokens_dropped=0.8"), pictures=True
-    ),
 }
 """Ways to see. Who is to act by objects that eyes find learns by objects that are told with errors like theirs."""
 

@@ -72,14 +72,9 @@ class EyePerception(nn.Module, Perception):
         return f"{fingerprint({'eyes': self.tower})}-{SIDE}x{SIDE}"
 
     @property
-    def pooled_key(self) -> str:
+    def key(self) -> str:
         """Identity of the pooled tokens: weights, and size of the pictures."""
         return f"{self._sight}-eyes{self.tokens_per_frame}"
-
-    @property
-    def key(self) -> str:
-        """Identity of what is remembered."""
-        return self.pooled_key
 
     @property
     def present_key(self) -> str:
@@ -120,10 +115,6 @@ class EyePerception(nn.Module, Perception):
     def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
         """Return the pooled tokens (n, 16, WIDTH) of some rows' pictures."""
         return self.pooled(self.look(batch[self.remembers][list(rows)]))
-
-    def recall(self, pooled: Tensor, columns: Mapping[str, Tensor], frames: Sequence[int]) -> Tensor:
-        """Return what `remember` does of recorded frames, of their ``pooled`` tokens and a dataset's ``columns``."""
-        return pooled
 
     def prefix(self, observed: Tensor) -> Tensor:
         """Return prefix tokens (B, 64, d_vlm) of a camera's tokens."""

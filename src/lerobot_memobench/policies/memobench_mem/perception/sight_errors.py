@@ -44,18 +44,13 @@ class SightErrors(NamedTuple):
 
     Attributes:
         size: of the errors; 1 is as the package's eyes err, 0 none.
-        share: of the frames that are seen so; the others are seen as they are told.
     """
 
     size: float = 0.0
-    share: float = 1.0
 
     def seen(self, slots: Tensor, hand: Tensor) -> Tensor:
         """Return slots (N, SLOTS, WIDTH) as they are seen beside a hand (N, >= 3)."""
-        if not self.size:
-            return slots
-        wrong = torch.rand(len(slots), 1, 1, device=slots.device) < self.share
-        return torch.where(wrong, as_found(slots, hand, self.size), slots)
+        return as_found(slots, hand, self.size) if self.size else slots
 
 
 TOLD = SightErrors()
