@@ -61,11 +61,10 @@ def test_small_brings_its_recipe_and_leaves_it_to_the_user(tmp_path: Path) -> No
     assert (config.optimizer_lr, config.optimizer_weight_decay, config.ema_decay) == (1e-3, 1e-4, 0.995)
     assert (config.tokens_per_frame, config.moments_per_episode, config.memory_frames) == (2, 6, 32)
     assert config.normalization_mapping["ACTION"] is NormalizationMode.MEAN_STD
-    own = {"chunk_size": 8, "width": 192, "depth": 2, "ema_decay": 0.0, "final_lr": 1.0, "tokens_per_frame": 4}
+    own = {"chunk_size": 8, "ema_decay": 0.0, "final_lr": 1.0, "tokens_per_frame": 4}
     other = MemobenchMemConfig(device="cpu", size="small", perception="objects", **own)
     assert {name: getattr(other, name) for name in own} == own
     assert other.n_action_steps == 6
-    assert (other.dimensions.vlm.width, other.dimensions.vlm.mlp_dim, other.dimensions.vlm.head_dim) == (192, 384, 24)
     other.save_pretrained(tmp_path)
     assert dataclasses.asdict(PreTrainedConfig.from_pretrained(tmp_path)) == dataclasses.asdict(other)
     before = MemobenchMemConfig(device="cpu", size="tiny")

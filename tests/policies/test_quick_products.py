@@ -11,7 +11,7 @@ from lerobot_memobench.computing import bfloat16
 from tests.support.object_dataset import make_object_dataset
 from tests.support.small_policy import batch_of, made_for_training
 
-OBJECTS = {"perception": "objects", "size": "small", "n_action_steps": 3, "memory_stride": 1, "width": 256}
+OBJECTS = {"perception": "objects", "size": "small", "n_action_steps": 3, "memory_stride": 1}
 
 
 @pytest.fixture(scope="module")

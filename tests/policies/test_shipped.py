@@ -76,7 +76,7 @@ def script() -> ModuleType:
 def test_a_card_tells_every_setting_that_is_not_the_sizes(script: ModuleType) -> None:
     import draccus
 
-    given = {"balance_tasks": False, "chunk_size": 8, "final_lr": 0.1, "integration": "context", "width": 192}
+    given = {"balance_tasks": False, "chunk_size": 8, "final_lr": 0.1, "integration": "context", "memory_frames": 16}
     usual = {"device": "cpu", "size": "small", "perception": "objects"}
     policy = encoded(MemobenchMemConfig(**usual, **given))
     words = script.settings(policy)

@@ -35,7 +35,7 @@ from tests.support.picture_rollouts import made_eyes, observed
 from tests.support.small_policy import batch_of, made_for_training, small_config
 
 INDICES = [10, 30, 50, 80]
-SEEING: dict[str, Any] = {"size": "small", "width": 64, "depth": 2, "n_action_steps": 3, "memory_stride": 2}
+SEEING: dict[str, Any] = {"size": "small", "n_action_steps": 3, "memory_stride": 2}
 SEEING |= {"align": "semantic"}
 
 
@@ -207,7 +207,7 @@ def test_a_foreign_decorator_changes_nothing(monkeypatch: pytest.MonkeyPatch, wr
 
         return functools.wraps(function)(traced) if wraps else traced
 
-    kept = Drawn.of(None, 1)  # ours stands
+    kept = Drawn.of(np.array([0]), 1)  # ours stands
     monkeypatch.setattr(EpisodeAwareSampler, "__init__", foreign(EpisodeAwareSampler.__init__))
     assert frames() == expected
     del kept  # ours goes
@@ -239,7 +239,7 @@ def test_a_sampler_that_is_not_ours_is_refused(monkeypatch: pytest.MonkeyPatch) 
 def test_a_function_that_takes_something_else_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(EpisodeAwareSampler, "__init__", lambda self, begin, end: None)
     with pytest.raises(MemobenchError, match=r"takes \(self, begin, end\) and not .*lerobot 0\.6\.1.*make setup"):
-        Drawn.of(None, 1)
+        Drawn.of(np.array([0]), 1)
 
 
 def test_a_foreign_reader_and_foreign_attention_are_kept(
