@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_memobench.run.short_forms import MEANINGS
+from lerobot_memobench.run.arguments import MEANINGS
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("src/**/*.md")])

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from lerobot_memobench.envs.episode_log import EpisodeLog, has_log, read_episodes
-from lerobot_memobench.run.flags import flag_value
+from lerobot_memobench.run.arguments import flag_value
 from lerobot_memobench.tasks.catalogue import load_task
 
 
@@ -112,6 +112,6 @@ def fake_lerobot(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeLeRobot
     """LeRobot is replaced, and the present folder is an empty one."""
     import lerobot_policy_memobench  # noqa: F401 - what LeRobot would find by looking through all that is installed
 
-    monkeypatch.setattr("lerobot_memobench.run.reading.register_plugins", lambda: None)
+    monkeypatch.setattr("lerobot_memobench.run.arguments.register_plugins", lambda: None)
     monkeypatch.chdir(tmp_path)
     return FakeLeRobot(monkeypatch)

@@ -26,8 +26,7 @@ from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID
 from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.run.flags import flag_value
-from lerobot_memobench.run.short_forms import EVALUATION_WORDS, MEANINGS, SHORT_FORMS, TRAINING_WORDS
+from lerobot_memobench.run.arguments import EVALUATION_WORDS, MEANINGS, SHORT_FORMS, TRAINING_WORDS, flag_value
 
 TASK = "turn_on_the_stove_and_turn_it_off"
 
@@ -153,7 +152,7 @@ def test_what_the_user_sets_stays(evaluation: Called) -> None:
 
 
 def test_the_batch_divides_the_episodes(evaluation: Called, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lerobot_memobench.run.defaults.cores", lambda: 16)
+    monkeypatch.setattr("lerobot_memobench.run.plan.cores", lambda: 16)
     evaluation.action = log_episodes
     assert main(["eval", "env=memobench", "episodes=9"]) == 0
     assert evaluation.value("eval.batch_size") == "9"

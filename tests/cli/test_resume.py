@@ -255,7 +255,7 @@ def test_more_parts_than_batches(fake_lerobot: Any, capsys: pytest.CaptureFixtur
 def test_parts_do_not_depend_on_the_cores_of_a_machine(fake_lerobot: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     words = [word for word in COMMAND if not word.startswith("batch_size")]
     for cores in (2, 64):
-        monkeypatch.setattr("lerobot_memobench.run.defaults.cores", lambda cores=cores: cores)
+        monkeypatch.setattr("lerobot_memobench.run.plan.cores", lambda cores=cores: cores)
         assert main([*words, f"output_dir=out{cores}", "shard=2/3"]) == 0
     assert comparable("out2/shard-2-of-3") == comparable("out64/shard-2-of-3")
 

@@ -29,7 +29,7 @@ from lerobot_memobench.policies.memobench_expert.configuration_memobench_expert 
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_random.configuration_memobench_random import MemobenchRandomConfig
 from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
-from lerobot_memobench.run.lerobot_command import call_lerobot
+from lerobot_memobench.run.lerobot_commands import call_lerobot
 from lerobot_memobench.run.merging import merge
 from lerobot_memobench.sim.object_slots import SIZE
 

@@ -17,7 +17,8 @@ from lerobot_memobench.cli.report import ReportFormat, compare, report
 from lerobot_memobench.envs.episode_log import check_protocol, read_episodes, write_protocol
 from lerobot_memobench.run import rerun as again
 from lerobot_memobench.run.card import new_card, with_episodes, write_card
-from lerobot_memobench.run.resume import earlier_batch_size, resumed_card
+from lerobot_memobench.run.plan import earlier_batch_size
+from lerobot_memobench.run.run import resumed_card
 from tests.support import logs, mutations
 
 STOVE, DRAWER = "press_the_stove_button_four_times", "two_of_them"

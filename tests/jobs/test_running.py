@@ -14,7 +14,7 @@ from filelock import lock_descriptor
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.executors import Datatrove, Needs, asked_for, check_executor, options_told, run_jobs
 from lerobot_memobench.jobs.processes import Advance, locked, taking_turns
-from lerobot_memobench.run.words import executor_options
+from lerobot_memobench.run.arguments import executor_options
 from tests.support.note_job import Note
 
 needs_datatrove = pytest.mark.skipif(find_spec("datatrove") is None, reason="datatrove is not installed")

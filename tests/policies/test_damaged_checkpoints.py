@@ -14,9 +14,8 @@ from lerobot_memobench.policies.checkpoint import check_checkpoint, checkpoint_t
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.saved_steps import require_agreement
 from lerobot_memobench.policies.memobench_mem.weights import require_statistics
-from lerobot_memobench.run.policy_identity import training_facts
-from lerobot_memobench.run.reading import read_settings
-from lerobot_memobench.run.words import split_words
+from lerobot_memobench.run.arguments import read_settings, split_words
+from lerobot_memobench.run.card import training_facts
 from tests.support import mutations
 
 FEATURES = {"observation.state": {"type": "STATE", "shape": [8]}, "action": {"type": "ACTION", "shape": [7]}}

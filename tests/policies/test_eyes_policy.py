@@ -249,7 +249,7 @@ def test_a_sample_has_tokens_in_the_place_of_pictures(root: Path, seeing: dict[s
 
 
 def test_pictures_that_are_changed_are_refused(root: Path, seeing: dict[str, Any]) -> None:
-    from lerobot_memobench.run.lerobot_training import trained_on
+    from lerobot_memobench.run.training import trained_on
 
     policy, _, _, dataset = made_for_training(root, **seeing)
     dataset.set_image_transforms(lambda picture: 1 - picture)

@@ -13,7 +13,7 @@ import pytest
 from lerobot_memobench.envs.episode_log import read_episodes, read_protocol_file
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.protocol import EXECUTION, PROMPT
-from lerobot_memobench.run.lerobot_command import call_lerobot
+from lerobot_memobench.run.lerobot_commands import call_lerobot
 
 MILK = "find_the_specific_milk_pointed_out_in_the_prompt_video_and_put_it_on_the_plate"
 PROMPTS = [147, 165]

@@ -13,8 +13,7 @@ from safetensors import safe_open
 
 import lerobot_policy_memobench  # noqa: F401  (registers the policy and the environment)
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.run.recipes import recipe_file, recipes, resolve_recipe
-from lerobot_memobench.run.words import split_words
+from lerobot_memobench.run.arguments import recipe_file, recipes, resolve_recipe, split_words
 
 RECIPE = "train_paper"
 WEIGHTS = {"semantic": 0.1, "contrastive": 0.1, "framewise": 0.05}

@@ -14,9 +14,9 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies import checkpoint
 from lerobot_memobench.policies.checkpoint import SHIPPED
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.run import memory_demo
-from lerobot_memobench.run.choices import checkpoint_of
-from lerobot_memobench.run.policy_identity import encoded
+from lerobot_memobench.run import demo
+from lerobot_memobench.run.arguments import checkpoint_of
+from lerobot_memobench.run.card import encoded
 from lerobot_memobench.tasks.catalogue import BOWL, task_names
 from tests.support.scripts import load_script
 
@@ -50,16 +50,16 @@ def test_a_policy_is_found_by_its_name(shipped: Path, tmp_path: Path, monkeypatc
 
 
 def test_the_demo_compares_only_what_is_there(shipped: Path) -> None:
-    assert not memory_demo.has_policies()
+    assert not demo.has_policies()
     (shipped / "memobench_small_memoryless").mkdir()
     (shipped / "memobench_small_memoryless" / "config.json").write_text("{}")
-    assert memory_demo.has_policies()
+    assert demo.has_policies()
 
 
 def test_a_name_that_is_nearly_one_is_told(shipped: Path) -> None:
     from lerobot.configs.eval import EvalPipelineConfig
 
-    from lerobot_memobench.run.choices import choice_flags
+    from lerobot_memobench.run.arguments import choice_flags
 
     with pytest.raises(MemobenchError, match="did you mean 'memobench_small'"):
         choice_flags(EvalPipelineConfig, "policy", "memobench_smal")

@@ -31,7 +31,7 @@ from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.settings_memobench_mem import FIXED, OF_ACTING, OF_TRAINING, SINCE_BEGUN
 from lerobot_memobench.policies.shown import SIZE_COUNTS, check_features, check_policy
-from lerobot_memobench.run.lerobot_command import call_lerobot
+from lerobot_memobench.run.lerobot_commands import call_lerobot
 
 TASK = "turn_on_the_stove_and_turn_it_off"
 IMAGES, STATE, ACTION = "observation.images.", "observation.state", "action"

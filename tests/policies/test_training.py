@@ -17,7 +17,7 @@ from safetensors import safe_open
 
 from lerobot_memobench.policies.memobench_mem import training_curve
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.run.lerobot_training import trained_on
+from lerobot_memobench.run.training import trained_on
 from tests.support.synthetic_dataset import make_dataset
 
 

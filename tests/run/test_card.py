@@ -13,13 +13,23 @@ import pytest
 from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records.protocol import read_card
-from lerobot_memobench.run.card import extended, joined_runs, new_card, with_episodes, write_card
-from lerobot_memobench.run.card_markdown import markdown
+from lerobot_memobench.run.card import (
+    checkpoint_files,
+    disagreement,
+    extended,
+    joined_runs,
+    markdown,
+    new_card,
+    outcome,
+    policy_facts,
+    training_facts,
+    tree_hash,
+    with_episodes,
+    write_card,
+)
 from lerobot_memobench.run.machine import run_facts
 from lerobot_memobench.run.merging import merge
-from lerobot_memobench.run.outcomes import disagreement, outcome
-from lerobot_memobench.run.policy_identity import checkpoint_files, policy_facts, training_facts, tree_hash
-from lerobot_memobench.run.resume import resumed_card
+from lerobot_memobench.run.run import resumed_card
 
 
 def record(task: str = "a_task", episode: int = 0, **changes: Any) -> dict[str, Any]:

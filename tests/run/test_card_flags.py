@@ -18,13 +18,11 @@ from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash
 from lerobot_memobench.perception.weights import SHIPPED
-from lerobot_memobench.run import card_flags
-from lerobot_memobench.run.card import new_card, with_episodes, write_card
-from lerobot_memobench.run.card_flags import allowed_flags
+from lerobot_memobench.run import rerun as card_flags
+from lerobot_memobench.run.card import checkpoint_files, new_card, tree_hash, with_episodes, write_card
 from lerobot_memobench.run.machine import run_facts
-from lerobot_memobench.run.planning import plan_line
-from lerobot_memobench.run.policy_identity import checkpoint_files, tree_hash
-from lerobot_memobench.run.rerun import check_policy, plan_of_card, repeatable_card
+from lerobot_memobench.run.plan import plan_line
+from lerobot_memobench.run.rerun import allowed_flags, check_policy, plan_of_card, repeatable_card
 
 STOVE, DRAWER = "turn_on_the_stove_and_turn_it_off", "check_the_top_drawer_of_the_cabinet"
 RECORD = {"task": STOVE, "memory_type": "temporal", "episode": 0, "seed": 7, "success": True, "checkpoints": []}
@@ -34,7 +32,7 @@ RECORD = {"task": STOVE, "memory_type": "temporal", "episode": 0, "seed": 7, "su
 def in_folder(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """An empty folder, and no look through all that is installed."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("run.reading", "run.card_flags"):
+        for module in ("run.arguments", "run.rerun"):
             patch.setattr(f"lerobot_memobench.{module}.register_plugins", lambda: None)
         patch.chdir(tmp_path_factory.mktemp("here"))
         Path("tasks").mkdir()

@@ -10,10 +10,11 @@ import pytest
 from PIL import Image
 
 from lerobot_memobench.envs.episode_log import write_episodes
+from lerobot_memobench.envs.video import LAST_FRAMES, Film
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.html import write_html
-from lerobot_memobench.run import contact_sheet as sheets
-from lerobot_memobench.run import demo, memory_demo
+from lerobot_memobench.run import demo
+from lerobot_memobench.run.demo import FAILED, SOLVED, STRIP_WIDTH, TITLE, joined, read_video, side_by_side, strip
 from lerobot_memobench.tasks.catalogue import BOWL, get_task
 from tests.support.logs import rollout
 
@@ -40,7 +41,7 @@ def fake_evaluation(output: Path) -> int:
 
 def fake_comparison(work: Path, made: Path) -> None:
     made.mkdir(parents=True)
-    for name in (memory_demo.MEMORY_FILM, memory_demo.MEMORY_STRIP, memory_demo.MEMORY_TABLE):
+    for name in (demo.MEMORY_VIDEO, demo.MEMORY_STRIP, demo.MEMORY_TABLE):
         (made / name).write_text(name)
 
 
@@ -58,9 +59,10 @@ def test_the_demo_folder(tmp_path: Path) -> None:
     assert {path.name for path in (out / "videos").iterdir()} == {f"{name}.0.mp4" for name in demo.TASKS}
     with Image.open(out / "contact_sheet.png") as sheet:
         pixels = np.asarray(sheet.convert("L")).astype(int)
-    assert pixels.shape == (4 * 160, sheets.FRAMES_PER_VIDEO * sheets.COLUMN_WIDTH)
-    means = pixels[:160].reshape(160, sheets.FRAMES_PER_VIDEO, -1).mean(axis=(0, 2))
+    assert pixels.shape == (4 * 160, demo.FRAMES_PER_VIDEO * demo.COLUMN_WIDTH)
+    means = pixels[:160].reshape(160, demo.FRAMES_PER_VIDEO, -1).mean(axis=(0, 2))
     assert (np.diff(means) > 20).all()  # evenly spaced in time, left to right
+    assert (means[0] < 20, means[-1] > 235) == (True, True), "both ends are there"
 
 
 def test_the_html_report_finds_the_demos_films(tmp_path: Path) -> None:
@@ -86,7 +88,7 @@ def test_a_failed_evaluation_leaves_the_earlier_demo(tmp_path: Path) -> None:
 def test_a_failed_comparison_leaves_the_earlier_demo(tmp_path: Path) -> None:
     (tmp_path / "report.json").write_text("earlier")
     with pytest.raises(MemobenchError, match="the evaluation expert has failed"):
-        demo.make_demo(tmp_path, fake_evaluation, lambda *where: memory_demo.compare_memories(*where, lambda *_: 2))
+        demo.make_demo(tmp_path, fake_evaluation, lambda *where: demo.compare_memories(*where, lambda *_: 2))
     assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
 
 
@@ -102,29 +104,29 @@ def test_the_memories_are_compared_on_the_same_episodes(tmp_path: Path) -> None:
         write_video(folder / "videos" / f"{BOWL}.1.mp4")  # the first on which they differ
         return 0
 
-    told = memory_demo.compare_memories(tmp_path / "work", tmp_path / "made", evaluate)
+    told = demo.compare_memories(tmp_path / "work", tmp_path / "made", evaluate)
     assert [one.solved for one in told.values()] == [
         (True, True, True, True, True),
         (True, True, True, False, True),
         (True, False, False, False, True),
     ]
-    assert "| without memory | 2/5 | 2 |" in (tmp_path / "made" / memory_demo.MEMORY_TABLE).read_text()
-    frames = sheets.read_video(tmp_path / "made" / memory_demo.MEMORY_FILM)
+    assert "| without memory | 2/5 | 2 |" in (tmp_path / "made" / demo.MEMORY_TABLE).read_text()
+    frames = demo.read_video(tmp_path / "made" / demo.MEMORY_VIDEO)
     assert frames[0].shape[1] == 3 * 128, "three films side by side"
 
 
 def test_what_is_compared_differs_in_the_policy_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory_demo, "plan_line", lambda words: words)
-    told = [memory_demo.memory_plan(name, tmp_path) for name in memory_demo.WHO]
+    monkeypatch.setattr(demo, "plan_line", lambda words: words)
+    told = [demo.memory_plan(name, tmp_path) for name in demo.POLICIES]
     others = [[word for word in words if not word.startswith("policy=")] for words in told]
     assert others[0] == others[1] == others[2]
     assert [len(words) - len(rest) for words, rest in zip(told, others, strict=True)] == [0, 1, 1]
 
 
 def test_without_trained_policies_the_demo_is_the_experts(tmp_path: Path) -> None:
-    (tmp_path / memory_demo.MEMORY_TABLE).write_text("of an earlier demo")
+    (tmp_path / demo.MEMORY_TABLE).write_text("of an earlier demo")
     assert demo.make_demo(tmp_path, fake_evaluation, None) == 0
-    assert not {path.name for path in tmp_path.iterdir()} & {memory_demo.MEMORY_FILM, memory_demo.MEMORY_TABLE}
+    assert not {path.name for path in tmp_path.iterdir()} & {demo.MEMORY_VIDEO, demo.MEMORY_TABLE}
 
 
 def test_a_missing_video_is_named(tmp_path: Path) -> None:
@@ -132,6 +134,52 @@ def test_a_missing_video_is_named(tmp_path: Path) -> None:
         demo.collect_videos(tmp_path, tmp_path / "videos")
 
 
-def test_even_distances_hold_both_ends() -> None:
-    frames = [np.full((1, 1, 3), k, dtype=np.uint8) for k in range(11)]
-    assert [int(frame[0, 0, 0]) for frame in sheets.evenly(frames, 3)] == [0, 5, 10]
+HEIGHT, WIDTH = 32, 64
+
+
+@pytest.fixture
+def films(tmp_path: Path) -> dict[str, tuple[Path, bool]]:
+    """A grey film of five frames that is solved, and a bright one of nine that is not."""
+    found = {}
+    for name, shade, length, solved in (("with", 60, 5, True), ("without", 200, 9, False)):
+        film = Film(tmp_path / f"{name}.mp4")
+        for _ in range(length):
+            film.add(np.full((HEIGHT, WIDTH, 3), shade, np.uint8))
+        path = film.finish()
+        assert path is not None
+        found[name] = (path, solved)
+    return found
+
+
+def coloured(picture: np.ndarray, colour: tuple[int, int, int]) -> bool:
+    return bool((picture == colour).all(axis=-1).any())
+
+
+def test_films_stand_side_by_side_and_say_how_they_ended(films: dict[str, tuple[Path, bool]], tmp_path: Path) -> None:
+    frames = list(joined(films))
+    assert len(frames) == 9 + LAST_FRAMES
+    assert frames[0].shape == (TITLE + HEIGHT, 2 * WIDTH, 3)
+    left, right = frames[0][TITLE:, :WIDTH], frames[0][TITLE:, WIDTH:]
+    assert abs(float(left.mean()) - 60) < 4
+    assert abs(float(right.mean()) - 200) < 4
+    ends = [[coloured(frame[:TITLE], colour) for frame in frames] for colour in (SOLVED, FAILED)]
+    assert [end.index(True) for end in ends] == [5 + LAST_FRAMES - 1, 9 + LAST_FRAMES - 1]
+    written = read_video(side_by_side(films, tmp_path / "both.mp4"))
+    assert len(written) == len(frames) + LAST_FRAMES
+
+
+def test_a_film_that_cannot_be_read_leaves_nothing(films: dict[str, tuple[Path, bool]], tmp_path: Path) -> None:
+    out = tmp_path / "new" / "both.mp4"
+    broken = tmp_path / "broken.mp4"
+    broken.write_bytes(b"no film")
+    with pytest.raises(Exception, match="Invalid data"):
+        side_by_side({**films, "broken": (broken, False)}, out)
+    assert not out.exists()
+
+
+def test_a_strip_has_a_row_per_film(films: dict[str, tuple[Path, bool]]) -> None:
+    picture = np.asarray(strip(films))
+    assert picture.shape == (2 * (TITLE + STRIP_WIDTH * HEIGHT // WIDTH), 6 * STRIP_WIDTH, 3)
+    half = len(picture) // 2
+    assert coloured(picture[:TITLE], SOLVED)
+    assert coloured(picture[half : half + TITLE], FAILED)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lerobot_memobench.run.flags import flag_value, has_flag, joined_flags, whole_number, without_flag
+from lerobot_memobench.run.arguments import flag_value, has_flag, joined_flags, whole_number, without_flag
 
 
 def test_flags_are_found_in_both_spellings() -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_memobench.run.folder import made
+from lerobot_memobench.run.run import made
 
 
 def test_of_a_new_folder_nothing_empty_stays(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from typing import Any, cast
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lerobot_memobench.run.grid import Grid, Place, Shard, parse_shard, task_names
+from lerobot_memobench.run.plan import Grid, Place, Shard, parse_shard, task_names
 
 
 def place(name: str, number: int = 0) -> Place:

@@ -18,10 +18,8 @@ from lerobot.scripts import lerobot_eval
 
 from lerobot_memobench import lerobot_hooks
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.run.loop import rollout as our_loop
-from lerobot_memobench.run.loop.looking import KNOWN
-from lerobot_memobench.run.loop.rollout import KEEPS_FRAMES, RECORDS
-from lerobot_memobench.run.loop.steering import batch_seed, steered
+from lerobot_memobench.run import rollout as our_loop
+from lerobot_memobench.run.rollout import KEEPS_FRAMES, KNOWN, RECORDS, batch_seed, steered
 
 
 class Env:
@@ -56,7 +54,7 @@ PARAMETERS = {
     },
 }
 
-LOOKING = "src/lerobot_memobench/run/loop/looking.py says by it when the policy looks at pictures"
+LOOKING = "src/lerobot_memobench/run/rollout.py says by it when the policy looks at pictures"
 
 CALLS = {
     ("eval_policy", "rollout("): "looks rollout up in its module for each batch, where _seeded() stands",
@@ -74,11 +72,11 @@ CALLS = {
 READ = {
     "lerobot.scripts.lerobot_eval.rollout": (
         "ed85d8da2c46",
-        "src/lerobot_memobench/run/loop/rollout.py takes the same steps in the same order",
+        "src/lerobot_memobench/run/rollout.py takes the same steps in the same order",
     ),
     "lerobot.envs.utils.preprocess_observation": (
         "10196a71b8af",
-        "src/lerobot_memobench/run/loop/rollout.py keeps the pictures that it makes, by their names",
+        "src/lerobot_memobench/run/rollout.py keeps the pictures that it makes, by their names",
     ),
     "lerobot.policies.act.modeling_act.ACTPolicy.select_action": ("031085d1a22c", LOOKING),
     "lerobot.policies.pi0.modeling_pi0.PI0Policy.select_action": ("a330b536084c", LOOKING),

@@ -23,7 +23,7 @@ from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.datasets import execution_frames
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.run.lerobot_training import trained_on
+from lerobot_memobench.run.training import trained_on
 
 LENGTHS, PROMPTS = (40, 23, 31), (0, 8, 0)
 START = LENGTHS[0] + PROMPTS[1]
@@ -55,7 +55,7 @@ CALLS = {
 def test_lerobot_does_what_is_relied_on(function: Any, call: str) -> None:
     assert call in inspect.getsource(function), (
         f"{function.__name__} holds no {call!r} any more; it was relied on that it {CALLS[function, call]}. Look at "
-        "src/lerobot_memobench/run/lerobot_training.py"
+        "src/lerobot_memobench/run/training.py"
     )
 
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.run.grid import Shard
-from lerobot_memobench.run.orders import Orders, take_orders
-from lerobot_memobench.run.words import Words
+from lerobot_memobench.run.arguments import Words
+from lerobot_memobench.run.plan import Orders, Shard, take_orders
 
 
 def orders(*settings: str) -> Orders:

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_memobench.run.orders import Orders
-from lerobot_memobench.run.plan import EvaluationPlan
-from lerobot_memobench.run.translation import LerobotSettings
+from lerobot_memobench.run.arguments import LerobotSettings
+from lerobot_memobench.run.plan import EvaluationPlan, Orders
 
 
 def evaluation(*flags: str) -> EvaluationPlan:

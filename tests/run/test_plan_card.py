@@ -8,7 +8,7 @@ from typing import Any
 import huggingface_hub
 import pytest
 
-from lerobot_memobench.run.plan_card import with_checkpoint
+from lerobot_memobench.run.card import with_checkpoint
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 

@@ -13,11 +13,10 @@ import lerobot_memobench.registration  # noqa: F401
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.run.flags import flag_value
-from lerobot_memobench.run.grid import Shard
-from lerobot_memobench.run.plan_card import card_of
-from lerobot_memobench.run.planning import plan_line
-from lerobot_memobench.run.resume import remainder
+from lerobot_memobench.run.arguments import flag_value
+from lerobot_memobench.run.card import card_of
+from lerobot_memobench.run.plan import Shard, plan_line
+from lerobot_memobench.run.run import remainder
 from lerobot_memobench.run.shards import executor_options, plan_shards
 
 STOVE, DRAWER = "turn_on_the_stove_and_turn_it_off", "check_the_top_drawer_of_the_cabinet"
@@ -27,7 +26,7 @@ LINE = ["env=memobench", f"tasks={STOVE},{DRAWER}", "episodes=4", "policy=memobe
 @pytest.fixture(autouse=True)
 def in_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("lerobot_memobench.run.reading.register_plugins", lambda: None)
+    monkeypatch.setattr("lerobot_memobench.run.arguments.register_plugins", lambda: None)
 
 
 def test_a_plan_says_everything() -> None:

@@ -18,7 +18,7 @@ from lerobot_memobench.envs import episode
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.run.loop.rollout import sparing
+from lerobot_memobench.run.rollout import sparing
 from lerobot_memobench.sim.object_slots import SIZE
 from lerobot_memobench.sim.rendering import close_renderers, gl_backend
 
@@ -38,7 +38,7 @@ def short_prompts(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         gl_backend()
     except MemobenchError as error:
         pytest.skip(str(error))
-    monkeypatch.setattr(episode, "PROMPT_LIMIT", PROMPT)
+    monkeypatch.setattr(episode, "PROMPT_HORIZON", PROMPT)
     yield
     close_renderers()
 

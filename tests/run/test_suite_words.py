@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.run.reading import check_task_names
-from lerobot_memobench.run.words import split_words
+from lerobot_memobench.run.arguments import check_task_names, split_words
 
 STRICT, PUBLISHED = "open_and_close_the_microwave_a_given_number_of_times", "open_and_close_the_microwave"
 

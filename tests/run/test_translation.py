@@ -11,9 +11,7 @@ from lerobot.configs.train import TrainPipelineConfig
 
 import lerobot_memobench.registration  # noqa: F401
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.run.recipes import recipe_file, recipes
-from lerobot_memobench.run.translation import LerobotSettings, translate
-from lerobot_memobench.run.words import split_words
+from lerobot_memobench.run.arguments import LerobotSettings, recipe_file, recipes, split_words, translate
 
 
 def evaluated(*words: str) -> list[str]:

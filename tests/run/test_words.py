@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.run.words import executor_options, split_words
+from lerobot_memobench.run.arguments import executor_options, split_words
 
 
 def test_words_are_taken_apart() -> None:

@@ -30,7 +30,7 @@ from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.jobs.threads import by_the_libraries, by_the_rule
 from lerobot_memobench.policies.memobench_random.modeling_memobench_random import MemobenchRandomPolicy
 from lerobot_memobench.protocol import EVALUATION_SEED
-from lerobot_memobench.run.planning import plan_line
+from lerobot_memobench.run.plan import plan_line
 from lerobot_memobench.run.run import run_evaluation
 
 NEVER, EACH, FIFTH = 0, 1, 5

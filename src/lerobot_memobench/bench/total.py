@@ -18,7 +18,7 @@ from lerobot_memobench.bench.machine import machine
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import EVALUATION_EPISODES, HORIZON
-from lerobot_memobench.run.planning import plan_line
+from lerobot_memobench.run.plan import plan_line
 from lerobot_memobench.run.run import run_evaluation
 from lerobot_memobench.tasks.catalogue import task_names
 

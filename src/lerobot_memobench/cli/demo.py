@@ -22,16 +22,17 @@ def demo(
 
     from lerobot_memobench.cli.evaluate import evaluate_here, tell, tell_beginning
     from lerobot_memobench.evaluation.documents.report import REPORT_MARKDOWN
-    from lerobot_memobench.run.demo import CONTACT_SHEET, demo_plan, make_demo
-    from lerobot_memobench.run.folder import VIDEOS
-    from lerobot_memobench.run.memory_demo import (
-        MEMORY_FILM,
+    from lerobot_memobench.run.demo import (
+        CONTACT_SHEET,
         MEMORY_TABLE,
+        MEMORY_VIDEO,
         compare_memories,
+        demo_plan,
         has_policies,
+        make_demo,
         memory_plan,
     )
-    from lerobot_memobench.run.run import run_evaluation
+    from lerobot_memobench.run.run import VIDEOS, run_evaluation
 
     def one_of_three(name: str, folder: Path) -> int:
         return run_evaluation(memory_plan(name, folder), tell, tell_beginning).status
@@ -49,6 +50,6 @@ def demo(
     screen.print(f"report:  {out / REPORT_MARKDOWN}", soft_wrap=True)
     screen.print(f"videos:  {out / VIDEOS}", soft_wrap=True)
     screen.print(f"picture: {out / CONTACT_SHEET}", soft_wrap=True)
-    if (out / MEMORY_FILM).is_file():
-        screen.print(f"memory:  {out / MEMORY_FILM}", soft_wrap=True)
+    if (out / MEMORY_VIDEO).is_file():
+        screen.print(f"memory:  {out / MEMORY_VIDEO}", soft_wrap=True)
     return 0

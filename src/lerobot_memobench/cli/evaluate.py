@@ -13,16 +13,12 @@ from lerobot_memobench.evaluation.documents.sentences import saw_phrase
 from lerobot_memobench.io import count_of
 from lerobot_memobench.jobs.executors import asked_for
 from lerobot_memobench.jobs.processes import saying_how_to_go_on
-from lerobot_memobench.run.lerobot_command import call_lerobot
+from lerobot_memobench.run.arguments import Words, read_settings
+from lerobot_memobench.run.lerobot_commands import call_lerobot
 from lerobot_memobench.run.merging import merge_and_report
-from lerobot_memobench.run.orders import take_orders
-from lerobot_memobench.run.plan import EvaluationPlan
-from lerobot_memobench.run.planning import is_benchmark, make_plan
-from lerobot_memobench.run.reading import read_settings
-from lerobot_memobench.run.reporting import EvaluationReport
-from lerobot_memobench.run.run import run_evaluation
+from lerobot_memobench.run.plan import EvaluationPlan, is_benchmark, make_plan, take_orders
+from lerobot_memobench.run.run import EvaluationReport, run_evaluation
 from lerobot_memobench.run.shards import executor_options, plan_shards, run_shards
-from lerobot_memobench.run.words import Words
 
 if TYPE_CHECKING:
     from lerobot_memobench.jobs.processes import Advance

@@ -14,7 +14,7 @@ from lerobot_memobench.cli.suite import Suite, WhichSuite
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.terminal import Unbroken
 from lerobot_memobench.jobs.executors import asked_for, options_told
-from lerobot_memobench.run.words import executor_options
+from lerobot_memobench.run.arguments import executor_options
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 
 if TYPE_CHECKING:

@@ -16,13 +16,17 @@ from pathlib import Path
 from lerobot_memobench.cli.errors import one_sentence
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.jobs.processes import saying_how_to_go_on
-from lerobot_memobench.run.flags import flag_value
-from lerobot_memobench.run.lerobot_command import call_lerobot
-from lerobot_memobench.run.lerobot_commands import lerobot_commands, without_configuration
-from lerobot_memobench.run.reading import check_task_names, read_settings
-from lerobot_memobench.run.recipes import resolve_recipe
-from lerobot_memobench.run.short_forms import MEANINGS, help_text
-from lerobot_memobench.run.words import Words, split_words
+from lerobot_memobench.run.arguments import (
+    MEANINGS,
+    Words,
+    check_task_names,
+    flag_value,
+    help_text,
+    read_settings,
+    resolve_recipe,
+    split_words,
+)
+from lerobot_memobench.run.lerobot_commands import call_lerobot, lerobot_commands, without_configuration
 
 USAGE_ERROR = 2
 
@@ -89,7 +93,7 @@ def train(words: Words, line: Sequence[str]) -> int:
     if words.wants_help:
         return call_lerobot("train", settings.flags)
     from lerobot_memobench.datasets.lerobot_format.layout import naming_damage
-    from lerobot_memobench.run.lerobot_training import trained_on
+    from lerobot_memobench.run.training import trained_on
 
     settings = complete_training(settings)
     root = flag_value(settings.flags, "dataset.root")

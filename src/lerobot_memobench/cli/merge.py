@@ -34,7 +34,7 @@ def rerun(
     from lerobot_memobench.cli.evaluate import evaluate_here
     from lerobot_memobench.envs.episode_log import read_episodes
     from lerobot_memobench.run import rerun as again
-    from lerobot_memobench.run.outcomes import first_disagreement
+    from lerobot_memobench.run.card import first_disagreement
 
     told = again.repeatable_card(card, server)
     again.check_policy(told)

@@ -8,7 +8,7 @@ import typer
 from rich.table import Table
 
 from lerobot_memobench.cli.console import console
-from lerobot_memobench.run.recipes import recipe_file, recipes
+from lerobot_memobench.run.arguments import recipe_file, recipes
 
 
 def recipe(

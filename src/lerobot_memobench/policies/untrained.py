@@ -14,7 +14,7 @@ class UntrainedConfig(PreTrainedConfig):
     """Answers to what LeRobot asks every policy's configuration, of one that is never trained."""
 
     perception: ClassVar[str] = "any"
-    """Whatever is observed will do (`envs.obs_types`), also where a checkpoint lists pictures among its features."""
+    """Whatever is observed will do (`envs.observations`), also where a checkpoint lists pictures among its features."""
 
     weightless: ClassVar[bool] = True
     """Nothing is computed in this process that more than one core would be quicker at (`jobs.threads`)."""

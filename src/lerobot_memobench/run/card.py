@@ -17,14 +17,20 @@ from __future__ import annotations
 
 import datetime as dt
 import json
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired, TypedDict
 
+from lerobot_memobench.envs.acting import ELSEWHERE, checkpoint_files, encoded, tree_hash
+from lerobot_memobench.envs.episode_log import EXTENT, SAW, SETTINGS
+from lerobot_memobench.envs.observations import what_is_seen
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records.protocol import CARD_FILE
-from lerobot_memobench.io import write_file
-from lerobot_memobench.run.card_markdown import markdown
-from lerobot_memobench.run.outcomes import outcome
+from lerobot_memobench.io import Count, file_hash, read_json, write_file
+from lerobot_memobench.policies.checkpoint import ADAPTER_FILE, WEIGHTS_FILE, local_folder, portable_path
+from lerobot_memobench.run.machine import gl_facts, run_facts
+from lerobot_memobench.run.plan import EvaluationPlan
 
 FORMAT = 1
 CARD_MARKDOWN = "card.md"
@@ -128,3 +134,252 @@ def _json(card: Mapping[str, Any]) -> str:
         text.replace('"episodes": []\n}', f'"episodes": [\n{episodes}\n ]\n}}' if episodes else '"episodes": []\n}')
         + "\n"
     )
+
+
+# ==== plan_card.py
+# The card of a plan: what is known of an evaluation before it has found anything.
+
+
+def card_of(plan: EvaluationPlan, *, here: bool = True) -> dict[str, Any]:
+    """Return the card of an evaluation that is about to begin. Hashes the checkpoint, opens a GL context if need be.
+
+    Args:
+        here: whether it is run on this machine, whose GL then counts.
+    """
+    shard = plan.orders.shard
+    card = new_card(
+        protocol=_plan_protocol(plan),
+        policy={} if plan.policy is None else policy_facts(encoded(plan.policy), plan.seed),
+        checkpoint=None,
+        trained_on=None,
+        task_files=_task_files(plan),
+        flags=_plan_flags(plan),
+        runs=[run_facts(plan.command, plan.batch, gl_facts() if plan.draws and here else {})],
+        shard=None if shard is None else str(shard),
+    )
+    return with_checkpoint(card, plan.policy_path)
+
+
+def _plan_flags(plan: EvaluationPlan) -> list[str]:
+    """Return the plan's flags as another machine may use them: a policy of this package goes by its name."""
+    key = "--policy.path="
+    return [
+        key + portable_path(flag.removeprefix(key)) if flag.startswith(key) else flag for flag in plan.portable_flags
+    ]
+
+
+def _plan_protocol(plan: EvaluationPlan) -> dict[str, Any]:
+    if plan.grid is None or plan.environment is None:
+        return {}
+    names = sorted(place.task.name for place in plan.grid.places)
+    environment = plan.environment
+    seen = (
+        {} if plan.policy is None else {SAW: what_is_seen(plan.policy, environment.obs_type, environment.oracle_memory)}
+    )
+    return {"tasks": names, "episodes": plan.grid.runs, **environment.protocol, **seen}
+
+
+def _task_files(plan: EvaluationPlan) -> dict[str, str]:
+    from lerobot_memobench.datasets.generation import task_hash
+
+    return {} if plan.grid is None else {place.task.name: task_hash(place.task) for place in plan.grid.places}
+
+
+def with_checkpoint(card: dict[str, Any], path: str | None) -> dict[str, Any]:
+    """Return a card with what is known of the checkpoint; a repository's is known once LeRobot has fetched it."""
+    folder = None if path is None else local_folder(path)
+    if folder is None or "sha256" in card["policy"]:
+        return card
+    files = checkpoint_files(folder)
+    if not any(name in files for name in (WEIGHTS_FILE, ADAPTER_FILE)):
+        return card
+    return {
+        **card,
+        "policy": {**card["policy"], "sha256": tree_hash(files)},
+        "checkpoint": {"path": portable_path(str(path)), "revision": _revision(folder), "files": files},
+        "trained_on": training_facts(folder),
+    }
+
+
+def _revision(folder: Path) -> str | None:
+    """Return the commit of a repository's copy in the hub's cache, None for any other folder."""
+    return folder.name if folder.parent.name == "snapshots" else None
+
+
+# ==== policy_identity.py
+# What identifies a policy beyond its name: settings, seed, the hash of its checkpoint, what it was trained on.
+
+
+class TrainedOn(TypedDict, total=False):
+    """LeRobot's settings of the dataset of a training run."""
+
+    repo_id: str | None
+    revision: str | None
+    root: str | None
+    episodes: list[int] | None
+
+
+class TrainConfig(TypedDict):
+    """What is used of a checkpoint's ``train_config.json``."""
+
+    dataset: TrainedOn
+    steps: NotRequired[Count | None]
+
+
+def policy_facts(settings: Mapping[str, Any], seed: int | None) -> dict[str, Any]:
+    """Return what identifies a policy beside its weights: its configuration as LeRobot encodes it, the run's seed.
+
+    Of eyes that are no part of its checkpoint also the hash.
+
+    Raises:
+        MemobenchError: there are no such eyes.
+    """
+    kept = {key: value for key, value in settings.items() if key not in ELSEWHERE and key != "type"}
+    eyes = eyes_hash(kept)
+    return {
+        "type": settings.get("type"),
+        "seed": seed,
+        "settings": kept,
+        **({} if eyes is None else {"eyes_sha256": eyes}),
+    }
+
+
+def eyes_hash(settings: Mapping[str, Any]) -> str | None:
+    """Return the hash of the eyes that a policy finds objects with, None where it has none.
+
+    Raises:
+        MemobenchError: there are no such eyes.
+    """
+    if settings.get("perception") != "objects" or settings.get("eyes") is None:
+        return None
+    from lerobot_memobench.perception.weights import eyes_file
+
+    return file_hash(eyes_file(settings["eyes"]))
+
+
+def training_facts(folder: Path) -> dict[str, Any] | None:
+    """Return what a checkpoint says about the dataset it was trained on, None where it says nothing.
+
+    Where the dataset is on this machine, ``sha256`` is that of its meta files and its manifest, which in turn hold a
+    digest of every episode that `memobench generate` made.
+    """
+    try:
+        told = read_json(folder / "train_config.json", TrainConfig, "it is ignored")
+    except (FileNotFoundError, MemobenchError):
+        return None
+    dataset = told["dataset"]
+    found = {key: dataset.get(key) for key in ("repo_id", "revision", "root", "episodes")}
+    found["steps"] = told.get("steps")
+    root = Path(str(found["root"] or ""))
+    if found["root"] and os.path.isdir(root / "meta"):  # pathlib's raises at names that are too long
+        files = sorted(path for path in [*(root / "meta").rglob("*"), root / "manifest.json"] if path.is_file())
+        found["sha256"] = tree_hash({str(path.relative_to(root)): file_hash(path) for path in files})
+    return found
+
+
+# ==== card_markdown.py
+# The result card as a page for people.
+
+
+def markdown(card: Mapping[str, Any]) -> str:
+    """Return the card as Markdown."""
+    lines = ["# Result card", "", *_protocol(card), "", *_policy(card)]
+    for number, run in enumerate(card["runs"], start=1):
+        lines += ["", *_run(number, run)]
+    lines += ["", f"`memobench rerun {CARD_FILE}` repeats the evaluation and compares every episode.", ""]
+    return "\n".join(lines)
+
+
+def _protocol(card: Mapping[str, Any]) -> list[str]:
+    protocol = card["protocol"]
+    tasks = protocol.get("tasks", [])
+    settings = {name: protocol[name] for name in SETTINGS if name in protocol}
+    others = {key: value for key, value in protocol.items() if key not in (*SETTINGS, *EXTENT)}
+    return [
+        *("| protocol | |", "|---|---|"),
+        f"| tasks | {len(tasks)}: {', '.join(tasks)} |",
+        f"| episodes of each | {protocol.get('episodes')} |",
+        *(f"| {name.replace('_', ' ')} | {value} |" for name, value in {**settings, **others}.items()),
+        f"| episodes in the log | {len(card['episodes'])} |",
+    ]
+
+
+def _policy(card: Mapping[str, Any]) -> list[str]:
+    policy = card["policy"]
+    lines = ["| policy | |", "|---|---|"]
+    lines += [f"| type | {policy.get('type', 'not known')} |", f"| seed | {policy.get('seed')} |"]
+    if card["checkpoint"]:
+        lines += [f"| checkpoint | {card['checkpoint']['path']} |"]
+        lines += [f"| its sha256 | {policy.get('sha256', 'not known')} |"]
+    if "eyes_sha256" in policy:
+        lines += [f"| sha256 of its eyes | {policy['eyes_sha256']} |"]
+    return lines + [f"| trained on: {key} | {value} |" for key, value in (card["trained_on"] or {}).items()]
+
+
+def _run(number: int, run: Mapping[str, Any]) -> list[str]:
+    times = run.get("times", 1)
+    lines = [f"## Run {number}" + (f" (started {times} times)" if times > 1 else ""), ""]
+    lines += ["```", " ".join(run["command"]), "```", "", "| | |", "|---|---|"]
+    lines += [f"| {name} | {version} |" for name, version in run["versions"].items()]
+    lines += [f"| commit | {run['git_commit']} |", f"| batch size | {run['batch_size']} |"]
+    lines += [f"| {name} | {value} |" for name, value in run["machine"].items()]
+    return lines + [f"| {name} | {value} |" for name, value in run["gl"].items()]
+
+
+# ==== outcomes.py
+# What an episode came to, as a card keeps it, and whether two runs of it agree.
+
+OUTCOME = ("success", "steps", "prompt_steps", "variant", "checkpoints", "failure", "fault", "not_run", "scene_hash")
+"""What two runs of the same episode must agree in."""
+
+
+def outcome(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a card keeps of a line of the log: its identity and what does not depend on the clock."""
+    return {
+        key: record[key] for key in ("task", "memory_type", "episode", "seed", "referent", *OUTCOME) if key in record
+    }
+
+
+def key_of(record: Mapping[str, Any]) -> tuple[str, int, str]:
+    """Return what identifies an episode: task, number, referent."""
+    return record["task"], record["episode"], record.get("referent", "fixed")
+
+
+def disagreement(a: Mapping[str, Any], b: Mapping[str, Any], here: str = "here", there: str = "there") -> str | None:
+    """Return in one phrase the first thing in which two records of the same episode differ, None when in nothing.
+
+    The time it took is no difference, nor what one of them leaves out.
+    """
+    for name in ("seed", "replan_steps", "scene_hash", *OUTCOME):
+        if name not in a or name not in b or a[name] == b[name]:
+            continue
+        if name == "checkpoints" and len(a[name]) == len(b[name]):
+            found = _first_checkpoint(a[name], b[name])
+        else:
+            found = (name, a[name], b[name])
+        if found is not None:
+            what, mine, other = found
+            return f"{a['task']}, episode {a['episode']}: {what} is {mine} {here} and {other} {there}"
+    return None
+
+
+def _first_checkpoint(a: Sequence[Mapping[str, Any]], b: Sequence[Mapping[str, Any]]) -> tuple[str, Any, Any] | None:
+    """Return the first thing in which checkpoints differ: what, and its two values."""
+    for number, (mine, other) in enumerate(zip(a, b, strict=True), start=1):
+        for key in ("operation", "first_step", "ordered_step"):
+            if mine.get(key) != other.get(key):
+                return f"{key} of checkpoint {number}", mine.get(key), other.get(key)
+    return None
+
+
+def first_disagreement(card: Sequence[Mapping[str, Any]], records: Sequence[Mapping[str, Any]]) -> str | None:
+    """Return where a log departs from a card's episodes, None when nowhere."""
+    found = {key_of(record): record for record in records}
+    for episode in card:
+        other = found.get(key_of(episode))
+        if other is None:
+            return f"{episode['task']}, episode {episode['episode']} is on the card and was not run here"
+        problem = disagreement(episode, other, "on the card", "here")
+        if problem is not None:
+            return problem
+    return None

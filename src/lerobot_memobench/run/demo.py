@@ -1,45 +1,79 @@
 """The demo: the scripted expert on one task of each memory type, and beside it policies that have learned one.
 
-In videos, a contact sheet and a report; one film shows expert, memory and no memory side by side (`memory_demo`).
+The expert's part is videos, a contact sheet and a report. The second part is a task that begins with a demonstration
+prompt, under the expert, a policy with a memory and one without; both come with the package. All three act in the same
+episodes, of the first evaluation seeds, and the table counts them all: so many that a policy without a memory, which
+guesses, stands out. Their inputs are the privileged object states, so that only the few recorded episodes are drawn.
+Video and strip show the first of these that did not end alike for all, or else the first.
 """
 
 from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from lerobot_memobench.envs.episode_log import MERGED_FILE, PROTOCOL_FILE
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.envs.episode_log import MERGED_FILE, PROTOCOL_FILE, read_episodes
+from lerobot_memobench.envs.observations import OBJECTS
+from lerobot_memobench.envs.video import Film
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.report import REPORT_JSON, REPORT_MARKDOWN
+from lerobot_memobench.evaluation.metrics.rollouts import saw
 from lerobot_memobench.evaluation.records.protocol import CARD_FILE
+from lerobot_memobench.io import write_file
+from lerobot_memobench.policies.checkpoint import shipped_policies
 from lerobot_memobench.run.card import CARD_MARKDOWN
-from lerobot_memobench.run.contact_sheet import contact_sheet
-from lerobot_memobench.run.folder import VIDEOS
-from lerobot_memobench.run.memory_demo import MEMORY_FILM, MEMORY_STRIP, MEMORY_TABLE
-from lerobot_memobench.run.plan import EvaluationPlan
-from lerobot_memobench.run.planning import plan_line
+from lerobot_memobench.run.plan import EvaluationPlan, plan_line
+from lerobot_memobench.run.run import VIDEOS
 from lerobot_memobench.tasks.catalogue import BOWL
+from lerobot_memobench.tasks.failures import REFERENCE_DRIFT
 
-#: One task of each memory type.
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
 TASKS = (
     "turn_on_the_stove_and_turn_it_off",
     "put_the_tomato_into_the_top_drawer_of_the_cabinet",
     BOWL,
     "execute_the_assembly_procedure_demonstrated_in_the_prompt_video",
 )
+"""One task of each memory type."""
 CONTACT_SHEET = "contact_sheet.png"
-
-#: What is taken over from the evaluation.
+MEMORY_VIDEO, MEMORY_STRIP, MEMORY_TABLE = "memory.mp4", "memory.png", "memory.md"
 RESULTS = (MERGED_FILE, REPORT_JSON, REPORT_MARKDOWN, PROTOCOL_FILE, CARD_FILE, CARD_MARKDOWN)
+"""Files that are taken over from the expert's evaluation."""
+PRODUCTS = (*RESULTS, VIDEOS, CONTACT_SHEET, MEMORY_VIDEO, MEMORY_STRIP, MEMORY_TABLE)
+"""All that a demo writes, and so all that a new one removes."""
 
-#: All that a demo writes, and so all that a new one removes.
-PRODUCTS = (*RESULTS, VIDEOS, CONTACT_SHEET, MEMORY_FILM, MEMORY_STRIP, MEMORY_TABLE)
+POLICIES: dict[str, tuple[str, ...]] = {
+    "expert": (),
+    "with memory": ("policy=memobench_small",),
+    "without memory": ("policy=memobench_small_memoryless",),
+}
+"""Name in the second part -> arguments of `lerobot eval` that choose who acts."""
+EPISODES, RECORDED, HORIZON = 12, 3, 400
+"""Of each policy; how many of them are recorded as videos; steps of an episode. The expert takes about 150."""
+
+TITLE = 28
+"""Height of the name over a video, pixels."""
+SOLVED, FAILED, TEXT, BACKGROUND = (0, 158, 115), (213, 94, 0), (240, 240, 240), (24, 26, 30)
+FRAMES_PER_VIDEO = 6
+COLUMN_WIDTH, STRIP_WIDTH = 320, 200
+"""Width of a frame in the contact sheet and in a strip, pixels."""
+
+Frame = NDArray[np.uint8]
+"""(height, width, 3), RGB."""
 
 
 def demo_plan(folder: Path) -> EvaluationPlan:
-    """Return the plan of the demo's evaluation: one filmed episode of each task."""
+    """Return the plan of the demo's evaluation: one recorded episode of each task."""
     words = ["env=memobench", f"tasks={','.join(TASKS)}", "episodes=1", "env.videos=true"]
     return plan_line([*words, f"output_dir={folder}"])
 
@@ -51,8 +85,8 @@ def make_demo(out: Path, evaluate: Callable[[Path], int], compare: Callable[[Pat
 
     Args:
         evaluate: runs the demo's evaluation in a folder and returns its exit status.
-        compare: works in one folder and writes into another what `memory_demo.compare_memories` does; None where the
-            package brings no trained policies.
+        compare: works in one folder and writes into another what `compare_memories` does; None where the package
+            brings no trained policies.
     """
     if out.exists() and not out.is_dir():
         raise MemobenchError(f"{out} is a file; name a folder")
@@ -70,26 +104,168 @@ def make_demo(out: Path, evaluate: Callable[[Path], int], compare: Callable[[Pat
         for name in RESULTS:
             shutil.move(work / name, made / name)
         for name in PRODUCTS:
-            _remove(out / name)
+            if (out / name).is_dir():
+                shutil.rmtree(out / name)
+            else:
+                (out / name).unlink(missing_ok=True)
             if (made / name).exists():
                 shutil.move(made / name, out / name)
     return 0
 
 
 def collect_videos(evaluation: Path, folder: Path) -> list[Path]:
-    """Move the film of each task's episode into ``folder``, under its name, by which the HTML report finds it."""
+    """Move the video of each task's episode into ``folder``, under its name, by which the HTML report finds it."""
     folder.mkdir(parents=True)
     found = []
     for name in TASKS:
-        film = evaluation / VIDEOS / f"{name}.0.mp4"
-        if not film.is_file():
-            raise MemobenchError(f"the evaluation left no film of {name}; see its messages above")
-        found.append(Path(shutil.move(film, folder / film.name)))
+        video = evaluation / VIDEOS / f"{name}.0.mp4"
+        if not video.is_file():
+            raise MemobenchError(f"the evaluation left no video of {name}; see its messages above")
+        found.append(Path(shutil.move(video, folder / video.name)))
     return found
 
 
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
+@dataclass(frozen=True)
+class Outcome:
+    """How a policy's episodes ended: whether each was solved, how many failed at a wrong referent; and its inputs."""
+
+    solved: tuple[bool, ...]
+    wrong: int
+    saw: str
+
+
+def has_policies() -> bool:
+    """Return whether the package brings the trained policies that are compared."""
+    return {word.partition("=")[2] for words in POLICIES.values() for word in words} <= set(shipped_policies())
+
+
+def memory_plan(name: str, folder: Path) -> EvaluationPlan:
+    """Return the plan of the evaluation of one of `POLICIES`."""
+    words = ["env=memobench", *POLICIES[name], f"tasks={BOWL}", "referent=random", f"horizon={HORIZON}"]
+    return plan_line(
+        [*words, f"obs_type={OBJECTS}", f"episodes={EPISODES}", f"films={RECORDED}", f"output_dir={folder}"]
+    )
+
+
+def compare_memories(work: Path, out: Path, evaluate: Callable[[str, Path], int]) -> dict[str, Outcome]:
+    """Evaluate all `POLICIES`, each in a folder of its own in ``work``; write video, strip and table into ``out``.
+
+    Args:
+        evaluate: runs the evaluation of a name in a folder and returns its exit status.
+
+    Raises:
+        MemobenchError: an evaluation failed.
+    """
+    outcomes: dict[str, Outcome] = {}
+    folders = {name: work / name.replace(" ", "_") for name in POLICIES}
+    for name, folder in folders.items():
+        if evaluate(name, folder):
+            raise MemobenchError(f"the evaluation {name} has failed; see its messages above")
+        outcomes[name] = _outcome(folder)
+    ends = enumerate(zip(*(one.solved[:RECORDED] for one in outcomes.values()), strict=True))
+    chosen = next((episode for episode, solved in ends if len({*solved}) > 1), 0)
+    videos = {
+        name: (folder / VIDEOS / f"{BOWL}.{chosen}.mp4", outcomes[name].solved[chosen])
+        for name, folder in folders.items()
+    }
+    out.mkdir(parents=True, exist_ok=True)
+    side_by_side(videos, out / MEMORY_VIDEO)
+    strip(videos).save(out / MEMORY_STRIP, optimize=True)
+    write_file(out / MEMORY_TABLE, table(outcomes))
+    return outcomes
+
+
+def _outcome(folder: Path) -> Outcome:
+    records = read_episodes(folder)
+    return Outcome(
+        solved=tuple(bool(record["success"]) for record in sorted(records, key=itemgetter("episode"))),
+        wrong=sum(not record["success"] and record.get("failure") == REFERENCE_DRIFT for record in records),
+        saw=saw(records),
+    )
+
+
+def table(outcomes: dict[str, Outcome]) -> str:
+    """Return who solved how many of the episodes, and how many failed at a wrong bowl, as Markdown."""
+    rows = [
+        f"| {name} | {sum(one.solved)}/{len(one.solved)} | {one.wrong} | {one.saw} |" for name, one in outcomes.items()
+    ]
+    head = "| butter into the bowl that the prompt showed, of three | solved | wrong bowl | saw |"
+    return "\n".join([head, "|---|---|---|---|", *rows]) + "\n"
+
+
+def contact_sheet(videos: Sequence[Path]) -> Image:
+    """Return a picture with one row per video: frames at even distances, the last one included."""
+    from PIL import Image
+
+    return Image.fromarray(np.concatenate([_row(video, COLUMN_WIDTH) for video in videos], axis=0))
+
+
+def strip(videos: Mapping[str, tuple[Path, bool]]) -> Image:
+    """Return a picture with a row per video, as in `contact_sheet`, under its name and how the episode ended."""
+    from PIL import Image
+
+    rows = []
+    for name, (path, solved) in videos.items():
+        row = _row(path, STRIP_WIDTH)
+        rows.append(np.concatenate([title(name, row.shape[1], solved), row]))
+    return Image.fromarray(np.concatenate(rows))
+
+
+def side_by_side(videos: Mapping[str, tuple[Path, bool]], out: Path) -> Path:
+    """Write one video of several; a shorter one waits at its last frame. Return its path.
+
+    Args:
+        videos: name -> file and whether the episode was solved. All are of the same height.
+    """
+    movie = Film(out)
+    try:
+        for frame in joined(videos):
+            movie.add(frame)
+        movie.finish()
+    finally:
+        movie.discard()
+    return out
+
+
+def joined(videos: Mapping[str, tuple[Path, bool]]) -> Iterator[Frame]:
+    """Yield the frames of the whole, (TITLE + height, sum of widths, 3) uint8."""
+    read = {name: (read_video(path), solved) for name, (path, solved) in videos.items()}
+    for step in range(max(len(frames) for frames, _ in read.values())):
+        parts = []
+        for name, (frames, solved) in read.items():
+            over = step >= len(frames) - 1
+            frame = frames[min(step, len(frames) - 1)]
+            parts.append(np.concatenate([title(name, frame.shape[1], solved if over else None), frame]))
+        yield np.concatenate(parts, axis=1)
+
+
+def title(name: str, width: int, solved: bool | None) -> Frame:
+    """Return the line over a video, (TITLE, width, 3): a name, and how it ended once it has (None before)."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    band = Image.new("RGB", (width, TITLE), BACKGROUND)
+    draw, font = ImageDraw.Draw(band), ImageFont.load_default(size=16)
+    draw.text((8, TITLE // 2), name, fill=TEXT, font=font, anchor="lm")
+    if solved is not None:
+        words, colour = ("solved", SOLVED) if solved else ("failed", FAILED)
+        draw.text((width - 8, TITLE // 2), words, fill=colour, font=font, anchor="rm")
+    return np.asarray(band)
+
+
+def _row(video: Path, width: int) -> Frame:
+    """Return frames of a video at even distances, the first and the last included, each ``width`` wide."""
+    from PIL import Image
+
+    frames = read_video(video)
+    chosen = [frames[k] for k in np.linspace(0, len(frames) - 1, FRAMES_PER_VIDEO).round().astype(int)]
+    height = round(frames[0].shape[0] * width / frames[0].shape[1])
+    resized = [Image.fromarray(frame).resize((width, height), Image.Resampling.LANCZOS) for frame in chosen]
+    return np.concatenate([np.asarray(frame) for frame in resized], axis=1)
+
+
+def read_video(path: Path) -> list[Frame]:
+    """Return every frame of a video."""
+    import av
+
+    with av.open(str(path)) as container:
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]

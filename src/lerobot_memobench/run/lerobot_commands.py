@@ -7,7 +7,7 @@ import logging
 import os
 import sys
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from functools import cache
 from importlib import metadata
@@ -139,3 +139,26 @@ def config_class(entry: Callable[[], Any]) -> type | None:
         if dataclasses.is_dataclass(first):
             return typing.cast(type, first)
     return None
+
+
+# ==== lerobot_command.py
+# LeRobot's own commands, called in this process.
+
+
+def call_lerobot(command: str, flags: Sequence[str]) -> int:
+    """Run ``lerobot-<command>`` with these flags; return its exit status. Its main function reads ``sys.argv``."""
+    entry = load_command(command)
+    before = sys.argv
+    sys.argv = [f"{PREFIX}{command}", *flags]
+    try:
+        status = entry()
+    except SystemExit as stop:
+        status = stop.code
+    finally:
+        sys.argv = before
+    if status is None:
+        return 0
+    if isinstance(status, int):
+        return status
+    print(status, file=sys.stderr)  # as Python does with such a status
+    return 1

@@ -26,10 +26,8 @@ from lerobot_memobench.evaluation.records.protocol import (
     read_protocol,
 )
 from lerobot_memobench.io import draft_of
-from lerobot_memobench.run.card import extended, remove_card, with_episodes, write_card
-from lerobot_memobench.run.folder import VIDEOS
-from lerobot_memobench.run.outcomes import disagreement, key_of
-from lerobot_memobench.run.reporting import EvaluationReport, report_on
+from lerobot_memobench.run.card import disagreement, extended, key_of, remove_card, with_episodes, write_card
+from lerobot_memobench.run.run import VIDEOS, EvaluationReport, report_on
 
 SHARDS = "shard-*-of-*"
 """Folders of the parts of an evaluation, in its own."""

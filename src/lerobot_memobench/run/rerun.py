@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Mapping
+import enum
+import json
+import re
+import typing
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records.protocol import CARD_FILE, read_card
 from lerobot_memobench.policies.checkpoint import local_folder
-from lerobot_memobench.run.card_flags import allowed_flags
-from lerobot_memobench.run.flags import flag_value
+from lerobot_memobench.run import arguments as fields
+from lerobot_memobench.run.arguments import chosen_class, flag_value
+from lerobot_memobench.run.card import checkpoint_files, eyes_hash, tree_hash
+from lerobot_memobench.run.lerobot_commands import config_class, load_command, register_plugins
 from lerobot_memobench.run.machine import gl_facts, versions
-from lerobot_memobench.run.plan import EvaluationPlan
-from lerobot_memobench.run.planning import plan_line
-from lerobot_memobench.run.policy_identity import checkpoint_files, eyes_hash, tree_hash
+from lerobot_memobench.run.plan import ENVIRONMENT, EvaluationPlan, plan_line
 
 
 def repeatable_card(path: Path, server: str | None = None) -> dict[str, Any]:
@@ -81,3 +85,192 @@ def differences_here(card: Mapping[str, Any]) -> list[str]:
         if changed:
             notes.append(f"the card's run used {', '.join(changed)}; results may depend on it")
     return list(dict.fromkeys(notes))
+
+
+# ==== card_flags.py
+# What may a card ask for when it is repeated? A card is data, and anybody may have written it.
+#
+# Its flags go to LeRobot, which would import packages, run code from the hub and read and write files by them. So only
+# those are taken that a card of ours can hold and that name no code, no place to write to, no machine but this one, and
+# of places to read from only folders that are here. Anything else is refused by name.
+
+ENV, POLICY_TYPE, POLICY_PATH, TASK_DIR = "env.type", "policy.type", "policy.path", "env.task_dir"
+
+NUMBERS = (
+    *("seed", "eval.n_episodes", "eval.batch_size", "eval.use_async_envs", "eval.recording"),
+    *("env.fps", "env.prompt_video", "env.horizon", "env.render_every", "env.replan_steps", "env.seed_base"),
+    *("env.expert_action", "env.blind_action", "env.oracle_memory", "env.videos", "env.films", "env.resume"),
+    *("env.max_parallel_tasks", "env.disable_env_checker"),
+)
+"""Numbers and truth values of the run and the environment. Of a policy's, all are taken but `REACHING_OUT`."""
+REACHING_OUT = ("push_to_hub", "private", "use_peft", "trust_remote_code", "discover_packages_path")
+"""Truth values of a policy by which more than its numbers changes."""
+WORDS = (
+    *("job_name", "env.task", "env.tasks", "env.suite", "env.obs_type", "env.referent", "env.prompt_in", "env.render"),
+    *("policy.size", "policy.perception", "policy.align", "policy.subgoal_level", "policy.integration"),
+    *("policy.memory_camera", "policy.eyes"),
+    *("policy.dtype", "policy.dialect", "policy.gripper"),
+)
+"""Words, which name one of several known things."""
+NOTES = ("policy.label", "policy.keys")
+"""Text that stands on a card, or in a message to the policy's server."""
+SERVERS = ("policy.host", "policy.servers")
+
+FLAG = re.compile(r"--([\w.]+)=(.*)", re.DOTALL)
+WORD = re.compile(r"[\w.,+' ()-]*")
+DEVICE = re.compile(r"cpu|mps|(cuda|xpu)(:\d+)?")
+SERVER = re.compile(r"(?:\w+://)?(?:127\.0\.0\.1|localhost)(?::\d+)?")
+OBSERVATION = re.compile(r"[\w./-]+")
+NOTHING = ("null", "none", "None", "~")
+
+
+def allowed_flags(flags: Any, server: str | None = None) -> list[str]:
+    """Return a card's flags as LeRobot may be given them: values checked, each key once, checkpoints by their folders.
+
+    Args:
+        flags: as they were read.
+        server: where the policy is asked, in place of the card's address; None for the card's.
+
+    Raises:
+        MemobenchError: one of them is none that a card which is repeated may hold.
+    """
+    if not isinstance(flags, list) or not all(isinstance(flag, str) for flag in flags):
+        raise MemobenchError("the card's flags are no list of --key=value; expected a card.json that we wrote")
+    settings = {key: _folder(key, value) for key, value in map(_taken_apart, flags)}
+    if ENV not in settings:
+        raise MemobenchError(f"the card does not say {ENV}={ENVIRONMENT}; only evaluations of ours are repeated")
+    named = []
+    if server is not None:
+        if settings.get(POLICY_TYPE) != "remote":
+            raise MemobenchError(f"--server {server} is for a policy that runs in a server, and the card's does not")
+        settings = {key: value for key, value in settings.items() if key not in (*SERVERS, "policy.port")}
+        named = [f"--policy.servers={server}"]
+    check = _checker([f"--{key}={settings[key]}" for key in (ENV, POLICY_TYPE, POLICY_PATH) if key in settings])
+    return [f"--{key}={check(key, value)}" for key, value in settings.items()] + named
+
+
+def _taken_apart(flag: str) -> tuple[str, str]:
+    """Return key and value; LeRobot would understand other spellings, a card of ours has none."""
+    found = FLAG.fullmatch(flag)
+    if found is None:
+        raise MemobenchError(f"the card's flag {flag[:80]!r} is not --key=value; expected a card.json that we wrote")
+    key, value = found.groups()
+    if key == ENV and value != ENVIRONMENT:
+        raise _refused(key, value, f"expected {ENVIRONMENT}")
+    return key, value
+
+
+def _folder(key: str, value: str) -> str:
+    """Return the folder that a setting names, other settings' values as they are.
+
+    Of a repository, it is the copy in the hub's cache: LeRobot must not fetch what nobody has seen.
+    """
+    if key == POLICY_PATH:
+        try:
+            folder = local_folder(value)
+        except (ValueError, RuntimeError, OSError):  # neither a path nor a repository
+            folder = None
+        if folder is None:
+            raise MemobenchError(
+                f"the checkpoint {value[:80]!r} (policy.path) is not here; put it there to repeat the evaluation"
+            )
+        return str(folder.absolute())
+    if key == TASK_DIR and not Path(value).is_dir():
+        raise _refused(key, value, "expected a folder that is here")
+    return value
+
+
+def _checker(choosing: list[str]) -> Callable[[str, str], str]:
+    """Return what checks a setting.
+
+    Args:
+        choosing: the flags that choose environment and policy.
+    """
+    config = config_class(load_command("eval"))
+    assert config is not None
+    register_plugins()
+    found = {key: chosen_class(config, key, choosing, {}) for key in ("env", "policy")}
+    chosen = {key: choice for key, choice in found.items() if choice is not None}
+
+    def check(key: str, value: str) -> str:
+        if key in (ENV, POLICY_TYPE, POLICY_PATH, TASK_DIR):
+            return value  # known by now
+        for keys, (holds, expected) in EXPECTED.items():
+            if key in keys:
+                if not holds(value):
+                    raise _refused(key, value, f"expected {expected}")
+                return value
+        return _number(config, chosen, key, value)
+
+    return check
+
+
+def _number(config: type, chosen: Mapping[str, type], key: str, value: str) -> str:
+    """Return a number, a truth value, one of a field's known values or a list of numbers, as LeRobot reads it."""
+    of_policy = key.startswith("policy.") and key.rpartition(".")[2] not in REACHING_OUT
+    if key not in NUMBERS and not of_policy:
+        raise _refused(key, value, "which no card sets that is repeated")
+    try:
+        annotation = fields.annotation_of(config, key, chosen.get)
+    except KeyError:
+        raise _refused(key, value, "which is no setting of this policy's") from None
+    if value in NOTHING:
+        return value
+    if _may_be_text(annotation):
+        raise _refused(key, value, "which may name a file or a repository")
+    if not _is_closed(annotation) and not _holds_numbers(value):
+        raise _refused(key, value, "expected numbers")
+    return fields.checked_value(key, annotation, value)
+
+
+def _may_be_text(annotation: Any) -> bool:
+    parts = typing.get_args(annotation) if typing.get_origin(annotation) is typing.Union else (annotation,)
+    return any(part in (str, Path, Any, object) for part in parts)
+
+
+def _is_closed(annotation: Any) -> bool:
+    """Whether `fields.checked_value` takes known values only."""
+    is_enum = isinstance(annotation, type) and issubclass(annotation, enum.Enum)
+    return annotation in (bool, int, float) or is_enum or typing.get_origin(annotation) is typing.Literal
+
+
+def _parsed(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+
+
+def _holds_numbers(text: str) -> bool:
+    """Whether a text is a JSON number or list of them, or of lists of them."""
+    found = _parsed(text)
+    lists = found if isinstance(found, list) else [found]
+    parts = [part for item in lists for part in (item if isinstance(item, list) else [item])]
+    return all(isinstance(part, int | float) for part in parts)
+
+
+def _renames_observations(text: str) -> bool:
+    found = _parsed(text)
+    return isinstance(found, dict) and all(
+        isinstance(name, str) and OBSERVATION.fullmatch(name) for pair in found.items() for name in pair
+    )
+
+
+def _all_here(text: str) -> bool:
+    return all(SERVER.fullmatch(part.strip()) for part in text.split(","))
+
+
+EXPECTED: dict[tuple[str, ...], tuple[Callable[[str], Any], str]] = {
+    WORDS: (WORD.fullmatch, "words"),
+    NOTES: (str.isprintable, "a line of text"),
+    SERVERS: (_all_here, "this machine (127.0.0.1); name the server that you trust by --server host:port"),
+    ("policy.device",): (DEVICE.fullmatch, "cpu, mps, cuda or cuda:<number>"),
+    ("rename_map",): (_renames_observations, "names of observations"),
+}
+
+
+def _refused(key: str, value: str, why: str) -> MemobenchError:
+    return MemobenchError(
+        f"the card sets {key}={value[:80]!r}, {why}; a card is data and is not repeated with it: run its command "
+        "yourself if you trust it"
+    )

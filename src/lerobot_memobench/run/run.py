@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.envs.episode_log import has_log, read_episodes, read_protocol_file
-from lerobot_memobench.evaluation.records.protocol import POLICY, read_protocol
-from lerobot_memobench.io import count_of
+from lerobot_memobench.envs.episode_log import PROTOCOL_FILE, has_log, read_episodes, read_log, read_protocol_file
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.documents.report import REPORT_MARKDOWN, write_report
+from lerobot_memobench.evaluation.metrics.summary import Summary
+from lerobot_memobench.evaluation.records.protocol import CARD_FILE, POLICY, differences, read_card, read_protocol
+from lerobot_memobench.io import count_of, remove_drafts
+from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.policies.checkpoint import check_weights, portable_path
 from lerobot_memobench.policies.untrained import UntrainedConfig
-from lerobot_memobench.run.card import with_episodes, write_card
-from lerobot_memobench.run.folder import check_new, held, made
-from lerobot_memobench.run.lerobot_command import call_lerobot
-from lerobot_memobench.run.lerobot_commands import without_chatter
-from lerobot_memobench.run.loop.steering import calm_output, steered
-from lerobot_memobench.run.plan import EvaluationPlan
-from lerobot_memobench.run.plan_card import card_of, with_checkpoint
-from lerobot_memobench.run.reporting import EvaluationReport, report_on
-from lerobot_memobench.run.resume import Ranges, Tell, missing, remainder, resumed_card
+from lerobot_memobench.run.card import card_of, extended, remove_card, with_checkpoint, with_episodes, write_card
+from lerobot_memobench.run.lerobot_commands import call_lerobot, without_chatter
+from lerobot_memobench.run.plan import EvaluationPlan, Range, task_names
+from lerobot_memobench.run.rollout import calm_output, steered
 
 
 @dataclass(frozen=True)
@@ -102,3 +103,205 @@ def _finish(plan: EvaluationPlan, card: dict[str, Any]) -> EvaluationReport:
     card = with_checkpoint({**card, "protocol": protocol}, plan.policy_path)
     write_card(plan.log, with_episodes(card, records))
     return report
+
+
+# ==== resume.py
+# Going on with an evaluation: whether it is the same one, which episodes are left, what is then run.
+
+Tell = Callable[[str], None]
+"""Told what a user should know and what stops nothing."""
+
+Ranges = Mapping[tuple[str, int], list[Range]]
+"""LeRobot's name of a task -> the runs of it that are made."""
+
+
+def resumed_card(folder: Path, card: dict[str, Any], tell: Tell) -> dict[str, Any]:
+    """Return the card for an evaluation that goes on with the one in ``folder``.
+
+    Tasks and episodes may be others: those that are there stay. A folder without an evaluation is begun.
+
+    Raises:
+        MemobenchError: it is another evaluation: of another protocol, policy, or of other task files.
+    """
+    check_folder(folder)
+    path = folder / CARD_FILE
+    if not has_log(folder):
+        return card
+    found = differences(read_protocol(folder), {**card["protocol"], POLICY: card[POLICY]}, policy=True)
+    if found:
+        raise MemobenchError(
+            f"{folder} holds an evaluation with another protocol ({'; '.join(found)}, there and now); repeat its "
+            "settings to go on with it, or choose another output_dir="
+        )
+    if not path.is_file():
+        tell(f"note: {folder} has no {CARD_FILE}: whether its episodes are this policy's cannot be checked")
+        return card
+    earlier = read_card(path, whole=True)
+    edited = [name for name, value in card["task_files"].items() if earlier["task_files"].get(name, value) != value]
+    if edited:
+        raise MemobenchError(f"the files of {edited[0]} are not those that the episodes in {folder} were run with")
+    for changed in _run_differences(earlier["runs"][-1], card["runs"][-1]):
+        tell(f"note: the episodes in {folder} were run otherwise ({changed}, there and now); numbers may depend on it")
+    return extended(earlier, card)
+
+
+def _run_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Return in what the start of a run differs from that of an earlier one, on which numbers may depend."""
+    found = []
+    if earlier["batch_size"] != now["batch_size"]:
+        found.append(f"batch_size: {earlier['batch_size']} and {now['batch_size']}")
+    for part in ("versions", "gl"):
+        there, here = earlier[part], now[part]
+        changed = [f"{key}: {there[key]} and {here[key]}" for key in here if there.get(key, here[key]) != here[key]]
+        found += changed[:1]
+    return found
+
+
+def missing(plan: EvaluationPlan) -> Ranges | None:
+    """Return the runs that are to be made, in whole batches; None for all of them."""
+    orders = plan.orders
+    if plan.grid is None or plan.environment is None or not (orders.resume or orders.shard is not None):
+        return None
+    done = logged(plan.log, plan.environment.referent)
+    return plan.grid.ranges(plan.grid.missing(done, orders.shard))
+
+
+def remainder(plan: EvaluationPlan, ranges: Ranges | None) -> EvaluationPlan:
+    """Return the plan of what is left: tasks that are done are not opened, episodes that are there are left out."""
+    if ranges is None or plan.grid is None:
+        return plan
+    settings, output = plan.settings, plan.output
+    names = task_names(plan.grid.places, ranges)
+    if len(names) < len(plan.grid.places) and not settings.has("env.task_dir"):
+        settings = settings.changed("env.task" if settings.has("env.task") else "env.tasks", ",".join(names))
+    if has_log(plan.log):
+        settings = settings.changed("env.resume", True)
+        output = unused_subfolder(plan.output)
+    return replace(plan, settings=settings, output=output)
+
+
+def unused_subfolder(output: Path) -> Path:
+    """Return the first folder ``continued-k`` that is not there: LeRobot would write over the first run's own files."""
+    k = 1
+    while (output / f"continued-{k}").exists():
+        k += 1
+    return output / f"continued-{k}"
+
+
+# ==== folder.py
+# The folder of an evaluation: whether it may be written to, held while a run lasts, left clean behind it.
+
+VIDEOS = "videos"
+EARLIER_DRAFTS = (".*.part", "*.part", f".{PROTOCOL_FILE}.*", f"{VIDEOS}/.*.part")
+"""What earlier versions of this package called files that were being written."""
+
+
+def check_new(folder: Path) -> None:
+    """Refuse to mix an evaluation with an earlier one in the same folder."""
+    if has_log(folder):
+        raise MemobenchError(
+            f"{folder} already holds an evaluation; choose another output_dir=, or go on with it by resume=true"
+        )
+    check_folder(folder)
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse to write into what is no folder."""
+    if folder.exists() and not folder.is_dir():
+        raise MemobenchError(f"output_dir={folder} is a file; name a folder")
+
+
+def logged(folder: Path, referent: str) -> set[tuple[str, int]]:
+    """Return (task, episode) of the episodes in a folder's log, those included that could not be run."""
+    if not has_log(folder):
+        return set()
+    records = read_log(folder)
+    return {(record["task"], record["episode"]) for record in records if record.get("referent", "fixed") == referent}
+
+
+@contextmanager
+def held(plan: EvaluationPlan) -> Iterator[None]:
+    """Hold the folder of an evaluation's log; a run that ends before its first episode leaves nothing in it.
+
+    Raises:
+        MemobenchError: another run holds it.
+    """
+    new = [folder for folder in (plan.output, plan.log) if not folder.exists()]
+    plan.log.mkdir(parents=True, exist_ok=True)
+    try:
+        with locked(plan.log, plan.log):
+            _clean(plan.log)
+            yield
+    finally:
+        if not has_log(plan.log):
+            remove_card(plan.log)
+            for folder in new:
+                _remove_empty(folder)
+
+
+@contextmanager
+def made(folder: Path) -> Iterator[None]:
+    """Make a folder for as long as it is written to; of a new one nothing that is empty stays behind."""
+    new = not folder.exists()
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    finally:
+        if new:
+            _remove_empty(folder)
+
+
+def _clean(folder: Path) -> None:
+    """Remove what a killed run was writing: whole files have names of their own."""
+    for place in (folder, folder / VIDEOS):
+        remove_drafts(place)
+    for pattern in EARLIER_DRAFTS:
+        for draft in folder.glob(pattern):
+            draft.unlink(missing_ok=True)
+
+
+def _remove_empty(folder: Path) -> None:
+    """Remove a folder and those below it, as far as they hold nothing."""
+    if not folder.is_dir():
+        return
+    for child in sorted(folder.rglob("*"), reverse=True):
+        if child.is_dir() and not any(child.iterdir()):
+            child.rmdir()
+    if not any(folder.iterdir()):
+        folder.rmdir()
+
+
+# ==== reporting.py
+# The report of an evaluation that has been run or merged, as the engine hands it back.
+
+
+@dataclass(frozen=True)
+class EvaluationReport:
+    """What an evaluation found.
+
+    Attributes:
+        folder: holds the log, and the report's files.
+        summary: its figures.
+        notes: what a reader must know, such as lines of the log that could not be read.
+        absent: (task, episode) of those that were asked for and are missing.
+    """
+
+    folder: Path
+    summary: Summary
+    notes: Sequence[str]
+    absent: Sequence[tuple[str, int]] = ()
+
+    @property
+    def page(self) -> Path:
+        """The report as a file to read."""
+        return self.folder / REPORT_MARKDOWN
+
+
+def report_on(folder: Path, episodes: int | None = None, absent: Sequence[tuple[str, int]] = ()) -> EvaluationReport:
+    """Write the report of the log in ``folder`` beside it and return it.
+
+    Args:
+        episodes: report those below this number; None for all.
+    """
+    summary, notes = write_report(folder, episodes)
+    return EvaluationReport(folder, summary, notes, absent)

@@ -20,13 +20,10 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.executors import ELSEWHERE, Needs, check_executor, options_told, run_jobs
 from lerobot_memobench.jobs.processes import ProgressCallback
 from lerobot_memobench.jobs.threads import LARGE, sharing
-from lerobot_memobench.run.folder import check_folder, check_new, logged
-from lerobot_memobench.run.grid import Shard
+from lerobot_memobench.run.card import card_of
 from lerobot_memobench.run.merging import SHARDS, merge_and_report
-from lerobot_memobench.run.plan import EvaluationPlan
-from lerobot_memobench.run.plan_card import card_of
-from lerobot_memobench.run.reporting import EvaluationReport
-from lerobot_memobench.run.resume import Tell, resumed_card
+from lerobot_memobench.run.plan import EvaluationPlan, Shard
+from lerobot_memobench.run.run import EvaluationReport, Tell, check_folder, check_new, logged, resumed_card
 
 LOGS = "logs"
 

@@ -222,7 +222,7 @@ class MemobenchMemConfig(MemobenchMemSettings):
 
     @property
     def sees(self) -> tuple[str, ...]:
-        """What it sees in a rollout, in the words of `envs.obs_types`."""
+        """What it sees in a rollout, in the words of `envs.observations`."""
         if not self.sees_objects:
             return (SEEN_PIXELS,)
         return (DETECTIONS,) if self.finds_objects else (SEEN_OBJECTS,)

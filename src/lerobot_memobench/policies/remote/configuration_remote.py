@@ -78,7 +78,7 @@ class RemoteConfig(UntrainedConfig):
 
     @property
     def sees(self) -> tuple[str, ...]:
-        """What its server is sent, in the words of `envs.obs_types`."""
+        """What its server is sent, in the words of `envs.observations`."""
         sent = set(self.sent().values())
         told = {"environment_state": PRIVILEGED, "expert_action": SIMULATOR, "blind_action": SIMULATOR}
         pixels = (SEEN_PIXELS,) * bool(sent & {IMAGE, WRIST_IMAGE})

@@ -6,6 +6,6 @@ looks for more in it. ``lerobot train`` does it by ``prompt_frames=``. As the fl
 it ends with the process, or where `undo` is called.
 """
 
-from lerobot_memobench.run.lerobot_training import steer
+from lerobot_memobench.run.training import steer
 
 undo = steer(prompt_frames=False)

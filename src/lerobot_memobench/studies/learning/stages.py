@@ -6,7 +6,7 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_memobench.run.words import split_words
+from lerobot_memobench.run.arguments import split_words
 from lerobot_memobench.studies.learning.commands import Cost, run_once
 from lerobot_memobench.studies.learning.experiments import PERCEPTIONS, Experiment, Sight
 from lerobot_memobench.tasks.catalogue import suite_of
@@ -63,7 +63,7 @@ class Stages:
         Raises:
             MemobenchError: an unknown setting or value, named with the nearest known one.
         """
-        from lerobot_memobench.run.reading import read_settings
+        from lerobot_memobench.run.arguments import read_settings
         from lerobot_memobench.run.training import take_training_words
 
         for arm in self.experiment.arms if self.experiment.settings else ():

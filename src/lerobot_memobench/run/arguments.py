@@ -1,0 +1,746 @@
+"""A command line in words: ``key=value`` taken apart, flags left as they are."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import logging
+import textwrap
+import types
+import typing
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, Union
+
+import draccus
+import yaml
+
+from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.policies.checkpoint import (
+    checkpoint_folder,
+    checkpoint_type,
+    folder_with_checkpoint,
+    looks_local,
+    shipped_policies,
+)
+from lerobot_memobench.run.lerobot_commands import config_class, load_command, register_plugins
+from lerobot_memobench.tasks.catalogue import check_suite, resolve_tasks
+from lerobot_memobench.tasks.task import PUBLISHED
+
+
+@dataclass(frozen=True)
+class Words:
+    """A command line after ``lerobot <name>``, taken apart.
+
+    Attributes:
+        settings: (key, value) of every ``key=value``, in order.
+        flags: everything from ``--…`` on, untouched, values in words of their own included.
+    """
+
+    settings: list[tuple[str, str]] = field(default_factory=list)
+    flags: list[str] = field(default_factory=list)
+
+    @property
+    def wants_help(self) -> bool:
+        """Whether ``-h`` or ``--help`` is among the flags."""
+        return any(flag in ("-h", "--help") for flag in self.flags)
+
+    def value(self, key: str) -> str | None:
+        """Return what ``key=`` says last, else what ``--key`` does."""
+        return dict(self.settings).get(key, flag_value(self.flags, key))
+
+
+def split_words(words: Sequence[str]) -> Words:
+    """Take a command line apart.
+
+    Raises:
+        MemobenchError: a word is neither ``key=value`` nor a flag nor a flag's value.
+    """
+    result = Words()
+    after_flag = False  # the word before was `--flag` without `=`: this one may be its value
+    for word in words:
+        is_flag = word.startswith("-") and word != "-"
+        key, equals, value = word.partition("=")
+        if is_flag or after_flag:
+            result.flags.append(word)
+        elif equals and key.replace("_", "").replace(".", "").replace("-", "").isalnum():
+            result.settings.append((key, value))
+        else:
+            raise MemobenchError(f"found {word!r} among the arguments; expected key=value or --flag=value")
+        after_flag = is_flag and word.startswith("--") and not equals
+    return result
+
+
+def executor_options(given: Sequence[str]) -> dict[str, Any]:
+    """Return ``key=value`` words (``executor_option=partition=cpu``) as arguments: numbers, truth values and nothing
+    (``none``) as such. In the words of another program (``srun_args.mpi=none``) that is a name.
+    """
+    plain: dict[str, bool | None] = {"true": True, "false": False}
+    options: dict[str, Any] = {}
+    for word in given:
+        key, equals, value = word.partition("=")
+        if not key or not equals:
+            raise MemobenchError(f"found executor option {word!r}, expected key=value, such as partition=cpu")
+        known = plain if "." in key else {**plain, "none": None, "null": None}
+        options[key] = int(value) if value.isdecimal() else known.get(value.lower(), value)
+    return options
+
+
+# ==== flags.py
+# LeRobot's flags as a list of words: ``--key=value`` and ``--key value`` mean the same.
+
+
+def flag_value(flags: Sequence[str], key: str) -> str | None:
+    """Return the value of ``--key`` among flags, in either spelling; the last one counts."""
+    found = None
+    for k, flag in enumerate(flags):
+        if flag.startswith(f"--{key}="):
+            found = flag.split("=", 1)[1]
+        elif flag == f"--{key}" and k + 1 < len(flags) and not flags[k + 1].startswith("--"):
+            found = flags[k + 1]
+    return found
+
+
+def has_flag(flags: Sequence[str], key: str) -> bool:
+    """Return whether ``--key`` is given, with or without a value."""
+    return any(flag == f"--{key}" or flag.startswith(f"--{key}=") for flag in flags)
+
+
+def without_flag(flags: Sequence[str], key: str) -> list[str]:
+    """Return the flags without ``--key`` and its value, in either spelling."""
+    kept, value_follows = [], False
+    for flag in flags:
+        if value_follows and not flag.startswith("--"):
+            value_follows = False
+            continue
+        value_follows = flag == f"--{key}"
+        if not value_follows and not flag.startswith(f"--{key}="):
+            kept.append(flag)
+    return kept
+
+
+def joined_flags(flags: Sequence[str]) -> list[str]:
+    """Return ``--key value`` as ``--key=value``."""
+    found: list[str] = []
+    for flag in flags:
+        if not flag.startswith("--") and found and found[-1].startswith("--") and "=" not in found[-1]:
+            found[-1] += f"={flag}"
+        else:
+            found.append(flag)
+    return found
+
+
+def whole_number(text: str | None) -> int | None:
+    """Return the whole number that a flag's value is, None when it is none."""
+    try:
+        return int(text) if text is not None else None
+    except ValueError:
+        return None
+
+
+# ==== recipes.py
+# The shipped training recipes: ``lerobot train config=train_paper`` and ``memobench recipe``.
+
+KEY = "config"
+logger = logging.getLogger(__name__)
+
+
+def recipes() -> dict[str, Path]:
+    """Return name -> file of every shipped recipe."""
+    folder = Path(str(resources.files("lerobot_memobench") / "configs"))
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+
+
+def recipe_file(value: str) -> Path:
+    """Return the file of a recipe: one shipped, by its name, or a YAML or JSON file.
+
+    Raises:
+        MemobenchError: there is none.
+    """
+    known = recipes()
+    path = Path(value).expanduser()
+    if value in known:
+        if path.is_file():
+            logger.warning("%s=%s is the shipped recipe; the file of that name is %s=./%s", KEY, value, KEY, value)
+        return known[value]
+    if path.is_file():
+        return path
+    if "/" in value or path.suffix:
+        raise MemobenchError(f"{KEY}={value}: there is no such file; name a shipped recipe or a YAML file")
+    raise MemobenchError(f"there is no recipe {value!r}, {nearest(value, known)}")
+
+
+def resolve_recipe(words: Words) -> Words:
+    """Replace ``config=<recipe>`` by LeRobot's ``config_path=<file>``."""
+    named = [value for key, value in words.settings if key == KEY]
+    if not named:
+        return words
+    others = [(key, value) for key, value in words.settings if key != KEY]
+    if len(named) > 1 or any(key == "config_path" for key, _ in others) or has_flag(words.flags, "config_path"):
+        raise MemobenchError(f"{KEY}={named[-1]}: give one recipe, either by {KEY}= or by config_path=")
+    return replace(words, settings=[("config_path", str(recipe_file(named[0]))), *others])
+
+
+# ==== short_forms.py
+# The words that are shorter than LeRobot's names for a setting, and those that are no settings of LeRobot's.
+
+EVERYWHERE: dict[str, tuple[str, ...]] = {
+    "align": ("policy.align",),
+    "size": ("policy.size",),
+    "perception": ("policy.perception",),
+    "eyes": ("policy.eyes",),
+    "device": ("policy.device",),
+    "replan": ("policy.n_action_steps", "env.replan_steps"),
+    "tasks": ("env.tasks",),
+    "obs_type": ("env.obs_type",),
+    "suite": ("env.suite",),
+    "referent": ("env.referent",),
+}
+
+#: Command -> short form -> the fields it sets, of which those that exist are set.
+SHORT_FORMS: dict[str, dict[str, tuple[str, ...]]] = {
+    "eval": {
+        **EVERYWHERE,
+        "host": ("policy.host",),
+        "port": ("policy.port",),
+        "dialect": ("policy.dialect",),
+        "prompt_video": ("env.prompt_video",),
+        "prompt_in": ("env.prompt_in",),
+        "horizon": ("env.horizon",),
+        "films": ("env.films",),
+        "episodes": ("eval.n_episodes",),
+        "batch_size": ("eval.batch_size",),
+    },
+    "train": {**EVERYWHERE, "episodes": ("dataset.episodes",)},
+}
+
+#: Short forms that choose something rather than set a field.
+CHOOSING = ("policy", "env", "dataset")
+
+#: Words of `lerobot eval env=memobench` that say how it is run, not what (see `engine.orders`).
+EVALUATION_WORDS = ("verbose", "resume", "shard", "shards", "workers", "executor", "executor_option")
+
+#: Words of `lerobot train` that are none of LeRobot's (see `settings.training`).
+TRAINING_WORDS = ("prompt_frames", "obs_type")
+
+
+class Meaning(NamedTuple):
+    """A row of the help: what is typed, what it sets, and what holds without it ("" where nothing is said)."""
+
+    words: str
+    sets: str
+    default: str = ""
+
+
+#: Command -> what `lerobot <command> --help` says of its words; docs/evaluate.md and docs/train.md have the same rows.
+MEANINGS: dict[str, tuple[Meaning, ...]] = {
+    "eval": (
+        Meaning(
+            "policy=",
+            "a checkpoint folder (or a training run's), a repository user/name, a policy of the package, or a policy "
+            "type; a folder that is named like one of these is named by a path, ./act",
+            "the scripted expert",
+        ),
+        Meaning(
+            "host=, port=, dialect=",
+            "with policy=remote: the policy server that acts",
+            "127.0.0.1, by dialect, openpi",
+        ),
+        Meaning("suite=", "published, or strict: thirty tasks made to need a memory", "published"),
+        Meaning(
+            "tasks=",
+            "of that suite all, memory types (temporal, spatial, object, procedural), task names, or numbers and "
+            "ranges of memobench tasks (12, 3-7), separated by commas",
+            "all",
+        ),
+        Meaning("episodes=", "episodes per task; episode i uses the seed 7 + i, or that of seed= + i", "50"),
+        Meaning(
+            "replan=",
+            "the policy executes so many actions of each prediction; also noted in the log",
+            "the policy's own",
+        ),
+        Meaning(
+            "obs_type=",
+            "what is seen: pixels_agent_pos, environment_state_agent_pos or both",
+            "what the policy was trained on, else pictures",
+        ),
+        Meaning(
+            "eyes=",
+            "with a policy that sees objects: package or a file, eyes that find them in pictures",
+            "none: the environment tells them",
+        ),
+        Meaning(
+            "referent=",
+            "fixed: the published goals; random: the seed decides what the prompt video shows; strict tasks are always "
+            "drawn",
+            "fixed",
+        ),
+        Meaning("prompt_video=", "false leaves the prompt out", "true"),
+        Meaning(
+            "prompt_in=",
+            "steps: the policy sees the prompt; reset: it plays before the first observation",
+            "by the policy",
+        ),
+        Meaning("horizon=", "execution steps per episode", "1200"),
+        Meaning(
+            "films=",
+            "episodes of each task that are filmed: 0 to n − 1",
+            "10, without pictures in the observations 0",
+        ),
+        Meaning(
+            "batch_size=",
+            "environments at once, each in a process of its own",
+            "by cores, dividing the episodes",
+        ),
+        Meaning("device=", "where the policy runs: cpu, cuda, …", "the checkpoint's, else by machine"),
+        Meaning("output_dir=", "where everything goes", "outputs/eval/<date>/<time>_…"),
+        Meaning("verbose=", "true: LeRobot's own messages too, its configuration and progress", "false"),
+        Meaning("resume=", "true: go on with the evaluation in output_dir=", "false"),
+        Meaning("shard=", "run this part alone, such as 1/8; memobench merge joins the parts", "all of it"),
+        Meaning("shards=", "run so many parts as jobs and merge them", "no parts"),
+        Meaning(
+            "workers=, executor=, executor_option=",
+            "with shards=: how many jobs at once; processes, local, slurm or ray; what that one takes, key=value",
+            "all at once, processes",
+        ),
+        Meaning(
+            "align=, size=, perception=",
+            "of a policy named by its type, as in lerobot train; a checkpoint keeps its own, and others are refused",
+            "the type's",
+        ),
+    ),
+    "train": (
+        Meaning("policy=", "a policy type, or a checkpoint to start from"),
+        Meaning("config=", "a recipe of memobench recipe, or a YAML file of your own"),
+        Meaning("align=", "how memory is aligned with checkpoint language: none, semantic, contrastive, framewise"),
+        Meaning("dataset=", "a folder that memobench generate wrote, or a repository user/name"),
+        Meaning("size=", "small and tiny: a few million parameters, from scratch, on a CPU; pi05: 3.2 billion"),
+        Meaning(
+            "perception=",
+            "pixels: pictures, through a frozen tower, at size=small through eyes; objects: what can be seen, as "
+            "numbers",
+        ),
+        Meaning(
+            "eyes=",
+            "with perception=objects: eyes that find them in pictures; with pixels, the eyes looked through",
+        ),
+        Meaning("replan=", "actions executed per prediction at evaluation"),
+        Meaning(
+            "obs_type=",
+            "what a policy of LeRobot's learns to see: pixels_agent_pos, environment_state_agent_pos or both; left "
+            "out: pictures where the dataset has them, else objects",
+        ),
+        Meaning("prompt_frames=", "false: no frame of a prompt is trained on; true: all are; left out: by the policy"),
+        Meaning("episodes=", "of the dataset, those of these numbers: [0, 1, 2]"),
+        Meaning("device=", "where it is trained: cpu, cuda, …"),
+        Meaning("output_dir=", "where everything goes; with resume=true, the training that is gone on with"),
+        Meaning("resume=", "true: go on with the last checkpoint in output_dir="),
+        Meaning("steps=", "updates of the weights, with resume=true those before included", "100000"),
+        Meaning("batch_size=", "frames per update", "8, of objects or through eyes 72"),
+        Meaning("save_freq=", "updates from one checkpoint to the next; the last update always makes one", "20000"),
+        Meaning("env=", "memobench: evaluate within the training, every env_eval_freq= updates", "no evaluation"),
+        Meaning("tasks=", "with env=: those evaluated on, as in lerobot eval", "all"),
+        Meaning("suite=", "with env=: theirs, published or strict", "published"),
+        Meaning("referent=", "with env=: fixed, the published goals; random, the seed decides", "fixed"),
+    ),
+}
+
+EXAMPLES = {
+    "eval": "lerobot eval env=memobench policy=<checkpoint> tasks=object episodes=10",
+    "train": "lerobot train policy=memobench_mem align=contrastive dataset=<folder>",
+}
+
+
+def help_text(command: str, width: int = 100) -> str:
+    """Return what `lerobot eval --help` or `lerobot train --help` says before LeRobot's own flags."""
+    lines = [f"usage: {EXAMPLES[command]}", "", "short forms:"]
+    for words, sets, default in MEANINGS[command]:
+        told = sets + (f" (default: {default})" if default else "")
+        lines += [f"  {words}", *textwrap.wrap(told, width, initial_indent=" " * 8, subsequent_indent=" " * 8)]
+    lines += [
+        "",
+        "Any other setting goes by LeRobot's full name, as key=value or --key=value; those of what env= and policy=",
+        "name are among them:",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+# ==== translation.py
+# From ``key=value`` to LeRobot's flags: ``policy=memobench_mem align=contrastive`` and the like.
+
+
+@dataclass(frozen=True)
+class LerobotSettings:
+    """What one of LeRobot's commands is to be called with. It never changes: other settings are another object.
+
+    Attributes:
+        flags: LeRobot's, as its parser reads them.
+        config: the command's configuration class; None for a command that has none (plain argparse).
+        chosen: ``policy`` and ``env`` -> the class chosen for them.
+    """
+
+    flags: tuple[str, ...]
+    config: type | None = None
+    chosen: Mapping[str, type] = field(default_factory=dict)
+
+    def get(self, key: str) -> str | None:
+        """Return the value of ``--key``, None without one."""
+        return flag_value(self.flags, key)
+
+    def has(self, key: str) -> bool:
+        """Return whether ``--key`` is given."""
+        return has_flag(self.flags, key)
+
+    def default(self, key: str, value: object) -> LerobotSettings:
+        """Return settings with ``--key=value`` where nobody has set it yet."""
+        if self.has(key):
+            return self
+        text = str(value).lower() if isinstance(value, bool) else str(value)
+        return replace(self, flags=(*self.flags, f"--{key}={text}"))
+
+    def changed(self, key: str, value: object) -> LerobotSettings:
+        """Return settings with ``--key=value``, whatever was set before."""
+        return self.without(key).default(key, value)
+
+    def without(self, *keys: str) -> LerobotSettings:
+        """Return settings that say nothing of these keys."""
+        flags: list[str] = list(self.flags)
+        for key in keys:
+            flags = without_flag(flags, key)
+        return replace(self, flags=tuple(flags))
+
+    def choosing(self, key: str, name: str) -> LerobotSettings:
+        """Return settings whose ``policy`` or ``env`` is of the registered type ``name``, where none is chosen yet."""
+        if key in self.chosen or self.config is None:
+            return self
+        return replace(self, chosen={**self.chosen, key: registry(self.config, key)[name]})
+
+
+def translate(command: str, words: Words, config: type | None, file: Mapping[str, Any]) -> LerobotSettings:
+    """Turn a command line into LeRobot's settings.
+
+    Args:
+        command: LeRobot's command without ``lerobot-``. config: the configuration class of the command, None
+            when it has none. file: content of the file named by ``config_path``, {} without one; it may hold
+            the policy and the environment.
+
+    Raises:
+        MemobenchError: an unknown key or value, named with the nearest known one.
+    """
+    if config is None:
+        return LerobotSettings((*words.flags, *(f"--{key}={value}" for key, value in words.settings)))
+    known = field_types(config)
+    choosing = [(key, value) for key, value in words.settings if key in CHOOSING and key in known]
+    others = [setting for setting in words.settings if setting not in choosing]
+    flags = [*words.flags, *(flag for key, value in choosing for flag in choice_flags(config, key, value))]
+    # Fields of the policy and the environment are known once these are, wherever they stand in the line.
+    explicit = [*flags, *(f"--{key}={value}" for key, value in others)]
+    found = {key: chosen_class(config, key, explicit, file) for key in ("policy", "env") if key in known}
+    chosen: dict[str, type] = {key: choice for key, choice in found.items() if choice is not None}
+    for key, value in others:
+        flags += _field_flags(command, config, chosen, key, value)
+    return LerobotSettings(tuple(flags), config, chosen)
+
+
+def _field_flags(command: str, config: type, chosen: Mapping[str, type], key: str, value: str) -> list[str]:
+    """Return the flags that set one field, or those that a short form stands for."""
+    targets = SHORT_FORMS.get(command, {}).get(key)
+    if targets is not None:
+        return _short_form_flags(config, chosen, key, value, targets)
+    try:
+        annotation = annotation_of(config, key, chosen.get)
+    except KeyError:
+        known = [*CHOOSING, *SHORT_FORMS.get(command, {}), *all_keys(config, chosen.get)]
+        known += {"eval": EVALUATION_WORDS, "train": TRAINING_WORDS}.get(command, ())
+        raise MemobenchError(f"lerobot {command} has no setting {key!r}, {nearest(key, known)}") from None
+    return [f"--{key}={checked_value(key, annotation, value)}"]
+
+
+def _short_form_flags(
+    config: type, chosen: Mapping[str, type], key: str, value: str, targets: tuple[str, ...]
+) -> list[str]:
+    """Return the flags of those of a short form's fields that exist; at least one must."""
+    found = []
+    for target in targets:
+        # replan= sets the policy's interval and tells the environment, which writes it down; either may be
+        # missing.
+        try:
+            annotation = annotation_of(config, target, chosen.get)
+        except (KeyError, MemobenchError):
+            continue
+        found.append(f"--{target}={checked_value(key, annotation, value)}")
+    if found:
+        return found
+    owner, _, name = targets[0].partition(".")
+    if owner in chosen:
+        kind = chosen[owner].__name__
+        raise MemobenchError(f"{key}= sets {targets[0]}, which this {owner} ({kind}) does not have")
+    raise MemobenchError(f"{key}= sets {name} of the {owner}: name one with {owner}=")
+
+
+# ==== choices.py
+# What ``policy=``, ``env=`` and ``dataset=`` choose: a registered type, a checkpoint, a repository, a folder.
+
+
+def choice_flags(config: type, key: str, value: str) -> list[str]:
+    """Return the flags for ``policy=``, ``env=`` or ``dataset=`` of a command with this configuration.
+
+    Raises:
+        MemobenchError: there is no such thing, with what is near.
+    """
+    if not value:
+        raise MemobenchError(f"{key}= is empty; name a {key}")
+    if key == "dataset":
+        return dataset_flags(value)
+    known = registry(config, key)
+    path = checkpoint_of(value, known) if key == "policy" else None
+    if path is not None:
+        return [f"--policy.path={path}"]
+    if value not in known:
+        others = shipped_policies() if key == "policy" else {}
+        raise MemobenchError(f"there is no {key} {value!r}, {nearest(value, [*known, *others])}")
+    return [f"--{key}.type={value}"]
+
+
+def checkpoint_of(value: str, known: Collection[str]) -> str | None:
+    """Return the checkpoint folder or the repository that ``policy=`` means; None where it means a type.
+
+    A known name is what has it, wherever the command is run: a folder of that name is named by a path.
+    """
+    if value in (*known, *shipped_policies()) and folder_with_checkpoint(value) is not None:
+        what = "the policy type" if value in known else "the policy of the package"
+        logger.warning("policy=%s is %s; the checkpoint in the folder of that name is policy=./%s", value, what, value)
+    folder = None if value in known else checkpoint_folder(value)
+    if folder is not None:
+        return str(folder)
+    if value not in known and (looks_local(value) or Path(value).is_dir()):
+        what = "holds no checkpoint (no config.json)" if Path(value).is_dir() else "does not exist"
+        raise MemobenchError(
+            f"policy={value}: this folder {what}; expected a checkpoint such as "
+            "outputs/train/<run>/checkpoints/last/pretrained_model, or a policy type"
+        )
+    return value if "/" in value else None
+
+
+def dataset_flags(value: str) -> list[str]:
+    """Return the flags for ``dataset=``: a folder here, or a repository's id."""
+    path = Path(value).expanduser()
+    if path.is_dir():
+        return [f"--dataset.repo_id=local/{path.resolve().name}", f"--dataset.root={path}"]
+    if looks_local(value) or "/" not in value:
+        raise MemobenchError(
+            f"dataset={value}: there is no such folder; expected one that `memobench generate` wrote, "
+            "or a repository such as user/name"
+        )
+    return [f"--dataset.repo_id={value}"]
+
+
+def chosen_class(config: type, key: str, flags: Sequence[str], file: Mapping[str, Any]) -> type | None:
+    """Return the class that flags or a configuration file choose for ``policy`` or ``env``.
+
+    None when nothing is chosen, or when it is not known here.
+    """
+    known = registry(config, key)
+    path = flag_value(flags, f"{key}.{PATH_KEY}")
+    name = flag_value(flags, f"{key}.type")
+    section = file.get(key)
+    if not path and not name and isinstance(section, Mapping):
+        path, name = (_text(key, section, word) for word in ("path", "type"))
+    if path:
+        name = checkpoint_type(path)
+    elif name and name not in known:
+        raise MemobenchError(f"there is no {key} {name!r}, {nearest(name, known)}")
+    return known.get(name) if name else None
+
+
+def _text(key: str, section: Mapping[str, Any], word: str) -> str | None:
+    value = section.get(word)
+    if value is not None and not isinstance(value, str):
+        raise MemobenchError(f"the configuration file says {key}.{word}: {str(value)[:80]}; expected a name")
+    return value
+
+
+# ==== fields.py
+# Which settings a LeRobot command has and which values they take: read from its dataclasses.
+
+#: Keys that LeRobot's parser understands beside the fields of a registry (``--policy.type``) or of a command.
+CHOICE_KEYS = ("type", "discover_packages_path")
+PATH_KEY = "path"
+CONFIG_KEY = "config_path"
+
+#: Given a dotted key of a registry field (``policy``), the chosen class; None when nothing is chosen.
+Chosen = Callable[[str], type | None]
+
+
+def is_registry(annotation: Any) -> bool:
+    """Return whether a field is chosen by ``.type`` among registered classes."""
+    return isinstance(annotation, type) and issubclass(annotation, draccus.ChoiceRegistry)
+
+
+def field_types(cls: type) -> dict[str, Any]:
+    """Return field name -> annotation without its None, for the fields that can be set."""
+    hints = typing.get_type_hints(cls)
+    return {field.name: without_none(hints[field.name]) for field in dataclasses.fields(cls) if field.init}
+
+
+def without_none(annotation: Any) -> Any:
+    """Return the annotation without its None: ``int`` for ``int | None``."""
+    if typing.get_origin(annotation) in (Union, types.UnionType):
+        parts = [part for part in typing.get_args(annotation) if part is not type(None)]
+        return parts[0] if len(parts) == 1 else Union[tuple(parts)]  # noqa: UP007 - built at run time
+    return annotation
+
+
+def registry(config: type, key: str) -> dict[str, type]:
+    """Return name -> class of what may be chosen for a registry field such as ``policy``."""
+    choices = field_types(config)[key].get_known_choices()
+    return {str(name): choice for name, choice in choices.items()}
+
+
+def all_keys(config: type, chosen: Chosen, before: str = "") -> Iterator[str]:
+    """Yield every dotted key that may be set."""
+    for name, annotation in field_types(config).items():
+        key = before + name
+        if is_registry(annotation):
+            choice = chosen(key)
+            yield from (f"{key}.{word}" for word in (*CHOICE_KEYS[:1], PATH_KEY))
+            if choice is not None:
+                yield from all_keys(choice, chosen, key + ".")
+        elif dataclasses.is_dataclass(annotation):
+            yield from all_keys(typing.cast(type, annotation), chosen, key + ".")
+        else:
+            yield key
+
+
+def annotation_of(config: type, key: str, chosen: Chosen) -> Any:
+    """Return the annotation of the field at a dotted key; ``Any`` where it cannot be known.
+
+    Raises:
+        KeyError: there is no such field. MemobenchError: the key belongs to a choice that has not been made
+            (``env.horizon`` without an environment).
+    """
+    if key == CONFIG_KEY:
+        return str
+    cls = config
+    parts = key.split(".")
+    for k, part in enumerate(parts[:-1]):
+        annotation = _field(cls, part, key)
+        if is_registry(annotation):
+            if k == len(parts) - 2 and parts[-1] in (*CHOICE_KEYS, PATH_KEY):
+                return str
+            choice = chosen(".".join(parts[: k + 1]))
+            if choice is None and k == 0:
+                raise MemobenchError(f"{key!r} needs {part}=: name one before setting something of it")
+            annotation = choice
+        if not dataclasses.is_dataclass(annotation):
+            return Any  # a dict, a union, a choice made elsewhere: LeRobot's parser decides
+        cls = typing.cast(type, annotation)
+    return _field(cls, parts[-1], key)
+
+
+def _field(cls: type, name: str, key: str) -> Any:
+    known = field_types(cls)
+    if name not in known:
+        raise KeyError(key)
+    return known[name]
+
+
+def checked_value(key: str, annotation: Any, text: str) -> str:
+    """Return ``text`` as LeRobot's parser reads it, after a check against the field's type.
+
+    Raises:
+        MemobenchError: the value cannot be one of this field.
+    """
+    if text in ("null", "~"):
+        return text
+    if annotation in (bool, int, float):
+        # For text, a word such as `align=none` is a value.
+        return "null" if text.lower() == "none" else _checked_plain(key, annotation, text)
+    if typing.get_origin(annotation) is Literal:
+        values = [str(value) for value in typing.get_args(annotation)]
+        _check_known(key, text, values, values)
+    elif isinstance(annotation, type) and issubclass(annotation, enum.Enum):
+        values = [str(member.value) for member in annotation]
+        _check_known(key, text, [*values, *annotation.__members__], list(annotation.__members__))
+    return text
+
+
+def _checked_plain(key: str, annotation: type, text: str) -> str:
+    """Return the text of a truth value or number."""
+    if annotation is bool:
+        if text.lower() not in ("true", "false"):
+            raise MemobenchError(f"{key}={text}: expected true or false")
+        return text.lower()
+    plain = text.replace("_", "") if annotation is int else text
+    try:
+        annotation(plain)
+    except ValueError:
+        word = "a whole number" if annotation is int else "a number"
+        raise MemobenchError(f"{key}={text}: expected {word}") from None
+    return plain
+
+
+def _check_known(key: str, text: str, known: list[str], named: list[str]) -> None:
+    if text not in known:
+        raise MemobenchError(f"{key}={text}: {nearest(text, named)}")
+
+
+# ==== reading.py
+# A command line, read whole: what LeRobot's command is to be called with, and what it would choose by it.
+
+
+def read_settings(command: str, words: Words) -> LerobotSettings:
+    """Return what the words of a LeRobot command mean to it; imports that command.
+
+    Raises:
+        MemobenchError: an unknown key or value, named with the nearest known one.
+    """
+    config = config_class(load_command(command))
+    register_plugins()
+    return translate(command, words, config, read_config_file(words))
+
+
+def check_task_names(words: Words) -> None:
+    """Refuse unknown task names before LeRobot's import, which takes many seconds.
+
+    Raises:
+        MemobenchError: a task that the catalogue does not have.
+    """
+    settings = dict(words.settings)
+    environment = settings.get("env", words.value("env.type"))
+    tasks = settings.get("tasks", words.value("env.tasks"))
+    own_folder = "env.task_dir" in settings or words.value("env.task_dir")
+    suite = settings.get("suite", words.value("env.suite"))
+    in_a_file = suite is None and words.value("config_path") is not None
+    if environment == "memobench" and not own_folder and not in_a_file:
+        resolve_tasks("all" if tasks is None else tasks, check_suite(suite or PUBLISHED))
+
+
+def read_config_file(words: Words) -> dict[str, Any]:
+    """Return the content of the local file that ``config_path`` names, {} without one.
+
+    Raises:
+        MemobenchError: it cannot be read as settings.
+    """
+    given = words.value("config_path")
+    if given is None:
+        return {}
+    path = Path(given).expanduser()
+    if path.is_dir():
+        path = path / "train_config.json"
+    if not path.is_file():
+        return {}  # a repository: LeRobot fetches it
+    try:
+        content = yaml.safe_load(path.read_bytes())
+    except OSError as error:
+        raise MemobenchError(f"config_path={given} cannot be read ({error.strerror or error})") from None
+    except (yaml.YAMLError, ValueError, TypeError, KeyError, RecursionError, AttributeError) as error:
+        # Beside its own errors, PyYAML lets through those of dates, numbers and keys that are none.
+        problem = " ".join(str(error).split())
+        raise MemobenchError(f"config_path={given} is neither YAML nor JSON: {problem}") from None
+    if not isinstance(content, dict):
+        raise MemobenchError(f"config_path={given} holds no settings; expected a mapping such as 'policy: …'")
+    return content

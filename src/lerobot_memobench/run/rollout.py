@@ -1,0 +1,315 @@
+"""What LeRobot's evaluation loop is made to do beside its own: run parts of a task, seed each batch, draw what is seen.
+
+Written against the loop of one version: what it relies on is listed in tests/engine/test_lerobot_loop.py, whose
+failures say what to look at when LeRobot moves on. How it gets there, and out again: `lerobot_hooks`.
+
+LeRobot seeds Python, NumPy and torch once per run, so what a sampling policy draws in an episode depends on all that
+ran before it. Here each batch is seeded from the run's seed, the task and the batch's first episode: an evaluation
+that is resumed or shared among machines draws what an undisturbed one draws.
+
+Frames are drawn for those who look at them (``rollout``), and the environment films (``env.films``): LeRobot would
+render ten episodes of each task a second time.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import logging
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.envs import check_env_attributes_and_types, preprocess_observation
+from lerobot.envs.utils import NEW_ROLLOUT_OPTION
+from lerobot.utils.constants import ACTION, OBS_IMAGES
+from numpy.typing import NDArray
+from tqdm import trange
+
+from lerobot_memobench.jobs.threads import limit_torch
+from lerobot_memobench.lerobot_hooks import INSIDE_SLURM, ROLLOUT, RUN_ONE, check_version, hooked
+from lerobot_memobench.run.plan import Range
+from lerobot_memobench.run.recording import Recorder
+
+KEEPS_ITS_NOISE = ("memobench_mem",)
+"""Policies that seed each episode's noise themselves, from torch's initial seed: it must stay the run's."""
+
+
+@contextmanager
+def calm_output() -> Iterator[None]:
+    """Keep progress bars out of log files, and a library's farewell out of the end of a run."""
+    logging.getLogger("OpenGL").setLevel(logging.WARNING)
+    with ExitStack() as stack:
+        if not sys.stderr.isatty():
+            # The bar is redrawn at every step. LeRobot leaves it out where it takes itself to be in a batch job.
+            stack.enter_context(hooked(INSIDE_SLURM, lambda _: lambda: True))
+        yield
+
+
+@contextmanager
+def steered(seed: int | None, ranges: Mapping[tuple[str, int], list[Range]] | None = None) -> Iterator[None]:
+    """While this lasts, LeRobot's loop seeds batches, draws what is looked at, films nothing and runs only ``ranges``.
+
+    Args:
+        seed: of the run; batches are not seeded when None.
+        ranges: by LeRobot's name of a task the runs of it; everything when None.
+
+    Raises:
+        MemobenchError: the installed LeRobot is another than the one whose loop is known here.
+    """
+    check_version()
+    from lerobot.scripts import lerobot_eval
+
+    def one(run_one: Callable[..., Any]) -> Callable[..., Any]:
+        return _unfilmed(run_one) if ranges is None else _only(_unfilmed(run_one), ranges)
+
+    def rolled(rollout: Callable[..., Any]) -> Callable[..., Any]:
+        spared = sparing(rollout, lambda: lerobot_eval.inside_slurm())
+        return spared if seed is None else _seeded(spared, seed)
+
+    with hooked(RUN_ONE, one), hooked(ROLLOUT, rolled):
+        yield
+
+
+def _unfilmed(run_one: Callable[..., Any]) -> Callable[..., Any]:
+    """Wrap LeRobot's evaluation of one task: it renders no episode, and makes no folder for films."""
+
+    @functools.wraps(run_one)
+    def run(task_group: str, task_id: int, env: Any, **settings: Any) -> tuple[str, int, dict[str, Any]]:
+        imagines = getattr(getattr(settings.get("policy"), "config", None), "save_predicted_video", False)
+        folder = settings["videos_dir"] if imagines else None  # a world model's own videos stay
+        return run_one(task_group, task_id, env, **{**settings, "max_episodes_rendered": 0, "videos_dir": folder})
+
+    return run
+
+
+def _only(run_one: Callable[..., Any], ranges: Mapping[tuple[str, int], list[Range]]) -> Callable[..., Any]:
+    """Wrap LeRobot's evaluation of one task: it is called once per range, the results are joined."""
+
+    @functools.wraps(run_one)
+    def run(task_group: str, task_id: int, env: Any, **settings: Any) -> tuple[str, int, dict[str, Any]]:
+        joined: dict[str, Any] = {}
+        mine = ranges.get((task_group, task_id), [])
+        for first, count in mine:
+            changed = {**settings, "start_seed": settings["start_seed"] + first, "n_episodes": count}
+            for folder in ("videos_dir", "recording_dir"):
+                if len(mine) > 1 and settings.get(folder) is not None:  # LeRobot numbers its films from 0
+                    changed[folder] = settings[folder] / f"from_{first}"
+            _, _, metrics = run_one(task_group, task_id, env, **changed)
+            for key, values in metrics.items():
+                joined[key] = [*joined.get(key, []), *values]
+        return task_group, task_id, joined
+
+    return run
+
+
+def _seeded(rollout: Callable[..., Any], seed: int) -> Callable[..., Any]:
+    """Wrap LeRobot's rollout of one batch: what the policy draws depends on the batch alone."""
+    first_seeds: dict[str, int] = {}  # of the policy's own generators: a setting of the policy's may have chosen them
+
+    @functools.wraps(rollout)
+    def run(env: Any, policy: Any, *args: Any, **settings: Any) -> Any:
+        seeds = settings.get("seeds")
+        if seeds and getattr(policy, "name", None) not in KEEPS_ITS_NOISE:
+            _seed_batch(policy, first_seeds, seed, env.call("task")[0], seeds[0])
+        return rollout(env, policy, *args, **settings)
+
+    return run
+
+
+def _seed_batch(policy: Any, first_seeds: dict[str, int], seed: int, task: str, first: int) -> None:
+    """Seed what LeRobot seeds, and the policy's own generators, whose first seeds are remembered and still count."""
+    from lerobot.utils.random_utils import set_seed
+    from torch import Generator
+
+    set_seed(batch_seed(seed, task, first))
+    for name, generator in vars(policy).items():
+        if isinstance(generator, Generator):
+            own = first_seeds.setdefault(name, generator.initial_seed())
+            generator.manual_seed(batch_seed(seed, task, first, own))
+
+
+def batch_seed(seed: int, task: str, first: int, *more: int) -> int:
+    """Return the seed (32 bits) of the batch that begins with the episode of the seed ``first``."""
+    text = " ".join(str(part) for part in (seed, task, first, *more))
+    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=4).digest(), "big")
+
+
+# ==== rollout.py
+# LeRobot's loop over control steps, in which pictures are drawn and converted only for a policy that looks at them.
+#
+# It takes the same steps in the same order as ``lerobot_eval.rollout`` and returns the same tensors, and records what a
+# dataset is asked for of (`recording`). Between two looks a
+# policy is handed the pictures and objects that it saw last, which it has said it will not read; everything else of an
+# observation is of the present.
+
+PIXELS, PHASE = "pixels", "phase"
+"""Of an observation: what is left out when nobody looks; 0 while the prompt plays, 1 in execution."""
+KEEPS_FRAMES = ("return_observations", "render_callback", "predicted_latents_callback")
+"""Settings of LeRobot's rollout that make use of every frame, or of what only its own loop does."""
+RECORDS = ("recording_dir", "env_features", "recording_repo_id", "recording_private")
+"""Settings by which a rollout is recorded as a dataset; see `recording`."""
+
+Processor = Callable[[Any], Any]
+
+
+class Eyes:
+    """The observations of a rollout as its policy gets them.
+
+    Args:
+        env: the vector environment, told by ``watch`` whether its next frames are seen.
+        looks: tells, after an action, whether the policy looks at the next observation.
+    """
+
+    def __init__(self, env: Any, looks: Callable[[], bool]) -> None:
+        self._env, self._looks = env, looks
+        self._watched = True  # since the environment's reset
+        self._pictures: dict[str, torch.Tensor] = {}
+        self._phase: NDArray[np.float32] | None = None
+
+    def announce(self) -> None:
+        """Tell the environment, before its step, whether anybody looks at what comes of it."""
+        looks = self._looks()
+        if looks != self._watched:
+            self._env.call("watch", looks)
+            self._watched = looks
+
+    def see(self, observation: dict[str, Any]) -> dict[str, Any]:
+        """Return LeRobot's form of an observation, with the pictures seen last where nobody looks."""
+        begins = self._phase is None or bool((observation[PHASE] != self._phase).any())
+        self._phase = np.array(observation[PHASE])
+        if begins or self._watched:  # the first frame of an execution is seen by all: none can know when it comes
+            seen = preprocess_observation(observation)
+            self._pictures = {key: value for key, value in seen.items() if key.startswith(OBS_IMAGES)}
+            return seen
+        seen = preprocess_observation({key: value for key, value in observation.items() if key != PIXELS})
+        return {**self._pictures, **seen}
+
+
+def sparing(
+    rollout: Callable[..., dict[str, Any]], hides_progress: Callable[[], bool]
+) -> Callable[..., dict[str, Any]]:
+    """Wrap LeRobot's rollout: where nothing but the policy sees the frames, only those that it looks at are drawn.
+
+    Args:
+        hides_progress: whether the bar over a rollout's steps is left out.
+    """
+
+    @functools.wraps(rollout)
+    def run(env: Any, policy: Any, *args: Any, **settings: Any) -> dict[str, Any]:
+        limit_torch(sum(parameter.numel() for parameter in getattr(policy, "parameters", tuple)()))
+        if args or any(settings.get(name) for name in KEEPS_FRAMES):
+            return rollout(env, policy, *args, **settings)
+        return _roll(env, policy, settings, quiet=hides_progress())
+
+    return run
+
+
+def _roll(env: Any, policy: Any, settings: dict[str, Any], quiet: bool) -> dict[str, Any]:
+    """Run one episode in each environment of a batch; see LeRobot's rollout for what is returned."""
+    policy.reset()
+    observation, _ = env.reset(seed=settings.get("seeds"), options={NEW_ROLLOUT_OPTION: True})
+    limit = env.call("_max_episode_steps")[0]
+    check_env_attributes_and_types(env)
+    done = ever = np.zeros(env.num_envs, bool)
+    steps: list[tuple[NDArray[Any], ...]] = []
+    bar = trange(limit, desc=f"Running rollout with at most {limit} steps", disable=quiet, leave=False)
+    with bar, _recorder(env, settings) as recorder:
+        eyes = Eyes(env, looking(policy) if recorder is None else lambda: True)
+        while not done.all() and len(steps) < limit:
+            before, seen = observation, eyes.see(observation)
+            action = _act(env, policy, settings, seen)
+            eyes.announce()
+            observation, reward, terminated, truncated, info = env.step(action)
+            success = _successes(info, env.num_envs)
+            done = terminated | truncated | done | (len(steps) + 1 == limit)
+            ever = ever | success
+            if recorder is not None:
+                broken = np.broadcast_to(info.get("_fault", False), done.shape)  # gymnasium's mark of rows that tell it
+                recorder.add(before, action, reward, success, done, seen["task"], broken)
+            steps.append((action, reward, success, done))
+            bar.set_postfix({"running_success_rate": f"{ever.mean() * 100:.1f}%"}, refresh=False)
+            bar.update()
+    if hasattr(policy, "use_original_modules"):
+        policy.use_original_modules()
+    stacked = (torch.from_numpy(np.stack(parts, axis=1)) for parts in zip(*steps, strict=True))
+    return dict(zip((ACTION, "reward", "success", "done"), stacked, strict=True))
+
+
+@contextmanager
+def _recorder(env: Any, settings: Mapping[str, Any]) -> Iterator[Recorder | None]:
+    """Yield what records the batch, None where nothing does; what it has recorded is whole when this ends."""
+    folder, features, repository, private = (settings.get(name) for name in RECORDS)
+    if folder is None or features is None:
+        yield None
+        return
+    fps = env.unwrapped.metadata["render_fps"]
+    recorder = Recorder(Path(folder), features, env.num_envs, fps, repository, bool(private))
+    try:
+        yield recorder
+    finally:
+        recorder.close()
+
+
+def _act(env: Any, policy: Any, through: Mapping[str, Processor], seen: dict[str, Any]) -> NDArray[np.float32]:
+    """Return the actions (batch, A) of a policy for an observation, both ``through`` the processors of each."""
+    seen["task"] = list(env.call("task_description"))
+    batch = through["preprocessor"](through["env_preprocessor"](seen))
+    with torch.inference_mode():
+        action = policy.select_action(batch)
+    action = through["env_postprocessor"]({ACTION: through["postprocessor"](action)})[ACTION]
+    found: NDArray[np.float32] = action.to("cpu").numpy()
+    return found
+
+
+def _successes(info: dict[str, Any], rows: int) -> NDArray[np.bool_]:
+    """Return which rows' goals hold (rows,)."""
+    told = info.get("final_info", info).get("is_success", False)
+    return np.broadcast_to(np.asarray(told, bool), rows)
+
+
+# ==== looking.py
+# Which policies look at the next observation: for those that do not, nothing is drawn and no objects are found.
+#
+# A policy of ours says so itself, by its method ``looks_next``. LeRobot's policies that plan chunks look when their queue
+# of planned actions is empty; each is known by the very function that was read (tests/engine/test_lerobot_loop.py), so a
+# subclass that acts in another way, a wrapped policy, and any other always look. (`diffusion` queues pictures at every
+# step.)
+
+
+def _looks_act(policy: Any) -> bool:
+    return policy.config.temporal_ensemble_coeff is not None or not policy._action_queue
+
+
+def _pi(policy: Any) -> bool:
+    return not policy._action_queue
+
+
+def _smolvla(policy: Any) -> bool:
+    return not policy._queues[ACTION]
+
+
+KNOWN: dict[tuple[str, str], Callable[[Any], bool]] = {
+    ("lerobot.policies.act.modeling_act", "ACTPolicy"): _looks_act,
+    ("lerobot.policies.pi0.modeling_pi0", "PI0Policy"): _pi,
+    ("lerobot.policies.pi05.modeling_pi05", "PI05Policy"): _pi,
+    ("lerobot.policies.smolvla.modeling_smolvla", "SmolVLAPolicy"): _smolvla,
+}
+"""Module and class of LeRobot's policies -> whether one of them looks next."""
+
+
+def looking(policy: Any) -> Callable[[], bool]:
+    """Return what tells, before a step, whether a policy looks at pictures or objects of the observation after it."""
+    own = getattr(policy, "looks_next", None)
+    if own is not None:
+        return own
+    acts = getattr(type(policy), "select_action", None)
+    for (module, name), looks in KNOWN.items():
+        # A policy of a module that nobody has imported is not here.
+        if acts is not None and acts is getattr(getattr(sys.modules.get(module), name, None), "select_action", None):
+            return lambda: looks(policy)
+    return lambda: True
