@@ -17,9 +17,8 @@ from lerobot.configs import FeatureType
 from lerobot.utils.constants import OBS_STATE
 
 from lerobot_memobench.datasets.execution_frames import ExecutionFrames, leave_out_prompts
-from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID
+from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, PRIVILEGED
 from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS as INPUT
-from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, OBS_TYPES, PIXELS
 from lerobot_memobench.envs.prompting import knows_phases, quiet
 from lerobot_memobench.errors import MemobenchError, nearest
