@@ -24,7 +24,7 @@ check: ## lint, formatting, types and declared dependencies
 	@.venv/bin/ruff check .
 	@.venv/bin/ruff format --check .
 	@.venv/bin/mypy
-	@.venv/bin/deptry src
+	@.venv/bin/deptry src research
 
 lock: ## resolve pyproject.toml again into requirements.lock
 	@scripts/setup

@@ -28,9 +28,8 @@ ROWS = {
 
 def ours(images: bool, logs: str) -> dict[str, Callable[[Any], Any]]:
     """Return how the project steps and resets: LeRobot's vector environment, or the simulation without images."""
-    from lerobot_memobench.bench.machine import TASK
-    from lerobot_memobench.bench.sides import Ours
     from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+    from research.speed.sides import TASK, Ours
 
     if not images:
         side = Ours(TASK, images=False)
@@ -44,7 +43,7 @@ def ours(images: bool, logs: str) -> dict[str, Callable[[Any], Any]]:
 
 def stock(images: bool, _: str) -> dict[str, Callable[[Any], Any]]:
     """Return how stock robosuite steps and resets."""
-    from lerobot_memobench.bench.sides import stock_robosuite
+    from research.speed.sides import stock_robosuite
 
     env = stock_robosuite(images)
     env.reset()
@@ -53,7 +52,7 @@ def stock(images: bool, _: str) -> dict[str, Callable[[Any], Any]]:
 
 def serve(side: str, kind: str) -> None:
     """Answer each line ``what times`` with the median seconds on the wall and of processors."""
-    from lerobot_memobench.bench.sides import actions
+    from research.speed.sides import actions
 
     with tempfile.TemporaryDirectory() as logs:
         does, moves, seed = (stock if side == "stock" else ours)(kind == "images", logs), actions(), 0
@@ -76,7 +75,7 @@ class Side:
     def __init__(self, name: str, source: Path, kind: str) -> None:
         self.process = subprocess.Popen(
             [sys.executable, "-W", "ignore", __file__, "--serve", name, kind],
-            env={**os.environ, "PYTHONPATH": str(source)},
+            env={**os.environ, "PYTHONPATH": f"{source}{os.pathsep}{source.parent}"},
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         )  # fmt: skip
 

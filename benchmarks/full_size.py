@@ -30,11 +30,11 @@ from lerobot.envs.utils import preprocess_observation
 from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 from policies import config, training_batch
 
-from lerobot_memobench.bench.machine import TASK, machine
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.random_weights import random_policy
 from lerobot_memobench.tasks.catalogue import get_task
+from research.speed.sides import TASK, machine
 
 WARM_UP = 3
 REPLAN = 5

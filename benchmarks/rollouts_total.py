@@ -6,8 +6,8 @@ python benchmarks/rollouts_total.py [tasks]
 import json
 import sys
 
-from lerobot_memobench.bench.total import rollouts_total
 from lerobot_memobench.jobs.threads import ACTING, use_threads
+from research.speed.evaluation import rollouts_total
 
 if __name__ == "__main__":
     use_threads(ACTING)  # as `lerobot eval` does, before torch is loaded

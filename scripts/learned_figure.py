@@ -16,12 +16,9 @@ from pathlib import Path
 from lerobot_memobench.datasets.lerobot_format.card import markdown
 from lerobot_memobench.evaluation.metrics.rollouts import Record, by_task
 from lerobot_memobench.evaluation.records.runs import read_runs
-from lerobot_memobench.studies.learning.contrasts import contrasts
-from lerobot_memobench.studies.learning.experiments import prompted
-from lerobot_memobench.studies.learning.figure import SCOPES, draw
-from lerobot_memobench.studies.learning.outcomes import outcomes_of
-from lerobot_memobench.studies.learning.tables import contrasts_table, outcomes_table
 from lerobot_memobench.tasks.failures import REFERENCE_DRIFT
+from research.learning.experiments import prompted
+from research.learning.results import SCOPES, contrasts, contrasts_table, draw, outcomes_of, outcomes_table
 
 
 def shared(arms: dict[str, list[Record]]) -> dict[str, list[Record]]:

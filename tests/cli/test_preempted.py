@@ -153,11 +153,3 @@ def test_a_training(tmp_path: Path) -> None:
     job.wait_until(lambda: (run / "checkpoints" / "last").resolve().name != before)
     assert int((run / "checkpoints" / "last").resolve().name) > int(before)
     job.end()
-
-
-@pytest.mark.slow
-def test_an_experiment(tmp_path: Path) -> None:
-    words = ["learn", "bowl", "--out", "bowl", "--episodes", "20", "--workers", "2"]
-    job = Job(["-m", COMMANDS["memobench"], *words], tmp_path)
-    job.wait_until(lambda: any((tmp_path / "bowl").rglob(".staging/*/*/*")))
-    assert job.end() == f"memobench: ended by SIGTERM; go on with: {shlex.join(['memobench', *words])}"

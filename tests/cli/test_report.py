@@ -69,22 +69,6 @@ def test_compare(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["compare", a, b, "--allow", "replan_steps", "--format", "csv"]) == 2
 
 
-def test_agreement(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    sheet = tmp_path / "labels.csv"
-    sheet.write_text("template,released,x,y\na,S,S,S\nb,U,U,C\n")
-    assert main(["agreement", str(sheet)]) == 0
-    assert "3/4" in capsys.readouterr().out
-    assert main(["agreement", str(sheet), "--format", "markdown", "--out", str(tmp_path / "out")]) == 0
-    assert (tmp_path / "out" / "agreement.md").is_file()
-    assert main(["agreement", "--paper"]) == 0
-    assert capsys.readouterr().out.count("equal") >= 7
-    blank = tmp_path / "new" / "blank.csv"
-    assert main(["agreement", "--template", str(blank)]) == 0
-    assert len(blank.read_text().splitlines()) == 85
-    assert main(["agreement", "--template", str(blank)]) == 2  # raters may have filled it in
-    assert main(["agreement"]) == 2
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [

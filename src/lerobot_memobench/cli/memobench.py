@@ -22,14 +22,11 @@ from lerobot_memobench.cli.doctor import doctor
 from lerobot_memobench.cli.errors import one_sentence
 from lerobot_memobench.cli.generate import generate
 from lerobot_memobench.cli.html import html
-from lerobot_memobench.cli.learn import learn
 from lerobot_memobench.cli.merge import merge, rerun
-from lerobot_memobench.cli.necessity import necessity
 from lerobot_memobench.cli.objects import objects
 from lerobot_memobench.cli.recipe import recipe
-from lerobot_memobench.cli.report import agreement, compare, report
-from lerobot_memobench.cli.simulator import bench, gallery
-from lerobot_memobench.cli.study import study
+from lerobot_memobench.cli.report import compare, report
+from lerobot_memobench.cli.simulator import gallery
 from lerobot_memobench.cli.tasks import tasks
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.processes import saying_how_to_go_on
@@ -68,15 +65,14 @@ app = typer.Typer(
 COMMANDS: dict[str, tuple[Callable[..., int | None] | tuple[str, typer.Typer], ...]] = {
     "Look around": (tasks, objects, gallery, doctor, demo),
     "Demonstrations": (generate, data.convert, cache, data.validate, data.describe, data.push),
-    "Train": (recipe, study, learn, ("eyes", eyes.app)),
+    "Train": (recipe, ("eyes", eyes.app)),
     "Results": (report, compare, html, merge, rerun, ("figures", figures.app), ("controls", controls.app)),
-    "The benchmark itself": (necessity, agreement, bench),
 }
 """Group -> its commands, as ``memobench --help`` lists them."""
 
-GO_ON = ("generate", "cache", "convert", "push", "eyes", "learn", "study", "necessity")
+GO_ON = ("generate", "cache", "convert", "push", "eyes")
 """Commands that go on when they are given again; any other begins anew."""
-LEARN = ("cache", "eyes", "learn", "study")
+LEARN = ("cache", "eyes")
 """Commands whose own process trains or encodes; every other simulates, or computes next to nothing."""
 
 for group, commands in COMMANDS.items():

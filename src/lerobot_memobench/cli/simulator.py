@@ -1,4 +1,4 @@
-"""``memobench gallery`` and ``memobench bench``: how the simulated world looks, and how fast it is."""
+"""``memobench gallery``: how the simulated world looks."""
 
 from __future__ import annotations
 
@@ -22,17 +22,3 @@ def gallery(
 
     for picture in write_gallery(out, suite):
         console().print(str(picture), soft_wrap=True)
-
-
-def bench(
-    names: Annotated[list[str] | None, typer.Argument(help="Which benchmarks; all when left out.")] = None,
-) -> None:
-    """Time steps, resets and workers against stock robosuite. All in one run; the table belongs in a bug report."""
-    from lerobot_memobench.bench.claims import run
-    from lerobot_memobench.bench.line import table
-
-    lines = []
-    for line in run(names):
-        print(line.json(), flush=True)
-        lines.append(line)
-    print(f"\n{table(lines)}")

@@ -1,0 +1,1 @@
+"""The lab: studies with and of the benchmark. It imports the product, never the other way round (README.md)."""

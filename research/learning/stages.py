@@ -1,0 +1,211 @@
+"""A command of ours, run as a user would, its output in a file and its cost known."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.io import read_json, write_file
+from lerobot_memobench.jobs.threads import sharing
+from lerobot_memobench.run.arguments import split_words
+from lerobot_memobench.tasks.catalogue import suite_of
+from lerobot_memobench.tasks.task import STRICT
+from research.learning.experiments import PERCEPTIONS, Experiment, Sight
+
+MODULES = {"lerobot": "lerobot_memobench.cli.lerobot", "memobench": "lerobot_memobench.cli.memobench"}
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a command took: seconds on the clock and of processors, over all its attempts."""
+
+    wall_s: float
+    cpu_s: float
+
+    def __add__(self, other: Cost) -> Cost:
+        """Return both together."""
+        return Cost(self.wall_s + other.wall_s, self.cpu_s + other.cpu_s)
+
+
+def run_once(
+    words: Sequence[str],
+    log: Path,
+    *,
+    how: Sequence[str] = (),
+    beside: int = 1,
+    accept: Sequence[int] = (0,),
+    going_on: Sequence[str] | None = None,
+) -> Cost:
+    """Run ``lerobot …`` or ``memobench …`` unless it has ended well before; return what it took.
+
+    Its output goes to ``log``, its cost and its words beside it.
+
+    Args:
+        how: more words, which decide nothing that comes out: in how many processes it is done.
+        beside: commands that run at once, this one included; they share the cores (`jobs.threads`).
+        accept: exit statuses of a command that did its work.
+        going_on: what is run instead, to finish what an earlier attempt has begun.
+
+    Raises:
+        MemobenchError: the command failed, or another one stands beside the log.
+    """
+    kept = log.with_suffix(".json")
+    spent = Cost(0.0, 0.0)
+    if kept.is_file():
+        told = read_json(kept, dict[str, object], "remove it, and the command is run again")
+        if told.get("words") != list(words):
+            raise MemobenchError(f"{kept} is of another command; name another --out, or remove the file")
+        spent = Cost(float(str(told["wall_s"])), float(str(told["cpu_s"])))
+        if told["ended"]:
+            return spent
+    log.parent.mkdir(parents=True, exist_ok=True)
+    status, took = _run(going_on or [*words, *how], log, sharing(beside))
+    spent, ended = spent + took, status in accept
+    write_file(kept, json.dumps({"words": list(words), "ended": ended, **asdict(spent)}, indent=1))
+    if not ended:
+        *_, last = log.read_text(errors="replace").rstrip().splitlines() or [""]
+        raise MemobenchError(f"`{' '.join(words)}` ended with status {status} ({last[:400]}); see {log}")
+    return spent
+
+
+def _run(words: Sequence[str], log: Path, environment: Mapping[str, str]) -> tuple[int, Cost]:
+    """Run a command to its end; return its exit status and what it and its own processes took."""
+    started = time.monotonic()
+    with log.open("a") as file:
+        process = subprocess.Popen(
+            [sys.executable, "-m", MODULES[words[0]], *words[1:]],
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            env=environment,
+        )
+        try:
+            _, status, used = os.wait4(process.pid, 0)
+        except BaseException:
+            process.terminate()
+            raise
+    process.returncode = os.waitstatus_to_exitcode(status)
+    wall = time.monotonic() - started
+    return process.returncode, Cost(round(wall, 1), round(used.ru_utime + used.ru_stime, 1))
+
+
+Costs = dict[str, list[Cost | None]]
+"""Part of an experiment -> what each of its commands took; None for one that was not needed."""
+
+
+SHARED = ("policy=memobench_mem", "size=small", "save_freq=2000")
+"""What every policy of an experiment is told; a run that is killed goes on from its last checkpoint."""
+
+
+@dataclass(frozen=True)
+class Stages:
+    """An experiment in a folder; what has been done there is not done again.
+
+    Args:
+        experiment: what is learned. out: its folder. dataset: demonstrations that are there already.
+        workers: processes that generate and roll out.
+    """
+
+    experiment: Experiment
+    out: Path
+    dataset: Path | None = None
+    workers: int = 1
+
+    @property
+    def _sight(self) -> Sight:
+        return PERCEPTIONS[self.experiment.perception]
+
+    @property
+    def _is_strict(self) -> bool:
+        return suite_of(self.experiment.tasks[0]) == STRICT
+
+    @property
+    def data(self) -> Path:
+        """Where the demonstrations are."""
+        return self.dataset or self.out / "data"
+
+    def generate(self) -> Cost | None:
+        """Make the demonstrations; None where they were given."""
+        if self.dataset is not None:
+            return None
+        words = ["memobench", "generate", "--tasks", ",".join(self.experiment.tasks)]
+        words += ["--referent", self.experiment.referent, "--episodes", str(self.experiment.episodes)]
+        more = self.experiment.prompted_episodes
+        words += [] if more is None else ["--prompted-episodes", str(more)]
+        words += ["--suite", STRICT] if self._is_strict else []
+        words += ["--perturb", "--out", str(self.data)]
+        words += [] if self._sight.pictures else ["--no-images"]
+        how = ["--workers", str(self.workers)]
+        return run_once(words, self.out / "data.log", how=how, accept=(0, 1))
+
+    def check_settings(self) -> None:
+        """Refuse what training would, before anything is made; LeRobot's import is left out where nothing was added.
+
+        Raises:
+            MemobenchError: an unknown setting or value, named with the nearest known one.
+        """
+        from lerobot_memobench.run.reading import read_settings
+        from lerobot_memobench.run.training import take_training_words
+
+        for arm in self.experiment.arms if self.experiment.settings else ():
+            # All but the dataset, which is not there yet.
+            told = [word for word in self.training_words(arm, 0)[2:] if not word.startswith("dataset=")]
+            *_, words = take_training_words(split_words(told))
+            read_settings("train", words)
+
+    def training_words(self, arm: str, seed: int) -> list[str]:
+        """Return the command that trains an arm's policy with one seed."""
+        words = ["lerobot", "train", *SHARED, *self._sight.training]
+        words += [f"dataset={self.data}", f"steps={self.experiment.steps}"]
+        words += [f"seed={seed}", f"output_dir={self.policy(arm, seed)}"]
+        return [*words, *self.experiment.settings, *self.experiment.arms[arm]]
+
+    def train(self, arm: str, seed: int) -> Cost:
+        """Train an arm's policy with one seed; as many at once as there are workers share the cores."""
+        folder = self.policy(arm, seed)
+        begun = self.checkpoint(arm, seed) / "train_config.json"
+        going_on = ["lerobot", "train", f"config_path={begun}", "resume=true"] if begun.is_file() else None
+        log = self.log("training", arm, seed)
+        if going_on is None and not log.with_suffix(".json").is_file():
+            shutil.rmtree(folder, ignore_errors=True)  # of an attempt that was killed before its first checkpoint
+        return run_once(self.training_words(arm, seed), log, beside=self.workers, going_on=going_on)
+
+    def evaluate(self, arm: str, seed: int) -> Cost:
+        """Roll a trained policy out on the experiment's evaluation seeds."""
+        words = ["lerobot", "eval", "env=memobench", f"policy={self.policy(arm, seed)}"]
+        words += [*self._sight.evaluation, f"referent={self.experiment.referent}", "films=0"]
+        words += [f"tasks={','.join(self.experiment.tasks)}"]
+        words += [f"episodes={self.experiment.rollouts}", f"seed={self.experiment.first_seed}"]
+        words += [f"output_dir={self.rollouts(arm, seed)}", "resume=true"]
+        words += [f"suite={STRICT}"] if self._is_strict else []
+        words += ["env.oracle_memory=true"] if "policy.oracle_memory=true" in self.experiment.arms[arm] else []
+        how = [f"shards={self.workers}", f"workers={self.workers}"] if self.workers > 1 else []
+        return run_once(words, self.log("evaluation", arm, seed), how=how)
+
+    def policy(self, arm: str, seed: int) -> Path:
+        """Return the folder of a training run."""
+        return self.out / "policies" / name_of(arm, seed)
+
+    def checkpoint(self, arm: str, seed: int) -> Path:
+        """Return the folder of a training run's last checkpoint."""
+        return self.policy(arm, seed) / "checkpoints" / "last" / "pretrained_model"
+
+    def rollouts(self, arm: str, seed: int) -> Path:
+        """Return the folder of an evaluation."""
+        return self.out / "rollouts" / name_of(arm, seed)
+
+    def log(self, part: str, arm: str, seed: int) -> Path:
+        """Return the file of a command's output."""
+        return self.out / part / f"{name_of(arm, seed)}.log"
+
+
+def name_of(arm: str, seed: int) -> str:
+    """Return what files of an arm and a training seed are called."""
+    return f"{arm.replace(' ', '_')}-{seed}"

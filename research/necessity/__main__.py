@@ -1,0 +1,113 @@
+"""``python -m research.necessity``: which tasks need a memory."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from lerobot_memobench.cli.console import Count, console, counting
+from lerobot_memobench.cli.suite import Suite, WhichSuite
+from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
+from research.command import run
+
+if TYPE_CHECKING:
+    from lerobot_memobench.jobs.processes import Advance, ProgressCallback
+    from lerobot_memobench.tasks.task import Task
+    from research.necessity.settings import Settings
+    from research.necessity.study import Study
+
+
+class WhichReferent(StrEnum):
+    """Which settings of the referent are looked at."""
+
+    FIXED = "fixed"
+    RANDOM = "random"
+    BOTH = "both"
+
+
+def necessity(
+    tasks: Annotated[str, typer.Option(help="all, memory types or task names, separated by commas.")] = "all",
+    suite: WhichSuite = Suite.PUBLISHED,
+    referent: Annotated[
+        WhichReferent, typer.Option(help="Goal of object and procedural tasks: fixed, random, or both settings.")
+    ] = WhichReferent.BOTH,
+    episodes: Annotated[int, typer.Option(min=1, help="Scenes per task, from seed 7 on.")] = 3,
+    budget: Annotated[
+        int, typer.Option(min=0, help="Steps simulated per start in search of other ways to the goal; 0: no search.")
+    ] = 10_000,
+    tolerance: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="Share of differing pixels up to which pictures look the same.")
+    ] = 0.005,
+    out: Annotated[Path, typer.Option(help="Folder of the results; the same command goes on there.")] = Path(
+        "outputs/necessity"
+    ),
+    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    page: Annotated[
+        Path | None, typer.Option(help="Markdown page whose table is made anew, between its marks.")
+    ] = None,
+    beside: Annotated[
+        Path | None,
+        typer.Option(
+            help="necessity.json of the published tasks; the page's table then shows them beside their twins."
+        ),
+    ] = None,
+) -> None:
+    """Find moments that look the same and need different answers. They tell what a policy without memory can reach."""
+    from lerobot_memobench.tasks.task import REFERENTS
+    from research.necessity.report import (
+        around_table,
+        put_into_page,
+        read_results,
+        terminal_table,
+        write,
+    )
+    from research.necessity.settings import Settings
+    from research.necessity.study import PIECES, make
+
+    # Now, not after the simulation.
+    published = None if beside is None else read_results(beside)
+    if page is not None:
+        around_table(page)
+    settings = Settings(episodes=episodes, budget=budget, tolerance=tolerance)
+    referents = REFERENTS if referent is WhichReferent.BOTH else (referent.value,)
+    studies = _studies([get_task(name) for name in resolve_tasks(tasks, suite)], referents, settings, out)
+    screen = console()
+    for piece, unit in PIECES.items():
+        with counting(screen, unit) as count:
+            make(studies, piece, workers, _telling(count))
+    results = [study.result() for study in studies]
+    written = write(out, results)
+    if page is not None:
+        written.append(put_into_page(page, results, published))
+    screen.print(terminal_table(results), crop=False)
+    for path in written:
+        screen.print(str(path), soft_wrap=True)
+
+
+def _telling(count: Count) -> ProgressCallback:
+    def tell(news: Advance) -> None:
+        count(news.done, news.total, f"{news.task_name}, seed {news.seed}", found=news.found)
+
+    return tell
+
+
+def _studies(tasks: Sequence[Task], referents: Sequence[str], settings: Settings, out: Path) -> list[Study]:
+    """Return every task with every setting of the referent that says something of its own."""
+    from research.necessity.settings import settings_of
+    from research.necessity.study import Study
+
+    return [Study(task, setting, settings, out) for task in tasks for setting in settings_of(task, referents)]
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return the exit status."""
+    return run("necessity", necessity, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

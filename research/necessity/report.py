@@ -1,0 +1,362 @@
+"""Is a memory needed? What the figures of a task come to."""
+
+from __future__ import annotations
+
+import io
+import json
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.documents.tables import NOT_APPLICABLE, figure
+from lerobot_memobench.io import read_json, write_file
+from lerobot_memobench.tasks.catalogue import get_task
+from lerobot_memobench.tasks.task import DRAWN, REFERENTS
+from research.necessity.study import KeptResult, Result, pictures_path
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from PIL.Image import Image as Strip
+
+
+VERDICTS = {
+    "no": "pictures decide every step of the demonstrated routine: no memory is needed",
+    "order": "with the arm at home, pictures tell not the demonstrated order but another that the goal accepts",
+    "yes": "no order that was found reaches the goal from pictures alone",
+    "order?": "with the arm at home, pictures do not tell the demonstrated order; other ways were not looked for",
+    "unknown": "the expert solved none of the scenes, so nothing can be said",
+}
+
+
+def verdict(result: Result) -> str:
+    """Return which of `VERDICTS` holds."""
+    in_order, any_order = result["in_order"], result["any_order"]
+    if in_order is None:
+        return "unknown"
+    if in_order["deterministic"] >= 1.0:
+        return "no"
+    if any_order is None:
+        return "order?"
+    return "order" if any_order["confirmed"] == any_order["of"] else "yes"
+
+
+HEADINGS = (
+    *("published task", "best map", "memory needed"),
+    *("its twin", "goals", "best map", "best prob.", "as it happens", "expert", "memory needed"),
+)
+
+
+def side_by_side(published: Sequence[Result], strict: Sequence[Result]) -> str:
+    """Return a Markdown table with a row per twin, and what it says in all; the published goals are the fixed ones."""
+    fixed = {result["task"]: result for result in published if result["referent"] == REFERENTS[0]}
+    lines = ["| " + " | ".join(HEADINGS) + " |", "|---" * len(HEADINGS) + "|"]
+    for result in strict:
+        name = get_task(result["task"]).derived_from or ""
+        row = [f"`{name}`", *_published(fixed.get(name)), f"`{result['task']}`", *_strict(result)]
+        lines.append("| " + " | ".join(row) + " |")
+    lines += ["", bounds(strict)]
+    return "\n".join(lines) + "\n"
+
+
+def _published(result: Result | None) -> list[str]:
+    """Return the cells of a published task: the best map in any order that its goal accepts, and the verdict."""
+    if result is None or result["in_order"] is None:
+        return [NOT_APPLICABLE] * 2
+    found = result["any_order"] or result["in_order"]
+    return [figure(found["deterministic"]), verdict(result)]
+
+
+def _strict(result: Result) -> list[str]:
+    """Return the cells of a twin."""
+    in_order, any_order, expert = result["in_order"], result["any_order"], result["expert"]
+    found = [NOT_APPLICABLE] * 2
+    if any_order is not None:
+        found = [
+            f"{figure(any_order['deterministic'])} ({any_order['confirmed']}/{any_order['of']})",
+            figure(any_order["stochastic"]) + ("" if any_order["exhausted"] else " ≥"),
+        ]
+    happens = NOT_APPLICABLE if in_order is None else figure(in_order["as_it_happens"])
+    return [str(result["variants"]), *found, happens, f"{expert['success']}/{expert['n']}", verdict(result)]
+
+
+def bounds(results: Sequence[Result]) -> str:
+    """Return in a paragraph how far policies without memory come at tasks whose goal is drawn; "" without any."""
+    drawn = [result for result in results if result["referent"] == DRAWN]
+    searched = [result for result in drawn if result["any_order"] is not None]
+    if not searched:
+        return ""
+    needed = sum(verdict(result) == "yes" for result in drawn)
+    told = [
+        f"the {name} at most {figure(max(values))} %, on average {figure(sum(values) / len(values))} %"
+        for name, values in (
+            ("best fixed map in any order", [result["any_order"]["deterministic"] for result in searched]),
+            ("best probabilities in any order", [result["any_order"]["stochastic"] for result in searched]),
+            ("best fixed map with the arm as it happens", [result["in_order"]["as_it_happens"] for result in searched]),
+        )
+    ]
+    return f"From pictures alone {needed} of {len(drawn)} tasks were not solved: {'; '.join(told)}."
+
+
+LARGEST_FIGURE = 300_000
+"""Bytes: the figure of the documentation is kept in the repository."""
+
+CAMERAS = ("third person", "wrist")
+
+
+def pairs_figure(out: Path, results: Sequence[Result]) -> bytes | None:
+    """Return a PNG of a few aliased pairs: both moments side by side, and what is right at each; None without any.
+
+    One pair within an episode and one between goals, the two ways in which memory is needed; of drawn tasks one of each
+    family.
+    """
+    shown = _chosen(out, results)
+    if not shown:
+        return None
+    found = _small_png(_drawn(shown))
+    if len(found) > LARGEST_FIGURE:
+        raise MemobenchError(f"the figure has {len(found)} bytes, expected at most {LARGEST_FIGURE}; draw it smaller")
+    return found
+
+
+def _chosen(out: Path, results: Sequence[Result]) -> list[tuple[Result, Strip]]:
+    from PIL import Image
+
+    shown: list[tuple[Result, Strip]] = []
+    for result in results:
+        if not result["examples"] or any(_kind(other) == _kind(result) for other, _ in shown):
+            continue
+        path = pictures_path(out, result["task"], result["referent"], result["examples"][0]["seed"])
+        if path.is_file():
+            shown.append((result, Image.open(path).convert("RGB")))
+    return shown
+
+
+def _kind(result: Result) -> str | bool:
+    """Return the family of a drawn task; of others whether the first pair lies within one episode."""
+    if result["referent"] == DRAWN:
+        return get_task(result["task"]).family
+    pair = result["examples"][0]
+    return bool(pair["a"]["variant"] == pair["b"]["variant"])
+
+
+def _drawn(shown: Sequence[tuple[Result, Strip]]) -> Figure:
+    from matplotlib.figure import Figure
+
+    plot = Figure(figsize=(10, 3.1 * len(shown)), layout="constrained")
+    grid = plot.subplots(len(shown), 4, squeeze=False)
+    for axes, (result, strip) in zip(grid, shown, strict=True):
+        pair, side = result["examples"][0], strip.height
+        for k, axis in enumerate(axes):
+            axis.imshow(strip.crop((k * side, 0, (k + 1) * side, side)))
+            axis.set_xticks([])
+            axis.set_yticks([])
+            axis.set_xlabel(CAMERAS[k % 2], fontsize=8)
+        for axis, moment in ((axes[0], pair["a"]), (axes[2], pair["b"])):
+            axis.set_title(f"step {moment['step']}: {_short(moment['answer'])}", fontsize=9, loc="left")
+        axes[0].set_ylabel(_wrapped(result["task"]), fontsize=8)
+    return plot
+
+
+def _small_png(plot: Figure) -> bytes:
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    plot.savefig(buffer, dpi=110 if len(plot.axes) <= 8 else 64, format="png")
+    small = Image.open(buffer).convert("RGB").quantize(192, dither=Image.Dither.NONE)
+    buffer = io.BytesIO()
+    small.save(buffer, "PNG", optimize=True)
+    return buffer.getvalue()
+
+
+def _short(answer: str) -> str:
+    return answer.strip("()").replace("_1", "").replace("_", " ")
+
+
+def _wrapped(name: str, width: int = 26) -> str:
+    return "\n".join(textwrap.wrap(name.replace("_", " "), width))
+
+
+JSON_FILE, MARKDOWN_FILE, FIGURE_FILE = "necessity.json", "necessity.md", "aliased_pairs.png"
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column: its heading, and what it says under the table."""
+
+    name: str
+    meaning: str
+
+
+COLUMNS = (
+    Column("referent", "what the goal is; *both*: the task has one goal, so the settings are the same"),
+    Column("goals", "goals that may lie behind the same start"),
+    Column("decisions", "times per episode at which the expert turns to something new"),
+    Column("aliased", "pictures at which more than one answer is right: arm at home / as it happens"),
+    Column("chance", "knows the routine, guesses evenly where the picture does not decide; one try each"),
+    Column("fixed map", "best map from pictures to answers, in the demonstrated order"),
+    Column("probabilities", "best probabilities of answers given the picture, same order, one try each"),
+    Column("exact", "fixed map if every pixel could be used (differences above 2 of 255)"),
+    Column("any order", "best map if any order will do that the goal accepts: found, and confirmed in the simulator"),
+    Column(
+        "any order, prob.", "best probabilities found, wrong answers mended as the scene allows, within the horizon"
+    ),
+    Column("expert", "the expert's episodes that reached the goal"),
+    Column("memory needed", "see below"),
+)
+
+
+def cells(result: Result, referent: str) -> list[str]:
+    """Return a row of the table, without the task."""
+    in_order, any_order, counts = result["in_order"], result["any_order"], result["aliased"]
+    found = NOT_APPLICABLE
+    if any_order is not None:
+        found = f"{figure(any_order['deterministic'])} ({any_order['confirmed']}/{any_order['of']})"
+        found += "" if any_order["complete"] else " ≥"
+    expert = result["expert"]
+    return [
+        referent,
+        str(result["variants"]),
+        f"{result['decisions']:.1f}",
+        NOT_APPLICABLE if counts is None else f"{counts['at_home']:.1f} / {counts['as_it_happens']:.1f}",
+        *(
+            NOT_APPLICABLE if in_order is None else figure(in_order[key])
+            for key in ("chance", "deterministic", "stochastic", "pixel_exact")
+        ),
+        found,
+        NOT_APPLICABLE if any_order is None else figure(any_order["stochastic"]),
+        f"{expert['success']}/{expert['n']}",
+        verdict(result),
+    ]
+
+
+def rows(results: Sequence[Result]) -> list[tuple[str, str, list[str]]]:
+    """Return memory type, task and cells per row; a task with one goal has one row for both settings."""
+    table = []
+    for result in results:
+        alone = result["referent"] == "fixed" and not result.get("has_variants", True)
+        table.append((result["memory_type"], result["task"], cells(result, "both" if alone else result["referent"])))
+    return table
+
+
+def terminal_table(results: Sequence[Result]) -> Any:
+    """Return the table for the terminal."""
+    from rich.table import Table
+
+    from lerobot_memobench.evaluation.documents.terminal import Unbroken
+
+    table = Table(header_style="bold", pad_edge=False)
+    table.add_column("task")
+    for column in COLUMNS:
+        table.add_column(column.name, justify="left" if column.name in ("referent", "memory needed") else "right")
+    before = None
+    for memory_type, task, row in rows(results):
+        if before not in (None, memory_type):
+            table.add_section()
+        before = memory_type
+        table.add_row(task, *row)
+    return Unbroken(table)
+
+
+def markdown(results: Sequence[Result]) -> str:
+    """Return the table, what its columns mean, what follows, and the best maps that were found."""
+    lines = ["| task | " + " | ".join(column.name for column in COLUMNS) + " |"]
+    lines.append("|---|" + "---|" * len(COLUMNS))
+    lines += [f"| {memory_type}: `{task}` | " + " | ".join(row) + " |" for memory_type, task, row in rows(results)]
+    lines += ["", "Per cent, means over scenes. Columns:", ""]
+    lines += [f"- **{column.name}**: {column.meaning}." for column in COLUMNS[:-1]]
+    lines += ["- **memory needed**: " + "; ".join(f"*{word}*: {meaning}" for word, meaning in VERDICTS.items()) + "."]
+    same = max((result["largest_same"] for result in results), default=0.0)
+    other = min((result["smallest_different"] for result in results), default=1.0)
+    lines += [
+        "",
+        f"Moments that count as looking the same differ in at most {100 * same:.2f} % of the pixels of a camera, those "
+        f"that count as different in at least {100 * other:.2f} %.",
+        "",
+        *([bounds(results), ""] if bounds(results) else []),
+        "### Ways to the goal that need no memory",
+        "",
+    ]
+    searched = any(result["any_order"] is not None for result in results)
+    lines += _ways(results) or ["None was found." if searched else "They were not looked for."]
+    return "\n".join(lines) + "\n"
+
+
+def _ways(results: Sequence[Result]) -> list[str]:
+    lines = []
+    for result in results:
+        if verdict(result) == "order":
+            lines.append(f"- `{result['task']}` ({result['referent']}):")
+            for rule in result["any_order"]["policy"]:
+                when = " or ".join(f"`{text}`" if text else "*nothing of the goal*" for text in rule["when"])
+                lines.append(f"  - seeing {when}: `{rule['do']}`")
+    return lines
+
+
+# --- files ---
+
+PAGE_BEGIN, PAGE_END = "<!-- made by `python -m research.necessity --page`: -->", "<!-- end of what it made -->"
+
+
+def read_results(path: Path) -> list[Result]:
+    """Return the results that another run wrote into its ``necessity.json``.
+
+    Raises:
+        MemobenchError: it is missing, cannot be read or holds something else.
+    """
+    advice = f"name the {JSON_FILE} that `python -m research.necessity` wrote"
+    try:
+        found: list[Result] = read_json(path, list[KeptResult], advice)
+    except FileNotFoundError:
+        raise MemobenchError(f"there is no {path}; {advice}") from None
+    return found
+
+
+def around_table(page: Path) -> tuple[str, str]:
+    """Return what stands before and after the table of a Markdown page, its marks included.
+
+    Raises:
+        MemobenchError: there is no such page, or it lacks the marks.
+    """
+    try:
+        text = page.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise MemobenchError(f"the page {page} cannot be read ({reason}); name a Markdown file") from None
+    before, begin, rest = text.partition(PAGE_BEGIN)
+    _, end, after = rest.partition(PAGE_END)
+    if not begin or not end:
+        raise MemobenchError(
+            f"the page {page} lacks the lines {PAGE_BEGIN!r} and {PAGE_END!r}; put them where the table goes"
+        )
+    return before + begin, end + after
+
+
+def put_into_page(page: Path, results: Sequence[Result], beside: Sequence[Result] | None = None) -> Path:
+    """Put the table into a Markdown page, between its two marks; return the page.
+
+    Args:
+        beside: results of the published tasks; then the table shows those and their twins, which ``results`` are of.
+
+    Raises:
+        MemobenchError: see `around_table`.
+    """
+    before, after = around_table(page)
+    table = markdown(results) if beside is None else side_by_side(beside, results)
+    return write_file(page, f"{before}\n\n{table}\n{after}")
+
+
+def write(out: Path, results: Sequence[Result]) -> list[Path]:
+    """Write JSON, Markdown and, where a pair of moments looks the same, the figure; return their paths."""
+    out.mkdir(parents=True, exist_ok=True)
+    content = [{**result, "memory_needed": verdict(result)} for result in results]
+    written = [
+        write_file(out / JSON_FILE, json.dumps(content, indent=1) + "\n"),
+        write_file(out / MARKDOWN_FILE, "# Memory necessity\n\n" + markdown(results)),
+    ]
+    picture = pairs_figure(out, results)
+    if picture is not None:
+        written.append(write_file(out / FIGURE_FILE, picture))
+    return written

@@ -1,0 +1,141 @@
+"""The demonstrations of all variants from one start: which of their moments look the same, and what follows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.tasks.task import Task
+from research.necessity.demonstrations import (
+    Demonstration,
+    Moment,
+    difference,
+    differences,
+    largest_pixel_difference,
+    pairwise_table,
+)
+from research.necessity.memoryless import (
+    Decision,
+    History,
+    aliased,
+    chance,
+    classes,
+    deterministic_ceiling,
+    stochastic_ceiling,
+)
+
+PIXEL_EXACT = 2
+"""Largest channel difference of pictures that count as exactly the same, of 255: shading rounds differently."""
+SAME_HAND = 0.01
+"""Difference of the proprioception (m, rad) up to which the arm is where it was, as things happen."""
+EXAMPLES = 3
+
+
+class Scene:
+    """Moments of successful demonstrations: what a failed one did is no answer to learn.
+
+    Args:
+        variants, shown: goals that may lie behind the start, and how each was demonstrated.
+        tolerance: difference up to which pictures look the same.
+    """
+
+    def __init__(self, variants: Sequence[Task], shown: Sequence[Demonstration], tolerance: float) -> None:
+        self._owners: list[int] = []
+        self._moments: list[Moment] = []
+        self._asked: list[str] = []
+        for variant, demonstration in zip(variants, shown, strict=True):
+            if demonstration.success:
+                self._moments += demonstration.moments
+                self._owners += [variant.variant_index] * len(demonstration.moments)
+                self._asked += [variant.language] * len(demonstration.moments)
+        self._tolerance = tolerance
+        self._differences = differences([moment.at_home for moment in self._moments])
+        self._pictures = classes(self._differences, tolerance)
+
+    def result(self, seed: int) -> dict[str, Any]:
+        """Return what is kept of a scene; ``aliased`` and ``in_order`` are empty where no demonstration succeeded."""
+        histories = self._histories(self._pictures)
+        as_exact = self._histories(classes(pairwise_table(self._moments, _exactly), PIXEL_EXACT))
+        as_it_happens = self._histories(classes(pairwise_table(self._moments, _as_it_happens), self._tolerance))
+        apart = ~np.equal.outer(self._pictures, self._pictures)
+        counts = {"at_home": histories, "pixel_exact": as_exact, "as_it_happens": as_it_happens}
+        return {
+            "seed": seed,
+            "solved": len(histories),
+            "decisions": sum(len(history) for history in histories),
+            "aliased": {key: len(aliased(found)) for key, found in counts.items()} if histories else {},
+            "in_order": _ceilings(histories, as_exact, as_it_happens) if histories else {},
+            "examples": [self._example(seed, i, j) for i, j in self._pairs[:EXAMPLES]],
+            "largest_same": float(self._differences[~apart].max(initial=0.0)),
+            "smallest_different": float(self._differences[apart].min(initial=1.0)),
+        }
+
+    def strip(self) -> NDArray[np.uint8] | None:
+        """Return the first pair side by side, (height, 4 × width, 3): cameras of a, of b; None without a pair."""
+        if not self._pairs:
+            return None
+        i, j = self._pairs[0]
+        return np.concatenate([*self._moments[i].at_home, *self._moments[j].at_home], axis=1)
+
+    def _histories(self, pictures: Sequence[int]) -> list[History]:
+        """Return a history per demonstration; what is seen under different instructions can be told apart."""
+        rows: dict[int, list[Decision]] = {}
+        instructions = list(dict.fromkeys(self._asked))
+        for owner, asked, moment, picture in zip(self._owners, self._asked, self._moments, pictures, strict=True):
+            seen = picture + instructions.index(asked) * len(self._moments)
+            rows.setdefault(owner, []).append(Decision(seen, moment.answer))
+        return [tuple(row) for row in rows.values()]
+
+    @cached_property
+    def _pairs(self) -> list[tuple[int, int]]:
+        """Moments that look the same and ask for different answers."""
+        return [
+            (i, j)
+            for i, j in combinations(range(len(self._moments)), 2)
+            if self._pictures[i] == self._pictures[j]
+            and self._asked[i] == self._asked[j]
+            and self._moments[i].answer != self._moments[j].answer
+        ]
+
+    def _example(self, seed: int, i: int, j: int) -> dict[str, Any]:
+        a, b = self._moments[i], self._moments[j]
+        return {
+            "seed": seed,
+            "a": self._said(i),
+            "b": self._said(j),
+            "difference": float(self._differences[i, j]),
+            "largest_pixel_difference": largest_pixel_difference(a.at_home, b.at_home),
+            "hand_apart_m": float(np.linalg.norm(a.proprio[:3] - b.proprio[:3])),
+        }
+
+    def _said(self, index: int) -> dict[str, Any]:
+        moment = self._moments[index]
+        return {"variant": self._owners[index], "step": moment.step, "answer": moment.answer}
+
+
+def _exactly(a: Moment, b: Moment) -> float:
+    """Return how much two moments differ with the arm at home if every pixel could be used."""
+    return largest_pixel_difference(a.at_home, b.at_home)
+
+
+def _as_it_happens(a: Moment, b: Moment) -> float:
+    """Return how much two moments differ with the arm where it was; 1 where the hand was elsewhere."""
+    return difference(a.seen, b.seen) if np.abs(a.proprio - b.proprio).max() <= SAME_HAND else 1.0
+
+
+def _ceilings(
+    histories: Sequence[History], as_exact: Sequence[History], as_it_happens: Sequence[History]
+) -> dict[str, float]:
+    """Return how far policies without memory can come in the demonstrated order."""
+    return {
+        "chance": chance(histories),
+        "deterministic": deterministic_ceiling(histories),
+        "stochastic": stochastic_ceiling(histories),
+        "pixel_exact": deterministic_ceiling(as_exact),
+        "as_it_happens": deterministic_ceiling(as_it_happens),
+    }

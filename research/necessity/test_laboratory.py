@@ -1,0 +1,30 @@
+"""What can be tried: everything the expert does in some variant."""
+
+from __future__ import annotations
+
+from lerobot_memobench.tasks.catalogue import get_task
+from lerobot_memobench.tasks.formula import Atom
+from research.necessity.demonstrations import rest_steps
+from research.necessity.exploration import answers_of
+from research.necessity.settings import variants_of
+
+PAN = "turn_on_the_stove_and_turn_it_off_then_put_the_frying_pan_on_it"
+STACK = "stack_the_bowls_one_by_one_in_the_exact_sequence_shown_in_the_video"
+
+
+def test_answers_are_what_the_expert_does_in_some_variant() -> None:
+    assert answers_of([get_task(PAN)]) == [
+        Atom("turnon", ("flat_stove_1",)),
+        Atom("turnoff", ("flat_stove_1",)),
+        Atom("on", ("chefmate_8_frypan_1", "flat_stove_1_cook_region")),
+    ]
+    stacks = answers_of(variants_of(get_task(STACK), "random"))
+    assert len(stacks) == 6
+    assert {atom.predicate for atom in stacks} == {"on"}
+
+
+def test_where_the_hand_stands_is_no_answer_and_rest_is_as_long_as_the_goal_says() -> None:
+    twin = get_task("turn_the_stove_on_and_off_a_given_number_of_times")
+    assert {atom.predicate for atom in answers_of(variants_of(twin, "drawn"))} == {"turnon", "turnoff"}
+    assert rest_steps(twin.goal) == 40
+    assert rest_steps(get_task(PAN).goal) == 0

@@ -1,1 +1,0 @@
-"""How fast is it? Claims measured beside stock robosuite, both sides in one run."""

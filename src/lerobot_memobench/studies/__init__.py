@@ -1,1 +1,0 @@
-"""Does a mechanism help? Policies trained and compared under one budget."""

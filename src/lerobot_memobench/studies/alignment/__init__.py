@@ -1,1 +1,0 @@
-"""What does each alignment do to a memory?"""
