@@ -151,7 +151,7 @@ class Stages:
         Raises:
             MemobenchError: an unknown setting or value, named with the nearest known one.
         """
-        from lerobot_memobench.run.reading import read_settings
+        from lerobot_memobench.run.arguments import read_settings
         from lerobot_memobench.run.training import take_training_words
 
         for arm in self.experiment.arms if self.experiment.settings else ():
