@@ -30,7 +30,7 @@ from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import
 from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, STEPS, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_RAW_STATE, frame_row
-from lerobot_memobench.sim.object_slots import SIZE, SLOTS, WIDTH
+from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH
 
 REMEMBERED, THINGS = 50, 10
 """Frames that are remembered of an episode of 400 steps, and things in each."""

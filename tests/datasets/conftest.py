@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.datasets.demonstration import Demonstration
-from lerobot_memobench.sim.object_slots import SIZE
+from lerobot_memobench.sim.object_layout import SIZE
 from lerobot_memobench.tasks import Atom, Checkpoint, Task
 
 MakeTask = Callable[..., Task]

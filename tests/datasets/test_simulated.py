@@ -34,7 +34,7 @@ from lerobot_memobench.datasets.replay import replay
 from lerobot_memobench.datasets.validate import Verdict, exit_status, validate
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import checkpoint_folder
-from lerobot_memobench.sim.object_slots import SLOTS, STARTS
+from lerobot_memobench.sim.object_layout import SLOTS, STARTS
 from lerobot_memobench.tasks import get_task
 from lerobot_memobench.tasks.catalogue import task_names
 
@@ -365,7 +365,7 @@ def test_an_episode_is_given_up_when_the_expert_is_through(monkeypatch):
 SCRIPT = """
 import sys
 from lerobot_memobench.datasets.generation import generate
-from lerobot_memobench.sim.object_slots import SLOTS, STARTS
+from lerobot_memobench.sim.object_layout import SLOTS, STARTS
 from lerobot_memobench.tasks import get_task
 from lerobot_memobench.tasks.catalogue import task_names
 

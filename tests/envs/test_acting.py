@@ -31,7 +31,7 @@ from lerobot_memobench.policies.memobench_random.configuration_memobench_random 
 from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
 from lerobot_memobench.run.lerobot_commands import call_lerobot
 from lerobot_memobench.run.merging import merge
-from lerobot_memobench.sim.object_slots import SIZE
+from lerobot_memobench.sim.object_layout import SIZE
 
 TASK = "turn_on_the_stove_and_turn_it_off"
 STATE = {"observation.state": PolicyFeature(FeatureType.STATE, (8,))}

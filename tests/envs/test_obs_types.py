@@ -23,7 +23,8 @@ from lerobot_memobench.evaluation.documents.html.videos import frame_count
 from lerobot_memobench.policies.untrained import UntrainedConfig
 from lerobot_memobench.protocol import EXECUTION, PROMPT
 from lerobot_memobench.sim import rendering
-from lerobot_memobench.sim.object_slots import SIZE, SLOTS, STARTS, WIDTH, ObjectSlots
+from lerobot_memobench.sim.object_layout import SIZE, SLOTS, STARTS, WIDTH
+from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.tasks.catalogue import get_task
 
 HIGHLIGHT = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"

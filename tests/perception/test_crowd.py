@@ -9,7 +9,8 @@ import numpy as np
 from lerobot_memobench.perception.crowd import MORE, crowded, object_classes, widened
 from lerobot_memobench.perception.labels import Labeller
 from lerobot_memobench.perception.scatter import Scatter
-from lerobot_memobench.sim.object_slots import SLOTS, ObjectSlots
+from lerobot_memobench.sim.object_layout import SLOTS
+from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 
 from .conftest import DRAWERS

@@ -19,7 +19,8 @@ from lerobot_memobench.perception.tower import Tower
 from lerobot_memobench.perception.views import view_of, views_of
 from lerobot_memobench.perception.weights import PACKAGE, Eyes, load_eyes
 from lerobot_memobench.sim.assets.registry import split_class
-from lerobot_memobench.sim.object_slots import SIZE, SLOTS, WIDTH, ObjectSlots, classes
+from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH
+from lerobot_memobench.sim.object_slots import ObjectSlots, classes
 from lerobot_memobench.sim.scene import TABLE_TOP
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names

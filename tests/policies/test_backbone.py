@@ -11,7 +11,7 @@ from lerobot_memobench.policies.memobench_mem.backbone import InstructionConditi
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory_pi05 import MemoryPI05
 from lerobot_memobench.policies.memobench_mem.perception.slots import HAND_DIM
-from lerobot_memobench.sim.object_slots import SIZE, SLOTS
+from lerobot_memobench.sim.object_layout import SIZE, SLOTS
 
 CHUNK, BATCH, FRAMES = 6, 2, 5
 

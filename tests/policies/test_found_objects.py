@@ -21,7 +21,7 @@ from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import
 from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.perception.found import FOUND, VIEWS
-from lerobot_memobench.sim.object_slots import SIZE
+from lerobot_memobench.sim.object_layout import SIZE
 from tests.support.object_dataset import make_object_dataset
 from tests.support.picture_rollouts import (
     made_eyes,

@@ -27,7 +27,7 @@ from lerobot_memobench.policies.memobench_mem.execution_frames import (
 )
 from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, STEPS, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.sim.object_slots import WIDTH as SLOT_WIDTH
+from lerobot_memobench.sim.object_layout import WIDTH as SLOT_WIDTH
 from tests.support import object_dataset
 from tests.support.object_dataset import LENGTHS, PROMPTS, make_object_dataset
 from tests.support.small_policy import batch_of, losses_in_training, made_for_training, small_config

@@ -14,7 +14,8 @@ from lerobot_memobench.policies.memobench_mem.perception.sight_errors import (
     SightErrors,
     as_found,
 )
-from lerobot_memobench.sim.object_slots import SIZE, SLOTS, WIDTH, classes, field, in_slots
+from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH, field
+from lerobot_memobench.sim.object_slots import classes, in_slots
 
 KIND = {name: classes().index(name) for name in ("butter", "akita_black_bowl", "drawer", "plate", "milk")}
 LEVEL = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)

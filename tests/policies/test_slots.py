@@ -15,7 +15,8 @@ from lerobot_memobench.policies.memobench_mem.perception.objects import (
 )
 from lerobot_memobench.policies.memobench_mem.perception.pooled_memory import PooledMemory
 from lerobot_memobench.policies.memobench_mem.perception.slots import FEATURES, SlotEncoder, rotation, slot_features
-from lerobot_memobench.sim.object_slots import SIZE, SLOTS, WIDTH, classes
+from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH
+from lerobot_memobench.sim.object_slots import classes
 from tests.support.object_dataset import slots_at, state_at
 
 KINDS = len(classes())

@@ -19,7 +19,7 @@ from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.run.rollout import sparing
-from lerobot_memobench.sim.object_slots import SIZE
+from lerobot_memobench.sim.object_layout import SIZE
 from lerobot_memobench.sim.rendering import close_renderers, gl_backend
 
 HIGHLIGHT = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"

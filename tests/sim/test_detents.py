@@ -64,7 +64,7 @@ def test_the_start_does_not_move() -> None:
 
 
 @pytest.mark.parametrize("name", task_names("temporal"))
-def test_published_scenes_have_no_catches(name: str) -> None:
+def test_published_scenes_have_no_detents(name: str) -> None:
     spec, _ = scene_spec(get_task(name))
     assert not spec.tendons
     assert all(tuple(joint.range) == (-0.16, 0.01) for joint in spec.joints if joint.name.endswith("_level"))
@@ -74,4 +74,4 @@ def test_published_scenes_have_no_catches(name: str) -> None:
 def test_every_strict_joint_has_one(name: str) -> None:
     spec, assets = scene_spec(get_task(name))
     joints = [articulation.joint for asset in assets.values() for articulation in asset.articulations.values()]
-    assert sorted(tendon.name for tendon in spec.tendons) == sorted(f"{joint}_catch" for joint in joints)
+    assert sorted(tendon.name for tendon in spec.tendons) == sorted(f"{joint}_detent" for joint in joints)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_memobench.datasets.lerobot_format.layout import EPISODE_INFO, OBJECTS, PRIVILEGED, EpisodeRecord
-from lerobot_memobench.sim.object_slots import SLOTS, STARTS, WIDTH
+from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from lerobot_memobench.tasks.catalogue import BOWL
 
 LENGTHS, PROMPTS = (40, 23, 31), (6, 8, 0)

@@ -14,7 +14,8 @@ def objects(
     as_json: Annotated[bool, typer.Option("--json", help="Print slots, fields and classes as JSON.")] = False,
 ) -> None:
     """Print the layout of object observations. Slots, the fields of each, the classes by index."""
-    from lerobot_memobench.sim.object_slots import SLOTS, layout
+    from lerobot_memobench.sim.object_layout import SLOTS
+    from lerobot_memobench.sim.object_slots import layout
 
     told = layout()
     if as_json:

@@ -45,7 +45,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     """One task of the benchmark.
 
     Observation: ``pixels/image`` and ``pixels/wrist_image`` uint8 (256, 256, 3) upright, or ``environment_state``
-    float32 (208,): the visible objects (`sim.object_slots`), or both; ``agent_pos`` float32 (8,): end-effector
+    float32 (208,): the visible objects (`sim.object_layout`), or both; ``agent_pos`` float32 (8,): end-effector
     position (3, m), axis-angle (3, rad), fingers (2, m); ``phase`` (1,): 0 while the prompt video plays and actions
     have no effect, 1 in execution; ``step`` (1,): control steps since the phase began; on request ``expert_action``
     (7,), ``blind_action`` (7,).

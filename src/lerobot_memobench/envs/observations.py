@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lerobot_memobench.envs.video import annotate
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, CONTROL_HZ, EXECUTION, IMAGE_SIZE, PROMPT, PROPRIO_DIM
-from lerobot_memobench.sim.object_slots import SIZE
+from lerobot_memobench.sim.object_layout import SIZE
 
 if TYPE_CHECKING:
     from lerobot.configs import PolicyFeature

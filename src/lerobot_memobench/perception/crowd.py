@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.perception.poses import away
-from lerobot_memobench.sim.object_slots import SLOTS, ObjectSlots
+from lerobot_memobench.sim.object_layout import SLOTS
+from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.scene import TABLE
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names

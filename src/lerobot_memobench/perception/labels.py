@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.perception.kinds import kinds_of
 from lerobot_memobench.perception.tower import SIDE, shrunk
-from lerobot_memobench.sim.object_slots import SLOTS, ObjectSlots, is_lit
+from lerobot_memobench.sim.object_layout import SLOTS
+from lerobot_memobench.sim.object_slots import ObjectSlots, is_lit
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 
 MASK = 32

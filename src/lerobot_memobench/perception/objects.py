@@ -23,7 +23,8 @@ from lerobot_memobench.perception.labels import level_depth, rays
 from lerobot_memobench.perception.tower import shrunk
 from lerobot_memobench.perception.views import View, views_of
 from lerobot_memobench.perception.weights import Eyes
-from lerobot_memobench.sim.object_slots import SLOTS, WIDTH, classes, field, in_slots
+from lerobot_memobench.sim.object_layout import SLOTS, WIDTH, field
+from lerobot_memobench.sim.object_slots import classes, in_slots
 from lerobot_memobench.sim.scene import TABLE_TOP
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS
 

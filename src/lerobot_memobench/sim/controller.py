@@ -5,6 +5,10 @@ robosuite 1.4.1 would command (a test holds them equal to its controller's along
 work that the published stack does around them: a second `mj_forward` per physics step, string look-ups, full-model
 Jacobians and mass matrix copies, pseudo-inverses of matrices that are never singular in reach.
 
+`make_controller` takes a control step as one compiled call where that gives the numpy controller's bits: Python and
+numpy take a third of a control step's time. What numba compiles calls the same libraries in the same order, and the
+first step of a process is taken both ways: a difference or a failure leaves the work to numpy, without a word.
+
 Source: robosuite 1.4.1 `controllers/osc.py`, `config/osc_pose.json`; Khatib 1987.
 """
 
@@ -20,6 +24,8 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 
 from lerobot_memobench.sim import robot
+
+_log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
@@ -175,13 +181,7 @@ def rotation_matrix(rotation_vector: Array) -> Array:
     )
 
 
-# ==== compiled_controller.py
-# A control step as one compiled call, where that gives the numpy controller's bits; elsewhere the numpy controller.
-#
-# Python and numpy take a third of a control step's time. What numba compiles calls the same libraries in the same order,  # noqa: E501
-# and the first step of a process is taken both ways: whatever differs or fails leaves the work to numpy, without a word.  # noqa: E501
-
-_log = logging.getLogger(__name__)
+# --- compiled ---
 
 
 class _Process:

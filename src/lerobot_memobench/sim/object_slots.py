@@ -8,7 +8,6 @@ they are sorted by class and place, so exchanging two equal objects changes noth
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
@@ -22,22 +21,9 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.assets.asset import Articulation, Asset
 from lerobot_memobench.sim.assets.builder import VISUAL_GROUP
 from lerobot_memobench.sim.assets.registry import known_classes, split_class
+from lerobot_memobench.sim.object_layout import FIELDS, SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.rendering import Highlight
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
-
-__all__ = [
-    "FIELDS",
-    "SIZE",
-    "SLOTS",
-    "STARTS",
-    "WIDTH",
-    "ObjectSlots",
-    "Thing",
-    "classes",
-    "in_slots",
-    "is_lit",
-    "layout",
-]
 
 POINTS = 24
 """Points of a thing to which rays run."""
@@ -232,31 +218,3 @@ def in_picture(rays: Array, fovy: float) -> NDArray[np.bool_]:
     """Return which rays (n, 3), in a camera's frame (it looks along -z), fall into its square picture."""
     edge = -rays[:, 2] * np.tan(np.radians(fovy) / 2)
     return (np.abs(rays[:, 0]) < edge) & (np.abs(rays[:, 1]) < edge)
-
-
-# ==== object_layout.py
-# How an object observation is laid out: numbers alone, without the simulator, for all who read it.
-
-SLOTS = 16
-"""Things that an observation has room for. The catalogue's fullest scene has ten."""
-
-FIELDS = {"present": 1, "class": 1, "position": 3, "rotation": 6, "joint": 1, "highlighted": 1}
-"""Numbers of a slot, in order.
-
-``present``: 1, or 0 for an empty slot, which is all zeros. ``class``: index into `object_slots.classes`.
-``position``: of the thing's origin in the world, m. ``rotation``: the first two columns of its rotation matrix.
-``joint``: position of a drawer (m), door or knob (rad), else 0. ``highlighted``: 1 while it stands in a highlight of
-the prompt.
-"""
-
-WIDTH = sum(FIELDS.values())
-SIZE = SLOTS * WIDTH
-"""Length of the observation."""
-
-STARTS = dict(zip(FIELDS, itertools.accumulate(FIELDS.values(), initial=0), strict=False))
-"""Field -> where it begins in its slot."""
-
-
-def field[Numbers: Any](slots: Numbers, name: str) -> Numbers:
-    """Return a field (..., size) of slots (..., WIDTH), an array or a tensor; a view."""
-    return slots[..., STARTS[name] : STARTS[name] + FIELDS[name]]

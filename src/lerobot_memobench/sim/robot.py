@@ -51,6 +51,11 @@ most."""
 HAND_FACES = 4
 """How much denser the gripper is drawn: the wrist camera sees it from near."""
 
+Vertices = NDArray[np.float64]
+"""(N, 3) points, m."""
+Faces = NDArray[np.int32]
+"""(M, 3) indices of vertices, counter-clockwise from outside."""
+
 
 def _robosuite_xml() -> str:
     """Compose the arm's MJCF with robosuite, quietly: it warns about macro files that nobody needs here."""
@@ -133,13 +138,7 @@ def robot_spec() -> mujoco.MjSpec:
     return spec
 
 
-# ==== thinning.py
-# Read triangle meshes and thin them out: a rendered face costs the same whether it is a pixel or not.
-
-Vertices = NDArray[np.float64]
-"""(N, 3) points, m."""
-Faces = NDArray[np.int32]
-"""(M, 3) indices of vertices, counter-clockwise from outside."""
+# --- meshes: read and thinned out, since a face costs the same whether it is a pixel or not ---
 
 
 def read_mesh(path: Path) -> tuple[Vertices, Faces]:

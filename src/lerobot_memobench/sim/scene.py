@@ -1,4 +1,4 @@
-"""Compile a task's scene: kitchen, arm, fixtures, objects. Once per task and process; seeds change only state."""
+"""Compile a task's scene: kitchen, arm, fixtures, objects; once per task and process, seeds change only state."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ from lerobot_memobench.sim.assets.builder import SITE_GROUP
 from lerobot_memobench.sim.assets.kitchen import build_kitchen
 from lerobot_memobench.sim.assets.registry import build_asset
 from lerobot_memobench.tasks.task import STRICT, Task
+
+Array = NDArray[np.float64]
 
 TABLE = "kitchen_table"
 TABLE_TOP = 0.90
@@ -86,7 +88,7 @@ def scene_spec(task: Task) -> tuple[mujoco.MjSpec, dict[str, Asset]]:
         assets[name] = build_asset(spec, spec.worldbody, name, class_name)
         spec.body(name).add_freejoint(name=f"{name}_joint0")
     if task.suite == STRICT:
-        add_catches(spec, assets)
+        add_detents(spec, assets)
         stop_rolling(spec, task.objects)
     return spec, assets
 
@@ -96,15 +98,16 @@ def state_size(model: mujoco.MjModel) -> int:
     return int(1 + model.nq + model.nv)
 
 
-# ==== catches.py
-# Catches: drawers, doors and knobs that come to rest where they began.
+# --- strict scenes: detents and rolling friction ---
 #
 # In the published scenes a drawer that was pushed shut stands up to 5 mm deeper than one that nobody has touched, and a
-# door or a knob rests wherever it was let go: who looks closely sees what has happened. In the strict suite each of them  # noqa: E501
-# has what furniture has, a spring that is over its dead centre near the closed end and presses against the stop, which
-# is where the joint starts. Away from the closed end it is slack, and everything moves as published.
-
-Array = NDArray[np.float64]
+# door or a knob rests wherever it was let go: a close look shows what has happened. In the strict suite each has a
+# detent, as furniture does: a spring that is over its dead centre near the closed end and presses against the stop,
+# which is where the joint starts. Away from the closed end it is slack, and everything moves as published.
+#
+# In the published scenes an artichoke in a drawer, or a biscuit on its edge, rolls on until something stops it; at the
+# back of a shut drawer no hand from above can take it. In the strict suite, where things are hidden and found, rolling
+# friction brings them to rest within a second.
 
 LEVER = 0.05
 """Distance from a hinge to the spring's moving end, m."""
@@ -113,25 +116,27 @@ OFFSET, SLACK = 0.5, 2.5
 the length from which on it does not press."""
 STIFF_STOP = (0.004, 1.0)
 """`solref` of the stop: twice the physics step, the stiffest that is stable, so that pressing moves it by microns."""
+ROLLING = 0.002
+"""Rolling friction, m: how far from under the middle a surface holds a thing that rolls."""
 
 
 @dataclass(frozen=True)
-class _Catch:
+class _Detent:
     """How far from the closed end the dead centre is, m or rad, and how hard the spring presses there, N or Nm."""
 
     travel: float
     press: float
 
 
-_CATCHES: dict[str, _Catch] = {
-    "drawer": _Catch(0.009, 5.0),
-    "door": _Catch(0.035, 0.45),
-    "knob": _Catch(0.09, 0.15),
+_DETENTS: dict[str, _Detent] = {
+    "drawer": _Detent(0.009, 5.0),
+    "door": _Detent(0.035, 0.45),
+    "knob": _Detent(0.09, 0.15),
 }
 """Each presses harder than the joint's friction, from wherever the joint counts as closed or off."""
 
 
-def add_catches(spec: mujoco.MjSpec, assets: Mapping[str, Asset]) -> None:
+def add_detents(spec: mujoco.MjSpec, assets: Mapping[str, Asset]) -> None:
     """Give every drawer, door and knob of a scene a stop where it starts, and the spring that keeps it there."""
     for asset in assets.values():
         for articulation in asset.articulations.values():
@@ -146,21 +151,21 @@ def _add_spring(
     spec: mujoco.MjSpec, fixture: mujoco.MjsBody, joint: mujoco.MjsJoint, articulation: Articulation
 ) -> None:
     """Add the spring: it runs from beside the way of a point of the moving part to that point."""
-    catch = _CATCHES[articulation.kind]
+    detent = _DETENTS[articulation.kind]
     lever = 1.0 if articulation.kind == "drawer" else LEVER
-    reach = catch.travel * lever
-    dead_centre = articulation.closed_q + np.sign(articulation.open_q - articulation.closed_q) * catch.travel
+    reach = detent.travel * lever
+    dead_centre = articulation.closed_q + np.sign(articulation.open_q - articulation.closed_q) * detent.travel
     point, place = _way(joint, lever, dead_centre)
     fixed = joint.parent.pos + place + OFFSET * reach * np.array([0.0, 0.0, 1.0])
     ends = {"fixed": (fixture, fixed), "moving": (joint.parent, point)}
-    tendon = spec.add_tendon(name=f"{joint.name}_catch", group=SITE_GROUP)
+    tendon = spec.add_tendon(name=f"{joint.name}_detent", group=SITE_GROUP)
     for end, (body, position) in ends.items():
-        name = f"{joint.name}_catch_{end}"
+        name = f"{joint.name}_detent_{end}"
         body.add_site(name=name, pos=position.tolist(), size=[0.001] * 3, group=SITE_GROUP)
         tendon.wrap_site(name)
     closed = float(np.hypot(1.0, OFFSET))
     pushes = (SLACK - closed) / closed * reach * lever
-    stiffness = catch.press / pushes
+    stiffness = detent.press / pushes
     # Newer MuJoCo takes the coefficients of a polynomial.
     tendon.stiffness = stiffness if np.ndim(tendon.stiffness) == 0 else [stiffness, 0.0, 0.0]
     tendon.springlength = [SLACK * reach, 1.0]
@@ -173,17 +178,6 @@ def _way(joint: mujoco.MjsJoint, lever: float, q: float) -> tuple[Array, Array]:
         return np.zeros(3), q * axis
     point = np.array([lever, 0.0, 0.0])
     return point, Rotation.from_rotvec(q * axis).apply(point)
-
-
-# ==== rolling.py
-# Rolling friction: what is put down stays there.
-#
-# In the published scenes an artichoke in a drawer, or a biscuit on its edge, rolls on until something stops it; what
-# rolls to the back of a drawer while that is shut cannot be taken out again by a hand from above. In the strict suite,
-# where things are hidden and found, they come to rest within a second.
-
-ROLLING = 0.002
-"""Rolling friction, m: how far from under the middle a surface holds a thing that rolls."""
 
 
 def stop_rolling(spec: mujoco.MjSpec, names: Iterable[str]) -> None:

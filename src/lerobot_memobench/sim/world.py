@@ -1,6 +1,7 @@
 """Answer the atoms of the task language from the simulator's state.
 
-The meaning of each predicate is LIBERO's, so that results compare (paper, section 3.1; `spec/benchmark.md`).
+`World` knows the predicates of the present, whose meaning is LIBERO's, so that results compare (paper, section 3.1).
+`Start` knows those that compare the present with how the episode began: is the hand home, is a thing in its place?
 """
 
 from __future__ import annotations
@@ -24,6 +25,20 @@ IN_SLACK = 0.01
 """How far under a region's lower bound an origin still counts as in it, m."""
 ON_SITE_BELOW, ON_SITE_ABOVE = 0.005, 0.10
 """Heights around a site's top between which an origin counts as on it, m."""
+
+DETENT_DISTANCE = 0.02
+"""How far from where it was the grip site is caught, m: twice what learned policies miss it by."""
+DETENT_ANGLE = 0.1
+"""How far the hand may be turned from how it was, rad."""
+DETENT_OPENING = 0.01
+"""How far each finger may be from where it was, m: a hand that holds something is not caught."""
+DETENT_SPEED = (0.03, 0.15)
+"""How fast the hand may be, m/s and rad/s: learned policies hover at 2 cm/s. An action of 0.2 leaves in a step."""
+SAME_ARM = 1e-4
+"""Difference of the arm's joints and fingers (rad, m) and their velocities up to which it stands as it did: states that
+were read from a file are rounded."""
+PLACE_DISTANCE = 0.01
+"""How far a thing may be from where it stood, m: two pixels, up to which pictures count as the same."""
 
 
 class World:
@@ -151,29 +166,11 @@ class World:
         return max((name for name in self._instances if region.startswith(f"{name}_")), key=len)
 
 
-# ==== start.py
-# Is the hand home, is a thing in its place? Predicates that compare the present with how the episode began.
-#
-# Within any tolerance a pose can carry a number. So nothing is tolerated: in strict scenes home has a detent, and an arm  # noqa: E501
-# counts as home only as the detent makes it stand (`Start.in_detent`).
-
-DETENT_DISTANCE = 0.02
-"""How far from where it was the grip site is caught, m: twice what learned policies miss it by."""
-DETENT_ANGLE = 0.1
-"""How far the hand may be turned from how it was, rad."""
-DETENT_OPENING = 0.01
-"""How far each finger may be from where it was, m: a hand that holds something is not caught."""
-DETENT_SPEED = (0.03, 0.15)
-"""How fast the hand may be, m/s and rad/s: learned policies hover at 2 cm/s. An action of 0.2 leaves in a step."""
-SAME_ARM = 1e-4
-"""Difference of the arm's joints and fingers (rad, m) and their velocities up to which it stands as it did: states that
-were read from a file are rounded."""
-PLACE_DISTANCE = 0.01
-"""How far a thing may be from where it stood, m: two pixels, up to which pictures count as the same."""
-
-
 class Start:
-    """What is compared with: the hand's pose after the scene settled, things as the execution found them.
+    """What the present is compared with: the hand's pose after the scene settled, things as the execution found them.
+
+    Within any tolerance a pose can carry a number. So nothing is tolerated: in strict scenes home has a detent, and an
+    arm counts as home only as the detent makes it stand (`in_detent`).
 
     Args:
         model, data: a simulation's; poses must belong to the present state.

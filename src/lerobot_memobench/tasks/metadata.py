@@ -5,8 +5,9 @@ three labels, 0 Storage, 1 Update, 2 Compression, per text level), ``subtask_goa
 ``key_frame`` (K integers), ``timestep_exec_start_idx`` (integer or list of integers), ``demo_summary`` (text). Of this
 project, optional too: ``memory_type``, ``family``, ``prompt`` ({"kind", "target"}), ``variants`` (list of {"memory",
 and optionally "substitute", "order", "subtask_goals", "goal", "demo_summary", "language", "prompt",
-"replaces_published"}), and of the strict suite ``suite``, ``derived_from``, ``drawn``, ``spoilt_as`` (see `Task`). A hiding
-is the prompt {"kind": "hide", "places": [[thing, drawer], ...]}. Other keys are kept in ``Task.metadata`` untouched.
+"replaces_published"}), and of the strict suite ``suite``, ``derived_from``, ``drawn``, ``spoilt_as`` (see `Task`). A
+hiding is the prompt {"kind": "hide", "places": [[thing, drawer], ...]}. Other keys are kept in ``Task.metadata``
+untouched.
 """
 
 from __future__ import annotations

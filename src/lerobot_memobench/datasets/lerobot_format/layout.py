@@ -57,7 +57,7 @@ def objects_column(names: Collection[str]) -> str:
 
 def dataset_features(image_size: tuple[int, int] | None, *, objects: bool = False) -> dict[str, dict[str, Any]]:
     """Return LeRobot's description of the columns; ``image_size`` is (height, width), None without images."""
-    from lerobot_memobench.sim.object_slots import SIZE
+    from lerobot_memobench.sim.object_layout import SIZE
 
     def feature(dtype: str, shape: tuple[int, ...] = (1,), names: list[str] | None = None) -> dict[str, Any]:
         return {"dtype": dtype, "shape": shape, "names": names}

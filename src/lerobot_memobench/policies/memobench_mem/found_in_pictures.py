@@ -22,7 +22,7 @@ from lerobot_memobench.datasets.feature_cache.layout import find_cache
 from lerobot_memobench.datasets.feature_cache.reading import MemoryCache, read_recorded
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.perception.found import VIEWS, ObjectsInPictures
-from lerobot_memobench.sim.object_slots import SIZE
+from lerobot_memobench.sim.object_layout import SIZE
 
 logger = logging.getLogger(__name__)
 

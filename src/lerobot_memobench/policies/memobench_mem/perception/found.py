@@ -23,7 +23,7 @@ from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_PHAS
 from lerobot_memobench.policies.memobench_mem.perception.perception import Seen
 from lerobot_memobench.policies.shown import cure
 from lerobot_memobench.protocol import CAMERAS
-from lerobot_memobench.sim.object_slots import SIZE
+from lerobot_memobench.sim.object_layout import SIZE
 
 FOUND = f"{SEEN}objects"
 """Name in a training sample of what was found in its pictures, (B, SIZE)."""

@@ -17,7 +17,8 @@ from lerobot_memobench.policies.memobench_mem.perception.perception import Perce
 from lerobot_memobench.policies.memobench_mem.perception.pooled_memory import PooledMemory
 from lerobot_memobench.policies.memobench_mem.perception.sight_errors import TOLD, SightErrors
 from lerobot_memobench.policies.memobench_mem.perception.slots import HAND_DIM, SlotEncoder
-from lerobot_memobench.sim.object_slots import SIZE, SLOTS, WIDTH, classes
+from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH
+from lerobot_memobench.sim.object_slots import classes
 
 OBS_RAW_STATE, OBS_PHASE = "observation.raw_state", "observation.phase"
 LOUD = 8.0

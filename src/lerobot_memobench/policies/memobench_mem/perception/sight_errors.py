@@ -17,7 +17,8 @@ from torch import Tensor
 from lerobot_memobench.perception.objects import set_axis, settled
 from lerobot_memobench.policies.memobench_mem.perception.slots import in_order
 from lerobot_memobench.sim.assets.registry import build_asset, known_classes
-from lerobot_memobench.sim.object_slots import classes, field
+from lerobot_memobench.sim.object_layout import field
+from lerobot_memobench.sim.object_slots import classes
 from lerobot_memobench.sim.scene import AGENTVIEW_POSITION, TABLE_TOP
 
 PLACE, KIND_PLACE = (0.0006, 1.45), (0.00065, 1.0)

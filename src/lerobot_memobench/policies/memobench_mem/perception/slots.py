@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from lerobot_memobench.sim.object_slots import FIELDS, WIDTH, field
+from lerobot_memobench.sim.object_layout import FIELDS, WIDTH, field
 
 CLASS_DIM = 32
 MIDDLE = (-0.05, 0.0, 0.95)

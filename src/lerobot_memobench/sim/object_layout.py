@@ -1,0 +1,30 @@
+"""The layout of an object observation: numbers alone, without the simulator, for all who read it."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+SLOTS = 16
+"""Things that an observation has room for. The catalogue's fullest scene has ten."""
+
+FIELDS = {"present": 1, "class": 1, "position": 3, "rotation": 6, "joint": 1, "highlighted": 1}
+"""Numbers of a slot, in order.
+
+``present``: 1, or 0 for an empty slot, which is all zeros. ``class``: index into `object_slots.classes`.
+``position``: of the thing's origin in the world, m. ``rotation``: the first two columns of its rotation matrix.
+``joint``: position of a drawer (m), door or knob (rad), else 0. ``highlighted``: 1 while it stands in a highlight of
+the prompt.
+"""
+
+WIDTH = sum(FIELDS.values())
+SIZE = SLOTS * WIDTH
+"""Length of the observation."""
+
+STARTS = dict(zip(FIELDS, itertools.accumulate(FIELDS.values(), initial=0), strict=False))
+"""Field -> where it begins in its slot."""
+
+
+def field[Numbers: Any](slots: Numbers, name: str) -> Numbers:
+    """Return a field (..., size) of slots (..., WIDTH), an array or a tensor; a view."""
+    return slots[..., STARTS[name] : STARTS[name] + FIELDS[name]]
