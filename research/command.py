@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import typer
 
-from lerobot_memobench.cli.errors import one_sentence
+from lerobot_memobench.cli.console import one_sentence
 from lerobot_memobench.jobs.processes import saying_how_to_go_on
 from lerobot_memobench.jobs.threads import ACTING, LEARNING, use_threads
 

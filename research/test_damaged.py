@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_memobench.cli.documents import ReportFormat
+from lerobot_memobench.cli.report import ReportFormat
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import get_task
 from research.agreement.__main__ import agreement

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from lerobot_memobench.cli.console import console
-from lerobot_memobench.cli.documents import Formats, show_report
+from lerobot_memobench.cli.report import Formats, show_report
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import write_file
 from lerobot_memobench.paper import annotator_agreement

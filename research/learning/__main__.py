@@ -9,8 +9,7 @@ from typing import Annotated
 
 import typer
 
-from lerobot_memobench.cli.console import console
-from lerobot_memobench.cli.suite import Suite, WhichSuite
+from lerobot_memobench.cli.console import Suite, WhichSuite, console
 from research.command import run
 
 EXPERIMENTS = "bowl: one task, in minutes; prompted: ten tasks; joint: all thirty."

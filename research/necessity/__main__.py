@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lerobot_memobench.cli.console import Count, console, counting
-from lerobot_memobench.cli.suite import Suite, WhichSuite
+from lerobot_memobench.cli.console import Count, Suite, WhichSuite, console, counting
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 from research.command import run
 

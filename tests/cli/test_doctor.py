@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 from lerobot_memobench.cli.console import console
-from lerobot_memobench.cli.doctor import finding_table
+from lerobot_memobench.cli.demo import finding_table
 from lerobot_memobench.doctor.examination import Finding, exit_status
 
 

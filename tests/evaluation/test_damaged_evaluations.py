@@ -10,10 +10,8 @@ from typing import Any
 
 import pytest
 
-from lerobot_memobench.cli import controls, figures
-from lerobot_memobench.cli.html import html
-from lerobot_memobench.cli.merge import merge
-from lerobot_memobench.cli.report import ReportFormat, compare, report
+from lerobot_memobench.cli import figures
+from lerobot_memobench.cli.report import ReportFormat, compare, granularity, html, merge, oracle, report, shuffled
 from lerobot_memobench.envs.episode_log import check_protocol, read_episodes, write_protocol
 from lerobot_memobench.run import rerun as again
 from lerobot_memobench.run.card import new_card, with_episodes, write_card
@@ -91,9 +89,9 @@ class Bench:
             (lambda _: earlier_batch_size(self.run), 5),
             (lambda _: check_protocol(self.run, SETTINGS), 5),
             (lambda _: self.rerun(), 20),
-            (lambda _: controls.oracle([self.run], [self.other], None, 100, self.out), 5),
-            (lambda _: controls.shuffled(self.run, self.other, None, 100, self.out), 5),
-            (lambda _: controls.granularity(self.run, self.other, self.other, None, self.out), 5),
+            (lambda _: oracle([self.run], [self.other], None, 100, self.out), 5),
+            (lambda _: shuffled(self.run, self.other, None, 100, self.out), 5),
+            (lambda _: granularity(self.run, self.other, self.other, None, self.out), 5),
             *((lambda _, draw=draw: draw([str(self.run)], None, out=self.out), 1) for draw in DRAWN),
         ]
 

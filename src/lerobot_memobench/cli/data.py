@@ -1,19 +1,167 @@
-"""``memobench convert``, ``validate``, ``describe`` and ``push``: datasets that are there."""
+"""``memobench generate``, ``convert``, ``cache``, ``validate``, ``describe`` and ``push``: datasets."""
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.table import Table
 
-from lerobot_memobench.cli.console import console, counting
-from lerobot_memobench.cli.suite import OfSuite
+from lerobot_memobench.cli.console import OfSuite, Suite, WhichSuite, console, counting
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.documents.terminal import Unbroken
 from lerobot_memobench.io import count_of
+from lerobot_memobench.jobs.executors import asked_for, options_told
+from lerobot_memobench.run.arguments import executor_options
+from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 
 if TYPE_CHECKING:
+    from lerobot_memobench.datasets.generation import GenerationSummary
     from lerobot_memobench.datasets.validate import Verdict
     from lerobot_memobench.jobs.processes import Advance
+
+
+class Referent(StrEnum):
+    """What the goal of object and procedural tasks is."""
+
+    FIXED = "fixed"
+    RANDOM = "random"
+
+
+class Format(StrEnum):
+    """What demonstrations are written as."""
+
+    LEROBOT = "lerobot"
+    HDF5 = "hdf5"
+
+
+class Executor(StrEnum):
+    """What runs the episodes."""
+
+    PROCESSES = "processes"
+    LOCAL = "local"
+    SLURM = "slurm"
+    RAY = "ray"
+
+
+def generate(
+    out: Annotated[Path, typer.Option(help="Folder of the dataset that is made.")],
+    tasks: Annotated[str, typer.Option(help="all, memory types or task names, separated by commas.")] = "all",
+    suite: WhichSuite = Suite.PUBLISHED,
+    episodes: Annotated[int, typer.Option(min=1, help="Demonstrations per task.")] = 50,
+    prompted_episodes: Annotated[
+        int | None, typer.Option(min=1, help="Demonstrations per task that begins with a prompt, if not --episodes.")
+    ] = None,
+    seed_base: Annotated[int, typer.Option(help="Demonstration i uses the seed seed_base + i.")] = 10_000,
+    referent: Annotated[
+        Referent, typer.Option(help="fixed: the catalogue's goal; random: the seed decides.")
+    ] = Referent.FIXED,
+    images: Annotated[bool, typer.Option(help="Record both cameras.")] = True,
+    image_size: Annotated[int, typer.Option(min=16, help="Height and width of the images, pixels.")] = 256,
+    prompt_video: Annotated[bool, typer.Option(help="Begin with the prompt where a task has one.")] = True,
+    perturb: Annotated[
+        bool, typer.Option("--perturb", help="Move the arm off its way at random; action is what the expert does then.")
+    ] = False,
+    policy: Annotated[
+        str | None,
+        typer.Option(help="A checkpoint, or a policy of the package, that moves the arm now and then; as --perturb."),
+    ] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    repo_id: Annotated[str | None, typer.Option(help="Name of the dataset, user/name.")] = None,
+    formats: Annotated[
+        list[Format] | None, typer.Option("--format", help="lerobot (default), hdf5, or both by naming both.")
+    ] = None,
+    executor: Annotated[
+        Executor, typer.Option(help="processes here, or datatrove's: local, slurm, ray.")
+    ] = Executor.PROCESSES,
+    executor_option: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="key=value for datatrove's executor, e.g. partition=cpu, account=me, gres=gpu:1; repeatable."
+        ),
+    ] = None,
+) -> int:
+    """Make a LeRobotDataset of the scripted experts' demonstrations. The same command continues a killed
+    run.
+    """
+    options = executor_options(executor_option or [])
+    named: dict[str, Any] = {} if repo_id is None else {"repo_id": repo_id}
+    chosen = [get_task(name) for name in resolve_tasks(tasks, suite)]
+    from lerobot_memobench.datasets.generation import NEEDS, episodes_of
+    from lerobot_memobench.datasets.generation import generate as run
+
+    screen = console()
+    total = sum(episodes_of(task, episodes, prompted_episodes) for task in chosen)
+    with counting(screen, "episodes", total) as count:
+
+        def advance(news: Advance) -> None:
+            what = f"{news.task_name}, seed {news.seed}"
+            count(news.done, news.total, what, trouble=news.failure, found=news.found)
+
+        summary = run(
+            chosen,
+            episodes,
+            out,
+            prompted_episodes=prompted_episodes,
+            seed_base=seed_base,
+            referent=referent.value,
+            images=images,
+            image_size=image_size,
+            prompt_video=prompt_video,
+            perturb=perturb,
+            policy=_folder_of(policy),
+            workers=workers,
+            formats=tuple(format_.value for format_ in formats or [Format.LEROBOT]),
+            executor=executor.value,
+            executor_options=options,
+            progress=advance,
+            tell=lambda said: screen.print(said, soft_wrap=True, markup=False),
+            **named,
+        )
+    _print_summary(summary, out)
+    if summary.submitted:
+        screen.print(asked_for(options_told(executor.value, options, NEEDS)), soft_wrap=True, highlight=False)
+    return summary.exit_status
+
+
+def _folder_of(policy: str | None) -> str | None:
+    """Return the folder of the policy that moves the arm."""
+    if policy is None:
+        return None
+    from lerobot_memobench.policies.checkpoint import check_checkpoint, local_folder
+
+    folder = local_folder(policy)
+    if folder is None:
+        raise MemobenchError(f"there is no checkpoint in {policy}; name a training run's folder, or memobench_small")
+    check_checkpoint(str(folder))
+    return str(folder.absolute())
+
+
+def _print_summary(summary: GenerationSummary, out: Path) -> None:
+    """Print what became of every seed, and where the dataset is."""
+    screen = console()
+    screen.print(Unbroken(_summary_table(summary)), crop=False)
+    for failure in summary.failures:
+        screen.print(f"no demonstration of {failure.task_name}, seed {failure.seed}: {failure.reason}")
+    if summary.submitted:
+        screen.print(f"jobs are submitted; the last of them assembles the dataset in {out}", soft_wrap=True)
+    elif summary.folder is None:
+        screen.print("no dataset was written: no seed was solved")
+    else:
+        screen.print(f"dataset: {summary.folder}", soft_wrap=True)
+
+
+def _summary_table(summary: GenerationSummary) -> Table:
+    table = Table(header_style="bold", pad_edge=False)
+    table.add_column("task")
+    for name in ("solved", "of", "frames", "mean length"):
+        table.add_column(name, justify="right")
+    for task in summary.tasks:
+        mean = f"{sum(task.frames) / len(task.frames):.0f}" if task.frames else "–"
+        table.add_row(task.name, str(task.solved), str(task.episodes), str(sum(task.frames)), mean)
+    return table
 
 
 def convert(
@@ -54,6 +202,58 @@ def convert(
     else:
         screen.print(f"dataset of {count_of(summary.episodes, 'episode')}: {summary.folder}", soft_wrap=True)
     return summary.exit_status
+
+
+def cache(
+    dataset: Annotated[Path, typer.Argument(help="Folder of a LeRobotDataset with the benchmark's columns.")],
+    size: Annotated[str, typer.Option(help="Size of the policy that reads it: tiny, small or pi05.")] = "tiny",
+    stride: Annotated[
+        int | None, typer.Option(min=1, help="Keep every how many frames (policy.memory_stride); 8 with eyes, else 1.")
+    ] = None,
+    perception: Annotated[
+        str, typer.Option(help="pixels; or objects, which eyes find in the pictures (policy.perception).")
+    ] = "pixels",
+    eyes: Annotated[
+        str | None, typer.Option(help="Eyes (policy.eyes): package or a file; at size small the package's by default.")
+    ] = None,
+    weights: Annotated[
+        str | None, typer.Option(help="Folder or repository whose image tower is used (size pi05).")
+    ] = None,
+    device: Annotated[str | None, typer.Option(help="cuda or cpu; the best there is by default.")] = None,
+    batch_size: Annotated[int, typer.Option(min=1, help="Frames per pass of the image tower.")] = 64,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for memory caches (policy.memory_cache_dir); memory_cache in the dataset's by default."
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Threads that decode videos; as many as there are cores by default.")
+    ] = None,
+) -> None:
+    """Encode a dataset once for policies with a memory. Its frames and its subgoals."""
+    from lerobot_memobench.envs.prompting import quiet
+    from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
+    from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+
+    with quiet():
+        place = None if out is None else str(out)
+        given: dict[str, Any] = {} if stride is None else {"memory_stride": stride}
+        config = MemobenchMemConfig(
+            size=size, perception=perception, eyes=eyes, memory_cache_dir=place, device=device, **given
+        )
+    screen = console()
+    with counting(screen, "episodes") as count:
+        folder = cache_dataset(
+            dataset,
+            config,
+            weights=weights,
+            batch_size=batch_size,
+            workers=workers,
+            progress=count,
+            tell=lambda said: screen.print(said, soft_wrap=True),
+        )
+    screen.print(f"memory cache: {folder}", soft_wrap=True)
 
 
 def validate(

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lerobot_memobench.cli.console import console, counting
+from lerobot_memobench.cli.console import WITH_PARENT, console, counting
 from lerobot_memobench.evaluation.documents.report import failure_line, table
 from lerobot_memobench.evaluation.documents.sentences import saw_phrase
 from lerobot_memobench.io import count_of
@@ -23,8 +23,9 @@ from lerobot_memobench.run.shards import executor_options, plan_shards, run_shar
 if TYPE_CHECKING:
     from lerobot_memobench.jobs.processes import Advance
 
-SHARD_PROGRAM = ("-m", "lerobot_memobench.cli.shard_process")
-"""Words after Python's name that start the process of one part."""
+
+SHARD_PROGRAM = ("-m", "lerobot_memobench.cli.lerobot", WITH_PARENT)
+"""Arguments of Python that start the process of one part."""
 
 
 def evaluate(words: Words, command: Sequence[str]) -> int:

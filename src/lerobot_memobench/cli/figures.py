@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lerobot_memobench.cli.console import console
-from lerobot_memobench.cli.documents import Folders, With, given_runs
+from lerobot_memobench.cli.report import Folders, With, given_runs
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.task import PUBLISHED
 

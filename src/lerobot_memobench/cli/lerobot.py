@@ -7,13 +7,15 @@ defaults that make them work as they stand (``engine.planning``, ``settings.trai
 
 from __future__ import annotations
 
+import os
 import shlex
 import sys
+import threading
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from lerobot_memobench.cli.errors import one_sentence
+from lerobot_memobench.cli.console import WITH_PARENT, one_sentence
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.jobs.processes import saying_how_to_go_on
 from lerobot_memobench.run.arguments import (
@@ -131,5 +133,21 @@ def overview(commands: Iterable[str]) -> str:
     )
 
 
+def end_with_the_parent() -> None:
+    """End this process when standard input closes: the process that wanted a part of an evaluation is gone."""
+    source = sys.stdin.fileno()
+
+    def watch() -> None:
+        while os.read(source, 1):
+            pass
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    words = sys.argv[1:]
+    if words[:1] == [WITH_PARENT]:
+        end_with_the_parent()
+        words = words[1:]
+    sys.exit(main(words))

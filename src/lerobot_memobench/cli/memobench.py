@@ -15,19 +15,12 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from lerobot_memobench.cli import controls, data, eyes, figures
-from lerobot_memobench.cli.cache import cache
-from lerobot_memobench.cli.demo import demo
-from lerobot_memobench.cli.doctor import doctor
-from lerobot_memobench.cli.errors import one_sentence
-from lerobot_memobench.cli.generate import generate
-from lerobot_memobench.cli.html import html
-from lerobot_memobench.cli.merge import merge, rerun
-from lerobot_memobench.cli.objects import objects
-from lerobot_memobench.cli.recipe import recipe
-from lerobot_memobench.cli.report import compare, report
-from lerobot_memobench.cli.simulator import gallery
-from lerobot_memobench.cli.tasks import tasks
+from lerobot_memobench.cli import data, eyes, figures
+from lerobot_memobench.cli.console import one_sentence
+from lerobot_memobench.cli.data import cache, generate
+from lerobot_memobench.cli.demo import demo, doctor
+from lerobot_memobench.cli.report import compare, controls, html, merge, report, rerun
+from lerobot_memobench.cli.tasks import gallery, objects, recipe, tasks
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.processes import saying_how_to_go_on
 from lerobot_memobench.jobs.threads import ACTING, LEARNING, use_threads
@@ -66,7 +59,7 @@ COMMANDS: dict[str, tuple[Callable[..., int | None] | tuple[str, typer.Typer], .
     "Look around": (tasks, objects, gallery, doctor, demo),
     "Demonstrations": (generate, data.convert, cache, data.validate, data.describe, data.push),
     "Train": (recipe, ("eyes", eyes.app)),
-    "Results": (report, compare, html, merge, rerun, ("figures", figures.app), ("controls", controls.app)),
+    "Results": (report, compare, html, merge, rerun, ("figures", figures.app), ("controls", controls)),
 }
 """Group -> its commands, as ``memobench --help`` lists them."""
 

@@ -1,19 +1,58 @@
-"""``memobench report`` and ``compare``: what evaluations found, in figures."""
+"""``memobench report``, ``compare``, ``html``, ``merge``, ``rerun`` and ``controls``: what evaluations found."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lerobot_memobench.cli.console import console
-from lerobot_memobench.cli.documents import Beside, Formats, ReportFormat, With, show_report
 
 if TYPE_CHECKING:
     from lerobot_memobench.evaluation.records.runs import Run
+
+
+class ReportFormat(StrEnum):
+    """What a report is written as."""
+
+    TABLE = "table"
+    MARKDOWN = "markdown"
+    CSV = "csv"
+    LATEX = "latex"
+    JSON = "json"
+
+
+class Beside(StrEnum):
+    """Whose figures stand beside."""
+
+    PAPER = "paper"
+
+
+With = Annotated[Beside | None, typer.Option("--with", help="paper: stand the published figures beside.")]
+Folders = Annotated[
+    list[str] | None,
+    typer.Argument(
+        help="Folders that evaluations have written, or NAME=FOLDER; the same name for one policy at several replan "
+        "intervals. None with --with paper: the paper's figure.",
+        metavar="[DIR...]",
+    ),
+]
+Formats = Annotated[
+    list[ReportFormat] | None,
+    typer.Option("--format", help="table (default), markdown, latex or json; repeatable."),
+]
+
+ENDINGS = {
+    ReportFormat.TABLE: "txt",
+    ReportFormat.MARKDOWN: "md",
+    ReportFormat.LATEX: "tex",
+    ReportFormat.JSON: "json",
+}
+
 
 Runs = Annotated[
     list[str],

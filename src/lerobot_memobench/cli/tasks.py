@@ -1,4 +1,4 @@
-"""``memobench tasks``: what the benchmark asks for, as a table or JSON."""
+"""``memobench tasks``, ``objects``, ``gallery`` and ``recipe``: what there is, to be looked at."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from lerobot_memobench.cli.console import console
-from lerobot_memobench.cli.suite import Suite, WhichSuite
+from lerobot_memobench.cli.console import Suite, WhichSuite, console
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.terminal import Unbroken
 from lerobot_memobench.io import count_of
+from lerobot_memobench.run.arguments import recipe_file, recipes
 from lerobot_memobench.tasks.catalogue import (
     CATALOGUE_DIR,
     find_tasks,
@@ -87,3 +87,50 @@ def task_table(found: Sequence[Task]) -> Table:
         number = str(task_number(task.name)) if CATALOGUE_DIR in task.folder.parents else ""
         table.add_row(number, task.name, task.memory_type, task.operations, prompt, task.title)
     return table
+
+
+def objects(
+    as_json: Annotated[bool, typer.Option("--json", help="Print slots, fields and classes as JSON.")] = False,
+) -> None:
+    """Print the layout of object observations. Slots, the fields of each, the classes by index."""
+    from lerobot_memobench.sim.object_layout import SLOTS
+    from lerobot_memobench.sim.object_slots import layout
+
+    told = layout()
+    if as_json:
+        print(json.dumps(told, indent=1))
+        return
+    screen = console()
+    screen.print(f"{SLOTS} slots, one after another; of each:")
+    for field in told["fields"]:
+        screen.print(f"  {field['start']:>2}  {field['name']} ({field['size']})")
+    screen.print("classes: " + ", ".join(f"{k} {name}" for k, name in enumerate(told["classes"])), soft_wrap=True)
+
+
+def gallery(
+    out: Annotated[Path, typer.Option(help="Folder of the pictures; those of the same name are replaced.")] = Path(
+        "outputs/gallery"
+    ),
+    suite: WhichSuite = Suite.PUBLISHED,
+) -> None:
+    """Draw every task's initial scene, every object and fixture. Objects from all sides, fixtures open and closed."""
+    from lerobot_memobench.sim.gallery import write_gallery
+
+    for picture in write_gallery(out, suite):
+        console().print(str(picture), soft_wrap=True)
+
+
+def recipe(
+    name: Annotated[str | None, typer.Argument(help="A recipe; all are listed without it.")] = None,
+) -> int:
+    """Print the file of a training recipe. As in `lerobot-train --config_path=$(memobench recipe train_paper)`."""
+    if name is not None:
+        print(recipe_file(name))
+        return 0
+    table = Table(header_style="bold", pad_edge=False)
+    table.add_column("recipe", no_wrap=True)
+    table.add_column("what it trains")
+    for key, path in recipes().items():
+        table.add_row(key, path.read_text().splitlines()[0].removeprefix("# "))
+    console().print(table)
+    return 0

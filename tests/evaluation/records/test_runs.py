@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_memobench.cli.documents import given_runs
+from lerobot_memobench.cli.report import given_runs
 from lerobot_memobench.envs.episode_log import write_protocol
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.html import write_html
