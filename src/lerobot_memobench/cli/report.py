@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,8 +13,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lerobot_memobench.cli.console import console
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.io import count_of, write_file
 
 if TYPE_CHECKING:
+    from lerobot_memobench.evaluation.documents.tables import Report
     from lerobot_memobench.evaluation.records.runs import Run
 
 
@@ -139,3 +144,216 @@ def compare(
     first, second = read_runs([a, b])
     found = compared(first, second, allow=allow or (), seed=seed, permutations=permutations)
     show_report(differences_report.report(found), "compare", format_, out)
+
+
+def html(
+    folders: Annotated[list[Path], typer.Argument(help="Folders that evaluations have written.")],
+    out: Annotated[Path, typer.Option(help="Folder of the report; an earlier report there is replaced.")] = Path(
+        "outputs/html"
+    ),
+    link: Annotated[
+        bool,
+        typer.Option("--link", help="Link to the videos where they are: saves space, but the folder cannot be moved."),
+    ] = False,
+    task_dir: Annotated[
+        Path | None,
+        typer.Option(help="Tasks in the published format that the evaluations ran, beside the catalogue's."),
+    ] = None,
+) -> None:
+    """Make a report for the browser. Rates, failures, and each episode's video over its timeline."""
+    from lerobot_memobench.evaluation.documents.html import write_html
+
+    written = write_html(folders, out, link=link, task_dir=task_dir)
+    screen = console()
+    for note in written.notes:
+        screen.print(f"note: {note}", soft_wrap=True)
+    screen.print(f"{count_of(written.rollouts, 'episode')}, {written.videos} with a video")
+    screen.print(f"open {written.page}", soft_wrap=True)
+
+
+def merge(
+    out: Annotated[Path, typer.Argument(help="Folder of the whole evaluation.")],
+    folders: Annotated[
+        list[Path] | None, typer.Argument(help="Folders of its parts; OUT/shard-*-of-* when left out.")
+    ] = None,
+) -> int:
+    """Join the parts of an evaluation and report the whole. They ran with shard=i/n. Status 1: some are missing."""
+    from lerobot_memobench.cli.evaluate import merge_and_print
+    from lerobot_memobench.run.merging import part_folders
+
+    return merge_and_print(out, folders or part_folders(out))
+
+
+def rerun(
+    card: Annotated[Path, typer.Argument(help="A card.json, or the folder of an evaluation that holds one.")],
+    out: Annotated[Path | None, typer.Option(help="Folder of the repetition; a dated one when left out.")] = None,
+    server: Annotated[
+        str | None, typer.Option(help="Where the card's policy server is here, host:port; 127.0.0.1 needs no saying.")
+    ] = None,
+) -> int:
+    """Repeat the evaluation of a card and compare every episode. Status 1: one ended differently."""
+    from lerobot_memobench.cli.evaluate import evaluate_here
+    from lerobot_memobench.envs.episode_log import read_episodes
+    from lerobot_memobench.run import rerun as again
+    from lerobot_memobench.run.card import first_disagreement
+
+    told = again.repeatable_card(card, server)
+    again.check_policy(told)
+    screen = console()
+    for note in again.differences_here(told):
+        screen.print(f"note: {note}", soft_wrap=True)
+    plan = again.plan_of_card(told, out)
+    status = evaluate_here(plan)
+    if status:
+        return status
+    problem = first_disagreement(told["episodes"], read_episodes(plan.log))
+    if problem is not None:
+        screen.print(f"not repeated: {problem}", soft_wrap=True)
+        return 1
+    screen.print(f"repeated: all {len(told['episodes'])} episodes agree with the card", soft_wrap=True)
+    return 0
+
+
+controls = typer.Typer(
+    help="Report the paper's controls. Oracle memory, shuffled memory, annotation granularity.", no_args_is_help=True
+)
+
+TableOut = Annotated[Path | None, typer.Option(help="Folder to write the table to, as Markdown, LaTeX and JSON.")]
+Draws = Annotated[int, typer.Option(min=100, help="Bootstrap draws of the intervals.")]
+
+
+@controls.command()
+def oracle(
+    standard: Annotated[
+        list[Path], typer.Argument(help="Evaluations of the policy as it is; one per replan interval.")
+    ],
+    oracle: Annotated[
+        list[Path], typer.Option("--oracle", help="Evaluation of the policy with oracle memory text; repeatable.")
+    ],
+    beside: With = None,
+    draws: Draws = 2000,
+    out: TableOut = None,
+) -> int:
+    """Print which share of the gap to 100 % oracle memory closes: what a perfect memory would recover."""
+    from lerobot_memobench.evaluation.comparison.control_rollouts import pairs_by_replan
+    from lerobot_memobench.evaluation.comparison.oracle_memory import contrasts, oracle_report, published_contrasts
+    from lerobot_memobench.paper import raw_tables
+
+    pairs, notes = pairs_by_replan(standard, oracle, ignore=("oracle_memory",))
+    found = {replan: contrasts(a, b, draws) for replan, (a, b) in pairs.items()}
+    published = raw_tables()["oracle_memory"]
+    paper = (published["replan_steps"], published_contrasts(published)) if beside else None
+    return _show(oracle_report(found, paper), notes, "oracle", out)
+
+
+@controls.command()
+def shuffled(
+    normal: Annotated[Path, typer.Argument(help="Evaluation of the policy taught with subgoals in order.")],
+    shuffled: Annotated[Path, typer.Argument(help="Evaluation of the policy taught with shuffled subgoals.")],
+    beside: With = None,
+    draws: Draws = 2000,
+    out: TableOut = None,
+) -> int:
+    """Print how far rollouts come with normal and with shuffled memory, checkpoint by checkpoint."""
+    from lerobot_memobench.evaluation.comparison.control_rollouts import pairs_by_replan
+    from lerobot_memobench.evaluation.comparison.shuffled_memory import prefix_curves, shuffled_report
+    from lerobot_memobench.paper import shuffled_control
+
+    pairs, notes = pairs_by_replan([normal], [shuffled])
+    found = {replan: prefix_curves(a, b, draws) for replan, (a, b) in pairs.items()}
+    return _show(shuffled_report(found, shuffled_control() if beside else None), notes, "shuffled", out)
+
+
+@controls.command()
+def granularity(
+    coarse: Annotated[Path, typer.Option(help="Evaluation of the policy taught with coarse subgoals.")],
+    intermediate: Annotated[Path, typer.Option(help="The same with intermediate subgoals.")],
+    fine: Annotated[Path, typer.Option(help="The same with fine subgoals.")],
+    beside: With = None,
+    out: TableOut = None,
+) -> int:
+    """Print the metrics by the language level of the subgoals that a policy was taught with."""
+    from lerobot_memobench.evaluation.comparison.control_rollouts import rollouts_by_level, with_labels_of_level
+    from lerobot_memobench.evaluation.comparison.granularity import granularity_report
+
+    levels, notes = rollouts_by_level(coarse, intermediate, fine)
+    own = with_labels_of_level(levels)
+    return _show(granularity_report(levels, own, paper=bool(beside)), notes, "granularity", out)
+
+
+def _show(report: Report, notes: Sequence[str], name: str, out: Path | None) -> int:
+    """Print a report, and write it where asked; return the exit status."""
+    from lerobot_memobench.evaluation.documents.formats import latex, markdown, terminal
+
+    noted = replace(report, sections=tuple(replace(each, notes=(*each.notes, *notes)) for each in report.sections))
+    told = " ".join(f"{note}." for note in notes)
+    captioned = [
+        replace(each, tables=tuple(replace(t, note=f"{t.note} {told}") for t in each.tables))
+        for each in report.sections
+    ]
+    screen = console()
+    screen.print(terminal(noted), crop=False)
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        data = {"title": report.title, "notes": list(notes), **report.data}
+        contents = {
+            "md": markdown(noted),
+            "tex": latex(replace(report, sections=tuple(captioned))),
+            "json": json.dumps(data, indent=1) + "\n",
+        }
+        for ending, content in contents.items():
+            screen.print(str(write_file(out / f"{name}.{ending}", content)), soft_wrap=True)
+    return 0
+
+
+def given_runs(folders: list[str] | None, with_: Beside | None) -> tuple[list[Run], bool]:
+    """Return the evaluations and whether the paper's figures are drawn; one of both is needed."""
+    from lerobot_memobench.evaluation.documents.beside_paper import check_beside
+    from lerobot_memobench.evaluation.records.runs import read_runs, unlike
+
+    paper = with_ is Beside.PAPER
+    if not folders and not paper:
+        raise MemobenchError("there is nothing to draw; name folders of evaluations, or --with paper, or both")
+    runs = read_runs(folders) if folders else []
+    check_beside(runs, paper)
+    for note in unlike({run.name: run.protocol for run in runs}) if runs else ():
+        print(f"memobench: note: {note}", file=sys.stderr)
+    return runs, paper
+
+
+def show_report(report: Report, name: str, formats: Sequence[ReportFormat] | None, out: Path | None) -> None:
+    """Print a report in the formats wanted, or write it to a folder as ``name`` with the formats' endings.
+
+    Raises:
+        MemobenchError: CSV is wanted.
+    """
+    wanted = list(dict.fromkeys(formats or [ReportFormat.TABLE]))
+    if ReportFormat.CSV in wanted:
+        raise MemobenchError(f"found --format csv; expected {', '.join(ENDINGS)}: what is told here is no one table")
+    for each in wanted:
+        if out is not None:
+            out.mkdir(parents=True, exist_ok=True)
+            path = write_file(out / f"{name}.{ENDINGS[each]}", _writer(each)(report))
+            console().print(str(path), soft_wrap=True)
+        elif each is ReportFormat.TABLE:
+            _print_table(report)
+        else:
+            print(_writer(each)(report), end="")
+
+
+def _print_table(report: Report) -> None:
+    from lerobot_memobench.evaluation.documents.formats import terminal
+
+    console().print(report.title, style="bold")
+    console().print(terminal(report), crop=False)
+
+
+def _writer(format_: ReportFormat) -> Callable[[Report], str]:
+    from lerobot_memobench.evaluation.documents import formats
+
+    return {
+        ReportFormat.TABLE: formats.text,
+        ReportFormat.MARKDOWN: formats.markdown,
+        ReportFormat.LATEX: formats.latex,
+        ReportFormat.JSON: lambda report: json.dumps(report.data, indent=2) + "\n",
+    }[format_]
