@@ -1,11 +1,11 @@
-"""What prompt videos show, acted out by the arm.
+"""Demonstration prompts, acted out by the arm.
 
-Whoever plays the prompt restores the scene exactly afterwards, but for what it hid; here it only has to be shown.
+The episode that plays one restores the scene exactly afterwards, but for what was hidden; here it only has to be shown.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,21 +13,21 @@ from numpy.typing import NDArray
 from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.experts.grasping import pick, put_at
 from lerobot_memobench.experts.hand import CLOSED, OPEN, UP, Array, Hand
-from lerobot_memobench.experts.travel import HOME, go_home, pointing
+from lerobot_memobench.experts.travel import HOME, Steps, go_home, pointing
 from lerobot_memobench.sim.rendering import Highlight
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task
 
 PAUSE = 8
-"""Still frames before and after, so that the video has a first and a last picture."""
+"""Still frames before and after, so that the demonstration prompt has a first and a last picture."""
 HIGHLIGHT_STEPS = 50
 BRISK = 1.25
-"""How much faster than at work the hand hides things: two of them fit into a prompt video."""
+"""How much faster than at work the hand hides things: two of them fit into a demonstration prompt."""
 
 
 class PromptDemonstrator:
-    """Play one prompt.
+    """Play one demonstration prompt.
 
     Args:
         task: the episode's task, a variant of the published one where the referent is random.
@@ -68,14 +68,14 @@ class PromptDemonstrator:
         assert self._prompt.target is not None
         return self._prompt.target
 
-    def _routine(self, home: tuple[Array, Array]) -> Generator[NDArray[np.float32], None, None]:
+    def _routine(self, home: tuple[Array, Array]) -> Steps:
         expert = Expert(self._task, self._sim, self._rng)
         while not expert.done:
             yield expert.act()
         self.shown = expert.succeeded
         yield from go_home(expert.hand, *home)
 
-    def _hide(self) -> Generator[NDArray[np.float32], None, None]:
+    def _hide(self) -> Steps:
         """Put each thing into its drawer and shut that, then come home; shown if all are out of sight."""
         expert = Expert(self._task, self._sim, self._rng)
         expert.hand.speed = min(1.0, BRISK * expert.hand.speed)
@@ -89,7 +89,7 @@ class PromptDemonstrator:
         yield from expert.hand.wait(PAUSE, OPEN)
         self.shown = all(self._sim.holds(atom) for atom in (*hidden, HOME))
 
-    def _pick(self, hand: Hand) -> Generator[NDArray[np.float32], None, None]:
+    def _pick(self, hand: Hand) -> Steps:
         place, turned = self._sim.body_pose(self._referent())
         held = yield from pick(hand, self._referent())
         if held is not None:
@@ -97,7 +97,7 @@ class PromptDemonstrator:
             yield from hand.wait(PAUSE, CLOSED)
             yield from put_at(hand, held, place, turned)
 
-    def _point(self, hand: Hand) -> Generator[NDArray[np.float32], None, None]:
+    def _point(self, hand: Hand) -> Steps:
         asset = self._sim.assets[self._referent()]
         place, _ = self._sim.body_pose(self._referent())
         above = place + (asset.top + 0.03) * UP
@@ -109,7 +109,7 @@ class PromptDemonstrator:
         self.shown = bool(np.linalg.norm((hand.position - place)[:2]) < 0.03)
         yield from hand.move(above + 0.10 * UP, rotation, CLOSED, tolerance=0.02)
 
-    def _highlight(self, hand: Hand) -> Generator[NDArray[np.float32], None, None]:
+    def _highlight(self, hand: Hand) -> Steps:
         self._sim.highlights = highlights_at(self._task, self._sim, PAUSE)
         self.shown = True
         yield from hand.wait(HIGHLIGHT_STEPS, OPEN)
@@ -117,7 +117,7 @@ class PromptDemonstrator:
 
 
 def highlights_at(task: Task, sim: Simulation, frame: int) -> tuple[Highlight, ...]:
-    """Return what is highlighted at a frame of a task's prompt video, where things stand in ``sim``."""
+    """Return what is highlighted at a frame of a task's demonstration prompt, where things stand in ``sim``."""
     prompt = task.prompt
     if prompt is None or prompt.kind != "highlight" or prompt.target is None:
         return ()

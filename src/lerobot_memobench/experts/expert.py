@@ -1,8 +1,11 @@
-"""The expert: a plan made from the task's checkpoints and goal, carried out and checked."""
+"""The expert: a plan made from the task's checkpoints and goal, carried out and checked.
+
+A goal that counts events or asks for their order is its own plan (`plan_of`): what to do, how often, when to come home.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from itertools import chain
 
 import numpy as np
@@ -20,7 +23,7 @@ from lerobot_memobench.experts.fixtures import (
 )
 from lerobot_memobench.experts.grasping import pick, put_in_drawer, put_on, put_on_region
 from lerobot_memobench.experts.hand import OPEN, UP, Hand
-from lerobot_memobench.experts.travel import come_home, drawer_around, outward_of, stands_out
+from lerobot_memobench.experts.travel import Steps, come_home, drawer_around, outward_of, stands_out
 from lerobot_memobench.sim.scene import TABLE, TABLE_TOP
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.formula import (
@@ -41,8 +44,6 @@ from lerobot_memobench.tasks.formula import (
 from lerobot_memobench.tasks.progress import HOLD_STEPS, Evaluator
 from lerobot_memobench.tasks.task import STRICT, Task
 
-Doing = Generator[NDArray[np.float32], None, None]
-
 TRIES = 3
 """How often a thing is picked up and placed before the plan goes on without it."""
 LINGER = 10
@@ -50,6 +51,11 @@ LINGER = 10
 learns to turn short of it."""
 REPAIRS = 3
 """How often the goal is gone through again when something in it does not hold at the end."""
+Step = Atom | Hold
+"""An atom to bring about, or a rest: a `Hold` whose child is so already."""
+
+_NOT_BROUGHT_ABOUT = ("inplace",)
+"""Predicates that an expert keeps true by leaving things alone."""
 
 
 def steps_of(formula: Formula) -> list[Atom]:
@@ -83,185 +89,6 @@ def rest_of(formula: Formula) -> int:
         case _:
             own = 0
     return own + max((rest_of(child) for child in children(formula)), default=0)
-
-
-class Expert:
-    """Solve a task by its checkpoints, in order, then by whatever of the goal is still open.
-
-    A goal that counts events is its own plan: what is true of the present does not tell what has been done.
-
-    It looks into the simulator, as a demonstrator with perfect sight would, and says one action per control step.
-
-    Args:
-        task: goal and checkpoints.
-        sim: the running scene.
-        rng: source of small variation in speed, grasp and approach.
-
-    Attributes:
-        done: nothing is left to do: the goal holds, or the plan has come to its end. Asked on, it goes on with what it
-            was at: who learns from it cannot see the moment at which the goal comes to hold.
-        succeeded: the goal held when the expert was last asked.
-        hand: the arm it moves.
-    """
-
-    def __init__(self, task: Task, sim: Simulation, rng: np.random.Generator) -> None:
-        self.task, self.sim = task, sim
-        self.hand = Hand(sim, rng)
-        self._watch = Evaluator([task.goal, *(checkpoint.goal for checkpoint in task.checkpoints)])
-        self._started = False
-        self._doing = self._plan()
-        self.done = self.succeeded = False
-
-    def act(self) -> NDArray[np.float32]:
-        """Return the action (7,) for the present state; coming to rest with open fingers once the plan is done.
-
-        Ask once per control step: each call moves the plan on.
-        """
-        if self._started:
-            # Latches and order are followed here too: what an atom says now does not tell whether a goal is reached.
-            self.succeeded, *_ = self._watch.step(self.sim.holds)
-            self.done = self.done or self.succeeded
-        self._started = True
-        try:
-            return np.clip(next(self._doing), -1.0, 1.0)
-        except StopIteration:
-            self.done = True
-        return self.hand.rest(OPEN)
-
-    def _plan(self) -> Doing:
-        if counts(self.task.goal):
-            for step in plan_of(self.task.goal):
-                yield from self._take(step)
-            return
-        for checkpoint in self.task.checkpoints:
-            for atom in steps_of(checkpoint.goal):
-                yield from self.achieve(atom)
-        for _ in range(REPAIRS):
-            missing = [atom for atom in steps_of(self.task.goal) if not self._holds(atom)]
-            if not missing:
-                break
-            for atom in missing:
-                yield from self.achieve(atom)
-        for _ in range(rest_of(self.task.goal)):
-            yield self.hand.rest(OPEN)
-
-    def _take(self, step: Step) -> Doing:
-        """Bring an atom about, or rest at home."""
-        if isinstance(step, Atom):
-            came = step.predicate == "handhome" and not self._holds(step)
-            yield from self.achieve(step)
-            rest = LINGER if came else 0
-        else:
-            rest = step.number
-        for _ in range(rest):
-            yield self.hand.toward(*self.sim.home, OPEN)
-
-    def _holds(self, atom: Atom) -> bool:
-        if atom.predicate in LATCHES:
-            return atom in self._watch.latched
-        return self.sim.holds(atom)
-
-    def achieve(self, atom: Atom) -> Doing:
-        """Bring one atom about, unless it is already so; for home that is not near enough."""
-        hand = self.hand
-        if atom.predicate == "handhome":
-            for _ in range(TRIES):  # the arm may be pushed on the way
-                yield from come_home(hand, *self.sim.home)
-                if self._holds(atom):
-                    return
-            return
-        if self._holds(atom):
-            return
-        match atom.predicate, atom.args:
-            case (("open" | "wasopen"), (name,)):
-                yield from self._open(name)
-            case "close", (name,):
-                yield from self._close(name)
-            case (("turnon" | "wasturnedon"), (name,)):
-                yield from turn_knob(hand, name, on=True)
-            case "turnoff", (name,):
-                yield from turn_knob(hand, name, on=False)
-            case "in", (name, region):
-                yield from self._bring(atom, lambda: self._put_in(name, region))
-            case "on", (name, support):
-                yield from self._bring(atom, lambda: self._put_on(name, support))
-            case _:
-                raise MemobenchError(f"the expert has no motion for {atom}")
-
-    def _bring(self, atom: Atom, once: Callable[[], Doing]) -> Doing:
-        """Pick and place until it holds: a thing may slip on the way, or come to lean on a drawer's wall."""
-        for _ in range(TRIES):
-            yield from once()
-            if self._holds(atom) and not (atom.predicate == "in" and stands_out(self.hand, *atom.args)):
-                return
-
-    def _put_on(self, name: str, support: str) -> Doing:
-        on_object = support in self.sim.assets
-        place = self.sim.body_pose(support)[0] if on_object else self._middle_of(support)
-        place = place - self.sim.assets[name].bottom * UP
-        drawer = drawer_around(self.hand, name)
-        if drawer is not None:
-            yield from self.achieve(Atom("open", (drawer,)))
-        held = yield from pick(self.hand, name, place=place)
-        if held is None:
-            return
-        if support in self.sim.assets:
-            yield from put_on(self.hand, held, support)
-        else:
-            yield from put_on_region(self.hand, held, self._middle_of(support))
-
-    def _middle_of(self, region: str) -> NDArray[np.float64]:
-        """The middle of a region's upper face, (3,), m."""
-        declared = self.task.regions.get(region)
-        if declared is not None and declared.target == TABLE:
-            x1, y1, x2, y2 = declared.ranges[0]
-            return np.array([(x1 + x2) / 2, (y1 + y2) / 2, TABLE_TOP])
-        centre, rotation = self.sim.site_pose(region)
-        return centre + rotation @ np.array([0.0, 0.0, self.sim.site_half_size(region)[2]])
-
-    def _open(self, name: str) -> Doing:
-        if self.sim.world.articulation(name)[0].kind != "door":
-            yield from open_drawer(self.hand, name)
-        elif self.task.suite == STRICT:
-            yield from pull_open(self.hand, name)
-        else:
-            yield from open_door(self.hand, name)
-
-    def _close(self, name: str) -> Doing:
-        if self.sim.world.articulation(name)[0].kind != "door":
-            yield from close_drawer(self.hand, name)
-        elif self.task.suite == STRICT:
-            yield from push_shut(self.hand, name)
-        else:
-            yield from close_door(self.hand, name)
-
-    def _put_in(self, name: str, region: str) -> Doing:
-        drawers = [
-            full
-            for asset in self.sim.assets.values()
-            for part, full in asset.regions.items()
-            if part in asset.articulations
-        ]
-        if region not in drawers:
-            known = nearest(region, drawers) if drawers else "the scene has no drawer, let a policy of your own do it"
-            raise MemobenchError(f"the expert puts things into drawers only, and {region!r} is none; {known}")
-        articulation, q = self.sim.world.articulation(region)
-        if articulation.open_below is not None and q > articulation.open_below:
-            yield from self._open(region)
-        out = outward_of(self.hand, articulation)
-        held = yield from pick(self.hand, name, avoid=out)
-        if held is not None:
-            yield from put_in_drawer(self.hand, held, region, out)
-
-
-# ==== plans.py
-# Read a plan off a goal that counts events or asks for their order: what to do, how often, when to come home.
-
-Step = Atom | Hold
-"""An atom to bring about, or a rest: a `Hold` whose child is so already."""
-
-_NOT_BROUGHT_ABOUT = ("inplace",)
-"""Predicates that an expert keeps true by leaving things alone."""
 
 
 def counts(formula: Formula) -> bool:
@@ -315,3 +142,172 @@ def _within(plan: list[Step], whole: list[Step]) -> bool:
     """Return whether all steps of a plan occur in another, in order."""
     left = iter(whole)
     return all(step in left for step in plan)
+
+
+class Expert:
+    """Solve a task by its checkpoints, in order, then by whatever of the goal is still open.
+
+    A goal that counts events is its own plan: what is true of the present does not tell what has been done.
+
+    It looks into the simulator, as a demonstrator with perfect sight would, and says one action per control step.
+
+    Args:
+        task: goal and checkpoints.
+        sim: the running scene.
+        rng: source of small variation in speed, grasp and approach.
+
+    Attributes:
+        done: nothing is left to do: the goal holds, or the plan has come to its end. Asked on, it goes on with what it
+            was at: who learns from it cannot see the moment at which the goal comes to hold.
+        succeeded: the goal held when the expert was last asked.
+        hand: the arm it moves.
+    """
+
+    def __init__(self, task: Task, sim: Simulation, rng: np.random.Generator) -> None:
+        self.task, self.sim = task, sim
+        self.hand = Hand(sim, rng)
+        self._watch = Evaluator([task.goal, *(checkpoint.goal for checkpoint in task.checkpoints)])
+        self._started = False
+        self._doing = self._plan()
+        self.done = self.succeeded = False
+
+    def act(self) -> NDArray[np.float32]:
+        """Return the action (7,) for the present state; coming to rest with open fingers once the plan is done.
+
+        Ask once per control step: each call moves the plan on.
+        """
+        if self._started:
+            # Latches and order are followed here too: what an atom says now does not tell whether a goal is reached.
+            self.succeeded, *_ = self._watch.step(self.sim.holds)
+            self.done = self.done or self.succeeded
+        self._started = True
+        try:
+            return np.clip(next(self._doing), -1.0, 1.0)
+        except StopIteration:
+            self.done = True
+        return self.hand.rest(OPEN)
+
+    def _plan(self) -> Steps:
+        if counts(self.task.goal):
+            for step in plan_of(self.task.goal):
+                yield from self._take(step)
+            return
+        for checkpoint in self.task.checkpoints:
+            for atom in steps_of(checkpoint.goal):
+                yield from self.achieve(atom)
+        for _ in range(REPAIRS):
+            missing = [atom for atom in steps_of(self.task.goal) if not self._holds(atom)]
+            if not missing:
+                break
+            for atom in missing:
+                yield from self.achieve(atom)
+        for _ in range(rest_of(self.task.goal)):
+            yield self.hand.rest(OPEN)
+
+    def _take(self, step: Step) -> Steps:
+        """Bring an atom about, or rest at home."""
+        if isinstance(step, Atom):
+            came = step.predicate == "handhome" and not self._holds(step)
+            yield from self.achieve(step)
+            rest = LINGER if came else 0
+        else:
+            rest = step.number
+        for _ in range(rest):
+            yield self.hand.toward(*self.sim.home, OPEN)
+
+    def _holds(self, atom: Atom) -> bool:
+        if atom.predicate in LATCHES:
+            return atom in self._watch.latched
+        return self.sim.holds(atom)
+
+    def achieve(self, atom: Atom) -> Steps:
+        """Bring one atom about, unless it is already so; for home that is not near enough."""
+        hand = self.hand
+        if atom.predicate == "handhome":
+            for _ in range(TRIES):  # the arm may be pushed on the way
+                yield from come_home(hand, *self.sim.home)
+                if self._holds(atom):
+                    return
+            return
+        if self._holds(atom):
+            return
+        match atom.predicate, atom.args:
+            case (("open" | "wasopen"), (name,)):
+                yield from self._open(name)
+            case "close", (name,):
+                yield from self._close(name)
+            case (("turnon" | "wasturnedon"), (name,)):
+                yield from turn_knob(hand, name, on=True)
+            case "turnoff", (name,):
+                yield from turn_knob(hand, name, on=False)
+            case "in", (name, region):
+                yield from self._bring(atom, lambda: self._put_in(name, region))
+            case "on", (name, support):
+                yield from self._bring(atom, lambda: self._put_on(name, support))
+            case _:
+                raise MemobenchError(f"the expert has no motion for {atom}")
+
+    def _bring(self, atom: Atom, once: Callable[[], Steps]) -> Steps:
+        """Pick and place until it holds: a thing may slip on the way, or come to lean on a drawer's wall."""
+        for _ in range(TRIES):
+            yield from once()
+            if self._holds(atom) and not (atom.predicate == "in" and stands_out(self.hand, *atom.args)):
+                return
+
+    def _put_on(self, name: str, support: str) -> Steps:
+        on_object = support in self.sim.assets
+        place = self.sim.body_pose(support)[0] if on_object else self._middle_of(support)
+        place = place - self.sim.assets[name].bottom * UP
+        drawer = drawer_around(self.hand, name)
+        if drawer is not None:
+            yield from self.achieve(Atom("open", (drawer,)))
+        held = yield from pick(self.hand, name, place=place)
+        if held is None:
+            return
+        if support in self.sim.assets:
+            yield from put_on(self.hand, held, support)
+        else:
+            yield from put_on_region(self.hand, held, self._middle_of(support))
+
+    def _middle_of(self, region: str) -> NDArray[np.float64]:
+        """The middle of a region's upper face, (3,), m."""
+        declared = self.task.regions.get(region)
+        if declared is not None and declared.target == TABLE:
+            x1, y1, x2, y2 = declared.ranges[0]
+            return np.array([(x1 + x2) / 2, (y1 + y2) / 2, TABLE_TOP])
+        centre, rotation = self.sim.site_pose(region)
+        return centre + rotation @ np.array([0.0, 0.0, self.sim.site_half_size(region)[2]])
+
+    def _open(self, name: str) -> Steps:
+        if self.sim.world.articulation(name)[0].kind != "door":
+            yield from open_drawer(self.hand, name)
+        elif self.task.suite == STRICT:
+            yield from pull_open(self.hand, name)
+        else:
+            yield from open_door(self.hand, name)
+
+    def _close(self, name: str) -> Steps:
+        if self.sim.world.articulation(name)[0].kind != "door":
+            yield from close_drawer(self.hand, name)
+        elif self.task.suite == STRICT:
+            yield from push_shut(self.hand, name)
+        else:
+            yield from close_door(self.hand, name)
+
+    def _put_in(self, name: str, region: str) -> Steps:
+        drawers = [
+            full
+            for asset in self.sim.assets.values()
+            for part, full in asset.regions.items()
+            if part in asset.articulations
+        ]
+        if region not in drawers:
+            known = nearest(region, drawers) if drawers else "the scene has no drawer, let a policy of your own do it"
+            raise MemobenchError(f"the expert puts things into drawers only, and {region!r} is none; {known}")
+        articulation, q = self.sim.world.articulation(region)
+        if articulation.open_below is not None and q > articulation.open_below:
+            yield from self._open(region)
+        out = outward_of(self.hand, articulation)
+        held = yield from pick(self.hand, name, avoid=out)
+        if held is not None:
+            yield from put_in_drawer(self.hand, held, region, out)

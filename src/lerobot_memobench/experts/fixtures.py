@@ -1,4 +1,4 @@
-"""Pull and push drawers by their handles, turn knobs."""
+"""Fixtures: pull and push drawers by their handles, turn knobs, open and shut hinged doors."""
 
 from __future__ import annotations
 
@@ -41,6 +41,33 @@ from lerobot_memobench.sim.assets.asset import Articulation
 
 TILT = np.radians(35)
 """How far the hand points down when it takes a handle: enough for the flange to clear the table."""
+
+REACH = 0.72
+"""Distance from the arm's foot up to which a hand that points down moves freely, m."""
+DOOR_THICKNESS = 0.02
+EDGE_INSET, EDGE_DEPTH = 0.012, 0.018
+"""Where a door's upper edge is taken: so far from the handle towards the hinge and so deep, m."""
+SWING_LEAD = 0.13
+"""Angle by which the hand leads a door along its arc, rad."""
+EASE = 0.04
+"""The same where the door is as far open as it should be, rad: a hand that arrives fast throws the door on, out of
+reach."""
+PUSH_GAP = 0.06
+"""Distance in front of a handle from which the closed fingers come to push it, m."""
+
+LEAD = 0.16
+"""Angle by which the hand leads a door along its arc, rad."""
+GRIP_BELOW = 0.018
+"""How far under a handle's upper end it is taken, m."""
+PUSH_IN, PUSH_BELOW = 0.045, 0.030
+"""Where a door is pushed: beside the handle towards the hinge by so much, and so far below its upper edge, m."""
+BEFORE, TOUCHING = 0.06, 0.018
+"""Distance of the hand from the panel's middle before and while it pushes, m."""
+STEPS = 150
+"""Control steps after which a pull or push is given up."""
+
+
+# --- drawers and knobs ---
 
 
 def _at_handle(hand: Hand, articulation: Articulation, tilt: float) -> tuple[Array, Array, Array]:
@@ -212,21 +239,7 @@ def _twist(hand: Hand, name: str, aim: float, reached: Callable[[], bool]) -> St
         yield hand.toward(_ridge(hand, articulation)[0], goal, CLOSED)
 
 
-# ==== doors.py
-# Pull, swing and push hinged doors.
-
-REACH = 0.72
-"""Distance from the arm's foot up to which a hand that points down moves freely, m."""
-DOOR_THICKNESS = 0.02
-EDGE_INSET, EDGE_DEPTH = 0.012, 0.018
-"""Where a door's upper edge is taken: so far from the handle towards the hinge and so deep, m."""
-SWING_LEAD = 0.13
-"""Angle by which the hand leads a door along its arc, rad."""
-EASE = 0.04
-"""The same where the door is as far open as it should be, rad: a hand that arrives fast throws the door on, out of
-reach."""
-PUSH_GAP = 0.06
-"""Distance in front of a handle from which the closed fingers come to push it, m."""
+# --- doors ---
 
 
 @dataclass(frozen=True)
@@ -412,27 +425,14 @@ def _push_door(hand: Hand, name: str) -> Steps:
     yield from rise(hand, CLOSED, 0.26)
 
 
-# ==== sweeping.py
-# Open a door in one pull and shut it in one push: half the steps of `open_door`, for rounds that are counted.
-#
-# The hand leans out as far as the door goes, where that of the published demonstrations lets go and takes it anew.
-
-LEAD = 0.16
-"""Angle by which the hand leads a door along its arc, rad."""
-GRIP_BELOW = 0.018
-"""How far under a handle's upper end it is taken, m."""
-PUSH_IN, PUSH_BELOW = 0.045, 0.030
-"""Where a door is pushed: beside the handle towards the hinge by so much, and so far below its upper edge, m."""
-BEFORE, TOUCHING = 0.06, 0.018
-"""Distance of the hand from the panel's middle before and while it pushes, m."""
-STEPS = 150
-"""Control steps after which a pull or push is given up."""
+# --- doors in one pull or push: half the steps of `open_door` and `close_door`, for rounds that are counted. The hand
+# leans out as far as the door goes, where that of the published demonstrations lets go and takes it anew ---
 
 
 def pull_open(hand: Hand, name: str) -> Doing:
     """Take a door's handle and follow the arc until the door counts as open; a second way where that fails."""
     articulation, _ = hand.sim.world.articulation(name)
-    yield from _pull_round(hand, name)
+    yield from _sweep_open(hand, name)
     yield from let_go(hand, 0.08)
     if wanted(hand.sim.world.articulation(name)[1], articulation, True):
         return True
@@ -442,7 +442,7 @@ def pull_open(hand: Hand, name: str) -> Doing:
 def push_shut(hand: Hand, name: str) -> Doing:
     """Push a door's panel from outside until it is shut; a second way where that fails."""
     articulation, _ = hand.sim.world.articulation(name)
-    yield from _push_round(hand, name)
+    yield from _sweep_shut(hand, name)
     if wanted(hand.sim.world.articulation(name)[1], articulation, False):
         return True
     return (yield from close_door(hand, name))
@@ -455,7 +455,7 @@ def _turned(hand: Hand, door: Door, place: Array, flip: float) -> Array:
     return leaning(closing, lean - (lean @ closing) * closing)
 
 
-def _pull_round(hand: Hand, name: str) -> Steps:
+def _sweep_open(hand: Hand, name: str) -> Steps:
     articulation, _ = hand.sim.world.articulation(name)
     up = (articulation.handle.length / 2 - GRIP_BELOW) * UP
     flip = np.sign(door_now(hand, name).along @ EASY_CLOSING) or 1.0
@@ -482,7 +482,7 @@ def _pull_round(hand: Hand, name: str) -> Steps:
         yield hand.toward(*grip(way * LEAD), CLOSED)
 
 
-def _push_round(hand: Hand, name: str) -> Steps:
+def _sweep_shut(hand: Hand, name: str) -> Steps:
     articulation, _ = hand.sim.world.articulation(name)
     way = float(np.sign(articulation.closed_q - articulation.open_q))
     flip = np.sign(door_now(hand, name).along @ EASY_CLOSING) or 1.0

@@ -1,4 +1,7 @@
-"""Pick: choose a way to hold a thing, take it from above, lift it, try another way when it was missed."""
+"""Pick and place: choose a way to hold a thing, take it from above and lift it, bring it to where it belongs.
+
+A hold that misses is tried another way.
+"""
 
 from __future__ import annotations
 
@@ -88,6 +91,8 @@ WIDE = 0.068
 """Width from which an object is hard to take, m."""
 RIM_LEAN = np.radians(14)
 """How far the hand may lean with the wall of a bowl, rad."""
+MOST_RIGHTING = np.radians(35)
+"""Tilt of a held thing up to which it is set upright before it is set down, rad."""
 
 
 def _yaw(rotation: Array) -> float:
@@ -337,11 +342,7 @@ def _lift(hand: Hand, name: str) -> Generator[NDArray[np.float32], None, Held | 
     return Held(name, rotation.T @ (now - position), rotation.T @ turn)
 
 
-# ==== placing.py
-# Place: bring a held thing to where it belongs and set it down there.
-
-MOST_RIGHTING = np.radians(35)
-"""Tilt of a held thing up to which it is set upright before it is set down, rad."""
+# --- placing ---
 
 
 def carry(
