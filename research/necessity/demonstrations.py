@@ -20,7 +20,8 @@ from lerobot_memobench.tasks.progress import Progress
 from lerobot_memobench.tasks.task import Prompt, Task
 
 if TYPE_CHECKING:
-    from lerobot_memobench.experts.expert import Doing, Expert
+    from lerobot_memobench.experts.expert import Expert
+    from lerobot_memobench.experts.travel import Steps
     from lerobot_memobench.sim.simulation import Simulation, Snapshot
 
 
@@ -235,7 +236,7 @@ def expert_of(task: Task, sim: Simulation, seed: int, listen: Callable[[Atom], o
     class Noting(Expert):
         """Tells what it turns to."""
 
-        def achieve(self, atom: Atom) -> Doing:
+        def achieve(self, atom: Atom) -> Steps:
             """Bring one atom about, and say so unless it is so already or no more than a way to stand."""
             if listen is not None and atom.predicate not in SINCE_START and not self._holds(atom):
                 listen(answer_of(atom))
