@@ -81,7 +81,7 @@ def main() -> None:
 
 def act(policy: MemobenchMemPolicy, steps: int) -> dict[str, float]:
     """Roll the policy out in the rendered environment; milliseconds per plan, per other call and per control step."""
-    env = gym.vector.SyncVectorEnv([lambda: MemobenchEnv(str(get_task(TASK).folder), prompt_video=False)])
+    env = gym.vector.SyncVectorEnv([lambda: MemobenchEnv(str(get_task(TASK).folder), demonstration_prompt=False)])
     words = prompt(policy)
     observation = env.reset(seed=[7])[0]
     policy.reset()

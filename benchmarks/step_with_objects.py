@@ -38,7 +38,7 @@ def main() -> None:
     }
     seconds = dict.fromkeys(looks, 0.0)
     for name in names[:: max(1, len(names) // asked.tasks)][: asked.tasks]:
-        episodes = {look: Episode(get_task(name), prompt_video=False) for look in looks}
+        episodes = {look: Episode(get_task(name), demonstration_prompt=False) for look in looks}
         sides = {look: stepper(episodes[look], see, asked.steps) for look, see in looks.items()}
         for look, taken in medians(sides, asked.repeats).items():
             seconds[look] += 1000 * taken / asked.steps / asked.tasks

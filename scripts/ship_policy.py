@@ -235,7 +235,7 @@ def generation(request: dict[str, Any]) -> list[str]:
         "--policy": driver(request),
     }
     flags = {"--perturb": request["perturb"], "--no-images": not request["images"]}
-    flags["--no-prompt-video"] = not request["prompt_video"]
+    flags["--no-demonstration-prompt"] = not request["demonstration_prompt"]
     given = [str(word) for option in options.items() if option[1] is not None for word in option]
     return given + [flag for flag, meant in flags.items() if meant]
 

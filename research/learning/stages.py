@@ -180,7 +180,7 @@ class Stages:
     def evaluate(self, arm: str, seed: int) -> Cost:
         """Roll a trained policy out on the experiment's evaluation seeds."""
         words = ["lerobot", "eval", "env=memobench", f"policy={self.policy(arm, seed)}"]
-        words += [*self._sight.evaluation, f"referent={self.experiment.referent}", "films=0"]
+        words += [*self._sight.evaluation, f"referent={self.experiment.referent}", "videos=0"]
         words += [f"tasks={','.join(self.experiment.tasks)}"]
         words += [f"episodes={self.experiment.rollouts}", f"seed={self.experiment.first_seed}"]
         words += [f"output_dir={self.rollouts(arm, seed)}", "resume=true"]

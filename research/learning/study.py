@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
-from lerobot_memobench.evaluation.documents.sentences import saw_phrase
-from lerobot_memobench.evaluation.metrics.rollouts import saw
+from lerobot_memobench.evaluation.documents.sentences import inputs_phrase
+from lerobot_memobench.evaluation.metrics.rollouts import policy_inputs
 from lerobot_memobench.evaluation.records.runs import read_rollouts
 from lerobot_memobench.io import write_file
 from research.learning.experiments import MEMORY, Experiment
@@ -97,7 +97,8 @@ def learn(experiment: Experiment, out: Path, say: Say, *, dataset: Path | None =
     draw(found, out / "learning.png")
     against = contrasts_table(contrasts(rolled.rollouts, MEMORY), experiment.seeds)
     seen = "; ".join(
-        f"{arm}: {saw_phrase(saw([record for run in runs for record in run]))}" for arm, runs in rolled.rollouts.items()
+        f"{arm}: {inputs_phrase(policy_inputs([record for run in runs for record in run]))}"
+        for arm, runs in rolled.rollouts.items()
     )
     text = f"{outcomes_table(found)}\n\n{seen}.\n\n{against}\n\n{costs_table(costs | rolled.costs)}\n"
     write_file(out / "learning.md", text)

@@ -133,7 +133,7 @@ def test_an_experiment_runs_its_parts_in_order(tmp_path: Path, monkeypatch: pyte
     assert f"| {BOWL}, {MEMORYLESS} | 20 | 30.0 |" in text
     assert f"| {MEMORYLESS} less {MEMORY} | 10 | -60.0 | " in text
     assert "| training | 4 | 1.0 | 6.0 |" in text
-    assert f"{MEMORY}: what the policy saw is not recorded" in text
+    assert f"{MEMORY}: policy inputs: not recorded" in text
     assert (tmp_path / "out" / "learning.md").read_text() == text
     assert json.loads((tmp_path / "out" / "learning.json").read_text())[MEMORYLESS][BOWL]["wrong"] == 12
     with Image.open(tmp_path / "out" / "learning.png") as picture:

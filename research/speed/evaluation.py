@@ -105,7 +105,13 @@ def looking_every(steps: int) -> Iterator[None]:
 
 def evaluate_once(every: int, films: int, steps: int, task: str = TASK) -> Cost:
     """Return what a step of ``lerobot eval`` costs, in an episode of so many."""
-    words = ["env=memobench", f"tasks={task}", "policy=memobench_random", "prompt_video=false", f"films={films}"]
+    words = [
+        "env=memobench",
+        f"tasks={task}",
+        "policy=memobench_random",
+        "demonstration_prompt=false",
+        f"videos={films}",
+    ]
     words += ["episodes=1", "batch_size=1", f"horizon={steps}"]
     with tempfile.TemporaryDirectory() as out, looking_every(every), stopwatch() as watch:
         run_evaluation(plan_line([*words, f"output_dir={Path(out) / 'run'}"]), lambda text: None)
@@ -116,13 +122,13 @@ def step_bare(every: int, steps: int, task: str = TASK) -> Cost:
     """Return what a step of our vector environment costs by itself, its pictures drawn as often as they are seen."""
     watched = True
     with tempfile.TemporaryDirectory() as out, stopwatch() as watch:
-        config = MemobenchEnvConfig(tasks=task, prompt_video=False, horizon=steps, log_dir=out)
+        config = MemobenchEnvConfig(tasks=task, demonstration_prompt=False, horizon=steps, log_dir=out)
         ((env,),) = (suite.values() for suite in config.create_envs(1).values())
         env.reset(seed=[EVALUATION_SEED])
         for number, action in enumerate(_moves(steps), start=1):
             looks = bool(every) and number % every == 0
             if looks != watched:
-                env.call("watch", looks)
+                env.call("need_observation", looks)
                 watched = looks
             env.step(action)
         watch.end()
@@ -289,7 +295,7 @@ def _evaluate(tasks: str, steps: int, shard: str, every: int, out: str) -> None:
     """Evaluate a part of the tasks, one rollout each, in a process of its own."""
     import lerobot_memobench.registration  # noqa: F401 - makes the policy known
 
-    words = ["env=memobench", f"tasks={tasks}", "policy=memobench_random", "episodes=1", "films=0", f"horizon={steps}"]
+    words = ["env=memobench", f"tasks={tasks}", "policy=memobench_random", "episodes=1", "videos=0", f"horizon={steps}"]
     with looking_every(every):
         run_evaluation(plan_line([*words, f"shard={shard}", f"output_dir={out}"]), lambda text: None)
 

@@ -112,7 +112,7 @@ class Vectored:
         from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 
         self._logs = TemporaryDirectory()
-        config = MemobenchEnvConfig(task=task, prompt_video=False, log_dir=self._logs.name)
+        config = MemobenchEnvConfig(task=task, demonstration_prompt=False, log_dir=self._logs.name)
         [suite] = config.create_envs(1).values()
         [self.env] = suite.values()
         self.reset(0)

@@ -23,7 +23,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(3 * 3600)]
 
 TASKS = "turn_on_the_stove_and_turn_it_off,check_the_top_drawer_of_the_cabinet"
 KILLS = 20
-COMMON = ["env=memobench", f"tasks={TASKS}", "env.render=fast", "env.videos=true", "batch_size=2"]
+COMMON = ["env=memobench", f"tasks={TASKS}", "env.render=fast", "env.videos=-1", "batch_size=2"]
 COMMON += ["eval.use_async_envs=false"]  # rows in one process: workers would start for longer than an episode lasts
 
 #: Within the horizon the expert reaches the stove's first checkpoint in some episodes. The random policy draws from a
@@ -138,7 +138,7 @@ def comparable(out: Path) -> list[dict[str, Any]]:
 
 
 def film_hashes(out: Path) -> dict[str, str]:
-    """Film -> hash of its frames."""
+    """VideoRecorder -> hash of its frames."""
     found = {}
     for path in sorted((out / "videos").glob("*.mp4")):
         digest = hashlib.sha256()

@@ -197,7 +197,7 @@ def test_generate_tells_what_became_of_every_seed(
         "referent": "random",
         "images": False,
         "image_size": 256,
-        "prompt_video": True,
+        "demonstration_prompt": True,
         "perturb": False,
         "policy": None,
         "workers": 1,

@@ -42,7 +42,7 @@ def test_report_in_several_formats_to_a_folder(tmp_path: Path) -> None:
     assert sorted(path.name for path in out.iterdir()) == ["report.json", "report.tex"]
     assert len(json.loads((out / "report.json").read_text())["paper"]) == 43
     beside = json.loads((tmp_path / "a" / "report.json").read_text())
-    assert set(beside) == {"tasks", "memory_types", "average", "failures", "prefix", "saw"}
+    assert set(beside) == {"tasks", "memory_types", "average", "failures", "prefix", "inputs"}
 
 
 def test_report_prints_json_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -104,7 +104,7 @@ def test_more_episodes_and_tasks_may_follow(fake_lerobot: Any) -> None:
         (["referent=random"], "referent: fixed and random"),
         (["env.render=fast"], "render: default and fast"),
         (["env.render_every=5"], "render_every: 1 and 5"),
-        (["prompt_video=false"], "prompt_video: True and False"),
+        (["demonstration_prompt=false"], "demonstration_prompt: True and False"),
         (["env.oracle_memory=true"], "oracle_memory: False and True"),
         (["env.seed_base=100"], "seed_base: 7 and 100"),
         (["env.replan_steps=5"], "replan_steps: None and 5"),

@@ -121,11 +121,11 @@ def test_failures_are_reported_everywhere(tasks, recorded, tmp_path):
     assert [row["episode_index"] for row in manifest["episodes"]] == [0, 1, None, 2, 3, 4]
 
 
-@pytest.mark.parametrize("prompt_video", [True, False])
-def test_the_card_says_whether_prompts_are_in_it(tasks, recorded, tmp_path, prompt_video):
-    run(tasks, tmp_path / "ds", prompt_video=prompt_video)
+@pytest.mark.parametrize("demonstration_prompt", [True, False])
+def test_the_card_says_whether_prompts_are_in_it(tasks, recorded, tmp_path, demonstration_prompt):
+    run(tasks, tmp_path / "ds", demonstration_prompt=demonstration_prompt)
     card = (tmp_path / "ds" / "README.md").read_text()
-    assert ("referent fixed, prompt videos left out." in card) == (not prompt_video)
+    assert ("referent fixed, prompt videos left out." in card) == (not demonstration_prompt)
 
 
 def test_nothing_but_failures_makes_no_dataset(tasks, recorded, tmp_path):

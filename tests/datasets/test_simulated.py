@@ -110,7 +110,7 @@ def test_recording_again_gives_the_same(stove):
 
 
 def test_without_the_prompt_video(butter):
-    demo = record_demonstration(get_task(BUTTER), SEED, images=False, prompt_video=False)
+    demo = record_demonstration(get_task(BUTTER), SEED, images=False, demonstration_prompt=False)
     assert demo.exec_start == 0
     assert demo.scene_hash == butter.scene_hash
 

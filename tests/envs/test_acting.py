@@ -1,4 +1,4 @@
-"""Who acts, what it saw, and which episodes were asked for: told by LeRobot's command line, kept by every line."""
+"""Who acts, on what inputs, and which episodes were asked for: told by LeRobot's command line, kept by every line."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from lerobot_memobench.cli.memobench import main as memobench
 from lerobot_memobench.envs.acting import acting
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode_log import read_episodes, read_protocol_file, write_episodes
-from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS, what_is_seen
+from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS, policy_inputs
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records.protocol import read_protocol
 from lerobot_memobench.evaluation.records.runs import read_runs
@@ -95,8 +95,8 @@ def lerobot_eval(policy: Path, out: Path, *more: str, episodes: int = 1, batch: 
     ],
 )
 def test_every_kind_of_policy_says_what_it_saw(policy: Any, shown: str, seen: str) -> None:
-    assert what_is_seen(policy, shown) == seen
-    oracle = what_is_seen(policy, shown, oracle_memory=True)
+    assert policy_inputs(policy, shown) == seen
+    oracle = policy_inputs(policy, shown, oracle_memory=True)
     assert oracle == ("oracle memory text" if seen == "nothing" else f"{seen}, oracle memory text")
 
 
@@ -108,18 +108,18 @@ def test_object_poses_are_refused_or_named(tmp_path: Path) -> None:
     assert not (tmp_path / "plain" / "episodes").exists()
     assert lerobot_eval(policy, tmp_path / "plain", "--env.obs_type=both") == 0
     (record,) = read_episodes(tmp_path / "plain")
-    assert record["saw"] == f"pixels, {POSES}"
+    assert record["inputs"] == f"pixels, {POSES}"
     assert record["policy"] == read_protocol_file(tmp_path / "plain")["policy"]["identity"]
     assert record["run"]
 
     ours = tmp_path / "ours"
-    words = [f"tasks={TASK}", "episodes=1", "horizon=3", "env.render=fast", "films=0"]
+    words = [f"tasks={TASK}", "episodes=1", "horizon=3", "env.render=fast", "videos=0"]
     assert main(["eval", "env=memobench", f"policy={policy}", *words, f"output_dir={ours}"]) == 0
     assert read_episodes(ours)[0]["policy"] == record["policy"], "the same policy by both commands"
-    assert json.loads((ours / "card.json").read_text())["protocol"]["saw"] == f"pixels, {POSES}"
-    assert f"| saw | pixels, {POSES} |" in (ours / "card.md").read_text()
-    assert json.loads((ours / "report.json").read_text())["saw"] == f"pixels, {POSES}"
-    assert (ours / "report.md").read_text().count(f"The policy saw pixels, {POSES}.") == 4, "under every table"
+    assert json.loads((ours / "card.json").read_text())["protocol"]["inputs"] == f"pixels, {POSES}"
+    assert f"| inputs | pixels, {POSES} |" in (ours / "card.md").read_text()
+    assert json.loads((ours / "report.json").read_text())["inputs"] == f"pixels, {POSES}"
+    assert (ours / "report.md").read_text().count(f"Policy inputs: pixels, {POSES}.") == 4, "under every table"
 
     out, page = tmp_path / "report", tmp_path / "page"
     formats = [word for name in ("table", "markdown", "csv", "latex", "json") for word in ("--format", name)]
@@ -127,13 +127,13 @@ def test_object_poses_are_refused_or_named(tmp_path: Path) -> None:
     for file in sorted(out.iterdir()):
         assert f"pixels, {POSES}" in " ".join(file.read_text().split()), file.name
     assert memobench(["html", str(ours), "--out", str(page)]) == 0
-    assert f"the policy saw pixels, {POSES}" in (page / "index.html").read_text()
+    assert f"policy inputs: pixels, {POSES}" in (page / "index.html").read_text()
 
     merged = tmp_path / "merged"
     assert merge(merged, [tmp_path / "plain"]) == []
-    assert read_protocol(merged)["saw"] == f"pixels, {POSES}"
+    assert read_protocol(merged)["inputs"] == f"pixels, {POSES}"
     assert read_protocol(merged)["policy"]["identity"] == record["policy"]
-    assert {each["saw"] for each in read_episodes(merged)} == {f"pixels, {POSES}"}
+    assert {each["inputs"] for each in read_episodes(merged)} == {f"pixels, {POSES}"}
 
 
 # --- whose episodes they are ---
@@ -197,7 +197,7 @@ def test_evaluations_within_a_training_are_kept_apart(tmp_path: Path, monkeypatc
     assert len({run.records[0]["policy"] for run in runs}) == 2
     assert runs[0].records[0]["policy"].startswith("act in training")
     assert len({run.method for run in runs}) == 2
-    assert {run.summary.saw for run in runs} == {POSES}
+    assert {run.summary.inputs for run in runs} == {POSES}
     with pytest.raises(MemobenchError, match="under other protocols"):
         merge(tmp_path / "merged", [out / name for name in folders])
 
@@ -213,6 +213,6 @@ def test_a_file_of_settings_tells_who_acts(tmp_path: Path, monkeypatch: pytest.M
     (tmp_path / "eval.json").write_text(json.dumps(told))
     monkeypatch.setattr(sys, "argv", ["lerobot-eval", f"--config_path={tmp_path / 'eval.json'}"])
     found = acting(PIXELS, False)
-    assert (found.policy["type"], found.saw, found.seeds) == ("memobench_random", "nothing", range(7, 9))
+    assert (found.policy["type"], found.inputs, found.seeds) == ("memobench_random", "nothing", range(7, 9))
     (tmp_path / "eval.json").write_text(json.dumps({**told, "policy": {"type": "memobench_random", "seed": 4}}))
     assert acting(PIXELS, False).policy["identity"] != found.policy["identity"]

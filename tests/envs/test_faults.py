@@ -222,7 +222,7 @@ def test_a_folder_with_a_task_that_cannot_be_run_is_evaluated(
         "env=memobench",
         f"env.task_dir={folder.parent}",
         "episodes=1",
-        "films=0",
+        "videos=0",
         "horizon=3",
         f"obs_type={OBJECTS}",
     )

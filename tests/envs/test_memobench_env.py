@@ -15,7 +15,7 @@ import pytest
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.envs.video import Film
+from lerobot_memobench.envs.video import VideoRecorder
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import EXECUTION, PROMPT, PROMPT_HORIZON
 from lerobot_memobench.sim.rendering import close_renderers, gl_backend
@@ -208,7 +208,7 @@ def test_highlight_is_seen_in_the_prompt_only() -> None:
 
 
 def test_without_prompt_video_execution_begins_at_once() -> None:
-    env = make(HIGHLIGHT, prompt_video=False)
+    env = make(HIGHLIGHT, demonstration_prompt=False)
     with_prompt = make(HIGHLIGHT)
     observation, info = env.reset(seed=7)
     with_prompt.reset(seed=7)
@@ -236,7 +236,7 @@ def test_render_every_changes_images_only() -> None:
 
 
 def test_random_referent_is_the_seeds() -> None:
-    env = make(HIGHLIGHT, referent="random", prompt_video=False)
+    env = make(HIGHLIGHT, referent="random", demonstration_prompt=False)
     chosen = []
     for _ in range(2):
         row = []
@@ -267,32 +267,32 @@ def test_rows_freeze_when_their_episode_ends(tmp_path: Path, use_async: bool) ->
     assert len(read_episodes(tmp_path)) == 2
 
 
-def test_the_first_episodes_are_filmed_or_all(tmp_path: Path) -> None:
-    for settings, filmed in (({}, []), ({"films": 2}, [0, 1]), ({"videos": True}, [-1, 0, 1, 2])):
-        folder = tmp_path / str(len(filmed))
+def test_the_first_episodes_are_recorded_or_all(tmp_path: Path) -> None:
+    for settings, recorded in (({}, []), ({"videos": 2}, [0, 1]), ({"videos": -1}, [-1, 0, 1, 2])):
+        folder = tmp_path / str(len(recorded))
         env = make(STOVE, log_dir=str(folder), horizon=1, render="fast", **settings)
         for seed in (6, 7, 8, 9):
             env.reset(seed=seed)
             env.step(np.zeros(7, np.float32))
         env.close()
-        assert {film.name for film in folder.rglob("*.mp4")} == {f"{STOVE}.{number}.mp4" for number in filmed}
+        assert {video.name for video in folder.rglob("*.mp4")} == {f"{STOVE}.{number}.mp4" for number in recorded}
 
 
-def test_a_film_that_cannot_be_written_leaves_the_log_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What was run before is there with its films; the episode at hand is not in the log, so that it is run again."""
-    env = make(STOVE, log_dir=str(tmp_path), videos=True, horizon=3, render="fast")
+def test_a_video_that_cannot_be_written_leaves_the_log_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was run before is there with its videos; the episode at hand is not in the log, so that it is run again."""
+    env = make(STOVE, log_dir=str(tmp_path), videos=-1, horizon=3, render="fast")
 
     def run(seed: int) -> None:
         env.reset(seed=seed)
         for action in actions(seed, 3):
             env.step(action)
 
-    def no_room(film: Film, picture: Any) -> None:
+    def no_room(video: VideoRecorder, picture: Any) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     run(20_007)
     with monkeypatch.context() as patch:
-        patch.setattr(Film, "_encode", no_room)
+        patch.setattr(VideoRecorder, "_encode", no_room)
         with pytest.raises(MemobenchError, match=r"cannot be written \(No space left on device\)"):
             run(20_008)
     assert [record["seed"] for record in read_episodes(tmp_path)] == [20_007]
@@ -348,7 +348,7 @@ def test_render_is_annotated() -> None:
         ({"prompt_in": "rest"}, "env.prompt_in is 'rest'; did you mean 'reset'"),
         ({"horizon": 0}, "env.horizon is 0"),
         ({"render_every": 0}, "env.render_every is 0"),
-        ({"films": -1}, "env.films is -1"),
+        ({"videos": -2}, "env.videos is -2"),
         ({"fps": 30}, "control rate is 20"),
     ],
 )

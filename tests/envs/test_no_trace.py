@@ -109,7 +109,7 @@ def test_an_event_leaves_no_trace(name: str, seed: int, gl: str) -> None:
 
 def hidden(name: str, variant: int, seed: int) -> Episode:
     """Return an episode at its first execution frame."""
-    episode = Episode(get_task(name).variant(variant), prompt_video=False)
+    episode = Episode(get_task(name).variant(variant), demonstration_prompt=False)
     episode.reset(seed)
     assert episode.phase == EXECUTION
     return episode
@@ -137,7 +137,7 @@ def test_every_variant_of_a_seed_begins_its_execution_alike(
 ) -> None:
     """Pictures, objects, arm and clock: what was shown, hidden or asked for is in none of them, to the bit."""
     task = get_task(name)
-    env = MemobenchEnv(str(task.folder), suite=task.suite, obs_type=BOTH, referent="random", prompt_in=RESET)
+    env = MemobenchEnv(task.name, obs_type=BOTH, referent="random", prompt_in=RESET)
     first: dict[str, NDArray[np.generic]] = {}
     for variant in task.random_variants:
 

@@ -135,7 +135,7 @@ def test_objects_that_nobody_looks_at_are_those_seen_last() -> None:
     env = make(DRAWER, horizon=5)
     env.reset(seed=20_007)
     seen = env.step(moves(1, 1)[0])[0]["environment_state"]
-    env.watch(False)
+    env.need_observation(False)
     articulation, _ = env.episode.sim.world.articulation("wooden_cabinet_1_top_region")
     env.episode.sim.data.joint(articulation.joint).qpos[0] = articulation.open_q
     for _ in range(3):
@@ -153,7 +153,7 @@ def test_a_film_shows_every_step_and_other_episodes_are_not_drawn(
     drawn: list[int] = []
     images = Episode.images
     monkeypatch.setattr(Episode, "images", lambda self: drawn.append(self.step_index) or images(self))  # type: ignore[func-returns-value]
-    env = make(DRAWER, log_dir=str(tmp_path), horizon=4, films=1, seed_base=20_007, render="fast")
+    env = make(DRAWER, log_dir=str(tmp_path), horizon=4, videos=1, seed_base=20_007, render="fast")
     for seed in (20_007, 20_008):
         env.reset(seed=seed)
         for action in moves(seed, 4):

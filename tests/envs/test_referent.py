@@ -102,7 +102,7 @@ def test_the_first_fifty_episodes_show_every_variant_of_small_tasks(name: str) -
 def acted(name: str, asked: int, answered: int, horizon: int = 1200) -> dict[str, Any]:
     """The record of an episode that asks for one variant, under the expert of another."""
     base = get_task(name)
-    episode = Episode(base.variant(asked), prompt_video=False, horizon=horizon)
+    episode = Episode(base.variant(asked), demonstration_prompt=False, horizon=horizon)
     episode.reset(20_000)
     expert = Expert(base.variant(answered), episode.sim, np.random.default_rng(3))
     while not (episode.done or expert.done):

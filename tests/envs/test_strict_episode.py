@@ -70,7 +70,6 @@ def test_a_variant_that_was_chosen_is_not_drawn_again() -> None:
 def test_resting_at_once_ends_the_episode_and_is_logged_as_a_miscount(tmp_path: Path) -> None:
     env = MemobenchEnv(
         str(get_task(STOVE).folder),
-        suite=STRICT,
         log_dir=str(tmp_path),
         render="fast",
         render_every=10_000,
@@ -179,7 +178,7 @@ def test_the_execution_begins_where_a_hiding_ended_even_unseen(
     task = dataclasses.replace(get_task(ASSEMBLY), drawn=False, prompt=prompt)
     sim = Simulation(task)
     sim.reset(20_000)
-    episode = Episode(task, prompt_video=shown)
+    episode = Episode(task, demonstration_prompt=shown)
     episode.reset(20_000)
     while episode.exec_start is None:
         episode.step(REST)

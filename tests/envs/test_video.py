@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.envs import video
-from lerobot_memobench.envs.video import AHEAD, LAST_FRAMES, Film
+from lerobot_memobench.envs.video import AHEAD, LAST_FRAMES, VideoRecorder
 from lerobot_memobench.errors import MemobenchError
 
 
@@ -21,7 +21,7 @@ def frame(value: int) -> np.ndarray:
 
 
 def test_a_film_appears_when_it_is_finished(tmp_path: Path) -> None:
-    film = Film(tmp_path / "videos" / "task.0.mp4")
+    film = VideoRecorder(tmp_path / "videos" / "task.0.mp4")
     for value in (0, 100, 200):
         film.add(frame(value))
     assert not (tmp_path / "videos" / "task.0.mp4").exists()
@@ -34,16 +34,16 @@ def test_a_film_appears_when_it_is_finished(tmp_path: Path) -> None:
 
 
 def test_an_unfinished_film_leaves_nothing(tmp_path: Path) -> None:
-    film = Film(tmp_path / "task.0.mp4")
+    film = VideoRecorder(tmp_path / "task.0.mp4")
     film.add(frame(10))
     film.discard()
     assert list(tmp_path.iterdir()) == []
-    assert Film(tmp_path / "empty.mp4").finish() is None
+    assert VideoRecorder(tmp_path / "empty.mp4").finish() is None
 
 
 def test_a_film_shows_each_frame_as_it_was_when_added(tmp_path: Path) -> None:
     """One buffer serves all frames; 100 pixels are no multiple of what a video library pads its lines to."""
-    film, shown = Film(tmp_path / "task.0.mp4"), np.zeros((64, 100, 3), np.uint8)
+    film, shown = VideoRecorder(tmp_path / "task.0.mp4"), np.zeros((64, 100, 3), np.uint8)
     for value in (0, 60, 120, 180):
         shown[:, value // 3 : value // 3 + 10] = value
         film.add(shown)
@@ -74,7 +74,7 @@ def encoded_directly(path: Path, frames: list[np.ndarray]) -> bytes:
 def test_films_are_those_that_are_encoded_directly(tmp_path: Path, count: int) -> None:
     """Two at once share the thread."""
     noise = np.random.default_rng(0).integers(0, 256, (2, count, 64, 128, 3), np.uint8)
-    films = [Film(tmp_path / f"task.{number}.mp4") for number in range(2)]
+    films = [VideoRecorder(tmp_path / f"task.{number}.mp4") for number in range(2)]
     for pictures in noise.swapaxes(0, 1):
         for film, picture in zip(films, pictures, strict=True):
             film.add(picture)
@@ -88,13 +88,13 @@ def test_frames_wait_for_the_encoder_when_it_is_behind(tmp_path: Path, monkeypat
     """What is in memory stays bounded, and discarding does not encode what waits."""
     begun, go_on, encoded = threading.Event(), threading.Event(), []
 
-    def encode(self: Film, picture: av.VideoFrame) -> None:
+    def encode(self: VideoRecorder, picture: av.VideoFrame) -> None:
         encoded.append(picture)
         begun.set()
         go_on.wait(60)
 
-    monkeypatch.setattr(Film, "_encode", encode)
-    film = Film(tmp_path / "task.0.mp4")
+    monkeypatch.setattr(VideoRecorder, "_encode", encode)
+    film = VideoRecorder(tmp_path / "task.0.mp4")
     for value in range(AHEAD):
         film.add(frame(value))
     adding = threading.Thread(target=film.add, args=(frame(AHEAD),))
@@ -108,7 +108,7 @@ def test_frames_wait_for_the_encoder_when_it_is_behind(tmp_path: Path, monkeypat
 
     begun.clear()
     go_on.clear()
-    other = Film(tmp_path / "task.1.mp4")
+    other = VideoRecorder(tmp_path / "task.1.mp4")
     for value in range(AHEAD):
         other.add(frame(value))
     begun.wait()
@@ -125,7 +125,7 @@ def on_a_full_disk(path: Path) -> Iterator[Path]:
     yield Path("/dev/full")
 
 
-def add_often(film: Film, picture: np.ndarray) -> None:
+def add_often(film: VideoRecorder, picture: np.ndarray) -> None:
     for _ in range(9):
         film.add(picture)
 
@@ -134,7 +134,7 @@ def add_often(film: Film, picture: np.ndarray) -> None:
 def test_what_cannot_be_written_is_told_and_nothing_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (320, 512, 3), np.uint8)  # more than is kept back for later
     monkeypatch.setattr(video, "draft_of", on_a_full_disk)
-    film = Film(tmp_path / "task.0.mp4")
+    film = VideoRecorder(tmp_path / "task.0.mp4")
     with pytest.raises(MemobenchError, match=r"task\.0\.mp4 cannot be written \(No space left on device\); make room"):
         add_often(film, noise)
     with pytest.raises(MemobenchError, match="No space left"):
@@ -142,7 +142,7 @@ def test_what_cannot_be_written_is_told_and_nothing_is_left(tmp_path: Path, monk
     film.discard()
     monkeypatch.undo()
     (tmp_path / "file").touch()
-    film = Film(tmp_path / "file" / "task.1.mp4")
+    film = VideoRecorder(tmp_path / "file" / "task.1.mp4")
     film.add(noise)
     with pytest.raises(MemobenchError, match=r"task\.1\.mp4 cannot be written"):
         film.finish()
@@ -151,7 +151,7 @@ def test_what_cannot_be_written_is_told_and_nothing_is_left(tmp_path: Path, monk
 
 
 def test_a_frame_of_another_size_is_refused(tmp_path: Path) -> None:
-    film = Film(tmp_path / "task.0.mp4")
+    film = VideoRecorder(tmp_path / "task.0.mp4")
     film.add(frame(0))
     with pytest.raises(ValueError, match="shape"):
         film.add(np.zeros((32, 128, 3), np.uint8))

@@ -23,7 +23,7 @@ STOVE, DRAWER = "press_the_stove_button_four_times", "two_of_them"
 SETTINGS: dict[str, Any] = {
     "seed_base": 7,
     "referent": "fixed",
-    "prompt_video": True,
+    "demonstration_prompt": True,
     "horizon": 1200,
     "replan_steps": 5,
     "render": "fast",

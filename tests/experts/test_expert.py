@@ -55,7 +55,7 @@ def play(
     disturb: Callable[[Episode, np.ndarray], np.ndarray] | None = None,
 ) -> Played:
     """Let the expert act until the episode ends; note whatever is not as it must be."""
-    episode = Episode(task, prompt_video=prompt, referent=referent)
+    episode = Episode(task, demonstration_prompt=prompt, referent=referent)
     episode.reset(seed)
     actions = []
     while not episode.done:
@@ -166,7 +166,7 @@ def test_a_far_thing_is_held_where_the_arm_reaches() -> None:
 @pytest.mark.parametrize(("name", "kind", "room"), [(BOWL, "akita_black_bowl", 0.012), (SWAP, "plate", 0.004)])
 def test_a_rim_is_taken_with_room_beside_it(name: str, kind: str, room: float) -> None:
     """A policy that saw 4 mm in a deep bowl came down on every second rim (19 of 50; with 12 mm 20 of 20)."""
-    episode = Episode(get_task(name), prompt_video=False)
+    episode = Episode(get_task(name), demonstration_prompt=False)
     episode.reset(20_000)
     thing, asset = next(item for item in episode.sim.assets.items() if item[1].class_name == kind)
     (grasp,) = asset.grasps
@@ -305,7 +305,7 @@ def test_seeds_differ_and_repeat() -> None:
 
 def test_a_prompt_ends_with_what_it_shows() -> None:
     """An order that was followed is not gone through again: what it began with no longer holds."""
-    episode = Episode(get_task(SWAP), prompt_video=True)
+    episode = Episode(get_task(SWAP), demonstration_prompt=True)
     episode.reset(10_041)
     while episode.phase != EXECUTION:
         episode.step(episode.expert_action())

@@ -101,7 +101,7 @@ def test_a_card_tells_how_the_demonstrations_were_made(script: ModuleType, tmp_p
     assert "not at hand" in card()
     (tmp_path / "data" / "meta").mkdir(parents=True)
     request = {"tasks": [BOWL], "episodes": 3, "seed_base": 10_000, "referent": "random", "perturb": True}
-    request |= {"images": False, "image_size": 256, "prompt_video": True}
+    request |= {"images": False, "image_size": 256, "demonstration_prompt": True}
     made = [{"task_name": BOWL, "seed": seed, "failure": None, "frames": 9} for seed in (10_000, 10_001)]
     manifest = {"request": request, "episodes": [*made, {"task_name": BOWL, "seed": 10_002, "failure": "it fell"}]}
     (tmp_path / "data" / "manifest.json").write_text(json.dumps(manifest))

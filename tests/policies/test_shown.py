@@ -97,7 +97,7 @@ def save_processors(folder: Path, policy: PreTrainedConfig) -> None:
 def refused_by_both(checkpoint: Path, capsys: pytest.CaptureFixture[str], *more: str) -> str:
     """Evaluate by both commands; return the sentence, which must be one and the same."""
     out = checkpoint.parent / "out"
-    words = (f"tasks={TASK}", "episodes=1", "horizon=3", "films=0", "device=cpu", f"output_dir={out}")
+    words = (f"tasks={TASK}", "episodes=1", "horizon=3", "videos=0", "device=cpu", f"output_dir={out}")
     status = main(["eval", "env=memobench", f"policy={checkpoint}", *words, *more])
     ours = capsys.readouterr().err.strip().splitlines()[-1]
     assert status == 2

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from lerobot_memobench.envs.episode_log import write_episodes
-from lerobot_memobench.envs.video import LAST_FRAMES, Film
+from lerobot_memobench.envs.video import LAST_FRAMES, VideoRecorder
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.html import write_html
 from lerobot_memobench.run import demo
@@ -142,7 +142,7 @@ def films(tmp_path: Path) -> dict[str, tuple[Path, bool]]:
     """A grey film of five frames that is solved, and a bright one of nine that is not."""
     found = {}
     for name, shade, length, solved in (("with", 60, 5, True), ("without", 200, 9, False)):
-        film = Film(tmp_path / f"{name}.mp4")
+        film = VideoRecorder(tmp_path / f"{name}.mp4")
         for _ in range(length):
             film.add(np.full((HEIGHT, WIDTH, 3), shade, np.uint8))
         path = film.finish()

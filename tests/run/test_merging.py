@@ -19,7 +19,7 @@ from lerobot_memobench.run.merging import merge, merge_and_report, part_folders
 SETTINGS = {
     "seed_base": 7,
     "referent": "fixed",
-    "prompt_video": True,
+    "demonstration_prompt": True,
     "horizon": 1200,
     "replan_steps": None,
     "render": "default",

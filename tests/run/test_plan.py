@@ -19,10 +19,10 @@ def evaluation(*flags: str) -> EvaluationPlan:
 def test_flags_are_complete_but_for_what_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("checkpoint").mkdir()
-    asked = evaluation("--policy.path=checkpoint", "--seed", "7", "--env.videos=true")
-    assert asked.portable_flags == ["--seed=7", "--env.videos=true", f"--policy.path={tmp_path / 'checkpoint'}"]
+    asked = evaluation("--policy.path=checkpoint", "--seed", "7", "--env.videos=-1")
+    assert asked.portable_flags == ["--seed=7", "--env.videos=-1", f"--policy.path={tmp_path / 'checkpoint'}"]
     assert evaluation("--policy.path=user/name").portable_flags == ["--policy.path=user/name"]  # a repository stays one
-    given = ["--policy.path=checkpoint", "--seed", "7", "--env.videos=true"]
+    given = ["--policy.path=checkpoint", "--seed", "7", "--env.videos=-1"]
     assert asked.lerobot_flags == [*given, "--output_dir=out", "--env.log_dir=log"]
 
 

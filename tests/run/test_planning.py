@@ -118,13 +118,13 @@ def test_objects_alone_need_nothing_to_draw_with(monkeypatch: pytest.MonkeyPatch
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     plan = plan_line([*LINE, f"obs_type={OBJECTS}"])
-    assert flag_value(plan.lerobot_flags, "env.films") == "0"
+    assert flag_value(plan.lerobot_flags, "env.videos") == "0"
     assert card_of(plan)["runs"][0]["gl"] == {}
     for words in (
         [],
         ["obs_type=both"],
-        [f"obs_type={OBJECTS}", "films=1"],
-        [f"obs_type={OBJECTS}", "env.videos=true"],
+        [f"obs_type={OBJECTS}", "videos=1"],
+        [f"obs_type={OBJECTS}", "env.videos=-1"],
     ):
         with pytest.raises(MemobenchError, match="MUJOCO_GL"):
             plan_line([*LINE, *words])
@@ -140,10 +140,10 @@ def test_going_on_keeps_the_earlier_batch_size() -> None:
 
 
 def test_ten_episodes_are_filmed_unless_another_number_is_given() -> None:
-    for words, films in (([], 10), (["films=0"], 0), (["env.films=3"], 3)):
+    for words, videos in (([], 10), (["videos=0"], 0), (["env.videos=3"], 3)):
         environment = plan_line([*LINE, *words]).environment
         assert environment is not None
-        assert environment.films == films
+        assert environment.videos == videos
 
 
 def test_what_is_left_is_a_plan_of_its_own() -> None:

@@ -20,8 +20,8 @@ from lerobot_memobench.policies.memobench_random.modeling_memobench_random impor
 
 TASK = "put_the_butter_into_the_bowl_from_the_prompt_video"
 STEPS = 4
-COMMAND = ["eval", "env=memobench", f"tasks={TASK}", "policy=memobench_random", f"horizon={STEPS}", "films=0"]
-COMMAND += ["prompt_video=false", "eval.use_async_envs=false", "eval.recording=true"]
+COMMAND = ["eval", "env=memobench", f"tasks={TASK}", "policy=memobench_random", f"horizon={STEPS}", "videos=0"]
+COMMAND += ["demonstration_prompt=false", "eval.use_async_envs=false", "eval.recording=true"]
 
 
 @pytest.mark.usefixtures("gl")

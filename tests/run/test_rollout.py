@@ -83,7 +83,7 @@ def rolled(
         render="fast",
         expert_action=name == "memobench_expert",
         log_dir=str(log),
-        films=films,
+        videos=films,
         obs_type=obs_type,
     )
     ((env,),) = (suite.values() for suite in config.create_envs(rows).values())
@@ -192,7 +192,7 @@ def test_a_memory_of_pictures_refuses_to_be_shown_objects_alone(tmp_path: Path) 
 @pytest.mark.parametrize("use_async", [False, True])
 def test_what_nobody_watches_is_not_drawn(use_async: bool, tmp_path: Path) -> None:
     """By the word of a vector environment, in this process or in workers, until the next reset."""
-    config = MemobenchEnvConfig(tasks=HIGHLIGHT, prompt_video=False, render="fast", log_dir=str(tmp_path))
+    config = MemobenchEnvConfig(tasks=HIGHLIGHT, demonstration_prompt=False, render="fast", log_dir=str(tmp_path))
     ((env,),) = (suite.values() for suite in config.create_envs(2, use_async).values())
     move = np.full((2, 7), 0.7, np.float32)
     try:
@@ -200,11 +200,11 @@ def test_what_nobody_watches_is_not_drawn(use_async: bool, tmp_path: Path) -> No
             first = env.reset(seed=[7, 8], options={lerobot_eval.NEW_ROLLOUT_OPTION: True})[0]["pixels"]["wrist_image"]
             seen = env.step(move)[0]["pixels"]["wrist_image"].copy()
             assert (seen != first).any()
-            env.call("watch", False)
+            env.call("need_observation", False)
             np.testing.assert_array_equal(env.step(move)[0]["pixels"]["wrist_image"], seen)
-            env.call("watch", True)
+            env.call("need_observation", True)
             assert (env.step(move)[0]["pixels"]["wrist_image"] != seen).any()
-            env.call("watch", False)
+            env.call("need_observation", False)
     finally:
         env.close()
 
@@ -214,7 +214,7 @@ def test_a_filmed_episode_is_drawn_whole(drawn: list[int], tmp_path: Path) -> No
     from lerobot_memobench.envs.video import LAST_FRAMES
     from lerobot_memobench.evaluation.documents.html.videos import frame_count
 
-    rolled(sparing(lerobot_eval.rollout, lambda: True), 3, tmp_path, "memobench_random", films=2)
+    rolled(sparing(lerobot_eval.rollout, lambda: True), 3, tmp_path, "memobench_random", videos=2)
     films = sorted((tmp_path / "videos").iterdir())
     assert [film.name for film in films] == [f"{HIGHLIGHT}.0.mp4", f"{HIGHLIGHT}.1.mp4"]
     assert {frame_count(film) for film in films} == {LAST + 1 + LAST_FRAMES}
@@ -224,7 +224,7 @@ def test_a_filmed_episode_is_drawn_whole(drawn: list[int], tmp_path: Path) -> No
 def test_the_command_draws_and_films_no_more_than_asked(drawn: list[int], tmp_path: Path) -> None:
     from lerobot_memobench.cli.lerobot import main
 
-    words = [f"tasks={HIGHLIGHT}", "episodes=2", "batch_size=1", f"horizon={HORIZON}", "env.render=fast", "films=1"]
+    words = [f"tasks={HIGHLIGHT}", "episodes=2", "batch_size=1", f"horizon={HORIZON}", "env.render=fast", "videos=1"]
     assert main(["eval", "env=memobench", *words, f"output_dir={tmp_path}"]) == 0
     assert [path.relative_to(tmp_path / "videos") for path in (tmp_path / "videos").rglob("*")] == [
         Path(f"{HIGHLIGHT}.0.mp4")

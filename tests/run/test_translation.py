@@ -33,7 +33,7 @@ def test_the_commands_of_the_readme() -> None:
 def test_short_forms_of_eval() -> None:
     flags = evaluated(
         "env=memobench", "policy=memobench_mem", "tasks=object,spatial", "episodes=3", "replan=20", "batch_size=2",
-        "referent=random", "seed=9", "device=cpu", "horizon=50", "prompt_video=False",
+        "referent=random", "seed=9", "device=cpu", "horizon=50", "demonstration_prompt=False",
     )  # fmt: skip
     assert flags == [
         "--env.type=memobench",
@@ -47,7 +47,7 @@ def test_short_forms_of_eval() -> None:
         "--seed=9",
         "--policy.device=cpu",
         "--env.horizon=50",
-        "--env.prompt_video=false",
+        "--env.demonstration_prompt=false",
     ]
 
 
@@ -149,7 +149,7 @@ def test_a_dataset_folder_is_a_root(tmp_path: Path) -> None:
         (["env=memobench", "policy=act", "policy.chunksize=3"], "'policy.chunk_size'"),
         (["env=memobench", "--policy.type=atc"], "there is no policy 'atc', did you mean 'act'"),
         (["env=memobench", "episodes=many"], "episodes=many: expected a whole number"),
-        (["env=memobench", "env.prompt_video=perhaps"], "expected true or false"),
+        (["env=memobench", "env.demonstration_prompt=perhaps"], "expected true or false"),
         (["env=memobench", "policy=act", "policy.dropout=x"], "expected a number"),
         (["env=memobench", "policy=act", "align=semantic"], "ACTConfig"),
         (["env=memobench", "align=semantic"], "name one with policy="),

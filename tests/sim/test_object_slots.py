@@ -110,7 +110,7 @@ def seen_pixels(sim: Simulation, name: str) -> int:
 @pytest.mark.usefixtures("gl")
 @pytest.mark.parametrize("name", [NINE, DRAWERS])
 def test_what_shows_many_pixels_is_there_and_what_shows_none_is_not(name: str) -> None:
-    episode = Episode(get_task(name), prompt_video=False, render=RenderSettings(256, 256, "fast"))
+    episode = Episode(get_task(name), demonstration_prompt=False, render=RenderSettings(256, 256, "fast"))
     episode.reset(20_001)
     sim, other = episode.sim, Simulation(get_task(name), RenderSettings(256, 256, "fast"))
     slots = ObjectSlots(sim)

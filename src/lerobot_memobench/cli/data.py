@@ -60,7 +60,7 @@ def generate(
     ] = Referent.FIXED,
     images: Annotated[bool, typer.Option(help="Record both cameras.")] = True,
     image_size: Annotated[int, typer.Option(min=16, help="Height and width of the images, pixels.")] = 256,
-    prompt_video: Annotated[bool, typer.Option(help="Begin with the prompt where a task has one.")] = True,
+    demonstration_prompt: Annotated[bool, typer.Option(help="Begin with the prompt where a task has one.")] = True,
     perturb: Annotated[
         bool, typer.Option("--perturb", help="Move the arm off its way at random; action is what the expert does then.")
     ] = False,
@@ -109,7 +109,7 @@ def generate(
             referent=referent.value,
             images=images,
             image_size=image_size,
-            prompt_video=prompt_video,
+            demonstration_prompt=demonstration_prompt,
             perturb=perturb,
             policy=_folder_of(policy),
             workers=workers,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from lerobot_memobench.cli.console import WITH_PARENT, console, counting
 from lerobot_memobench.evaluation.documents.report import failure_line, table
-from lerobot_memobench.evaluation.documents.sentences import saw_phrase
+from lerobot_memobench.evaluation.documents.sentences import inputs_phrase
 from lerobot_memobench.io import count_of
 from lerobot_memobench.jobs.executors import asked_for
 from lerobot_memobench.jobs.processes import saying_how_to_go_on
@@ -104,7 +104,7 @@ def print_figures(report: EvaluationReport) -> None:
     screen.print()
     screen.print(table(report.summary), crop=False)
     screen.print(failure_line(report.summary))
-    screen.print(saw_phrase(report.summary.saw))
+    screen.print(inputs_phrase(report.summary.inputs))
     for note in report.notes:
         screen.print(f"note: {note}")
 

@@ -64,7 +64,7 @@ def generate(
     referent: str = "fixed",
     images: bool = True,
     image_size: int = 256,
-    prompt_video: bool = True,
+    demonstration_prompt: bool = True,
     hold_frames: int = HOLD_FRAMES,
     perturb: bool = False,
     policy: str | None = None,
@@ -104,11 +104,11 @@ def generate(
             "must be at least 1"
         )
     check_executor(executor, executor_options)
-    _check_prompts(tasks, prompt_video)
+    _check_prompts(tasks, demonstration_prompt)
     referent = referent_told(referent, drawn=all(task.drawn for task in tasks))
     if perturb and policy is not None:
         raise MemobenchError("the arm is to be moved both at random and by a policy; leave out --perturb or --policy")
-    settings = RecordingSettings(referent, images, image_size, prompt_video, hold_frames, perturb, policy)
+    settings = RecordingSettings(referent, images, image_size, demonstration_prompt, hold_frames, perturb, policy)
     plan = _Plan(tuple(tasks), episodes, prompted_episodes, seed_base, settings, _checked_formats(formats, settings))
     if is_finished(out):
         return _finished(out, plan)
@@ -197,12 +197,12 @@ def episodes_of(task: Task, episodes: int, prompted_episodes: int | None) -> int
     return episodes if task.prompt is None or prompted_episodes is None else prompted_episodes
 
 
-def _check_prompts(tasks: Sequence[Task], prompt_video: bool) -> None:
+def _check_prompts(tasks: Sequence[Task], demonstration_prompt: bool) -> None:
     hiding = next((task for task in tasks if task.prompt is not None and not task.prompt.restores), None)
-    if hiding is not None and not prompt_video:
+    if hiding is not None and not demonstration_prompt:
         raise MemobenchError(
             f"demonstrations of {hiding.name} were asked for without its prompt video, which hides what is to be "
-            "found; leave out --no-prompt-video"
+            "found; leave out --no-demonstration-prompt"
         )
 
 
@@ -240,7 +240,10 @@ class _Plan:
     @property
     def made_by(self) -> str:
         """A sentence for the card."""
-        referent, prompts = self.settings.referent, "" if self.settings.prompt_video else ", prompt videos left out"
+        referent, prompts = (
+            self.settings.referent,
+            "" if self.settings.demonstration_prompt else ", prompt videos left out",
+        )
         more = "" if self.prompted_episodes is None else f" ({self.prompted_episodes} of those with a prompt)"
         seeds = f"{self.episodes} seeds per task{more} from {self.seed_base} on"
         moved = ", the arm moved off its way at random in two thirds of them" if self.settings.perturb else ""

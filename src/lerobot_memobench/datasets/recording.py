@@ -44,7 +44,7 @@ class RecordingSettings:
     referent: str = "fixed"
     images: bool = True
     image_size: int = 256
-    prompt_video: bool = True
+    demonstration_prompt: bool = True
     hold_frames: int = HOLD_FRAMES
     perturb: bool = False
     policy: str | None = None
@@ -57,7 +57,7 @@ def record_demonstration(
     referent: str = "fixed",
     variant: int = 0,
     images: bool = True,
-    prompt_video: bool = True,
+    demonstration_prompt: bool = True,
     hold_frames: int = HOLD_FRAMES,
     image_size: int = 256,
     perturb: bool = False,
@@ -72,7 +72,7 @@ def record_demonstration(
         raise MemobenchError(
             f"variant {variant} was asked for together with referent={referent!r}; choose variants with 'fixed' only"
         )
-    settings = RecordingSettings(referent, images, image_size, prompt_video, hold_frames, perturb, policy)
+    settings = RecordingSettings(referent, images, image_size, demonstration_prompt, hold_frames, perturb, policy)
     return record(compiled_episode(task.variant(variant), settings), seed, settings)
 
 
@@ -86,7 +86,7 @@ def compiled_episode(task: Task, settings: RecordingSettings) -> Episode:
     return Episode(
         task,
         referent=settings.referent,
-        prompt_video=settings.prompt_video,
+        demonstration_prompt=settings.demonstration_prompt,
         render=replace(RenderSettings(), width=size, height=size),
     )
 

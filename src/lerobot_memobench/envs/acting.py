@@ -17,8 +17,8 @@ from typing import Any
 
 import yaml
 
-from lerobot_memobench.envs.episode_log import POLICY, SAW
-from lerobot_memobench.envs.observations import what_is_seen
+from lerobot_memobench.envs.episode_log import INPUTS, POLICY
+from lerobot_memobench.envs.observations import policy_inputs
 from lerobot_memobench.envs.prompting import checkpoint_being_run, in_file, policy_being_run, quiet, training_runs
 from lerobot_memobench.io import file_hash
 
@@ -44,14 +44,14 @@ class Acting:
 
     Attributes:
         policy: ``type``, ``identity`` and, of a checkpoint in a folder, ``sha256``; {} where nobody knows.
-        saw: what it sees, in words; None where nobody knows.
+        inputs: what it sees, in words; None where nobody knows.
         run: names this run of LeRobot's evaluation; a log may hold several, of one policy.
         seeds: of the episodes that were asked for; None where nobody knows. LeRobot runs whole batches, and what it
             runs beyond these is no part of the evaluation.
     """
 
     policy: Mapping[str, Any] = field(default_factory=dict)
-    saw: str | None = None
+    inputs: str | None = None
     run: str | None = None
     seeds: range | None = None
 
@@ -62,12 +62,12 @@ class Acting:
     @property
     def protocol(self) -> dict[str, Any]:
         """What goes beside the log, as far as it is known."""
-        return _known({SAW: self.saw, POLICY: dict(self.policy) or None})
+        return _known({INPUTS: self.inputs, POLICY: dict(self.policy) or None})
 
     @property
     def line(self) -> dict[str, Any]:
         """What goes on every line of the log, as far as it is known."""
-        return _known({POLICY: self.policy.get("identity"), "run": self.run, SAW: self.saw})
+        return _known({POLICY: self.policy.get("identity"), "run": self.run, INPUTS: self.inputs})
 
 
 NOBODY = Acting()
@@ -84,8 +84,7 @@ def acting(obs_type: str, oracle_memory: bool) -> Acting:
     if policy is None:
         return NOBODY
     run = f"{dt.datetime.now():%Y%m%dT%H%M%S}-{secrets.token_hex(3)}"
-    saw = what_is_seen(policy, obs_type, oracle_memory)
-    return Acting(_identity(policy, run), saw, run, _seeds())
+    return Acting(_identity(policy, run), policy_inputs(policy, obs_type, oracle_memory), run, _seeds())
 
 
 # --- the command line ---

@@ -22,6 +22,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot_memobench.envs.acting import acting
 from lerobot_memobench.envs.episode_log import SETTINGS, check_protocol
 from lerobot_memobench.envs.observations import (
+    EVERY,
     METADATA,
     OBJECTS,
     OBS_TYPES,
@@ -72,7 +73,7 @@ class MemobenchEnvConfig(EnvConfig):
             they would show as object slots (`observation.environment_state`), and nothing is drawn; or `both`.
         referent: `fixed`, the published goals, or `random`: by seed another admissible referent or order. Strict tasks
             are drawn by seed whatever is said here: `drawn`.
-        prompt_video: whether object and procedural tasks begin with their prompt video.
+        demonstration_prompt: whether object and procedural tasks begin with their prompt video.
         prompt_in: `steps`, the policy sees the prompt step by step, with `phase` 0; `reset`, it plays before the first
             observation; `auto`: in steps for a policy that knows phases, in reset for any other (`envs.prompting`).
         horizon: execution steps per episode.
@@ -87,9 +88,8 @@ class MemobenchEnvConfig(EnvConfig):
         oracle_memory: write what has been completed so far behind the instruction (the paper's oracle memory control),
             word for word as the column `memory` of a dataset says it for the same frame.
         log_dir: where the episode log goes; LeRobot's output folder when left out.
-        films: film so many episodes of each task, from episode 0 on, into `<log_dir>/videos/<task>.<episode>.mp4`,
-            annotated as `render()` is; none when left out.
-        videos: film every episode, whatever `films` says.
+        videos: record so many episodes of each task, from episode 0 on, as `<log_dir>/videos/<task>.<episode>.mp4`,
+            annotated as `render()` is; −1 records every one, none is recorded when left out.
         seed_base: the seed that counts as episode 0.
         resume: leave out the episodes that the log in `log_dir` holds already.
     """
@@ -101,7 +101,7 @@ class MemobenchEnvConfig(EnvConfig):
     fps: int = 20
     obs_type: str = PIXELS
     referent: str = "fixed"
-    prompt_video: bool = True
+    demonstration_prompt: bool = True
     prompt_in: str = AUTO
     horizon: int = 1200
     render: str = "default"
@@ -111,8 +111,7 @@ class MemobenchEnvConfig(EnvConfig):
     blind_action: bool = False
     oracle_memory: bool = False
     log_dir: str | None = None
-    films: int | None = None
-    videos: bool = False
+    videos: int | None = None
     seed_base: int = EVALUATION_SEED
     resume: bool = False
     features: dict[str, PolicyFeature] = field(default_factory=policy_features)
@@ -133,8 +132,8 @@ class MemobenchEnvConfig(EnvConfig):
         for name, number in (("horizon", self.horizon), ("render_every", self.render_every)):
             if number < 1:
                 raise MemobenchError(f"env.{name} is {number}; expected a whole number from 1 on")
-        if self.films is not None and self.films < 0:
-            raise MemobenchError(f"env.films is {self.films}; expected a whole number of episodes from 0 on")
+        if self.videos is not None and self.videos < EVERY:
+            raise MemobenchError(f"env.videos is {self.videos}; expected a number of episodes from 0 on, or -1 for all")
         if self.task is not None and self.tasks != "all":
             raise MemobenchError(
                 f"env.task={self.task} and tasks={self.tasks} both choose the tasks; leave one of them out"
@@ -150,17 +149,16 @@ class MemobenchEnvConfig(EnvConfig):
 
     @property
     def draws(self) -> bool:
-        """Whether a picture is ever asked for, to be observed or to be filmed."""
-        return self.obs_type != OBJECTS or bool(self.films) or self.videos
+        """Whether a picture is ever asked for, to be observed or to be recorded."""
+        return self.obs_type != OBJECTS or bool(self.videos)
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
         """What every sub-environment is made with."""
         return {
             "obs_type": self.obs_type,
-            "suite": self.suite,
             "referent": self.referent,
-            "prompt_video": self.prompt_video,
+            "demonstration_prompt": self.demonstration_prompt,
             "prompt_in": self.resolved_prompt_in(),
             "horizon": self.horizon,
             "render": self.render,
@@ -169,7 +167,6 @@ class MemobenchEnvConfig(EnvConfig):
             "expert_action": self.expert_action,
             "blind_action": self.blind_action,
             "oracle_memory": self.oracle_memory,
-            "films": self.films,
             "videos": self.videos,
             "seed_base": self.seed_base,
         }
@@ -214,10 +211,9 @@ class MemobenchEnvConfig(EnvConfig):
         check_protocol(log_dir, protocol)  # now, not when the first episode has been simulated
         suites: dict[str, dict[int, gym.vector.VectorEnv]] = {}
         for memory_type, task_id, folder in chosen:
-            make: Callable[[], gym.Env[Any, Any]]
-            make = partial(MemobenchEnv, str(folder), log_dir=str(log_dir), **settings)
+            make: Callable[[], gym.Env[Any, Any]] = partial(MemobenchEnv, str(folder), log_dir=str(log_dir), **settings)
             if self.resume:
-                make = skip_logged(make, log_dir, self.referent, self.seed_base)
+                make = partial(skip_logged, make, log_dir, self.referent, self.seed_base)
             suites.setdefault(memory_type, {})[task_id] = self._vector([make] * n_envs, use_async_envs)
         return suites
 

@@ -42,7 +42,7 @@ class Episode:
         task: the published task.
         referent: `fixed`, the catalogue's goal, or `random`, one of the task's variants by seed; of the strict suite
             one of the variants always, which is told as `drawn`.
-        prompt_video: whether tasks that have a prompt begin with it; what a prompt hides is hidden unseen without.
+        demonstration_prompt: whether tasks that have a prompt begin with it; what it hides is hidden unseen without.
         horizon: execution steps before truncation.
         render: size and quality of frames.
 
@@ -61,7 +61,7 @@ class Episode:
         task: Task,
         *,
         referent: str = "fixed",
-        prompt_video: bool = True,
+        demonstration_prompt: bool = True,
         horizon: int = HORIZON,
         render: RenderSettings | None = None,
     ) -> None:
@@ -70,7 +70,7 @@ class Episode:
             raise MemobenchError(f"referent is {referent!r}; {nearest(referent, known)}")
         self.published = task
         self.referent, self.horizon = referent_told(referent, task.drawn), horizon
-        self.prompt_video = prompt_video and task.prompt is not None
+        self.demonstration_prompt = demonstration_prompt and task.prompt is not None
         self.sim = Simulation(task, render)
         self._slots: ObjectSlots | None = None
         self.task = task
@@ -98,7 +98,7 @@ class Episode:
         self._blind: BlindRoutine | None = None
         self._demonstrator: Iterator[NDArray[np.float32]] | None = None
         hides = task.prompt is not None and not task.prompt.restores
-        if self.prompt_video or hides:
+        if self.demonstration_prompt or hides:
             self._prompt = PromptDemonstrator(task, self.sim, self._rng(2))
             self._demonstrator = self._prompt.actions()
             self._next_prompt_action = next(self._demonstrator, None)
@@ -106,7 +106,7 @@ class Episode:
                 self._begin_execution()
         else:
             self._begin_execution()
-        if hides and not self.prompt_video:
+        if hides and not self.demonstration_prompt:
             self._hide_unseen()
 
     def _hide_unseen(self) -> None:

@@ -85,7 +85,7 @@ class EpisodeRecord(Outcome):
     not_run: NotRequired[str]
     policy: NotRequired[Name | None]
     run: NotRequired[Name | None]
-    saw: NotRequired[Name | None]
+    inputs: NotRequired[Name | None]
     written_at: NotRequired[Number]
 
 
@@ -280,7 +280,7 @@ SETTINGS = (
     "seed_base",
     "obs_type",
     "referent",
-    "prompt_video",
+    "demonstration_prompt",
     "prompt_in",
     "horizon",
     "replan_steps",
@@ -290,10 +290,10 @@ SETTINGS = (
 )
 """What must agree for two evaluations to be one, or to be compared."""
 
-SAW = "saw"
-"""What the policy saw, in the words of `observations.what_is_seen`; absent where nobody wrote it down."""
+INPUTS = "inputs"
+"""Inputs of the policy, in the words of `observations.policy_inputs`; absent where nobody wrote it down."""
 
-OF_THE_POLICY = ("prompt_in", SAW)
+OF_THE_POLICY = ("prompt_in", INPUTS)
 """What follows from what a policy can take in: evaluations of two policies may differ in it, which is told, the parts
 of one may not."""
 
@@ -316,13 +316,13 @@ class Settings(TypedDict, total=False):
     seed_base: Whole | list[Whole]
     obs_type: Name | None
     referent: Name | list[Name]
-    prompt_video: bool | None
+    demonstration_prompt: bool | None
     horizon: Count | None
     replan_steps: Count | list[Count | None] | None
     render: Name | None
     render_every: Count | None
     oracle_memory: bool | None
-    saw: Name | None
+    inputs: Name | None
 
 
 class PolicyIdentity(TypedDict, total=False):

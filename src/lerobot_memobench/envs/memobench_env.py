@@ -1,4 +1,4 @@
-"""The gym environment that LeRobot steps: an `Episode`, its observations, its line in the log."""
+"""The gymnasium environment: an `Episode`, its observations, its video, its line in the log."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +17,17 @@ from numpy.typing import ArrayLike, NDArray
 from lerobot_memobench.envs.acting import NOBODY, Acting
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.episode_log import EpisodeLog, episode_record, has_log, not_run_record, read_log
-from lerobot_memobench.envs.observations import METADATA, PIXELS, Sight, action_space, blank, observation_space
+from lerobot_memobench.envs.observations import (
+    EVERY,
+    METADATA,
+    PIXELS,
+    Observer,
+    action_space,
+    blank,
+    observation_space,
+)
 from lerobot_memobench.envs.prompting import RESET, STEPS
-from lerobot_memobench.envs.video import BAND, Film
+from lerobot_memobench.envs.video import BAND, VideoRecorder
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_name
 from lerobot_memobench.protocol import (
@@ -34,9 +41,9 @@ from lerobot_memobench.protocol import (
     UNSEEDED,
 )
 from lerobot_memobench.sim.rendering import RenderSettings
-from lerobot_memobench.tasks.catalogue import load_task
+from lerobot_memobench.tasks.catalogue import get_task, load_task, suite_of
 from lerobot_memobench.tasks.memory_text import memory_text, with_memory
-from lerobot_memobench.tasks.task import PUBLISHED, referent_told
+from lerobot_memobench.tasks.task import referent_told
 
 logger = logging.getLogger(__name__)
 
@@ -46,9 +53,9 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     Observation: ``pixels/image`` and ``pixels/wrist_image`` uint8 (256, 256, 3) upright, or ``environment_state``
     float32 (208,): the visible objects (`sim.object_layout`), or both; ``agent_pos`` float32 (8,): end-effector
-    position (3, m), axis-angle (3, rad), fingers (2, m); ``phase`` (1,): 0 while the prompt video plays and actions
-    have no effect, 1 in execution; ``step`` (1,): control steps since the phase began; on request ``expert_action``
-    (7,), ``blind_action`` (7,).
+    position (3, m), axis-angle (3, rad), fingers (2, m); ``phase`` (1,): 0 while the demonstration prompt plays and
+    actions have no effect, 1 in execution; ``step`` (1,): control steps since the phase began; on request
+    ``expert_action`` (7,), ``blind_action`` (7,).
 
     Action: float32 (7,) in [−1, 1]: end-effector displacement (±5 cm, ±0.5 rad per unit), gripper (−1 opens, 1 closes).
 
@@ -59,9 +66,10 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     A pickled copy has the settings and must be reset: the running episode stays where it is.
 
     Args:
-        folder: the task's folder.
+        task: a name in the catalogue of either suite, or a task's folder.
         log_dir: where finished episodes are logged; nowhere when None.
-        acting: whose episodes they are; one that it does not count is neither logged nor filmed.
+        acting: whose episodes they are; one that it does not count is neither logged nor recorded.
+        render_mode: gymnasium's; there is one.
         others: see `MemobenchEnvConfig`.
     """
 
@@ -69,13 +77,12 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     def __init__(
         self,
-        folder: str,
+        task: str,
         *,
         log_dir: str | None = None,
         obs_type: str = PIXELS,
-        suite: str = PUBLISHED,
         referent: str = "fixed",
-        prompt_video: bool = True,
+        demonstration_prompt: bool = True,
         prompt_in: str = STEPS,
         horizon: int = HORIZON,
         render: str = "default",
@@ -84,13 +91,13 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         expert_action: bool = False,
         blind_action: bool = False,
         oracle_memory: bool = False,
-        films: int | None = None,
-        videos: bool = False,
+        videos: int | None = None,
         seed_base: int = EVALUATION_SEED,
         acting: Acting = NOBODY,
+        render_mode: str = "rgb_array",
     ) -> None:
-        self.render_mode = "rgb_array"
-        self._task = load_task(folder)
+        self.render_mode = render_mode
+        self._task = load_task(task) if suite_of(task) is None else get_task(task)
         self.task = self._task.name
         if log_dir is not None:  # now, not when the first episode has been simulated
             file_name(self.task, "the name of a task")
@@ -100,11 +107,11 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self.observation_space = observation_space(expert_action, render_every, obs_type, blind_action)
         self.action_space = action_space()
         protocol = {
-            "suite": suite,
+            "suite": self._task.suite,
             "seed_base": seed_base,
             "obs_type": obs_type,
             "referent": referent_told(referent, self._task.drawn),
-            "prompt_video": prompt_video,
+            "demonstration_prompt": demonstration_prompt,
             "prompt_in": prompt_in,
             "horizon": horizon,
             "replan_steps": replan_steps,
@@ -116,14 +123,13 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._acting = acting
         self._log = EpisodeLog(log_dir, protocol) if log_dir is not None else None
         self._videos = Path(log_dir) / "videos" if log_dir is not None else None
-        self._filmed = range(films or 0)
-        self._films_all = videos
-        self._film: Film | None = None
-        self._sight = Sight(obs_type, render_every)
+        self._recorded = videos or 0
+        self._video: VideoRecorder | None = None
+        self._observer = Observer(obs_type, render_every)
         self._referent = str(protocol["referent"])
         self._settings: dict[str, Any] = {
             "referent": referent,
-            "prompt_video": prompt_video,
+            "demonstration_prompt": demonstration_prompt,
             "horizon": horizon,
             "render": RenderSettings(IMAGE_SIZE, IMAGE_SIZE, render),
         }
@@ -136,7 +142,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy is made of: all but the running episode, with its scene, generators and GL context."""
-        return {**vars(self), "_episode": None, "_film": None, "_began": False}
+        return {**vars(self), "_episode": None, "_video": None, "_began": False}
 
     @property
     def episode(self) -> Episode:
@@ -148,7 +154,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     @property
     def _max_episode_steps(self) -> int:
         """Upper bound for LeRobot's loop: what it steps through. The horizon itself counts execution steps."""
-        prompt = self._settings["prompt_video"] and self._task.prompt is not None and self._prompt_in == STEPS
+        prompt = self._settings["demonstration_prompt"] and self._task.prompt is not None and self._prompt_in == STEPS
         return int(self._settings["horizon"]) + (PROMPT_HORIZON if prompt else 0)
 
     def reset(
@@ -162,30 +168,30 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._seed = seed = int(self.np_random.integers(*UNSEEDED)) if seed is None else int(seed)
         self._started = time.monotonic()
         self._began, self._closed, self._over, self._not_run = True, False, False, None
-        self._discard_film()
+        self._discard_video()
         with self._noting():
             self.episode.reset(seed)
         if self._not_run is not None:
             return blank(self.observation_space), self._info()
         self._describe(0)
-        self._sight.begin(self.episode)
+        self._observer.begin(self.episode)
         number = seed - self._seed_base
-        filmed = (self._films_all or number in self._filmed) and self._acting.counts(seed)
-        if self._videos is not None and filmed:
-            self._film = Film(self._videos / f"{self.task}.{number}.mp4", METADATA["render_fps"])
-            self._film.add(self.render())
+        recorded = (self._recorded == EVERY or 0 <= number < self._recorded) and self._acting.counts(seed)
+        if self._videos is not None and recorded:
+            self._video = VideoRecorder(self._videos / f"{self.task}.{number}.mp4", METADATA["render_fps"])
+            self._video.add(self.render())
         with self._noting():
             if self._prompt_in == RESET and self.episode.phase == PROMPT:
                 self._play_prompt()
         return self._observation(), self._info()
 
     def _play_prompt(self) -> None:
-        """Let the prompt run to its end, where the scene is restored; only a film watches it."""
-        self._sight.watched = False
+        """Let the prompt run to its end, where the scene is restored; it is drawn for a video only."""
+        self._observer.needed = False
         while self.episode.phase == PROMPT:
             self.episode.step(np.zeros(ACTION_DIM, np.float32))
-            self._see()
-        self._sight.watched = True
+            self._observe()
+        self._observer.needed = True
 
     def step(self, action: ArrayLike) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Advance by one control step of 50 ms. The reward is 1 at success, else 0.
@@ -213,21 +219,21 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
                 raise MemobenchError(episode.fault.why)
             self._warn(episode.fault.why)
         self._describe(completed)
-        self._see()
+        self._observe()
         if episode.done:
             self._end()
         success, ended = episode.success, episode.success or episode.lost
         return self._observation(), float(success), ended, episode.done and not ended, self._info()
 
-    def _see(self) -> None:
-        """Look at the present frame, and film it where the episode is filmed."""
-        self._sight.look(self.episode, filmed=self._film is not None)
-        if self._film is not None:
-            self._film.add(self.render())
+    def _observe(self) -> None:
+        """Observe the present frame, and record it where the episode is recorded."""
+        self._observer.observe(self.episode, recorded=self._video is not None)
+        if self._video is not None:
+            self._video.add(self.render())
 
-    def watch(self, watched: bool) -> None:
-        """Say whether somebody looks at the frames that follow, until the next reset or another word; see `Sight`."""
-        self._sight.watched = watched
+    def need_observation(self, needed: bool) -> None:
+        """Say whether the frames that follow are read, until the next reset or another call; see `Observer`."""
+        self._observer.needed = needed
 
     @contextmanager
     def _noting(self) -> Iterator[None]:
@@ -258,10 +264,10 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         if self._over:
             return
         self._over = True
-        if self._film is not None and self._not_run is None:
-            self._film.finish()
-            self._film = None
-        self._discard_film()
+        if self._video is not None and self._not_run is None:
+            self._video.finish()
+            self._video = None
+        self._discard_video()
         if self._log is not None and self._acting.counts(self._seed):
             self._log.append(self.record())
 
@@ -298,7 +304,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             return blank(self.observation_space)
         episode = self.episode
         observation: dict[str, Any] = {
-            **self._sight.observed(),
+            **self._observer.observation(),
             "agent_pos": episode.sim.proprio(),
             "phase": np.array([episode.phase], dtype=np.float32),
             "step": np.array([episode.clock], dtype=np.float32),
@@ -328,30 +334,26 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         }
 
     def render(self) -> NDArray[np.uint8]:
-        """Return both cameras side by side under what is being remembered and done; see `Sight.frame`.
+        """Return both cameras side by side under what is being remembered and done; see `Observer.frame`.
 
         Raises:
             gymnasium.error.ResetNeeded, gymnasium.error.ClosedEnvironmentError: as `step`.
         """
         self._check_began("render")
         if self._not_run is not None:
-            return np.zeros((BAND + IMAGE_SIZE, 2 * IMAGE_SIZE, 3), np.uint8)
-        return self._sight.frame(self.episode)
+            return _black()
+        return self._observer.frame(self.episode)
 
     def close(self) -> None:
         """Let the scene go; the next reset compiles or fetches it anew. Closing twice does no harm."""
-        self._discard_film()
+        self._discard_video()
         self._episode = None
         self._began, self._closed = False, True
 
-    def _discard_film(self) -> None:
-        if self._film is not None:
-            self._film.discard()
-            self._film = None
-
-
-# ==== resuming.py
-# Episodes that the log holds already are not run again: their rows of a batch tell how they ended, and rest.
+    def _discard_video(self) -> None:
+        if self._video is not None:
+            self._video.discard()
+            self._video = None
 
 
 class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
@@ -390,7 +392,7 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
         """Return what the environment shows; black while it rests."""
         if self._skipped is None:
             return self.env.render()
-        return np.zeros((BAND + IMAGE_SIZE, 2 * IMAGE_SIZE, 3), np.uint8)
+        return _black()
 
     def _info(self, success: bool) -> dict[str, Any]:
         return {"is_success": success, "phase": EXECUTION, "checkpoints_completed": 0}
@@ -408,12 +410,11 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
         return self._logged
 
 
-def skip_logged(
-    make: Callable[[], gym.Env[Any, Any]], log_dir: Path, referent: str, seed_base: int
-) -> Callable[[], SkipLogged]:
-    """Wrap an environment's factory."""
-    return partial(_make, make, log_dir, referent, seed_base)
-
-
-def _make(make: Callable[[], gym.Env[Any, Any]], log_dir: Path, referent: str, seed_base: int) -> SkipLogged:
+def skip_logged(make: Callable[[], gym.Env[Any, Any]], log_dir: Path, referent: str, seed_base: int) -> SkipLogged:
+    """Make an environment and wrap it."""
     return SkipLogged(make(), log_dir, referent, seed_base)
+
+
+def _black() -> NDArray[np.uint8]:
+    """Return what is rendered of an episode that is not run."""
+    return np.zeros((BAND + IMAGE_SIZE, 2 * IMAGE_SIZE, 3), np.uint8)

@@ -26,6 +26,9 @@ PIXELS, OBJECTS, BOTH = "pixels_agent_pos", "environment_state_agent_pos", "both
 OBS_TYPES = (PIXELS, OBJECTS, BOTH)
 """Values of ``env.obs_type``, by LeRobot's names: what is observed beside the arm's state."""
 
+EVERY = -1
+"""Value of ``env.videos``: record every episode."""
+
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": CONTROL_HZ}
 
 # --- which of them a policy reads ---
@@ -76,7 +79,7 @@ def check_obs_type(policy: Any, obs_type: str) -> None:
         )
 
 
-def what_is_seen(policy: Any, obs_type: str, oracle_memory: bool = False) -> str:
+def policy_inputs(policy: Any, obs_type: str, oracle_memory: bool = False) -> str:
     """Return a policy's inputs beside the arm's state in words; all of ``obs_type`` where they are not known.
 
     Args:
@@ -170,7 +173,7 @@ def blank(space: spaces.Space[Any]) -> Any:
 # --- contents ---
 
 
-class Sight:
+class Observer:
     """Pictures and objects of the observations, which take time: drawn only where they are needed.
 
     Args:
@@ -178,51 +181,47 @@ class Sight:
         render_every: pictures are drawn every so many execution steps, and repeated in between; objects are not.
 
     Attributes:
-        watched: whether somebody looks at the frames that follow. What nobody looks at is as it was seen last; the
-            first and the last frame of the execution always are of the present.
+        needed: whether the frames that follow are read. An observation that nobody reads repeats an earlier one; the
+            first and the last frame of the execution are always of the present.
     """
 
     def __init__(self, obs_type: str, render_every: int) -> None:
-        self._sees_pictures, self._sees_objects = obs_type != OBJECTS, obs_type != PIXELS
+        self._has_pictures, self._has_objects = obs_type != OBJECTS, obs_type != PIXELS
         self._render_every = render_every
-        self.watched = True
+        self.needed = True
 
     def begin(self, episode: Episode) -> None:
-        """Look at the first frame of an episode."""
-        self.watched = True
+        """Observe the first frame of an episode."""
+        self.needed = True
         self._picture_step: int | None = None
-        self.look(episode, filmed=False)
+        self.observe(episode, recorded=False)
 
-    def look(self, episode: Episode, *, filmed: bool) -> None:
-        """Take in the present frame, as far as anybody looks at it.
-
-        Args:
-            filmed: whether a film does.
-        """
+    def observe(self, episode: Episode, *, recorded: bool) -> None:
+        """Take in the present frame, as far as it is needed; ``recorded``: in a video."""
         always = episode.done or episode.step_index == episode.exec_start
-        if self._sees_objects and (always or self.watched):
+        if self._has_objects and (always or self.needed):
             self._objects = episode.objects()
         due = episode.phase == PROMPT or episode.exec_steps % self._render_every == 0
-        if self._sees_pictures and (always or (due and (self.watched or filmed))):
+        if self._has_pictures and (always or (due and (self.needed or recorded))):
             self._draw(episode)
 
     def _draw(self, episode: Episode) -> None:
         self._images: dict[str, Image] = episode.images()
         self._picture_step, self._picture_clock = episode.step_index, episode.clock
 
-    def observed(self) -> dict[str, Any]:
+    def observation(self) -> dict[str, Any]:
         """Return the observation's pictures and objects, see `observation_space`."""
-        seen: dict[str, Any] = {}
-        if self._sees_pictures:
-            seen["pixels"] = dict(self._images)
+        found: dict[str, Any] = {}
+        if self._has_pictures:
+            found["pixels"] = dict(self._images)
             if self._render_every > 1:
-                seen["picture_step"] = np.array([self._picture_clock], dtype=np.float32)
-        if self._sees_objects:
-            seen["environment_state"] = self._objects
-        return seen
+                found["picture_step"] = np.array([self._picture_clock], dtype=np.float32)
+        if self._has_objects:
+            found["environment_state"] = self._objects
+        return found
 
     def frame(self, episode: Episode) -> NDArray[np.uint8]:
         """Return both cameras annotated: as they were drawn last, or now where observations hold no pictures."""
-        if not self._sees_pictures and self._picture_step != episode.step_index:
+        if not self._has_pictures and self._picture_step != episode.step_index:
             self._draw(episode)
         return annotate(self._images, episode)

@@ -47,7 +47,7 @@ def _encoder(process: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(1, "film")
 
 
-class Film:
+class VideoRecorder:
     """Write frames to an MP4 that appears under its name only when it is whole.
 
     Opening, encoding and writing happen in the order of the calls, in a thread; PyAV and x264 let others compute
@@ -112,7 +112,7 @@ class Film:
                 raise self._error
             raise MemobenchError(
                 f"the film {self._path} cannot be written ({reason}); make room there, choose another output_dir=, or "
-                "film nothing with films=0"
+                "film nothing with videos=0"
             ) from self._error
         return picture
 

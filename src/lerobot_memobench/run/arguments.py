@@ -206,10 +206,10 @@ SHORT_FORMS: dict[str, dict[str, tuple[str, ...]]] = {
         "host": ("policy.host",),
         "port": ("policy.port",),
         "dialect": ("policy.dialect",),
-        "prompt_video": ("env.prompt_video",),
+        "demonstration_prompt": ("env.demonstration_prompt",),
         "prompt_in": ("env.prompt_in",),
         "horizon": ("env.horizon",),
-        "films": ("env.films",),
+        "videos": ("env.videos",),
         "episodes": ("eval.n_episodes",),
         "batch_size": ("eval.batch_size",),
     },
@@ -277,7 +277,7 @@ MEANINGS: dict[str, tuple[Meaning, ...]] = {
             "drawn",
             "fixed",
         ),
-        Meaning("prompt_video=", "false leaves the prompt out", "true"),
+        Meaning("demonstration_prompt=", "false leaves the prompt out", "true"),
         Meaning(
             "prompt_in=",
             "steps: the policy sees the prompt; reset: it plays before the first observation",
@@ -285,8 +285,8 @@ MEANINGS: dict[str, tuple[Meaning, ...]] = {
         ),
         Meaning("horizon=", "execution steps per episode", "1200"),
         Meaning(
-            "films=",
-            "episodes of each task that are filmed: 0 to n − 1",
+            "videos=",
+            "episodes of each task that are recorded as videos, from the first; −1 all",
             "10, without pictures in the observations 0",
         ),
         Meaning(

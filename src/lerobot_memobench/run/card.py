@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
 from lerobot_memobench.envs.acting import ELSEWHERE, checkpoint_files, encoded, tree_hash
-from lerobot_memobench.envs.episode_log import EXTENT, SAW, SETTINGS
-from lerobot_memobench.envs.observations import what_is_seen
+from lerobot_memobench.envs.episode_log import EXTENT, INPUTS, SETTINGS
+from lerobot_memobench.envs.observations import policy_inputs
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records.protocol import CARD_FILE
 from lerobot_memobench.io import Count, file_hash, read_json, write_file
@@ -174,7 +174,9 @@ def _plan_protocol(plan: EvaluationPlan) -> dict[str, Any]:
     names = sorted(place.task.name for place in plan.grid.places)
     environment = plan.environment
     seen = (
-        {} if plan.policy is None else {SAW: what_is_seen(plan.policy, environment.obs_type, environment.oracle_memory)}
+        {}
+        if plan.policy is None
+        else {INPUTS: policy_inputs(plan.policy, environment.obs_type, environment.oracle_memory)}
     )
     return {"tasks": names, "episodes": plan.grid.runs, **environment.protocol, **seen}
 

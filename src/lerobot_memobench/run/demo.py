@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.envs.episode_log import MERGED_FILE, PROTOCOL_FILE, read_episodes
 from lerobot_memobench.envs.observations import OBJECTS
-from lerobot_memobench.envs.video import Film
+from lerobot_memobench.envs.video import VideoRecorder
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.report import REPORT_JSON, REPORT_MARKDOWN
-from lerobot_memobench.evaluation.metrics.rollouts import saw
+from lerobot_memobench.evaluation.metrics.rollouts import policy_inputs
 from lerobot_memobench.evaluation.records.protocol import CARD_FILE
 from lerobot_memobench.io import write_file
 from lerobot_memobench.policies.checkpoint import shipped_policies
@@ -74,7 +74,7 @@ Frame = NDArray[np.uint8]
 
 def demo_plan(folder: Path) -> EvaluationPlan:
     """Return the plan of the demo's evaluation: one recorded episode of each task."""
-    words = ["env=memobench", f"tasks={','.join(TASKS)}", "episodes=1", "env.videos=true"]
+    words = ["env=memobench", f"tasks={','.join(TASKS)}", "episodes=1", "videos=1"]
     return plan_line([*words, f"output_dir={folder}"])
 
 
@@ -131,7 +131,7 @@ class Outcome:
 
     solved: tuple[bool, ...]
     wrong: int
-    saw: str
+    inputs: str
 
 
 def has_policies() -> bool:
@@ -143,7 +143,7 @@ def memory_plan(name: str, folder: Path) -> EvaluationPlan:
     """Return the plan of the evaluation of one of `POLICIES`."""
     words = ["env=memobench", *POLICIES[name], f"tasks={BOWL}", "referent=random", f"horizon={HORIZON}"]
     return plan_line(
-        [*words, f"obs_type={OBJECTS}", f"episodes={EPISODES}", f"films={RECORDED}", f"output_dir={folder}"]
+        [*words, f"obs_type={OBJECTS}", f"episodes={EPISODES}", f"videos={RECORDED}", f"output_dir={folder}"]
     )
 
 
@@ -180,16 +180,17 @@ def _outcome(folder: Path) -> Outcome:
     return Outcome(
         solved=tuple(bool(record["success"]) for record in sorted(records, key=itemgetter("episode"))),
         wrong=sum(not record["success"] and record.get("failure") == REFERENCE_DRIFT for record in records),
-        saw=saw(records),
+        inputs=policy_inputs(records),
     )
 
 
 def table(outcomes: dict[str, Outcome]) -> str:
     """Return who solved how many of the episodes, and how many failed at a wrong bowl, as Markdown."""
     rows = [
-        f"| {name} | {sum(one.solved)}/{len(one.solved)} | {one.wrong} | {one.saw} |" for name, one in outcomes.items()
+        f"| {name} | {sum(one.solved)}/{len(one.solved)} | {one.wrong} | {one.inputs} |"
+        for name, one in outcomes.items()
     ]
-    head = "| butter into the bowl that the prompt showed, of three | solved | wrong bowl | saw |"
+    head = "| butter into the bowl that the prompt showed, of three | solved | wrong bowl | inputs |"
     return "\n".join([head, "|---|---|---|---|", *rows]) + "\n"
 
 
@@ -217,7 +218,7 @@ def side_by_side(videos: Mapping[str, tuple[Path, bool]], out: Path) -> Path:
     Args:
         videos: name -> file and whether the episode was solved. All are of the same height.
     """
-    movie = Film(out)
+    movie = VideoRecorder(out)
     try:
         for frame in joined(videos):
             movie.add(frame)

@@ -43,7 +43,7 @@ def merge_and_report(out: Path, folders: Sequence[Path]) -> EvaluationReport:
 
 
 def merge(out: Path, folders: Sequence[Path]) -> list[tuple[str, int]]:
-    """Join the logs, cards and films of evaluations of one protocol into the folder ``out``.
+    """Join the logs, cards and videos of evaluations of one protocol into the folder ``out``.
 
     What ``out`` holds already is joined as well. Films are hard links where the disk allows it, else copies; LeRobot's
     own files stay where they are. Every check comes before anything is written.
@@ -169,7 +169,7 @@ def _check_task_files(card: Mapping[str, Any], folder: Path) -> None:
 
 
 def _share_films(source: Path, target: Path) -> None:
-    """Give films of episodes a second name, or copy them; ones that are there stay."""
+    """Give videos of episodes a second name, or copy them; ones that are there stay."""
     for film in sorted(source.glob("*.mp4")):
         place = target / film.name
         if place.exists():

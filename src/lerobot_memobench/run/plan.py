@@ -310,9 +310,9 @@ EXPERT = "memobench_expert"
 SCRIPTED = {EXPERT: "env.expert_action", "memobench_blind": "env.blind_action"}
 """Policies whose actions the environment offers, and by which setting it does."""
 LARGEST_BATCH = 64
-FILMS = 10
-"""Episodes of each task that are filmed, as many as LeRobot renders of an environment without films of its own;
-none where only objects are seen, so that nothing is drawn unasked."""
+VIDEO_EPISODES = 10
+"""Episodes of each task that are recorded as videos, as many as LeRobot renders of an environment without videos of its
+own; none where only objects are observed, so that nothing is drawn unasked."""
 
 
 def with_policy(settings: LerobotSettings) -> LerobotSettings:
@@ -369,7 +369,7 @@ def _batch_is_open(settings: LerobotSettings) -> bool:
 
 
 def with_protocol(settings: LerobotSettings, n_action_steps: int | None, in_parts: bool = False) -> LerobotSettings:
-    """Return settings with the protocol's seed and episodes, a batch, a device, the policy's replan interval, films.
+    """Return settings with the protocol's seed and episodes, a batch, a device, the policy's replan interval, videos.
 
     Args:
         in_parts: all of them are run as jobs, each of which decides on its own machine which device there is.
@@ -385,7 +385,7 @@ def with_protocol(settings: LerobotSettings, n_action_steps: int | None, in_part
         settings = settings.default("policy.device", "cpu")
     if n_action_steps is not None:
         settings = settings.default("env.replan_steps", n_action_steps)
-    return settings.default("env.films", 0 if settings.get("env.obs_type") == OBJECTS else FILMS)
+    return settings.default("env.videos", 0 if settings.get("env.obs_type") == OBJECTS else VIDEO_EPISODES)
 
 
 def unused_folder(settings: LerobotSettings) -> Path:

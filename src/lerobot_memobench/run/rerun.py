@@ -98,8 +98,8 @@ ENV, POLICY_TYPE, POLICY_PATH, TASK_DIR = "env.type", "policy.type", "policy.pat
 
 NUMBERS = (
     *("seed", "eval.n_episodes", "eval.batch_size", "eval.use_async_envs", "eval.recording"),
-    *("env.fps", "env.prompt_video", "env.horizon", "env.render_every", "env.replan_steps", "env.seed_base"),
-    *("env.expert_action", "env.blind_action", "env.oracle_memory", "env.videos", "env.films", "env.resume"),
+    *("env.fps", "env.demonstration_prompt", "env.horizon", "env.render_every", "env.replan_steps", "env.seed_base"),
+    *("env.expert_action", "env.blind_action", "env.oracle_memory", "env.videos", "env.resume"),
     *("env.max_parallel_tasks", "env.disable_env_checker"),
 )
 """Numbers and truth values of the run and the environment. Of a policy's, all are taken but `REACHING_OUT`."""

@@ -7,8 +7,8 @@ LeRobot seeds Python, NumPy and torch once per run, so what a sampling policy dr
 ran before it. Here each batch is seeded from the run's seed, the task and the batch's first episode: an evaluation
 that is resumed or shared among machines draws what an undisturbed one draws.
 
-Frames are drawn for those who look at them (``rollout``), and the environment films (``env.films``): LeRobot would
-render ten episodes of each task a second time.
+Frames are drawn for those who look at them (``rollout``), and the environment records videos (``env.videos``): LeRobot
+would render ten episodes of each task a second time.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def calm_output() -> Iterator[None]:
 
 @contextmanager
 def steered(seed: int | None, ranges: Mapping[tuple[str, int], list[Range]] | None = None) -> Iterator[None]:
-    """While this lasts, LeRobot's loop seeds batches, draws what is looked at, films nothing and runs only ``ranges``.
+    """While this lasts, LeRobot's loop seeds batches, draws what is looked at, records nothing and runs only ``ranges``.
 
     Args:
         seed: of the run; batches are not seeded when None.
@@ -76,7 +76,7 @@ def steered(seed: int | None, ranges: Mapping[tuple[str, int], list[Range]] | No
 
 
 def _unfilmed(run_one: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap LeRobot's evaluation of one task: it renders no episode, and makes no folder for films."""
+    """Wrap LeRobot's evaluation of one task: it renders no episode, and makes no folder for videos."""
 
     @functools.wraps(run_one)
     def run(task_group: str, task_id: int, env: Any, **settings: Any) -> tuple[str, int, dict[str, Any]]:
@@ -97,7 +97,7 @@ def _only(run_one: Callable[..., Any], ranges: Mapping[tuple[str, int], list[Ran
         for first, count in mine:
             changed = {**settings, "start_seed": settings["start_seed"] + first, "n_episodes": count}
             for folder in ("videos_dir", "recording_dir"):
-                if len(mine) > 1 and settings.get(folder) is not None:  # LeRobot numbers its films from 0
+                if len(mine) > 1 and settings.get(folder) is not None:  # LeRobot numbers its videos from 0
                     changed[folder] = settings[folder] / f"from_{first}"
             _, _, metrics = run_one(task_group, task_id, env, **changed)
             for key, values in metrics.items():
@@ -161,7 +161,7 @@ class Eyes:
     """The observations of a rollout as its policy gets them.
 
     Args:
-        env: the vector environment, told by ``watch`` whether its next frames are seen.
+        env: the vector environment, told by ``need_observation`` whether its next frames are seen.
         looks: tells, after an action, whether the policy looks at the next observation.
     """
 
@@ -175,7 +175,7 @@ class Eyes:
         """Tell the environment, before its step, whether anybody looks at what comes of it."""
         looks = self._looks()
         if looks != self._watched:
-            self._env.call("watch", looks)
+            self._env.call("need_observation", looks)
             self._watched = looks
 
     def see(self, observation: dict[str, Any]) -> dict[str, Any]:

@@ -81,7 +81,7 @@ def _run_lerobot(plan: EvaluationPlan, card: dict[str, Any], ranges: Ranges | No
             if card["protocol"]:
                 write_card(plan.log, card)
             left = remainder(plan, ranges)
-            with made(left.output):  # LeRobot makes it for films of its own only
+            with made(left.output):  # LeRobot makes it for videos of its own only
                 status = call_lerobot("eval", left.lerobot_flags)
             return Ended(status, None if status else _finish(plan, card))
     finally:

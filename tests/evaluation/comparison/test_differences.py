@@ -80,10 +80,10 @@ def test_what_differs_is_refused_by_name_and_may_be_allowed(
 
 
 @pytest.mark.parametrize(
-    ("setting", "value"), [("horizon", 600), ("render", "fast"), ("seed_base", 1007), ("prompt_video", False)]
+    ("setting", "value"), [("horizon", 600), ("render", "fast"), ("seed_base", 1007), ("demonstration_prompt", False)]
 )
 def test_settings_beside_the_log_count(tmp_path: Path, setting: str, value: Any) -> None:
-    settings = {"seed_base": 7, "referent": "fixed", "prompt_video": True, "horizon": 1200, "render": "default"}
+    settings = {"seed_base": 7, "referent": "fixed", "demonstration_prompt": True, "horizon": 1200, "render": "default"}
     a, b = logs.evaluation(tmp_path / "a"), logs.evaluation(tmp_path / "b")
     (a / "protocol.json").write_text(json.dumps(settings))
     (b / "protocol.json").write_text(json.dumps({**settings, setting: value}))

@@ -18,7 +18,7 @@ import pytest
 
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode_log import write_episodes
-from lerobot_memobench.envs.video import OPERATION_COLOURS, Film
+from lerobot_memobench.envs.video import OPERATION_COLOURS, VideoRecorder
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.documents.html import write_html
 from lerobot_memobench.evaluation.documents.html.collect import page_data, read_runs, task_source
@@ -62,7 +62,7 @@ def evaluation(folder: Path, records: list[dict[str, Any]]) -> Path:
 
 def film(path: Path, frames: int) -> Path:
     """A video of ``frames`` frames, the last one held for a second as the environment does it."""
-    strip = Film(path)
+    strip = VideoRecorder(path)
     for _ in range(frames):
         strip.add(np.zeros((32, 48, 3), np.uint8))
     strip.finish()
@@ -102,7 +102,7 @@ def test_figures_are_those_of_the_report(tmp_path: Path) -> None:
         "1 task",
         "seeds 7 to 10",
         "referent fixed",
-        "what the policy saw is not recorded",
+        "policy inputs: not recorded",
     ]
     assert run["commands"] == []
 

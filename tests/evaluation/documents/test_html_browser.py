@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.envs.episode_log import write_episodes
-from lerobot_memobench.envs.video import OPERATION_COLOURS, Film
+from lerobot_memobench.envs.video import OPERATION_COLOURS, VideoRecorder
 from lerobot_memobench.evaluation.documents.html import write_html
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support import browser as chromium
@@ -63,7 +63,7 @@ RECORDS = [
 
 
 def film(path: Path, frames: int) -> None:
-    strip = Film(path)
+    strip = VideoRecorder(path)
     for k in range(frames):
         strip.add(np.full((80, 128, 3), 16 + 4 * k, np.uint8))
     strip.finish()

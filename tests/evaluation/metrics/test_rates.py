@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.documents.sentences import pooled_sentence, saw_sentence
+from lerobot_memobench.evaluation.documents.sentences import inputs_sentence, pooled_sentence
 from lerobot_memobench.evaluation.metrics.rates import Rate, mean_rate, mean_row, percent, wilson
-from lerobot_memobench.evaluation.metrics.rollouts import by_task, faults, mixtures, prefix, saw
+from lerobot_memobench.evaluation.metrics.rollouts import by_task, faults, mixtures, policy_inputs, prefix
 from lerobot_memobench.evaluation.metrics.summary import report, summarise
 from lerobot_memobench.paper import published_rows
 
@@ -83,7 +83,7 @@ def test_report_of_the_hand_made_log() -> None:
             "execution_failure": 0,
         },
         "prefix": {"t1": [75.0, 50.0, 25.0], "t2": [100.0, 50.0], "s1": [50.0, 50.0], "o1": [50.0]},
-        "saw": "not recorded",
+        "inputs": "not recorded",
     }
 
 
@@ -140,17 +140,17 @@ def test_mixed_protocols_are_said() -> None:
 
 def test_lines_of_two_scenes_two_eyes_or_of_nobody_are_said() -> None:
     """Of one policy, by other lines of it or by none."""
-    whose = {"policy": "act 1", "run": "1", "saw": "pixels"}
+    whose = {"policy": "act 1", "run": "1", "inputs": "pixels"}
     mine = [rollout("t", "temporal", "S", [1], True, k, **whose) for k in range(3)]
     assert mixtures(mine) == []
     (seeds,) = mixtures([*mine, rollout("t", "temporal", "S", [1], True, 3, **{**whose, "seed": 5002})])
     assert "seeds of episode 0 (7, 4999)" in seeds
-    (seen,) = mixtures([*mine, rollout("t", "temporal", "S", [1], True, 3, **{**whose, "saw": "poses"})])
-    assert "what the policy saw (pixels, poses)" in seen
+    (seen,) = mixtures([*mine, rollout("t", "temporal", "S", [1], True, 3, **{**whose, "inputs": "poses"})])
+    assert "policy inputs (pixels, poses)" in seen
     nobodys = [rollout("t", "temporal", "S", [1], True, 3 + k) for k in range(2)]
     assert mixtures(nobodys) == [], "nothing is mixed"
     assert mixtures([*mine, *nobodys])[0].startswith("2 rollouts of 5 do not say whose they are;")
-    without_run = {"policy": "act 1", "saw": "pixels"}
+    without_run = {"policy": "act 1", "inputs": "pixels"}
     (one,) = mixtures([*mine, rollout("t", "temporal", "S", [1], True, 3, **without_run)])
     assert one.startswith("1 rollout of 4 does not say whose it is;")
 
@@ -159,11 +159,11 @@ def test_one_is_no_plural_and_what_is_unknown_is_no_thing_seen() -> None:
     one = rollout("t", "temporal", "S", [1], True, fault="NaN")
     assert "1 rollout was broken off and counts as failed" in faults([one])[0]
     assert "(1 record)" in pooled_sentence(summarise([one]))
-    told = saw([{**one, "saw": "privileged object state"}, one])
+    told = policy_inputs([{**one, "inputs": "privileged object state"}, one])
     assert told == "privileged object state; of 1 rollout it is not recorded"
-    assert saw_sentence(told) == f"What the policy saw: {told}."
-    assert saw_sentence(saw([one])) == "What the policy saw is not recorded."
-    assert saw_sentence("pixels") == "The policy saw pixels."
+    assert inputs_sentence(told) == f"Policy inputs: {told}."
+    assert inputs_sentence(policy_inputs([one])) == "Policy inputs: not recorded."
+    assert inputs_sentence("pixels") == "Policy inputs: pixels."
 
 
 @pytest.mark.parametrize(

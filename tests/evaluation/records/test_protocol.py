@@ -15,7 +15,7 @@ from lerobot_memobench.evaluation.records.protocol import CARD_FILE, differences
 SETTINGS: dict[str, Any] = {
     "seed_base": 7,
     "referent": "fixed",
-    "prompt_video": True,
+    "demonstration_prompt": True,
     "horizon": 1200,
     "replan_steps": None,
     "render": "default",

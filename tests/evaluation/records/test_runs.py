@@ -80,12 +80,12 @@ def test_rollouts_beyond_those_asked_for_are_not_counted(tmp_path: Path) -> None
 def test_evaluations_that_were_not_run_alike_are_shown_with_a_notice(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    settings = {"horizon": 1200, "referent": "fixed", "saw": "pixels"}
-    for name, changes in (("a", {}), ("b", {"horizon": 600, "saw": "privileged object state"}), ("c", {})):
-        folder = logs.evaluation(tmp_path / name, saw={**settings, **changes}["saw"])
+    settings = {"horizon": 1200, "referent": "fixed", "inputs": "pixels"}
+    for name, changes in (("a", {}), ("b", {"horizon": 600, "inputs": "privileged object state"}), ("c", {})):
+        folder = logs.evaluation(tmp_path / name, inputs={**settings, **changes}["inputs"])
         write_protocol(folder, {**settings, **changes})
     found = [f"{tmp_path}/{name}" for name in "abc"]
-    words = "b was not run as a was (horizon: 1200 and 600; saw: pixels and privileged object state"
+    words = "b was not run as a was (horizon: 1200 and 600; inputs: pixels and privileged object state"
     for name in ("markdown", "table", "latex", "json"):
         told = " ".join(render(build(read_runs(found)), read_runs(found), name).split())
         assert words in told.replace("\\_", "_"), name

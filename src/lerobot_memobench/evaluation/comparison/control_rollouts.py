@@ -10,8 +10,8 @@ from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.comparison.granularity import relabelled
 from lerobot_memobench.evaluation.comparison.pairing import by_replan, paired
-from lerobot_memobench.evaluation.documents.sentences import saw_phrase
-from lerobot_memobench.evaluation.metrics.rollouts import Record, saw
+from lerobot_memobench.evaluation.documents.sentences import inputs_phrase
+from lerobot_memobench.evaluation.metrics.rollouts import Record, policy_inputs
 from lerobot_memobench.evaluation.records.protocol import POLICY, differences, read_protocol
 from lerobot_memobench.evaluation.records.runs import asked_for
 from lerobot_memobench.io import count_of
@@ -94,9 +94,9 @@ def check_one_policy(folders: Sequence[Path]) -> None:
 
 
 def _rollouts(folder: Path, notes: list[str], seen: list[str]) -> list[Record]:
-    """Return the rollouts of an evaluation that were asked for; what its policy saw is told in ``seen``."""
+    """Return the rollouts of an evaluation that were asked for; its policy's inputs are told in ``seen``."""
     found: list[Record] = [*asked_for(folder, read_episodes(folder, notes), notes)]
-    seen.append(f"{folder}: {saw_phrase(saw(found))}")
+    seen.append(f"{folder}: {inputs_phrase(policy_inputs(found))}")
     return found
 
 

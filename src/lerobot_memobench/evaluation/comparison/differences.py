@@ -12,7 +12,7 @@ from lerobot_memobench.evaluation.comparison import paired_tests
 from lerobot_memobench.evaluation.comparison.pairing import ALLOWED, Pair, common_episodes, unlike_pairs
 from lerobot_memobench.evaluation.documents.evaluation_tables import AVERAGE
 from lerobot_memobench.evaluation.metrics.rates import METRICS, value_of
-from lerobot_memobench.evaluation.metrics.rollouts import saw
+from lerobot_memobench.evaluation.metrics.rollouts import policy_inputs
 from lerobot_memobench.evaluation.records.protocol import OF_THE_POLICY, differences
 from lerobot_memobench.evaluation.records.runs import Run
 from lerobot_memobench.io import count_of
@@ -56,14 +56,14 @@ class Difference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Both evaluations' names, how many pairs there are, all differences, what a reader must know, what each saw."""
+    """Both evaluations' names, how many pairs there are, all differences, what a reader must know, each one's inputs."""
 
     a: str
     b: str
     pairs: int
     differences: tuple[Difference, ...]
     notes: tuple[str, ...]
-    saw: tuple[str, str]
+    inputs: tuple[str, str]
 
 
 def compare(
@@ -93,7 +93,7 @@ def compare(
     ]
     notes, seen = (
         tuple(_notes(a, b, len(pairs))),
-        (saw([mine for mine, _ in pairs]), saw([other for _, other in pairs])),
+        (policy_inputs([mine for mine, _ in pairs]), policy_inputs([other for _, other in pairs])),
     )
     return Comparison(a.name, b.name, len(pairs), tuple(_adjusted(rows)), notes, seen)
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from lerobot_memobench.evaluation.comparison.differences import Comparison, Difference
-from lerobot_memobench.evaluation.documents.sentences import saw_phrase
+from lerobot_memobench.evaluation.documents.sentences import inputs_phrase
 from lerobot_memobench.evaluation.documents.tables import Cell, Count, Name, Numbers, Report, Section, Table
 from lerobot_memobench.evaluation.metrics.rates import percent
 from lerobot_memobench.io import count_of
@@ -37,7 +37,9 @@ def _table(key: str, title: str, found: Comparison, rows: Sequence[Difference], 
     header += ["p (Holm)"] * tasks + ["detectable"]
     starts = [k for k, row in enumerate(rows) if k == 0 or rows[k - 1].scope != row.scope]
     cells = tuple(_row(row, tasks, k in starts) for k, row in enumerate(rows))
-    seen = "; ".join(f"{name}: {saw_phrase(words)}" for name, words in zip((found.a, found.b), found.saw, strict=True))
+    seen = "; ".join(
+        f"{name}: {inputs_phrase(words)}" for name, words in zip((found.a, found.b), found.inputs, strict=True)
+    )
     return Table(key, title, tuple(header), cells, note=f"{seen}.", rules=frozenset(starts) - {0})
 
 
@@ -74,7 +76,7 @@ def data(found: Comparison) -> dict[str, Any]:
     return {
         "a": found.a,
         "b": found.b,
-        "saw": {found.a: found.saw[0], found.b: found.saw[1]},
+        "inputs": {found.a: found.inputs[0], found.b: found.inputs[1]},
         "pairs": found.pairs,
         "differences": [_entry(row) for row in found.differences],
         "notes": list(found.notes),

@@ -13,7 +13,7 @@ from lerobot_memobench.io import count_of
 from lerobot_memobench.paper import PublishedRow, failure_taxonomy, published_rows
 from lerobot_memobench.tasks.task import MEMORY_TYPES, PUBLISHED
 
-PAPER_PROTOCOL = {"referent": "fixed", "prompt_video": True, "horizon": 1200, "seed_base": 7}
+PAPER_PROTOCOL = {"referent": "fixed", "demonstration_prompt": True, "horizon": 1200, "seed_base": 7}
 PAPER_SAW = "pixels"
 PAPER_TASKS, PAPER_EPISODES = 30, 50
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from lerobot_memobench.evaluation.documents.evaluation_tables import HOW_TO_READ, rate_row
-from lerobot_memobench.evaluation.documents.sentences import saw_sentence
+from lerobot_memobench.evaluation.documents.sentences import inputs_sentence
 from lerobot_memobench.evaluation.documents.tables import Section, Table, best_in_columns, figure
 from lerobot_memobench.evaluation.documents.wide_tables import all_rates, wide_table
 from lerobot_memobench.evaluation.metrics.rates import METRICS, Rate, percent
-from lerobot_memobench.evaluation.metrics.rollouts import saw
+from lerobot_memobench.evaluation.metrics.rollouts import policy_inputs
 from lerobot_memobench.evaluation.records.runs import Run
 
 
@@ -51,7 +51,7 @@ def _memory_types(method: str, runs: Sequence[Run]) -> Table:
 
 
 def _seen(runs: Sequence[Run]) -> str:
-    return saw_sentence(saw([record for run in runs for record in run.records]))
+    return inputs_sentence(policy_inputs([record for run in runs for record in run.records]))
 
 
 def _best(runs: Sequence[Run]) -> list[str]:

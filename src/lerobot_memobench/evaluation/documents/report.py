@@ -132,7 +132,7 @@ def build(runs: Sequence[Run], paper: bool = False) -> Report:
 
 def _section(summary: Summary, records: Sequence[Record], notes: Sequence[str]) -> Section:
     """Return the section of one evaluation, without a title."""
-    seen = sentences.saw_sentence(summary.saw)
+    seen = sentences.inputs_sentence(summary.inputs)
     made = (tables.memory_types(summary), tables.tasks(summary), tables.prefix(summary), tables.failures(summary))
     return Section(
         "",

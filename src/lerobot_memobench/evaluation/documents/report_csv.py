@@ -11,7 +11,7 @@ from lerobot_memobench.evaluation.metrics.summary import Summary
 from lerobot_memobench.evaluation.records.runs import Run
 from lerobot_memobench.paper import PublishedRow, published_rows
 
-HEADER = ("evaluation", "replan_steps", "table", "name", "figure", "percent", "low", "high", "n", "saw")
+HEADER = ("evaluation", "replan_steps", "table", "name", "figure", "percent", "low", "high", "n", "inputs")
 """``table`` is tasks, memory_types, average, pooled, prefix, ordered_prefix, failures, or extent beside the paper's."""
 
 CsvRow = tuple[object, ...]
@@ -41,14 +41,14 @@ def _run_rows(run: Run) -> Iterator[CsvRow]:
             low,
             high,
             rate.n or None,
-            run.summary.saw,
+            run.summary.inputs,
         )
 
 
 def _extent(run: Run) -> Iterator[CsvRow]:
     """Yield how much was run: beside rows of 30 tasks and 1,500 rollouts."""
     for figure, count in (("tasks", len(run.summary.tasks)), ("rollouts", run.summary.rollouts)):
-        yield (run.name, run.replan_steps, "extent", "", figure, None, None, None, count, run.summary.saw)
+        yield (run.name, run.replan_steps, "extent", "", figure, None, None, None, count, run.summary.inputs)
 
 
 def _published_rows(published: PublishedRow) -> Iterator[CsvRow]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from lerobot_memobench.evaluation.documents.tables import figure
-from lerobot_memobench.evaluation.metrics.rollouts import NOT_RECORDED, Record, saw
+from lerobot_memobench.evaluation.metrics.rollouts import Record, policy_inputs
 from lerobot_memobench.evaluation.metrics.summary import Summary
 from lerobot_memobench.io import count_of
 
@@ -27,20 +27,17 @@ def settings_phrases(records: Sequence[Record]) -> list[str]:
     phrases.append(f"referent {', '.join(referents)}")
     if replans:
         phrases.append(f"replan interval {', '.join(map(str, replans))}")
-    return [*phrases, saw_phrase(saw(records))]
+    return [*phrases, inputs_phrase(policy_inputs(records))]
 
 
-def saw_phrase(words: str) -> str:
-    """Return what a policy saw as a phrase, of `rollouts.saw`."""
-    if words == NOT_RECORDED:
-        return "what the policy saw is not recorded"
-    return f"what the policy saw: {words}" if words.endswith(NOT_RECORDED) else f"the policy saw {words}"
+def inputs_phrase(words: str) -> str:
+    """Return a policy's inputs, of `rollouts.policy_inputs`, as a phrase."""
+    return f"policy inputs: {words}"
 
 
-def saw_sentence(words: str) -> str:
-    """Return what a policy saw as a sentence, of `rollouts.saw`."""
-    phrase = saw_phrase(words)
-    return f"{phrase[0].upper()}{phrase[1:]}."
+def inputs_sentence(words: str) -> str:
+    """Return a policy's inputs, of `rollouts.policy_inputs`, as a sentence."""
+    return f"Policy inputs: {words}."
 
 
 def pooled_sentence(summary: Summary) -> str:

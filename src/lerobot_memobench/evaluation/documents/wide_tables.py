@@ -10,9 +10,9 @@ from lerobot_memobench.evaluation.metrics.summary import Summary
 from lerobot_memobench.evaluation.records.runs import Run, unlike
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 
-LEADING = ("evaluation", "saw", "k")
+LEADING = ("evaluation", "inputs", "k")
 """Columns before the rates."""
-NOTE = "saw: what the policy saw; k: the replan interval."
+NOTE = "inputs: of the policy; k: the replan interval."
 
 
 def overview(runs: Sequence[Run]) -> Table:
@@ -24,7 +24,7 @@ def overview(runs: Sequence[Run]) -> Table:
 
 def run_row(run: Run) -> tuple[Cell, ...]:
     """Return the row of an evaluation."""
-    return (run.name, run.summary.saw, run.replan_steps, *all_rates(run.summary))
+    return (run.name, run.summary.inputs, run.replan_steps, *all_rates(run.summary))
 
 
 def all_rates(summary: Summary) -> list[Rate]:

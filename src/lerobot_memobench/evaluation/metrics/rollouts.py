@@ -64,12 +64,12 @@ def _check_one_version(name: str, group: Sequence[Record]) -> None:
 
 
 NOT_RECORDED = "not recorded"
-"""What is said of a policy of which nobody wrote down what it saw."""
+"""What is said of a policy of which nobody wrote down its inputs."""
 
 
-def saw(records: Iterable[Record]) -> str:
-    """Return what the policy saw, by the rollouts' own words; of how many it is unknown where some tell it."""
-    told = Counter(str(record.get("saw") or NOT_RECORDED) for record in records)
+def policy_inputs(records: Iterable[Record]) -> str:
+    """Return the policy's inputs, by the rollouts' own words; of how many it is unknown where some tell it."""
+    told = Counter(str(record.get("inputs") or NOT_RECORDED) for record in records)
     unknown = told.pop(NOT_RECORDED, 0)
     parts = [*sorted(told), *([f"of {count_of(unknown, 'rollout')} it is {NOT_RECORDED}"] if told and unknown else [])]
     return "; ".join(parts) or NOT_RECORDED
@@ -78,7 +78,7 @@ def saw(records: Iterable[Record]) -> str:
 PROTOCOL: dict[str, Callable[[Record], Any]] = {
     "referent settings": lambda record: str(record.get("referent")),
     "replan intervals": lambda record: str(record.get("replan_steps")),
-    "what the policy saw": lambda record: record.get("saw"),
+    "policy inputs": lambda record: record.get("inputs"),
     "seeds of episode 0": lambda record: None if record.get("seed") is None else record["seed"] - record["episode"],
 }
 """What should agree within one report -> what a record says of it, None where nothing, which is no difference."""

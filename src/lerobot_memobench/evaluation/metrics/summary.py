@@ -24,9 +24,9 @@ from lerobot_memobench.evaluation.metrics.rollouts import (
     by_task,
     completed_in_order,
     operations,
+    policy_inputs,
     prefix,
     satisfied,
-    saw,
 )
 from lerobot_memobench.tasks.task import MEMORY_TYPES, OPERATIONS
 
@@ -46,7 +46,7 @@ class Summary:
         failures_of: the same by task.
         memory_type_of: task -> memory type.
         operations_of: task -> its checkpoints' labels, such as "SUU".
-        saw: what the policy saw.
+        inputs: of the policy, in words.
     """
 
     tasks: dict[str, Row]
@@ -60,7 +60,7 @@ class Summary:
     failures_of: dict[str, dict[str, int]]
     memory_type_of: dict[str, str]
     operations_of: dict[str, str]
-    saw: str
+    inputs: str
 
     @property
     def rollouts(self) -> int:
@@ -95,7 +95,7 @@ def summarise(records: Iterable[Record]) -> Summary:
         failures_of={name: failure_counts(group) for name, group in groups.items()},
         memory_type_of=memory_type_of,
         operations_of={name: operations(group[0]) for name, group in groups.items()},
-        saw=saw(records),
+        inputs=policy_inputs(records),
     )
 
 
@@ -107,7 +107,7 @@ def report(summary: Summary) -> dict[str, Any]:
         "average": _percentages(summary.average),
         "failures": dict(summary.failures),
         "prefix": {name: [percent(rate.value) for rate in rates] for name, rates in summary.prefix.items()},
-        "saw": summary.saw,
+        "inputs": summary.inputs,
     }
 
 

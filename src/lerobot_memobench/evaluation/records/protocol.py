@@ -42,8 +42,8 @@ def read_protocol(folder: str | Path) -> dict[str, Any]:
 
     Keys: ``tasks`` (names, sorted) and ``episodes`` (per task; the largest number where they differ) as asked for, or
     as found in the log where nobody wrote down what was asked for; ``suite``; ``seed_base``, ``referent``,
-    ``prompt_video``, ``prompt_in``, ``horizon``, ``replan_steps``, ``render``, ``render_every`` as far as they are
-    known; ``saw``, what the policy saw; ``policy``, what is known of the policy ({} where nobody wrote it down).
+    ``demonstration_prompt``, ``prompt_in``, ``horizon``, ``replan_steps``, ``render``, ``render_every`` as
+    far as known; ``inputs``, of the policy; ``policy``, what is known of the policy ({} where nobody wrote it down).
 
     Raises:
         MemobenchError: there is no evaluation in the folder.

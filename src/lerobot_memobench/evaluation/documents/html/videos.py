@@ -1,6 +1,6 @@
 """Which video belongs to which rollout, and how it comes into the report's folder.
 
-``env.films`` and ``env.videos`` film episodes as ``<log_dir>/videos/<task>.<episode>.mp4`` (``envs.film``): one frame
+``env.videos`` records episodes as ``<log_dir>/videos/<task>.<episode>.mp4`` (``envs.film``): one frame
 at the start, one per control step of prompt and execution, the last one held. Plain ``lerobot-eval`` leaves
 ``videos/<memory type>_<task id>/eval_episode_<k>.mp4`` of its first ten episodes, without the last frame. In both,
 frame k shows the world after k control steps.

@@ -67,7 +67,7 @@ function stage(episode, moved) {
 
 function emptyStage() {
   const word = el("p", { role: "status" }, "There is no video of this episode.");
-  const hint = "The timeline below is from the log. Evaluate with env.videos=true to film every episode.";
+  const hint = "The timeline below is from the log. Evaluate with videos=-1 to record every episode.";
   const ask = () => word.classList.add("asked");
   return {
     root: el("div", { class: "stage absent" }, word, el("p", { class: "hint" }, hint)),
