@@ -173,12 +173,10 @@ def _plan_protocol(plan: EvaluationPlan) -> dict[str, Any]:
         return {}
     names = sorted(place.task.name for place in plan.grid.places)
     environment = plan.environment
-    seen = (
-        {}
-        if plan.policy is None
-        else {INPUTS: policy_inputs(plan.policy, environment.obs_type, environment.oracle_memory)}
-    )
-    return {"tasks": names, "episodes": plan.grid.runs, **environment.protocol, **seen}
+    found = {"tasks": names, "episodes": plan.grid.runs, **environment.protocol}
+    if plan.policy is not None:
+        found[INPUTS] = policy_inputs(plan.policy, environment.obs_type, environment.oracle_memory)
+    return found
 
 
 def _task_files(plan: EvaluationPlan) -> dict[str, str]:
