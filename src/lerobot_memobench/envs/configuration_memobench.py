@@ -64,7 +64,7 @@ class MemobenchEnvConfig(EnvConfig):
     """The benchmark's 30 tasks, as LeRobot's suites: temporal, spatial, object, procedural.
 
     Args:
-        suite: `published`, or `strict`: the 30 tasks' memory-necessary variants, which cannot be solved without a memory.
+        suite: `published`, or `strict`: memory-necessary variants of the 30 tasks, not solvable without a memory.
         tasks: `all`, memory types or task names, separated by commas.
         task: the same, for those used to LeRobot's field.
         task_dir: a folder in the published format to run instead of the catalogue (one task, or a tree of them), all

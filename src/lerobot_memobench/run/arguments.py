@@ -263,7 +263,7 @@ MEANINGS: dict[str, tuple[Meaning, ...]] = {
         ),
         Meaning(
             "obs_type=",
-            "what is seen: pixels_agent_pos, environment_state_agent_pos or both",
+            "what is observed: pixels_agent_pos, environment_state_agent_pos or both",
             "what the policy was trained on, else pictures",
         ),
         Meaning(

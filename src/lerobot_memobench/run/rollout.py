@@ -52,7 +52,7 @@ def calm_output() -> Iterator[None]:
 
 @contextmanager
 def steered(seed: int | None, ranges: Mapping[tuple[str, int], list[Range]] | None = None) -> Iterator[None]:
-    """While this lasts, LeRobot's loop seeds batches, draws what is looked at, records nothing and runs only ``ranges``.
+    """While this lasts, LeRobot's loop seeds batches, draws what is observed, records nothing and runs only ``ranges``.
 
     Args:
         seed: of the run; batches are not seeded when None.

@@ -56,7 +56,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Both evaluations' names, how many pairs there are, all differences, what a reader must know, each one's inputs."""
+    """Both evaluations' names, number of pairs, all differences, what a reader must know, and each one's inputs."""
 
     a: str
     b: str
