@@ -1,4 +1,4 @@
-"""The reader of BDDL problems."""
+"""Reading and writing of BDDL problems."""
 
 from __future__ import annotations
 
@@ -173,8 +173,7 @@ def test_deep_nesting_is_an_error_not_a_crash(bddl: str) -> None:
         parse_bddl("(" * 50_000)
 
 
-# ==== test_writing.py
-# The writer of BDDL problems.
+# --- writing ---
 
 
 def test_print_and_parse_give_the_same_problem(bddl: str) -> None:

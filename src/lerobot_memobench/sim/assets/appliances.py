@@ -1,7 +1,7 @@
-"""The microwave. Its door is on the local -y side, hinged on the left and opening to q = -2.094.
+"""The microwave and the stove.
 
-The body stands back from its origin: in the published scenes a plate starts where the published microwave's
-door is; here it has room.
+The microwave's door is on the local -y side, hinged on the left and opening to q = -2.094. Its body stands back from
+its origin: in the published scenes a plate starts where the published microwave's door is; here it has room.
 """
 
 from __future__ import annotations
@@ -179,9 +179,7 @@ def _regions(b: Builder) -> dict[str, str]:
     }
 
 
-# ==== stove.py
-# A flat stove with one burner and a knob, as the published scenes have it.
-#
+# Flat stove with one burner and a knob -----------------------------------------------------------
 # The knob's axis is the origin: it stands on the robot's side, the burner plate on the camera's. At q = 0 (off)
 # the knob's ridge runs along the fixture's x axis; turning it on turns the ridge counter-clockwise from above.
 

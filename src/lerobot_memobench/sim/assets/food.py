@@ -1,6 +1,6 @@
-"""Vegetables: tomato, artichoke, broccoli, Brussels sprout. Each fits the gripper across and the drawer in height.
+"""Vegetables and snacks: tomato, artichoke, broccoli, Brussels sprout, bag of snacks, chestnut, biscuit.
 
-Contacts have flat bottoms, so that nothing rolls.
+Vegetables fit the gripper across and the drawer in height; their contacts have flat bottoms, so that nothing rolls.
 """
 
 from __future__ import annotations
@@ -249,9 +249,6 @@ def _sprout(b: Builder) -> Asset:
     b.grasp((0, 0, 0), ALONG_X, 2 * radius, symmetric=True, depth=0.008)
     return b.object((-radius, -radius, -half), (radius, radius, half), round=True)
 
-
-# ==== snacks.py
-# Small food beside the vegetables: a bag of snacks, a chestnut, a biscuit.
 
 # Bag of snacks ---------------------------------------------------------------------------------
 _BAG = (0.0230, 0.0480, 0.0600)

@@ -1,4 +1,4 @@
-"""The room: table, floor, walls and light. The table's top is at z = 0.90 m, its middle at x = y = 0."""
+"""The room: table, floor, walls, light, and a shelf. The table's top is at z = 0.90 m, its middle at x = y = 0."""
 
 from __future__ import annotations
 
@@ -101,8 +101,7 @@ def _table(b: Builder) -> Asset:
     return b.fixture(low=(-x, -y, -TABLE_TOP), high=(x, y, 0.0), regions={}, clear=x)
 
 
-# ==== shelf.py
-# The wooden shelf with two layers, open to local -y and to the back.
+# Wooden shelf with two layers, open to local -y and to the back ----------------------------------
 
 _SHELF_HALF_X = 0.176
 _SHELF_FRONT, _SHELF_BACK = -0.075, 0.116

@@ -1,4 +1,4 @@
-"""Things in boxes and blocks, with labels that can be read: butter, oatmeal, cereal, flour, bean curd."""
+"""Things in boxes, blocks and cartons, with labels that can be read: butter, cereal, flour, milk …"""
 
 from __future__ import annotations
 
@@ -191,8 +191,7 @@ def _bean_curd(b: Builder) -> Asset:
     return _package(b, "bean_curd", (0.0250, 0.0300, 0.0175), _bean_curd_texture, 0.12)
 
 
-# ==== cartons.py
-# Cartons of milk with a gable top.
+# Cartons of milk with a gable top ---------------------------------------------------------------
 
 
 def _carton_mesh(half: Half, shoulder: float, fin: float = 0.009) -> MeshData:

@@ -1,4 +1,7 @@
-"""Bowls and plates. Their origin is the centre of the bottom, so that things put into them lie above it."""
+"""Bowls, plates, a frying pan and a moka pot.
+
+The origin of bowls and plates is the centre of the bottom, so that things put into them lie above it.
+"""
 
 from __future__ import annotations
 
@@ -162,9 +165,6 @@ def _plate(b: Builder) -> Asset:
     r = _PLATE
     return b.object((-r, -r, 0), (r, r, _PLATE_HIGH), round=True, floor=0.005, clear=_PLATE_FLOOR)
 
-
-# ==== cookware.py
-# A frying pan and a moka pot.
 
 # Frying pan: the disc's middle is the origin, the handle points to +y and rises.
 _PAN = 0.102

@@ -21,6 +21,8 @@ LAYER_SIZE = 512
 """Side to which textures are brought, pixels: the largest of the project's own."""
 ROWS = 5
 """Texels per geom in the table: three rows of the pose, colour, material."""
+ROUND = 32
+"""Sides of cylinders and spheres."""
 
 _DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], dtype=np.float32)
 """A geom of this colour shows its material's, as in MuJoCo."""
@@ -28,6 +30,8 @@ _DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], dtype=np.float32)
 VERTEX = np.dtype([("position", "<f4", 3), ("normal", "<f4", 3), ("uv", "<f4", 2), ("geom", "<f4")])
 
 Floats = NDArray[np.float32]
+Triangles = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating], NDArray[np.integer]]
+"""Positions (N, 3), normals (N, 3), texture coordinates (N, 2), triangles (M, 3)."""
 
 
 @dataclass(frozen=True)
@@ -155,14 +159,7 @@ def _layers(model: mujoco.MjModel) -> tuple[NDArray[np.uint8], dict[int, int]]:
     return np.stack(layers), layer_of
 
 
-# ==== shapes.py
-# The triangles of what MuJoCo knows as shapes: meshes, boxes, cylinders, spheres, ellipsoids, capsules.
-
-ROUND = 32
-"""Sides of cylinders and spheres."""
-
-Triangles = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating], NDArray[np.integer]]
-"""Positions (N, 3), normals (N, 3), texture coordinates (N, 2), triangles (M, 3)."""
+# --- the triangles of MuJoCo's shapes: meshes, boxes, cylinders, spheres, ellipsoids, capsules ---
 
 
 def triangles_of(model: mujoco.MjModel, geom: int) -> Triangles:

@@ -270,8 +270,7 @@ class Rasterizer:
         self._resources.free()
 
 
-# ==== views.py
-# What a camera and a light see, as matrices to clip space, and all that the shaders are told of a frame.
+# --- the view of a camera and of a light: matrices to clip space ---
 
 
 class View:
@@ -353,8 +352,7 @@ def light_matrix(model: mujoco.MjModel, data: mujoco.MjData, light: int) -> Floa
     return matrix
 
 
-# ==== shadows.py
-# What a light sees: the depths of all that casts shadows, of which only what has moved is drawn anew.
+# --- shadows: depths as the light sees them; only what has moved is drawn anew ---
 
 
 class ShadowMap:

@@ -1,4 +1,4 @@
-"""GL objects that are made together and freed together."""
+"""GL objects that are made together and freed together, and the GL functions of a frame."""
 
 from __future__ import annotations
 
@@ -10,6 +10,56 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
+
+_TYPES = {
+    "b": ctypes.c_ubyte,
+    "f": ctypes.c_float,
+    "i": ctypes.c_int,
+    "n": ctypes.c_ssize_t,
+    "p": ctypes.c_void_p,
+    "u": ctypes.c_uint,
+}
+_ARGUMENTS = {
+    "glActiveTexture": "u",
+    "glBindBuffer": "uu",
+    "glBindBufferBase": "uuu",
+    "glBindFramebuffer": "uu",
+    "glBindTexture": "uu",
+    "glBindVertexArray": "u",
+    "glBlendFunc": "uu",
+    "glBlitFramebuffer": "iiiiiiiiuu",
+    "glBufferData": "unpu",
+    "glClear": "u",
+    "glClearColor": "ffff",
+    "glDepthMask": "b",
+    "glDisable": "u",
+    "glDrawElements": "uiup",
+    "glEnable": "u",
+    "glFrontFace": "u",
+    "glPixelStorei": "ui",
+    "glPolygonOffset": "ff",
+    "glReadPixels": "iiiiuup",
+    "glUseProgram": "u",
+    "glViewport": "iiii",
+}
+
+
+def frame_calls() -> SimpleNamespace:
+    """Return the GL functions of a frame by their names, without PyOpenGL around them; a context has been opened.
+
+    PyOpenGL converts arguments and asks for errors at every call, a tenth of the time of a frame. Here arrays are given
+    by their address, and one question for errors per frame is the caller's. Set-up calls stay with PyOpenGL.
+    ``glGetError`` gives a number, the others nothing.
+    """
+    from OpenGL.platform import PLATFORM
+
+    library = PLATFORM.GL
+    make = PLATFORM.functionTypeFor(library)
+    calls = {
+        name: make(None, *(_TYPES[letter] for letter in letters))((name, library))
+        for name, letters in _ARGUMENTS.items()
+    }
+    return SimpleNamespace(glGetError=make(ctypes.c_uint)(("glGetError", library)), **calls)
 
 
 class Resources:
@@ -115,58 +165,3 @@ class Resources:
         ):
             if names:
                 delete(len(names), names)
-
-
-# ==== calls.py
-# The GL functions of a frame, called without PyOpenGL around them.
-#
-# PyOpenGL converts arguments and asks for errors at every call, a tenth of the time of a frame. Here arrays are given
-# by their address, and whoever draws asks once per frame. What is called once, to set up, stays with PyOpenGL.
-
-_TYPES = {
-    "b": ctypes.c_ubyte,
-    "f": ctypes.c_float,
-    "i": ctypes.c_int,
-    "n": ctypes.c_ssize_t,
-    "p": ctypes.c_void_p,
-    "u": ctypes.c_uint,
-}
-_ARGUMENTS = {
-    "glActiveTexture": "u",
-    "glBindBuffer": "uu",
-    "glBindBufferBase": "uuu",
-    "glBindFramebuffer": "uu",
-    "glBindTexture": "uu",
-    "glBindVertexArray": "u",
-    "glBlendFunc": "uu",
-    "glBlitFramebuffer": "iiiiiiiiuu",
-    "glBufferData": "unpu",
-    "glClear": "u",
-    "glClearColor": "ffff",
-    "glDepthMask": "b",
-    "glDisable": "u",
-    "glDrawElements": "uiup",
-    "glEnable": "u",
-    "glFrontFace": "u",
-    "glPixelStorei": "ui",
-    "glPolygonOffset": "ff",
-    "glReadPixels": "iiiiuup",
-    "glUseProgram": "u",
-    "glViewport": "iiii",
-}
-
-
-def frame_calls() -> SimpleNamespace:
-    """Return the functions by their names, from the library that PyOpenGL has loaded; a context has been opened.
-
-    ``glGetError`` gives a number, the others nothing.
-    """
-    from OpenGL.platform import PLATFORM
-
-    library = PLATFORM.GL
-    make = PLATFORM.functionTypeFor(library)
-    calls = {
-        name: make(None, *(_TYPES[letter] for letter in letters))((name, library))
-        for name, letters in _ARGUMENTS.items()
-    }
-    return SimpleNamespace(glGetError=make(ctypes.c_uint)(("glGetError", library)), **calls)
