@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -11,8 +12,17 @@ import torch
 from lerobot.configs import PreTrainedConfig
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.memobench_mem import schedule
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+
+
+@pytest.mark.parametrize(("gpu", "fused"), [(True, True), (False, None)])
+def test_the_optimizer_makes_no_copy_on_a_gpu(gpu: bool, fused: bool | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[dict[str, Any]] = []
+    monkeypatch.setattr(schedule, "AdamW", lambda *_, **options: made.append(options))
+    MemobenchMemConfig(device="cpu").get_optimizer_preset().build([SimpleNamespace(is_cuda=gpu)] * 2)  # type: ignore
+    assert made == [{"fused": fused}]
 
 
 def test_a_compiled_model_is_refused() -> None:

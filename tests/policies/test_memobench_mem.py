@@ -21,6 +21,8 @@ from safetensors.torch import load_file, save_file
 from lerobot_memobench.datasets.feature_cache.layout import find_cache
 from lerobot_memobench.datasets.feature_cache.reading import MemoryCache
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem
+from lerobot_memobench.policies.memobench_mem.alignment.objectives import make_alignment
 from lerobot_memobench.policies.memobench_mem.language import tokenizer as tokenizer_module
 from lerobot_memobench.policies.memobench_mem.language.text_encoders import WordTextEncoder
 from lerobot_memobench.policies.memobench_mem.language.tokenizer import (
@@ -320,6 +322,21 @@ def test_lerobots_rollout_loop_runs_on_a_checkpoint(trained: Any) -> None:
 
 
 # -- checkpoints ---------------------------------------------------------------------------------------------------
+
+
+def test_what_a_checkpoint_holds_is_not_drawn_first(trained: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[torch.Tensor] = []
+
+    def noted(*given: Any) -> Any:
+        drawn.append(torch.get_rng_state())
+        return make_alignment(*given)
+
+    monkeypatch.setattr(modeling_memobench_mem, "make_alignment", noted)
+    before = torch.get_rng_state()
+    MemobenchMemPolicy.from_pretrained(trained[4])
+    assert torch.equal(drawn[0], before)
+    MemobenchMemPolicy(copy.deepcopy(trained[0].config))
+    assert not torch.equal(drawn[1], before)
 
 
 def test_evaluation_loads_the_average_and_training_both(trained: Any) -> None:

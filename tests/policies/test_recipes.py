@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import yaml
 from lerobot.configs.train import TrainPipelineConfig
+from lerobot.optim import AdamWConfig
 from safetensors import safe_open
 
 import lerobot_policy_memobench  # noqa: F401  (registers the policy and the environment)
@@ -49,7 +50,7 @@ def test_values_are_the_papers(row: str) -> None:
         0.0,
         1.0,
     )
-    assert type(optimizer).__name__ == "AdamWConfig"
+    assert isinstance(optimizer, AdamWConfig)
     schedule: Any = config.scheduler
     assert (schedule.type, schedule.warmup_fraction) == ("memobench_constant_with_warmup", 0.05)
     assert (config.batch_size, config.steps, config.save_freq) == (64, 80_000, 10_000)

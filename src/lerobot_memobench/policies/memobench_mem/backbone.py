@@ -7,6 +7,7 @@ other attribute and every method stays LeRobot's.
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from copy import deepcopy
 from typing import Any
 
@@ -15,6 +16,7 @@ from einops import rearrange, repeat
 from lerobot.policies.pi05.modeling_pi05 import GemmaConfig, PaliGemmaWithExpertModel, PI05Pytorch
 from lerobot.policies.pi_gemma import PaliGemmaForConditionalGenerationWithPiGemma, PiGemmaForCausalLM
 from torch import Tensor, nn
+from transformers.initialization import no_init_weights
 
 from lerobot_memobench.perception.tower import Tower
 from lerobot_memobench.perception.weights import load_eyes
@@ -70,8 +72,10 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
             vlm = _resize(lerobots.paligemma.config, dims, image_size)
             expert = deepcopy(lerobots.gemma_expert.config)
             expert.vocab_size = dims.vocabulary
-        self.paligemma = PaliGemmaForConditionalGenerationWithPiGemma(config=vlm)
-        self.gemma_expert = PiGemmaForCausalLM(config=expert)
+        # pi0.5's weights replace all of these.
+        with no_init_weights() if config.base_weights else nullcontext():
+            self.paligemma = PaliGemmaForConditionalGenerationWithPiGemma(config=vlm)
+            self.gemma_expert = PiGemmaForCausalLM(config=expert)
         self.gemma_expert.model.embed_tokens = None
         self.to_bfloat16_for_selected_params(config.dtype)
         # After LeRobot's cast, which rounds what it keeps in float32 too: one tower, one cache, at every precision.

@@ -18,7 +18,7 @@ from lerobot_memobench.perception.tower import SIDE
 from lerobot_memobench.perception.weights import PACKAGE, RANDOM
 from lerobot_memobench.policies.memobench_mem.action_objective import OBJECTIVES, REGRESSION
 from lerobot_memobench.policies.memobench_mem.dimensions import GRID, SIZES, Dimensions
-from lerobot_memobench.policies.memobench_mem.schedule import WarmupFractionSchedulerConfig
+from lerobot_memobench.policies.memobench_mem.schedule import FusedAdamWConfig, WarmupFractionSchedulerConfig
 from lerobot_memobench.policies.memobench_mem.settings_memobench_mem import MemobenchMemSettings
 from lerobot_memobench.protocol import CAMERAS, IMAGE_SIZE
 
@@ -270,6 +270,10 @@ class MemobenchMemConfig(MemobenchMemSettings):
     def cache_name(self) -> str:
         """What the name of the memory cache begins with that this policy reads."""
         return f"{self.size}-stride{self.memory_stride}"
+
+    def get_optimizer_preset(self) -> FusedAdamWConfig:
+        """Return the optimizer that lerobot-train takes."""
+        return FusedAdamWConfig(**vars(super().get_optimizer_preset()))
 
     def get_scheduler_preset(self) -> WarmupFractionSchedulerConfig:
         """Return the schedule that lerobot-train takes."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
 from safetensors.torch import load_file
 from torch import Tensor
+from transformers.initialization import no_init_weights
 
 from lerobot_memobench.computing.freed_memory import keep_freed_memory
 from lerobot_memobench.datasets.feature_cache.reading import RecordedFrames
@@ -93,7 +95,9 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
             require_texts(Path(dataset_meta.root), config)
         config.validate_features()
         self.init_rtc_processor()
-        self.model = MemoryPI05(config, rtc_processor=self.rtc_processor)
+        # What a checkpoint holds is not drawn first: at full size that takes two minutes.
+        with nullcontext() if load_base else no_init_weights():
+            self.model = MemoryPI05(config, rtc_processor=self.rtc_processor)
         dims = config.dimensions
         self.alignment = make_alignment(
             config.align, dims.vlm.width, dims.text_dim, config.memory_frames, config.tokens_per_frame
