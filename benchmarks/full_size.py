@@ -20,12 +20,12 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
+from policies import config, observation, training_batch
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.random_weights import random_policy
-from policies import config, observation, training_batch
 
 ARMS: dict[str, dict[str, Any]] = {
     "paper": {"gradient_checkpointing": True},
