@@ -1,4 +1,4 @@
-"""History for training samples: gathered from the memory cache, beside decoding the same frames from the videos.
+"""History for training samples: gathered from the feature cache, beside decoding the same frames from the videos.
 
     python benchmarks/history_loading.py [DATASET] [--size pi05] [--frames 1 8 32] [--samples 16] [--repeats 5]
 
@@ -29,9 +29,9 @@ import numpy as np
 import torch
 from turns import medians, peak, reset_peak, resident
 
-from lerobot_memobench.datasets.feature_cache.building import build_memory_cache
+from lerobot_memobench.datasets.feature_cache.building import build_feature_cache
 from lerobot_memobench.datasets.feature_cache.layout import FOLDER
-from lerobot_memobench.datasets.feature_cache.reading import MemoryCache
+from lerobot_memobench.datasets.feature_cache.reading import FeatureCache
 from lerobot_memobench.policies.memobench_mem.dimensions import SIZES
 from lerobot_memobench.policies.memobench_mem.language.text_encoders import WordTextEncoder
 from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import sample_frames
@@ -90,8 +90,8 @@ def measure(root: Path, size: str, numbers: list[int], samples: int, repeats: in
     from lerobot.datasets.video_utils import decode_video_frames
 
     dim = SIZES[size].vlm.width
-    folder = build_memory_cache(root, CACHE, RandomTokens(dim), WordTextEncoder(8), camera=CAMERA)
-    cache = MemoryCache.open(root, CACHE, frames_key=RandomTokens.key, camera=CAMERA, stride=1)
+    folder = build_feature_cache(root, CACHE, RandomTokens(dim), WordTextEncoder(8), camera=CAMERA)
+    cache = FeatureCache.open(root, CACHE, frames_key=RandomTokens.key, camera=CAMERA, stride=1)
     meta = LeRobotDatasetMetadata(root.name, root=root)
     rng = np.random.default_rng(0)
     length = int(np.diff(cache.episodes).max())

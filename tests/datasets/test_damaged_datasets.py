@@ -19,7 +19,7 @@ import pytest
 from lerobot_memobench.datasets.convert import convert
 from lerobot_memobench.datasets.describe import short_manifest
 from lerobot_memobench.datasets.feature_cache.layout import FORMAT, CacheMeta, read_meta
-from lerobot_memobench.datasets.feature_cache.reading import MemoryCache
+from lerobot_memobench.datasets.feature_cache.reading import FeatureCache
 from lerobot_memobench.datasets.generation import is_finished
 from lerobot_memobench.datasets.hdf5.reading import read_extras
 from lerobot_memobench.datasets.lerobot_format.layout import episode_count, read_manifest
@@ -117,11 +117,11 @@ def infos(folder: Path) -> None:
     pq.write_table(pa.table({"episode_index": [0, 1]}), folder / "meta" / "episodes" / "file-000.parquet")
 
 
-CACHE = "memory_cache/tiny-stride1"
+CACHE = "feature_cache/tiny-stride1"
 
 
 def caches(folder: Path) -> None:
-    """A memory cache of two episodes of three frames."""
+    """A feature cache of two episodes of three frames."""
     meta = CacheMeta(FORMAT, "print", "tower", "words", "camera", 1, 2, 4, 6, ["coarse"], True, True)
     write(folder / CACHE / "meta.json", vars(meta))
     write(folder / CACHE / "texts.json", ["a", "b"])
@@ -140,7 +140,7 @@ def caches(folder: Path) -> None:
 def use_cache(folder: Path) -> None:
     if read_meta(folder, "tiny-stride1") is None:
         return
-    cache = MemoryCache.open(folder, "tiny-stride1", frames_key="tower", camera="camera", stride=1)
+    cache = FeatureCache.open(folder, "tiny-stride1", frames_key="tower", camera="camera", stride=1)
     for index in range(cache.num_frames):
         episode, frame = cache.locate(index)
         assert cache.tokens(episode, [frame]).shape == (1, cache.meta.tokens_per_frame, cache.meta.dim)

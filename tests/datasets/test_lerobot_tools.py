@@ -163,7 +163,7 @@ def test_with_images_it_caches_and_trains(filmed, demos, tmp_path):
         )
     )
     assert (tmp_path / "run" / "checkpoints" / "000001" / "pretrained_model" / "model.safetensors").is_file()
-    (cached,) = [path.parent for path in (folder / "memory_cache").rglob("episodes.npy")]
+    (cached,) = [path.parent for path in (folder / "feature_cache").rglob("episodes.npy")]
     lengths = np.diff(np.load(cached / "episodes.npy"))
     assert lengths.tolist() == [len(demo) for demo in (demos[1], *demos[:2])]
 

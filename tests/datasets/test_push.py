@@ -83,16 +83,16 @@ print(json.dumps(found))
 
 
 def test_push_load_and_stream(hub, folder, tmp_path):
-    (folder / "memory_cache").mkdir()
-    (folder / "memory_cache" / "big.bin").write_bytes(b"0" * 100)
+    (folder / "feature_cache").mkdir()
+    (folder / "feature_cache" / "big.bin").write_bytes(b"0" * 100)
     code = PUSH.format(folder=str(folder), repo=REPO)
     pushed = python(code, hub, tmp_path / "home")
     told, address = pushed.stdout.splitlines()
-    assert told == f"told: the memory caches in {folder} stay here: they are made anew where the dataset is trained on"
+    assert told == f"told: the feature caches in {folder} stay here: they are made anew where the dataset is trained on"
     assert address == f"{hub.address}/datasets/{REPO}", pushed.stderr
     there = hub.repos[REPO]
     ours = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
-    assert set(there) - {".gitattributes"} == {n for n in ours if not n.startswith((".cache", "memory_cache"))}
+    assert set(there) - {".gitattributes"} == {n for n in ours if not n.startswith((".cache", "feature_cache"))}
     same = {name for name in there if name not in (".gitattributes", "README.md")}
     assert all(there[name] == (folder / name).read_bytes() for name in same)
     assert list(hub.tags[REPO]) == ["v3.0"]
@@ -130,11 +130,11 @@ def test_an_earlier_larger_dataset_leaves_nothing(hub, folder, make_demo, tmp_pa
     earlier = Path(shutil.copytree(folder, tmp_path / "earlier"))
     table = next((earlier / "data").rglob("*.parquet"))
     shutil.copy(table, table.with_name("file-001.parquet"))  # as of a dataset of two files
-    for extra in ("hdf5/old_demo.hdf5", "memory_cache/old/tokens.bin", "states/chunk-000/file-001.parquet"):
+    for extra in ("hdf5/old_demo.hdf5", "feature_cache/old/tokens.bin", "states/chunk-000/file-001.parquet"):
         (earlier / extra).parent.mkdir(parents=True, exist_ok=True)
         (earlier / extra).write_bytes(b"old")
     assert python(PUSH.format(folder=str(earlier), repo=REPO), hub, tmp_path / "home").returncode == 0
-    hub.repos[REPO] |= {"memory_cache/old/tokens.bin": b"old", "hdf5/old_demo.hdf5": b"old", "notes.md": b"mine"}
+    hub.repos[REPO] |= {"feature_cache/old/tokens.bin": b"old", "hdf5/old_demo.hdf5": b"old", "notes.md": b"mine"}
     hub.requests.clear()
     pushed = python(PUSH.format(folder=str(folder), repo=REPO), hub, tmp_path / "home")
     assert (
@@ -156,18 +156,18 @@ LeRobotDataset({repo!r}, root={folder!r}).push_to_hub()
 """
 
 
-def test_lerobots_own_push_leaves_memory_caches_here(hub, folder, tmp_path):
+def test_lerobots_own_push_leaves_feature_caches_here(hub, folder, tmp_path):
     keep_from_the_hub(folder)
-    (folder / "memory_cache" / "tiny").mkdir(parents=True)
-    (folder / "memory_cache" / "tiny" / "tokens.bin").write_bytes(b"0" * 100)
+    (folder / "feature_cache" / "tiny").mkdir(parents=True)
+    (folder / "feature_cache" / "tiny" / "tokens.bin").write_bytes(b"0" * 100)
     pushed = python(LEROBOTS_PUSH.format(folder=str(folder), repo=REPO), hub, tmp_path / "home")
     assert pushed.returncode == 0, pushed.stderr
     assert "meta/info.json" in hub.repos[REPO]
-    assert [name for name in hub.repos[REPO] if name.startswith("memory_cache")] == []
+    assert [name for name in hub.repos[REPO] if name.startswith("feature_cache")] == []
     (folder / ".gitignore").write_text("mine\n")
     keep_from_the_hub(folder)
     keep_from_the_hub(folder)
-    assert (folder / ".gitignore").read_text() == "mine\n/memory_cache/\n"
+    assert (folder / ".gitignore").read_text() == "mine\n/feature_cache/\n"
 
 
 def test_the_card_on_the_hub_loads_from_there(hub, folder, tmp_path):

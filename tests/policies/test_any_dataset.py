@@ -179,7 +179,7 @@ def test_names_are_mapped_in_training_and_acting(size: str, tmp_path: Path) -> N
     root = other.write(tmp_path / "other")
     flags = (f"--policy.path={checkpoint}", f"--rename_map={json.dumps(renamed)}")
     on = train(root, tmp_path / "on", *flags, size=None)
-    shown = {json.loads(file.read_text())["camera"] for file in root.glob("memory_cache/*/meta.json")}
+    shown = {json.loads(file.read_text())["camera"] for file in root.glob("feature_cache/*/meta.json")}
     assert "observation.image.b" in shown, "what is remembered is the dataset's column of that camera"
     assert shown <= other.cameras.keys()
     policy, *pipelines = loaded(on, **renamed)
@@ -203,13 +203,13 @@ def test_a_memory_camera_is_one_that_is_seen(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("size", ["tiny", "small"])
-def test_no_memory_makes_no_memory_cache(size: str, tmp_path: Path) -> None:
+def test_no_memory_makes_no_feature_cache(size: str, tmp_path: Path) -> None:
     robot = Foreign()
     root = robot.write(tmp_path / "data")
     policy, *pipelines = loaded(train(root, tmp_path / "run", "--policy.integration=none", size=size))
     assert act(robot, policy, *pipelines).isfinite().all()
     # Eyes keep what they see of present pictures, with or without a memory; nothing is kept to be remembered.
-    assert [file.name.split("-")[1] for file in root.glob("memory_cache/*/")] == (
+    assert [file.name.split("-")[1] for file in root.glob("feature_cache/*/")] == (
         ["present"] if size == "small" else []
     )
 
@@ -230,7 +230,7 @@ def test_texts_that_are_not_there_are_refused_before_anything_is_built(
     monkeypatch.setattr(modeling_memobench_mem, "MemoryPI05", None)
     with pytest.raises(MemobenchError, match=said):
         train(root, tmp_path / "run", f"--policy.{flag}")
-    assert not (root / "memory_cache").exists()
+    assert not (root / "feature_cache").exists()
 
 
 def test_more_numbers_than_loaded_weights_have_room_for_are_refused() -> None:

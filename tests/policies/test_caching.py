@@ -1,4 +1,4 @@
-"""The memory cache as training and `memobench cache` make it: found, finished, side by side, elsewhere."""
+"""The feature cache as training and `memobench cache` make it: found, finished, side by side, elsewhere."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import torch
 
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.datasets.feature_cache.layout import FOLDER
-from lerobot_memobench.datasets.feature_cache.reading import MemoryCache
+from lerobot_memobench.datasets.feature_cache.reading import FeatureCache
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset, load_perception, open_cache
 from lerobot_memobench.policies.memobench_mem.perception.pixels import PixelPerception
 from tests.support.object_dataset import make_object_dataset
 from tests.support.small_policy import made_for_training, small_config
 
 
-def _opened(root: Path, **fields: Any) -> MemoryCache:
+def _opened(root: Path, **fields: Any) -> FeatureCache:
     """The cache that a policy opens when it is made to train."""
     config = small_config(**fields)
     return open_cache(root, config, load_perception(config))

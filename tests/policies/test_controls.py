@@ -16,7 +16,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
 
 from lerobot_memobench.datasets.feature_cache.layout import FOLDER
-from lerobot_memobench.datasets.feature_cache.reading import MemoryCache
+from lerobot_memobench.datasets.feature_cache.reading import FeatureCache
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
 from lerobot_memobench.policies.memobench_mem.language.text_encoders import WordTextEncoder
@@ -202,7 +202,7 @@ def test_a_dataset_without_the_columns_is_refused(dataset_root: Path, tmp_path: 
     folder = cache_dataset(root, small_config())
     meta = json.loads((folder / "meta.json").read_text())
     keys = {key: meta[key] for key in ("frames_key", "camera", "stride")}
-    cache = MemoryCache.open(root, folder.name, **keys)
+    cache = FeatureCache.open(root, folder.name, **keys)
     with pytest.raises(MemobenchError, match=r"coarse_subgoal.*levels it has: intermediate, fine"):
         cache.text_rows("coarse")
     with pytest.raises(MemobenchError, match="no column 'memory'"):

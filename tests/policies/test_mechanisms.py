@@ -62,7 +62,7 @@ def test_rows_of_a_rollout_and_the_cache_agree(name: str) -> None:
     episode, mechanism = Recorded(-(-length // stride), stride), make_mechanism(name, 5)
 
     class Cache:
-        """One episode, as `MemoryCache` has it."""
+        """One episode, as `FeatureCache` has it."""
 
         meta = type("Meta", (), {"stride": stride})
         episodes, phase, texts = torch.tensor([0, length]).numpy(), torch.ones(length).numpy(), ()

@@ -19,7 +19,7 @@ from lerobot.processor import TokenizerProcessorStep
 from safetensors.torch import load_file, save_file
 
 from lerobot_memobench.datasets.feature_cache.layout import find_cache
-from lerobot_memobench.datasets.feature_cache.reading import MemoryCache
+from lerobot_memobench.datasets.feature_cache.reading import FeatureCache
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem
 from lerobot_memobench.policies.memobench_mem.alignment.objectives import make_alignment
@@ -579,7 +579,7 @@ def test_word_text_encoder_tells_texts_apart() -> None:
 def test_cache_of_one_dataset_is_not_used_for_another(trained: Any) -> None:
     contents = {"frames_key": trained[0].perception.key, "camera": "observation.images.image", "stride": 1}
     root = Path(trained[3].root)
-    cache = MemoryCache.open(root, find_cache(root, "tiny-stride1", **contents).name, **contents)
+    cache = FeatureCache.open(root, find_cache(root, "tiny-stride1", **contents).name, **contents)
     step = GatherMemoryProcessorStep(frames=4, cache=cache)
-    with pytest.raises(MemobenchError, match="outside the memory cache"):
+    with pytest.raises(MemobenchError, match="outside the feature cache"):
         step.gather(cache, [10_000])

@@ -224,7 +224,7 @@ def cache(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for memory caches (policy.memory_cache_dir); memory_cache in the dataset's by default."
+            help="Folder for feature caches (policy.memory_cache_dir); feature_cache in the dataset's by default."
         ),
     ] = None,
     workers: Annotated[
@@ -253,7 +253,7 @@ def cache(
             progress=count,
             tell=lambda said: screen.print(said, soft_wrap=True),
         )
-    screen.print(f"memory cache: {folder}", soft_wrap=True)
+    screen.print(f"feature cache: {folder}", soft_wrap=True)
 
 
 def validate(

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from huggingface_hub import HfApi
 
 PARTS = (MANIFEST_FILE, "data/**", "meta/**", "states/**", "videos/**")
-"""What is uploaded beside the card: the dataset, and nothing that was later put beside it, such as a memory cache."""
+"""What is uploaded beside the card: the dataset, and nothing that was later put beside it, such as a feature cache."""
 HDF5 = f"{HDF5_FOLDER}/**"
-DERIVED = "memory_cache/**"
+DERIVED = "feature_cache/**"
 """Made from a dataset's frames on the machine that trains; one on the hub is of frames that are replaced."""
 
 
@@ -40,7 +40,7 @@ def push(
     """Upload a finished dataset; return its address. The same call continues an upload that was broken off.
 
     The repository then holds this dataset and no file of an earlier one: what it had in the dataset's folders, HDF5
-    files and memory caches, and what is not uploaded now, is deleted (its history keeps it). The card says how to load
+    files and feature caches, and what is not uploaded now, is deleted (its history keeps it). The card says how to load
     it from there.
 
     Args:
@@ -69,7 +69,7 @@ def push(
     card = hub_card(folder, repo_id)
     parts = [*PARTS, *([HDF5] if hdf5 else [])]
     if (folder / DERIVED.removesuffix("/**")).is_dir():
-        tell(f"the memory caches in {folder} stay here: they are made anew where the dataset is trained on")
+        tell(f"the feature caches in {folder} stay here: they are made anew where the dataset is trained on")
     api = HfApi(token=token)
     with _told(repo_id):
         repo_id = api.create_repo(repo_id, repo_type="dataset", private=private, exist_ok=True).repo_id

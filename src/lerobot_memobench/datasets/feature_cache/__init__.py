@@ -1,4 +1,4 @@
-"""Memory cache: what a memory policy would otherwise recompute for every sample, made once beside the dataset.
+"""Feature cache: what a memory policy would otherwise recompute for every sample, made once beside the dataset.
 
 It holds the pooled tokens of the frozen vision tower for every ``stride``-th frame of one camera, the embedding of
 every subgoal text, and per frame its phase and subgoal. Everything large is memory-mapped, so training gathers 32

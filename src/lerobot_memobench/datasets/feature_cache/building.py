@@ -1,4 +1,4 @@
-"""Make a memory cache, or finish one."""
+"""Make a feature cache, or finish one."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ MOST_THREADS = 8
 
 
 def _warn(folder: Path) -> None:
-    logger.warning("Another process is making the memory cache %s; waiting for it to finish.", folder)
+    logger.warning("Another process is making the feature cache %s; waiting for it to finish.", folder)
 
 
-def build_memory_cache(
+def build_feature_cache(
     root: Path,
     name: str,
     frames: FrameEncoder,
@@ -64,7 +64,7 @@ def build_memory_cache(
     tell: Callable[[str], None] = logger.info,
     wait: Callable[[Path], None] = _warn,
 ) -> Path:
-    """Build, or finish building, the cache ``<root>/memory_cache/<name>``; a fitting complete one is left alone.
+    """Build, or finish building, the cache ``<root>/feature_cache/<name>``; a fitting complete one is left alone.
 
     A killed build goes on with the first episode it did not finish. A cache that does not fit is made again. A second
     builder (another rank) waits, and finds the work done. Room for the whole is taken on the disk before anything is
@@ -186,12 +186,12 @@ class _Work:
         """Say what will be made, and take away what lies in its place."""
         if self.folder.exists():
             self.tell(
-                f"The memory cache {self.folder} cannot be used (its dataset has changed since, or an earlier version "
+                f"The feature cache {self.folder} cannot be used (its dataset has changed since, or an earlier version "
                 "made it): it is made again."
             )
             shutil.rmtree(self.folder)
         self.tell(
-            f"The memory cache {self.folder} takes {in_words(self.meta.bytes)}: {self.meta.slots:,} frames of "
+            f"The feature cache {self.folder} takes {in_words(self.meta.bytes)}: {self.meta.slots:,} frames of "
             f"{in_words(self.meta.frame_bytes)}; {in_words(free_bytes(self.folder))} are free there."
         )
 
@@ -252,7 +252,7 @@ def require_room(place: Path, folders: Mapping[Path, int]) -> None:
 def no_room(folder: Path, found: str) -> MemobenchError:
     """Return the error of a disk that is full; ``found`` says how one knows."""
     return MemobenchError(
-        f"The memory cache {folder} does not fit on its disk: {found}; make room, store fewer frames "
+        f"The feature cache {folder} does not fit on its disk: {found}; make room, store fewer frames "
         f"(--policy.memory_stride, `memobench cache --stride`), or {_ELSEWHERE}."
     )
 
@@ -271,7 +271,7 @@ def telling_of_the_disk(folder: Path) -> Iterator[None]:
             raise no_room(folder, f"it is full ({error.strerror})") from error
         if error.errno in _CLOSED and error.filename is not None and _is_of(Path(error.filename), folder):
             raise MemobenchError(
-                f"The memory cache {folder} cannot be written ({error.strerror}); {_ELSEWHERE}."
+                f"The feature cache {folder} cannot be written ({error.strerror}); {_ELSEWHERE}."
             ) from error
         raise
 
@@ -282,7 +282,7 @@ def _is_of(path: Path, folder: Path) -> bool:
 
 
 # ==== tables.py
-# Everything of a memory cache but its tokens: small tables, and the embeddings of the subgoal texts.
+# Everything of a feature cache but its tokens: small tables, and the embeddings of the subgoal texts.
 
 
 class TextEncoder(Protocol):
@@ -373,7 +373,7 @@ def _save_array(path: Path, array: np.ndarray, *, durable: bool = False) -> None
 
 
 # ==== encoding.py
-# The tokens of a memory cache: every stored frame through the frozen vision tower, episode by episode.
+# The tokens of a feature cache: every stored frame through the frozen vision tower, episode by episode.
 
 Progress = Callable[[int, int], None]
 """Called as progress(episodes done, episodes in all)."""

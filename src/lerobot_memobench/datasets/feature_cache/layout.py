@@ -1,8 +1,8 @@
-"""Where a memory cache lies, what is in it, and whether it fits.
+"""Where a feature cache lies, what is in it, and whether it fits.
 
 Caches made with another tower (weights, input size, pooling), camera or stride have other names and lie side by side.
 
-Layout of ``<dataset>/memory_cache/<name>/``, or of ``<name>/`` in a folder that was chosen for caches::
+Layout of ``<dataset>/feature_cache/<name>/``, or of ``<name>/`` in a folder that was chosen for caches::
 
     meta.json       what the cache was made from (keys), sizes, and whether it is complete
     tokens.bin      bfloat16 (slots, P, D), seen as uint16; slot = one stored frame, episodes one after the other
@@ -27,7 +27,7 @@ import numpy as np
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import read_json, short
 
-FOLDER = "memory_cache"
+FOLDER = "feature_cache"
 FORMAT = 2
 META_FILE, TOKENS_FILE, DONE_FILE, TEXTS_FILE = "meta.json", "tokens.bin", "done.npy", "texts.json"
 _SAMPLE = 1 << 16
@@ -100,7 +100,7 @@ def read_meta(root: Path, name: str, place: Path | None = None) -> CacheMeta | N
     path = (place or Path(root) / FOLDER) / name / META_FILE
     if not path.is_file():
         return None
-    advice = f"it is not a memory cache this version can read. {fix_hint(Path(root))}"
+    advice = f"it is not a feature cache this version can read. {fix_hint(Path(root))}"
     found = read_json(path, META_SCHEMA, advice)
     if set(found) != set(META_SCHEMA.__annotations__) or min(map(found.__getitem__, SIZES)) < 1:
         raise MemobenchError(f"{path}: {advice}")

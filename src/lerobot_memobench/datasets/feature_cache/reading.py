@@ -1,4 +1,4 @@
-"""Read a complete memory cache, through memory maps."""
+"""Read a complete feature cache, through memory maps."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class FrameLookup(ABC):
         """Episode and frame in it, of a frame of the dataset's global index."""
         if not 0 <= index < self.num_frames:
             raise MemobenchError(
-                f"Frame {index} lies outside the memory cache {self.folder}, which has {self.num_frames} frames. "
+                f"Frame {index} lies outside the feature cache {self.folder}, which has {self.num_frames} frames. "
                 f"{fix_hint(self.root)}"
             )
         episode = int(np.searchsorted(self.episodes, index, "right")) - 1
@@ -109,7 +109,7 @@ class FrameLookup(ABC):
         return self.subgoal_rows[level]
 
 
-class MemoryCache(FrameLookup):
+class FeatureCache(FrameLookup):
     """A complete cache, read through memory maps. Open one with :meth:`open`."""
 
     def __init__(self, folder: Path, meta: CacheMeta, texts_key: str | None = None) -> None:
@@ -158,8 +158,8 @@ class MemoryCache(FrameLookup):
         stride: int,
         texts_key: str | None = None,
         place: Path | None = None,
-    ) -> MemoryCache:
-        """Open ``<root>/memory_cache/<name>`` after checking that it fits.
+    ) -> FeatureCache:
+        """Open ``<root>/feature_cache/<name>`` after checking that it fits.
 
         Args:
             root: folder of the LeRobotDataset.
@@ -174,7 +174,7 @@ class MemoryCache(FrameLookup):
         root = Path(root)
         meta, folder = read_meta(root, name, place), (place or root / FOLDER) / name
         if meta is None:
-            raise MemobenchError(f"{folder.parent} has no memory cache '{name}'. {fix_hint(root)}")
+            raise MemobenchError(f"{folder.parent} has no feature cache '{name}'. {fix_hint(root)}")
         wanted = {
             "format": FORMAT,
             "dataset": dataset_fingerprint(root, camera),
@@ -186,15 +186,15 @@ class MemoryCache(FrameLookup):
         if reason is None and texts_key is not None and not (folder / texts_file(meta.texts_key, texts_key)).is_file():
             reason = "is foreign: another text encoder made it"
         if reason:
-            raise MemobenchError(f"The memory cache {folder} {reason}. {fix_hint(root)}")
+            raise MemobenchError(f"The feature cache {folder} {reason}. {fix_hint(root)}")
         if not meta.complete:
-            raise MemobenchError(f"The memory cache {folder} is not finished. Go on with `memobench cache {root}`.")
+            raise MemobenchError(f"The feature cache {folder} is not finished. Go on with `memobench cache {root}`.")
         try:
             return cls(folder, meta, texts_key)
         except Exception as error:  # NumPy answers damaged arrays with errors of every type
             told = " ".join(str(error).split())[:200]
             raise MemobenchError(
-                f"The memory cache {folder} is damaged ({told}). Delete that folder. {fix_hint(root)}"
+                f"The feature cache {folder} is damaged ({told}). Delete that folder. {fix_hint(root)}"
             ) from None
 
     def all_tokens(self) -> Tensor:

@@ -1,4 +1,4 @@
-"""The memory cache of a dataset, made and opened with the frozen towers of a policy."""
+"""The feature cache of a dataset, made and opened with the frozen towers of a policy."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Any
 import torch
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
-from lerobot_memobench.datasets.feature_cache.building import Progress, build_memory_cache
+from lerobot_memobench.datasets.feature_cache.building import Progress, build_feature_cache
 from lerobot_memobench.datasets.feature_cache.frames import read_frame_table
 from lerobot_memobench.datasets.feature_cache.layout import find_cache
 from lerobot_memobench.datasets.feature_cache.reading import (
+    FeatureCache,
     FrameLookup,
-    MemoryCache,
     RecordedFrames,
     RecordedTexts,
     read_recorded,
@@ -74,7 +74,7 @@ def load_perception(config: MemobenchMemConfig, weights: str | Path | None = Non
     """
     if config.sees_objects:
         raise MemobenchError(
-            "perception=objects needs no memory cache where the environment tells the objects: training reads the "
+            "perception=objects needs no feature cache where the environment tells the objects: training reads the "
             "dataset's columns; leave this command out, or name eyes that find them."
         )
     with torch.device("meta"):
@@ -111,7 +111,7 @@ def cache_dataset(
         tell: told where it lies and how large it will be, before it is made.
 
     Returns:
-        The cache's folder, ``<root>/memory_cache/<size>-stride<n>-<hash>``, or below ``config.memory_cache_dir``; with
+        The cache's folder, ``<root>/feature_cache/<size>-stride<n>-<hash>``, or below ``config.memory_cache_dir``; with
         eyes that of the memory's, beside which those of the present lie.
     """
     config.memory_camera = config.memory_camera or next(iter(cameras_of(root)), None)
@@ -157,7 +157,7 @@ def open_frames(root: Path, config: MemobenchMemConfig, perception: Perception) 
     )
 
 
-def open_cache(root: Path, config: MemobenchMemConfig, perception: PixelPerception) -> MemoryCache:
+def open_cache(root: Path, config: MemobenchMemConfig, perception: PixelPerception) -> FeatureCache:
     """Open the cache that ``config`` reads of the dataset at ``root``; make or finish it first where that is needed.
 
     Of several processes (the ranks of a training run) one makes it, and the others wait.
@@ -169,9 +169,9 @@ def open_cache(root: Path, config: MemobenchMemConfig, perception: PixelPercepti
         root,
         config,
         perception,
-        progress=lambda done, count: logger.info("memory cache: %d of %d episodes", done, count),
+        progress=lambda done, count: logger.info("feature cache: %d of %d episodes", done, count),
     )
-    return MemoryCache.open(
+    return FeatureCache.open(
         root,
         folder.name,
         frames_key=perception.key,
@@ -186,7 +186,7 @@ def _build(root: Path, config: MemobenchMemConfig, perception: PixelPerception, 
     """Make or finish the cache of what ``perception`` remembers, beside the dataset or where ``config`` says."""
     seen: dict[str, Any] = {"camera": _column(root, perception), "stride": config.memory_stride}
     folder = find_cache(root, config.cache_name, frames_key=perception.key, place=config.cache_place, **seen)
-    return build_memory_cache(root, folder.name, perception, _text_encoder(config), place=folder.parent, **seen, **how)
+    return build_feature_cache(root, folder.name, perception, _text_encoder(config), place=folder.parent, **seen, **how)
 
 
 def _column(root: Path, perception: PixelPerception) -> str:

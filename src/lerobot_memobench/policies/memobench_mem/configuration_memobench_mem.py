@@ -234,7 +234,7 @@ class MemobenchMemConfig(MemobenchMemSettings):
 
     @property
     def cache_place(self) -> Path | None:
-        """Folder that holds memory caches; None: the one beside each dataset."""
+        """Folder that holds feature caches; None: the one beside each dataset."""
         return None if self.memory_cache_dir is None else Path(self.memory_cache_dir).expanduser()
 
     @property
@@ -268,7 +268,7 @@ class MemobenchMemConfig(MemobenchMemSettings):
 
     @property
     def cache_name(self) -> str:
-        """What the name of the memory cache begins with that this policy reads."""
+        """What the name of the feature cache begins with that this policy reads."""
         return f"{self.size}-stride{self.memory_stride}"
 
     def get_optimizer_preset(self) -> FusedAdamWConfig:

@@ -5,7 +5,7 @@ and leaves no say in where an episode begins. What it does ask the configuration
 end; our answer is none, and carries for its sampler where each episode's execution begins and how many of its frames
 follow one another in the order. The sampler is LeRobot's, and any other answer leaves it as it was; a sampler that
 takes ours for a number would draw prompts, and is refused. Histories still hold the prompt, because they come from the
-memory cache.
+feature cache.
 
 Where tasks are balanced, an epoch has as many frames as otherwise, but not each of them once: tasks whose episodes are
 short would else be a small part of every batch, and they learned several times slower than the others.

@@ -1,4 +1,4 @@
-"""What eyes find in a dataset's pictures, made once for every frame: a memory cache of slots instead of tokens.
+"""What eyes find in a dataset's pictures, made once for every frame: a feature cache of slots instead of tokens.
 
 A cache holds bfloat16 numbers, which know places to 4 mm. So a slot's number is kept as two: what it is rounded to, and
 what that leaves of it.
@@ -16,10 +16,10 @@ import torch
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from lerobot_memobench.datasets.feature_cache.building import TextEncoder, build_memory_cache
+from lerobot_memobench.datasets.feature_cache.building import TextEncoder, build_feature_cache
 from lerobot_memobench.datasets.feature_cache.frames import FrameReader, frame_reader
 from lerobot_memobench.datasets.feature_cache.layout import find_cache
-from lerobot_memobench.datasets.feature_cache.reading import MemoryCache, read_recorded
+from lerobot_memobench.datasets.feature_cache.reading import FeatureCache, read_recorded
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.perception.found import VIEWS, ObjectsInPictures
 from lerobot_memobench.sim.object_layout import SIZE
@@ -52,11 +52,11 @@ class SlotEncoder:
 
 def make_found(
     root: Path, config: MemobenchMemConfig, look: ObjectsInPictures, texts: TextEncoder, **how: Any
-) -> MemoryCache:
+) -> FeatureCache:
     """Make or finish the cache of what is found in the pictures of the dataset at ``root``.
 
     Args:
-        how: of `build_memory_cache`.
+        how: of `build_feature_cache`.
 
     Raises:
         MemobenchError: the dataset lacks a camera, or the disk has no room.
@@ -64,8 +64,8 @@ def make_found(
     where: dict[str, Any] = {"camera": next(iter(VIEWS)), "stride": 1}
     folder = find_cache(root, "objects", frames_key=look.key, place=config.cache_place, **where)
     where["place"] = folder.parent
-    build_memory_cache(root, folder.name, SlotEncoder(look), texts, read=_reader(root), **where, **how)
-    return MemoryCache.open(root, folder.name, frames_key=look.key, **where)
+    build_feature_cache(root, folder.name, SlotEncoder(look), texts, read=_reader(root), **where, **how)
+    return FeatureCache.open(root, folder.name, frames_key=look.key, **where)
 
 
 def _reader(root: Path) -> FrameReader:

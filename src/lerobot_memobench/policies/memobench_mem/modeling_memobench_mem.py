@@ -80,7 +80,7 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
         """Build the policy from scratch, or from ``config.base_weights``.
 
         Args:
-            dataset_meta: metadata of the dataset to train on; its memory cache is checked, and made or finished.
+            dataset_meta: metadata of the dataset to train on; its feature cache is checked, and made or finished.
             load_base: whether this is all; not when a checkpoint follows, with which training begins.
         """
         # As PI05Policy.__init__, which names its model class.

@@ -1,6 +1,6 @@
 """What eyes see in a dataset, made once: all tokens of every picture, and pooled ones of what is remembered.
 
-Both are memory caches (`datasets.memory_cache`), so they are found, finished, waited for and refused alike: one of each
+Both are feature caches (`datasets.feature_cache`), so they are found, finished, waited for and refused alike: one of each
 camera's present pictures, at every frame, and the memory's. The memory's is pooled from its camera's, so no video is
 decoded twice. Training samples are then made of the dataset's columns in main memory and of tokens that are read where
 they lie (`recorded_items`).
@@ -20,11 +20,11 @@ from torch import Tensor
 from lerobot_memobench.datasets.feature_cache.building import (
     FrameEncoder,
     TextEncoder,
-    build_memory_cache,
+    build_feature_cache,
     require_room,
 )
 from lerobot_memobench.datasets.feature_cache.layout import find_cache
-from lerobot_memobench.datasets.feature_cache.reading import MemoryCache, RecordedFrames, read_recorded
+from lerobot_memobench.datasets.feature_cache.reading import FeatureCache, RecordedFrames, read_recorded
 from lerobot_memobench.datasets.lerobot_format.layout import read_info
 from lerobot_memobench.envs.prompting import name_in_data
 from lerobot_memobench.io import in_words
@@ -63,10 +63,10 @@ class Wanted:
     tokens: FrameEncoder
     folder: Path
 
-    def open(self, root: Path) -> MemoryCache:
+    def open(self, root: Path) -> FeatureCache:
         """Open it, which is there."""
         how: dict[str, Any] = {"camera": self.camera, "stride": self.stride, "place": self.folder.parent}
-        return MemoryCache.open(root, self.folder.name, frames_key=self.tokens.key, **how)
+        return FeatureCache.open(root, self.folder.name, frames_key=self.tokens.key, **how)
 
 
 def make_caches(
@@ -77,11 +77,11 @@ def make_caches(
     *,
     tell: Callable[[str], None] = logger.info,
     **how: Any,
-) -> tuple[MemoryCache | None, dict[str, MemoryCache]]:
+) -> tuple[FeatureCache | None, dict[str, FeatureCache]]:
     """Make or finish what ``eyes`` see of the dataset at ``root``; how large it will be is told before.
 
     Args:
-        how: of `build_memory_cache`.
+        how: of `build_feature_cache`.
 
     Returns:
         The memory's cache, None where nothing is remembered, and those of the present pictures by their cameras' names
@@ -127,7 +127,7 @@ class Busy(Exception):
 
 
 def come_back(folder: Path) -> None:
-    """Wait for no other process: a ``wait`` of `build_memory_cache`.
+    """Wait for no other process: a ``wait`` of `build_feature_cache`.
 
     Raises:
         Busy: in any case.
@@ -137,7 +137,7 @@ def come_back(folder: Path) -> None:
 
 def _make(root: Path, cache: Wanted, texts: TextEncoder, **how: Any) -> None:
     named: dict[str, Any] = {"camera": cache.camera, "stride": cache.stride, "place": cache.folder.parent}
-    build_memory_cache(root, cache.folder.name, cache.tokens, texts, **named, **how)
+    build_feature_cache(root, cache.folder.name, cache.tokens, texts, **named, **how)
 
 
 def _wanted(root: Path, config: MemobenchMemConfig, eyes: EyePerception, cameras: Sequence[str]) -> list[Wanted]:

@@ -117,7 +117,7 @@ class MemobenchMemSettings(PI05Config):
     """Every how many control steps a frame enters the history (and the cache); none: 8 with objects and
     with eyes, 1 with other pixels."""
     memory_cache_dir: str | None = None
-    """Folder for memory caches, of several datasets perhaps; none: ``memory_cache`` in the dataset's folder."""
+    """Folder for feature caches, of several datasets perhaps; none: ``feature_cache`` in the dataset's folder."""
 
     # -- training
     objective: str = SIZES_OWN

@@ -1,4 +1,4 @@
-"""The memory of training samples: a mechanism recalls it from the dataset's memory cache."""
+"""The memory of training samples: a mechanism recalls it from the dataset's feature cache."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import Frame, Mem
 
 
 class CachedEpisode:
-    """The stored frames of one episode of a memory cache; see `EpisodeFrames`."""
+    """The stored frames of one episode of a feature cache; see `EpisodeFrames`."""
 
     def __init__(self, cache: FrameLookup, episode: int) -> None:
         self.cache, self.episode = cache, episode

@@ -1,4 +1,4 @@
-"""Memory, phase and subgoals of training samples, looked up in the memory cache.
+"""Memory, phase and subgoals of training samples, looked up in the feature cache.
 
 LeRobot keeps of a training batch only what its transition knows, and that is the frame's global ``index``; phase,
 subgoals and history are therefore all looked up by it. Rollouts carry no ``index``; there the policy itself keeps the

@@ -1,4 +1,4 @@
-"""What a training reads: the policy's configuration, its dataset's memory cache and what its prompts say.
+"""What a training reads: the policy's configuration, its dataset's feature cache and what its prompts say.
 
 It belongs to the policy that is trained, to its processors, and to nobody else in the process: a configuration and a
 dataset know their trainings weakly. LeRobot rebuilds a saved pipeline (resume, starting from a checkpoint) without
@@ -103,7 +103,7 @@ def require_cache(own: FrameLookup | None, run: TrainingRun | None) -> FrameLook
     cache = own or (run.cache if run is not None else None)
     if cache is None:
         raise MemobenchError(
-            "The preprocessor of memobench_mem has no memory cache to look up history in: make the policy with its "
+            "The preprocessor of memobench_mem has no feature cache to look up history in: make the policy with its "
             "dataset_meta first, and then its processors with that policy's configuration, or give "
             "GatherMemoryProcessorStep a cache."
         )

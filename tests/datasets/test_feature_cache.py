@@ -1,4 +1,4 @@
-"""The memory cache: contents, going on after a kill, waiting for others, full disks, refusing what does not fit."""
+"""The feature cache: contents, going on after a kill, waiting for others, full disks, refusing what does not fit."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_memobench.datasets.feature_cache.building import build_memory_cache
+from lerobot_memobench.datasets.feature_cache.building import build_feature_cache
 from lerobot_memobench.datasets.feature_cache.frames import resolve_subgoals
 from lerobot_memobench.datasets.feature_cache.layout import FOLDER, dataset_fingerprint, find_cache, read_meta
-from lerobot_memobench.datasets.feature_cache.reading import MemoryCache
+from lerobot_memobench.datasets.feature_cache.reading import FeatureCache
 from lerobot_memobench.errors import MemobenchError
 from tests.support import synthetic_dataset
 
@@ -83,9 +83,9 @@ def root(original: Path, tmp_path: Path) -> Path:
     return tmp_path / "data"
 
 
-def _open(root: Path, **changes: object) -> MemoryCache:
+def _open(root: Path, **changes: object) -> FeatureCache:
     wanted = {"frames_key": "tower", "camera": CAMERA, "stride": 1, "texts_key": "texts"} | changes
-    return MemoryCache.open(root, "test", **wanted)  # type: ignore[arg-type]
+    return FeatureCache.open(root, "test", **wanted)  # type: ignore[arg-type]
 
 
 def _frame(root: Path, episode: int, frame: int) -> torch.Tensor:
@@ -97,7 +97,7 @@ def _frame(root: Path, episode: int, frame: int) -> torch.Tensor:
 
 def test_contents(root: Path) -> None:
     calls: list[tuple[int, int]] = []
-    folder = build_memory_cache(
+    folder = build_feature_cache(
         root, "test", _Frames(), _Texts(), batch_size=7, progress=lambda *done: calls.append(done)
     )
     assert folder == root / FOLDER / "test"
@@ -129,7 +129,7 @@ def test_contents(root: Path) -> None:
 
 def test_stride(root: Path) -> None:
     frames = _Frames()
-    build_memory_cache(root, "test", frames, _Texts(), stride=4)
+    build_feature_cache(root, "test", frames, _Texts(), stride=4)
     assert frames.seen == 10 + 6 + 8
     cache = _open(root, stride=4)
     expected = _frame(root, 2, 28).mean().to(torch.bfloat16)
@@ -137,9 +137,9 @@ def test_stride(root: Path) -> None:
 
 
 def test_a_finished_cache_is_left_alone_and_moves_with_its_dataset(root: Path, tmp_path: Path) -> None:
-    build_memory_cache(root, "test", _Frames(), _Texts())
+    build_feature_cache(root, "test", _Frames(), _Texts())
     again = _Frames()
-    build_memory_cache(root, "test", again, _Texts())
+    build_feature_cache(root, "test", again, _Texts())
     assert again.seen == 0
     moved = tmp_path / "elsewhere"
     root.rename(moved)
@@ -148,43 +148,43 @@ def test_a_finished_cache_is_left_alone_and_moves_with_its_dataset(root: Path, t
 
 def test_a_killed_build_goes_on(root: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
-        build_memory_cache(root, "test", _Frames(stop_after=45), _Texts(), batch_size=10)
+        build_feature_cache(root, "test", _Frames(stop_after=45), _Texts(), batch_size=10)
     meta = read_meta(root, "test")
     assert meta is not None
     assert not meta.complete
     with pytest.raises(MemobenchError, match=r"not finished.*memobench cache"):
         _open(root)
     rest = _Frames()
-    build_memory_cache(root, "test", rest, _Texts())
+    build_feature_cache(root, "test", rest, _Texts())
     assert rest.seen == 94 - 40  # the first episode was done
     whole = root / FOLDER / "test" / "tokens.bin"
     resumed = whole.read_bytes()
     shutil.rmtree(root / FOLDER)
-    build_memory_cache(root, "test", _Frames(), _Texts())
+    build_feature_cache(root, "test", _Frames(), _Texts())
     assert whole.read_bytes() == resumed
 
 
 @pytest.mark.parametrize("content", [b"", b"\x93NUMPY\x01", b"PK\x03\x04", None])
 def test_a_build_that_does_not_know_how_far_it_was_begins_again(root: Path, content: bytes | None) -> None:
     with pytest.raises(KeyboardInterrupt):
-        build_memory_cache(root, "test", _Frames(stop_after=45), _Texts(), batch_size=10)
+        build_feature_cache(root, "test", _Frames(stop_after=45), _Texts(), batch_size=10)
     done = root / FOLDER / "test" / "done.npy"
     if content is None:
         np.save(done, np.ones(7, np.uint8))  # of another dataset
     else:
         done.write_bytes(content)
     rest = _Frames()
-    build_memory_cache(root, "test", rest, _Texts())
+    build_feature_cache(root, "test", rest, _Texts())
     assert rest.seen == 94
     assert np.load(done).tolist() == [1, 1, 1]
 
 
 def test_damaged_texts_of_an_unfinished_cache_are_told(root: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
-        build_memory_cache(root, "test", _Frames(stop_after=45), _Texts(), batch_size=10)
+        build_feature_cache(root, "test", _Frames(stop_after=45), _Texts(), batch_size=10)
     (root / FOLDER / "test" / "texts.json").write_text('["a", 5')
     with pytest.raises(MemobenchError, match=r"texts.json: it is not JSON .*; delete .*/test, and it is made again"):
-        build_memory_cache(root, "test", _Frames(), _Texts("others"))
+        build_feature_cache(root, "test", _Frames(), _Texts("others"))
 
 
 def test_the_number_of_threads_changes_nothing(root: Path) -> None:
@@ -192,7 +192,7 @@ def test_the_number_of_threads_changes_nothing(root: Path) -> None:
     contents = []
     for workers in (1, 4):
         shutil.rmtree(root / FOLDER, ignore_errors=True)
-        build_memory_cache(root, "test", _Frames(), _Texts(), batch_size=7, workers=workers)
+        build_feature_cache(root, "test", _Frames(), _Texts(), batch_size=7, workers=workers)
         contents.append(whole.read_bytes())
     assert contents[0] == contents[1]
     assert any(contents[0])
@@ -201,16 +201,16 @@ def test_the_number_of_threads_changes_nothing(root: Path) -> None:
 def test_a_decoder_that_fails_stops_the_build(root: Path) -> None:
     next((root / "videos" / CAMERA).rglob("*.mp4")).write_bytes(b"no video")
     with pytest.raises((RuntimeError, ValueError, OSError)):
-        build_memory_cache(root, "test", _Frames(), _Texts(), workers=3)
+        build_feature_cache(root, "test", _Frames(), _Texts(), workers=3)
     meta = read_meta(root, "test")
     assert meta is not None
     assert not meta.complete
 
 
 def test_refusals_name_reason_and_fix(root: Path) -> None:
-    with pytest.raises(MemobenchError, match=r"no memory cache.*memobench cache"):
+    with pytest.raises(MemobenchError, match=r"no feature cache.*memobench cache"):
         _open(root)
-    build_memory_cache(root, "test", _Frames(), _Texts())
+    build_feature_cache(root, "test", _Frames(), _Texts())
     for changes, reason in (
         ({"frames_key": "other"}, "another vision tower"),
         ({"stride": 2}, "stride 1, and stride 2"),
@@ -222,12 +222,12 @@ def test_refusals_name_reason_and_fix(root: Path) -> None:
     assert _open(root, texts_key=None).texts  # without alignment the text encoder does not matter
     meta_file = root / FOLDER / "test" / "meta.json"
     meta_file.write_text(json.dumps({"something": "else"}))
-    with pytest.raises(MemobenchError, match=r"cannot|not a memory cache"):
+    with pytest.raises(MemobenchError, match=r"cannot|not a feature cache"):
         _open(root)
 
 
 def test_a_changed_dataset_makes_its_cache_stale_and_building_mends_it(root: Path) -> None:
-    build_memory_cache(root, "test", _Frames(), _Texts())
+    build_feature_cache(root, "test", _Frames(), _Texts())
     before = dataset_fingerprint(root, CAMERA)
     (root / "README.md").write_text("a card changes nothing")
     assert dataset_fingerprint(root, CAMERA) == before
@@ -238,16 +238,16 @@ def test_a_changed_dataset_makes_its_cache_stale_and_building_mends_it(root: Pat
     with pytest.raises(MemobenchError, match=r"stale.*memobench cache"):
         _open(root)
     again = _Frames()
-    build_memory_cache(root, "test", again, _Texts())
+    build_feature_cache(root, "test", again, _Texts())
     assert again.seen == 94
     assert _open(root).num_frames == 94
 
 
 def test_wrong_folders_and_cameras(root: Path, tmp_path: Path) -> None:
     with pytest.raises(MemobenchError, match="no LeRobotDataset"):
-        build_memory_cache(tmp_path, "test", _Frames(), _Texts())
+        build_feature_cache(tmp_path, "test", _Frames(), _Texts())
     with pytest.raises(MemobenchError, match=r"no camera 'observation.images.top'.*observation.images.image"):
-        build_memory_cache(root, "test", _Frames(), _Texts(), camera="observation.images.top")
+        build_feature_cache(root, "test", _Frames(), _Texts(), camera="observation.images.top")
     assert not (root / FOLDER / "test").exists()
 
 
@@ -271,7 +271,7 @@ def test_whoever_comes_second_says_so_and_waits(root: Path) -> None:
     logger, listener = logging.getLogger("lerobot_memobench"), Listener()
     first, second = _HeldFrames(), _Frames()
     builders = [
-        threading.Thread(target=build_memory_cache, args=(root, "test", frames, _Texts()), daemon=True)
+        threading.Thread(target=build_feature_cache, args=(root, "test", frames, _Texts()), daemon=True)
         for frames in (first, second)
     ]
     logger.addHandler(listener)
@@ -304,11 +304,11 @@ def test_what_decides_the_content_decides_the_name(root: Path, tmp_path: Path) -
 
 
 def test_a_cache_named_before_the_hash_is_found_when_it_fits(root: Path) -> None:
-    earlier = build_memory_cache(root, "tiny-stride1", _Frames(), _Texts())
+    earlier = build_feature_cache(root, "tiny-stride1", _Frames(), _Texts())
     contents = {"camera": CAMERA, "stride": 1}
     assert find_cache(root, "tiny-stride1", frames_key="tower", **contents) == earlier
     other = find_cache(root, "tiny-stride1", frames_key="other", **contents)
-    build_memory_cache(root, other.name, _Frames("other"), _Texts())
+    build_feature_cache(root, other.name, _Frames("other"), _Texts())
     meta = read_meta(root, earlier.name)
     assert meta is not None
     assert (meta.complete, meta.frames_key) == (True, "tower")
@@ -316,9 +316,9 @@ def test_a_cache_named_before_the_hash_is_found_when_it_fits(root: Path) -> None
 
 
 def test_another_text_encoder_adds_its_texts_and_nothing_else(root: Path) -> None:
-    build_memory_cache(root, "test", _Frames(), _Texts())
+    build_feature_cache(root, "test", _Frames(), _Texts())
     again = _Frames()
-    build_memory_cache(root, "test", again, _Texts("second"))
+    build_feature_cache(root, "test", again, _Texts("second"))
     assert again.seen == 0
     first, second = _open(root, texts_key="texts"), _open(root, texts_key="second")
     assert torch.equal(first.text_embeddings, second.text_embeddings)
@@ -342,7 +342,7 @@ def small_disk(root: Path) -> Iterator[Path]:
 
 def test_its_size_is_told_before_anything_is_encoded(root: Path, tmp_path: Path) -> None:
     frames, told = _WideFrames(), []
-    build_memory_cache(
+    build_feature_cache(
         root, "test", frames, _Texts(), place=tmp_path / "b" / "c", tell=lambda said: told.append((frames.seen, said))
     )
     assert (tmp_path / "b" / "c" / "test" / "tokens.bin").stat().st_size == 94 * 16 * 1024
@@ -361,7 +361,7 @@ def test_a_disk_without_room_is_one_sentence_and_nothing_is_left(
     with pytest.raises(
         MemobenchError, match=r"1\.5 MiB are needed there and 976\.6 KiB are free.*memory_cache_dir"
     ) as told:
-        build_memory_cache(root, "test", frames, _Texts())
+        build_feature_cache(root, "test", frames, _Texts())
     assert "\n" not in str(told.value)
     assert frames.seen == 0
     assert not (root / FOLDER / "test").exists()
@@ -370,11 +370,11 @@ def test_a_disk_without_room_is_one_sentence_and_nothing_is_left(
 def test_a_disk_that_is_full_kills_nobody(root: Path, small_disk: Path) -> None:
     frames = _WideFrames()
     with pytest.raises(MemobenchError, match="does not fit on its disk"):
-        build_memory_cache(root, "test", frames, _Texts())
+        build_feature_cache(root, "test", frames, _Texts())
     assert frames.seen == 0
     assert [path for path in small_disk.iterdir() if path.is_dir()] == []
     subprocess.run(["mount", "-o", "remount,size=4m", small_disk], check=True)
-    build_memory_cache(root, "test", frames, _Texts())
+    build_feature_cache(root, "test", frames, _Texts())
     assert frames.seen == 94
 
 
@@ -386,7 +386,7 @@ def test_a_disk_that_fills_up_meanwhile_loses_nothing_that_was_done(
     with monkeypatch.context() as patched:
         patched.setattr(f"{building}.reserve", lambda path, size: path.open("wb").truncate(size))
         with pytest.raises(MemobenchError, match=r"is full.*make room") as told:
-            build_memory_cache(root, "test", _WideFrames(), _Texts(), batch_size=5)
+            build_feature_cache(root, "test", _WideFrames(), _Texts(), batch_size=5)
     assert "\n" not in str(told.value)
     meta = read_meta(root, "test")
     assert meta is not None
@@ -395,7 +395,7 @@ def test_a_disk_that_fills_up_meanwhile_loses_nothing_that_was_done(
     assert done.tolist() == [1, 0, 0]
     subprocess.run(["mount", "-o", "remount,size=4m", small_disk], check=True)
     rest = _WideFrames()
-    build_memory_cache(root, "test", rest, _Texts())
+    build_feature_cache(root, "test", rest, _Texts())
     assert rest.seen == 94 - 40
 
 
@@ -406,11 +406,11 @@ def test_where_nothing_may_be_written_it_says_so(root: Path, monkeypatch: pytest
     with monkeypatch.context() as patched:
         patched.setattr("lerobot_memobench.datasets.feature_cache.building.taking_turns", refuse)
         with pytest.raises(MemobenchError, match=r"cannot be written \(Permission denied\).*memobench cache --out"):
-            build_memory_cache(root, "test", _Frames(), _Texts())
-    build_memory_cache(root, "test", _Frames(), _Texts())
+            build_feature_cache(root, "test", _Frames(), _Texts())
+    build_feature_cache(root, "test", _Frames(), _Texts())
     with monkeypatch.context() as patched:  # a finished one is read all the same
         patched.setattr("lerobot_memobench.datasets.feature_cache.building.taking_turns", refuse)
-        build_memory_cache(root, "test", _Frames(), _Texts())
+        build_feature_cache(root, "test", _Frames(), _Texts())
 
 
 @pytest.mark.parametrize("pattern", ["data/**/*.parquet", "videos/observation.images.image/**/*.mp4"])
@@ -418,5 +418,5 @@ def test_a_damaged_file_of_the_dataset_is_named(root: Path, pattern: str) -> Non
     path = next(root.glob(pattern))
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     with pytest.raises(MemobenchError, match=f"{path.name} cannot be read .*the dataset is damaged") as told:
-        build_memory_cache(root, "test", _Frames(), _Texts())
+        build_feature_cache(root, "test", _Frames(), _Texts())
     assert str(told.value).startswith(f"{path} ")
