@@ -13,8 +13,8 @@ import json
 import torch
 from policies import config
 
-from lerobot_memobench.policies.memobench_mem.alignment.objectives import make_alignment
-from lerobot_memobench.policies.memobench_mem.memory_pi05 import MemoryPI05
+from lerobot_memobench.policies.memobench_mem.alignment import make_alignment
+from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 
 
 def main() -> None:

@@ -25,11 +25,11 @@ from policies import config, remembered, training_batch, updates
 from turns import medians
 
 from lerobot_memobench.computing.freed_memory import keep_freed_memory
-from lerobot_memobench.policies.memobench_mem import learning
+from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, STEPS, TOKENS
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, MASK, STEPS, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_RAW_STATE, frame_row
+from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE, frame_row
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH
 
 REMEMBERED, THINGS = 50, 10
@@ -61,7 +61,10 @@ def main() -> None:
 
 def in_float32(update: Callable[[], None]) -> None:
     """Make an update without products in bfloat16."""
-    with mock.patch.object(learning, "quick_products", nullcontext), mock.patch.object(learning, "quick_gradients"):
+    with (
+        mock.patch.object(modeling_memobench_mem, "quick_products", nullcontext),
+        mock.patch.object(modeling_memobench_mem, "quick_gradients"),
+    ):
         update()
 
 

@@ -24,10 +24,10 @@ from turns import medians
 from lerobot_memobench.computing.freed_memory import keep_freed_memory
 from lerobot_memobench.perception.tower import GRID, POOLED, WIDTH
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.fused_attention import attend_fused
-from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, STEPS, TOKENS
+from lerobot_memobench.policies.memobench_mem.encoders import seen_key
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, MASK, STEPS, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.memobench_mem.perception.eyes import seen_key
+from lerobot_memobench.policies.memobench_mem.network import attend_fused
 
 SLOTS = 50
 """Remembered frames of an episode: its prompt, and an execution of 250 steps."""

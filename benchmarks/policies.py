@@ -10,8 +10,12 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.dimensions import SIZES, Gemma, Vision
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import (
+    SIZES,
+    Gemma,
+    MemobenchMemConfig,
+    Vision,
+)
 from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import sample_frames
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 

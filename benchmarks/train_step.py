@@ -75,8 +75,8 @@ def count_operations(fields: dict[str, Any]) -> int:
     """Floating-point operations of one sample's forward and backward at full size; nothing is computed."""
     from torch.utils.flop_counter import FlopCounterMode
 
-    from lerobot_memobench.policies.memobench_mem.alignment.objectives import make_alignment
-    from lerobot_memobench.policies.memobench_mem.memory_pi05 import MemoryPI05
+    from lerobot_memobench.policies.memobench_mem.alignment import make_alignment
+    from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 
     settings = config("pi05", device="cpu", **fields)
     dims = settings.dimensions

@@ -18,11 +18,10 @@ from torch.utils.data import default_collate
 from lerobot_memobench.datasets.feature_cache.reading import FrameLookup, RecordedFrames
 from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, list_episodes
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem.alignment.objectives import masked_mean
-from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, STEPS, TOKENS, MemoryBatch
+from lerobot_memobench.policies.memobench_mem.alignment import masked_mean
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, MASK, STEPS, TOKENS, MemoryBatch
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.memobench_mem.processing.training_run import TrainingRun
-from lerobot_memobench.policies.memobench_mem.recorded_items import item
+from lerobot_memobench.policies.memobench_mem.sampler import TrainingRun, item
 from lerobot_memobench.protocol import PROMPT
 from lerobot_memobench.tasks.catalogue import suite_of
 

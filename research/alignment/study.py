@@ -21,7 +21,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import Count, Number, read_json, write_file
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.processing.training_run import training_run
+from lerobot_memobench.policies.memobench_mem.sampler import training_run
 from lerobot_memobench.protocol import CAMERAS
 from research.alignment.measures import Measures, Split, guesses, make_questions, split_episodes
 from research.alignment.report import draw, measures_table, summarise

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_memobench.policies.memobench_mem.adapters import trained_whole
 from tests.support.small_policy import batch_of, made_for_training
 
 
@@ -29,8 +28,8 @@ def test_memory_and_heads_are_trained_whole_and_nothing_else(dataset_root: Path,
 
 def test_what_is_asked_for_is_trained_whole_too(dataset_root: Path) -> None:
     policy, *_ = made_for_training(dataset_root)
-    assert trained_whole(policy, ["action_out_proj"]) == ["action_out_proj", *trained_whole(policy)]
-    assert trained_whole(policy, ["modulator"]).count("modulator") == 1
+    assert policy.trained_whole(["action_out_proj"]) == ["action_out_proj", *policy.trained_whole()]
+    assert policy.trained_whole(["modulator"]).count("modulator") == 1
 
 
 def test_adapters_are_made_beside_memory_and_heads(dataset_root: Path, tmp_path: Path) -> None:

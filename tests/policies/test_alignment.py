@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem.alignment.objectives import (
+from lerobot_memobench.policies.memobench_mem.alignment import (
     FramewiseAlignment,
     make_alignment,
     retrieval_accuracy,

@@ -26,8 +26,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import FrameSampling
-from lerobot_memobench.policies.memobench_mem.memory.mechanism import Frame, MemoryMechanism
-from lerobot_memobench.policies.memobench_mem.memory.rollout import RolloutMemory
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import Frame, MemoryMechanism, RolloutMemory
 from lerobot_memobench.run.lerobot_commands import call_lerobot
 
 IMAGES, STATE, ACTION = "observation.images.", "observation.state", "action"

@@ -7,10 +7,9 @@ import torch
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from lerobot.policies.pi05.modeling_pi05 import PI05Pytorch
 
-from lerobot_memobench.policies.memobench_mem.backbone import InstructionCondition, SizedPI05
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.memory_pi05 import MemoryPI05
-from lerobot_memobench.policies.memobench_mem.perception.slots import HAND_DIM
+from lerobot_memobench.policies.memobench_mem.network import InstructionCondition, MemoryPI05, SizedPI05
+from lerobot_memobench.policies.memobench_mem.objects import HAND_DIM
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS
 
 CHUNK, BATCH, FRAMES = 6, 2, 5

@@ -12,9 +12,9 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.sampler import EpisodeAwareSampler
 from lerobot.scripts.lerobot_train import train
 
-from lerobot_memobench.policies.memobench_mem.action_loss import counted_actions, mean_losses
-from lerobot_memobench.policies.memobench_mem.execution_frames import execution_starts
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from lerobot_memobench.policies.memobench_mem.sampler import execution_starts
+from lerobot_memobench.policies.memobench_mem.training import counted_actions, mean_losses
 from tests.support.small_policy import CHUNK, batch_of, made_for_training, small_config
 
 EXECUTION = [*range(40), *range(48, 94)]  # the second episode, from 40 on, has eight prompt frames

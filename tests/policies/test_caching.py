@@ -13,7 +13,7 @@ from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.datasets.feature_cache.layout import FOLDER
 from lerobot_memobench.datasets.feature_cache.reading import FeatureCache
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset, load_perception, open_cache
-from lerobot_memobench.policies.memobench_mem.perception.pixels import PixelPerception
+from lerobot_memobench.policies.memobench_mem.encoders import PixelPerception
 from tests.support.object_dataset import make_object_dataset
 from tests.support.small_policy import made_for_training, small_config
 

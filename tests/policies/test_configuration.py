@@ -12,7 +12,7 @@ import torch
 from lerobot.configs import PreTrainedConfig
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem import schedule
+from lerobot_memobench.policies.memobench_mem import configuration_memobench_mem
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 
@@ -20,7 +20,7 @@ from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import Memo
 @pytest.mark.parametrize(("gpu", "fused"), [(True, True), (False, None)])
 def test_the_optimizer_makes_no_copy_on_a_gpu(gpu: bool, fused: bool | None, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[dict[str, Any]] = []
-    monkeypatch.setattr(schedule, "AdamW", lambda *_, **options: made.append(options))
+    monkeypatch.setattr(configuration_memobench_mem, "AdamW", lambda *_, **options: made.append(options))
     MemobenchMemConfig(device="cpu").get_optimizer_preset().build([SimpleNamespace(is_cuda=gpu)] * 2)  # type: ignore
     assert made == [{"fused": fused}]
 

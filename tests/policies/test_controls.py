@@ -18,10 +18,10 @@ from lerobot.policies import make_pre_post_processors
 from lerobot_memobench.datasets.feature_cache.layout import FOLDER
 from lerobot_memobench.datasets.feature_cache.reading import FeatureCache
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.memobench_mem.alignment import SEVERAL, shuffled_subgoals, text_rows
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
-from lerobot_memobench.policies.memobench_mem.language.text_encoders import WordTextEncoder
+from lerobot_memobench.policies.memobench_mem.language import WordTextEncoder
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.memobench_mem.processing.subgoals import SEVERAL, shuffled_subgoals, text_rows
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.memory_text import with_memory
 from lerobot_memobench.tasks.task import LEVELS
@@ -78,7 +78,7 @@ def test_plain_policies_read_no_memory_text(dataset_root: Path) -> None:
 
 def test_six_checkpoints_fit_into_the_prompt() -> None:
     """The longest memory of the catalogue is not cut off by the word tokenizer's length."""
-    from lerobot_memobench.policies.memobench_mem.language.tokenizer import words
+    from lerobot_memobench.policies.memobench_mem.language import words
     from lerobot_memobench.tasks.catalogue import get_task, task_names
     from lerobot_memobench.tasks.memory_text import memory_text
 
@@ -213,7 +213,7 @@ def test_a_dataset_without_the_columns_is_refused(dataset_root: Path, tmp_path: 
 
 
 def test_without_integration_it_is_plain_pi05(dataset_root: Path, tmp_path: Path) -> None:
-    from lerobot_memobench.policies.memobench_mem.backbone import SizedPI05
+    from lerobot_memobench.policies.memobench_mem.network import SizedPI05
 
     policy, before, after, dataset = made_for_training(dataset_root, integration="none")
     assert set(dict(policy.model.named_parameters())) == set(dict(SizedPI05(small_config()).named_parameters()))

@@ -11,9 +11,8 @@ import pytest
 from safetensors.numpy import save_file
 
 from lerobot_memobench.policies.checkpoint import check_checkpoint, checkpoint_type
+from lerobot_memobench.policies.memobench_mem.checkpoints import require_agreement, require_statistics
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.saved_steps import require_agreement
-from lerobot_memobench.policies.memobench_mem.weights import require_statistics
 from lerobot_memobench.run.arguments import read_settings, split_words
 from lerobot_memobench.run.card import training_facts
 from tests.support import mutations

@@ -21,12 +21,12 @@ from lerobot_memobench.datasets.feature_cache.layout import FOLDER
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.tower import GRID, POOLED, SIDE, WIDTH, Tower
 from lerobot_memobench.perception.weights import Eyes, save_eyes
-from lerobot_memobench.policies.memobench_mem import fused_attention
+from lerobot_memobench.policies.memobench_mem import network
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, TOKENS
+from lerobot_memobench.policies.memobench_mem.encoders import seen_key
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, MASK, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.memobench_mem.perception.eyes import seen_key
 from tests.support.picture_rollouts import (
     CAMERAS,
     acts_as_its_checkpoint,
@@ -312,7 +312,7 @@ def test_attention_in_one_kernel_learns_the_same_and_acts_by_lerobots(
         fused.append(torch.is_grad_enabled())
         return scaled_dot_product_attention(*tensors, **named)
 
-    monkeypatch.setattr(fused_attention, "scaled_dot_product_attention", counting)
+    monkeypatch.setattr(network, "scaled_dot_product_attention", counting)
     policy, before, _, dataset = made_for_training(root, **seeing)
     batch = before(batch_of(dataset, [10, 30, 50]))
     layers = [module for module in policy.modules() if isinstance(module, modeling_gemma.GemmaAttention)]
@@ -326,10 +326,10 @@ def test_attention_in_one_kernel_learns_the_same_and_acts_by_lerobots(
         assert torch.backends.cuda.flash_sdp_enabled(), "not left out for quick products"
         found.append([loss, *(weight.grad for weight in policy.get_optim_params())])
         for layer in layers:
-            vars(layer).pop(fused_attention.MARK, None)
+            vars(layer).pop(network.MARK, None)
     for ours, lerobots in zip(*found, strict=True):
         torch.testing.assert_close(ours, lerobots, rtol=1e-3, atol=1e-5)
-    fused_attention.attend_fused(policy)
+    network.attend_fused(policy)
     policy.eval().select_action(before(observed(root, dataset, 0)))
     with torch.no_grad():
         policy.forward(batch)

@@ -18,9 +18,9 @@ from lerobot_memobench.envs.observations import PIXELS, obs_type_of
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, TOKENS
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, MASK, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.memobench_mem.perception.found import FOUND, VIEWS
+from lerobot_memobench.policies.memobench_mem.objects import FOUND, VIEWS
 from lerobot_memobench.sim.object_layout import SIZE
 from tests.support.object_dataset import make_object_dataset
 from tests.support.picture_rollouts import (

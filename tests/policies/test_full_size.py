@@ -14,11 +14,10 @@ from lerobot.policies.pi05.modeling_pi05 import PaliGemmaWithExpertModel, PI05Py
 from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 from torch import Tensor
 
-from lerobot_memobench.policies.memobench_mem.backbone import SizedPI05
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.memory.mechanism import Frame
-from lerobot_memobench.policies.memobench_mem.memory.rollout import Row
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import Frame, Row
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from lerobot_memobench.policies.memobench_mem.network import SizedPI05
 from lerobot_memobench.policies.memobench_mem.random_weights import fill_buffers, random_policy
 
 CAMERA = "observation.images.image"

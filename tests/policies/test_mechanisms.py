@@ -10,12 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import INTEGRATIONS, MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.memory.batch import MASK, STEPS, TOKENS
-from lerobot_memobench.policies.memobench_mem.memory.mechanism import Frame, MemoryMechanism
-from lerobot_memobench.policies.memobench_mem.memory.registry import MECHANISMS, make_mechanism
-from lerobot_memobench.policies.memobench_mem.memory.rollout import RolloutMemory
-from lerobot_memobench.policies.memobench_mem.memory_pi05 import INTEGRATIONS as INTEGRATION_CLASSES
-from lerobot_memobench.policies.memobench_mem.processing.gather_memory import GatherMemoryProcessorStep
+from lerobot_memobench.policies.memobench_mem.memory import MECHANISMS, make_mechanism
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
+    MASK,
+    STEPS,
+    TOKENS,
+    Frame,
+    MemoryMechanism,
+    RolloutMemory,
+)
+from lerobot_memobench.policies.memobench_mem.network import FUSIONS
+from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import GatherMemoryProcessorStep
 
 P, D = 3, 2
 
@@ -94,7 +99,7 @@ def test_frame_sampling_loads_no_more_than_it_reads() -> None:
 
 def test_what_the_configuration_names_is_there() -> None:
     assert {MemobenchMemConfig(device="cpu", integration=name).memory for name in INTEGRATIONS} <= set(MECHANISMS)
-    assert {*INTEGRATION_CLASSES, "none"} == set(INTEGRATIONS)
+    assert {*FUSIONS, "none"} == set(INTEGRATIONS)
 
 
 @pytest.mark.parametrize("name", MECHANISMS)

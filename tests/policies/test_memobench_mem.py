@@ -21,19 +21,18 @@ from safetensors.torch import load_file, save_file
 from lerobot_memobench.datasets.feature_cache.layout import find_cache
 from lerobot_memobench.datasets.feature_cache.reading import FeatureCache
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem
-from lerobot_memobench.policies.memobench_mem.alignment.objectives import make_alignment
-from lerobot_memobench.policies.memobench_mem.language import tokenizer as tokenizer_module
-from lerobot_memobench.policies.memobench_mem.language.text_encoders import WordTextEncoder
-from lerobot_memobench.policies.memobench_mem.language.tokenizer import (
+from lerobot_memobench.policies.memobench_mem import language, modeling_memobench_mem
+from lerobot_memobench.policies.memobench_mem.alignment import make_alignment
+from lerobot_memobench.policies.memobench_mem.language import (
     PromptTokenizerProcessorStep,
+    WordTextEncoder,
     WordTokenizerProcessorStep,
     make_vocabulary,
     make_word_tokenizer,
 )
 from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import sample_frames
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.memobench_mem.processing.gather_memory import GatherMemoryProcessorStep
+from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import GatherMemoryProcessorStep
 from tests.support.small_policy import CHUNK, batch_of, made_for_training, small_config
 
 
@@ -367,7 +366,7 @@ def test_evaluation_loads_the_average_and_training_both(trained: Any) -> None:
 
 
 def test_average_follows_its_formula() -> None:
-    from lerobot_memobench.policies.memobench_mem.averaging import WeightAverage
+    from lerobot_memobench.policies.memobench_mem.training import WeightAverage
 
     parameter = torch.nn.Parameter(torch.tensor([1.0]))
     average = WeightAverage({"w": parameter}, decay=0.15)
@@ -463,7 +462,7 @@ def test_weights_that_do_not_fit_are_refused(trained: Any, tmp_path: Path) -> No
 
 def test_pi05_weights_as_a_start(trained: Any, tmp_path: Path) -> None:
     """A file named as pi0.5's own, at tiny dimensions: everything but the memory comes from it."""
-    from lerobot_memobench.policies.memobench_mem.backbone import SizedPI05
+    from lerobot_memobench.policies.memobench_mem.network import SizedPI05
 
     torch.manual_seed(11)
     plain = SizedPI05(small_config())
@@ -511,7 +510,7 @@ def step_of(texts: list[str], length: int = 24) -> WordTokenizerProcessorStep:
 
 
 def test_unknown_words_are_told_once_by_name(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    monkeypatch.setattr(tokenizer_module, "_told", set())
+    monkeypatch.setattr(language, "_told", set())
     step = step_of(["Switch the stove on."])
     for _ in range(3):
         step._tokenize_text(["Switch the stove on.", "Switch the stove on twice, then once."])
@@ -519,7 +518,7 @@ def test_unknown_words_are_told_once_by_name(monkeypatch: pytest.MonkeyPatch, ca
     told = caplog.text
     assert "does not know 'twice', 'then', 'once' in 'Switch the stove on twice, then once.'" in told
     monkeypatch.setattr(step, "input_tokenizer", None)  # what has been looked at is not tokenized again
-    tokenizer_module.warn_of_losses(None, "Switch the stove on twice, then once.", 24, full=False)
+    language.warn_of_losses(None, "Switch the stove on twice, then once.", 24, full=False)
     step = step_of(["Switch the stove on."])
     step._tokenize_text("Task: Turn the stove on once, State: 1 2;")
     assert "does not know 'turn' in 'Turn the stove on once'" in caplog.messages[1]
@@ -528,7 +527,7 @@ def test_unknown_words_are_told_once_by_name(monkeypatch: pytest.MonkeyPatch, ca
 def test_what_the_token_limit_cuts_off_is_told_once_per_instruction(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(tokenizer_module, "_told", set())
+    monkeypatch.setattr(language, "_told", set())
     prompt = "Task: Switch the stove on. Memory: the stove was on, State: {} 12 200;\nAction: "
     step = step_of([prompt], length=14)
     for state in (7, 8, 9):
@@ -549,7 +548,7 @@ def test_what_the_token_limit_cuts_off_is_told_once_per_instruction(
 def test_the_pretrained_tokenizer_tells_what_it_cuts_off(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(tokenizer_module, "_told", set())
+    monkeypatch.setattr(language, "_told", set())
     words = make_word_tokenizer(make_vocabulary(["put the bowl"], 1024))
     step = PromptTokenizerProcessorStep(tokenizer=words, max_length=3)
     step._tokenize_text(["put the bowl"])

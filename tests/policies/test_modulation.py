@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import torch
 
-from lerobot_memobench.policies.memobench_mem.integration.modulation import (
+from lerobot_memobench.policies.memobench_mem.fusion import (
     MemoryModulator,
     ModulatedNorm,
     SharedMemory,
 )
-from lerobot_memobench.policies.memobench_mem.memory.tokens import MemoryTokens
+from lerobot_memobench.policies.memobench_mem.memory.encoder import MemoryTokens
 
 
 def _modulator() -> MemoryModulator:

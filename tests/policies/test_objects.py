@@ -19,14 +19,14 @@ from lerobot.utils.constants import OBS_ENV_STATE
 from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.execution_frames import (
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, MASK, STEPS, TOKENS
+from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from lerobot_memobench.policies.memobench_mem.sampler import (
     in_groups,
     in_turns,
     prompted_factors,
     task_of_frames,
 )
-from lerobot_memobench.policies.memobench_mem.memory.batch import FRAMES, MASK, STEPS, TOKENS
-from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.sim.object_layout import WIDTH as SLOT_WIDTH
 from tests.support import object_dataset
 from tests.support.object_dataset import LENGTHS, PROMPTS, make_object_dataset

@@ -18,7 +18,7 @@ from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.envs.episode_log import read_episodes, read_protocol_file
-from lerobot_memobench.policies.memobench_mem.language.tokenizer import make_vocabulary, make_word_tokenizer
+from lerobot_memobench.policies.memobench_mem.language import make_vocabulary, make_word_tokenizer
 from lerobot_memobench.sim.object_layout import SIZE
 from lerobot_memobench.tasks.catalogue import get_task
 

@@ -6,9 +6,9 @@ import pytest
 import torch
 from lerobot.policies.pi05.modeling_pi05 import PaliGemmaWithExpertModel
 
-from lerobot_memobench.policies.memobench_mem.backbone import SizedPaliGemmaWithExpert
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.perception.pixels import pool_tokens
+from lerobot_memobench.policies.memobench_mem.encoders import pool_tokens
+from lerobot_memobench.policies.memobench_mem.network import SizedPaliGemmaWithExpert
 
 
 def test_pooling_is_the_mean_of_blocks() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from lerobot_memobench.policies.memobench_mem.plans import RowPlans
+from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import RowPlans
 
 STATE = torch.tensor([0.1, 0.2, 1.0, 3.13, 0.1, 0.0, 0.04, -0.04])
 AXIS = torch.tensor([0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0])

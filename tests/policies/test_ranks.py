@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from lerobot_memobench.policies.memobench_mem.ranks import means_over_ranks
+from lerobot_memobench.policies.memobench_mem.training import means_over_ranks
 from tests.support import rank_case
 
 

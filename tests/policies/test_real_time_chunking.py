@@ -11,7 +11,7 @@ from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from lerobot.rollout.inference.rtc import supports_rtc_inference
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem.memory.batch import MASK, STEPS
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import MASK, STEPS
 from tests.support.object_dataset import make_object_dataset
 from tests.support.small_policy import made_for_training
 

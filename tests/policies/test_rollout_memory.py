@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import FrameSampling
-from lerobot_memobench.policies.memobench_mem.memory.rollout import RolloutMemory
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import RolloutMemory
 
 
 def _encode(values: list[float]):  # type: ignore[no-untyped-def]

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_RAW_STATE, FramePool, ObjectPerception
-from lerobot_memobench.policies.memobench_mem.perception.sight_errors import (
+from lerobot_memobench.policies.memobench_mem.detection_noise import (
     FALSE,
     KIND_MISSED,
     MISSED,
     SightErrors,
     as_found,
 )
+from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE, FramePool, ObjectPerception
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH, field
 from lerobot_memobench.sim.object_slots import classes, in_slots
 

@@ -6,15 +6,17 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from lerobot_memobench.policies.memobench_mem.memory.encoder import MemoryEncoder
-from lerobot_memobench.policies.memobench_mem.perception.objects import (
+from lerobot_memobench.policies.memobench_mem.memory.encoder import MemoryEncoder, PooledMemory
+from lerobot_memobench.policies.memobench_mem.objects import (
+    FEATURES,
     OBS_RAW_STATE,
     FramePool,
     ObjectPerception,
+    SlotEncoder,
     frame_row,
+    rotation,
+    slot_features,
 )
-from lerobot_memobench.policies.memobench_mem.perception.pooled_memory import PooledMemory
-from lerobot_memobench.policies.memobench_mem.perception.slots import FEATURES, SlotEncoder, rotation, slot_features
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH
 from lerobot_memobench.sim.object_slots import classes
 from tests.support.object_dataset import slots_at, state_at

@@ -15,7 +15,7 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.scripts.lerobot_train import train
 from safetensors import safe_open
 
-from lerobot_memobench.policies.memobench_mem import training_curve
+from lerobot_memobench.policies.memobench_mem import training
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.run.training import trained_on
 from tests.support.synthetic_dataset import make_dataset
@@ -71,12 +71,12 @@ def test_training_saves_and_goes_on(
 def test_the_loss_of_held_out_episodes_lies_beside_the_checkpoint(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logs: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(training_curve, "WINDOW", 2)
+    monkeypatch.setattr(training, "WINDOW", 2)
     config = _config(make_dataset(tmp_path / "two", repeats=2), tmp_path / "run", 4, 4, chunk_size=8)
     config.dataset.eval_split, config.eval_steps = 0.5, 2
     with trained_on(None):
         train(config)
-    numbers = json.loads((tmp_path / "run/checkpoints/000004/pretrained_model" / training_curve.NUMBERS).read_text())
+    numbers = json.loads((tmp_path / "run/checkpoints/000004/pretrained_model" / training.NUMBERS).read_text())
     lerobots = [float(loss) for loss in re.findall(r"eval_loss=([\d.]+)", logs.text)]
     assert [look["updates"] for look in numbers["held_out"]] == [2, 4]
     assert [look["action_loss"] for look in numbers["held_out"]] == pytest.approx(lerobots, abs=1e-4)

@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.memobench_mem.training_curve import NUMBERS, PICTURE, WINDOW, TrainingCurve
+from lerobot_memobench.policies.memobench_mem.training import NUMBERS, PICTURE, WINDOW, TrainingCurve
 from tests.support.object_dataset import make_object_dataset
 from tests.support.small_policy import batch_of, made_for_training
 

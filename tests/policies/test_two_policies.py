@@ -28,9 +28,9 @@ from lerobot_memobench import lerobot_hooks
 from lerobot_memobench.datasets.feature_cache.layout import FOLDER
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.lerobot_hooks import ATTEND, DRAW_FRAMES, MAKE_PROCESSORS, READ_SAMPLE
-from lerobot_memobench.policies.memobench_mem import fused_attention
-from lerobot_memobench.policies.memobench_mem.execution_frames import Drawn
+from lerobot_memobench.policies.memobench_mem import network
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from lerobot_memobench.policies.memobench_mem.sampler import Drawn
 from tests.support.picture_rollouts import made_eyes, observed
 from tests.support.small_policy import batch_of, made_for_training, small_config
 
@@ -263,7 +263,7 @@ def test_a_foreign_reader_and_foreign_attention_are_kept(
         fused.append(True)
         return original(*tensors, **named)
 
-    monkeypatch.setattr(fused_attention, "scaled_dot_product_attention", counting)
+    monkeypatch.setattr(network, "scaled_dot_product_attention", counting)
     policy, before, _, dataset = made_for_training(root, **SEEING | {"eyes": str(eyes[0])})
     batch = batch_of(dataset, INDICES)
     assert "observation.images.image" not in batch

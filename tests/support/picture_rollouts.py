@@ -17,7 +17,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.kinds import kinds
 from lerobot_memobench.perception.tower import Tower
 from lerobot_memobench.perception.weights import Eyes, save_eyes
-from lerobot_memobench.policies.memobench_mem.memory.batch import MASK, STEPS
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import MASK, STEPS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from tests.support.small_policy import batch_of, made_for_training
 from tests.support.synthetic_dataset import LENGTHS

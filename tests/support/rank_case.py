@@ -8,10 +8,8 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from lerobot_memobench.policies.memobench_mem.action_loss import mean_losses
-from lerobot_memobench.policies.memobench_mem.alignment.loss import alignment_loss
-from lerobot_memobench.policies.memobench_mem.alignment.objectives import make_alignment
-from lerobot_memobench.policies.memobench_mem.ranks import means_over_ranks
+from lerobot_memobench.policies.memobench_mem.alignment import alignment_loss, make_alignment
+from lerobot_memobench.policies.memobench_mem.training import mean_losses, means_over_ranks
 
 ROWS, FRAMES, TOKENS, DIM = 7, 2, 2, 5
 RANKS = (slice(0, 4), slice(4, ROWS))

@@ -399,7 +399,7 @@ def _steered(make: Callable[..., Any], prompt_frames: bool | None, obs_type: str
 
     @functools.wraps(make)
     def run(config: Any) -> Any:
-        from lerobot_memobench.policies.memobench_mem.recorded_items import check_transforms
+        from lerobot_memobench.policies.memobench_mem.sampler import check_transforms
 
         if prompt_frames is not False:
             _check_streaming(config)

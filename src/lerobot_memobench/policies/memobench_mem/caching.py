@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import functools
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from torch import Tensor
 
-from lerobot_memobench.datasets.feature_cache.building import Progress, build_feature_cache
-from lerobot_memobench.datasets.feature_cache.frames import read_frame_table
+from lerobot_memobench.datasets.feature_cache.building import (
+    FrameEncoder,
+    Progress,
+    TextEncoder,
+    build_feature_cache,
+    require_room,
+)
+from lerobot_memobench.datasets.feature_cache.frames import FrameReader, frame_reader, read_frame_table
 from lerobot_memobench.datasets.feature_cache.layout import find_cache
 from lerobot_memobench.datasets.feature_cache.reading import (
     FeatureCache,
@@ -20,26 +29,37 @@ from lerobot_memobench.datasets.feature_cache.reading import (
     RecordedTexts,
     read_recorded,
 )
+from lerobot_memobench.datasets.lerobot_format.layout import read_info
 from lerobot_memobench.envs.prompting import name_in_data
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.perception.tower import Tower
+from lerobot_memobench.io import in_words
+from lerobot_memobench.perception.tower import GRID, POOLED, WIDTH, Tower
 from lerobot_memobench.perception.weights import load_eyes, load_tower
-from lerobot_memobench.policies.memobench_mem.backbone import SizedPaliGemmaWithExpert
+from lerobot_memobench.policies.memobench_mem.checkpoints import load_exactly, read_weights
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.found_in_pictures import found_in, make_found
-from lerobot_memobench.policies.memobench_mem.language.text_encoders import (
+from lerobot_memobench.policies.memobench_mem.encoders import (
+    VISION_SEED,
+    EyePerception,
+    Perception,
+    PixelPerception,
+    seed_parameters,
+    seen_key,
+)
+from lerobot_memobench.policies.memobench_mem.language import (
     SiglipTextEncoder,
     WordTextEncoder,
     make_text_encoder,
 )
-from lerobot_memobench.policies.memobench_mem.perception.eyes import EyePerception
-from lerobot_memobench.policies.memobench_mem.perception.found import FOUND, FoundObjects, ObjectsInPictures
-from lerobot_memobench.policies.memobench_mem.perception.frozen import VISION_SEED, seed_parameters
-from lerobot_memobench.policies.memobench_mem.perception.objects import OBS_PHASE, OBS_RAW_STATE
-from lerobot_memobench.policies.memobench_mem.perception.perception import Perception
-from lerobot_memobench.policies.memobench_mem.perception.pixels import PixelPerception
-from lerobot_memobench.policies.memobench_mem.seen_pictures import cameras_of, make_caches, open_pictures
-from lerobot_memobench.policies.memobench_mem.weights import load_exactly, read_weights
+from lerobot_memobench.policies.memobench_mem.network import SizedPaliGemmaWithExpert
+from lerobot_memobench.policies.memobench_mem.objects import (
+    FOUND,
+    OBS_PHASE,
+    OBS_RAW_STATE,
+    VIEWS,
+    FoundObjects,
+    ObjectsInPictures,
+)
+from lerobot_memobench.sim.object_layout import SIZE
 
 logger = logging.getLogger(__name__)
 
@@ -197,3 +217,240 @@ def _column(root: Path, perception: PixelPerception) -> str:
 def _text_encoder(config: MemobenchMemConfig) -> WordTextEncoder | SiglipTextEncoder:
     assert config.text_encoder is not None  # set by the configuration
     return make_text_encoder(config.text_encoder, config.dimensions.text_dim, str(config.device))
+
+
+# ==== seen_pictures.py
+# What eyes see in a dataset, made once: all tokens of every picture, and pooled ones of what is remembered.
+#
+# Both are feature caches (`datasets.feature_cache`), so they are found, finished, waited for and refused alike: one of each
+# camera's present pictures, at every frame, and the memory's. The memory's is pooled from its camera's, so no video is
+# decoded twice. Training samples are then made of the dataset's columns in main memory and of tokens that are read where
+# they lie (`recorded_items`).
+
+
+@dataclass
+class Tokens:
+    """What makes the tokens of a cache; a `FrameEncoder`."""
+
+    key: str
+    tokens_per_frame: int
+    make: Callable[[Tensor], Tensor]
+    dim: int = WIDTH
+
+    def __call__(self, images: Tensor) -> Tensor:
+        """Make them."""
+        return self.make(images)
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """A cache that is wanted: of which camera, at every how many frames, made how, and where.
+
+    Attributes:
+        name: the camera's at the policy. camera: in the dataset.
+    """
+
+    name: str
+    camera: str
+    stride: int
+    tokens: FrameEncoder
+    folder: Path
+
+    def open(self, root: Path) -> FeatureCache:
+        """Open it, which is there."""
+        how: dict[str, Any] = {"camera": self.camera, "stride": self.stride, "place": self.folder.parent}
+        return FeatureCache.open(root, self.folder.name, frames_key=self.tokens.key, **how)
+
+
+def make_caches(
+    root: Path,
+    config: MemobenchMemConfig,
+    eyes: EyePerception,
+    texts: TextEncoder,
+    *,
+    tell: Callable[[str], None] = logger.info,
+    **how: Any,
+) -> tuple[FeatureCache | None, dict[str, FeatureCache]]:
+    """Make or finish what ``eyes`` see of the dataset at ``root``; how large it will be is told before.
+
+    Args:
+        how: of `build_feature_cache`.
+
+    Returns:
+        The memory's cache, None where nothing is remembered, and those of the present pictures by their cameras' names
+        at the policy.
+
+    Raises:
+        MemobenchError: the dataset lacks a camera, or the disk has no room for all of them.
+    """
+    frames = int(read_info(root).get("total_frames", 0))
+    wanted = _wanted(root, config, eyes, cameras_of(root))
+    memory = wanted[-1] if config.memory != "none" else None
+    present = wanted if memory is None else wanted[:-1]
+    sizes = {cache.folder: _bytes(cache, frames) for cache in wanted}
+    tell(
+        f"What is seen in the {frames:,} frames of {root} takes {in_words(sum(sizes.values()))}: "
+        f"{in_words(2 * GRID**2 * WIDTH)} of each of {len(present)} pictures of a frame, and "
+        f"{in_words(2 * POOLED**2 * WIDTH)} of every frame that is remembered; what is not there yet is made now."
+    )
+    require_room(wanted[-1].folder.parent, sizes)
+    busy = []
+    for cache in present:
+        try:
+            _make(root, cache, texts, tell=tell, wait=come_back, **how)
+        except Busy:
+            busy.append(cache)  # whoever trains beside us is at it; the other camera's is made here meanwhile
+    for cache in busy:
+        _make(root, cache, texts, tell=tell, **how)
+    opened = {cache.name: cache.open(root) for cache in present}
+    if memory is None:
+        return None, opened
+    _make(root, memory, texts, read=opened[memory.name].tokens, tell=tell, **how)
+    return memory.open(root), opened
+
+
+def cameras_of(root: Path) -> list[str]:
+    """Return the cameras of a dataset, in its order."""
+    features = read_info(root)["features"].items()
+    return [name for name, feature in features if feature.get("dtype") in ("video", "image")]
+
+
+class Busy(Exception):
+    """Another process is making this."""
+
+
+def come_back(folder: Path) -> None:
+    """Wait for no other process: a ``wait`` of `build_feature_cache`.
+
+    Raises:
+        Busy: in any case.
+    """
+    raise Busy(folder)
+
+
+def _make(root: Path, cache: Wanted, texts: TextEncoder, **how: Any) -> None:
+    named: dict[str, Any] = {"camera": cache.camera, "stride": cache.stride, "place": cache.folder.parent}
+    build_feature_cache(root, cache.folder.name, cache.tokens, texts, **named, **how)
+
+
+def _wanted(root: Path, config: MemobenchMemConfig, eyes: EyePerception, cameras: Sequence[str]) -> list[Wanted]:
+    """Return the caches: of the present of each camera, and last the memory's, where something is remembered."""
+
+    def wanted(name: str, stride: int, begins: str, tokens: Tokens) -> Wanted:
+        camera = name_in_data(name)
+        where: dict[str, Any] = {"camera": camera, "stride": stride, "place": config.cache_place}
+        return Wanted(name, camera, stride, tokens, find_cache(root, begins, frames_key=tokens.key, **where))
+
+    whole = Tokens(eyes.present_key, GRID**2, eyes.look)
+    pooled = Tokens(eyes.key, eyes.tokens_per_frame, eyes.pooled)
+    seen = dict.fromkeys(eyes.cameras or [*cameras, eyes.remembers])
+    present = [wanted(camera, 1, f"{config.size}-present", whole) for camera in seen]
+    if config.memory == "none":
+        return present
+    return [*present, wanted(eyes.remembers, config.memory_stride, config.cache_name, pooled)]
+
+
+def _bytes(cache: Wanted, frames: int) -> int:
+    """Return about how large a cache is; each episode may remember one frame more."""
+    return -(-frames // cache.stride) * cache.tokens.tokens_per_frame * cache.tokens.dim * 2
+
+
+def open_pictures(
+    root: Path,
+    config: MemobenchMemConfig,
+    eyes: EyePerception,
+    texts: TextEncoder,
+    names: Sequence[str],
+) -> RecordedFrames:
+    """Open what training looks up of the dataset at ``root``: its columns ``names``, and what ``eyes`` see.
+
+    Raises:
+        MemobenchError: the dataset lacks a column, or a cache cannot be made.
+    """
+    memory, present = make_caches(
+        root, config, eyes, texts, progress=lambda done, count: logger.info("seen: %d of %d episodes", done, count)
+    )
+    columns, table = read_recorded(root, names)
+    columns |= {seen_key(camera): cache.all_tokens() for camera, cache in present.items()}
+
+    def remember(_: Any, frames: Sequence[int]) -> Tensor:
+        """Return what is remembered of frames of one episode, by their global numbers."""
+        if memory is None:  # training asks for none; a sample's shape is asked for all the same
+            return torch.zeros(len(frames), eyes.tokens_per_frame, WIDTH)
+        episode, first = memory.locate(frames[0])
+        return memory.tokens(episode, [(first + frame - frames[0]) // memory.meta.stride for frame in frames])
+
+    return RecordedFrames(root, columns, table, texts, remember=remember, key=eyes.key, stride=config.memory_stride)
+
+
+# ==== found_in_pictures.py
+# What eyes find in a dataset's pictures, made once for every frame: a feature cache of slots instead of tokens.
+#
+# A cache holds bfloat16 numbers, which know places to 4 mm. So a slot's number is kept as two: what it is rounded to, and
+# what that leaves of it.
+
+
+Look = tuple[dict[str, Tensor], Tensor]
+"""Pictures of some frames by their names, and the robot's states."""
+
+
+@dataclass
+class SlotEncoder:
+    """What makes a cache's numbers; a `FrameEncoder`."""
+
+    look: ObjectsInPictures
+    tokens_per_frame: int = 2
+    dim: int = SIZE
+
+    @property
+    def key(self) -> str:
+        """Identity of what is found."""
+        return self.look.key
+
+    def __call__(self, seen: Look) -> Tensor:
+        """Return the slots of frames in two parts, (N, 2, SIZE) bfloat16."""
+        slots = self.look(*seen)
+        rounded = slots.to(torch.bfloat16)
+        return torch.stack([rounded, (slots - rounded.float()).to(torch.bfloat16)], dim=1)
+
+
+def make_found(
+    root: Path, config: MemobenchMemConfig, look: ObjectsInPictures, texts: TextEncoder, **how: Any
+) -> FeatureCache:
+    """Make or finish the cache of what is found in the pictures of the dataset at ``root``.
+
+    Args:
+        how: of `build_feature_cache`.
+
+    Raises:
+        MemobenchError: the dataset lacks a camera, or the disk has no room.
+    """
+    where: dict[str, Any] = {"camera": next(iter(VIEWS)), "stride": 1}
+    folder = find_cache(root, "objects", frames_key=look.key, place=config.cache_place, **where)
+    where["place"] = folder.parent
+    build_feature_cache(root, folder.name, SlotEncoder(look), texts, read=_reader(root), **where, **how)
+    return FeatureCache.open(root, folder.name, frames_key=look.key, **where)
+
+
+def _reader(root: Path) -> FrameReader:
+    """Return what reads frames of all cameras, and the states at them."""
+    readers = {name: frame_reader(root, name) for name in VIEWS}
+    recorded = functools.cache(
+        lambda: read_recorded(root, [OBS_STATE])
+    )  # read when a frame is: a whole cache needs none
+
+    def read(episode: int, numbers: list[int]) -> Look:
+        columns, table = recorded()
+        states = columns[OBS_STATE][[int(table.episodes[episode]) + number for number in numbers]]
+        return {name: one(episode, numbers) for name, one in readers.items()}, states
+
+    return read
+
+
+def found_in(root: Path, config: MemobenchMemConfig, look: ObjectsInPictures, texts: TextEncoder, **how: Any) -> Tensor:
+    """Return what is found at every frame of the dataset at ``root``, (N, SIZE) float32; all else as `make_found`."""
+
+    def tell(done: int, count: int) -> None:
+        logger.info("objects found in %d of %d episodes", done, count)
+
+    return make_found(root, config, look, texts, progress=tell, **how).all_tokens().sum(dim=1, dtype=torch.float32)

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
+from huggingface_hub import hf_hub_download
+from huggingface_hub.errors import EntryNotFoundError, HfHubHTTPError, LocalEntryNotFoundError
 from lerobot.configs import PreTrainedConfig
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.checkpoint import CONFIG_FILE, read_json
-from lerobot_memobench.policies.memobench_mem.averaging import WeightAverage
+from lerobot_memobench.policies.checkpoint import CONFIG_FILE, Processor, read_json
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.memory_pi05 import MemoryPI05
-from lerobot_memobench.policies.memobench_mem.weights import (
-    TRAINING_FILE,
-    checkpoint_file,
-    load_exactly,
-)
+from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
+from lerobot_memobench.policies.memobench_mem.training import WeightAverage
 
 logger = logging.getLogger(__name__)
 
@@ -89,3 +88,154 @@ def restore_average(average: WeightAverage, source: str | Path, revision: str | 
     if new:
         logger.info("The average goes on from '%s'; that of %s begins anew.", source, ", ".join(new))
     return average
+
+
+# ==== weights.py
+# Files of a checkpoint: finding them, what they must hold, and starting from pi0.5's.
+
+MODEL_FILE = "model.safetensors"
+TRAINING_FILE = "training_weights.safetensors"
+PREPROCESSOR_FILE = "policy_preprocessor.json"
+
+
+def checkpoint_file(source: str | Path, name: str, revision: str | None = None) -> Path | None:
+    """A file of a checkpoint folder or hub repository; None when it has no such file.
+
+    Raises:
+        MemobenchError: the repository cannot be reached.
+    """
+    folder = Path(source)
+    if folder.is_dir():
+        return folder / name if (folder / name).is_file() else None
+    try:
+        return Path(hf_hub_download(str(source), name, revision=revision))
+    except LocalEntryNotFoundError as error:
+        raise MemobenchError(f"'{source}' is neither a folder nor reachable on the hub.") from error
+    except EntryNotFoundError:
+        return None
+    except (HfHubHTTPError, ValueError) as error:
+        raise MemobenchError(f"'{source}' is neither a folder nor a repository that can be read.") from error
+
+
+def weights_file(source: str | Path, revision: str | None = None, *, named: str, fix: str) -> Path:
+    """The file of a checkpoint's weights.
+
+    Raises:
+        MemobenchError: it has none; the message calls it ``named`` and ends with ``fix``.
+    """
+    path = checkpoint_file(source, MODEL_FILE, revision)
+    if path is None:
+        raise MemobenchError(f"{named} has no {MODEL_FILE}; {fix}.")
+    return path
+
+
+def require_statistics(source: str | Path, revision: str | None = None) -> None:
+    """Check that a checkpoint brings the statistics that normalise states and actions.
+
+    LeRobot passes values through unchanged where a statistic is missing, and an evaluation then scores 0 %.
+
+    Raises:
+        MemobenchError: a file or a statistic is missing.
+    """
+    fix = "copy the preprocessor files of its training run into it, or train again"
+    path = checkpoint_file(source, PREPROCESSOR_FILE, revision)
+    if path is None:
+        raise MemobenchError(f"The checkpoint '{source}' has no {PREPROCESSOR_FILE}, so it cannot be evaluated; {fix}.")
+    steps = read_json(path, Processor).get("steps", [])
+    step = next((step for step in steps if step.get("registry_name") == "normalizer_processor"), None)
+    state = None if step is None or not step.get("state_file") else step["state_file"]
+    file = None if state is None else checkpoint_file(source, state, revision)
+    present: set[str] = set()
+    if file is not None:
+        with safe_open(file, framework="pt") as tensors:
+            present = {name.rsplit(".", 1)[0] for name in tensors.keys()}  # noqa: SIM118 (not a dict)
+    missing = sorted({"observation.state", "action"} - present)
+    if missing:
+        raise MemobenchError(
+            f"The checkpoint '{source}' has no dataset statistics for {' and '.join(missing)}, so states and actions "
+            f"could not be normalised; {fix}."
+        )
+
+
+def read_weights(source: str | Path, prefix: str = "") -> dict[str, Tensor]:
+    """Weights of a checkpoint whose names start with ``prefix``, without a leading ``model.`` and the prefix.
+
+    Raises:
+        MemobenchError: no weights there.
+    """
+    path = weights_file(source, named=f"'{source}'", fix="give the folder or repository of a pi0.5 checkpoint")
+    with safe_open(path, framework="pt") as tensors:
+        found = {}
+        for name in tensors.keys():  # noqa: SIM118 (not a dict)
+            short = name.removeprefix("model.")
+            if short.startswith(prefix):
+                found[short.removeprefix(prefix)] = tensors.get_tensor(name)
+    return found
+
+
+def load_exactly(module: nn.Module, weights: dict[str, Tensor], source: str | Path, optional: set[str]) -> None:
+    """Load ``weights`` into ``module``, whose names in ``optional`` may be absent.
+
+    Raises:
+        MemobenchError: names or shapes differ.
+    """
+    own = module.state_dict()
+    missing = sorted(set(own) - set(weights) - optional)
+    wrong = sorted(name for name in set(own) & set(weights) if own[name].shape != weights[name].shape)
+    if missing or wrong:
+        name = (missing + wrong)[0]
+        raise MemobenchError(
+            f"The weights of '{source}' do not fit this policy: {len(missing)} are missing and {len(wrong)} have "
+            f"another shape, the first being '{name}'; give weights of the same size (--policy.size) and "
+            "perception (--policy.perception)."
+        )
+    module.load_state_dict({name: weights[name] for name in own if name in weights}, strict=False)
+
+
+# ==== saved_steps.py
+# What the preprocessor of a checkpoint must agree on with the policy that goes on from it.
+#
+# LeRobot loads the saved steps. Ours follow the policy (`processing.training_run`) and LeRobot hands some of its own
+# their new settings; the rest would keep the checkpoint's, whatever the configuration says.
+
+_ORACLE = "memobench_oracle_memory"
+
+
+def require_agreement(source: str | Path, revision: str | None, config: MemobenchMemConfig, *, training: bool) -> None:
+    """Check that the saved steps of a checkpoint do, or will do, what ``config`` says.
+
+    A checkpoint without a preprocessor passes: LeRobot says what it lacks.
+
+    Raises:
+        MemobenchError: a setting would silently have no effect.
+    """
+    path = checkpoint_file(source, PREPROCESSOR_FILE, revision)
+    if path is None:
+        return
+    entries = read_json(path, Processor).get("steps", [])
+    steps = {entry.get("registry_name", ""): entry.get("config", {}) for entry in entries}
+    for field, held in _held(steps, config, training):
+        asked = getattr(config, field)
+        if asked != held:
+            raise MemobenchError(
+                f"--policy.{field}={asked} would have no effect, because the preprocessor of '{source}' was saved with "
+                f"{held} and cannot change it; leave {field} as it is there, or train from --policy.base_weights."
+            )
+
+
+def _held(
+    steps: Mapping[str, Mapping[str, Any]], config: MemobenchMemConfig, training: bool
+) -> Iterator[tuple[str, object]]:
+    """Settings that the saved steps keep, with their values there."""
+    if not training or _ORACLE not in steps:
+        yield "oracle_memory", _ORACLE in steps and bool(steps[_ORACLE].get("enabled", True))
+    if not training:
+        return
+    tokenizer = steps.get("memobench_tokenizer", steps.get("tokenizer_processor"))  # ours, or LeRobot's pi05
+    words = "memobench_word_tokenizer" in steps
+    if tokenizer is not None or words:
+        yield "tokenizer_name", "words" if tokenizer is None else tokenizer.get("tokenizer_name")
+    if tokenizer is not None:
+        yield "tokenizer_max_length", tokenizer.get("max_length")
+    if not config.use_relative_actions:  # LeRobot switches them on, and never off
+        yield "use_relative_actions", bool(steps.get("relative_actions_processor", {}).get("enabled", False))

@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
+from lerobot.optim import AdamWConfig, LRSchedulerConfig, OptimizerConfig
+from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
+from torch import nn
+from torch.optim import AdamW, Optimizer
+from torch.optim.lr_scheduler import LambdaLR
 
 from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
 from lerobot_memobench.envs.observations import DETECTIONS, SEEN_PIXELS
@@ -16,23 +23,183 @@ from lerobot_memobench.envs.observations import PRIVILEGED as SEEN_OBJECTS
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.perception.tower import SIDE
 from lerobot_memobench.perception.weights import PACKAGE, RANDOM
-from lerobot_memobench.policies.memobench_mem.action_objective import OBJECTIVES, REGRESSION
-from lerobot_memobench.policies.memobench_mem.dimensions import GRID, SIZES, Dimensions
-from lerobot_memobench.policies.memobench_mem.schedule import FusedAdamWConfig, WarmupFractionSchedulerConfig
-from lerobot_memobench.policies.memobench_mem.settings_memobench_mem import MemobenchMemSettings
 from lerobot_memobench.protocol import CAMERAS, IMAGE_SIZE
 
 logger = logging.getLogger(__name__)
+
+FLOW_MATCHING, REGRESSION = "flow_matching", "regression"
+
+
+OBJECTIVES = (FLOW_MATCHING, REGRESSION)
+MEMORY_GRID = 4
+"""A remembered picture is pooled to MEMORY_GRID x MEMORY_GRID tokens."""
+
+
+@dataclass(frozen=True)
+class Gemma:
+    """One transformer of the pair (names as LeRobot's ``GemmaConfig``)."""
+
+    width: int
+    depth: int
+    mlp_dim: int
+    num_heads: int
+    num_kv_heads: int
+    head_dim: int
+
+
+@dataclass(frozen=True)
+class Vision:
+    """The SigLIP image tower."""
+
+    width: int
+    depth: int
+    mlp_dim: int
+    num_heads: int
+    patch: int
+    image: int  # pixels per side of the policy's input
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What is trained how, as far as a size decides it; the first values are the paper's.
+
+    Attributes:
+        chunk_size: actions of a plan. n_action_steps: how many of them are taken before the next plan.
+        final_lr: learning rate at the end, as a fraction of the highest; below 1 it falls there as a cosine.
+        normalization: LeRobot's mode for states and actions.
+        objective: how actions are learned (`action_objective`).
+    """
+
+    chunk_size: int = 50
+    n_action_steps: int = 50
+    weight_decay: float = 0.0
+    ema_decay: float = 0.999
+    final_lr: float = 1.0
+    normalization: str = "QUANTILES"
+    objective: str = "flow_matching"
+
+
+@dataclass(frozen=True)
+class Dimensions:
+    """All dimensions and size-dependent defaults of one size."""
+
+    vlm: Gemma
+    expert: Gemma
+    vision: Vision
+    vocabulary: int
+    tokenizer: str  # "words" (built here) or a Hugging Face tokenizer
+    tokenizer_max_length: int
+    text_encoder: str  # "words" (built here) or a folder or repository of a SigLIP model
+    text_dim: int
+    learning_rate: float
+    recipe: Recipe = field(default_factory=Recipe)
+
+
+# The VLM's width is also the width d_m of the memory tokens (2048 at full size).
+# LeRobot's attention code fixes 8 heads; widths and head dimensions are free.
+SIZES = {
+    "tiny": Dimensions(
+        vlm=Gemma(width=128, depth=4, mlp_dim=256, num_heads=8, num_kv_heads=1, head_dim=16),
+        expert=Gemma(width=128, depth=4, mlp_dim=256, num_heads=8, num_kv_heads=1, head_dim=16),
+        vision=Vision(width=96, depth=2, mlp_dim=192, num_heads=4, patch=12, image=96),
+        vocabulary=1024,
+        tokenizer="words",
+        tokenizer_max_length=64,
+        text_encoder="words",
+        text_dim=64,
+        learning_rate=1e-3,
+    ),
+    "small": Dimensions(
+        vlm=Gemma(width=128, depth=3, mlp_dim=256, num_heads=8, num_kv_heads=1, head_dim=16),
+        expert=Gemma(width=128, depth=3, mlp_dim=256, num_heads=8, num_kv_heads=1, head_dim=16),
+        vision=Vision(width=96, depth=2, mlp_dim=192, num_heads=4, patch=12, image=96),
+        vocabulary=512,
+        tokenizer="words",
+        tokenizer_max_length=48,
+        text_encoder="words",
+        text_dim=64,
+        learning_rate=1e-3,
+        recipe=Recipe(
+            chunk_size=16,
+            n_action_steps=6,
+            weight_decay=1e-4,
+            ema_decay=0.995,
+            final_lr=0.02,
+            normalization="MEAN_STD",
+            objective="regression",
+        ),
+    ),
+    "pi05": Dimensions(
+        vlm=Gemma(width=2048, depth=18, mlp_dim=16_384, num_heads=8, num_kv_heads=1, head_dim=256),
+        expert=Gemma(width=1024, depth=18, mlp_dim=4096, num_heads=8, num_kv_heads=1, head_dim=256),
+        vision=Vision(width=1152, depth=27, mlp_dim=4304, num_heads=16, patch=14, image=224),
+        vocabulary=257_152,
+        tokenizer="google/paligemma-3b-pt-224",
+        tokenizer_max_length=200,
+        text_encoder="google/siglip-so400m-patch14-224",
+        text_dim=1152,
+        learning_rate=5e-5,
+    ),
+}
 
 ALIGN_WEIGHTS = {"none": 0.0, "semantic": 0.1, "contrastive": 0.1, "framewise": 0.05}
 INTEGRATIONS = ("modulation", "context", "none")
 PERCEPTIONS = ("pixels", "objects")
 SUBGOAL_LEVELS = ("coarse", "intermediate", "fine")
-TOKENS_PER_FRAME = {"pixels": GRID**2, "objects": 2}
+TOKENS_PER_FRAME = {"pixels": MEMORY_GRID**2, "objects": 2}
 MEMORY_STRIDE, MOMENTS_PER_EPISODE = 8, 6
 """Where samples are made of what was read before training; 1 elsewhere."""
 ORACLE_TOKENS = 128
 """Room that oracle memory text needs in a prompt of the word tokenizer: six checkpoints of some ten words."""
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(text.split())
+
+
+FIXED = _names(
+    """
+    size perception object_classes integration oracle_memory memory_camera memory_frames
+    tokens_per_frame memory_stride objective chunk_size normalization_mapping image_resolution tokenizer_name
+    tokenizer_max_length input_features n_obs_steps paligemma_variant action_expert_variant max_state_dim max_action_dim
+    min_period max_period use_relative_actions relative_exclude_joints action_feature_names empty_cameras
+    """
+)
+"""Fields by which a checkpoint was trained, and which are refused where it acts under another value: its weights would
+mean something else, mostly without a word. Those that decide others stand before them."""
+OF_ACTING = _names(
+    """
+    n_action_steps whole_plan_if_still eyes num_inference_steps rtc_config device dtype use_amp
+    compile_model compile_mode pretrained_path pretrained_revision use_peft output_features
+    """
+)
+"""Fields that are free where a checkpoint acts. ``eyes`` that find objects are no part of it, and its own tower has a
+rule of its own (`checkpoints.read_config`); LeRobot makes ``output_features`` of the environment's, which
+`policies.shown` compares with the checkpoint's."""
+OF_TRAINING = _names(
+    """
+    sight_errors base_weights align align_weight subgoal_level shuffle_subgoals
+    shuffle_seed text_encoder memory_cache_dir ema_decay moments_per_episode balance_tasks prompted_weight
+    train_expert_only warmup_fraction final_lr gradient_checkpointing time_sampling_beta_alpha
+    time_sampling_beta_beta time_sampling_scale time_sampling_offset optimizer_lr optimizer_betas optimizer_eps
+    optimizer_weight_decay optimizer_grad_clip_norm scheduler_warmup_steps scheduler_decay_steps scheduler_decay_lr
+    push_to_hub repo_id private tags license
+    """
+)
+"""Fields that say how a policy is trained and where it goes: a checkpoint that acts reads none of them, and another
+value is refused there, or its card would tell of a training that never was."""
+SINCE_BEGUN = _names(
+    """
+    align subgoal_level shuffle_subgoals shuffle_seed text_encoder base_weights train_expert_only
+    ema_decay warmup_fraction final_lr optimizer_lr optimizer_betas optimizer_eps optimizer_weight_decay
+    optimizer_grad_clip_norm scheduler_warmup_steps scheduler_decay_steps scheduler_decay_lr
+    """
+)
+"""Those of `OF_TRAINING` that a training keeps where it is gone on with: they decide the model's parts and what these
+learn, or stand in the optimizer's saved state, which LeRobot makes from them once."""
+
+SIZES_OWN: Any = None
+"""Default of what the size or the perception decides once the rest is known; then it is a number."""
 
 
 def _choose(field: str, given: str, known: tuple[str, ...]) -> None:
@@ -45,8 +212,99 @@ def _choose(field: str, given: str, known: tuple[str, ...]) -> None:
 
 @PreTrainedConfig.register_subclass("memobench_mem")
 @dataclass
-class MemobenchMemConfig(MemobenchMemSettings):
-    """The settings, completed and checked."""
+class MemobenchMemConfig(PI05Config):
+    """pi0.5's fields plus the memory's. Fields that are ``None`` here take the size's value after construction."""
+
+    knows_phases: ClassVar[bool] = True
+    execution_only: ClassVar[bool] = True
+    fixed_by_training: ClassVar[tuple[str, ...]] = FIXED
+    of_training_alone: ClassVar[tuple[str, ...]] = OF_TRAINING
+    kept_since_begun: ClassVar[tuple[str, ...]] = (*FIXED, *SINCE_BEGUN)
+
+    size: str = "tiny"
+    """``small`` (from scratch, learns from objects in minutes on a CPU), ``tiny`` (from scratch, trains on a CPU) or
+    ``pi05`` (3.2 B)."""
+
+    perception: str = "pixels"
+    """How a moment is seen: ``pixels``, by the image tower, or ``objects``, by the slots of
+    ``observation.environment_state`` (`sim.object_slots`), without any picture, or as ``eyes`` find them."""
+    eyes: str | None = None
+    """What pictures are seen through: a file of `memobench eyes train`, ``package``: the eyes that come with the
+    package, or ``random``: pi0.5's image tower with random weights. With ``perception=objects``, the eyes that find
+    them in pictures; none: the environment tells them. With pixels at ``size=small``, whose tower's tokens are seen;
+    none: ``package``. A checkpoint of pixels holds its tower; there this only says where it was from."""
+    sight_errors: float = 0.0
+    """With which errors told objects are seen in training, so that the policy acts through ``eyes`` afterwards; 1: as
+    large as those of the package's eyes, 0: none."""
+    object_classes: list[str] | None = None
+    """Names of the classes that slots were trained with, in order of their indices; none: those of this version."""
+
+    base_weights: str | None = None
+    """Folder or repository of pi0.5 weights to start from (e.g. ``lerobot/pi05_base``); none: from scratch."""
+
+    # -- alignment
+    align: str = "none"
+    align_weight: float | None = None
+    """Weight of the alignment loss; none or 0: the paper's for this objective (``align=none`` trains without one)."""
+    subgoal_level: str = "intermediate"
+    shuffle_subgoals: bool = False
+    """Control of the paper: the subgoal texts of an episode change places among themselves, or with those of other
+    episodes where it has fewer than three."""
+    shuffle_seed: int = 7
+    """Which shuffle; the same for every epoch and on every machine."""
+    text_encoder: str | None = None
+
+    # -- memory
+    integration: str = "modulation"
+    """How actions read memory: ``modulation``, ``context`` (memory joins the prefix), or ``none``: plain pi0.5, the
+    baseline that never sees the past."""
+    oracle_memory: bool = False
+    """Control of the paper: ground-truth memory text stands in the prompt, from the dataset's column ``memory`` in
+    training and from the environment (``--env.oracle_memory=true``) at evaluation."""
+    memory_camera: str | None = None
+    """Whose pictures are remembered; none: the first camera's that the policy sees."""
+    memory_frames: int = 32
+    tokens_per_frame: int = SIZES_OWN
+    """Memory tokens of a remembered frame: 16 of a picture; 2, or another number, of objects."""
+    memory_stride: int = SIZES_OWN
+    """Every how many control steps a frame enters the history (and the cache); none: 8 with objects and
+    with eyes, 1 with other pixels."""
+    memory_cache_dir: str | None = None
+    """Folder for feature caches, of several datasets perhaps; none: ``feature_cache`` in the dataset's folder."""
+
+    # -- training
+    objective: str = SIZES_OWN
+    """How actions are learned: ``flow_matching``, as in pi0.5, or ``regression``, whose plan is one pass of the model
+    instead of ten (`action_objective`). None: the size's, ``regression`` at ``small``."""
+    ema_decay: float = SIZES_OWN
+    """Decay of the weights' moving average, which evaluation uses; 0 turns it off. None: the size's, the paper's
+    0.999 or 0.995 at ``small``."""
+    moments_per_episode: int = SIZES_OWN
+    """How many frames of an episode stand side by side in a batch, which shares what they remember; none: 6 with
+    objects and with eyes, and 1, LeRobot's order, with other pixels. ``batch_size`` counts frames all the same."""
+    balance_tasks: float = SIZES_OWN
+    """1: each task is drawn equally often, however long its episodes are; 0: each frame once per epoch; between: in
+    proportion to its frames to the power 1 - balance_tasks. None: 1 with objects and with eyes, else 0."""
+    prompted_weight: float = 1.0
+    """How many times as often as another a task that begins with a prompt is drawn, where tasks are balanced: to read a
+    prompt takes more updates than to act."""
+    warmup_fraction: float = 0.05
+    final_lr: float = SIZES_OWN
+    """Learning rate at the end, as a fraction of the highest, to which it falls as a cosine; 1: it stays constant.
+    None: the size's, 0.02 at ``small`` and the paper's 1 elsewhere."""
+
+    # -- pi0.5's fields with this recipe's values, or the size's where they are None or empty
+    chunk_size: int = SIZES_OWN
+    n_action_steps: int = SIZES_OWN
+    whole_plan_if_still: bool = False
+    """Whether all of a plan is carried out, and not its first ``n_action_steps``, where the hand stands as it stood at
+    the plan before: on a rim it might stand for ever, and plan each time to let go a little later."""
+    normalization_mapping: dict[str, NormalizationMode] = field(default_factory=dict)
+    image_resolution: tuple[int, int] | None = None
+    tokenizer_name: str | None = None
+    tokenizer_max_length: int | None = None
+    optimizer_lr: float | None = None
+    optimizer_weight_decay: float = SIZES_OWN
 
     def __post_init__(self) -> None:
         try:
@@ -154,10 +412,10 @@ class MemobenchMemConfig(MemobenchMemSettings):
                 "--policy.whole_plan_if_still=true is for policies that see objects, which are told where the hand is; "
                 "leave it out, or use --policy.perception=objects."
             )
-        if self.perception == "pixels" and self.tokens_per_frame != GRID**2:
+        if self.perception == "pixels" and self.tokens_per_frame != MEMORY_GRID**2:
             raise MemobenchError(
                 f"--policy.tokens_per_frame={self.tokens_per_frame} is not supported: frames are pooled to a "
-                f"4x4 grid, so leave it at {GRID**2}."
+                f"4x4 grid, so leave it at {MEMORY_GRID**2}."
             )
         if self.sees_tokens:
             if self.image_size != (SIDE, SIDE):
@@ -167,9 +425,9 @@ class MemobenchMemConfig(MemobenchMemSettings):
                 )
             return
         patch = self.dimensions.vision.patch
-        if any(side % patch or (side // patch) % GRID for side in self.image_size):
+        if any(side % patch or (side // patch) % MEMORY_GRID for side in self.image_size):
             raise MemobenchError(
-                f"--policy.image_resolution={self.image_resolution} must be a multiple of {GRID * patch} pixels at "
+                f"--policy.image_resolution={self.image_resolution} must be a multiple of {MEMORY_GRID * patch} pixels at "
                 f"size {self.size}, so that its patches pool to a 4x4 grid."
             )
 
@@ -338,3 +596,42 @@ class MemobenchMemConfig(MemobenchMemSettings):
                     "with fewer."
                 )
             setattr(self, name, needed)
+
+
+@OptimizerConfig.register_subclass("memobench_adamw")
+@dataclass
+class FusedAdamWConfig(AdamWConfig):
+    """AdamW that needs no room beside its state on a GPU, where torch's default makes a copy of all that learns.
+
+    At full size that copy is 10.5 GiB, and is what made four cards of 80 GB too small for `config=train_paper`.
+    """
+
+    def build(self, params: Iterable[nn.Parameter]) -> Optimizer:
+        """Return the optimizer of some parameters."""
+        learning = list(params)
+        fused = all(parameter.is_cuda for parameter in learning) or None  # elsewhere torch's own choice
+        return AdamW(learning, self.lr, self.betas, self.eps, self.weight_decay, fused=fused)
+
+
+@LRSchedulerConfig.register_subclass("memobench_constant_with_warmup")
+@dataclass
+class WarmupFractionSchedulerConfig(LRSchedulerConfig):
+    """Linear warm-up over a fraction of the run, then constant (paper: 5 %), or a cosine down to ``final`` at its end.
+
+    LeRobot's own constant schedule counts warm-up steps, which would have to change with ``--steps``.
+    """
+
+    num_warmup_steps: int | None = None
+    warmup_fraction: float = 0.05
+    final: float = 1.0
+
+    def build(self, optimizer: Optimizer, num_training_steps: int) -> LambdaLR:
+        """Return the schedule of a run of so many updates."""
+        steps = self.num_warmup_steps
+        warmup = max(1, round(self.warmup_fraction * num_training_steps) if steps is None else steps)
+
+        def rate(step: int) -> float:
+            fallen = (1 - math.cos(math.pi * min(1.0, step / num_training_steps))) / 2
+            return min(1.0, (step + 1) / warmup) * (1 - (1 - self.final) * fallen)
+
+        return LambdaLR(optimizer, rate)

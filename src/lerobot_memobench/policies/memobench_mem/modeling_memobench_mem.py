@@ -1,78 +1,115 @@
-"""``memobench_mem``: LeRobot's pi0.5 with a visual memory, trained with or without aligning it to checkpoint text."""
+"""``memobench_mem``: LeRobot's pi0.5 with a visual memory, trained with or without aligning it to subgoal texts.
+
+The policy from its construction to an update (``forward``) and to an action (``select_action``). The network that it
+trains and asks for actions is `network`; what training adds to it is `training`; what a checkpoint holds, `checkpoints`.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import logging
-from contextlib import nullcontext
+import threading
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 from lerobot.configs import PreTrainedConfig
+from lerobot.policies.common.vla_utils import pad_vector
+from lerobot.policies.pi05.modeling_pi05 import PI05Policy
 from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
 from safetensors.torch import load_file
-from torch import Tensor
+from torch import Tensor, nn
 from transformers.initialization import no_init_weights
 
+from lerobot_memobench.computing.bfloat16 import quick_gradients, quick_products
 from lerobot_memobench.computing.freed_memory import keep_freed_memory
 from lerobot_memobench.datasets.feature_cache.reading import RecordedFrames
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.weights import load_tower
 from lerobot_memobench.policies.checkpoint import check_as_trained
-from lerobot_memobench.policies.memobench_mem.acting import ActingPolicy
-from lerobot_memobench.policies.memobench_mem.adapters import trained_whole
-from lerobot_memobench.policies.memobench_mem.alignment.objectives import make_alignment
-from lerobot_memobench.policies.memobench_mem.averaging import WeightAverage
+from lerobot_memobench.policies.freshness import PICTURE_STEP, require_fresh
+from lerobot_memobench.policies.memobench_mem.alignment import alignment_loss, make_alignment, require_texts
 from lerobot_memobench.policies.memobench_mem.caching import open_frames
 from lerobot_memobench.policies.memobench_mem.checkpoints import (
     load_base_weights,
     load_weights,
     read_config,
+    require_agreement,
+    require_statistics,
     restore_average,
     save_training_weights,
+    weights_file,
 )
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.drawn_statistics import count_drawn_only
-from lerobot_memobench.policies.memobench_mem.execution_frames import (
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import REGRESSION, MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.encoders import EyePerception, Perception, Seen
+from lerobot_memobench.policies.memobench_mem.memory import make_mechanism
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
+    FRAMES,
+    MASK,
+    PHASE,
+    STEPS,
+    TOKENS,
+    MemoryBatch,
+    RolloutMemory,
+)
+from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Precision, attend_fused
+from lerobot_memobench.policies.memobench_mem.objects import HAND_DIM, OBS_PHASE, OBS_RAW_STATE, rotation
+from lerobot_memobench.policies.memobench_mem.sampler import (
     Drawn,
+    TrainingRun,
+    begin_training,
+    count_drawn_only,
     execution_starts,
     prompted_factors,
+    read_from_memory,
     task_of_frames,
 )
-from lerobot_memobench.policies.memobench_mem.fused_attention import attend_fused
-from lerobot_memobench.policies.memobench_mem.learning import LearningPolicy
-from lerobot_memobench.policies.memobench_mem.memory.registry import make_mechanism
-from lerobot_memobench.policies.memobench_mem.memory.rollout import RolloutMemory
-from lerobot_memobench.policies.memobench_mem.memory_pi05 import MemoryPI05
-from lerobot_memobench.policies.memobench_mem.noise import EpisodeNoise
-from lerobot_memobench.policies.memobench_mem.one_thread import OneThread
-from lerobot_memobench.policies.memobench_mem.perception.eyes import EyePerception
-from lerobot_memobench.policies.memobench_mem.plans import RowPlans
-from lerobot_memobench.policies.memobench_mem.precision import Precision
-from lerobot_memobench.policies.memobench_mem.processing.subgoals import require_texts
-from lerobot_memobench.policies.memobench_mem.processing.training_run import TrainingRun, begin_training
-from lerobot_memobench.policies.memobench_mem.recorded_items import read_from_memory
-from lerobot_memobench.policies.memobench_mem.saved_steps import require_agreement
-from lerobot_memobench.policies.memobench_mem.training_curve import TrainingCurve
-from lerobot_memobench.policies.memobench_mem.weights import require_statistics, weights_file
+from lerobot_memobench.policies.memobench_mem.training import (
+    TrainingCurve,
+    WeightAverage,
+    counted_actions,
+    losses_of,
+    mean_losses,
+    means_over_ranks,
+    noise_and_time,
+)
+from lerobot_memobench.policies.shown import cure
+from lerobot_memobench.protocol import EXECUTION, PROMPT
 
 # A saved pipeline is built right after its policy, by the names under which its steps register when imported.
 from lerobot_memobench.policies.memobench_mem import processor_memobench_mem  # noqa: F401  # isort: skip
 
 logger = logging.getLogger(__name__)
 
+OBS_STEP, OBS_PICTURE = "observation.step", f"observation.{PICTURE_STEP}"
+OWN_MODULES = (
+    *("model.memory", "model.memory_to_expert", "modulator", "alignment"),
+    *("model.state_token", "model.instruction", "paligemma_with_expert.perception"),
+)
+"""Ends of the names of modules that plain pi0.5 does not have; beside adapters (``--peft…``) they are trained whole."""
 
-class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
-    """pi0.5 plus memory. ``forward`` trains, ``select_action`` acts; both see the same history for the same frame.
+
+class MemobenchMemPolicy(PI05Policy):
+    """pi0.5 plus memory. ``forward`` trains, ``select_action`` acts; both read the same history at the same frame.
 
     Attributes:
+        alignment: objective and head that tie memory to text; None without one.
+        precision: in which the weights are kept.
         average: moving average of the trained weights, which evaluation uses; None before training, or without one.
-        history: what the rows of a rollout remember. plans: what they are about to do.
-        run: what it is trained with; None where it only acts.
+        run: the dataset and its features that it is trained with; None where it only acts.
+        curve: how its losses fell.
+        history: frames that the rows of a rollout remember. plans: their action queues. noise: for sampling chunks.
+        thread: the one that acts.
     """
 
     config_class = MemobenchMemConfig
     name = "memobench_mem"
     config: MemobenchMemConfig
+    model: MemoryPI05
 
     def __init__(
         self, config: MemobenchMemConfig, *, dataset_meta: Any | None = None, load_base: bool = True, **kwargs: Any
@@ -81,7 +118,7 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
 
         Args:
             dataset_meta: metadata of the dataset to train on; its feature cache is checked, and made or finished.
-            load_base: whether this is all; not when a checkpoint follows, with which training begins.
+            load_base: False where a checkpoint's weights follow, with which training begins.
         """
         # As PI05Policy.__init__, which names its model class.
         PreTrainedPolicy.__init__(self, config)
@@ -96,7 +133,7 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
         config.validate_features()
         self.init_rtc_processor()
         # What a checkpoint holds is not drawn first: at full size that takes two minutes.
-        with nullcontext() if load_base else no_init_weights():
+        with contextlib.nullcontext() if load_base else no_init_weights():
             self.model = MemoryPI05(config, rtc_processor=self.rtc_processor)
         dims = config.dimensions
         self.alignment = make_alignment(
@@ -106,7 +143,9 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
         if dataset_meta is not None:
             self.precision.settle()  # before weights are loaded, which may be finer than bfloat16
         if config.base_weights and load_base:
-            self._load_base_weights(config.base_weights)
+            source = config.base_weights
+            path = weights_file(source, named=f"--policy.base_weights='{source}'", fix="give a pi0.5 checkpoint")
+            load_base_weights(self.model, self._fix_pytorch_state_dict_keys(load_file(path), config), source)
         elif isinstance(self.perception, EyePerception) and load_base:
             assert config.eyes is not None
             self.perception.tower.load_state_dict(load_tower(config.eyes).state_dict())
@@ -124,8 +163,44 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
         if dataset_meta is not None and load_base:
             self._begin_training(dataset_meta)
 
+    @property
+    def perception(self) -> Perception:
+        """The encoder of observations."""
+        return self.model.paligemma_with_expert.perception
+
+    @property
+    def _action_dim(self) -> int:
+        assert self.config.output_features is not None
+        return self.config.output_features[ACTION].shape[0]
+
+    @property
+    def _device(self) -> torch.device:
+        return next(self.parameters()).device
+
+    @property
+    def _remembers(self) -> bool:
+        return self.history.mechanism.frames > 0
+
+    def _preprocess_images(self, batch: dict[str, Tensor]) -> Seen:
+        """Return what the model is given in the place of images: the observation's parts, and the state's token."""
+        parts, masks = self.perception.present(batch) or super()._preprocess_images(batch)
+        if self.config.state_token:
+            state = pad_vector(batch[OBS_STATE], self.config.max_state_dim)
+            parts, masks = [*parts, state], [*masks, torch.ones(len(state), dtype=torch.bool)]
+        return [part.to(self._device) for part in parts], [mask.to(self._device) for mask in masks]
+
+    @contextlib.contextmanager
+    def _acting(self) -> Iterator[None]:
+        """Compute as a checkpoint saved now would: by the average, in the precision that it is loaded in."""
+        wide = self.precision.narrowed()
+        average = contextlib.nullcontext() if self.average is None else self.average.applied(wide)
+        with average, self.precision.computing(self._device):
+            yield
+
+    # -- training --------------------------------------------------------------------------------------------------
+
     def _begin_training(self, meta: Any) -> None:
-        """Make ready to train on a dataset: what the preprocessor looks up, and what LeRobot draws."""
+        """Make ready to train on a dataset: the features that the preprocessor looks up, and LeRobot's sampler."""
         cache = open_frames(Path(meta.root), self.config, self.perception)
         self.run = TrainingRun(self.config, cache, meta)
         begin_training(self.run)
@@ -143,11 +218,261 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
         order = Drawn(starts, self.config.moments_per_episode, tasks, balance, factors)
         self.config.drop_n_last_frames = order  # type: ignore[assignment]  # a number to nobody but LeRobot's sampler
 
-    # -- checkpoints -----------------------------------------------------------------------------------------------
+    @property
+    def _averages(self) -> bool:
+        """Whether weights are averaged: not those of adapters, of which peft writes a checkpoint's file."""
+        return bool(self.config.ema_decay) and not self.config.use_peft
 
-    def _load_base_weights(self, source: str) -> None:
-        path = weights_file(source, named=f"--policy.base_weights='{source}'", fix="give a pi0.5 checkpoint")
-        load_base_weights(self.model, self._fix_pytorch_state_dict_keys(load_file(path), self.config), source)
+    def _trained(self) -> dict[str, nn.Parameter]:
+        return {name: parameter for name, parameter in self.named_parameters() if parameter.requires_grad}
+
+    def get_optim_params(self) -> list[nn.Parameter]:
+        """Return the parameters that learn, in float32: all but the image tower and what pi0.5 never uses."""
+        self.precision.settle()
+        return list(self._trained().values())
+
+    def update(self) -> None:
+        """Move the average of the weights; lerobot-train calls this after each optimiser step."""
+        if self.average is not None:
+            self.average.update()
+
+    def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, Any]]:
+        """Return the loss of the actions plus the weighted alignment on a preprocessed training batch.
+
+        A loss that is only measured (lerobot-train's ``eval_loss``: not training, no gradients) is that of the averaged
+        weights, which a checkpoint holds and rollouts act by.
+
+        Args:
+            batch: what LeRobot's pi0.5 needs, and ``memory.*`` and ``phase`` as the preprocessor adds them.
+            reduction: ``mean`` for a scalar, ``none`` for one loss per sample (B,).
+
+        Returns:
+            The loss, and numbers to log: ``action_loss``, and with an alignment ``align_loss`` (unweighted),
+            ``align_grad_norm`` (of the weighted loss, over the memory encoder's parameters) and ``align_top1`` (share
+            of memory vectors whose nearest text in the batch is theirs).
+
+        Raises:
+            MemobenchError: the batch has no memory, or pictures where it should have their tokens.
+        """
+        self._require_memory(batch)
+        if self._averages and self.average is None and self.training:
+            self.average = WeightAverage(self._trained(), self.config.ema_decay)
+        measures = not self.training and not torch.is_grad_enabled()
+        quick = self.training and self._device.type == "cpu" and not self.config.sees_tokens
+        computing = self._acting() if measures else self.precision.computing(self._device)
+        with computing, quick_products() if quick else contextlib.nullcontext():
+            memory = self._read_memory(batch)
+            per_sample, total, logged = self._action_loss(batch)
+            if self.alignment is not None and memory is not None:
+                assert self.config.align_weight is not None
+                encoder = [parameter for parameter in self.model.memory.parameters() if parameter.requires_grad]
+                weighted, numbers = alignment_loss(self.alignment, self.config.align_weight, batch, *memory, encoder)
+                per_sample, total, logged = per_sample + weighted, total + weighted, logged | numbers
+        logged["loss"] = total.item()
+        if self.training:
+            self.curve.note(means_over_ranks(logged, self._device))
+        else:
+            self.curve.note_held_out(logged)
+        loss = per_sample if reduction == "none" else total
+        if quick:
+            quick_gradients(loss)
+        return loss, logged
+
+    def _require_memory(self, batch: dict[str, Tensor]) -> None:
+        needed = TOKENS if self._remembers else PHASE
+        if needed not in batch:
+            raise MemobenchError(
+                f"The training batch has no '{needed}': the preprocessor lacks the step memobench_gather_memory; to "
+                "start from pi0.5's weights pass --policy.base_weights instead of --policy.pretrained_path."
+            )
+        if self.config.has_eyes and self.training and any(key in batch for key in self.config.image_features):
+            raise MemobenchError(
+                "The training batch has pictures, which a policy with eyes does not look at (it reads what was once "
+                "seen in them), because a stream or loader processes made it, or because another policy is trained on "
+                "the same dataset object: pass --num_workers=0, which is quicker too, leave dataset.streaming out, and "
+                "open the dataset once for each policy."
+            )
+
+    def _read_memory(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor] | None:
+        """Hand a batch's memory to the model; return its tokens (B, L, d_m) and their mask (B, L)."""
+        if not self._remembers:
+            return None
+        memory = MemoryBatch(batch[TOKENS], batch[STEPS], batch[MASK]).to(self._device)
+        numbers = batch.get(FRAMES)
+        return self.model.set_memory(*memory, numbers=None if numbers is None else numbers.to(self._device))
+
+    def _action_loss(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor, dict[str, Any]]:
+        """Return the loss of the actions per sample (B,), its mean over the actions that count, and numbers to log."""
+        images, image_masks = self._preprocess_images(batch)
+        actions = self.prepare_action(batch)
+        words = batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK]
+        drawn = noise_and_time(self.config.objective, self.model, actions)
+        squared = self.model.forward(images, image_masks, *words, actions, *drawn)[:, :, : self._action_dim]
+        losses = losses_of(self.config.objective, squared)
+        found = mean_losses(losses, counted_actions(batch, losses))
+        logged = {"action_loss": found.mean.item(), "loss_per_dim": found.per_dim.cpu().tolist()}
+        return found.per_sample, found.mean, logged
+
+    # -- acting ----------------------------------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Forget histories and planned actions. LeRobot calls it once per batch of episodes."""
+        super().reset()
+        for part in (self.history, self.plans, self.noise):
+            part.reset()
+        self._calls = self._planned = 0
+        self.thread.begin()
+        self._acting_rows: list[int] = []
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """Return the next action of every row (B, A), normalised.
+
+        Every row uses up its own chunk: ``n_action_steps`` of it, or all (``whole_plan_if_still``). A chunk is planned
+        from that row alone, so rows of a batch are independent, when the row's execution begins or its last chunk is
+        used up. In the prompt phase, where actions have no effect, and for frozen rows nothing is planned.
+        """
+        self.thread.check()
+        if self.training:  # a millisecond, if it were said at every step
+            self.eval()
+        steps, started, frozen = self.observe(batch)
+        count = len(steps)
+        self.plans.resize(count)
+        prompt = [phase == PROMPT for phase in _column(batch, OBS_PHASE) or [EXECUTION] * count]
+        for row in range(count):
+            if started[row] or prompt[row]:
+                self.plans.drop(row)
+        acting = self._acting_rows = [row for row in range(count) if not prompt[row] and not frozen[row]]
+        wanting = self.plans.wanting(acting)
+        if wanting:
+            plans = self.plan(batch, wanting, self._noise(wanting, steps))
+            states = batch[OBS_RAW_STATE] if self.config.whole_plan_if_still else None
+            for row, plan in zip(wanting, plans.float().cpu(), strict=True):
+                self.plans.begin(row, plan, self.config.n_action_steps, None if states is None else states[row])
+        return self.plans.step(acting).to(self._device)
+
+    def observe(self, batch: dict[str, Tensor]) -> tuple[list[int], list[bool], list[bool]]:
+        """Take the current frames of all rows into their histories.
+
+        Returns:
+            Per row its control step since the episode began, whether a new episode began, and whether it is frozen.
+        """
+        seen = self.perception.remembers
+        if seen not in batch:
+            what = f"'{seen}'" if seen else "picture"
+            raise MemobenchError(f"The observation has no {what}, which this policy remembers; {cure(seen, batch)}")
+        count = len(batch[seen])
+        steps = _column(batch, OBS_STEP) or [self._calls] * count  # without a clock one call is one step
+        phases = _column(batch, OBS_PHASE) if OBS_STEP in batch else None
+        clocks = list(zip(phases or [EXECUTION] * count, steps, strict=True))
+        self._calls += 1
+        steps, started, frozen = self.history.observe(clocks, lambda rows: self._encode(batch, clocks, rows))
+        self.noise.resize(count)
+        for row in range(count):
+            if started[row]:
+                told = (key for key in (seen, OBS_STATE, OBS_LANGUAGE_TOKENS) if key in batch)
+                self.noise.begin(row, (batch[key][row] for key in told))
+        return steps, started, frozen
+
+    def _encode(self, batch: dict[str, Tensor], clocks: list[tuple[int, int]], rows: list[int]) -> Tensor:
+        """Return tokens (n, P, D) of the present frames of some rows; refuse a frame of an earlier step."""
+        if OBS_PICTURE in batch and self.perception.pictures:
+            for row in rows:
+                require_fresh(clocks[row][1], round(float(batch[OBS_PICTURE][row])))
+        return self.perception.remember(batch, rows)
+
+    def plan(self, batch: dict[str, Tensor], rows: list[int], noise: Tensor, **kwargs: Any) -> Tensor:
+        """Return action chunks (n, chunk, A) of some rows of the batch, with their histories and sampling noise."""
+        part = {key: batch[key][rows] for key in self._inputs if key in batch}
+        images, image_masks = self._preprocess_images(part)
+        words = part[OBS_LANGUAGE_TOKENS], part[OBS_LANGUAGE_ATTENTION_MASK]
+        with self._acting():
+            if self._remembers:
+                self._require_history(rows)
+                self.model.set_memory(*self.history.gather(rows).to(self._device))
+            noise = noise.to(self._device)
+            actions = self.model.sample_actions(images, image_masks, *words, noise=noise, **kwargs)
+        return actions[:, :, : self._action_dim]
+
+    @property
+    def _inputs(self) -> list[str]:
+        """Observations of the present that the model is given, if they are there."""
+        images = [*self.config.image_features] if self.config.sees_pictures else []
+        objects = [OBS_ENV_STATE, OBS_RAW_STATE] if self.config.sees_objects else []
+        return [*images, *objects, OBS_STATE, OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK]
+
+    def _require_history(self, rows: list[int]) -> None:
+        missed = self.history.missed(rows)
+        if missed is not None:
+            raise MemobenchError(
+                f"This policy remembers every {self.history.stride} control steps, and was not shown step {missed} of "
+                "this episode: its memory would be another one than in training; offer it the observation of every "
+                "control step, by select_action or by observe."
+            )
+
+    def _noise(self, rows: list[int], steps: list[int]) -> Tensor:
+        shape = self.config.chunk_size, self.config.max_action_dim
+        if self.config.objective == REGRESSION:
+            return torch.zeros(len(rows), *shape)
+        return self.noise.draw(rows, steps, shape)
+
+    def looks_next(self) -> bool:
+        """Return whether the next observation's pictures or objects are read: it is remembered, or planned from.
+
+        Asked after an action. Whether the next frame is the first of an execution, where chunks begin, only the
+        environment knows: that one is to be shown in any case, as the first of an episode.
+        """
+        return self.history.writes_next() or bool(self.plans.wanting(self._acting_rows))
+
+    def supports_rtc(self) -> bool:
+        """Return whether LeRobot's real-time chunking may ask this policy for its chunks.
+
+        It guides the denoising of a chunk, which regression lacks, and offers one observation per chunk, of which no
+        history can be made.
+        """
+        denoises = self.config.objective != REGRESSION
+        return bool(super().supports_rtc()) and denoises and not self._remembers
+
+    @torch.no_grad()
+    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """Take in one observation per row and plan for all rows: (B, chunk, A), normalised.
+
+        A policy that remembers must be offered the observation of every control step by `observe`, this one included,
+        unless it tells its step (``observation.step``); or let `select_action` see to it. ``noise``
+        (B, chunk, max_action_dim) replaces the episodes' own; other keywords are LeRobot's real-time chunking ones.
+
+        Raises:
+            MemobenchError: observations were left out between two chunks; or real-time chunking, by regression.
+        """
+        self.eval()
+        if self._rtc_enabled() and self.config.objective == REGRESSION:
+            raise MemobenchError(
+                "Real-time chunking guides the denoising of a plan, which a policy of objective=regression lacks: its "
+                "plans would not continue the last one; use --inference.type=sync, or train with "
+                "--policy.objective=flow_matching."
+            )
+        steps = self._offered(batch)
+        rows = list(range(len(steps)))
+        noise = kwargs.pop("noise", None)
+        return self.plan(batch, rows, self._noise(rows, steps) if noise is None else noise, **kwargs)
+
+    def _offered(self, batch: dict[str, Tensor]) -> list[int]:
+        """Take in the observation of a chunk, unless it was offered before; return each row's control step."""
+        if OBS_STEP in batch or not self._remembers or not self._calls:
+            steps, _, _ = self.observe(batch)
+        elif self._calls > self._planned:
+            steps = [row.position for row in self.history.rows]
+        else:
+            raise MemobenchError(
+                "This policy remembers what it saw at every control step, and was asked for two plans with no "
+                "observation between them: its memory would be another one than in training; let select_action see "
+                "every observation (--inference.type=sync), offer each to observe before planning, or train with "
+                "--policy.integration=none."
+            )
+        self._planned = self._calls
+        return steps
+
+    # -- checkpoints -----------------------------------------------------------------------------------------------
 
     @classmethod
     def from_pretrained(
@@ -184,7 +509,8 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
         if dataset_meta is None:
             return policy
         if policy._averages:
-            policy.average = restore_average(policy._new_average(), source, revision)
+            average = WeightAverage(policy._trained(), policy.config.ema_decay)
+            policy.average = restore_average(average, source, revision)
         policy.curve = TrainingCurve.read(Path(source))
         policy._begin_training(dataset_meta)
         return policy
@@ -216,10 +542,145 @@ class MemobenchMemPolicy(LearningPolicy, ActingPolicy):
         return wrapped
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
-        return super()._get_default_peft_targets() | {"modules_to_save": trained_whole(self)}
+        return super()._get_default_peft_targets() | {"modules_to_save": self.trained_whole()}
 
     def _preprocess_peft_cli_overrides(self, cli_overrides: dict[str, Any], peft_method_type: Any) -> dict[str, Any]:
         overrides: dict[str, Any] = super()._preprocess_peft_cli_overrides(cli_overrides, peft_method_type)
         if overrides.get("modules_to_save") is not None:
-            overrides["modules_to_save"] = trained_whole(self, overrides["modules_to_save"])
+            overrides["modules_to_save"] = self.trained_whole(overrides["modules_to_save"])
         return overrides
+
+    def trained_whole(self, asked: Iterable[str] = ()) -> list[str]:
+        """Return peft's ``modules_to_save``: those ``asked`` for, and memory and heads as far as there are some."""
+        names = [name for name, _ in self.named_modules()]
+        own = [end for end in OWN_MODULES if any(name == end or name.endswith(f".{end}") for name in names)]
+        return [*asked, *(end for end in own if end not in set(asked))]
+
+
+def _column(batch: dict[str, Tensor], key: str) -> list[int] | None:
+    """Return a whole number per row, None where a batch does not have it."""
+    if key not in batch:
+        return None
+    return [round(value) for value in batch[key].reshape(len(batch[key]), -1)[:, 0].tolist()]
+
+
+# -- rows of a rollout ---------------------------------------------------------------------------------------------
+
+STILL, PER_RADIAN = 0.006, 0.1
+"""How little a hand or a finger may move from one plan to the next to be still, m, and what a radian counts, m."""
+
+
+class RowPlans:
+    """A queue of planned actions per row, and the action each row took last."""
+
+    def __init__(self, action_dim: int) -> None:
+        self.action_dim = action_dim
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all plans."""
+        self.queues: list[deque[Tensor]] = []
+        self.last: list[Tensor] = []
+        self.stood: list[Tensor | None] = []
+
+    def resize(self, rows: int) -> None:
+        """Begin anew if the number of rows is another."""
+        if len(self.queues) != rows:
+            self.queues = [deque() for _ in range(rows)]
+            self.last = [torch.zeros(self.action_dim) for _ in range(rows)]
+            self.stood = [None] * rows
+
+    def drop(self, row: int) -> None:
+        """Forget a row's plan; until it has another its action is zero."""
+        self.queues[row].clear()
+        self.last[row] = torch.zeros(self.action_dim)
+        self.stood[row] = None
+
+    def begin(self, row: int, plan: Tensor, count: int, state: Tensor | None = None) -> None:
+        """Take the first actions of a plan (n, A) as a row's.
+
+        Args:
+            count: how many. state: the robot's (8,), as it is, m and rad; with it, a hand that stands as it stood when
+                the row's last plan was made carries out the whole plan. Where each plan would do the next thing later
+                than it is carried out, the hand would stand there for ever.
+        """
+        stands = None
+        if state is not None:
+            turned = rotation(state[None, 3:HAND_DIM]).flatten() * PER_RADIAN
+            stands = torch.cat([state[:3], turned, state[HAND_DIM:]]).cpu()
+        stood, self.stood[row] = self.stood[row], stands
+        still = stands is not None and stood is not None and bool((stands - stood).abs().max() < STILL)
+        self.queues[row].extend(plan if still else plan[:count])
+
+    def wanting(self, rows: Sequence[int]) -> list[int]:
+        """Return those of ``rows`` that have no plan left."""
+        return [row for row in rows if not self.queues[row]]
+
+    def step(self, rows: Sequence[int]) -> Tensor:
+        """Let ``rows`` go on with their plans; return every row's action (B, A), those of others repeated."""
+        for row in rows:
+            self.last[row] = self.queues[row].popleft()
+        return torch.stack(self.last)
+
+
+class EpisodeNoise:
+    """A seed per row of a vector environment, from its episode's first observation and the process's seed.
+
+    Noise drawn from a common generator would make a row's actions depend on how many rows run beside it.
+    """
+
+    def __init__(self) -> None:
+        self.seeds: list[int] = []
+
+    def reset(self) -> None:
+        """Forget all episodes."""
+        self.seeds = []
+
+    def resize(self, rows: int) -> None:
+        """Begin anew if the number of rows is another."""
+        if len(self.seeds) != rows:
+            self.seeds = [0] * rows
+
+    def begin(self, row: int, observed: Iterable[Tensor]) -> None:
+        """Begin a row's episode with its first observation."""
+        digest = hashlib.blake2b(str(torch.initial_seed()).encode(), digest_size=7)
+        for value in observed:
+            digest.update(value.detach().to("cpu").contiguous().numpy().tobytes())
+        self.seeds[row] = int.from_bytes(digest.digest(), "big")
+
+    def draw(self, rows: Sequence[int], steps: Sequence[int], shape: tuple[int, int]) -> Tensor:
+        """Return noise (n, *shape) on the CPU for plans of ``rows`` at ``steps``, those of all rows."""
+        generators = (torch.Generator().manual_seed(self.seeds[row] + steps[row]) for row in rows)
+        return torch.stack([torch.randn(shape, generator=generator) for generator in generators])
+
+
+class OneThread:
+    """Notices when several threads act with one policy, whose histories and plans they would mix.
+
+    ``env.max_parallel_tasks`` above 1 makes LeRobot do so. Rollouts one after the other may come from any thread.
+    """
+
+    def __init__(self) -> None:
+        self._owner: int | None = None
+
+    def begin(self) -> None:
+        """Begin a rollout in this thread."""
+        self._owner = threading.get_ident()
+
+    def forget(self) -> None:
+        """Leave it open to whichever thread acts first."""
+        self._owner = None
+
+    def check(self) -> None:
+        """Refuse to act in another thread than the one that began.
+
+        Raises:
+            MemobenchError: this is another.
+        """
+        if self._owner is None:
+            self.begin()
+        if self._owner != threading.get_ident():
+            raise MemobenchError(
+                "Two threads act with one memobench_mem policy, whose memory of one rollout would then enter the "
+                "other; evaluate with --env.max_parallel_tasks=1, and more rows per task by --eval.batch_size."
+            )

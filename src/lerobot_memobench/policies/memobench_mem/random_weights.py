@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.encoders import VISION_SEED, seed_parameters
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.memobench_mem.perception.frozen import VISION_SEED, seed_parameters
 
 
 def random_policy(config: MemobenchMemConfig, seed: int = 0) -> MemobenchMemPolicy:

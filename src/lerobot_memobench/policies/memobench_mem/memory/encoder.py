@@ -6,12 +6,15 @@ D width of the vision tokens, d_m width of memory tokens.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 import torch
 import torch.nn.functional as F
 from einops import rearrange, repeat
 from torch import Tensor, nn
 
-from lerobot_memobench.policies.memobench_mem.dimensions import GRID
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MEMORY_GRID
 
 POSITION_DIM = 768
 _FREQUENCIES = 128
@@ -26,7 +29,7 @@ def position_features(steps: Tensor) -> Tensor:
     """
     grid = _grid_waves(steps.device)
     time = rearrange(_waves(steps, _TIME_BASE), "... d -> ... 1 d")
-    rows, columns = repeat(grid, "y d -> (y x) d", x=GRID), repeat(grid, "x d -> (y x) d", y=GRID)
+    rows, columns = repeat(grid, "y d -> (y x) d", x=MEMORY_GRID), repeat(grid, "x d -> (y x) d", y=MEMORY_GRID)
     return torch.cat(torch.broadcast_tensors(time, rows, columns), dim=-1)
 
 
@@ -39,7 +42,7 @@ def _waves(values: Tensor, base: float) -> Tensor:
 
 def _grid_waves(device: torch.device) -> Tensor:
     """Waves (4, 256) of the rows, or columns, of the token grid."""
-    return _waves(4.0 * torch.arange(GRID, dtype=torch.float32, device=device) + 2.0, _SPACE_BASE)
+    return _waves(4.0 * torch.arange(MEMORY_GRID, dtype=torch.float32, device=device) + 2.0, _SPACE_BASE)
 
 
 class MemoryEncoder(nn.Module):
@@ -52,7 +55,7 @@ class MemoryEncoder(nn.Module):
 
     framewise = True
 
-    def __init__(self, image_dim: int, memory_dim: int, grid: int = GRID) -> None:
+    def __init__(self, image_dim: int, memory_dim: int, grid: int = MEMORY_GRID) -> None:
         super().__init__()
         self.grid = grid
         self.position = nn.Linear(POSITION_DIM, POSITION_DIM) if grid else nn.Linear(2 * _FREQUENCIES, memory_dim)
@@ -86,3 +89,72 @@ class MemoryEncoder(nn.Module):
         rows = rearrange(F.linear(grid, of_row), "y d -> y 1 d")
         columns = rearrange(F.linear(grid, of_column), "x d -> 1 x d")
         return rearrange(time, "... d -> ... 1 d") + rearrange(rows + columns, "y x d -> (y x) d")
+
+
+# ==== tokens.py
+# Memory tokens as they are read: by each row its own, or made once of what many rows remember.
+
+
+class MemoryTokens(NamedTuple):
+    """Tokens that B rows read, L each.
+
+    Attributes:
+        each: (B, L, d), or (U, P, d) of U frames.
+        mask: (B, L) bool, which are real.
+        places: (B, F), which of the U frames each row reads, with F P = L; None where ``each`` lies in rows.
+    """
+
+    each: Tensor
+    mask: Tensor
+    places: Tensor | None = None
+
+    def through(self, made: Callable[[Tensor], Tensor]) -> MemoryTokens:
+        """Return what is made of every token by itself."""
+        return self._replace(each=made(self.each))
+
+    def rows(self) -> Tensor:
+        """Return what each row reads, (B, L, d)."""
+        if self.places is None:
+            return self.each
+        return self.each.index_select(0, self.places.flatten()).unflatten(0, self.places.shape).flatten(1, 2)
+
+
+# ==== pooled_memory.py
+# A memory of frames that are stored as they were seen, and of which it is learned what becomes of each.
+
+
+class PooledMemory(nn.Module):
+    """Stored frames to memory tokens: each through a pool, then the mechanism's encoder over the frames.
+
+    Args:
+        pool: from N frames (N, P, D') to their tokens (N, P'', D). encoder: of (B, F, P'', D).
+    """
+
+    def __init__(self, pool: nn.Module, encoder: nn.Module) -> None:
+        super().__init__()
+        self.pool, self.encoder = pool, encoder
+
+    def forward(self, frames: Tensor, steps: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """Encode frames (B, F, P, D') seen at steps (B, F), of which mask (B, F) are real.
+
+        Returns:
+            H (B, L, d_m) and its mask (B, L).
+        """
+        memory, real = self.encoder(self.pool(frames.flatten(0, 1)).unflatten(0, mask.shape), steps, mask)
+        return memory, real
+
+    def shared(self, frames: Tensor, steps: Tensor, mask: Tensor, numbers: Tensor) -> MemoryTokens:
+        """Encode what `forward` does; a frame that many rows read is pooled once, and, if the encoder is ``framewise``,
+        encoded once.
+
+        Args:
+            numbers: (B, F), equal where frames and their steps are.
+        """
+        unique, places = numbers.unique(return_inverse=True)
+        order = torch.arange(places.numel(), device=places.device)
+        first = places.new_zeros(len(unique)).scatter_(0, places.flatten(), order)
+        pooled = self.pool(frames.flatten(0, 1)[first])
+        if not getattr(self.encoder, "framewise", False):
+            return MemoryTokens(*self.encoder(pooled[places], steps, mask))
+        each, real = self.encoder(pooled.unsqueeze(1), steps.flatten()[first, None], mask.flatten()[first, None])
+        return MemoryTokens(each, real[places].flatten(1, 2), places)

@@ -15,9 +15,8 @@ import torch
 from torch import Tensor
 
 from lerobot_memobench.perception.objects import set_axis, settled
-from lerobot_memobench.policies.memobench_mem.perception.slots import in_order
 from lerobot_memobench.sim.assets.registry import build_asset, known_classes
-from lerobot_memobench.sim.object_layout import field
+from lerobot_memobench.sim.object_layout import WIDTH, field
 from lerobot_memobench.sim.object_slots import classes
 from lerobot_memobench.sim.scene import AGENTVIEW_POSITION, TABLE_TOP
 
@@ -126,3 +125,11 @@ def _add_false(seen: Tensor, there: Tensor, size: float) -> None:
     place += torch.randn_like(place) * torch.where(misnamed, MISNAMED, ASTRAY)
     seen[~there] = 0.0
     seen[false] = made
+
+
+def in_order(slots: Tensor) -> Tensor:
+    """Return slots (N, n, WIDTH) sorted as by `sim.object_slots.in_slots`: by class and place, the empty ones last."""
+    x = field(slots, "position")[..., 0].clamp(-4, 4) / 10
+    order = (field(slots, "class").squeeze(-1) + x).masked_fill(field(slots, "present").squeeze(-1) == 0, torch.inf)
+    rows: Tensor = slots.gather(1, order.argsort(dim=1)[..., None].expand(-1, -1, WIDTH))
+    return rows

@@ -1,12 +1,15 @@
-"""pi0.5 at a chosen size. LeRobot's classes do the work; only the dimensions and the way of seeing are ours.
+"""Attention in one kernel, for the passes in which a policy with eyes learns.
 
-LeRobot fixes vocabulary, image tower and widths inside constructors. These subclasses run those constructors on the
-meta device (no memory, no time), and then build the few sized modules again at this policy's dimensions, so every
-other attribute and every method stays LeRobot's.
+LeRobot's pi0.5 attends by Hugging Face's ``eager_attention_forward``, which keeps a weight for each pair of tokens: of
+72 samples with two pictures 56 MB in a layer, which come from the system page by page. torch's kernel keeps none and
+takes a third of the time. It rounds otherwise, so what acts goes on with LeRobot's.
 """
 
 from __future__ import annotations
 
+import contextlib
+import functools
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from copy import deepcopy
 from typing import Any
@@ -16,21 +19,64 @@ from einops import rearrange, repeat
 from lerobot.policies.pi05.modeling_pi05 import GemmaConfig, PaliGemmaWithExpertModel, PI05Pytorch
 from lerobot.policies.pi_gemma import PaliGemmaForConditionalGenerationWithPiGemma, PiGemmaForCausalLM
 from torch import Tensor, nn
+from torch.nn.functional import scaled_dot_product_attention
 from transformers.initialization import no_init_weights
+from transformers.models.gemma import modeling_gemma
 
+from lerobot_memobench.lerobot_hooks import ATTEND, hooked_for
 from lerobot_memobench.perception.tower import Tower
 from lerobot_memobench.perception.weights import load_eyes
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.dimensions import Dimensions, Gemma
-from lerobot_memobench.policies.memobench_mem.integration.integration import Prefix
-from lerobot_memobench.policies.memobench_mem.perception.eyes import EyePerception
-from lerobot_memobench.policies.memobench_mem.perception.found import FoundObjects, ObjectsInPictures
-from lerobot_memobench.policies.memobench_mem.perception.frozen import VISION_SEED, seed_parameters
-from lerobot_memobench.policies.memobench_mem.perception.objects import LOUD, ObjectPerception
-from lerobot_memobench.policies.memobench_mem.perception.perception import Perception
-from lerobot_memobench.policies.memobench_mem.perception.pixels import PixelPerception
-from lerobot_memobench.policies.memobench_mem.perception.sight_errors import SightErrors
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import Dimensions, Gemma, MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.detection_noise import SightErrors
+from lerobot_memobench.policies.memobench_mem.encoders import (
+    LOUD,
+    VISION_SEED,
+    EyePerception,
+    Perception,
+    PixelPerception,
+    seed_parameters,
+)
+from lerobot_memobench.policies.memobench_mem.fusion import Context, Integration, Modulation, Prefix
+from lerobot_memobench.policies.memobench_mem.memory import make_mechanism
+from lerobot_memobench.policies.memobench_mem.memory.encoder import MemoryTokens
+from lerobot_memobench.policies.memobench_mem.objects import FoundObjects, ObjectPerception, ObjectsInPictures
 from lerobot_memobench.sim.object_slots import classes
+
+MARK = "learns_fused"
+"""Attribute of the attention modules that it is for."""
+
+
+def attend_fused(model: nn.Module) -> None:
+    """Let the attention of a model's layers be computed in one kernel wherever gradients are wanted, while it lives."""
+    for module in model.modules():
+        if isinstance(module, modeling_gemma.GemmaAttention):
+            setattr(module, MARK, True)
+    hooked_for(model, ATTEND, _fused)
+
+
+def _fused(attend: Callable[..., Any]) -> Callable[..., Any]:
+    """Wrap transformers' attention: modules that are marked learn in one kernel."""
+
+    @functools.wraps(attend)
+    def attention(
+        module: nn.Module, query: Tensor, key: Tensor, value: Tensor, mask: Tensor | None, scaling: float, **more: Any
+    ) -> tuple[Tensor, Tensor | None]:
+        if not (hasattr(module, MARK) and torch.is_grad_enabled()):
+            weighed: tuple[Tensor, Tensor] = attend(module, query, key, value, mask, scaling, **more)
+            return weighed
+        key, value = (modeling_gemma.repeat_kv(kept, module.num_key_value_groups) for kept in (key, value))
+        read = scaled_dot_product_attention(query, key, value, attn_mask=mask, scale=scaling)
+        return read.transpose(1, 2).contiguous(), None
+
+    return attention
+
+
+# ==== backbone.py
+# pi0.5 at a chosen size. LeRobot's classes do the work; only the dimensions and the way of seeing are ours.
+#
+# LeRobot fixes vocabulary, image tower and widths inside constructors. These subclasses run those constructors on the
+# meta device (no memory, no time), and then build the few sized modules again at this policy's dimensions, so every
+# other attribute and every method stays LeRobot's.
 
 
 def _gemma(size: Gemma) -> GemmaConfig:
@@ -200,3 +246,100 @@ class SizedPI05(PI05Pytorch):
         embeddings = torch.cat([*(part.to(words.dtype) for part in seen), words], dim=1)
         real = torch.cat([*shown, real], dim=1)
         return embeddings, real, torch.zeros_like(real)
+
+
+# ==== memory_pi05.py
+# pi0.5 with a memory: an encoder makes memory tokens of the frames read, an integration lets actions read those.
+
+FUSIONS: dict[str, type[Integration]] = {"modulation": Modulation, "context": Context}
+
+
+OWN = ("memory.", "state_token.", "instruction.", "paligemma_with_expert.perception.")
+"""What the names of parameters begin with that plain pi0.5 does not have; an integration has more."""
+
+
+class MemoryPI05(SizedPI05):
+    """pi0.5 with a memory: ``set_memory`` first, then LeRobot's ``forward`` or ``sample_actions``."""
+
+    def __init__(self, config: MemobenchMemConfig, rtc_processor: Any = None) -> None:
+        super().__init__(config, rtc_processor=rtc_processor)
+        self.integration: Integration | None = None
+        if config.integration == "none":
+            return
+        dims = config.dimensions
+        mechanism = make_mechanism(config.memory, config.memory_frames)
+        seeing = self.paligemma_with_expert.perception
+        self.memory = seeing.memory(mechanism.encoder(seeing.dim, dims.vlm.width, seeing.grid))
+        self.integration = FUSIONS[config.integration](self, dims.vlm.width, dims.expert.width)
+
+    def memory_parameters(self) -> dict[str, nn.Parameter]:
+        """Every parameter that plain pi0.5 does not have, by name."""
+        integration = self.integration
+        return {
+            name: parameter
+            for name, parameter in self.named_parameters()
+            if name.startswith(OWN) or (integration is not None and integration.owns(name))
+        }
+
+    def place_of(self, name: str) -> str:
+        """Return the name in this model of a parameter of plain pi0.5."""
+        return name if self.integration is None else self.integration.place_of(name)
+
+    def set_memory(
+        self, tokens: Tensor, steps: Tensor, frame_mask: Tensor, numbers: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Encode tokens (B, F, P, D) seen at steps (B, F) and hand them to the integration.
+
+        Args:
+            numbers: (B, F), equal where frames are; only of a perception that learns to remember, which encodes each
+                once.
+
+        Returns:
+            H (B, F*P, d_m) and its mask (B, F*P), for the alignment objectives.
+        """
+        assert self.integration is not None  # the policy asks no plain pi0.5
+        if numbers is None:
+            memory = MemoryTokens(*self.memory(tokens, steps, frame_mask))
+        else:
+            memory = self.memory.shared(tokens, steps, frame_mask, numbers)
+        self.integration.hand_over(memory)
+        return memory.rows(), memory.mask
+
+    def embed_prefix(self, images: Any, img_masks: Any, tokens: Any, masks: Any) -> Prefix:
+        """LeRobot's prefix (what is seen now, language), as the integration changes it."""
+        prefix: Prefix = super().embed_prefix(images, img_masks, tokens, masks)
+        return prefix if self.integration is None else self.integration.prefix(prefix)
+
+
+# ==== precision.py
+# Numbers of a bfloat16 policy: what learns is kept in float32, and computed with in bfloat16.
+#
+# A bfloat16 weight near 1 has steps of 1/128, so an update at a learning rate of 5e-5 rounds to none. As pi0.5's
+# reference implementation does, trained weights are float32 and autocast rounds them for each pass; what is frozen, and
+# all of a policy that only acts, stays in the bfloat16 that LeRobot gives it.
+
+
+class Precision:
+    """The parameters of a module that are bfloat16 while nothing learns.
+
+    Args:
+        parameters: all of the module's, as LeRobot has cast them.
+    """
+
+    def __init__(self, parameters: Sequence[nn.Parameter]) -> None:
+        self._narrow = [parameter for parameter in parameters if parameter.dtype == torch.bfloat16]
+
+    def settle(self) -> None:
+        """Widen what learns to float32; narrow what does not (any more)."""
+        for parameter in self._narrow:
+            parameter.data = parameter.data.to(torch.float32 if parameter.requires_grad else torch.bfloat16)
+
+    def narrowed(self) -> dict[nn.Parameter, torch.dtype]:
+        """Return those that are wider now than they are in a policy that only acts, and their width there."""
+        return {parameter: torch.bfloat16 for parameter in self._narrow if parameter.dtype == torch.float32}
+
+    def computing(self, device: torch.device) -> contextlib.AbstractContextManager[object]:
+        """Return the context to compute in: autocast while weights are wider than what is computed with."""
+        if any(parameter.dtype == torch.float32 for parameter in self._narrow):
+            return torch.autocast(device.type, dtype=torch.bfloat16)
+        return contextlib.nullcontext()

@@ -1,11 +1,9 @@
-"""Modulation: memory scales and shifts what every layer of the action expert feeds forward (RoboMME's modulator).
-
-Shapes: B rows, L memory tokens, W width of the action expert, T action tokens.
-"""
+"""What an integration of memory into pi0.5 is."""
 
 from __future__ import annotations
 
 import re
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 
 import torch
@@ -13,8 +11,40 @@ import torch.nn.functional as F
 from einops import rearrange, repeat
 from torch import Tensor, nn
 
-from lerobot_memobench.policies.memobench_mem.integration.integration import Integration
-from lerobot_memobench.policies.memobench_mem.memory.tokens import MemoryTokens
+from lerobot_memobench.policies.memobench_mem.memory.encoder import MemoryTokens
+
+Prefix = tuple[Tensor, Tensor, Tensor]
+"""LeRobot's prefix: embeddings (B, N, D), which of them are real (B, N), and where attention blocks begin (B, N)."""
+
+
+class Integration(ABC):
+    """A way by which actions read memory tokens; made once for a model, to which it may add parameters."""
+
+    @abstractmethod
+    def __init__(self, model: nn.Module, memory_dim: int, expert_dim: int) -> None:
+        """Make ``model`` ready: memory tokens are ``memory_dim`` wide, the action expert ``expert_dim``."""
+
+    @abstractmethod
+    def hand_over(self, memory: MemoryTokens) -> None:
+        """Take the memory, of width d_m, that the next passes read."""
+
+    def prefix(self, prefix: Prefix) -> Prefix:
+        """Return the prefix that the model sees, given LeRobot's."""
+        return prefix
+
+    def owns(self, name: str) -> bool:
+        """Say whether a parameter of the model is this integration's, and no part of pi0.5."""
+        return False
+
+    def place_of(self, name: str) -> str:
+        """Return the name in this model of a parameter of plain pi0.5."""
+        return name
+
+
+# ==== modulation.py
+# Modulation: memory scales and shifts what every layer of the action expert feeds forward (RoboMME's modulator).
+#
+# Shapes: B rows, L memory tokens, W width of the action expert, T action tokens.
 
 _ROPE_BASE = 10_000.0
 
@@ -172,3 +202,30 @@ class Modulation(Integration):
         if ".gemma_expert." not in name:
             return name
         return re.sub(r"post_attention_layernorm\.(dense|weight)", r"post_attention_layernorm.norm.\1", name)
+
+
+# ==== context.py
+# Context: memory tokens join the prefix, behind images and language.
+
+
+class Context(Integration):
+    """Memory tokens are seen by the whole prefix and by the actions; nothing is added to the model."""
+
+    def __init__(self, model: nn.Module, memory_dim: int, expert_dim: int) -> None:
+        self.memory: MemoryTokens | None = None
+
+    def hand_over(self, memory: MemoryTokens) -> None:
+        """Keep this memory for the next prefix."""
+        self.memory = memory
+
+    def prefix(self, prefix: Prefix) -> Prefix:
+        """Append the memory, which attends and is attended like images and language."""
+        if self.memory is None:
+            return prefix
+        embeddings, real, blocks = prefix
+        mask = self.memory.mask
+        return (
+            torch.cat([embeddings, self.memory.rows().to(embeddings.dtype)], dim=1),
+            torch.cat([real, mask], dim=1),
+            torch.cat([blocks, torch.zeros_like(mask)], dim=1),
+        )

@@ -1,0 +1,270 @@
+"""What a perception is: what the present shows the policy, and what of a frame is remembered."""
+
+from __future__ import annotations
+
+import hashlib
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+
+import torch
+from einops import reduce
+from lerobot.policies.common.vla_utils import resize_with_pad_torch
+from lerobot.utils.constants import OBS_IMAGES
+from torch import Tensor, nn
+from torch.nn.functional import rms_norm
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.perception.tower import GRID, POOLED, SIDE, WIDTH, Tower, shrunk
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MEMORY_GRID
+from lerobot_memobench.policies.memobench_mem.memory.encoder import PooledMemory
+from lerobot_memobench.policies.shown import cure
+
+LOUD = 8.0
+"""How much larger than a layer's output tokens are made; at 1 they learned slower."""
+Seen = tuple[list[Tensor], list[Tensor]]
+"""What is seen now, in the place of LeRobot's images: parts (B, ...), and which of each one's tokens are real: (B,)
+for all of them, or (B, n)."""
+
+
+class Perception(ABC):
+    """A way to see a moment. Training and a rollout use the same, so that what they remember agrees.
+
+    Attributes:
+        remembers: the observation of which a frame's tokens are made, without which nothing is seen.
+        dim: D, width of the tokens that the memory's encoder is given.
+        grid: side of the square of a picture's tokens; 0 where tokens have no place in a picture.
+        pictures: whether it looks at pictures, which an environment may repeat.
+    """
+
+    remembers: str
+    dim: int
+    grid: int
+    pictures: bool
+
+    @property
+    @abstractmethod
+    def key(self) -> str:
+        """Identity of what is remembered of frames: with equal keys, equal frames are remembered alike."""
+
+    @abstractmethod
+    def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
+        """Return what is remembered of some rows of an observation, (n, P, D'); nothing in it learns."""
+
+    def present(self, batch: Mapping[str, Tensor]) -> Seen | None:
+        """Return what is seen now of a batch of observations; None where it is LeRobot's images."""
+        return None
+
+    @abstractmethod
+    def prefix(self, observed: Tensor) -> Tensor:
+        """Return the prefix tokens (B, n, d_vlm) of one part of the present (B, ...)."""
+
+    def memory(self, encoder: nn.Module) -> nn.Module:
+        """Return what makes memory tokens of remembered frames, given the mechanism's encoder of (B, F, P, D)."""
+        return encoder
+
+
+# ==== frozen.py
+# Frozen weights: drawn from a fixed seed where none are given, and told apart by a hash.
+
+VISION_SEED = 20_250_705  # weights of an image tower for which none were given
+
+
+def seed_parameters(module: nn.Module, seed: int) -> None:
+    """Draw a module's weights from a fixed seed, the same on every machine: matrices ~ N(0, 1/fan_in), biases 0.
+
+    Norm weights are one. The image tower gets these when no weights are given, so a cache made today agrees with a
+    policy built tomorrow.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for name, parameter in sorted(module.named_parameters()):
+            if parameter.is_meta:
+                continue
+            if parameter.ndim == 1:
+                parameter.fill_(0.0 if name.endswith("bias") else 1.0)
+            else:
+                fan_in = parameter[0].numel()
+                noise = torch.randn(parameter.shape, generator=generator) / fan_in**0.5
+                parameter.copy_(noise)
+
+
+def fingerprint(modules: dict[str, nn.Module]) -> str:
+    """Short hash of names, shapes and values of the modules' parameters."""
+    digest = hashlib.blake2b(digest_size=12)
+    for prefix, module in sorted(modules.items()):
+        for name, parameter in sorted(module.named_parameters()):
+            digest.update(f"{prefix}.{name}{tuple(parameter.shape)}".encode())
+            digest.update(parameter.detach().to("cpu", torch.float32).contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
+# ==== pixels.py
+# Pixels: pictures through pi0.5's frozen image tower; a remembered one is pooled to 4 x 4 tokens.
+
+
+def pool_tokens(tokens: Tensor) -> Tensor:
+    """Mean-pool the patch tokens of square images (N, g*g, D) to (N, 16, D); g is a multiple of 4 (16 at full size)."""
+    patches = tokens.shape[1]
+    side = round(patches**0.5)
+    if side * side != patches or side % MEMORY_GRID:
+        raise ValueError(f"cannot pool {patches} tokens to a {MEMORY_GRID}x{MEMORY_GRID} grid")
+    return reduce(
+        tokens, "n (gy by gx bx) d -> n (gy gx) d", "mean", gy=MEMORY_GRID, gx=MEMORY_GRID, by=side // MEMORY_GRID
+    )
+
+
+class PixelPerception(Perception):
+    """The image tower, and the projection of its tokens to the language model's width.
+
+    Args:
+        resolution: height and width of the pictures that the tower sees, pixels.
+        camera: whose pictures are remembered.
+    """
+
+    tokens_per_frame = MEMORY_GRID**2
+    grid = MEMORY_GRID
+    pictures = True
+
+    def __init__(self, tower: nn.Module, projector: nn.Module, resolution: tuple[int, int], camera: str) -> None:
+        self.tower, self.projector, self.resolution = tower, projector, resolution
+        self.remembers = camera
+        self.dim: int = projector.linear.out_features
+
+    @cached_property
+    def key(self) -> str:
+        """Identity of the tokens this makes: weights, input size and pooling."""
+        weights = fingerprint({"vision_tower": self.tower, "multi_modal_projector": self.projector})
+        return f"{weights}-{self.resolution[0]}x{self.resolution[1]}-mean{self.tokens_per_frame}"
+
+    def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
+        """Return the tokens (n, 16, D) of some rows' pictures."""
+        return self(batch[self.remembers][list(rows)])
+
+    @torch.no_grad()
+    def __call__(self, images: Tensor) -> Tensor:
+        """Encode pictures (N, 3, H, W) float in [0, 1] to (N, 16, D) bfloat16 on the tower's device."""
+        device = next(self.tower.parameters()).device
+        images = images.to(device, torch.float32)
+        if tuple(images.shape[-2:]) != tuple(self.resolution):
+            images = resize_with_pad_torch(images, *self.resolution)
+        # Mixed precision would make rollout tokens differ from cached ones.
+        with torch.autocast(device.type, enabled=False):
+            return pool_tokens(self.prefix(images * 2.0 - 1.0)).to(torch.bfloat16)
+
+    def prefix(self, observed: Tensor) -> Tensor:
+        """Return all patch tokens (B, g*g, D) of pictures (B, 3, H, W) in [-1, 1], in the pictures' precision.
+
+        The tower computes in float32 whatever the rest of the model does.
+        """
+        return self.projector(self.tower(observed.to(torch.float32)).last_hidden_state).to(observed.dtype)
+
+
+# ==== eyes.py
+# Eyes: pictures through the tower of `lerobot_memobench.perception`, which learns no more; its tokens do.
+#
+# All tokens of a present picture enter the prefix; of a remembered one the pooled ones are kept. In a training sample the
+# tokens stand in the pictures' place, see `seen_pictures`.
+
+SEEN = "observation.seen."
+"""What the names of pictures' tokens in training samples begin with."""
+
+
+def seen_key(camera: str) -> str:
+    """Return the name in a training sample of the tokens (B, 64, WIDTH) of a camera's picture."""
+    return SEEN + camera.removeprefix(f"{OBS_IMAGES}.")
+
+
+class PicturePool(nn.Module):
+    """The pooled tokens of a remembered picture at the policy's width, of unit size as those of `FramePool`."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.project = nn.Linear(WIDTH, width)
+
+    def forward(self, frames: Tensor) -> Tensor:
+        """Return tokens (N, 16, width) of pooled ones (N, 16, WIDTH)."""
+        made = self.project(frames.to(self.project.weight.dtype))
+        return rms_norm(made, made.shape[-1:], eps=1e-6)
+
+
+class EyePerception(nn.Module, Perception):
+    """The tokens of all cameras' present pictures; pooled ones of one camera's are remembered.
+
+    Args:
+        tower: without batch normalisation. It is the model's own part, as image towers are, and not registered here.
+        cameras: whose pictures are seen now. camera: whose are remembered. width: of the policy's tokens.
+    """
+
+    tokens_per_frame = POOLED**2
+    grid = POOLED
+    pictures = True
+
+    def __init__(self, tower: Tower, cameras: Sequence[str], camera: str, width: int) -> None:
+        super().__init__()
+        self._tower = (tower,)
+        self.cameras, self.remembers, self.dim = list(cameras), camera, width
+        self.project = nn.Linear(WIDTH, width)
+
+    @property
+    def tower(self) -> Tower:
+        """What pictures are seen through."""
+        return self._tower[0]
+
+    @cached_property
+    def _sight(self) -> str:
+        return f"{fingerprint({'eyes': self.tower})}-{SIDE}x{SIDE}"
+
+    @property
+    def key(self) -> str:
+        """Identity of the pooled tokens: weights, and size of the pictures."""
+        return f"{self._sight}-eyes{self.tokens_per_frame}"
+
+    @property
+    def present_key(self) -> str:
+        """Identity of the tokens of present pictures."""
+        return f"{self._sight}-eyes{GRID**2}"
+
+    @torch.no_grad()
+    def look(self, pictures: Tensor) -> Tensor:
+        """Return the tokens (N, 64, WIDTH) bfloat16 of pictures (N, 3, H, W) in [0, 1]."""
+        device = self.tower.place.device
+        with torch.autocast(device.type, enabled=False):  # mixed precision would see otherwise than the cache did
+            seen: Tensor = self.tower(shrunk(pictures.to(device)))
+        return seen.to(torch.bfloat16)
+
+    @torch.no_grad()
+    def pooled(self, tokens: Tensor) -> Tensor:
+        """Return what is remembered, (N, 16, WIDTH) bfloat16, of what `look` returns."""
+        tower = self.tower
+        with torch.autocast(tower.place.device.type, enabled=False):
+            return tower.pooled(tokens.to(tower.place.device, torch.float32)).to(torch.bfloat16)
+
+    def present(self, batch: Mapping[str, Tensor]) -> Seen:
+        """Return each camera's tokens (B, 64, WIDTH), all of them real: those that the batch has, or of its pictures.
+
+        Raises:
+            MemobenchError: it has neither of a camera.
+        """
+        parts = [self._seen(batch, camera) for camera in self.cameras]
+        return parts, [torch.ones(len(part), dtype=torch.bool) for part in parts]
+
+    def _seen(self, batch: Mapping[str, Tensor], camera: str) -> Tensor:
+        if seen_key(camera) in batch:
+            return batch[seen_key(camera)]
+        if camera not in batch:
+            raise MemobenchError(f"The observation has no '{camera}', which this policy sees; {cure(camera, batch)}")
+        return self.look(batch[camera])
+
+    def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
+        """Return the pooled tokens (n, 16, WIDTH) of some rows' pictures."""
+        return self.pooled(self.look(batch[self.remembers][list(rows)]))
+
+    def prefix(self, observed: Tensor) -> Tensor:
+        """Return prefix tokens (B, 64, d_vlm) of a camera's tokens."""
+        made: Tensor = self.project(observed.to(self.project.weight.dtype))
+        return made * LOUD
+
+    def memory(self, encoder: nn.Module) -> nn.Module:
+        """Return the encoder behind a projection of each frame's tokens."""
+        return PooledMemory(PicturePool(self.dim), encoder)

@@ -1,1 +1,0 @@
-"""How do actions read memory? One file per integration."""
