@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.formula import Atom
@@ -16,20 +14,21 @@ LIT = Atom("turnon", ("flat_stove_1",))
 def test_the_published_task_is_done_and_begun_again() -> None:
     episode = Episode(get_task(STOVE))
     episode.reset(20_001)
-    lit = [False]
-    succeeded = False
+    lit, turned_on, succeeded = False, 0, False
     for _ in range(600):
         episode.step(episode.blind_action())
         succeeded = succeeded or episode.success
-        lit.append(episode.sim.holds(LIT))
+        before, lit = lit, episode.sim.holds(LIT)
+        turned_on += lit and not before
+        if turned_on > 1:
+            break
     assert succeeded
-    assert np.count_nonzero(np.diff(np.array(lit, dtype=int)) == 1) > 1, "it goes on after the goal has come true"
+    assert turned_on > 1, "it goes on after the goal has come true"
 
 
 def test_who_cannot_count_fails_the_strict_task() -> None:
     episode = Episode(get_task(COUNTED))
-    for seed in (20_001, 20_002, 20_003):
-        episode.reset(seed)
-        while not episode.done:
-            episode.step(episode.blind_action())
-        assert not episode.success
+    episode.reset(20_001)
+    while not episode.done:
+        episode.step(episode.blind_action())
+    assert not episode.success

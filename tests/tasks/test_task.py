@@ -10,8 +10,10 @@ from typing import Any
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.tasks import get_task
 from lerobot_memobench.tasks.catalogue import load_task
 from lerobot_memobench.tasks.formula import Atom, format_formula, parse_formula
+from lerobot_memobench.tasks.memory_text import memory_text, with_memory
 from lerobot_memobench.tasks.task import Prompt
 
 Write = Callable[..., Path]
@@ -65,3 +67,19 @@ def test_variants(write_task: Write, metadata: dict[str, Any]) -> None:
             task.variant(k)
     metadata["variants"][1]["replaces_published"] = True
     assert load_task(write_task(metadata=metadata)).random_variants == (1, 2, 3)
+
+
+# --- memory text ---
+
+
+def test_memory_grows_by_one_intermediate_text_per_checkpoint() -> None:
+    task = get_task("turn_on_the_stove_and_turn_it_off")
+    texts = [checkpoint.language[1] for checkpoint in task.checkpoints]
+    assert memory_text(task, 0) == ""
+    assert memory_text(task, 1) == texts[0]
+    assert memory_text(task, len(texts)) == "; ".join(texts)
+
+
+def test_prompt_says_that_nothing_is_done_yet() -> None:
+    assert with_memory("Put it back", "") == "Put it back Memory: nothing yet"
+    assert with_memory("Put it back", "took it") == "Put it back Memory: took it"
