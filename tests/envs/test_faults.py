@@ -51,7 +51,7 @@ SHELF = """
 
 
 def make(**settings: Any) -> MemobenchEnv:
-    return MemobenchEnv(str(get_task(STOVE).folder), **{"obs_type": OBJECTS, "seed_base": 20_000, **settings})
+    return MemobenchEnv(STOVE, **{"obs_type": OBJECTS, "seed_base": 20_000, **settings})
 
 
 def vector(log: Path, rows: int = 3, use_async: bool = False, **settings: Any) -> gym.vector.VectorEnv:

@@ -25,7 +25,6 @@ from lerobot_memobench.protocol import EXECUTION, PROMPT
 from lerobot_memobench.sim import rendering
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots
-from lerobot_memobench.tasks.catalogue import get_task
 
 HIGHLIGHT = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
 DRAWER = "put_the_tomato_into_the_top_drawer_of_the_cabinet"
@@ -46,7 +45,7 @@ def blind(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def make(name: str, obs_type: str = OBJECTS, **settings: Any) -> MemobenchEnv:
-    return MemobenchEnv(str(get_task(name).folder), obs_type=obs_type, **settings)
+    return MemobenchEnv(name, obs_type=obs_type, **settings)
 
 
 def vector(name: str, batch: int, log: Path, use_async: bool = False, **settings: Any) -> gym.vector.VectorEnv:

@@ -69,7 +69,7 @@ def test_equals_the_dataset_frame_by_frame(name: str, referent: str) -> None:
 
 
 def test_without_the_option_the_instruction_stays() -> None:
-    env = MemobenchEnv(str(get_task(STOVE).folder), render="fast", render_every=10_000)
+    env = MemobenchEnv(STOVE, render="fast", render_every=10_000)
     env.reset(seed=SEED)
     env.step(np.zeros(7, np.float32))
     assert env.task_description == get_task(STOVE).language

@@ -37,7 +37,7 @@ def seed_of(name: str, variant: int) -> int:
 
 @pytest.mark.parametrize("referent", ["fixed", "random"])
 def test_every_episode_is_drawn_whatever_referent_is_asked_for(referent: str) -> None:
-    env = MemobenchEnv(str(get_task(STOVE).folder), referent=referent, render="fast", render_every=10_000)
+    env = MemobenchEnv(STOVE, referent=referent, render="fast", render_every=10_000)
     assert env.episode.referent == "drawn"
     for variant, words in enumerate(("once", "twice", "three times")):
         env.reset(seed=seed_of(STOVE, variant))
@@ -69,7 +69,7 @@ def test_a_variant_that_was_chosen_is_not_drawn_again() -> None:
 
 def test_resting_at_once_ends_the_episode_and_is_logged_as_a_miscount(tmp_path: Path) -> None:
     env = MemobenchEnv(
-        str(get_task(STOVE).folder),
+        STOVE,
         log_dir=str(tmp_path),
         render="fast",
         render_every=10_000,

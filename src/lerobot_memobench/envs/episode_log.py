@@ -1,7 +1,9 @@
-"""The episode log: one JSON line per finished rollout, written when it ends (spec: benchmark.md).
+"""The episode log of an evaluation, one JSON line per finished rollout, and the protocol file beside it.
 
-Each process appends to files of its own, ``<dir>/episodes/<task>.<pid>.jsonl``, so workers never wait for one
-another and a killed run loses at most the line being written. ``read_episodes`` merges them.
+Each process appends to a file of its own, ``<dir>/episodes/<task>.<pid>.jsonl``, so workers never wait for one another
+and a killed run loses at most the line being written. ``read_episodes`` merges them. Settings that the lines leave out
+and that decide whether two evaluations may be compared (horizon, rendering) are in ``<dir>/protocol.json``, written
+with the first line, also by plain ``lerobot-eval`` and from async workers.
 """
 
 from __future__ import annotations
@@ -37,15 +39,16 @@ from lerobot_memobench.tasks.task import PUBLISHED, Task
 if TYPE_CHECKING:
     from lerobot_memobench.envs.episode import Episode
 
-
 logger = logging.getLogger(__name__)
 
 EPISODES_FOLDER = "episodes"
 MERGED_FILE = "episodes.jsonl"
-
-#: In the workers' files only: when the line was written (seconds since 1970). It decides which of two lines
-#: is newer.
+PROTOCOL_FILE = "protocol.json"
 WRITTEN_AT = "written_at"
+"""In the workers' files only: when the line was written, s since 1970. It decides which of two lines is newer."""
+
+
+# --- lines ---
 
 
 class CheckpointRecord(TypedDict):
@@ -57,7 +60,7 @@ class CheckpointRecord(TypedDict):
 
 
 class Outcome(TypedDict, total=False):
-    """What a log and a card may both say of an episode; logs of other tools leave parts of it out."""
+    """Fields of an episode that a log and a card share; logs of other tools leave some of them out."""
 
     seed: Whole | None
     referent: Name
@@ -73,7 +76,7 @@ class Outcome(TypedDict, total=False):
 
 
 class EpisodeRecord(Outcome):
-    """What a line must hold to count as a rollout (see `episode_record`)."""
+    """A line, as it must be to count as a rollout (see `episode_record`)."""
 
     task: Name
     memory_type: Name
@@ -87,6 +90,67 @@ class EpisodeRecord(Outcome):
     run: NotRequired[Name | None]
     inputs: NotRequired[Name | None]
     written_at: NotRequired[Number]
+
+
+def episode_record(episode: Episode, *, seed_base: int, replan_steps: int | None, wall_s: float) -> dict[str, Any]:
+    """Return an episode's line for the log (`docs/evaluate.md` tells its fields).
+
+    Args:
+        seed_base: the seed that counts as episode 0.
+        replan_steps: actions that the policy executes per prediction, where it is known.
+        wall_s: seconds that the episode took.
+    """
+    progress, task, fault = episode.progress, episode.task, episode.fault
+    failure = classify_failure(
+        task,
+        progress.first_step,
+        episode.success,
+        drift=episode.drifted,
+        lost=episode.lost,
+        cut_off=episode.cut_off,
+    )
+    return {
+        "task": task.name,
+        "memory_type": task.memory_type,
+        "episode": episode.seed - seed_base,
+        "seed": episode.seed,
+        "referent": episode.referent,
+        "variant": task.variant_index,
+        "replan_steps": replan_steps,
+        "prompt_steps": episode.exec_start if episode.exec_start is not None else episode.step_index,
+        "prompt_shown": episode.prompt_shown,
+        "steps": episode.exec_steps,
+        "success": episode.success,
+        "checkpoints": [
+            {"operation": checkpoint.operation, "first_step": first, "ordered_step": ordered}
+            for checkpoint, first, ordered in zip(
+                task.checkpoints, progress.first_step, progress.ordered_step, strict=True
+            )
+        ],
+        "failure": failure if fault is None else fault.failure,
+        **({} if fault is None else {"fault": fault.why}),
+        **({} if task.suite == PUBLISHED else {"suite": task.suite, "lost": episode.lost}),
+        "scene_hash": episode.scene_hash,
+        "wall_s": round(wall_s, 3),
+    }
+
+
+def not_run_record(task: Task, seed: int, *, seed_base: int, referent: str, why: str) -> dict[str, Any]:
+    """Return the line for the log of an episode that could not be run."""
+    return {
+        "task": task.name,
+        "memory_type": task.memory_type,
+        "episode": seed - seed_base,
+        "seed": seed,
+        "referent": referent,
+        "success": False,
+        "checkpoints": [],
+        **({} if task.suite == PUBLISHED else {"suite": task.suite}),
+        "not_run": why,
+    }
+
+
+# --- writing ---
 
 
 class EpisodeLog:
@@ -144,8 +208,18 @@ def _ends_torn(file: Any) -> bool:
     return bool(file.read(1) != b"\n")
 
 
+def write_episodes(directory: str | Path, records: list[dict[str, Any]]) -> Path:
+    """Write ``records`` as ``<directory>/episodes.jsonl``, whole or not at all, and return its path."""
+    path = Path(directory) / MERGED_FILE
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return write_file(path, "".join(json.dumps(record) + "\n" for record in records))
+
+
+# --- reading ---
+
+
 def read_episodes(directory: str | Path, problems: list[str] | None = None) -> list[dict[str, Any]]:
-    """Return the rollouts logged under ``directory``, see `read_log`; what could not be run is told in ``problems``."""
+    """Return the rollouts logged under ``directory``, see `read_log`; ``problems`` names those that were not run."""
     records = read_log(directory, problems)
     if problems is not None:
         problems += notes_on_not_run(records)
@@ -172,7 +246,7 @@ def notes_on_not_run(records: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def read_log(directory: str | Path, problems: list[str] | None = None) -> list[dict[str, Any]]:
-    """Return all that is logged under ``directory``, sorted by task, episode and referent: what was not run as well.
+    """Return all lines logged under ``directory``, sorted by task, episode and referent; also of episodes not run.
 
     Reads the workers' files and a plain ``episodes.jsonl``; of several lines about the same task, episode and
     referent the newest counts. Lines that cannot be read, such as the last one of a killed run, are left out,
@@ -239,13 +313,6 @@ def _log_files(directory: Path) -> list[Path]:
     return [merged] * merged.is_file() + sorted((directory / EPISODES_FOLDER).glob("*.jsonl"))
 
 
-def write_episodes(directory: str | Path, records: list[dict[str, Any]]) -> Path:
-    """Write ``records`` as ``<directory>/episodes.jsonl``, whole or not at all, and return its path."""
-    path = Path(directory) / MERGED_FILE
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return write_file(path, "".join(json.dumps(record) + "\n" for record in records))
-
-
 def _read_lines(file: Path, problems: list[str]) -> Iterator[dict[str, Any]]:
     try:
         content = file.read_bytes()
@@ -266,13 +333,7 @@ def _read_lines(file: Path, problems: list[str]) -> Iterator[dict[str, Any]]:
             problems.append(f"{file}, line {number}: {error}; left out")
 
 
-# ==== protocol.py
-# The protocol that an episode log was made under: one small file beside it, written with the first episode.
-#
-# The log's lines tell what happened; what they leave out and what decides whether two evaluations may be compared (the
-# horizon, the rendering) is told here once, also by plain ``lerobot-eval`` and from async workers.
-
-PROTOCOL_FILE = "protocol.json"
+# --- the protocol ---
 
 
 SETTINGS = (
@@ -288,29 +349,22 @@ SETTINGS = (
     "render_every",
     "oracle_memory",
 )
-"""What must agree for two evaluations to be one, or to be compared."""
-
+"""Settings that must agree for two evaluations to be one, or to be compared."""
 INPUTS = "inputs"
-"""Inputs of the policy, in the words of `observations.policy_inputs`; absent where nobody wrote it down."""
-
+"""Inputs of the policy, in the words of `observations.policy_inputs`; absent where nobody wrote them down."""
 OF_THE_POLICY = ("prompt_in", INPUTS)
-"""What follows from what a policy can take in: evaluations of two policies may differ in it, which is told, the parts
-of one may not."""
-
+"""Settings that follow from the policy: evaluations of two policies may differ in them, which is told, parts of one may
+not."""
 EXTENT = ("tasks", "episodes")
 """How much was run: it may differ, the episodes in common still compare."""
-
 POLICY = "policy"
-
 MOST_EPISODES = 100_000
 """Of one task. Every episode that was asked for and is missing is counted, so a file must not ask for any number."""
-
-
 Episodes = Annotated[int, Ge(0), Le(MOST_EPISODES)]
 
 
 class Settings(TypedDict, total=False):
-    """Under what it was run; a setting in which joined episodes differ is a list of its values."""
+    """Settings of an evaluation; one in which joined episodes differ is a list of its values."""
 
     suite: Name
     seed_base: Whole | list[Whole]
@@ -334,7 +388,7 @@ class PolicyIdentity(TypedDict, total=False):
 
 
 class Protocol(Settings, total=False):
-    """What ``protocol.json`` and a card may say."""
+    """``protocol.json``, and the protocol of a card."""
 
     tasks: list[Name]
     episodes: Episodes
@@ -342,7 +396,7 @@ class Protocol(Settings, total=False):
 
 
 class WholeProtocol(Settings):
-    """What a card must say from which an evaluation is gone on with: how much was asked for."""
+    """The protocol of a card from which an evaluation is resumed: it says how much was asked for."""
 
     tasks: list[Name]
     episodes: Episodes
@@ -427,65 +481,3 @@ def write_protocol(directory: Path, settings: Mapping[str, Any]) -> None:
     if check_protocol(directory, settings):
         return
     write_file(directory / PROTOCOL_FILE, json.dumps(dict(settings), indent=1) + "\n", durable=True)
-
-
-# ==== episode_record.py
-# What the log keeps of a finished episode.
-
-
-def episode_record(episode: Episode, *, seed_base: int, replan_steps: int | None, wall_s: float) -> dict[str, Any]:
-    """Return an episode's line for the log (`docs/evaluate.md` tells its fields).
-
-    Args:
-        seed_base: the seed that counts as episode 0.
-        replan_steps: actions that the policy executes per prediction, where it is known.
-        wall_s: seconds that the episode took.
-    """
-    progress, task, fault = episode.progress, episode.task, episode.fault
-    failure = classify_failure(
-        task,
-        progress.first_step,
-        episode.success,
-        drift=episode.drifted,
-        lost=episode.lost,
-        cut_off=episode.cut_off,
-    )
-    return {
-        "task": task.name,
-        "memory_type": task.memory_type,
-        "episode": episode.seed - seed_base,
-        "seed": episode.seed,
-        "referent": episode.referent,
-        "variant": task.variant_index,
-        "replan_steps": replan_steps,
-        "prompt_steps": episode.exec_start if episode.exec_start is not None else episode.step_index,
-        "prompt_shown": episode.prompt_shown,
-        "steps": episode.exec_steps,
-        "success": episode.success,
-        "checkpoints": [
-            {"operation": checkpoint.operation, "first_step": first, "ordered_step": ordered}
-            for checkpoint, first, ordered in zip(
-                task.checkpoints, progress.first_step, progress.ordered_step, strict=True
-            )
-        ],
-        "failure": failure if fault is None else fault.failure,
-        **({} if fault is None else {"fault": fault.why}),
-        **({} if task.suite == PUBLISHED else {"suite": task.suite, "lost": episode.lost}),
-        "scene_hash": episode.scene_hash,
-        "wall_s": round(wall_s, 3),
-    }
-
-
-def not_run_record(task: Task, seed: int, *, seed_base: int, referent: str, why: str) -> dict[str, Any]:
-    """Return the line for the log of an episode that could not be run."""
-    return {
-        "task": task.name,
-        "memory_type": task.memory_type,
-        "episode": seed - seed_base,
-        "seed": seed,
-        "referent": referent,
-        "success": False,
-        "checkpoints": [],
-        **({} if task.suite == PUBLISHED else {"suite": task.suite}),
-        "not_run": why,
-    }
