@@ -22,7 +22,7 @@ from policies import config, remembered, training_batch, updates
 from turns import medians
 
 from lerobot_memobench.computing.freed_memory import keep_freed_memory
-from lerobot_memobench.perception.tower import GRID, POOLED, WIDTH
+from lerobot_memobench.perception.visual_encoder import GRID, POOLED, WIDTH
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import seen_key
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, MASK, STEPS, TOKENS

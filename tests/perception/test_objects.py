@@ -1,8 +1,6 @@
-"""Objects of what was found: perfect finds are the slots that the simulator tells, and two cameras see one thing."""
+"""Objects in the world: perfect detections are the simulator's slots, and two cameras detect one object."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -10,42 +8,38 @@ import torch
 from numpy.typing import NDArray
 
 from lerobot_memobench.experts.demonstration_prompt import highlight_of
-from lerobot_memobench.perception.finding import FOUND, SURE
-from lerobot_memobench.perception.kinds import PARTS, kinds
-from lerobot_memobench.perception.labels import Labeller, Rows, projected, settle
-from lerobot_memobench.perception.objects import ALONE, APART, ONE, ROUND, SAME, ObjectFinder
-from lerobot_memobench.perception.poses import reach
-from lerobot_memobench.perception.tower import Tower
-from lerobot_memobench.perception.views import view_of, views_of
-from lerobot_memobench.perception.weights import PACKAGE, Eyes, load_eyes
+from lerobot_memobench.perception.detector import DETECTION, MIN_SCORE, Detector
+from lerobot_memobench.perception.geometry import projected, view_of, views_of
+from lerobot_memobench.perception.objects import APART, MIN_SCORE_ALONE, ONE, PARTS, ROUND, SAME, ObjectLocalizer
+from lerobot_memobench.perception.weights import PACKAGE, load_detector
 from lerobot_memobench.sim.assets.registry import split_class
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots, classes
 from lerobot_memobench.sim.scene import TABLE_TOP
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
+from research.detector.labels import Labeller, Rows, kinds
+from research.detector.randomisation import reach, settle
+from tests.support.labelled_images import BOWLS, DRAWERS, simulation, small_encoder
 
-from .conftest import BOWLS, DRAWERS
-
-Simulate = Callable[[str], Simulation]
 STOVE = "turn_on_the_stove_and_turn_it_off_then_put_the_frying_pan_on_the_shelf"
 PLACE = slice(2, 5)
 
 
 @pytest.fixture(scope="module")
-def finder() -> ObjectFinder:
-    return ObjectFinder(Eyes(Tower((4, 4, 8, 8, 16), (0, 0, 0, 1, 0)), kinds()))
+def localizer() -> ObjectLocalizer:
+    return ObjectLocalizer(Detector(small_encoder(), kinds()))
 
 
 def perfect(row: Rows, score: float = 1.0) -> NDArray[np.void]:
-    """Return what is found by eyes that say of a picture what its labels do."""
+    """Return what is found by detector that say of a picture what its labels do."""
     things = row["things"][: row["count"]]
-    finds = np.zeros(len(things), FOUND)
+    detected = np.zeros(len(things), DETECTION)
     place, depth = projected(things["position"].astype(float), row)
-    finds["kind"], finds["score"], finds["place"], finds["depth"] = things["kind"], score, place, depth
-    finds["height"], finds["joint"] = things["position"][:, 2] - TABLE_TOP, things["joint"]
-    finds["turn"], finds["lit"] = np.nan_to_num(things["turn"]), things["lit"]
-    return finds
+    detected["kind"], detected["score"], detected["place"], detected["depth"] = things["kind"], score, place, depth
+    detected["height"], detected["joint"] = things["position"][:, 2] - TABLE_TOP, things["joint"]
+    detected["turn"], detected["lit"] = np.nan_to_num(things["turn"]), things["lit"]
+    return detected
 
 
 def bent(sim: Simulation) -> Simulation:
@@ -63,8 +57,8 @@ def told(slots: NDArray[np.float32] | torch.Tensor) -> NDArray[np.float32]:
 
 
 @pytest.mark.parametrize("camera", MJCF_CAMERAS)
-def test_views_are_the_cameras(simulate: Simulate, camera: str) -> None:
-    for sim in (simulate(BOWLS), bent(simulate(DRAWERS))):
+def test_views_are_the_cameras(camera: str) -> None:
+    for sim in (simulation(BOWLS), bent(simulation(DRAWERS))):
         view, own = view_of(camera, sim.proprio()), sim.model.camera(MJCF_CAMERAS[camera]).id
         assert np.allclose(view["eye"], sim.data.cam_xpos[own], atol=1e-5)
         assert np.allclose(view["turned"], sim.data.cam_xmat[own].reshape(3, 3), atol=1e-5)
@@ -72,16 +66,14 @@ def test_views_are_the_cameras(simulate: Simulate, camera: str) -> None:
 
 
 @pytest.mark.parametrize("task", [BOWLS, DRAWERS, STOVE])
-def test_perfect_finds_are_what_the_simulator_tells(
-    gl: str, simulate: Simulate, finder: ObjectFinder, task: str
-) -> None:
-    sim = bent(simulate(task))
+def test_perfect_finds_are_what_the_simulator_tells(gl: str, localizer: ObjectLocalizer, task: str) -> None:
+    sim = bent(simulation(task))
     sim.highlights = (highlight_of(sim, next(name for name, asset in sim.assets.items() if asset.kind == "object")),)
     labeller = Labeller(sim)
-    finds = {
-        camera: perfect(labeller.look(camera), score) for camera, score in zip(MJCF_CAMERAS, (1.0, 0.9), strict=True)
+    detected = {
+        camera: perfect(labeller.take(camera), score) for camera, score in zip(MJCF_CAMERAS, (1.0, 0.9), strict=True)
     }
-    found, true = told(finder.slots(finds, views_of(sim.proprio()))), told(ObjectSlots(sim).observe())
+    found, true = told(localizer.slots(detected, views_of(sim.proprio()))), told(ObjectSlots(sim).observe())
     assert len(true) > 3
     assert true[:, -1].any()
     assert not true[:, -1].all()
@@ -107,77 +99,79 @@ def test_kinds_are_alone_or_round_as_assets_say() -> None:
     assert ONE - {*PARTS, "kitchen_table"} <= known
 
 
-def seen(finder: ObjectFinder, state: NDArray[np.floating], *things: tuple[str, str, float, tuple[float, ...]]) -> int:
-    """Return how many things there are by finds (camera, kind, score, place)."""
-    finds = {camera: np.zeros(sum(one[0] == camera for one in things), FOUND) for camera in MJCF_CAMERAS}
+def count(
+    localizer: ObjectLocalizer, state: NDArray[np.floating], *things: tuple[str, str, float, tuple[float, ...]]
+) -> int:
+    """Return the number of objects by detections (camera, kind, score, place)."""
+    detected = {camera: np.zeros(sum(one[0] == camera for one in things), DETECTION) for camera in MJCF_CAMERAS}
     filled = dict.fromkeys(MJCF_CAMERAS, 0)
     for camera, kind, score, place in things:
-        find = finds[camera][filled[camera] : filled[camera] + 1]
+        find = detected[camera][filled[camera] : filled[camera] + 1]
         filled[camera] += 1
         at, depth = projected(np.array([place]), view_of(camera, state))
         find["kind"], find["score"], find["turn"] = kinds().index(kind), score, (1.0, 0.0)
         find["place"], find["depth"], find["height"] = at, depth, place[2] - TABLE_TOP
-    return len(told(finder.slots(finds, views_of(state))))
+    return len(told(localizer.slots(detected, views_of(state))))
 
 
-def test_one_thing_is_seen_by_both_cameras(simulate: Simulate, finder: ObjectFinder) -> None:
-    state = bent(simulate(BOWLS)).proprio().astype(float)
+def test_one_thing_is_seen_by_both_cameras(localizer: ObjectLocalizer) -> None:
+    state = bent(simulation(BOWLS)).proprio().astype(float)
     x, y = float(state[0]), float(state[1])
     here, beside = (x, y, 0.91), (x, y + 0.8 * SAME, 0.91)
-    assert seen(finder, state, ("agentview", "butter", 0.9, here), ("wrist", "butter", 0.8, beside)) == 1
-    assert seen(finder, state, ("agentview", "butter", 0.9, here), ("wrist", "milk", 0.8, here)) == 2
+    assert count(localizer, state, ("agentview", "butter", 0.9, here), ("wrist", "butter", 0.8, beside)) == 1
+    assert count(localizer, state, ("agentview", "butter", 0.9, here), ("wrist", "milk", 0.8, here)) == 2
     twice = [("agentview", "butter", 0.9, here), ("agentview", "butter", 0.8, beside)]
     assert APART < 0.8 * SAME
-    assert seen(finder, state, *twice) == 2, "two of a kind may stand side by side"
-    assert seen(finder, state, twice[0], ("agentview", "butter", 0.8, (x, y + 0.8 * APART, 0.91))) == 1
+    assert count(localizer, state, *twice) == 2, "two of a kind may stand side by side"
+    assert count(localizer, state, twice[0], ("agentview", "butter", 0.8, (x, y + 0.8 * APART, 0.91))) == 1
     far = ("agentview", "wooden_cabinet", 0.8, (x, y + 0.3, 0.91))
-    assert seen(finder, state, ("wrist", "wooden_cabinet", 0.9, here), far) == 1, "a scene has one"
+    assert count(localizer, state, ("wrist", "wooden_cabinet", 0.9, here), far) == 1, "a scene has one"
 
 
-def test_a_place_is_where_both_lines_of_sight_meet(simulate: Simulate, finder: ObjectFinder) -> None:
-    state = simulate(BOWLS).proprio().astype(float)
-    true, finds = np.array([float(state[0]) + 0.03, float(state[1]), 0.91]), {}
+def test_a_place_is_where_both_lines_of_sight_meet(localizer: ObjectLocalizer) -> None:
+    state = simulation(BOWLS).proprio().astype(float)
+    true, detected = np.array([float(state[0]) + 0.03, float(state[1]), 0.91]), {}
     for camera in MJCF_CAMERAS:
-        finds[camera] = one = np.zeros(1, FOUND)
+        detected[camera] = one = np.zeros(1, DETECTION)
         place, depth = projected(true[None], view_of(camera, state))
         one["kind"], one["score"], one["turn"] = kinds().index("butter"), 0.9, (1.0, 0.0)
         one["place"], one["depth"], one["height"] = place, depth + 0.012, true[2] - TABLE_TOP + 0.012
-        one["doubt"] = (0.001, 0.01, 0.01)
+        one["uncertainty"] = (0.001, 0.01, 0.01)
     views = views_of(state)
     alone = {
-        camera: told(finder.slots({**finds, other: finds[other][:0]}, views))[0, PLACE]
+        camera: told(localizer.slots({**detected, other: detected[other][:0]}, views))[0, PLACE]
         for camera, other in zip(MJCF_CAMERAS, reversed(MJCF_CAMERAS), strict=True)
     }
     assert min(np.linalg.norm(place - true) for place in alone.values()) > 0.01
-    assert np.linalg.norm(told(finder.slots(finds, views))[0, PLACE] - true) < 0.004
-    finds["wrist"]["doubt"] = (0.1, 0.1, 0.1)
-    assert told(finder.slots(finds, views))[0, PLACE] == pytest.approx(alone["agentview"], abs=1e-3)
+    assert np.linalg.norm(told(localizer.slots(detected, views))[0, PLACE] - true) < 0.004
+    detected["wrist"]["uncertainty"] = (0.1, 0.1, 0.1)
+    assert told(localizer.slots(detected, views))[0, PLACE] == pytest.approx(alone["agentview"], abs=1e-3)
 
 
 @pytest.mark.parametrize("camera", MJCF_CAMERAS)
-def test_what_one_camera_finds_alone_must_be_surer(simulate: Simulate, finder: ObjectFinder, camera: str) -> None:
-    state = simulate(BOWLS).proprio().astype(float)
+def test_what_one_camera_finds_alone_must_be_surer(localizer: ObjectLocalizer, camera: str) -> None:
+    state = simulation(BOWLS).proprio().astype(float)
     here = (float(state[0]), float(state[1]), 0.91)
-    doubtful = [(name, "butter", (SURE + ALONE) / 2, here) for name in MJCF_CAMERAS]
-    assert seen(finder, state, *doubtful) == 1
-    assert seen(finder, state, next(one for one in doubtful if one[0] == camera)) == 0
-    assert seen(finder, state, (camera, "butter", ALONE + 0.01, here)) == 1
+    doubtful = [(name, "butter", (MIN_SCORE + MIN_SCORE_ALONE) / 2, here) for name in MJCF_CAMERAS]
+    assert count(localizer, state, *doubtful) == 1
+    assert count(localizer, state, next(one for one in doubtful if one[0] == camera)) == 0
+    assert count(localizer, state, (camera, "butter", MIN_SCORE_ALONE + 0.01, here)) == 1
 
 
-def test_a_kind_that_this_version_does_not_know_is_passed_over(simulate: Simulate) -> None:
-    foreign = ObjectFinder(Eyes(Tower((4, 4, 8, 8, 16), (0, 0, 0, 1, 0)), ("teapot", "butter")))
-    finds = np.zeros(1, FOUND)
-    finds["score"], finds["place"], finds["depth"], finds["turn"] = 1.0, 0.5, 1.0, (1.0, 0.0)
-    state = simulate(BOWLS).proprio().astype(float)
+def test_a_kind_that_this_version_does_not_know_is_passed_over() -> None:
+    foreign = ObjectLocalizer(Detector(small_encoder(), ("teapot", "butter")))
+    detected = np.zeros(1, DETECTION)
+    detected["score"], detected["place"], detected["depth"], detected["turn"] = 1.0, 0.5, 1.0, (1.0, 0.0)
+    state = simulation(BOWLS).proprio().astype(float)
     for kind, count in ((0, 0), (1, 1)):
-        finds["kind"] = kind
-        assert len(told(foreign.slots({"agentview": finds, "wrist": finds[:0]}, views_of(state)))) == count
+        detected["kind"] = kind
+        assert len(told(foreign.slots({"agentview": detected, "wrist": detected[:0]}, views_of(state)))) == count
 
 
-def test_the_packages_eyes_find_what_stands_on_a_table(gl: str, simulate: Simulate) -> None:
-    sim = simulate(BOWLS)
+def test_the_packages_eyes_find_what_stands_on_a_table(gl: str) -> None:
+    sim = simulation(BOWLS)
     pictures = {name: torch.from_numpy(sim.render(name)).permute(2, 0, 1)[None] / 255 for name in MJCF_CAMERAS}
-    found = ObjectFinder(load_eyes(PACKAGE))(pictures, torch.from_numpy(sim.proprio())[None])
+    found = ObjectLocalizer(load_detector(PACKAGE))(pictures, torch.from_numpy(sim.proprio())[None])
     assert found.shape == (1, SIZE)
     assert found.dtype == torch.float32
     for thing in told(ObjectSlots(sim).observe()):

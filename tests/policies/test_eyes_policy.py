@@ -19,8 +19,9 @@ from transformers.models.gemma import modeling_gemma
 from lerobot_memobench.datasets.feature_cache import building
 from lerobot_memobench.datasets.feature_cache.layout import FOLDER
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.perception.tower import GRID, POOLED, SIDE, WIDTH, Tower
-from lerobot_memobench.perception.weights import Eyes, save_eyes
+from lerobot_memobench.perception.visual_encoder import GRID, POOLED, SIDE, WIDTH, VisualEncoder
+from lerobot_memobench.perception.detector import Detector
+from lerobot_memobench.perception.weights import save_detector
 from lerobot_memobench.policies.memobench_mem import network
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
@@ -44,7 +45,7 @@ ROUNDED = 2**-7
 
 def made_eyes(path: Path, seed: int) -> Path:
     torch.manual_seed(seed)
-    save_eyes(Eyes(Tower().eval(), ("cork",)), path)
+    save_detector(Detector(VisualEncoder().eval(), ("cork",)), path)
     return path
 
 
@@ -72,13 +73,13 @@ def copy(dataset_root: Path, to: Path) -> Path:
 def looked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """How many pictures each pass of a tower saw."""
     seen: list[int] = []
-    original = Tower.forward
+    original = VisualEncoder.forward
 
-    def counting(tower: Tower, images: torch.Tensor) -> torch.Tensor:
+    def counting(tower: VisualEncoder, images: torch.Tensor) -> torch.Tensor:
         seen.append(len(images))
         return original(tower, images)
 
-    monkeypatch.setattr(Tower, "forward", counting)
+    monkeypatch.setattr(VisualEncoder, "forward", counting)
     return seen
 
 
@@ -118,10 +119,10 @@ def test_bad_settings_are_refused(fields: dict[str, Any], message: str) -> None:
 
 
 def test_eyes_that_are_none_are_refused(root: Path, tmp_path: Path) -> None:
-    with pytest.raises(MemobenchError, match=r"there is no file.*memobench eyes train"):
+    with pytest.raises(MemobenchError, match=r"there is no file.*python -m research.detector train"):
         cache_dataset(root, small_config(size="small", eyes=str(tmp_path / "absent")))
-    save_eyes(Eyes(Tower((4, 4, 8, 8, 16), (0, 0, 0, 1, 0)), ("cork",)), tmp_path / "narrow.safetensors")
-    with pytest.raises(MemobenchError, match=r"widths \(4, 4, 8, 8, 16\).*memobench eyes train"):
+    save_detector(Detector(VisualEncoder((4, 4, 8, 8, 16), (0, 0, 0, 1, 0)), ("cork",)), tmp_path / "narrow.safetensors")
+    with pytest.raises(MemobenchError, match=r"widths \(4, 4, 8, 8, 16\).*python -m research.detector train"):
         cache_dataset(root, small_config(size="small", eyes=str(tmp_path / "narrow.safetensors")))
 
 
@@ -159,15 +160,15 @@ def test_a_cache_that_was_killed_is_finished(
 ) -> None:
     killed = copy(dataset_root, tmp_path / "data")
     passes = iter(range(4))
-    original = Tower.forward
+    original = VisualEncoder.forward
 
-    def kill(tower: Tower, images: torch.Tensor) -> torch.Tensor:
+    def kill(tower: VisualEncoder, images: torch.Tensor) -> torch.Tensor:
         if next(passes) == 3:
             raise KeyboardInterrupt
         return original(tower, images)
 
     with monkeypatch.context() as patched:
-        patched.setattr(Tower, "forward", kill)
+        patched.setattr(VisualEncoder, "forward", kill)
         with pytest.raises(KeyboardInterrupt):
             cache_dataset(killed, small_config(**seeing), batch_size=40)
     for where in (killed, root):
@@ -180,18 +181,18 @@ def test_a_cache_that_was_killed_is_finished(
 def test_of_two_trainings_each_looks_at_one_camera(
     dataset_root: Path, tmp_path: Path, seeing: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    root, original = copy(dataset_root, tmp_path / "data"), Tower.forward
+    root, original = copy(dataset_root, tmp_path / "data"), VisualEncoder.forward
     begun, waits, go = threading.Event(), threading.Event(), threading.Event()
     looked = {"first": 0, "second": 0}
 
-    def held(tower: Tower, images: torch.Tensor) -> torch.Tensor:
+    def held(tower: VisualEncoder, images: torch.Tensor) -> torch.Tensor:
         looked[threading.current_thread().name] += len(images)
         if threading.current_thread().name == "first":
             begun.set()
             assert go.wait(60)
         return original(tower, images)
 
-    monkeypatch.setattr(Tower, "forward", held)
+    monkeypatch.setattr(VisualEncoder, "forward", held)
     monkeypatch.setattr(building.logger, "warning", lambda *_: waits.set())
     first, second = (
         threading.Thread(target=cache_dataset, args=(root, small_config(**seeing)), name=name, daemon=True)

@@ -73,7 +73,7 @@ def test_objects_are_found_where_eyes_are_named(tmp_path: Path) -> None:
 
 
 def test_eyes_that_are_none_are_refused(root: Path, finding: dict[str, Any], tmp_path: Path) -> None:
-    with pytest.raises(MemobenchError, match=r"there is no file.*memobench eyes train"):
+    with pytest.raises(MemobenchError, match=r"there is no file.*python -m research.detector train"):
         made_for_training(root, **finding | {"eyes": str(tmp_path / "absent")})
     with pytest.raises(MemobenchError, match="or name eyes that find them"):
         cache_dataset(root, small_config(size="small", perception="objects"))

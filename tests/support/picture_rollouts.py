@@ -14,9 +14,10 @@ from lerobot.utils.constants import OBS_STATE
 
 from lerobot_memobench.datasets.feature_cache.frames import frame_reader
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.perception.kinds import kinds
-from lerobot_memobench.perception.tower import Tower
-from lerobot_memobench.perception.weights import Eyes, save_eyes
+from research.detector.labels import kinds
+from lerobot_memobench.perception.visual_encoder import VisualEncoder
+from lerobot_memobench.perception.detector import Detector
+from lerobot_memobench.perception.weights import save_detector
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MASK, STEPS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from tests.support.small_policy import batch_of, made_for_training
@@ -30,9 +31,9 @@ STARTS = np.cumsum([0, *LENGTHS])
 def made_eyes(path: Path, seed: int) -> Path:
     """Write eyes that find something everywhere."""
     torch.manual_seed(seed)
-    eyes = Eyes(Tower().eval(), kinds())
-    torch.nn.init.zeros_(eyes.fine_heads.heat.bias)
-    save_eyes(eyes, path)
+    eyes = Detector(VisualEncoder().eval(), kinds())
+    torch.nn.init.zeros_(eyes.fine_heads.heatmap.bias)
+    save_detector(eyes, path)
     return path
 
 

@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from lerobot_memobench.cli import data, eyes, figures
+from lerobot_memobench.cli import data, figures
 from lerobot_memobench.cli.console import one_sentence
 from lerobot_memobench.cli.data import cache, generate
 from lerobot_memobench.cli.demo import demo, doctor
@@ -58,14 +58,14 @@ app = typer.Typer(
 COMMANDS: dict[str, tuple[Callable[..., int | None] | tuple[str, typer.Typer], ...]] = {
     "Look around": (tasks, objects, gallery, doctor, demo),
     "Demonstrations": (generate, data.convert, cache, data.validate, data.describe, data.push),
-    "Train": (recipe, ("eyes", eyes.app)),
+    "Train": (recipe,),
     "Results": (report, compare, html, merge, rerun, ("figures", figures.app), ("controls", controls)),
 }
 """Group -> its commands, as ``memobench --help`` lists them."""
 
-GO_ON = ("generate", "cache", "convert", "push", "eyes")
+GO_ON = ("generate", "cache", "convert", "push")
 """Commands that go on when they are given again; any other begins anew."""
-LEARN = ("cache", "eyes")
+LEARN = ("cache",)
 """Commands whose own process trains or encodes; every other simulates, or computes next to nothing."""
 
 for group, commands in COMMANDS.items():

@@ -252,9 +252,9 @@ def eyes_hash(settings: Mapping[str, Any]) -> str | None:
     """
     if settings.get("perception") != "objects" or settings.get("eyes") is None:
         return None
-    from lerobot_memobench.perception.weights import eyes_file
+    from lerobot_memobench.perception.weights import detector_file
 
-    return file_hash(eyes_file(settings["eyes"]))
+    return file_hash(detector_file(settings["eyes"]))
 
 
 def training_facts(folder: Path) -> dict[str, Any] | None:

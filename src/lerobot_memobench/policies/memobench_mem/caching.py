@@ -33,8 +33,8 @@ from lerobot_memobench.datasets.lerobot_format.layout import read_info
 from lerobot_memobench.envs.prompting import name_in_data
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import in_words
-from lerobot_memobench.perception.tower import GRID, POOLED, WIDTH, Tower
-from lerobot_memobench.perception.weights import load_eyes, load_tower
+from lerobot_memobench.perception.visual_encoder import GRID, POOLED, WIDTH, VisualEncoder
+from lerobot_memobench.perception.weights import load_detector, load_visual_encoder
 from lerobot_memobench.policies.memobench_mem.checkpoints import load_exactly, read_weights
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import (
@@ -74,9 +74,9 @@ def load_sight(config: MemobenchMemConfig, weights: str | Path | None = None) ->
     source = weights or config.base_weights
     if source is None:
         assert config.eyes is not None  # asked of a configuration that has some
-        tower = load_tower(config.eyes)
+        tower = load_visual_encoder(config.eyes)
     else:
-        tower = Tower(folded=True).eval()
+        tower = VisualEncoder(folded=True).eval()
         load_exactly(tower, read_weights(source, _VISION_PREFIX + "vision_tower."), source, optional=set())
     width = config.dimensions.vlm.width
     return EyePerception(tower.to(config.device), [*config.image_features], config.memory_camera or "", width)
@@ -138,7 +138,9 @@ def cache_dataset(
     how: dict[str, Any] = {"batch_size": batch_size, "workers": workers, "progress": progress, "tell": tell}
     if config.finds_objects:
         assert config.eyes is not None
-        return make_found(root, config, ObjectsInPictures(load_eyes(config.eyes)), _text_encoder(config), **how).folder
+        return make_found(
+            root, config, ObjectsInPictures(load_detector(config.eyes)), _text_encoder(config), **how
+        ).folder
     if config.has_eyes:
         memory, present = make_caches(root, config, load_sight(config, weights), _text_encoder(config), **how)
         return (memory or next(iter(present.values()))).folder

@@ -21,7 +21,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
 from lerobot_memobench.envs.observations import DETECTIONS, SEEN_PIXELS
 from lerobot_memobench.envs.observations import PRIVILEGED as SEEN_OBJECTS
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.perception.tower import SIDE
+from lerobot_memobench.perception.visual_encoder import SIDE
 from lerobot_memobench.perception.weights import PACKAGE, RANDOM
 from lerobot_memobench.protocol import CAMERAS, IMAGE_SIZE
 
@@ -229,8 +229,9 @@ class MemobenchMemConfig(PI05Config):
     """How a moment is seen: ``pixels``, by the image tower, or ``objects``, by the slots of
     ``observation.environment_state`` (`sim.object_slots`), without any picture, or as ``eyes`` find them."""
     eyes: str | None = None
-    """What pictures are seen through: a file of `memobench eyes train`, ``package``: the eyes that come with the
-    package, or ``random``: pi0.5's image tower with random weights. With ``perception=objects``, the eyes that find
+    """What pictures are seen through: a file of `python -m research.detector train`, ``package``: the eyes that
+    come with the package, or ``random``: pi0.5's image tower with random weights.
+    With ``perception=objects``, the eyes that find
     them in pictures; none: the environment tells them. With pixels at ``size=small``, whose tower's tokens are seen;
     none: ``package``. A checkpoint of pixels holds its tower; there this only says where it was from."""
     sight_errors: float = 0.0
@@ -378,8 +379,8 @@ class MemobenchMemConfig(PI05Config):
             )
         elif self.eyes == RANDOM:
             raise MemobenchError(
-                f"--policy.eyes={RANDOM} finds no objects; name {PACKAGE} or a file of `memobench eyes train`, or "
-                "leave it out: then objects are told by the environment."
+                f"--policy.eyes={RANDOM} finds no objects; name {PACKAGE} or a file of "
+                "`python -m research.detector train`, or leave it out: then objects are told by the environment."
             )
 
     def _check_numbers(self) -> None:

@@ -14,7 +14,7 @@ import mujoco
 import torch
 from torch import Tensor
 
-from lerobot_memobench.perception.objects import set_axis, settled
+from lerobot_memobench.perception.objects import set_axis, upright
 from lerobot_memobench.sim.assets.registry import build_asset, known_classes
 from lerobot_memobench.sim.object_layout import WIDTH, field
 from lerobot_memobench.sim.object_slots import classes
@@ -63,7 +63,7 @@ def as_found(slots: Tensor, hand: Tensor, size: float) -> Tensor:
     Args:
         hand: its place in the world, m, and its turn, (N, >= 3). size: of the errors; 1 is as those eyes err.
     """
-    seen = settled(slots)
+    seen = upright(slots)
     there = field(seen, "present").squeeze(-1) > 0
     kind = field(seen, "class").squeeze(-1).long()
     place, joint = field(seen, "position"), field(seen, "joint")

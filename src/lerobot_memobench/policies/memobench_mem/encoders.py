@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn.functional import rms_norm
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.perception.tower import GRID, POOLED, SIDE, WIDTH, Tower, shrunk
+from lerobot_memobench.perception.visual_encoder import GRID, POOLED, SIDE, WIDTH, VisualEncoder, resized
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MEMORY_GRID
 from lerobot_memobench.policies.memobench_mem.memory.encoder import PooledMemory
 from lerobot_memobench.policies.shown import cure
@@ -161,7 +161,7 @@ class PixelPerception(Perception):
 
 
 # ==== eyes.py
-# Eyes: pictures through the tower of `lerobot_memobench.perception`, which learns no more; its tokens do.
+# Detector: pictures through the tower of `lerobot_memobench.perception`, which learns no more; its tokens do.
 #
 # All tokens of a present picture enter the prefix; of a remembered one the pooled ones are kept. In a training sample the
 # tokens stand in the pictures' place, see `seen_pictures`.
@@ -200,14 +200,14 @@ class EyePerception(nn.Module, Perception):
     grid = POOLED
     pictures = True
 
-    def __init__(self, tower: Tower, cameras: Sequence[str], camera: str, width: int) -> None:
+    def __init__(self, tower: VisualEncoder, cameras: Sequence[str], camera: str, width: int) -> None:
         super().__init__()
         self._tower = (tower,)
         self.cameras, self.remembers, self.dim = list(cameras), camera, width
         self.project = nn.Linear(WIDTH, width)
 
     @property
-    def tower(self) -> Tower:
+    def tower(self) -> VisualEncoder:
         """What pictures are seen through."""
         return self._tower[0]
 
@@ -228,17 +228,17 @@ class EyePerception(nn.Module, Perception):
     @torch.no_grad()
     def look(self, pictures: Tensor) -> Tensor:
         """Return the tokens (N, 64, WIDTH) bfloat16 of pictures (N, 3, H, W) in [0, 1]."""
-        device = self.tower.place.device
+        device = self.tower.grid_position.device
         with torch.autocast(device.type, enabled=False):  # mixed precision would see otherwise than the cache did
-            seen: Tensor = self.tower(shrunk(pictures.to(device)))
+            seen: Tensor = self.tower(resized(pictures.to(device)))
         return seen.to(torch.bfloat16)
 
     @torch.no_grad()
     def pooled(self, tokens: Tensor) -> Tensor:
         """Return what is remembered, (N, 16, WIDTH) bfloat16, of what `look` returns."""
         tower = self.tower
-        with torch.autocast(tower.place.device.type, enabled=False):
-            return tower.pooled(tokens.to(tower.place.device, torch.float32)).to(torch.bfloat16)
+        with torch.autocast(tower.grid_position.device.type, enabled=False):
+            return tower.pooled(tokens.to(tower.grid_position.device, torch.float32)).to(torch.bfloat16)
 
     def present(self, batch: Mapping[str, Tensor]) -> Seen:
         """Return each camera's tokens (B, 64, WIDTH), all of them real: those that the batch has, or of its pictures.

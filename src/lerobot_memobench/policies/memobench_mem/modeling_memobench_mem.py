@@ -29,7 +29,7 @@ from lerobot_memobench.computing.bfloat16 import quick_gradients, quick_products
 from lerobot_memobench.computing.freed_memory import keep_freed_memory
 from lerobot_memobench.datasets.feature_cache.reading import RecordedFrames
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.perception.weights import load_tower
+from lerobot_memobench.perception.weights import load_visual_encoder
 from lerobot_memobench.policies.checkpoint import check_as_trained
 from lerobot_memobench.policies.freshness import PICTURE_STEP, require_fresh
 from lerobot_memobench.policies.memobench_mem.alignment import alignment_loss, make_alignment, require_texts
@@ -148,7 +148,7 @@ class MemobenchMemPolicy(PI05Policy):
             load_base_weights(self.model, self._fix_pytorch_state_dict_keys(load_file(path), config), source)
         elif isinstance(self.perception, EyePerception) and load_base:
             assert config.eyes is not None
-            self.perception.tower.load_state_dict(load_tower(config.eyes).state_dict())
+            self.perception.tower.load_state_dict(load_visual_encoder(config.eyes).state_dict())
         if config.gradient_checkpointing:
             self.model.gradient_checkpointing_enable()
         self.to(config.device)

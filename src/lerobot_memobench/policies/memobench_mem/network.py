@@ -24,8 +24,8 @@ from transformers.initialization import no_init_weights
 from transformers.models.gemma import modeling_gemma
 
 from lerobot_memobench.lerobot_hooks import ATTEND, hooked_for
-from lerobot_memobench.perception.tower import Tower
-from lerobot_memobench.perception.weights import load_eyes
+from lerobot_memobench.perception.visual_encoder import VisualEncoder
+from lerobot_memobench.perception.weights import load_detector
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import Dimensions, Gemma, MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.detection_noise import SightErrors
 from lerobot_memobench.policies.memobench_mem.encoders import (
@@ -135,7 +135,7 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
         seeing = self.paligemma.model
         if config.sees_tokens:
             # Where the frozen image tower lies in pi0.5; its weights are loaded by the policy.
-            tower = seeing.vision_tower = Tower(folded=True).eval().requires_grad_(False)
+            tower = seeing.vision_tower = VisualEncoder(folded=True).eval().requires_grad_(False)
             seeing.multi_modal_projector = nn.Identity()
             return EyePerception(
                 tower, [*config.image_features], config.memory_camera or "", config.dimensions.vlm.width
@@ -149,7 +149,7 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
         slots = config.object_classes, config.tokens_per_frame, config.dimensions.vlm.width
         if config.eyes is not None:
             # A policy that learned of told objects with errors goes on, if it does, by what eyes find.
-            return FoundObjects(ObjectsInPictures(load_eyes(config.eyes)), *slots)
+            return FoundObjects(ObjectsInPictures(load_detector(config.eyes)), *slots)
         return ObjectPerception(*slots, SightErrors(config.sight_errors))
 
     def _set_requires_grad(self) -> None:

@@ -15,9 +15,9 @@ from torch import Tensor, nn
 from torch.nn.functional import rms_norm
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.perception.objects import ObjectFinder
-from lerobot_memobench.perception.tower import SIDE
-from lerobot_memobench.perception.weights import Eyes
+from lerobot_memobench.perception.detector import Detector
+from lerobot_memobench.perception.objects import ObjectLocalizer
+from lerobot_memobench.perception.visual_encoder import SIDE
 from lerobot_memobench.policies.memobench_mem.detection_noise import TOLD, SightErrors
 from lerobot_memobench.policies.memobench_mem.encoders import LOUD, SEEN, Perception, Seen, fingerprint
 from lerobot_memobench.policies.memobench_mem.memory.encoder import PooledMemory
@@ -201,7 +201,7 @@ class ObjectPerception(nn.Module, Perception):
 # Objects that eyes find in the present pictures, in the place of those that the environment tells.
 #
 # All that learns is as in `objects`, so a policy that was trained on the environment's objects acts from pictures too.
-# Eyes are no part of the policy: a checkpoint names them, and others may be given to it.
+# Detector are no part of the policy: a checkpoint names them, and others may be given to it.
 
 FOUND = f"{SEEN}objects"
 """Name in a training sample of what was found in its pictures, (B, SIZE)."""
@@ -212,8 +212,8 @@ VIEWS = {f"{OBS_IMAGES}.{name}": camera for name, camera in CAMERAS.items()}
 class ObjectsInPictures:
     """Find objects in pictures by the policy's names of these."""
 
-    def __init__(self, eyes: Eyes) -> None:
-        self._eyes, self._find = eyes, ObjectFinder(eyes)
+    def __init__(self, eyes: Detector) -> None:
+        self._eyes, self._find = eyes, ObjectLocalizer(eyes)
 
     @cached_property
     def key(self) -> str:

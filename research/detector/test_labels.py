@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import mujoco
 import numpy as np
 import pytest
 
-from lerobot_memobench.perception.kinds import kinds
-from lerobot_memobench.perception.labels import MASK, Labeller, projected, rays
-from lerobot_memobench.perception.tower import SIDE
+from lerobot_memobench.perception.geometry import projected, rays
+from lerobot_memobench.perception.visual_encoder import SIDE
 from lerobot_memobench.sim.assets.builder import VISUAL_GROUP
-from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
-
-from .conftest import BOWLS, DRAWERS
-
-Simulate = Callable[[str], Simulation]
+from lerobot_memobench.sim.simulation import MJCF_CAMERAS
+from research.detector.labels import MASK, Labeller, kinds
+from tests.support.labelled_images import BOWLS, DRAWERS, simulation
 
 
 @pytest.mark.parametrize("camera", MJCF_CAMERAS)
-def test_geoms_are_those_that_rays_meet(gl: str, simulate: Simulate, camera: str) -> None:
-    sim = simulate(DRAWERS)
-    geoms, row = sim.geoms(camera), Labeller(sim).look(camera)
+def test_geoms_are_those_that_rays_meet(gl: str, camera: str) -> None:
+    sim = simulation(DRAWERS)
+    geoms, row = sim.geoms(camera), Labeller(sim).take(camera)
     group, hit = np.zeros(6, np.uint8), np.zeros(1, np.int32)
     group[VISUAL_GROUP] = 1
     pixels = np.random.default_rng(0).integers(0, 256, (400, 2))
@@ -34,8 +29,8 @@ def test_geoms_are_those_that_rays_meet(gl: str, simulate: Simulate, camera: str
     assert (geoms[pixels[:, 0], pixels[:, 1]] == met).mean() > 0.98  # but for some on edges
 
 
-def test_drawing_geoms_leaves_pictures_as_they_are(gl: str, simulate: Simulate) -> None:
-    sim = simulate(BOWLS)
+def test_drawing_geoms_leaves_pictures_as_they_are(gl: str) -> None:
+    sim = simulation(BOWLS)
     before = sim.render()
     sim.data.joint("butter_1_joint0").qpos[0] += 0.1
     mujoco.mj_fwdPosition(sim.model, sim.data)
@@ -48,10 +43,10 @@ def test_drawing_geoms_leaves_pictures_as_they_are(gl: str, simulate: Simulate) 
 
 
 @pytest.mark.parametrize("camera", MJCF_CAMERAS)
-def test_the_mask_covers_what_is_projected(gl: str, simulate: Simulate, camera: str) -> None:
+def test_the_mask_covers_what_is_projected(gl: str, camera: str) -> None:
     """Butter is convex and lies free: its origin projects to the middle of what shows it."""
-    sim = simulate(BOWLS)
-    row = Labeller(sim).look(camera)
+    sim = simulation(BOWLS)
+    row = Labeller(sim).take(camera)
     butter = kinds().index("butter")
     (thing,) = (thing for thing in row["things"][: row["count"]] if thing["kind"] == butter)
     place, depth = projected(sim.body_pose("butter_1")[0], row)
@@ -63,29 +58,29 @@ def test_the_mask_covers_what_is_projected(gl: str, simulate: Simulate, camera: 
     assert 0.05 < depth < 1.5
 
 
-def test_rays_undo_projection(gl: str, simulate: Simulate) -> None:
-    sim = simulate(BOWLS)
-    row = Labeller(sim).look("agentview")
+def test_rays_undo_projection(gl: str) -> None:
+    sim = simulation(BOWLS)
+    row = Labeller(sim).take("agentview")
     points = row["things"]["position"][: row["count"]].astype(float)
     places, depths = projected(points, row)
     assert np.allclose(row["eye"] + rays(places, row) * depths[:, None], points, atol=1e-6)
 
 
-def test_drawers_are_told_apart_and_say_how_far_they_are_open(gl: str, simulate: Simulate) -> None:
-    sim = simulate(DRAWERS)
+def test_drawers_are_told_apart_and_say_how_far_they_are_open(gl: str) -> None:
+    sim = simulation(DRAWERS)
     sim.data.joint("wooden_cabinet_1_middle_level").qpos[0] = -0.1
     mujoco.mj_fwdPosition(sim.model, sim.data)
-    row = Labeller(sim).look("agentview")
+    row = Labeller(sim).take("agentview")
     joints = {kinds()[thing["kind"]]: thing["joint"] for thing in row["things"][: row["count"]]}
     assert joints["middle_drawer"] == pytest.approx(-0.1)
     assert joints["top_drawer"] == pytest.approx(0.005, abs=0.004)
     assert np.isnan(joints["wooden_cabinet"])
 
 
-def test_what_is_out_of_sight_is_not_labelled(gl: str, simulate: Simulate) -> None:
-    sim = simulate(BOWLS)
+def test_what_is_out_of_sight_is_not_labelled(gl: str) -> None:
+    sim = simulation(BOWLS)
     sim.data.joint("butter_1_joint0").qpos[2] = -3
     mujoco.mj_fwdPosition(sim.model, sim.data)
-    row = Labeller(sim).look("agentview")
+    row = Labeller(sim).take("agentview")
     assert kinds().index("butter") not in row["things"]["kind"][: row["count"]]
     assert kinds().index("akita_black_bowl") in row["things"]["kind"][: row["count"]]

@@ -1,4 +1,4 @@
-"""Pictures on disk: made once, the same again, and refused where they are not what they should be."""
+"""Labelled images on disk: made once, the same again, and refused where they are not what they should be."""
 
 from __future__ import annotations
 
@@ -9,22 +9,19 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.perception.pictures import NAMES, PER_MOMENT, Pictures, Shard, make_pictures
-from lerobot_memobench.perception.school import TESTED, TRAINED, Lessons
-from tests.support.made_up import made_up
-
-from .conftest import BOWLS
+from research.detector.data import KINDS_FILE, PER_FRAME, TESTED, TRAINED, DetectorData, EpisodeImages, Pictures
+from tests.support.labelled_images import BOWLS, synthetic
 
 
 def test_an_episode_is_made_once_and_the_same_again(gl: str, tmp_path: Path) -> None:
-    pictures = make_pictures(tmp_path, [BOWLS], [20_000], 2)
-    assert PER_MOMENT <= len(pictures) <= 2 * PER_MOMENT
+    pictures = DetectorData([BOWLS], 20_000, 1, 2).pictures(tmp_path, TRAINED)
+    assert PER_FRAME <= len(pictures) <= 2 * PER_FRAME
     (file,) = tmp_path.glob("*.npy")
     first = file.read_bytes()
     made = file.stat().st_mtime_ns
-    make_pictures(tmp_path, [BOWLS], [20_000], 2)
+    DetectorData([BOWLS], 20_000, 1, 2).pictures(tmp_path, TRAINED)
     assert file.stat().st_mtime_ns == made
-    again = Shard(BOWLS, 20_000, tmp_path / "again.npy", 2)
+    again = EpisodeImages(BOWLS, 20_000, tmp_path / "again.npy", 2)
     again.run()
     assert again.folder.read_bytes() == first
     rows = pictures.rows([0, 1])
@@ -33,7 +30,7 @@ def test_an_episode_is_made_once_and_the_same_again(gl: str, tmp_path: Path) -> 
 
 
 def test_files_are_read_as_one(tmp_path: Path) -> None:
-    rows = made_up(5)
+    rows = synthetic(5)
     for name, part in (("a", rows[:2]), ("b", rows[2:])):
         np.save(tmp_path / f"{name}.npy", part)
     pictures = Pictures([tmp_path / "a.npy", tmp_path / "b.npy"])
@@ -56,12 +53,12 @@ def test_other_arrays_are_no_pictures(tmp_path: Path) -> None:
 
 
 def test_a_folder_of_other_kinds_is_refused(tmp_path: Path) -> None:
-    (tmp_path / NAMES).write_text(json.dumps(["sock"]))
+    (tmp_path / KINDS_FILE).write_text(json.dumps(["sock"]))
     with pytest.raises(MemobenchError, match="other kinds"):
-        make_pictures(tmp_path, [BOWLS], [20_000], 1)
+        DetectorData([BOWLS], 20_000, 1, 1).pictures(tmp_path, TRAINED)
 
 
 @pytest.mark.parametrize(("first", "allowed"), [(7, TRAINED), (39_999, TRAINED), (20_000, TESTED)])
 def test_seeds_of_training_test_and_evaluation_are_apart(tmp_path: Path, first: int, allowed: range) -> None:
     with pytest.raises(MemobenchError, match="seeds"):
-        Lessons([BOWLS], first, 2, 1).pictures(tmp_path, allowed, None)
+        DetectorData([BOWLS], first, 2, 1).pictures(tmp_path, allowed)

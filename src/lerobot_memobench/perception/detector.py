@@ -1,0 +1,342 @@
+"""Detect objects in images: a feature pyramid, linear heads and a refinement head on the tokens of a visual encoder.
+
+One token of 192 numbers covers a square in which four objects can hardly be told apart. So objects are detected on a
+map four times as fine, which a feature pyramid (Lin et al. 2017) makes of the tokens and the encoder's feature maps.
+Heads are linear: a heat map of the objects' visible centres (CenterNet, Zhou et al. 2019), their geometry and a mask.
+A linear head confuses kinds where little of an object shows. The few peaks of the heat map are therefore scored once
+more by a small network that sees their surroundings, the second stage of a detector (Faster R-CNN, Ren et al. 2015).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+import torch
+from einops import rearrange
+from numpy.typing import NDArray
+from scipy.special import expit
+from torch import Tensor, nn
+from torch.nn.functional import max_pool2d, pad, relu
+
+from lerobot_memobench.perception.visual_encoder import GRID, POOLED, ResidualBlock, VisualEncoder, fold_norms
+
+LEVELS = 2
+"""Levels of the feature pyramid, each twice as fine as the one before."""
+FINER = 2**LEVELS
+"""Cells of the finest map along a token's side."""
+FINE, COARSE = 4, 2
+"""Cells along a token's side: of heat map and mask, and of geometry."""
+GEOMETRY = ("across", "down", "depth", "height", "joint", "lit", "turn cosine", "turn sine")
+"""Values predicted for an object of each kind in each coarse cell. ``across``, ``down``: from the cell's centre to the
+object's origin, in cells. ``depth``: of its origin along the camera's view, m. ``height``: of its origin over the
+table, m. ``joint``: of a moving part, m or rad. ``lit``: logit that it stands in a highlight. ``turn``: of twice the
+angle of its x axis in the image, which a half turn leaves as it is."""
+UNCERTAINTIES = ("place", "depth", "height")
+"""Expected errors that may be predicted too: of ``across`` and ``down`` together in cells, of the others in m."""
+FIRST_UNCERTAINTIES = (0.3, 0.01, 0.01)
+"""Their values before training."""
+PRIOR = 0.01
+"""Probability of an object in a cell before training."""
+READINGS = ("fine", "tokens", "pooled")
+"""What heads read: the finest map, to detect; the 64 tokens and the 16 pooled ones, to measure what those hold."""
+
+HIDDEN, REDUCED = 96, 24
+"""Width of the refinement head, and channels to which it reduces the encoder's feature map."""
+AROUND, NEAR = 5, 13
+"""Side of the square around a peak that it sees: in cells of the finest map, and of the encoder's, half as wide."""
+LOGIT_SCALE = 4.0
+"""Divisor of heat map logits: about their standard deviation."""
+
+DETECTION = np.dtype(
+    [
+        ("kind", "u1"),
+        ("score", "<f4"),
+        ("place", "<f4", 2),
+        ("depth", "<f4"),
+        ("height", "<f4"),
+        ("joint", "<f4"),
+        ("lit", "<f4"),
+        ("turn", "<f4", 2),
+        ("uncertainty", "<f4", len(UNCERTAINTIES)),
+    ]
+)
+"""A detected object. ``score``: probability. ``place``: of its origin in the image, a fraction of the side from the
+upper left corner. ``lit``: probability. ``uncertainty``: expected error of its place, a fraction of the image's side,
+of its depth and its height, m; 0 where none is predicted. The others as in `GEOMETRY`."""
+Detections = NDArray[np.void]
+"""Detections (n,) of one image, of dtype `DETECTION`."""
+MIN_SCORE, MIN_HEAT = 0.03, 0.3
+"""Probability from which on an object is detected: refined, and by the heat map alone, which is overconfident."""
+MOST = 64
+"""Largest number of detections in an image."""
+
+CellQuery = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
+"""From image, kind, row and column of coarse cells, (n,) each, to (n, values), float32: predictions for an object of
+that kind in that cell. Asking for few cells is much less work than predicting all kinds in all cells."""
+
+
+@dataclass(frozen=True)
+class DetectorOutput:
+    """Predictions of heads for images.
+
+    Attributes:
+        heatmap: (N, kinds, cells, cells), logits of an object's visible centre.
+        geometry: len(GEOMETRY) values. side: coarse cells along the image's side.
+        mask: (N, kinds + 1, cells, cells), logits of what is shown; the first is background.
+        uncertainty: len(UNCERTAINTIES) values, logarithms of the expected errors of the geometry; None: not predicted.
+        score: a logit per kind of an object at a peak of the heat map; None: not refined.
+    """
+
+    heatmap: Tensor
+    geometry: CellQuery
+    side: int
+    mask: Tensor
+    uncertainty: CellQuery | None = None
+    score: CellQuery | None = None
+
+
+class Detector(nn.Module):
+    """Visual encoder, feature pyramid and heads.
+
+    Args:
+        encoder: makes the tokens. kinds: names of the kinds of objects.
+
+    Attributes:
+        fine_heads, token_heads, pooled_heads: of each of `READINGS`.
+        refinement_head: scores the peaks of the finest map's heat map.
+    """
+
+    def __init__(self, encoder: VisualEncoder, kinds: tuple[str, ...]) -> None:
+        super().__init__()
+        self.encoder, self.fpn, self.kinds = encoder, FeaturePyramid(encoder), kinds
+        self.fine_heads = Heads(self.fpn.width, len(kinds), FINER * GRID, FINE // FINER, 1, uncertain=True)
+        self.token_heads = Heads(encoder.width, len(kinds), GRID)
+        self.pooled_heads = Heads(encoder.width, len(kinds), POOLED)
+        self.refinement_head = RefinementHead(self.fpn.width, encoder.widths[-2 - LEVELS], len(kinds))
+
+    def forward(self, images: Tensor) -> dict[str, DetectorOutput]:
+        """Return the output of each of `READINGS` for images (N, 3, SIDE, SIDE) in [0, 1]."""
+        tokens, maps = self.encoder.tokens_and_maps(images)
+        return {
+            "fine": self.read(self.fpn(tokens, maps), maps),
+            "tokens": self.token_heads(tokens),
+            "pooled": self.pooled_heads(self.encoder.pooled(tokens)),
+        }
+
+    def detect(self, images: Tensor) -> DetectorOutput:
+        """Return the output of the finest map alone for images (N, 3, SIDE, SIDE) in [0, 1]."""
+        tokens, maps = self.encoder.tokens_and_maps(images)
+        return self.read(self.fpn(tokens, maps), maps)
+
+    def read(self, fine: Tensor, maps: Sequence[Tensor]) -> DetectorOutput:
+        """Return the refined output for the finest map (N, (GRID FINER)², width) and the encoder's feature maps."""
+        output: DetectorOutput = self.fine_heads(fine)
+        return replace(output, score=self.refinement_head(fine, maps[-1 - LEVELS], output.heatmap))
+
+    def fold(self) -> None:
+        """Fold batch normalisation into the convolutions. A folded detector is not trained further."""
+        self.encoder.fold()
+        fold_norms(self.fpn)
+
+
+class FeaturePyramid(nn.Module):
+    """From tokens and the encoder's feature maps to a finer map, as wide as the encoder's of that resolution."""
+
+    def __init__(self, encoder: VisualEncoder) -> None:
+        super().__init__()
+        widths = encoder.widths[: -2 - LEVELS : -1]
+        self.width = widths[-1]
+        self.levels = nn.ModuleList(PyramidLevel(*pair) for pair in pairwise(widths))
+
+    def forward(self, tokens: Tensor, maps: Sequence[Tensor]) -> Tensor:
+        """Return (N, (GRID FINER)², width), row by row, of tokens (N, 64, encoder's width) and feature maps."""
+        x = tokens.unflatten(1, (GRID, GRID))
+        for level, lateral in zip(self.levels, reversed(maps), strict=False):
+            x = level(x, lateral)
+        return x.flatten(1, 2)
+
+
+class PyramidLevel(nn.Module):
+    """From a coarse map and the encoder's feature map, twice as fine, to another one as fine.
+
+    Args:
+        coarse, lateral: channels of the two.
+    """
+
+    def __init__(self, coarse: int, lateral: int) -> None:
+        super().__init__()
+        self.upsample = nn.Linear(coarse, 4 * lateral)
+        self.lateral = nn.Conv2d(lateral, lateral, 1)
+        self.block = ResidualBlock(lateral)
+
+    def forward(self, coarse: Tensor, lateral: Tensor) -> Tensor:
+        """Map (N, side, side, coarse) and (N, lateral, 2 side, 2 side) to (N, 2 side, 2 side, lateral)."""
+        around = rearrange(self.upsample(coarse), "n gy gx (d y x) -> n d (gy y) (gx x)", y=2, x=2)
+        around = around.contiguous(memory_format=torch.channels_last)
+        return self.block(relu(around + self.lateral(lateral))).permute(0, 2, 3, 1)
+
+
+class Heads(nn.Module):
+    """Linear maps from tokens, or cells of a map, to a `DetectorOutput`.
+
+    Args:
+        width: of a token. kinds: number of kinds of objects. grid: side of the square of tokens.
+        fine, coarse: cells along a token's side. uncertain: predict the geometry's expected errors too.
+    """
+
+    def __init__(
+        self, width: int, kinds: int, grid: int, fine: int = FINE, coarse: int = COARSE, *, uncertain: bool = False
+    ) -> None:
+        super().__init__()
+        self.grid, self.fine, self.coarse = grid, fine, coarse
+        self.heatmap = nn.Linear(width, kinds * fine**2)
+        self.geometry = nn.Linear(width, kinds * len(GEOMETRY) * coarse**2)
+        self.mask = nn.Linear(width, (kinds + 1) * fine**2)
+        self.uncertainty = nn.Linear(width, kinds * len(UNCERTAINTIES) * coarse**2) if uncertain else None
+        nn.init.constant_(self.heatmap.bias, float(torch.logit(torch.tensor(PRIOR))))
+        if self.uncertainty is not None:
+            nn.init.zeros_(self.uncertainty.weight)
+            first = torch.tensor(FIRST_UNCERTAINTIES).log()
+            self.uncertainty.bias.data = first.repeat_interleave(coarse**2).repeat(kinds)
+
+    def forward(self, tokens: Tensor) -> DetectorOutput:
+        """Return the output for tokens (N, grid², width)."""
+        return DetectorOutput(
+            self._as_map(self.heatmap(tokens)),
+            self._query(self.geometry, tokens, len(GEOMETRY)),
+            self.grid * self.coarse,
+            self._as_map(self.mask(tokens)),
+            None if self.uncertainty is None else self._query(self.uncertainty, tokens, len(UNCERTAINTIES)),
+        )
+
+    def _query(self, linear: nn.Linear, tokens: Tensor, values: int) -> CellQuery:
+        """Return a query of a linear map that predicts so many values of each kind in each coarse cell."""
+        c, layout = self.coarse, "(k v y x) ... -> (k y x) v ..."
+        weight, bias = (rearrange(part, layout, v=values, y=c, x=c) for part in (linear.weight, linear.bias))
+
+        def query(image: Tensor, kind: Tensor, row: Tensor, column: Tensor) -> Tensor:
+            which = (kind * c + row % c) * c + column % c
+            token = (image * self.grid + row // c) * self.grid + column // c
+            inputs = tokens.flatten(0, 1).index_select(0, token).float()
+            return bias.index_select(0, which) + torch.einsum("nvw,nw->nv", weight.index_select(0, which), inputs)
+
+        return query
+
+    def _as_map(self, values: Tensor) -> Tensor:
+        """Arrange each token's fine cells as a map (N, values, cells, cells), float32."""
+        sides = {"gy": self.grid, "gx": self.grid, "y": self.fine, "x": self.fine}
+        return rearrange(values.float(), "n (gy gx) (v y x) -> n v (gy y) (gx x)", **sides)
+
+
+class RefinementHead(nn.Module):
+    """From the surroundings of a heat map's peaks to their scores.
+
+    Args:
+        width: of the finest map. channels: of the encoder's feature map, twice as fine. kinds: number of kinds.
+    """
+
+    def __init__(self, width: int, channels: int, kinds: int) -> None:
+        super().__init__()
+        self.around = nn.Linear(width * AROUND**2, HIDDEN)
+        self.reduce = nn.Conv2d(channels, REDUCED, 3, stride=2)
+        self.near = nn.Linear(REDUCED * (NEAR // 2) ** 2, HIDDEN, bias=False)
+        self.heat = nn.Linear(kinds, HIDDEN, bias=False)
+        self.hidden = nn.Linear(HIDDEN, HIDDEN)
+        self.score = nn.Linear(HIDDEN, kinds)
+
+    def forward(self, fine: Tensor, maps: Tensor, heatmap: Tensor) -> CellQuery:
+        """Return a query of scores: a logit per kind of an object in a cell of the finest map.
+
+        Args:
+            fine: (N, side², width) the finest map. maps: (N, channels, 2 side, 2 side) the encoder's.
+            heatmap: (N, kinds, side, side) logits.
+        """
+        grid = fine.unflatten(1, heatmap.shape[-2:]).permute(0, 3, 1, 2)
+
+        def query(image: Tensor, _: Tensor, row: Tensor, column: Tensor) -> Tensor:
+            where = (image, slice(None), row, column)
+            around = _squares(grid, AROUND, 1)[where]
+            near = relu(self.reduce(_squares(maps, NEAR, 2)[where]))
+            heat = max_pool2d(heatmap, 3, 1, 1)[where] / LOGIT_SCALE
+            hidden = relu(self.around(around.flatten(1)) + self.near(near.flatten(1)) + self.heat(heat))
+            score: Tensor = self.score(hidden + relu(self.hidden(hidden)))
+            return score
+
+        return query
+
+
+def _squares(maps: Tensor, side: int, step: int) -> Tensor:
+    """Return the squares around every ``step``-th cell of maps (N, C, H, W), zero-padded.
+
+    Returns:
+        (N, C, H / step, W / step, side, side).
+    """
+    return pad(maps.float(), (side // 2,) * 4).unfold(2, side, step).unfold(3, side, step)
+
+
+def detections(output: DetectorOutput) -> list[Detections]:
+    """Return the detections of each image, highest score first.
+
+    They score more than `MIN_SCORE`, or `MIN_HEAT` where they are not refined.
+    """
+    scores, cells = peaks(output)
+    scores, order = scores.sort(dim=1, descending=True, stable=True)
+    which, rank = torch.nonzero(scores > (MIN_HEAT if output.score is None else MIN_SCORE), as_tuple=True)
+    image, kind, row, column = (cell.gather(1, order)[which, rank] for cell in cells)
+    side = output.heatmap.shape[-1]
+    there = (image, kind, (row + 0.5) / side, (column + 0.5) / side)
+    geometry = _interpolated(_geometry_in_image(output), output.side, *there)
+    found = np.zeros(len(image), DETECTION)
+    found["kind"], found["score"] = kind.numpy(), scores[which, rank].detach().numpy()
+    found["place"] = geometry[:, :2]
+    for name in ("depth", "height", "joint"):
+        found[name] = geometry[:, GEOMETRY.index(name)]
+    found["lit"] = expit(geometry[:, GEOMETRY.index("lit")])
+    found["turn"] = geometry[:, -2:]
+    if output.uncertainty is not None:
+        found["uncertainty"] = np.exp(_interpolated(output.uncertainty, output.side, *there)) / [output.side, 1, 1]
+    owner = image.numpy()
+    return [found[owner == number] for number in range(len(scores))]
+
+
+def peaks(output: DetectorOutput) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor, Tensor]]:
+    """Return the local maxima of heat maps: scores (N, MOST), 0 where there are fewer, and the cells they are in.
+
+    A cell is image, kind, row and column, (N, MOST) each.
+    """
+    heat, side = torch.sigmoid(output.heatmap), output.heatmap.shape[-1]
+    scores, places = torch.where(heat == max_pool2d(heat, 3, 1, 1), heat, torch.zeros(())).flatten(1).topk(MOST, dim=1)
+    images = torch.arange(len(heat))[:, None].expand_as(places)
+    cells = (images, places // side**2, places // side % side, places % side)
+    if output.score is not None:
+        logits = output.score(*(cell.flatten() for cell in cells)).view(*scores.shape, -1)
+        refined = torch.sigmoid(logits.gather(2, cells[1][..., None])[..., 0])
+        scores = torch.where(scores > 0, refined, scores)
+    return scores, cells
+
+
+def _geometry_in_image(output: DetectorOutput) -> CellQuery:
+    """Return a query of geometry with places in the image, fractions of its side, instead of offsets from cells."""
+
+    def query(image: Tensor, kind: Tensor, row: Tensor, column: Tensor) -> Tensor:
+        offset, rest = output.geometry(image, kind, row, column).split([2, len(GEOMETRY) - 2], dim=1)
+        return torch.cat([(offset + torch.stack([column, row], dim=1) + 0.5) / output.side, rest], dim=1)
+
+    return query
+
+
+def _interpolated(
+    query: CellQuery, side: int, image: Tensor, kind: Tensor, down: Tensor, across: Tensor
+) -> NDArray[np.float32]:
+    """Return values (n, values) at places between cells, interpolated bilinearly."""
+    y, x = down * side - 0.5, across * side - 0.5
+    total = weights = torch.zeros(len(y), 1)
+    for row, column in ((y.floor() + a, x.floor() + b) for a in (0, 1) for b in (0, 1)):
+        inside = (row >= 0) & (row < side) & (column >= 0) & (column < side)
+        weight = (inside * (1 - (y - row).abs()) * (1 - (x - column).abs()))[:, None]
+        cell = (row.long().clamp(0, side - 1), column.long().clamp(0, side - 1))
+        total, weights = total + weight * query(image, kind, *cell).detach(), weights + weight
+    return np.asarray((total / weights).numpy())

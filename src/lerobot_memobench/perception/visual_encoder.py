@@ -1,0 +1,117 @@
+"""Encode images as 8 x 8 tokens, and those as 4 x 4 pooled ones that keep where things are."""
+
+from __future__ import annotations
+
+import torch
+from einops import rearrange
+from torch import Tensor, nn
+from torch.nn.functional import interpolate, relu
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+SIDE = 256
+"""Side of the encoder's images, pixels: the benchmark's own."""
+GRID, POOLED = 8, 4
+"""Sides of the squares of tokens."""
+WIDTH = 192
+"""Dimension of a token."""
+WIDTHS, BLOCKS = (16, 24, 48, 96, WIDTH), (0, 0, 2, 3, 1)
+"""Channels of each stage, which halves the image, and its residual blocks."""
+
+
+def resized(images: Tensor) -> Tensor:
+    """Return square images (N, 3, H, H) at the encoder's size, float (N, 3, SIDE, SIDE), by area averaging."""
+    images = images.to(torch.float32)
+    return images if images.shape[-1] == SIDE else interpolate(images, (SIDE, SIDE), mode="area")
+
+
+class ConvNorm(nn.Module):
+    """A 3 x 3 convolution with batch normalisation, which `fold_norms` makes part of it."""
+
+    def __init__(self, channels: int, out_channels: int, stride: int = 1) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(channels, out_channels, 3, stride, 1, bias=False)
+        self.norm: nn.Module = nn.BatchNorm2d(out_channels)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (N, channels, H, W) to (N, out_channels, H / stride, W / stride)."""
+        return self.norm(self.conv(x))
+
+
+class ResidualBlock(nn.Module):
+    """Two convolutions with a skip connection."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.first, self.second = ConvNorm(channels, channels), ConvNorm(channels, channels)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (N, channels, H, W) to the same shape."""
+        return relu(x + self.second(relu(self.first(x))))
+
+
+class VisualEncoder(nn.Module):
+    """A small convolutional network from images to tokens.
+
+    Args:
+        widths: channels of each stage; the last is the dimension of a token.
+        blocks: residual blocks of each stage.
+        folded: without batch normalisation, as `weights` keeps it.
+    """
+
+    def __init__(
+        self, widths: tuple[int, ...] = WIDTHS, blocks: tuple[int, ...] = BLOCKS, *, folded: bool = False
+    ) -> None:
+        super().__init__()
+        self.widths, self.blocks = widths, blocks
+        self.stages = nn.ModuleList(
+            nn.Sequential(ConvNorm(here, there, stride=2), nn.ReLU(), *(ResidualBlock(there) for _ in range(count)))
+            for here, there, count in zip((3, *widths[:-1]), widths, blocks, strict=True)
+        )
+        self.grid_position = nn.Parameter(torch.zeros(widths[-1], GRID, GRID))
+        self.decorrelate: nn.Module = nn.Identity()
+        self.pool = nn.Linear(widths[-1] * (GRID // POOLED) ** 2, widths[-1])
+        if folded:
+            self.fold()
+
+    @property
+    def width(self) -> int:
+        """Dimension of a token."""
+        return self.widths[-1]
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Return the tokens (N, 64, width) of images (N, 3, SIDE, SIDE) in [0, 1], row by row."""
+        return self.tokens_and_maps(images)[0]
+
+    def tokens_and_maps(self, images: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """Return the tokens, and the feature maps (N, channels, H, W) of the stages before the last, finest first."""
+        x = (images * 2 - 1).contiguous(memory_format=torch.channels_last)
+        maps = []
+        for stage in self.stages[:-1]:
+            x = stage(x)
+            maps.append(x)
+        tokens = rearrange(self.stages[-1](x) + self.grid_position, "n d y x -> n (y x) d")
+        return self.decorrelate(tokens), maps
+
+    def pooled(self, tokens: Tensor) -> Tensor:
+        """Return 16 tokens (N, 16, width) of 64: one per square of four, by a linear map that keeps their order."""
+        near = rearrange(tokens, "n (y b x a) d -> n (y x) (b a d)", b=2, a=2, y=POOLED, x=POOLED)
+        return self.pool(near)
+
+    def fold(self) -> None:
+        """Fold batch normalisation into the convolutions and add the linear map that whitens tokens, as identity.
+
+        Outputs stay as they were in evaluation. A folded encoder is not trained further.
+        """
+        fold_norms(self)
+        if isinstance(self.decorrelate, nn.Identity):
+            self.decorrelate = nn.Linear(self.width, self.width)
+            nn.init.eye_(self.decorrelate.weight)
+            nn.init.zeros_(self.decorrelate.bias)
+
+
+def fold_norms(module: nn.Module) -> None:
+    """Fold all batch normalisation of a module into its convolutions."""
+    for part in module.modules():
+        if isinstance(part, ConvNorm) and isinstance(part.norm, nn.BatchNorm2d):
+            part.conv = fuse_conv_bn_eval(part.conv.eval(), part.norm.eval())
+            part.norm = nn.Identity()
