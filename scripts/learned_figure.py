@@ -14,8 +14,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lerobot_memobench.datasets.lerobot_format.card import markdown
-from lerobot_memobench.evaluation.metrics.rollouts import Record, by_task
-from lerobot_memobench.evaluation.records.runs import read_runs
+from lerobot_memobench.evaluation.metrics import Record, by_task
+from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.tasks.failures import REFERENCE_DRIFT
 from research.learning.experiments import prompted
 from research.learning.results import SCOPES, contrasts, contrasts_table, draw, outcomes_of, outcomes_table

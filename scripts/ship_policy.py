@@ -23,7 +23,7 @@ from safetensors.torch import load_file, save_file
 from lerobot_memobench.datasets.lerobot_format.layout import read_manifest
 from lerobot_memobench.envs.acting import ELSEWHERE
 from lerobot_memobench.envs.episode_log import MERGED_FILE
-from lerobot_memobench.evaluation.documents.report import REPORT_JSON
+from lerobot_memobench.evaluation.report import REPORT_JSON
 from lerobot_memobench.io import file_hash, write_file
 from lerobot_memobench.policies.checkpoint import SHIPPED, WEIGHTS_FILE, checkpoint_folder, shipped_policies
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from lerobot_memobench.evaluation.documents.tables import Numbers, Report, Section, Table
+from lerobot_memobench.evaluation.tables import Numbers, Report, Section, Table
 from lerobot_memobench.paper import AgreementFigures
 from lerobot_memobench.tasks.task import OPERATIONS
 from research.agreement.study import confusion_kappa, confusion_table, kappa

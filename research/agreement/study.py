@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.documents.formats import csv_text
-from lerobot_memobench.evaluation.documents.tables import (
+from lerobot_memobench.evaluation.metrics import Rate
+from lerobot_memobench.evaluation.tables import (
     NOT_APPLICABLE,
     OPERATION_NAMES,
     Cell,
@@ -24,8 +24,8 @@ from lerobot_memobench.evaluation.documents.tables import (
     Report,
     Section,
     Table,
+    csv_text,
 )
-from lerobot_memobench.evaluation.metrics.rates import Rate
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import format_formula
 from lerobot_memobench.tasks.task import DEFAULT_LEVEL, OPERATIONS

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.documents.formats import markdown
+from lerobot_memobench.evaluation.tables import markdown
 from research.agreement.__main__ import main
 from research.agreement.study import Labels, majority, report, study
 

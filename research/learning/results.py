@@ -16,10 +16,8 @@ from typing import Any
 import numpy as np
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.comparison.estimates import DRAWS, Array, difference_interval
-from lerobot_memobench.evaluation.comparison.paired_tests import detectable, holm, sign_flip
-from lerobot_memobench.evaluation.metrics.rates import Rate, mean_rate, success_rate
-from lerobot_memobench.evaluation.metrics.rollouts import Record, by_task
+from lerobot_memobench.evaluation.metrics import Rate, Record, by_task, mean_rate, success_rate
+from lerobot_memobench.evaluation.statistics import DRAWS, Array, detectable, difference_interval, holm, sign_flip
 from lerobot_memobench.io import draft_of
 from lerobot_memobench.tasks.failures import REFERENCE_DRIFT, WRONG_ORDER
 from lerobot_memobench.tasks.task import MEMORY_TYPES, STRICT_FAILURES

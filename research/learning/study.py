@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
-from lerobot_memobench.evaluation.documents.sentences import inputs_phrase
-from lerobot_memobench.evaluation.metrics.rollouts import policy_inputs
-from lerobot_memobench.evaluation.records.runs import read_rollouts
+from lerobot_memobench.evaluation.metrics import policy_inputs
+from lerobot_memobench.evaluation.records import read_rollouts
+from lerobot_memobench.evaluation.report_tables import inputs_phrase
 from lerobot_memobench.io import write_file
 from research.learning.experiments import MEMORY, Experiment
 from research.learning.results import (

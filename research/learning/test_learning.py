@@ -14,7 +14,7 @@ from PIL import Image, ImageColor
 
 from lerobot_memobench.envs.episode_log import MERGED_FILE, write_episodes
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.records.runs import read_rollouts
+from lerobot_memobench.evaluation.records import read_rollouts
 from lerobot_memobench.tasks.catalogue import BOWL, get_task, task_names
 from research.alignment.study import ALIGNMENTS
 from research.learning import stages as stages_module

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.documents.tables import NOT_APPLICABLE, figure
+from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, figure
 from lerobot_memobench.io import read_json, write_file
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.task import DRAWN, REFERENTS
@@ -245,7 +245,7 @@ def terminal_table(results: Sequence[Result]) -> Any:
     """Return the table for the terminal."""
     from rich.table import Table
 
-    from lerobot_memobench.evaluation.documents.terminal import Unbroken
+    from lerobot_memobench.evaluation.tables import Unbroken
 
     table = Table(header_style="bold", pad_edge=False)
     table.add_column("task")

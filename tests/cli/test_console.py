@@ -9,9 +9,9 @@ from rich.console import Console, RenderableType
 
 from lerobot_memobench.cli.console import counting
 from lerobot_memobench.cli.tasks import task_table
-from lerobot_memobench.evaluation.documents.report import table
-from lerobot_memobench.evaluation.documents.terminal import Unbroken
-from lerobot_memobench.evaluation.metrics.summary import summarise
+from lerobot_memobench.evaluation.metrics import summarise
+from lerobot_memobench.evaluation.report import table
+from lerobot_memobench.evaluation.tables import Unbroken
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 
 

@@ -22,8 +22,7 @@ from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode_log import read_episodes, read_protocol_file, write_episodes
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS, policy_inputs
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.records.protocol import read_protocol
-from lerobot_memobench.evaluation.records.runs import read_runs
+from lerobot_memobench.evaluation.records import read_protocol, read_runs
 from lerobot_memobench.policies.memobench_blind.configuration_memobench_blind import MemobenchBlindConfig
 from lerobot_memobench.policies.memobench_expert.configuration_memobench_expert import MemobenchExpertConfig
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig

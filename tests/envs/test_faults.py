@@ -24,10 +24,9 @@ from lerobot_memobench.envs.episode_log import MOST_EPISODES, read_episodes, rea
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.envs.observations import OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.documents.report import write_report
-from lerobot_memobench.evaluation.metrics.failures import failure_of
-from lerobot_memobench.evaluation.records.protocol import read_protocol
-from lerobot_memobench.evaluation.records.runs import read_rollouts
+from lerobot_memobench.evaluation.metrics import failure_of
+from lerobot_memobench.evaluation.records import read_protocol, read_rollouts
+from lerobot_memobench.evaluation.report import write_report
 from lerobot_memobench.protocol import EVALUATION_SEED, UNSEEDED
 from lerobot_memobench.run.merging import merge_and_report
 from lerobot_memobench.tasks.catalogue import get_task

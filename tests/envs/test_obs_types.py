@@ -19,7 +19,7 @@ from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, OBS_TYPES, PIXELS, check_obs_type, obs_type_of
 from lerobot_memobench.envs.video import LAST_FRAMES
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.documents.html.videos import frame_count
+from lerobot_memobench.evaluation.html.write import frame_count
 from lerobot_memobench.policies.untrained import UntrainedConfig
 from lerobot_memobench.protocol import EXECUTION, PROMPT
 from lerobot_memobench.sim import rendering

@@ -12,7 +12,7 @@ import pytest
 
 from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.records.protocol import read_card
+from lerobot_memobench.evaluation.records import read_card
 from lerobot_memobench.run.card import (
     checkpoint_files,
     disagreement,

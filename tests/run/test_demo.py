@@ -12,7 +12,7 @@ from PIL import Image
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.envs.video import LAST_FRAMES, VideoRecorder
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.documents.html import write_html
+from lerobot_memobench.evaluation.html.write import write_html
 from lerobot_memobench.run import demo
 from lerobot_memobench.run.demo import FAILED, SOLVED, STRIP_WIDTH, TITLE, joined, read_video, side_by_side, strip
 from lerobot_memobench.tasks.catalogue import BOWL, get_task

@@ -11,7 +11,7 @@ import pytest
 
 from lerobot_memobench.envs.episode_log import EpisodeLog, read_episodes
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.records.protocol import read_card, read_protocol
+from lerobot_memobench.evaluation.records import read_card, read_protocol
 from lerobot_memobench.run.card import new_card, policy_facts, write_card
 from lerobot_memobench.run.machine import run_facts
 from lerobot_memobench.run.merging import merge, merge_and_report, part_folders

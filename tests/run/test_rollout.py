@@ -212,7 +212,7 @@ def test_what_nobody_watches_is_not_drawn(use_async: bool, tmp_path: Path) -> No
 def test_a_filmed_episode_is_drawn_whole(drawn: list[int], tmp_path: Path) -> None:
     """Two of three episodes are filmed, whoever looks."""
     from lerobot_memobench.envs.video import LAST_FRAMES
-    from lerobot_memobench.evaluation.documents.html.videos import frame_count
+    from lerobot_memobench.evaluation.html.write import frame_count
 
     rolled(sparing(lerobot_eval.rollout, lambda: True), 3, tmp_path, "memobench_random", videos=2)
     films = sorted((tmp_path / "videos").iterdir())

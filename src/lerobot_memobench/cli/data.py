@@ -11,7 +11,7 @@ from rich.table import Table
 
 from lerobot_memobench.cli.console import OfSuite, Suite, WhichSuite, console, counting
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.documents.terminal import Unbroken
+from lerobot_memobench.evaluation.tables import Unbroken
 from lerobot_memobench.io import count_of
 from lerobot_memobench.jobs.executors import asked_for, options_told
 from lerobot_memobench.run.arguments import executor_options

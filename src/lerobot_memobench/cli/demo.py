@@ -30,7 +30,7 @@ def demo(
     from rich.markdown import Markdown
 
     from lerobot_memobench.cli.evaluate import evaluate_here, tell, tell_beginning
-    from lerobot_memobench.evaluation.documents.report import REPORT_MARKDOWN
+    from lerobot_memobench.evaluation.report import REPORT_MARKDOWN
     from lerobot_memobench.run.demo import (
         CONTACT_SHEET,
         MEMORY_TABLE,

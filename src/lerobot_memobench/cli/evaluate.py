@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lerobot_memobench.cli.console import WITH_PARENT, console, counting
-from lerobot_memobench.evaluation.documents.report import failure_line, table
-from lerobot_memobench.evaluation.documents.sentences import inputs_phrase
+from lerobot_memobench.evaluation.report import table
+from lerobot_memobench.evaluation.report_tables import failure_line, inputs_phrase
 from lerobot_memobench.io import count_of
 from lerobot_memobench.jobs.executors import asked_for
 from lerobot_memobench.jobs.processes import saying_how_to_go_on

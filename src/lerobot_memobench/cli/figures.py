@@ -16,7 +16,7 @@ from lerobot_memobench.tasks.task import PUBLISHED
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from lerobot_memobench.evaluation.records.runs import Run
+    from lerobot_memobench.evaluation.records import Run
 
 app = typer.Typer(
     help="Draw figures of evaluations and of the paper's tables. Evaluations: DIR, or NAME=DIR; the paper's: --with "
@@ -54,18 +54,19 @@ def radar(
     out: Out = DEFAULT_OUT,
 ) -> None:
     """Per method the best value over replan intervals, each axis normalised by its highest."""
-    from lerobot_memobench.evaluation.documents.figures import entries, radar
+    from lerobot_memobench.evaluation.figures.rates import draw_radar
+    from lerobot_memobench.evaluation.figures.style import average_axes, entries_of, published_entries, type_axes
 
     runs, paper = given_runs(folders, with_)
-    ours = entries.entries_of(runs)
-    chosen = entries.average_axes() if axes is Axes.AVERAGE else entries.type_axes()
-    panels = [("", ours)]
+    ours = entries_of(runs)
+    chosen = average_axes() if axes is Axes.AVERAGE else type_axes()
+    webs = [("", ours)]
     if paper:
-        panels = [
-            ("Main results", [*ours, *entries.published_entries("main")]),
-            ("Memory alignment", [*ours, *entries.published_entries("alignment")]),
+        webs = [
+            ("Main results", [*ours, *published_entries("main")]),
+            ("Memory alignment", [*ours, *published_entries("alignment")]),
         ]
-    _save(radar.draw(panels, chosen), out, "radar" if axes is Axes.AVERAGE else "radar_types")
+    _save(draw_radar(webs, chosen), out, "radar" if axes is Axes.AVERAGE else "radar_types")
 
 
 @app.command()
@@ -79,14 +80,15 @@ def correlations(
     out: Out = DEFAULT_OUT,
 ) -> None:
     """MSR, MUR and MCR against SR with Pearson's r."""
-    from lerobot_memobench.evaluation.documents.figures import correlations, entries
+    from lerobot_memobench.evaluation.figures.rates import draw_correlations
+    from lerobot_memobench.evaluation.figures.style import entries_of, published_entries
 
     runs, paper = given_runs(folders, with_)
     if paper and by is Grouping.TASKS:
         raise MemobenchError("the paper publishes no figures per task; leave out --by tasks or --with paper")
-    rows = [*(entries.published_entries("main") if paper else ()), *entries.entries_of(runs)]
+    rows = [*(published_entries("main") if paper else ()), *entries_of(runs)]
     by_task = by is Grouping.TASKS or (by is None and not paper)
-    _save(correlations.draw(rows, by_task), out, "correlations")
+    _save(draw_correlations(rows, by_task), out, "correlations")
 
 
 @app.command()
@@ -97,11 +99,11 @@ def failures(
     out: Out = DEFAULT_OUT,
 ) -> None:
     """How rollouts ended: success and the classes of failure, as bars."""
-    from lerobot_memobench.evaluation.documents.figures import failures
+    from lerobot_memobench.evaluation.figures.rollouts import bars, draw_failures, paper_bar
 
     runs, paper = given_runs(folders, with_)
-    bars = [*failures.bars(runs, by is Grouping.TASKS), *([failures.paper_bar()] if paper else [])]
-    _save(failures.draw(bars), out, "failures")
+    drawn = [*bars(runs, by is Grouping.TASKS), *([paper_bar()] if paper else [])]
+    _save(draw_failures(drawn), out, "failures")
 
 
 @app.command()
@@ -114,11 +116,11 @@ def prefix(
     out: Out = DEFAULT_OUT,
 ) -> None:
     """Prefix completion per checkpoint, in any order and in order, one panel per task."""
-    from lerobot_memobench.evaluation.documents.figures import prefix
+    from lerobot_memobench.evaluation.figures.rollouts import draw_prefix, panels, paper_panel
 
     runs, paper = given_runs(folders, with_)
-    panels = prefix.panels(runs, None if tasks is None else _chosen(tasks, runs))
-    _save(prefix.draw([*panels, *([prefix.paper_panel()] if paper else [])]), out, "prefix")
+    drawn = panels(runs, None if tasks is None else _chosen(tasks, runs))
+    _save(draw_prefix([*drawn, *([paper_panel()] if paper else [])]), out, "prefix")
 
 
 @app.command()
@@ -131,12 +133,12 @@ def replan(
     out: Out = DEFAULT_OUT,
 ) -> None:
     """SR, MSR, MUR and MCR by replan interval."""
-    from lerobot_memobench.evaluation.documents.figures import replan
+    from lerobot_memobench.evaluation.figures.rates import draw_replan
 
     runs, paper = given_runs(folders, with_)
     if by is Grouping.TASKS:
         raise MemobenchError("found --by tasks; expected types: replan curves are drawn of averages and memory types")
-    _save(replan.draw(runs, paper, by is Grouping.TYPES), out, "replan")
+    _save(draw_replan(runs, paper, by is Grouping.TYPES), out, "replan")
 
 
 def _chosen(spec: str, runs: list[Run]) -> list[str]:
@@ -151,8 +153,8 @@ def _chosen(spec: str, runs: list[Run]) -> list[str]:
 
 
 def _save(figure: Figure, out: Path, name: str) -> None:
-    from lerobot_memobench.evaluation.documents.figures.style import look, save
+    from lerobot_memobench.evaluation.figures.style import paper_style, save
 
-    with look():
+    with paper_style():
         for path in save(figure, out, name):
             console().print(str(path), soft_wrap=True)

@@ -17,8 +17,8 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import count_of, write_file
 
 if TYPE_CHECKING:
-    from lerobot_memobench.evaluation.documents.tables import Report
-    from lerobot_memobench.evaluation.records.runs import Run
+    from lerobot_memobench.evaluation.records import Run
+    from lerobot_memobench.evaluation.tables import Report
 
 
 class ReportFormat(StrEnum):
@@ -84,8 +84,8 @@ def report(
 
     report.json and report.md of each evaluation are written beside its log as well.
     """
-    from lerobot_memobench.evaluation.documents.report import write_documents
-    from lerobot_memobench.evaluation.records.runs import read_runs
+    from lerobot_memobench.evaluation.records import read_runs
+    from lerobot_memobench.evaluation.report import write_documents
 
     runs = read_runs(folders)
     wanted = list(dict.fromkeys(each.value for each in format_ or [ReportFormat.TABLE]))
@@ -100,7 +100,7 @@ def report(
 
 def _write_beside(runs: Sequence[Run]) -> None:
     """Write each evaluation's own report beside its log, where that can be written."""
-    from lerobot_memobench.evaluation.documents.report import write_report
+    from lerobot_memobench.evaluation.report import write_report
 
     for run in runs:
         try:
@@ -111,8 +111,8 @@ def _write_beside(runs: Sequence[Run]) -> None:
 
 
 def _print_report(runs: Sequence[Run], formats: Sequence[str], paper: bool) -> None:
-    from lerobot_memobench.evaluation.documents.formats import terminal
-    from lerobot_memobench.evaluation.documents.report import build, render
+    from lerobot_memobench.evaluation.report import build, render
+    from lerobot_memobench.evaluation.tables import terminal
 
     found = build(runs, paper)
     for name in formats:
@@ -137,13 +137,13 @@ def compare(
     permutations: Annotated[int, typer.Option(min=100, help="Random signs where not all can be tried.")] = 10_000,
 ) -> None:
     """Compare two evaluations of the same episodes, pair by pair. McNemar for success, sign-flip for the rates."""
-    from lerobot_memobench.evaluation.comparison import differences_report
-    from lerobot_memobench.evaluation.comparison.differences import compare as compared
-    from lerobot_memobench.evaluation.records.runs import read_runs
+    from lerobot_memobench.evaluation.comparison import compare as compared
+    from lerobot_memobench.evaluation.comparison import comparison_report
+    from lerobot_memobench.evaluation.records import read_runs
 
     first, second = read_runs([a, b])
     found = compared(first, second, allow=allow or (), seed=seed, permutations=permutations)
-    show_report(differences_report.report(found), "compare", format_, out)
+    show_report(comparison_report(found), "compare", format_, out)
 
 
 def html(
@@ -161,7 +161,7 @@ def html(
     ] = None,
 ) -> None:
     """Make a report for the browser. Rates, failures, and each episode's video over its timeline."""
-    from lerobot_memobench.evaluation.documents.html import write_html
+    from lerobot_memobench.evaluation.html.write import write_html
 
     written = write_html(folders, out, link=link, task_dir=task_dir)
     screen = console()
@@ -235,8 +235,8 @@ def oracle(
     out: TableOut = None,
 ) -> int:
     """Print which share of the gap to 100 % oracle memory closes: what a perfect memory would recover."""
-    from lerobot_memobench.evaluation.comparison.control_rollouts import pairs_by_replan
-    from lerobot_memobench.evaluation.comparison.oracle_memory import contrasts, oracle_report, published_contrasts
+    from lerobot_memobench.evaluation.controls import pairs_by_replan
+    from lerobot_memobench.evaluation.memory_controls import contrasts, oracle_report, published_contrasts
     from lerobot_memobench.paper import raw_tables
 
     pairs, notes = pairs_by_replan(standard, oracle, ignore=("oracle_memory",))
@@ -255,8 +255,8 @@ def shuffled(
     out: TableOut = None,
 ) -> int:
     """Print how far rollouts come with normal and with shuffled memory, checkpoint by checkpoint."""
-    from lerobot_memobench.evaluation.comparison.control_rollouts import pairs_by_replan
-    from lerobot_memobench.evaluation.comparison.shuffled_memory import prefix_curves, shuffled_report
+    from lerobot_memobench.evaluation.controls import pairs_by_replan
+    from lerobot_memobench.evaluation.memory_controls import prefix_curves, shuffled_report
     from lerobot_memobench.paper import shuffled_control
 
     pairs, notes = pairs_by_replan([normal], [shuffled])
@@ -273,8 +273,7 @@ def granularity(
     out: TableOut = None,
 ) -> int:
     """Print the metrics by the language level of the subgoals that a policy was taught with."""
-    from lerobot_memobench.evaluation.comparison.control_rollouts import rollouts_by_level, with_labels_of_level
-    from lerobot_memobench.evaluation.comparison.granularity import granularity_report
+    from lerobot_memobench.evaluation.controls import granularity_report, rollouts_by_level, with_labels_of_level
 
     levels, notes = rollouts_by_level(coarse, intermediate, fine)
     own = with_labels_of_level(levels)
@@ -283,7 +282,7 @@ def granularity(
 
 def _show(report: Report, notes: Sequence[str], name: str, out: Path | None) -> int:
     """Print a report, and write it where asked; return the exit status."""
-    from lerobot_memobench.evaluation.documents.formats import latex, markdown, terminal
+    from lerobot_memobench.evaluation.tables import latex, markdown, terminal
 
     noted = replace(report, sections=tuple(replace(each, notes=(*each.notes, *notes)) for each in report.sections))
     told = " ".join(f"{note}." for note in notes)
@@ -308,8 +307,8 @@ def _show(report: Report, notes: Sequence[str], name: str, out: Path | None) -> 
 
 def given_runs(folders: list[str] | None, with_: Beside | None) -> tuple[list[Run], bool]:
     """Return the evaluations and whether the paper's figures are drawn; one of both is needed."""
-    from lerobot_memobench.evaluation.documents.beside_paper import check_beside
-    from lerobot_memobench.evaluation.records.runs import read_runs, unlike
+    from lerobot_memobench.evaluation.records import read_runs, unlike
+    from lerobot_memobench.evaluation.report_tables import check_beside
 
     paper = with_ is Beside.PAPER
     if not folders and not paper:
@@ -342,18 +341,18 @@ def show_report(report: Report, name: str, formats: Sequence[ReportFormat] | Non
 
 
 def _print_table(report: Report) -> None:
-    from lerobot_memobench.evaluation.documents.formats import terminal
+    from lerobot_memobench.evaluation.tables import terminal
 
     console().print(report.title, style="bold")
     console().print(terminal(report), crop=False)
 
 
 def _writer(format_: ReportFormat) -> Callable[[Report], str]:
-    from lerobot_memobench.evaluation.documents import formats
+    from lerobot_memobench.evaluation.tables import json_text, latex, markdown, text
 
     return {
-        ReportFormat.TABLE: formats.text,
-        ReportFormat.MARKDOWN: formats.markdown,
-        ReportFormat.LATEX: formats.latex,
-        ReportFormat.JSON: lambda report: json.dumps(report.data, indent=2) + "\n",
+        ReportFormat.TABLE: text,
+        ReportFormat.MARKDOWN: markdown,
+        ReportFormat.LATEX: latex,
+        ReportFormat.JSON: json_text,
     }[format_]

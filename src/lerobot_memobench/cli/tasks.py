@@ -13,7 +13,7 @@ from rich.table import Table
 
 from lerobot_memobench.cli.console import Suite, WhichSuite, console
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.documents.terminal import Unbroken
+from lerobot_memobench.evaluation.tables import Unbroken
 from lerobot_memobench.io import count_of
 from lerobot_memobench.run.arguments import recipe_file, recipes
 from lerobot_memobench.tasks.catalogue import (

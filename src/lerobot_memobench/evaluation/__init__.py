@@ -1,6 +1,7 @@
-"""What did a policy learn, and what do the tasks ask of it?
+"""What a policy has learned, and how that is written down: log -> metrics -> comparison, controls -> documents.
 
-Rooms, each importing only from those before it: `metrics` (rollouts to rates), `records` (evaluations read back),
-`documents` (tables, reports, figures, the page for the browser), and three studies that do not know one another:
-`comparison` of evaluations, `agreement` of annotators, `necessity` of a memory.
+`records` reads evaluations, `metrics` counts. `comparison` pairs two evaluations and tests their difference
+(`statistics`); `controls` and `memory_controls` are the paper's controls. `tables` is what a report is made of and its
+formats, `report_tables` what stands in it, `report` puts it together; `figures` are those of the paper, `html` is the
+page for the browser.
 """

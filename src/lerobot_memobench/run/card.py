@@ -26,7 +26,7 @@ from lerobot_memobench.envs.acting import ELSEWHERE, checkpoint_files, encoded, 
 from lerobot_memobench.envs.episode_log import EXTENT, INPUTS, SETTINGS
 from lerobot_memobench.envs.observations import policy_inputs
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.records.protocol import CARD_FILE
+from lerobot_memobench.evaluation.records import CARD_FILE
 from lerobot_memobench.io import Count, file_hash, read_json, write_file
 from lerobot_memobench.policies.checkpoint import ADAPTER_FILE, WEIGHTS_FILE, local_folder, portable_path
 from lerobot_memobench.run.machine import gl_facts, run_facts

@@ -24,9 +24,9 @@ from lerobot_memobench.envs.episode_log import MERGED_FILE, PROTOCOL_FILE, read_
 from lerobot_memobench.envs.observations import OBJECTS
 from lerobot_memobench.envs.video import VideoRecorder
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.documents.report import REPORT_JSON, REPORT_MARKDOWN
-from lerobot_memobench.evaluation.metrics.rollouts import policy_inputs
-from lerobot_memobench.evaluation.records.protocol import CARD_FILE
+from lerobot_memobench.evaluation.metrics import policy_inputs
+from lerobot_memobench.evaluation.records import CARD_FILE
+from lerobot_memobench.evaluation.report import REPORT_JSON, REPORT_MARKDOWN
 from lerobot_memobench.io import write_file
 from lerobot_memobench.policies.checkpoint import shipped_policies
 from lerobot_memobench.run.card import CARD_MARKDOWN

@@ -19,7 +19,7 @@ from lerobot_memobench.envs.episode_log import (
     write_protocol,
 )
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.records.protocol import (
+from lerobot_memobench.evaluation.records import (
     CARD_FILE,
     differences,
     read_card,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 from lerobot_memobench.envs.observations import OBJECTS, PIXELS, check_obs_type, obs_type_of
 from lerobot_memobench.envs.prompting import prompt_in, quiet, read_rename_map
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.records.protocol import CARD_FILE, read_card
+from lerobot_memobench.evaluation.records import CARD_FILE, read_card
 from lerobot_memobench.jobs.executors import ELSEWHERE
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint

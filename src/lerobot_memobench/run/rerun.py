@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.records.protocol import CARD_FILE, read_card
+from lerobot_memobench.evaluation.records import CARD_FILE, read_card
 from lerobot_memobench.policies.checkpoint import local_folder
 from lerobot_memobench.run import arguments as fields
 from lerobot_memobench.run.arguments import chosen_class, flag_value

@@ -10,9 +10,9 @@ from typing import Any
 
 from lerobot_memobench.envs.episode_log import PROTOCOL_FILE, has_log, read_episodes, read_log, read_protocol_file
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.documents.report import REPORT_MARKDOWN, write_report
-from lerobot_memobench.evaluation.metrics.summary import Summary
-from lerobot_memobench.evaluation.records.protocol import CARD_FILE, POLICY, differences, read_card, read_protocol
+from lerobot_memobench.evaluation.metrics import Summary
+from lerobot_memobench.evaluation.records import CARD_FILE, POLICY, differences, read_card, read_protocol
+from lerobot_memobench.evaluation.report import REPORT_MARKDOWN, write_report
 from lerobot_memobench.io import count_of, remove_drafts
 from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.policies.checkpoint import check_weights, portable_path

@@ -1,0 +1,225 @@
+"""From episode logs to the data of the page: rates, texts and timelines, as plain JSON values.
+
+Every figure is computed here, by ``evaluation.metrics``; the page only draws and filters.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lerobot_memobench import __version__
+from lerobot_memobench.envs.video import OPERATION_COLOURS
+from lerobot_memobench.evaluation.metrics import (
+    Rate,
+    Record,
+    Row,
+    Summary,
+    failure_counts,
+    failure_of,
+    operations,
+    percent,
+    summarise,
+)
+from lerobot_memobench.evaluation.records import (
+    CARD_FILE,
+    POLICY,
+    check_one_suite,
+    folder_names,
+    read_card,
+    read_protocol,
+    read_rollouts,
+    unlike,
+)
+from lerobot_memobench.evaluation.report_tables import outcomes, settings_phrases
+from lerobot_memobench.evaluation.tables import OPERATION_NAMES
+from lerobot_memobench.io import count_of
+from lerobot_memobench.protocol import CONTROL_HZ
+from lerobot_memobench.tasks.catalogue import find_tasks, get_task, load_task, task_names
+from lerobot_memobench.tasks.failures import FAILURES
+from lerobot_memobench.tasks.formula import format_formula
+from lerobot_memobench.tasks.task import LEVELS, MEMORY_TYPES, Task
+
+
+@dataclass(frozen=True)
+class Run:
+    """One evaluation: its name in the report, where it lies, its rollouts, what a reader must know of them, its
+    protocol, and its result card ({} where there is none).
+    """
+
+    name: str
+    folder: Path
+    records: list[dict[str, Any]]
+    notes: list[str] = field(default_factory=list)
+    protocol: dict[str, Any] = field(default_factory=dict)
+    card: dict[str, Any] = field(default_factory=dict)
+
+
+def read_runs(folders: Sequence[str | Path]) -> list[Run]:
+    """Read the logs of several evaluations and name them after their folders."""
+    runs = []
+    for folder, name in zip(folders, folder_names(folders), strict=True):
+        records, notes = read_rollouts(folder)
+        path = Path(folder) / CARD_FILE
+        card = read_card(path) if path.is_file() else {}
+        runs.append(Run(name, Path(folder), records, notes, read_protocol(folder), card))
+    check_one_suite({run.folder: run.records for run in runs})
+    return runs
+
+
+def task_source(task_dir: str | Path | None) -> dict[str, Task]:
+    """Return the tasks whose texts are known: the catalogue's, and those of a folder in the published format."""
+    known = {name: get_task(name) for name in task_names(suite=None)}
+    if task_dir is not None:
+        known |= {folder.name: load_task(folder) for folder in find_tasks(task_dir)}
+    return known
+
+
+def page_data(runs: Sequence[Run], videos: Sequence[Mapping[int, str]], known: Mapping[str, Task]) -> dict[str, Any]:
+    """Return everything that the page shows.
+
+    Args:
+        videos: per run, position of a rollout in its records -> address of its video, relative to the page.
+        known: task name -> task, for language and checkpoint texts.
+    """
+    return {
+        "version": __version__,
+        "notices": unlike({run.name: run.protocol for run in runs}),
+        "fps": CONTROL_HZ,
+        "levels": list(LEVELS),
+        "memory_types": list(MEMORY_TYPES),
+        "operations": {
+            key: {"name": OPERATION_NAMES[key], "colour": "#" + bytes(colour).hex()}
+            for key, colour in OPERATION_COLOURS.items()
+        },
+        "failures": list(dict.fromkeys([*FAILURES, *(name for run in runs for name in failure_counts(run.records))])),
+        "tasks": tasks_data([record for run in runs for record in run.records], known),
+        "runs": [run_data(run, addresses) for run, addresses in zip(runs, videos, strict=True)],
+    }
+
+
+# --- tasks ---
+
+
+def tasks_data(records: Iterable[Record], known: Mapping[str, Task]) -> dict[str, Any]:
+    """Return per task of the rollouts, by memory type and name, its language, and the texts of each variant."""
+    order = {memory_type: k for k, memory_type in enumerate(MEMORY_TYPES)}
+    sample = {record["task"]: record for record in records}
+    seen = {(record["task"], _variant(record)) for record in records}
+    result: dict[str, Any] = {}
+    for name, record in sorted(sample.items(), key=lambda item: (order.get(item[1]["memory_type"], 9), item[0])):
+        task = known.get(name)
+        result[name] = {
+            "memory_type": record["memory_type"],
+            "language": task.title if task else name.replace("_", " "),
+            "variants": {
+                str(k): variant_data(task.variant(k))
+                for k in sorted(variant for its_name, variant in seen if its_name == name)
+                if task and k < task.num_variants and task.operations == operations(record)
+            },
+        }
+    return result
+
+
+def variant_data(task: Task) -> dict[str, Any]:
+    """Return goal and checkpoints of one variant; texts are coarse, intermediate, fine."""
+    return {
+        "goal": format_formula(task.goal),
+        "checkpoints": [
+            {"goal": format_formula(checkpoint.goal), "texts": list(checkpoint.language)}
+            for checkpoint in task.checkpoints
+        ],
+    }
+
+
+def _variant(record: Record) -> int:
+    return int(record.get("variant") or 0)
+
+
+# --- runs ---
+
+
+def run_data(run: Run, videos: Mapping[int, str]) -> dict[str, Any]:
+    """Return one evaluation: protocol, rates, failures and rollouts."""
+    summary = summarise(run.records)
+    return {
+        "name": run.name,
+        "folder": str(run.folder),
+        "facts": facts(run.records, run.protocol),
+        "commands": [shlex.join(it["command"]) for it in run.card.get("runs", []) if it.get("command")],
+        "notes": run.notes,
+        "average": row_data(summary.average),
+        "memory_types": {name: row_data(row) for name, row in summary.memory_types.items()},
+        "tasks": {name: task_data(name, summary) for name in summary.tasks},
+        "episodes": [episode_data(record, videos.get(k)) for k, record in enumerate(run.records)],
+    }
+
+
+def facts(records: Sequence[Record], protocol: Mapping[str, Any]) -> list[str]:
+    """Return the protocol in words: whose rollouts, tasks, seeds, referent, replan interval, horizon, what was seen."""
+    policy = protocol.get(POLICY, {}).get("type")
+    horizon = protocol.get("horizon")
+    return [
+        *([f"policy {policy}"] if policy else []),
+        count_of(len(records), "rollout"),
+        count_of(len({record["task"] for record in records}), "task"),
+        *settings_phrases(records),
+        *([] if horizon is None else [f"horizon {horizon}"]),
+    ]
+
+
+def task_data(name: str, summary: Summary) -> dict[str, Any]:
+    """Return the rates of one task and, per checkpoint, how many rollouts got that far."""
+    return {
+        "rates": row_data(summary.tasks[name]),
+        "operations": summary.operations_of[name],
+        "prefix": [rate_data(rate) for rate in summary.prefix[name]],
+        "ordered_prefix": [rate_data(rate) for rate in summary.ordered_prefix[name]],
+        "outcomes": outcomes(summary, [name]),
+    }
+
+
+def row_data(row: Row) -> dict[str, Any]:
+    """Return metric -> rate as `rate_data` writes it."""
+    return {metric: rate_data(rate) for metric, rate in row.items()}
+
+
+def rate_data(rate: Rate) -> list[float | int | None] | None:
+    """Return [per cent, lower, upper bound of Wilson's 95 % interval, n]; None where not applicable."""
+    if rate.value is None or rate.interval is None:
+        return None
+    low, high = rate.interval
+    return [percent(rate.value), percent(low), percent(high), rate.n]
+
+
+def episode_data(record: Record, video: str | None) -> dict[str, Any]:
+    """Return one rollout. Checkpoints are [operation, first step, ordered step], execution steps counted from 1."""
+    return {
+        "id": episode_id(record),
+        "task": record["task"],
+        "episode": record["episode"],
+        "seed": record.get("seed"),
+        "referent": record.get("referent", "fixed"),
+        "variant": _variant(record),
+        "prompt": int(record.get("prompt_steps") or 0),
+        "steps": int(record.get("steps") or _last_step(record)),
+        "checkpoints": [[c["operation"], c["first_step"], c.get("ordered_step")] for c in record["checkpoints"]],
+        "outcome": failure_of(record) or "success",
+        "fault": record.get("fault"),
+        "scene": record.get("scene_hash"),
+        "video": video,
+    }
+
+
+def episode_id(record: Record) -> str:
+    """Return a name that is the same in every run: task, episode, and the referent where it is not the published."""
+    referent = record.get("referent", "fixed")
+    return f"{record['task']}.{record['episode']}" + ("" if referent == "fixed" else f".{referent}")
+
+
+def _last_step(record: Record) -> int:
+    """The last step known of a log that does not say how long its rollouts were."""
+    return max([1, *(c["first_step"] for c in record["checkpoints"] if c["first_step"] is not None)])

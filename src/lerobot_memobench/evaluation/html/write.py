@@ -1,0 +1,310 @@
+"""Write the report: find each rollout's video, fill the template beside this module, make the folder.
+
+Everything but the videos is inside ``index.html``, because a browser lets a page from disk read no other file. Its
+content security policy allows this style, this script and videos from its own place, and nothing else: the page cannot
+reach the network.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import os
+import re
+import shutil
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from html import escape
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from lerobot_memobench.envs.video import LAST_FRAMES
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.html.data import Run, episode_id, page_data, read_runs, task_source
+from lerobot_memobench.evaluation.metrics import Record
+from lerobot_memobench.io import draft_of, file_name, parsed, write_file
+
+PAGE = "index.html"
+VIDEOS = "videos"
+LEROBOT_INFO = "eval_info.json"
+SCRIPTS = ("dom", "address", "filter", "overview", "list", "lanes", "timeline", "player", "panel", "detail", "main")
+"""Parts of the one script, in ``script/``; a later part uses earlier ones."""
+MARK = "memobench html"
+"""What the page's ``generator`` says; by it a folder is known as a report."""
+UNFINISHED = f'''<!doctype html><meta charset="utf-8"><meta name="generator" content="{MARK}"><title>Unfinished</title>
+<p>This report was not finished; run <code>memobench html</code> again.'''
+
+
+@dataclass(frozen=True)
+class Written:
+    """What a report holds: the page, its rollouts, how many of them have a video, and notes on the logs."""
+
+    page: Path
+    rollouts: int
+    videos: int
+    notes: list[str]
+
+
+def write_html(
+    folders: Sequence[str | Path], out: str | Path, *, link: bool = False, task_dir: str | Path | None = None
+) -> Written:
+    """Write the report of one or several evaluations into ``out``; an earlier report there is replaced.
+
+    Args:
+        folders: what evaluations have written. link: let videos be symbolic links to where they are, which saves space
+            on another file system but ties the report to this machine. task_dir: task folders in the published format
+            whose texts are to be shown, beside the catalogue.
+
+    Raises:
+        MemobenchError: a folder holds no log, or ``out`` holds something that is no report.
+    """
+    out = Path(out)
+    _check_target(out)
+    runs: list[Run] = []
+    chosen: dict[Path, Path] = {}
+    addresses: list[dict[int, str]] = []
+    for run, slug in zip(*_with_slugs(read_runs(folders)), strict=True):
+        found, notes = find_videos(run.folder, run.records)
+        names = {k: f"{VIDEOS}/{slug}/{episode_id(run.records[k])}.mp4" for k in found}
+        chosen |= {out / name: found[k] for k, name in names.items()}
+        addresses.append(names)
+        runs.append(replace(run, notes=run.notes + notes))
+    text = page(page_data(runs, addresses, task_source(task_dir)), title=", ".join(run.name for run in runs))
+    out.mkdir(parents=True, exist_ok=True)
+    if not (out / PAGE).exists():
+        write_file(out / PAGE, UNFINISHED)  # the folder is known as ours from now on
+    place_videos(chosen, link)
+    write_file(out / PAGE, text)
+    _remove_others(out / VIDEOS, chosen)
+    return Written(
+        page=out / PAGE,
+        rollouts=sum(len(run.records) for run in runs),
+        videos=len(chosen),
+        notes=[f"{run.name}: {note}" for run in runs for note in run.notes],
+    )
+
+
+def _with_slugs(runs: list[Run]) -> tuple[list[Run], list[str]]:
+    """Return the runs, and for each a folder name made of plain characters that no other run has."""
+    slugs: list[str] = []
+    for run in runs:
+        base = re.sub(r"[^A-Za-z0-9._-]+", "_", run.name).strip("._") or "run"
+        slug, k = base, 1
+        while slug.lower() in (other.lower() for other in slugs):  # file systems may not tell A from a
+            k += 1
+            slug = f"{base}_{k}"
+        slugs.append(slug)
+    return runs, slugs
+
+
+def _check_target(out: Path) -> None:
+    """Refuse to write among files that are not a report's."""
+    if out.exists() and not out.is_dir():
+        raise MemobenchError(f"--out {out} is a file; name a folder")
+    if not out.is_dir() or not any(out.iterdir()):
+        return
+    head = ""
+    if (out / PAGE).is_file():
+        with (out / PAGE).open(encoding="utf-8", errors="replace") as file:
+            head = file.read(2000)
+    if f'content="{MARK}' not in head:
+        raise MemobenchError(f"--out {out} holds files that are no earlier report; name a new or an empty folder")
+
+
+def _remove_others(folder: Path, kept: Collection[Path]) -> None:
+    """Remove videos of an earlier report in this place, and folders that this leaves empty."""
+    for path in sorted(folder.rglob("*"), reverse=True):
+        if path.is_dir() and not path.is_symlink():
+            if not any(path.iterdir()):
+                path.rmdir()
+        elif path not in kept:
+            path.unlink()
+    if folder.is_dir() and not any(folder.iterdir()):
+        folder.rmdir()
+
+
+# --- videos ---
+
+
+def find_videos(folder: Path, records: Sequence[Record]) -> tuple[dict[int, Path], list[str]]:
+    """Return position of a rollout in ``records`` -> its video, and a note on videos that do not fit theirs.
+
+    A video counts only when it is as long as its rollout: a timeline under another rollout's video would mislead.
+    """
+    others = _lerobot_videos(folder, records)
+    found: dict[int, Path] = {}
+    misfits: list[str] = []
+    for k, record in enumerate(records):
+        if not _names_a_file(episode_id(record)):
+            continue
+        film = folder / VIDEOS / f"{record['task']}.{record['episode']}.mp4"
+        if film.is_file():
+            if _fits(frame_count(film), record, held=LAST_FRAMES + 1):
+                found[k] = film
+                continue
+            misfits.append(film.name)
+        other = others.get(k)
+        if other is not None and _fits(frame_count(other), record, held=0):
+            found[k] = other
+    # A film's name does not tell the referent: where both settings are in one log, it could be of either.
+    claims = Counter(found.values())
+    misfits += [video.name for video, count in claims.items() if count > 1]
+    found = {k: video for k, video in found.items() if claims[video] == 1}
+    if not misfits:
+        return found, []
+    named = ", ".join(misfits[:3]) + (f" and {len(misfits) - 3} more" if len(misfits) > 3 else "")
+    return found, [f"Videos that do not clearly belong to a logged rollout were left out: {named}."]
+
+
+def _names_a_file(name: str) -> bool:
+    """Whether a rollout's name may be a file's: a log is only text, which must not lead out of these folders."""
+    try:
+        return bool(file_name(name, "a rollout's name"))
+    except MemobenchError:
+        return False
+
+
+def _fits(frames: int | None, record: Record, held: int) -> bool:
+    """Whether a video has a frame per control step and ``held`` more; logs without lengths take any."""
+    if frames is None:
+        return False
+    if record.get("steps") is None:
+        return True
+    return frames == int(record.get("prompt_steps") or 0) + int(record["steps"]) + held
+
+
+def frame_count(path: Path) -> int | None:
+    """Return the number of frames that a video's header tells; None when it is no whole video."""
+    import av
+
+    try:
+        with av.open(str(path)) as container:
+            return int(container.streams.video[0].frames)
+    except (av.FFmpegError, IndexError, OSError):
+        return None
+
+
+def _lerobot_videos(folder: Path, records: Sequence[Record]) -> dict[int, Path]:
+    """Return position -> LeRobot's video of it.
+
+    LeRobot numbers its videos by the order of its run and does not write the seeds down. They are believed only where
+    its list of successes is that of the task's logged rollouts, which it is not after a resumed or a sharded run.
+    """
+    try:
+        info: Any = parsed((folder / LEROBOT_INFO).read_bytes())
+        entries = [(e["task_group"], e["task_id"], e["metrics"]["successes"]) for e in info["per_task"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+    by_task = _positions(records)
+    found: dict[int, Path] = {}
+    for group, task_id, successes in entries:
+        if not _names_a_file(f"{group}_{task_id}"):
+            continue
+        for positions in by_task.values():
+            rollouts = [records[k] for k in positions]
+            if rollouts[0]["memory_type"] != group or [r["success"] for r in rollouts] != successes:
+                continue
+            if _task_number(str(rollouts[0]["task"])) != task_id:
+                continue
+            for number, k in enumerate(positions):
+                video = folder / VIDEOS / f"{group}_{task_id}" / f"eval_episode_{number}.mp4"
+                if video.is_file():
+                    found[k] = video
+    return found
+
+
+def _positions(records: Sequence[Record]) -> dict[str, list[int]]:
+    positions: dict[str, list[int]] = {}
+    for k, record in enumerate(records):
+        positions.setdefault(record["task"], []).append(k)
+    for name, ks in positions.items():
+        positions[name] = sorted(ks, key=lambda k: int(records[k]["episode"]))
+    return positions
+
+
+def _task_number(name: str) -> int | None:
+    """The number under which LeRobot runs a task of the catalogue."""
+    from lerobot_memobench.tasks.catalogue import task_names
+
+    names = task_names(suite=None)
+    return names.index(name) if name in names else None
+
+
+def place_videos(chosen: Mapping[Path, Path], link: bool) -> None:
+    """Bring videos into the report, target -> source: as hard links or copies, so that it can be moved, or as links.
+
+    A target that is there and unchanged is left alone; each appears under its name only when it is whole.
+    """
+    for target, source in chosen.items():
+        if _is_same(source, target, link):
+            continue
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with draft_of(target) as draft:
+            _bring(source.resolve(), draft, link)
+
+
+def _bring(source: Path, target: Path, link: bool) -> None:
+    if link:
+        target.symlink_to(source)
+        return
+    try:
+        os.link(source, target)
+    except OSError:  # another file system, or one without hard links
+        shutil.copy2(source, target)
+
+
+def _is_same(source: Path, target: Path, link: bool) -> bool:
+    if not target.exists() or target.is_symlink() != link:
+        return False
+    here, there = source.stat(), target.stat()
+    return os.path.samestat(here, there) or (here.st_size, here.st_mtime_ns) == (there.st_size, there.st_mtime_ns)
+
+
+# --- the page ---
+
+
+def page(data: Mapping[str, Any], title: str) -> str:
+    """Return the page that shows ``data`` (see `data.page_data`)."""
+    style, script = _read("style.css"), _script()
+    parts = {
+        "title": escape(title),
+        "generator": escape(f"{MARK} {data['version']}"),
+        "policy": escape(content_policy(style, script)),
+        "style": style,
+        "script": script,
+        "data": inline_json(data),
+    }
+    # In one pass, so that what is put in is never taken for a place to put something.
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], _read(PAGE))
+
+
+def inline_json(value: Any) -> str:
+    """Return JSON that may stand inside ``<script type="application/json">``.
+
+    Nothing in it can end the element or open a comment: ``<``, ``>`` and ``&`` are written as escapes.
+    """
+    text = json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def content_policy(style: str, script: str) -> str:
+    """Return the content security policy for a page with this style and this script."""
+    return f"default-src 'none'; style-src {_hash(style)}; script-src {_hash(script)}; media-src 'self'; img-src data:"
+
+
+def _script() -> str:
+    """The parts as one script, in a scope of its own."""
+    data = 'const DATA = JSON.parse(document.getElementById("data").textContent);\n'
+    parts = [_read(f"script/{name}.js") for name in SCRIPTS]
+    return '"use strict";\n(() => {\n' + data + "\n".join(parts) + "})();\n"
+
+
+def _hash(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+
+def _read(name: str) -> str:
+    return resources.files(__package__).joinpath(name).read_text(encoding="utf-8")

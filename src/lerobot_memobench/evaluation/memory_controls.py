@@ -1,0 +1,345 @@
+"""What a perfect memory would recover: rates with and without oracle memory text, and the share of the gap it closes.
+
+Two evaluations are compared episode by episode. A memory type is the mean over its applicable tasks, the average the
+mean over applicable memory types, as in every table of the benchmark. Rates are fractions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lerobot_memobench.evaluation.controls import (
+    PAPER,
+    PAPER_TASK,
+    prefix_header,
+    prefix_row,
+    replan_title,
+)
+from lerobot_memobench.evaluation.metrics import METRICS, Rate, Record, by_task, prefix, satisfied, value_of
+from lerobot_memobench.evaluation.statistics import (
+    DRAWS,
+    Array,
+    Estimate,
+    as_percent,
+    difference_interval,
+    estimate,
+    newcombe,
+    number,
+    percentiles,
+)
+from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, Cell, Name, Report, Section, Table
+from lerobot_memobench.tasks.task import MEMORY_TYPES
+
+AVERAGE = "average"
+LEAST_GAP = 0.01
+"""Gap to 100 % under which a share of it is not given: one rollout would turn it round."""
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """One metric of one memory type (or the average) under two evaluations.
+
+    Attributes:
+        standard, other: the rates.
+        difference: other − standard.
+        closed: (other − standard) / (1 − standard), the share of the gap to 100 % that the other closes.
+    """
+
+    standard: float | None
+    other: float | None
+    difference: Estimate
+    closed: Estimate
+
+
+Contrasts = dict[str, dict[str, Contrast]]
+"""Memory type, or the average -> metric -> contrast."""
+
+
+def gap_closed(standard: float | None, other: float | None) -> float | None:
+    """Return the share of the gap between ``standard`` and 1 that ``other`` closes (paper, oracle memory).
+
+    Negative when the other is worse; None where a rate does not apply or the gap is under `LEAST_GAP`.
+    """
+    if standard is None or other is None or 1.0 - standard < LEAST_GAP:
+        return None
+    return (other - standard) / (1.0 - standard)
+
+
+def contrasts(standard: Sequence[Record], other: Sequence[Record], draws: int = DRAWS, seed: int = 0) -> Contrasts:
+    """Return, per memory type and on average, each metric under both evaluations; rollouts are paired already."""
+    points = [_rates(records, np.random.default_rng(seed), 0) for records in (standard, other)]
+    # The same seed draws the same episodes of both.
+    clouds = [_rates(records, np.random.default_rng(seed), draws) for records in (standard, other)]
+    return {
+        name: {
+            metric: _contrast(
+                _pairs(standard, other, name, metric),
+                *(point[name][metric] for point in points),
+                *(cloud[name][metric] for cloud in clouds),
+            )
+            for metric in metrics
+        }
+        for name, metrics in points[0].items()
+    }
+
+
+def _pairs(standard: Sequence[Record], other: Sequence[Record], scope: str, metric: str) -> tuple[Array, Array, Array]:
+    """Return each pair's two values and its weight in the mean of a scope, (n,) each, where the metric applies."""
+    groups: dict[str, list[tuple[Array, Array]]] = {}
+    others = by_task(other)
+    for task, group in by_task(standard).items():
+        kind = str(group[0]["memory_type"])
+        a, b = _values(group)[metric], _values(others[task])[metric]
+        if scope in (kind, AVERAGE) and a is not None and b is not None:
+            groups.setdefault(kind, []).append((a, b))
+    parts = [
+        (a, b, np.full(len(a), 1 / (len(groups) * len(tasks) * len(a)))) for tasks in groups.values() for a, b in tasks
+    ]
+    if not parts:
+        return np.empty(0), np.empty(0), np.empty(0)
+    a, b, weights = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return a, b, weights
+
+
+def _contrast(
+    pairs: tuple[Array, Array, Array],
+    a: Array | None,
+    b: Array | None,
+    many_a: Array | None,
+    many_b: Array | None,
+) -> Contrast:
+    """Return what pairs, their rates, (1,), and bootstrap draws of these, (draws,), say of two evaluations."""
+    if a is None or b is None or many_a is None or many_b is None:
+        return Contrast(None, None, Estimate(None), Estimate(None))
+    gap = 1.0 - many_a
+    shares = (many_b - many_a)[gap >= LEAST_GAP] / gap[gap >= LEAST_GAP]
+    closed = Estimate(gap_closed(float(a[0]), float(b[0])))
+    # Where the gap vanishes in many draws, the share has no interval worth the name.
+    if closed.value is not None and len(shares) > 0.9 * len(gap):
+        least, most = (bound / (1.0 - float(a[0])) for bound in newcombe(*pairs))
+        low, high = percentiles(shares)
+        closed = Estimate(closed.value, min(low, least), min(max(high, most), 1.0))
+    difference = Estimate(float(b[0]) - float(a[0]), *difference_interval(many_b - many_a, *pairs))
+    return Contrast(float(a[0]), float(b[0]), difference, closed)
+
+
+def _rates(records: Sequence[Record], rng: np.random.Generator, draws: int) -> dict[str, dict[str, Array | None]]:
+    """Return rates per memory type and average, each (draws,), or (1,) as they are when ``draws`` is 0."""
+    tasks: dict[str, list[dict[str, Array | None]]] = {}
+    for group in by_task(records).values():
+        chosen = rng.integers(len(group), size=(draws, len(group))) if draws else np.arange(len(group))[None]
+        tasks.setdefault(str(group[0]["memory_type"]), []).append(
+            {
+                metric: None if values is None else values[chosen].mean(axis=1)
+                for metric, values in _values(group).items()
+            }
+        )
+    rates: dict[str, dict[str, Array | None]] = {name: _mean(tasks[name]) for name in MEMORY_TYPES if name in tasks}
+    return {**rates, AVERAGE: _mean(list(rates.values()))}
+
+
+def _values(group: Sequence[Record]) -> dict[str, Array | None]:
+    """Return each metric of each rollout of one task, (n,); None for an operation that the task has not."""
+    values: dict[str, Array | None] = {}
+    for metric in METRICS:
+        found = [value_of(record, metric) for record in group]
+        values[metric] = None if None in found else np.array(found, dtype=float)
+    return values
+
+
+def _mean(rows: Sequence[Mapping[str, Array | None]]) -> dict[str, Array | None]:
+    result: dict[str, Array | None] = {}
+    for metric in METRICS:
+        known = [values for row in rows if (values := row[metric]) is not None]
+        result[metric] = np.mean(known, axis=0) if known else None
+    return result
+
+
+def published_contrasts(table: Mapping[str, Any]) -> Contrasts:
+    """Return the contrasts of the published table (``oracle_memory`` of the paper's tables), without intervals.
+
+    The average is the published one: its cells are rounded, so a mean of ours may differ in the last digit.
+    """
+    return {
+        name: {
+            metric: _published(*(table[key][name][metric] for key in ("standard_pi05", "oracle_pi05")))
+            for metric in METRICS
+        }
+        for name in (*MEMORY_TYPES, AVERAGE)
+    }
+
+
+def _published(standard: float | None, oracle: float | None) -> Contrast:
+    """Return a contrast of two published percentages."""
+    a, b = (None if value is None else value / 100.0 for value in (standard, oracle))
+    difference = None if a is None or b is None else b - a
+    return Contrast(a, b, Estimate(difference), Estimate(gap_closed(a, b)))
+
+
+# --- the report ---
+
+ORACLE_SENTENCE = (
+    "Cells are standard/oracle in per cent. Gap closed is (oracle − standard)/(100 − standard), with "
+    "the 95 % interval of a bootstrap over paired episodes, at least Newcombe's of so many; – where an operation "
+    "does not occur, or the gap is under one point."
+)
+
+
+def oracle_report(found: Mapping[int | None, Contrasts], paper: tuple[int, Contrasts] | None = None) -> Report:
+    """Return the decomposition, one table per replan interval.
+
+    Args:
+        paper: the published contrasts and their replan interval; in rows of their own under ours of that interval, or
+            in a table of their own.
+    """
+    tables, data = [], {}
+    for replan, contrasts in found.items():
+        beside = paper[1] if paper is not None and replan == paper[0] else None
+        tables.append(_oracle_table(replan, contrasts, beside))
+        data[str(replan)] = as_percent(contrasts)
+    if paper is not None:
+        data[PAPER] = as_percent(paper[1])
+        if paper[0] not in found:
+            tables.append(_oracle_table(paper[0], paper[1], None, f", {PAPER}"))
+    return Report("Oracle memory decomposition", (Section("", tuple(tables), sentences=(ORACLE_SENTENCE,)),), data)
+
+
+def _oracle_table(replan: int | None, found: Contrasts, beside: Contrasts | None, suffix: str = "") -> Table:
+    rows: list[tuple[Cell, ...]] = []
+    strong = set()
+    for name, metrics in found.items():
+        if name == AVERAGE:
+            strong.add(len(rows))
+        rows.append((name, *_cells(metrics)))
+        if beside is not None and name in beside:
+            rows.append((f"{name}, {PAPER}", *_cells(beside[name])))
+    header = ("memory type", *METRICS, *(f"{metric} gap closed" for metric in METRICS))
+    return Table(f"oracle_{replan}", replan_title(replan) + suffix, header, tuple(rows), strong=frozenset(strong))
+
+
+def _cells(metrics: Mapping[str, Contrast]) -> list[Cell]:
+    pairs = [
+        NOT_APPLICABLE if metrics[m].standard is None else f"{number(metrics[m].standard)}/{number(metrics[m].other)}"
+        for m in METRICS
+    ]
+    return [*pairs, *(estimate(metrics[m].closed) for m in METRICS)]
+
+
+# Does a policy need its subgoals in order? How far rollouts come with normal and with shuffled memory.
+
+
+@dataclass(frozen=True)
+class PrefixCurve:
+    """Prefix completion of one task under two evaluations, (K + 1,): each checkpoint, then success.
+
+    Attributes:
+        normal, other: rates.
+        differences: other − normal.
+        n: episodes.
+    """
+
+    task: str
+    normal: tuple[float, ...]
+    other: tuple[float, ...]
+    differences: tuple[Estimate, ...]
+    n: int
+
+
+def prefix_curves(
+    normal: Sequence[Record], other: Sequence[Record], draws: int = DRAWS, seed: int = 0
+) -> list[PrefixCurve]:
+    """Return how far the rollouts of both come, per task; rollouts are paired already.
+
+    A checkpoint counts when it and all before it were satisfied at some step (paper, prefix completion); the last entry
+    is success.
+    """
+    curves = []
+    others = by_task(other)
+    for task, group in by_task(normal).items():
+        a, b = _prefixes(group), _prefixes(others[task])
+        chosen = np.random.default_rng(seed).integers(len(group), size=(draws, len(group)))
+        step = (b - a)[chosen].mean(axis=1)
+        difference = (b - a).mean(axis=0)
+        weights = np.full(len(group), 1 / len(group))
+        curves.append(
+            PrefixCurve(
+                task,
+                tuple(a.mean(axis=0).tolist()),
+                tuple(b.mean(axis=0).tolist()),
+                tuple(
+                    Estimate(float(d), *difference_interval(step[:, k], a[:, k], b[:, k], weights))
+                    for k, d in enumerate(difference)
+                ),
+                len(group),
+            )
+        )
+    return curves
+
+
+def _prefixes(group: Sequence[Record]) -> Array:
+    return np.array([[*prefix(satisfied(record)), bool(record["success"])] for record in group], dtype=float)
+
+
+# --- the report ---
+
+SHUFFLED_SENTENCE = (
+    "Rollouts in which a checkpoint and all before it were satisfied, per cent, with Wilson's 95 % interval. The "
+    "difference is shuffled − normal, with its bootstrap interval over paired episodes, "
+    "at least Newcombe's of so many pairs."
+)
+SEVERAL = 3
+"""Subgoals of a task that can change places in more than one way."""
+ELSEWHERE = (
+    f"Fewer than {SEVERAL} subgoals that change places are only renamed, and still tell what is seen: such a task is "
+    "taught subgoals of other episodes in their place."
+)
+
+
+def shuffled_report(
+    found: Mapping[int | None, Sequence[PrefixCurve]], published: Mapping[str, Sequence[float]] | None = None
+) -> Report:
+    """Return prefix completion with normal and with shuffled memory per task, and their difference.
+
+    Args:
+        published: the paper's, per cent, ``normal`` and ``shuffled``.
+    """
+    tables = [_shuffled_table(replan, curves) for replan, curves in found.items()]
+    short = {curve.task for curves in found.values() for curve in curves if len(curve.normal) <= SEVERAL}
+    said = f"{ELSEWHERE} So it was with {', '.join(sorted(short))}." if short else ""
+    if published is not None:
+        tables.append(_published_table(published))
+    data: dict[str, Any] = {str(replan): as_percent(list(curves)) for replan, curves in found.items()}
+    if published is not None:
+        data[PAPER] = dict(published)
+    sentences = (SHUFFLED_SENTENCE, said) if said else (SHUFFLED_SENTENCE,)
+    return Report("Shuffled memory", (Section("", tuple(tables), sentences=sentences),), data)
+
+
+def _shuffled_table(replan: int | None, curves: Sequence[PrefixCurve]) -> Table:
+    width = max(len(curve.normal) for curve in curves) - 1
+    rows: list[tuple[Cell, ...]] = []
+    for curve in curves:
+        for memory, rates in (("normal", curve.normal), ("shuffled", curve.other)):
+            rows.append(prefix_row(Name(curve.task), memory, [Rate(rate, curve.n) for rate in rates], width))
+        change = [estimate(difference, sign=True) for difference in curve.differences]
+        rows.append(prefix_row(Name(curve.task), "difference", change, width))
+    return Table(f"shuffled_{replan}", replan_title(replan), prefix_header("memory", width), tuple(rows))
+
+
+def _published_table(published: Mapping[str, Sequence[float]]) -> Table:
+    """The last of the paper's three figures is that of the last checkpoint, which it calls final success too."""
+    normal, shuffled = ([rate / 100.0 for rate in published[key]] for key in ("normal", "shuffled"))
+    change = [b - a for a, b in zip(normal, shuffled, strict=True)]
+    rows = [
+        prefix_row(PAPER_TASK, memory, [*cells, cells[-1]], len(cells))
+        for memory, cells in (
+            ("normal", [number(rate) for rate in normal]),
+            ("shuffled", [number(rate) for rate in shuffled]),
+            ("difference", [number(rate, sign=True) for rate in change]),
+        )
+    ]
+    return Table("shuffled_paper", PAPER, prefix_header("memory", len(normal)), tuple(rows))

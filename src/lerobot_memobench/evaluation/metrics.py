@@ -1,0 +1,375 @@
+"""What rollouts did: checkpoint by checkpoint, task by task, under one protocol or several."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.io import count_of
+from lerobot_memobench.tasks.failures import FAILURES, FAULTS, REFINED_FAILURES, classify
+from lerobot_memobench.tasks.task import MEMORY_TYPES, OPERATIONS, STRICT_FAILURES
+
+Record = Mapping[str, Any]
+"""A rollout: one line of the episode log."""
+
+
+def operations(record: Record) -> str:
+    """Return the labels of a rollout's checkpoints, such as "SUU"."""
+    return "".join(checkpoint["operation"] for checkpoint in record["checkpoints"])
+
+
+def satisfied(record: Record) -> list[bool]:
+    """Return per checkpoint whether its predicate held at some step of the execution, (K,)."""
+    return [checkpoint["first_step"] is not None for checkpoint in record["checkpoints"]]
+
+
+def completed_in_order(record: Record) -> list[bool]:
+    """Return per checkpoint whether it held while all earlier ones were complete, (K,)."""
+    return [checkpoint.get("ordered_step") is not None for checkpoint in record["checkpoints"]]
+
+
+def prefix(values: Sequence[bool]) -> list[bool]:
+    """Return per checkpoint whether it and all earlier ones are true, (K,)."""
+    return [all(values[: k + 1]) for k in range(len(values))]
+
+
+def by_task(records: Iterable[Record]) -> dict[str, list[Record]]:
+    """Group records by task, in the order of memory types and then of names."""
+    grouped: dict[str, list[Record]] = {}
+    for record in records:
+        grouped.setdefault(record["task"], []).append(record)
+    for name, group in grouped.items():
+        _check_one_version(name, group)
+    order = {memory_type: k for k, memory_type in enumerate(MEMORY_TYPES)}
+    return dict(sorted(grouped.items(), key=lambda item: (order[item[1][0]["memory_type"]], item[0])))
+
+
+def _check_one_version(name: str, group: Sequence[Record]) -> None:
+    """Refuse rollouts of one task that do not agree on what the task is."""
+    for what, found in (
+        ("memory_type", {record["memory_type"] for record in group}),
+        ("operations", {operations(record) for record in group}),
+    ):
+        if len(found) > 1:
+            raise MemobenchError(
+                f"rollouts of {name!r} disagree on their {what} ({', '.join(sorted(found))}); "
+                "report logs of different versions of a task separately"
+            )
+    if group[0]["memory_type"] not in MEMORY_TYPES:
+        raise MemobenchError(
+            f"rollouts of {name!r} have the memory type {group[0]['memory_type']!r}; expected one of "
+            + ", ".join(MEMORY_TYPES)
+        )
+
+
+NOT_RECORDED = "not recorded"
+"""What is said of a policy of which nobody wrote down its inputs."""
+
+
+def policy_inputs(records: Iterable[Record]) -> str:
+    """Return the policy's inputs, by the rollouts' own words; of how many it is unknown where some tell it."""
+    told = Counter(str(record.get("inputs") or NOT_RECORDED) for record in records)
+    unknown = told.pop(NOT_RECORDED, 0)
+    parts = [*sorted(told), *([f"of {count_of(unknown, 'rollout')} it is {NOT_RECORDED}"] if told and unknown else [])]
+    return "; ".join(parts) or NOT_RECORDED
+
+
+PROTOCOL: dict[str, Callable[[Record], Any]] = {
+    "referent settings": lambda record: str(record.get("referent")),
+    "replan intervals": lambda record: str(record.get("replan_steps")),
+    "policy inputs": lambda record: record.get("inputs"),
+    "seeds of episode 0": lambda record: None if record.get("seed") is None else record["seed"] - record["episode"],
+}
+"""What should agree within one report -> what a record says of it, None where nothing, which is no difference."""
+
+OWNER = ("policy", "run")
+"""Fields of a record that say whose it is."""
+
+
+def mixtures(records: Iterable[Record]) -> list[str]:
+    """Return a sentence for each part of the protocol in which rollouts differ: their mean mixes unlike things."""
+    records = list(records)
+    notes = []
+    for words, told in PROTOCOL.items():
+        found = sorted({told(record) for record in records} - {None})
+        if len(found) > 1:
+            listed = ", ".join(map(str, found[:5])) + (", …" if len(found) > 5 else "")
+            notes.append(f"The rollouts mix {words} ({listed}); the figures are over all of them.")
+    known = [field for field in OWNER if any(record.get(field) for record in records)]
+    nobodys = sum(any(not record.get(field) for field in known) for record in records)
+    if nobodys:
+        said = "does not say whose it is" if nobodys == 1 else "do not say whose they are"
+        notes.append(f"{count_of(nobodys, 'rollout')} of {len(records)} {said}; the figures are over all of them.")
+    return notes
+
+
+def faults(records: Iterable[Record]) -> list[str]:
+    """Return a sentence for each task of which rollouts were broken off, and so failed, with the first reason."""
+    found: dict[str, list[Record]] = {}
+    for record in records:
+        if record.get("fault"):
+            found.setdefault(record["task"], []).append(record)
+    return [
+        f"{task}: {count_of(len(group), 'rollout')} {'was' if len(group) == 1 else 'were'} broken off and "
+        f"{'counts' if len(group) == 1 else 'count'} as failed, the first in episode "
+        f"{group[0]['episode']}: {group[0]['fault']}"
+        for task, group in found.items()
+    ]
+
+
+# SR, MSR, MUR and MCR of rollouts, and their intervals (paper, section on metrics).
+#
+# Rates are fractions in [0, 1]; `summary.report` turns them into percentages with one decimal. None stands for not
+# applicable: a task without checkpoints of an operation has no rate for it and leaves that average.
+
+PROCESS_METRICS: dict[str, str] = {"MSR": "S", "MUR": "U", "MCR": "C"}
+"""Metric -> operation of the checkpoints it looks at."""
+
+METRICS = ("SR", *PROCESS_METRICS)
+
+Z95 = 1.959963984540054
+"""Quantile of the normal distribution for two-sided 95 %."""
+
+
+@dataclass(frozen=True)
+class Rate:
+    """A rate and how many rollouts it rests on.
+
+    Attributes:
+        value: fraction in [0, 1]; None when not applicable.
+        n: rollouts. Checkpoints of one rollout depend on one another, so rollouts, not checkpoints, are counted, which
+            makes the interval the wider one.
+        effective: of a mean of rates, the number of rollouts of a plain rate with the same standard error; None where
+            it is n.
+    """
+
+    value: float | None
+    n: int
+    effective: float | None = None
+
+    @property
+    def trials(self) -> float:
+        """The number of trials that the interval is computed with."""
+        return self.n if self.effective is None else self.effective
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """Wilson's 95 % interval."""
+        return None if self.value is None else wilson(self.value, self.trials)
+
+
+Row = dict[str, Rate]
+"""Metric -> rate."""
+
+
+def wilson(rate: float, n: float, z: float = Z95) -> tuple[float, float]:
+    """Return the Wilson score interval of a rate over ``n`` trials (95 % by default), within [0, 1].
+
+    Written out although statsmodels has it: every report and every evaluation's end needs it, and importing statsmodels
+    takes longer than all the rest of a report.
+    """
+    if n < 1 or not 0.0 <= rate <= 1.0:
+        raise MemobenchError(f"a Wilson interval needs a rate in [0, 1] over at least one trial, got {rate} over {n}")
+    centre = rate + z * z / (2 * n)
+    spread = z * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
+    scale = 1 + z * z / n
+    return max(0.0, (centre - spread) / scale), min(1.0, (centre + spread) / scale)
+
+
+def percent(value: float | None) -> float | None:
+    """Return a fraction as a percentage with one decimal; None stays None."""
+    return None if value is None else round(100.0 * value, 1)
+
+
+# --- of rollouts ---
+
+
+def success_rate(records: Sequence[Record]) -> Rate:
+    """Return the share of rollouts that succeeded."""
+    return Rate(sum(bool(record["success"]) for record in records) / len(records), len(records))
+
+
+def task_row(records: Sequence[Record]) -> Row:
+    """Return the metrics of one task's rollouts: the mean over rollouts of the mean over an operation's checkpoints."""
+    row = {"SR": success_rate(records)}
+    for metric, operation in PROCESS_METRICS.items():
+        found = checkpoint_rate(records, operation)
+        row[metric] = Rate(found.value, len(records) if found.n else 0)
+    return row
+
+
+def value_of(record: Record, metric: str) -> float | None:
+    """Return what a rollout gives to a metric: success, or the share of its operation's checkpoints satisfied."""
+    return (
+        float(bool(record["success"])) if metric == "SR" else checkpoint_rate([record], PROCESS_METRICS[metric]).value
+    )
+
+
+def pooled_row(records: Sequence[Record]) -> Row:
+    """Return SR over all rollouts, and MSR, MUR, MCR over all checkpoint records of the operation."""
+    rates = {metric: checkpoint_rate(records, operation) for metric, operation in PROCESS_METRICS.items()}
+    return {"SR": success_rate(records), **rates}
+
+
+def checkpoint_rate(records: Iterable[Record], wanted: str) -> Rate:
+    """Return the share of the checkpoint records of some operations that were satisfied; n counts records."""
+    values = [
+        done
+        for record in records
+        for operation, done in zip(operations(record), satisfied(record), strict=True)
+        if operation in wanted
+    ]
+    return Rate(sum(values) / len(values) if values else None, len(values))
+
+
+def column_rates(rows: Sequence[Sequence[bool]]) -> list[Rate]:
+    """Return the share of (n, K) values that are true, (K,)."""
+    return [Rate(sum(column) / len(rows), len(rows)) for column in zip(*rows, strict=True)]
+
+
+# --- means ---
+
+
+def mean_row(rows: Iterable[Row]) -> Row:
+    """Return the mean of several rows, metric by metric, over those to which the metric applies."""
+    rows = list(rows)
+    return {metric: mean_rate([row[metric] for row in rows]) for metric in METRICS}
+
+
+def mean_rate(rates: Iterable[Rate]) -> Rate:
+    """Return the mean of the applicable rates, each of the same weight whatever its n.
+
+    A mean of m rates over n₁ … n_m rollouts has the variance p(1 − p) · Σ 1/(m² n_i) where they share p, which is that
+    of a plain rate over m² / Σ 1/n_i rollouts. With equal n_i this is their sum.
+    """
+    applicable = [rate for rate in rates if rate.value is not None]
+    if not applicable:
+        return Rate(None, 0)
+    count, n = len(applicable), sum(rate.n for rate in applicable)
+    mean = sum(rate.value for rate in applicable if rate.value is not None) / count
+    trials = [rate.trials for rate in applicable]
+    if 0 in trials:  # rates without rollouts, such as the paper's
+        return Rate(mean, n)
+    effective = count * count / sum(1 / each for each in trials)
+    return Rate(mean, n, None if math.isclose(effective, n) else effective)
+
+
+# How often each failure class occurs among rollouts; the rule itself is ``tasks.failures``.
+
+_ALL = (*FAILURES, *REFINED_FAILURES, *STRICT_FAILURES, *FAULTS)
+
+
+def failure_of(record: Record) -> str | None:
+    """Return the failure class of a logged rollout, None for a success.
+
+    A log without the class gets it from its checkpoints. Drift cannot be told from them, so it is then never
+    named.
+    """
+    if record["success"]:
+        return None
+    logged = record.get("failure")
+    if logged is None:
+        checkpoints = record["checkpoints"]
+        return classify([c["operation"] for c in checkpoints], [c["first_step"] for c in checkpoints], False)
+    if logged not in _ALL:
+        raise MemobenchError(
+            f"a rollout of {record['task']!r} has the unknown failure class {logged!r}, " + nearest(str(logged), _ALL)
+        )
+    return str(logged)
+
+
+def failure_counts(records: Iterable[Record]) -> dict[str, int]:
+    """Return class -> number of failed rollouts, in the report's order: the paper's classes, others as found."""
+    found = Counter(failure_of(record) for record in records)
+    return {name: found[name] for name in _ALL if name in FAILURES or found[name]}
+
+
+# Every figure of a set of rollouts, and what of it stands in ``report.json``.
+
+
+@dataclass(frozen=True)
+class Summary:
+    """All figures of a set of rollouts.
+
+    Attributes:
+        tasks, memory_types: name -> metrics; a memory type is the mean over its applicable tasks.
+        average: mean over the applicable memory types.
+        pooled: MSR, MUR, MCR over all checkpoint records of the operation, whatever the task; n counts records.
+        pooled_checkpoints: the same over all checkpoint records, whatever the operation.
+        prefix, ordered_prefix: task -> per checkpoint the rate of rollouts in which it and all earlier ones were
+            satisfied, in any order and in order.
+        failures: class -> number of failed rollouts.
+        failures_of: the same by task.
+        memory_type_of: task -> memory type.
+        operations_of: task -> its checkpoints' labels, such as "SUU".
+        inputs: of the policy, in words.
+    """
+
+    tasks: dict[str, Row]
+    memory_types: dict[str, Row]
+    average: Row
+    pooled: Row
+    pooled_checkpoints: Rate
+    prefix: dict[str, list[Rate]]
+    ordered_prefix: dict[str, list[Rate]]
+    failures: dict[str, int]
+    failures_of: dict[str, dict[str, int]]
+    memory_type_of: dict[str, str]
+    operations_of: dict[str, str]
+    inputs: str
+
+    @property
+    def rollouts(self) -> int:
+        """How many rollouts there are."""
+        return self.pooled["SR"].n
+
+
+def summarise(records: Iterable[Record]) -> Summary:
+    """Compute every figure of a set of rollouts."""
+    records = list(records)
+    if not records:
+        raise MemobenchError("there are no rollouts to report; run an evaluation first")
+    groups = by_task(records)
+    tasks = {name: task_row(group) for name, group in groups.items()}
+    memory_type_of = {name: str(group[0]["memory_type"]) for name, group in groups.items()}
+    memory_types: dict[str, Row] = {
+        memory_type: mean_row(tasks[name] for name in tasks if memory_type_of[name] == memory_type)
+        for memory_type in MEMORY_TYPES
+        if memory_type in memory_type_of.values()
+    }
+    return Summary(
+        tasks=tasks,
+        memory_types=memory_types,
+        average=mean_row(memory_types.values()),
+        pooled=pooled_row(records),
+        pooled_checkpoints=checkpoint_rate(records, "".join(OPERATIONS)),
+        prefix={name: column_rates([prefix(satisfied(r)) for r in group]) for name, group in groups.items()},
+        ordered_prefix={
+            name: column_rates([prefix(completed_in_order(r)) for r in group]) for name, group in groups.items()
+        },
+        failures=failure_counts(records),
+        failures_of={name: failure_counts(group) for name, group in groups.items()},
+        memory_type_of=memory_type_of,
+        operations_of={name: operations(group[0]) for name, group in groups.items()},
+        inputs=policy_inputs(records),
+    )
+
+
+def report_values(summary: Summary) -> dict[str, Any]:
+    """Return the content of ``report.json``: percentages with one decimal, null where not applicable."""
+    return {
+        "tasks": {name: _percentages(row) for name, row in summary.tasks.items()},
+        "memory_types": {name: _percentages(row) for name, row in summary.memory_types.items()},
+        "average": _percentages(summary.average),
+        "failures": dict(summary.failures),
+        "prefix": {name: [percent(rate.value) for rate in rates] for name, rates in summary.prefix.items()},
+        "inputs": summary.inputs,
+    }
+
+
+def _percentages(row: Row) -> dict[str, Any]:
+    return {"n": row["SR"].n, **{metric: percent(row[metric].value) for metric in METRICS}}

@@ -1,0 +1,411 @@
+"""Of which types is a result card? What its parts mean, `engine.card` says."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal, NotRequired, TypedDict
+
+from annotated_types import Ge, Le, MinLen
+
+from lerobot_memobench.envs.episode_log import (
+    EXTENT,
+    MOST_EPISODES,
+    OF_THE_POLICY,
+    POLICY,
+    SETTINGS,
+    CheckpointRecord,
+    Outcome,
+    Protocol,
+    WholeProtocol,
+    differences,
+    read_episodes,
+    read_protocol_file,
+)
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.metrics import Record, Summary, faults, mixtures, summarise
+from lerobot_memobench.io import LARGEST, Count, Name, Whole, count_of, read_json
+from lerobot_memobench.tasks.task import PUBLISHED
+
+
+class PolicySettings(TypedDict, total=False):
+    """Whatever a policy can be set to; what reports and `memobench rerun` read of it."""
+
+    n_action_steps: Count | None
+    perception: str | None
+    eyes: str | None
+
+
+class Policy(TypedDict, total=False):
+    """What identifies a policy; {} where nothing is known of it."""
+
+    type: Name | None
+    seed: Whole | None
+    settings: PolicySettings
+    sha256: str | None
+    eyes_sha256: str
+
+
+class Checkpoint(TypedDict):
+    """Where a policy's weights were, and the hash of each file."""
+
+    path: str
+    revision: NotRequired[str | None]
+    files: NotRequired[dict[str, str]]
+
+
+BatchSize = Annotated[int, Ge(1), Le(LARGEST)]
+
+
+class Start(TypedDict):
+    """One start of the evaluation, on one machine."""
+
+    command: list[str]
+    batch_size: BatchSize
+    versions: dict[str, str]
+    git_commit: str | None
+    machine: dict[str, Any]
+    gl: dict[str, Any]
+    times: NotRequired[Count]
+
+
+class Found(Outcome):
+    """What an episode came to."""
+
+    task: Name
+    episode: Whole
+    memory_type: NotRequired[str]
+    success: NotRequired[bool]
+    checkpoints: NotRequired[list[CheckpointRecord]]
+
+
+class Told(TypedDict, total=False):
+    """What is taken from a start where the rest of it does not matter."""
+
+    command: list[str]
+    batch_size: BatchSize
+
+
+class Card(TypedDict):
+    """What reports take from a card: all but the protocol may be absent."""
+
+    protocol: Protocol
+    policy: NotRequired[Policy]
+    runs: NotRequired[list[Told]]
+
+
+class WholeCard(TypedDict):
+    """A card from which an evaluation is gone on with, merged or repeated."""
+
+    format: Literal[1]
+    written: NotRequired[str]
+    protocol: WholeProtocol
+    policy: Policy
+    checkpoint: Checkpoint | None
+    trained_on: dict[str, Any] | None
+    task_files: dict[str, str]
+    flags: list[str]
+    shard: str | None
+    runs: Annotated[list[Start], MinLen(1)]
+    episodes: list[Found]
+
+
+# What an evaluation was run under, read back from its folder, and in what two of them differ.
+
+__all__ = [
+    "CARD_FILE",
+    "EXTENT",
+    "OF_THE_POLICY",
+    "POLICY",
+    "SETTINGS",
+    "differences",
+    "one_suite",
+    "protocol_of_log",
+    "read_card",
+    "read_protocol",
+]
+
+CARD_FILE = "card.json"
+
+
+def read_protocol(folder: str | Path) -> dict[str, Any]:
+    """Return the protocol of the evaluation in ``folder``.
+
+    Keys: ``tasks`` (names, sorted) and ``episodes`` (per task; the largest number where they differ) as asked for, or
+    as found in the log where nobody wrote down what was asked for; ``suite``; ``seed_base``, ``referent``,
+    ``demonstration_prompt``, ``prompt_in``, ``horizon``, ``replan_steps``, ``render``, ``render_every`` as
+    far as known; ``inputs``, of the policy; ``policy``, what is known of the policy ({} where nobody wrote it down).
+
+    Raises:
+        MemobenchError: there is no evaluation in the folder.
+    """
+    folder = Path(folder)
+    card = read_card(folder / CARD_FILE) if (folder / CARD_FILE).is_file() else {}
+    told: dict[str, Any] = {**card.get("protocol", {}), **read_protocol_file(folder)}
+    if not {*EXTENT, *SETTINGS} - {"suite"} <= set(told):  # without a suite it is of the time when there was one
+        told = {**protocol_of_log(read_episodes(folder)), **told}
+    return {**told, POLICY: card.get(POLICY) or told.get(POLICY) or {}}
+
+
+def protocol_of_log(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return what a log tells of its protocol; settings in which its episodes differ are lists."""
+    numbers = (record["episode"] + 1 for record in records)
+    found: dict[str, Any] = {
+        "tasks": sorted({record["task"] for record in records}),
+        "episodes": max((number for number in numbers if number <= MOST_EPISODES), default=0),  # others have no number
+    }
+    if all(record.get("seed") is not None for record in records):
+        _note(found, "seed_base", [record["seed"] - record["episode"] for record in records])
+    if (suite := one_suite(records)) != PUBLISHED:
+        found["suite"] = suite
+    for key in ("referent", "replan_steps"):
+        _note(found, key, [record[key] for record in records if key in record])
+    return found
+
+
+def one_suite(records: Iterable[Mapping[str, Any]]) -> str:
+    """Return the suite of an evaluation's rollouts.
+
+    Raises:
+        MemobenchError: they are of several.
+    """
+    there = {record.get("suite", PUBLISHED) for record in records} or {PUBLISHED}
+    if len(there) > 1:
+        raise MemobenchError(
+            f"the rollouts are of the suites {' and '.join(sorted(there))}; report each suite by itself"
+        )
+    (suite,) = there
+    return str(suite)
+
+
+def _note(found: dict[str, Any], key: str, values: list[Any]) -> None:
+    distinct = list(dict.fromkeys(values))
+    if distinct:
+        found[key] = distinct[0] if len(distinct) == 1 else sorted(distinct, key=str)
+
+
+def read_card(path: Path, *, whole: bool = False) -> dict[str, Any]:
+    """Return a result card (see ``engine.card``).
+
+    Args:
+        whole: nothing of it may be left out, as reports allow.
+
+    Raises:
+        MemobenchError: it is missing or none.
+    """
+    try:
+        found: dict[str, Any] = read_json(
+            path, WholeCard if whole else Card, "it is no result card as `lerobot eval` writes it"
+        )
+    except FileNotFoundError:
+        raise MemobenchError(
+            f"the card {path} cannot be read (it is missing); name a {CARD_FILE} that `lerobot eval` wrote"
+        ) from None
+    return found
+
+
+# Evaluations as reports and figures see them: what each is called, its rollouts, its rates, whose they are.
+#
+# An evaluation is given as its folder, or as ``NAME=FOLDER``. Evaluations of the same name are one method at several
+# replan intervals; without names, those of the same policy are.
+
+HASH_DIGITS = 8
+
+
+@dataclass(frozen=True)
+class Run:
+    """One evaluation.
+
+    Attributes:
+        name: unique in a report. method: whose result it is; several runs of one method differ in the replan interval.
+        notes: what a reader must know, such as lines that could not be read.
+    """
+
+    name: str
+    method: str
+    folder: Path
+    records: Sequence[Record]
+    protocol: Mapping[str, Any]
+    notes: Sequence[str] = field(default_factory=tuple)
+
+    @cached_property
+    def summary(self) -> Summary:
+        """Every figure of its rollouts."""
+        return summarise(self.records)
+
+    @cached_property
+    def replan_steps(self) -> int | None:
+        """The one interval of all rollouts; the policy's own where none was asked for; None where nobody knows."""
+        found = {record.get("replan_steps") for record in self.records}
+        if len(found) > 1:
+            return None
+        (steps,) = found
+        if steps is None:
+            steps = (self.protocol.get(POLICY) or {}).get("settings", {}).get("n_action_steps")
+        return steps if isinstance(steps, int) else None
+
+
+def read_runs(words: Sequence[str | Path]) -> list[Run]:
+    """Read evaluations given as ``FOLDER`` or ``NAME=FOLDER``.
+
+    Raises:
+        MemobenchError: a folder holds no rollouts or is given twice, one method has two results at one interval, or
+            the suites differ.
+    """
+    given = [_split(word) for word in words]
+    if not given:
+        raise MemobenchError("no evaluation was given; expected folders that evaluations have written")
+    names = folder_names([folder for _, folder in given])
+    runs = []
+    for (label, folder), name in zip(given, names, strict=True):
+        records, notes = read_rollouts(folder)
+        runs.append(Run(name, label or "", folder, records, read_protocol(folder), notes))
+    check_one_suite({run.folder: run.records for run in runs})
+    return _with_methods(runs)
+
+
+def check_one_suite(records: Mapping[Path, Sequence[Record]]) -> None:
+    """Refuse evaluations (folder -> rollouts) of several suites: their figures are of other tasks.
+
+    Raises:
+        MemobenchError: naming two of them.
+    """
+    suites = {folder: one_suite(rollouts) for folder, rollouts in records.items()}
+    (first, reference), *others = suites.items()
+    for folder, suite in others:
+        if suite != reference:
+            raise MemobenchError(
+                f"{first} is an evaluation of the {reference} suite and {folder} one of the {suite} suite; report each "
+                "suite by itself"
+            )
+
+
+def unlike(protocols: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return a sentence for each of several evaluations (name -> protocol) that was not run as the first one was.
+
+    Replan intervals may differ: they are compared on purpose.
+    """
+    (first, reference), *others = protocols.items()
+    found = {name: differences(reference, protocol, extent=True, ignore=("replan_steps",)) for name, protocol in others}
+    return [
+        f"{name} was not run as {first} was ({'; '.join(settings)}, the first value being that of {first}): their "
+        "figures do not compare; `memobench compare` does so over the episodes in common, where it can"
+        for name, settings in found.items()
+        if settings
+    ]
+
+
+def read_rollouts(folder: str | Path) -> tuple[list[dict[str, Any]], list[str]]:
+    """Return the rollouts of an evaluation, and what a reader must know: unreadable lines, what was not run or
+    was broken off, mixed protocols.
+
+    Raises:
+        MemobenchError: there are none.
+    """
+    notes: list[str] = []
+    records = asked_for(Path(folder), read_episodes(folder, notes), notes)
+    if not records:
+        told = "".join(f"; {note}" for note in notes)
+        raise MemobenchError(f"{folder} holds no rollout that can be read{told}; run an evaluation first")
+    return records, notes + faults(records) + mixtures(records)
+
+
+def asked_for(folder: Path, records: list[dict[str, Any]], notes: list[str]) -> list[dict[str, Any]]:
+    """Return the rollouts without those that LeRobot's last batch held beyond what was asked for, by the card.
+
+    Logs of today hold none. Of others that are left out, ``notes`` gets a sentence.
+    """
+    card = read_card(folder / CARD_FILE) if (folder / CARD_FILE).is_file() else {}
+    count, base = (card.get("protocol", {}).get(key) for key in ("episodes", "seed_base"))
+    if count is None:
+        return records
+    seed = (card.get(POLICY) or {}).get("seed")
+    first = seed - base if isinstance(seed, int) and isinstance(base, int) else 0
+    kept = [record for record in records if record["episode"] < first + count]
+    if len(kept) < len(records):
+        beyond = count_of(len(records) - len(kept), "rollout")
+        notes.append(f"{beyond} beyond the {count} of each task that were asked for left out")
+    return kept
+
+
+def _split(word: str | Path) -> tuple[str | None, Path]:
+    """Take ``NAME=FOLDER`` apart; a folder whose own name holds an equals sign is still one."""
+    if isinstance(word, Path) or Path(word).exists():
+        return None, Path(word)
+    label, equals, folder = word.partition("=")
+    if not equals or "/" in label:
+        return None, Path(word)
+    if not label.strip() or not folder:
+        raise MemobenchError(f"found {word!r}; expected a folder, or NAME=FOLDER")
+    return label.strip(), Path(folder)
+
+
+def folder_names(folders: Sequence[str | Path]) -> list[str]:
+    """Return the shortest ends of the folders' paths that tell them apart."""
+    paths = [Path(folder).resolve() for folder in folders]
+    if len(set(paths)) < len(paths):
+        twice = next(path for path in paths if paths.count(path) > 1)
+        raise MemobenchError(f"{twice} is given twice; name each evaluation once")
+    depth = 1
+    while len({path.parts[-depth:] for path in paths}) < len(paths):
+        depth += 1
+    return ["/".join(path.parts[-depth:]) for path in paths]
+
+
+def _with_methods(runs: Sequence[Run]) -> list[Run]:
+    """Name the methods of runs that were not given a name, and the runs of named methods after them."""
+    methods = _methods(runs)
+    result = []
+    for run, method in zip(runs, methods, strict=True):
+        name = run.name
+        if run.method:
+            name = method if methods.count(method) == 1 else f"{method} k={run.replan_steps}"
+        result.append(replace(run, name=name, method=method))
+    return result
+
+
+def _methods(runs: Sequence[Run]) -> list[str]:
+    """Return whose result each run is: the name that it was given, else its policy's, else its folder's."""
+    policies = dict.fromkeys(_policy(run) for run in runs if not run.method and run.protocol.get(POLICY))
+    kinds = Counter(kind for kind, _ in policies)
+    chosen = [run.method or (_policy_name(run, kinds) if run.protocol.get(POLICY) else run.name) for run in runs]
+    # Where policies are not told, or several results of one stand at the same interval, folders are what is known.
+    places = Counter((method, run.replan_steps) for run, method in zip(runs, chosen, strict=True))
+    repeated = {method for (method, _), count in places.items() if count > 1}
+    taken = {run.method for run in runs if run.method} & repeated
+    if taken:
+        raise MemobenchError(
+            f"two evaluations named {min(taken)!r} have the same replan interval; give them names of their own"
+        )
+    return [run.name if method in repeated else method for run, method in zip(runs, chosen, strict=True)]
+
+
+def _policy_name(run: Run, kinds: Mapping[str, int]) -> str:
+    kind, digest = _policy(run)
+    return kind if kinds[kind] == 1 else f"{kind} {digest[:HASH_DIGITS]}".strip()
+
+
+def _policy(run: Run) -> tuple[str, str]:
+    """Return type and hash of a run's policy, "" as far as they are unknown."""
+    policy = run.protocol.get(POLICY) or {}
+    return str(policy.get("type") or "policy"), str(policy.get("sha256") or "")
+
+
+def by_method(runs: Sequence[Run]) -> dict[str, list[Run]]:
+    """Return method -> its runs, by replan interval; runs without one come last."""
+    grouped: dict[str, list[Run]] = {}
+    for run in runs:
+        grouped.setdefault(run.method, []).append(run)
+    return {
+        method: sorted(group, key=lambda run: (run.replan_steps is None, run.replan_steps or 0))
+        for method, group in grouped.items()
+    }
+
+
+def sweeps(runs: Sequence[Run]) -> dict[str, list[Run]]:
+    """Return the methods that were evaluated at several replan intervals."""
+    known = {name: [run for run in group if run.replan_steps is not None] for name, group in by_method(runs).items()}
+    return {name: group for name, group in known.items() if len({run.replan_steps for run in group}) > 1}

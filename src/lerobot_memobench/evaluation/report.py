@@ -1,0 +1,342 @@
+"""The figures of evaluations as JSON values: the keys of ``report.json``, and more beside them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from rich.console import RenderableType
+
+from lerobot_memobench.envs.episode_log import not_run, notes_on_not_run, read_log, write_episodes
+from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.evaluation.metrics import (
+    METRICS,
+    Rate,
+    Record,
+    Row,
+    Summary,
+    faults,
+    mixtures,
+    percent,
+    report_values,
+    summarise,
+)
+from lerobot_memobench.evaluation.records import POLICY, Run, asked_for, sweeps, unlike
+from lerobot_memobench.evaluation.report_tables import (
+    PAPER_SAW,
+    beside_paper,
+    best_interval,
+    check_beside,
+    departures,
+    failures_table,
+    inputs_sentence,
+    memory_types_table,
+    overview,
+    pooled_sentence,
+    prefix_table,
+    protocol_sentence,
+    rates_table,
+    sweep,
+    tasks_table,
+)
+from lerobot_memobench.evaluation.tables import WRITERS, Report, Section, csv_text, markdown, terminal_table
+from lerobot_memobench.io import write_file
+from lerobot_memobench.paper import PublishedRow, published_rows
+
+
+def report_data(runs: Sequence[Run], paper: bool) -> dict[str, Any]:
+    """Return the figures of one or several evaluations, and the published ones where asked for."""
+    found: dict[str, Any]
+    if len(runs) == 1:
+        found = run_data(runs[0])
+    else:
+        found = {
+            "evaluations": {run.name: run_data(run) for run in runs},
+            "notes": unlike({run.name: run.protocol for run in runs}),
+        }
+    if swept := sweeps(runs):
+        found["replan_sweep"] = {method: _sweep_data(group) for method, group in swept.items()}
+    if paper:
+        found["departs_from_paper"] = {run.name: departures(run) for run in runs}
+        found["paper"] = [_published_data(row) for row in published_rows()]
+    return found
+
+
+def run_data(run: Run) -> dict[str, Any]:
+    """Return the figures of one evaluation: the keys of ``report.json``, and more beside them."""
+    summary = run.summary
+    policy = run.protocol.get(POLICY) or {}
+    return {
+        **report_values(summary),
+        "name": run.name,
+        "method": run.method,
+        "replan_steps": run.replan_steps,
+        "protocol": {key: value for key, value in run.protocol.items() if key != POLICY},
+        "policy": {key: policy.get(key) for key in ("type", "sha256", "seed")},
+        "intervals": {
+            "tasks": {name: _intervals(row) for name, row in summary.tasks.items()},
+            "memory_types": {name: _intervals(row) for name, row in summary.memory_types.items()},
+            "average": _intervals(summary.average),
+        },
+        "ordered_prefix": {
+            name: [percent(rate.value) for rate in rates] for name, rates in summary.ordered_prefix.items()
+        },
+        "pooled": {
+            "checkpoints": _pooled(summary.pooled_checkpoints),
+            **{metric: _pooled(rate) for metric, rate in summary.pooled.items()},
+        },
+        "failures_by_task": {name: dict(counts) for name, counts in summary.failures_of.items()},
+        "notes": list(run.notes),
+    }
+
+
+def _intervals(row: Row) -> dict[str, list[float | None] | None]:
+    return {metric: interval_of(row[metric]) for metric in METRICS}
+
+
+def interval_of(rate: Rate) -> list[float | None] | None:
+    """Return the interval of a rate in per cent, None where it has none."""
+    interval = rate.interval if rate.trials else None
+    return None if interval is None else [percent(bound) for bound in interval]
+
+
+def _pooled(rate: Rate) -> dict[str, Any]:
+    return {"percent": percent(rate.value), "n": rate.n}
+
+
+def _sweep_data(runs: Sequence[Run]) -> dict[str, Any]:
+    return {
+        "best": {metric: best_interval(runs, metric)[0] for metric in METRICS},
+        "average": {
+            str(run.replan_steps): {metric: percent(run.summary.average[metric].value) for metric in METRICS}
+            for run in runs
+        },
+    }
+
+
+def _published_data(row: PublishedRow) -> dict[str, Any]:
+    return {
+        "table": row.table,
+        "model": row.model,
+        "replan_steps": row.replan_steps,
+        "memory_types": {name: dict(figures) for name, figures in row.memory_types.items()},
+        "average": dict(row.average),
+    }
+
+
+# The figures of evaluations as rows of CSV, one figure a row.
+
+HEADER = ("evaluation", "replan_steps", "table", "name", "figure", "percent", "low", "high", "n", "inputs")
+"""``table`` is tasks, memory_types, average, pooled, prefix, ordered_prefix, failures, or extent beside the paper's."""
+
+CsvRow = tuple[object, ...]
+
+
+def csv_rows(runs: Sequence[Run], paper: bool) -> list[CsvRow]:
+    """Return every figure of evaluations, and the published ones where asked for."""
+    rows = [row for run in runs for row in _run_rows(run)]
+    if paper:
+        rows += [row for run in runs for row in _extent(run)]
+        rows += [row for published in published_rows() for row in _published_rows(published)]
+    return rows
+
+
+def _run_rows(run: Run) -> Iterator[CsvRow]:
+    for place, name, figure, rate in _figures(run.summary):
+        # Records of one rollout are not independent: an interval over them would be too narrow.
+        interval = None if place == "pooled" and figure != "SR" else interval_of(rate)
+        low, high = interval or (None, None)
+        yield (
+            run.name,
+            run.replan_steps,
+            place,
+            name,
+            figure,
+            percent(rate.value),
+            low,
+            high,
+            rate.n or None,
+            run.summary.inputs,
+        )
+
+
+def _extent(run: Run) -> Iterator[CsvRow]:
+    """Yield how much was run: beside rows of 30 tasks and 1,500 rollouts."""
+    for figure, count in (("tasks", len(run.summary.tasks)), ("rollouts", run.summary.rollouts)):
+        yield (run.name, run.replan_steps, "extent", "", figure, None, None, None, count, run.summary.inputs)
+
+
+def _published_rows(published: PublishedRow) -> Iterator[CsvRow]:
+    method = f"paper, {published.table}: {published.model}"
+    groups: list[tuple[str, str, Mapping[str, float | None]]] = [
+        *(("memory_types", name, figures) for name, figures in published.memory_types.items()),
+        ("average", "", published.average),
+    ]
+    for place, name, figures in groups:
+        for metric in METRICS:
+            yield (method, published.replan_steps, place, name, metric, figures[metric], None, None, None, PAPER_SAW)
+
+
+def _figures(summary: Summary) -> Iterator[tuple[str, str, str, Rate]]:
+    """Yield (table, name, figure, rate) of everything in a summary."""
+    rows: list[tuple[str, str, Row]] = [
+        *(("tasks", name, row) for name, row in summary.tasks.items()),
+        *(("memory_types", name, row) for name, row in summary.memory_types.items()),
+        ("average", "", summary.average),
+        ("pooled", "", summary.pooled),
+    ]
+    for place, name, row in rows:
+        for metric in METRICS:
+            yield place, name, metric, row[metric]
+    yield "pooled", "", "checkpoints", summary.pooled_checkpoints
+    for place, prefixes in (("prefix", summary.prefix), ("ordered_prefix", summary.ordered_prefix)):
+        for name, rates in prefixes.items():
+            for k, rate in enumerate(rates):
+                yield place, name, f"c{k + 1}", rate
+    total = summary.rollouts
+    for failure, count in summary.failures.items():
+        yield "failures", "", failure, Rate(count / total, total)
+
+
+# The report of evaluations: for the terminal, Markdown, CSV, LaTeX, and JSON for programs.
+#
+# ``report.json`` beside an evaluation's log holds exactly the keys of the benchmark's specification. As JSON among the
+# formats the same keys stand with more beside them: intervals, prefix completion in order, pooled rates, protocol.
+
+REPORT_JSON = "report.json"
+REPORT_MARKDOWN = "report.md"
+
+FILES: dict[str, str] = {
+    "table": "report.txt",
+    "markdown": REPORT_MARKDOWN,
+    "csv": "report.csv",
+    "latex": "report.tex",
+    "json": REPORT_JSON,
+}
+"""Format -> file that it is written to."""
+
+
+# --- beside the log ---
+
+
+def write_report(directory: str | Path, episodes: int | None = None) -> tuple[Summary, list[str]]:
+    """Read the log under ``directory`` and write ``episodes.jsonl``, ``report.json`` and ``report.md`` into it.
+
+    Args:
+        episodes: report episodes 0 to ``episodes`` − 1 of each task; None for all. LeRobot runs whole batches, so its
+            last one may hold more than were asked for.
+
+    Returns:
+        The figures, and notes a reader must know: unreadable lines, what was not run, mixed protocols.
+
+    Raises:
+        MemobenchError: there is no rollout: nothing was run, or nothing could be.
+    """
+    directory = Path(directory)
+    notes: list[str] = []
+    logged = asked_for(directory, read_log(directory, notes), notes)
+    if episodes is not None:
+        logged = [record for record in logged if record["episode"] < episodes]
+    write_episodes(directory, logged)
+    notes += notes_on_not_run(logged)
+    records = [record for record in logged if "not_run" not in record]
+    if logged and not records:
+        raise MemobenchError(f"no episode in {directory} could be run; {'; '.join(notes)}")
+    summary = summarise(records)
+    notes += faults(records) + mixtures(records)
+    unrun = {task: len(lines) for task, lines in not_run(logged).items()}
+    figures = {**report_values(summary), **({"not_run": unrun} if unrun else {})}
+    write_file(directory / REPORT_JSON, json.dumps(figures, indent=2) + "\n")
+    write_file(directory / REPORT_MARKDOWN, evaluation_markdown(summary, records, notes))
+    return summary, notes
+
+
+def table(summary: Summary, title: str | None = None) -> RenderableType:
+    """Return the table of SR, MSR, MUR, MCR per task, memory type and on average, for the terminal."""
+    return terminal_table(replace(rates_table(summary), title=title or ""))
+
+
+def evaluation_markdown(summary: Summary, records: Iterable[Record], notes: Sequence[str] = ()) -> str:
+    """Return the report of one evaluation as Markdown."""
+    return markdown(Report("Evaluation report", (_section(summary, list(records), notes),)))
+
+
+# --- documents ---
+
+
+def build(runs: Sequence[Run], paper: bool = False) -> Report:
+    """Return the report of one or several evaluations.
+
+    Args:
+        paper: stand the published figures beside.
+
+    Raises:
+        MemobenchError: the published figures are wanted beside those of other tasks.
+    """
+    check_beside(runs, paper)
+    found = []
+    if len(runs) > 1:
+        notes = unlike({run.name: run.protocol for run in runs})
+        found.append(Section("Evaluations", (overview(runs),), notes=tuple(notes)))
+    found += [sweep(method, group) for method, group in sweeps(runs).items()]
+    for run in runs:
+        section = _section(run.summary, run.records, run.notes)
+        if len(runs) > 1:
+            where = f"Evaluation in {run.folder}."
+            section = replace(section, title=run.name, sentences=(where, *section.sentences))
+        found.append(section)
+    if paper:
+        found.append(beside_paper(runs))
+    return Report("Evaluation report", tuple(found), report_data(runs, paper))
+
+
+def _section(summary: Summary, records: Sequence[Record], notes: Sequence[str]) -> Section:
+    """Return the section of one evaluation, without a title."""
+    seen = inputs_sentence(summary.inputs)
+    made = (memory_types_table(summary), tasks_table(summary), prefix_table(summary), failures_table(summary))
+    return Section(
+        "",
+        tuple(replace(each, note=f"{each.note} {seen}".strip()) for each in made),
+        (protocol_sentence(records), pooled_sentence(summary)),
+        tuple(notes),
+    )
+
+
+def render(found: Report, runs: Sequence[Run], format_: str, paper: bool = False) -> str:
+    """Return a report in one of the formats of ``FILES``."""
+    if format_ == "csv":
+        return csv_text(csv_rows(runs, paper), HEADER)
+    if format_ not in WRITERS:
+        raise MemobenchError(f"found the format {format_!r}, {nearest(format_, FILES)}")
+    return WRITERS[format_](_unique_keys(found) if format_ == "latex" else found)
+
+
+def write_documents(runs: Sequence[Run], out: Path, wanted: Sequence[str], paper: bool = False) -> list[Path]:
+    """Write a report of evaluations into a folder in the formats wanted; return the files."""
+    found = build(runs, paper)
+    if out.exists() and not out.is_dir():
+        raise MemobenchError(f"--out {out} is a file; name a folder")
+    out.mkdir(parents=True, exist_ok=True)
+    return [write_file(out / FILES[name], render(found, runs, name, paper)) for name in wanted]
+
+
+OF_EACH_EVALUATION = ("memory-types", "tasks", "prefix", "failures")
+"""Keys of the tables that stand in the section of every evaluation."""
+
+
+def _unique_keys(found: Report) -> Report:
+    """Number the labels of tables that stand in several sections."""
+    if len(found.sections) < 2:
+        return found
+    return replace(found, sections=tuple(_numbered(section, k) for k, section in enumerate(found.sections, start=1)))
+
+
+def _numbered(section: Section, number: int) -> Section:
+    numbered = []
+    for each in section.tables:
+        title = f"{each.title}: {section.title}" if section.title and each.key in OF_EACH_EVALUATION else each.title
+        numbered.append(replace(each, key=f"{each.key}-{number}", title=title))
+    return replace(section, tables=tuple(numbered))

@@ -1,0 +1,431 @@
+"""What a report says in sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.metrics import METRICS, Rate, Record, Row, Summary, percent, policy_inputs
+from lerobot_memobench.evaluation.records import Run, unlike
+from lerobot_memobench.evaluation.tables import Cell, Count, Name, Numbers, Section, Table, best_in_columns, figure
+from lerobot_memobench.io import count_of
+from lerobot_memobench.paper import PublishedRow, failure_taxonomy, published_rows
+from lerobot_memobench.tasks.task import MEMORY_TYPES, PUBLISHED
+
+
+def protocol_sentence(records: Sequence[Record]) -> str:
+    """Return how many rollouts there are, of what, under which seeds, referent and replan interval."""
+    extent = f"{count_of(len(records), 'rollout')} of {count_of(len({r['task'] for r in records}), 'task')}"
+    return ", ".join([extent, *settings_phrases(records)]) + "."
+
+
+def settings_phrases(records: Sequence[Record]) -> list[str]:
+    """Return under which seeds, referent and replan interval rollouts were made, and what was seen, as phrases."""
+    seeds = sorted({record["seed"] for record in records if record.get("seed") is not None})
+    referents = sorted({str(record.get("referent", "fixed")) for record in records})
+    replans = sorted({record["replan_steps"] for record in records if record.get("replan_steps") is not None})
+    phrases = []
+    if seeds:
+        phrases.append(f"seeds {seeds[0]} to {seeds[-1]}" if len(seeds) > 1 else f"seed {seeds[0]}")
+    phrases.append(f"referent {', '.join(referents)}")
+    if replans:
+        phrases.append(f"replan interval {', '.join(map(str, replans))}")
+    return [*phrases, inputs_phrase(policy_inputs(records))]
+
+
+def inputs_phrase(words: str) -> str:
+    """Return a policy's inputs, of `rollouts.policy_inputs`, as a phrase."""
+    return f"policy inputs: {words}"
+
+
+def inputs_sentence(words: str) -> str:
+    """Return a policy's inputs, of `rollouts.policy_inputs`, as a sentence."""
+    return f"Policy inputs: {words}."
+
+
+def pooled_sentence(summary: Summary) -> str:
+    """Return the rates over all checkpoint records; no intervals, since records of one rollout are not independent."""
+    parts = [
+        f"{metric} {figure(rate.value)} ({count_of(rate.n, 'record')})"
+        for metric, rate in summary.pooled.items()
+        if metric != "SR" and rate.value is not None
+    ]
+    overall = summary.pooled_checkpoints
+    return (
+        f"Pooled over all rollouts, whatever the task: SR {figure(summary.pooled['SR'].value)}, "
+        f"checkpoints satisfied {figure(overall.value)} ({count_of(overall.n, 'record')}): {', '.join(parts)}."
+    )
+
+
+def failure_line(summary: Summary) -> str:
+    """Return the failures in one line, for under a table."""
+    failed = {name: count for name, count in summary.failures.items() if count}
+    if not failed:
+        return "no failed rollouts"
+    return "failed rollouts: " + ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in failed.items())
+
+
+# The tables of one evaluation: rates, prefix completion, how rollouts ended.
+
+AVERAGE = "average of memory types"
+
+HOW_TO_READ = (
+    "SR is success, MSR, MUR and MCR the rates at which checkpoints of Storage, Update and Compression were satisfied "
+    "at some step. Per cent, with the Wilson 95 % interval; n counts rollouts; – is not applicable."
+)
+
+
+# --- rates ---
+
+
+def rates_table(summary: Summary) -> Table:
+    """Return one table of all tasks, each memory type's after them, and the average."""
+    rows: list[tuple[Cell, ...]] = []
+    strong, rules = [], []
+    for memory_type, row in summary.memory_types.items():
+        if rows:
+            rules.append(len(rows))
+        names = _tasks_of(summary, memory_type)
+        rows += [rate_row(Name(name), summary.tasks[name]) for name in names]
+        strong.append(len(rows))
+        rows.append(rate_row(f"{memory_type} ({count_of(len(names), 'task')})", row))
+    rules.append(len(rows))
+    strong.append(len(rows))
+    rows.append(rate_row(AVERAGE, summary.average))
+    return Table("rates", "", ("task", "n", *METRICS), tuple(rows), strong=frozenset(strong), rules=frozenset(rules))
+
+
+def memory_types_table(summary: Summary, title: str = "Rates by memory type") -> Table:
+    """Return one row per memory type, and the average."""
+    rows = [rate_row(name, row) for name, row in summary.memory_types.items()]
+    return Table(
+        "memory-types",
+        title,
+        ("memory type", "n", *METRICS),
+        (*rows, rate_row(AVERAGE, summary.average)),
+        note=HOW_TO_READ,
+        strong=frozenset({len(rows)}),
+        rules=frozenset({len(rows)}),
+    )
+
+
+def tasks_table(summary: Summary) -> Table:
+    """Return one row per task."""
+    names = list(summary.tasks)
+    types = [summary.memory_type_of[name] for name in names]
+    return Table(
+        "tasks",
+        "Rates by task",
+        ("task", "n", *METRICS),
+        tuple(rate_row(Name(name), summary.tasks[name]) for name in names),
+        rules=frozenset(k for k in range(1, len(types)) if types[k] != types[k - 1]),
+    )
+
+
+def rate_row(name: Cell, row: Row) -> tuple[Cell, ...]:
+    """Return a row of a table of rates: name, n, metrics."""
+    return (name, Count(row["SR"].n), *(row[metric] for metric in METRICS))
+
+
+# --- prefix completion ---
+
+
+def prefix_table(summary: Summary) -> Table:
+    """Return per task how many rollouts came as far as each checkpoint, in any order and in order."""
+    width = max((len(found) for found in summary.prefix.values()), default=0)
+    rows = []
+    for name, plain in summary.prefix.items():
+        cells: list[Cell] = [
+            Numbers(f"{figure(a.value)} / {figure(b.value)}")
+            for a, b in zip(plain, summary.ordered_prefix[name], strict=True)
+        ]
+        labels = " ".join(summary.operations_of[name])
+        rows.append((Name(name), labels, *cells, *[Numbers("")] * (width - len(cells))))
+    return Table(
+        "prefix",
+        "Prefix completion, in any order / in order",
+        ("task", "operations", *(f"c{k + 1}" for k in range(width))),
+        tuple(rows),
+        note=(
+            "Rollouts in which a checkpoint and all before it were satisfied, at whatever steps / one after another, "
+            "per cent."
+        ),
+    )
+
+
+# --- failures ---
+
+
+FURTHER_NOTES = {
+    "wrong_order": " Wrong order: the steps of a procedure were done in another order than its prompt's.",
+    "cut_off": " Cut off: the horizon is shorter than the protocol's 1,200 steps, so nobody knows what was remembered.",
+    "miscount": " Miscount: the event was done too seldom or too often.",
+    "wrong_place": " Wrong place: the thing was looked for where it is not.",
+    "invalid_action": " Invalid action: one of another shape, or not finite, broke the rollout off.",
+    "unstable_physics": " Unstable physics: MuJoCo warned of its own state, which broke the rollout off.",
+}
+"""Classes that not every evaluation has -> what the table says of them."""
+
+
+def failures_table(summary: Summary) -> Table:
+    """Return how rollouts ended, in all and by memory type."""
+    counts: dict[str, Mapping[str, int]] = {"all": outcomes(summary, summary.tasks)}
+    for memory_type in summary.memory_types:
+        counts[memory_type] = outcomes(summary, _tasks_of(summary, memory_type))
+    total = summary.rollouts
+    rows: list[tuple[Cell, ...]] = []
+    for outcome in ("success", *summary.failures):
+        found = [Count(column[outcome]) for column in counts.values()]
+        rows.append((outcome.replace("_", " "), *found, Rate(found[0] / total, total)))
+    return Table(
+        "failures",
+        "Outcomes of rollouts",
+        ("outcome", "rollouts", *list(counts)[1:], "of all"),
+        tuple(rows),
+        note=(
+            "A failed rollout is named after the first checkpoint that was never satisfied: Storage, Update (stale "
+            "memory) or Compression; reference drift where another answer than the prompt's took the place; execution "
+            "failure where all checkpoints were satisfied."
+            + "".join(FURTHER_NOTES.get(name, "") for name in summary.failures)
+        ),
+        rules=frozenset({1}),
+    )
+
+
+def outcomes(summary: Summary, names: Iterable[str]) -> dict[str, int]:
+    """Return how the rollouts of some tasks ended: success, then every class of failure -> rollouts."""
+    names = list(names)
+    found = {failure: sum(summary.failures_of[name].get(failure, 0) for name in names) for failure in summary.failures}
+    return {"success": sum(summary.tasks[name]["SR"].n for name in names) - sum(found.values()), **found}
+
+
+def _tasks_of(summary: Summary, memory_type: str) -> list[str]:
+    return [name for name, its_type in summary.memory_type_of.items() if its_type == memory_type]
+
+
+# Several evaluations side by side, in the layout of the paper's main table: every memory type's rates in one row.
+
+LEADING = ("evaluation", "inputs", "k")
+"""Columns before the rates."""
+NOTE = "inputs: of the policy; k: the replan interval."
+
+
+def overview(runs: Sequence[Run]) -> Table:
+    """Return one row per evaluation, and under the table in what they were not run alike."""
+    rows = tuple(run_row(run) for run in runs)
+    notes = unlike({run.name: run.protocol for run in runs})
+    return wide_table("overview", "Evaluations", rows, note=" ".join([NOTE, *notes]), best=best_in_columns(rows))
+
+
+def run_row(run: Run) -> tuple[Cell, ...]:
+    """Return the row of an evaluation."""
+    return (run.name, run.summary.inputs, run.replan_steps, *all_rates(run.summary))
+
+
+def all_rates(summary: Summary) -> list[Rate]:
+    """Return the metrics of every memory type and of the average, in the paper's order."""
+    absent = dict.fromkeys(METRICS, Rate(None, 0))
+    rows = [*(summary.memory_types.get(name, absent) for name in MEMORY_TYPES), summary.average]
+    return [row[metric] for row in rows for metric in METRICS]
+
+
+def wide_table(
+    key: str,
+    title: str,
+    rows: tuple[tuple[Cell, ...], ...],
+    leading: tuple[str, ...] = LEADING,
+    note: str = NOTE,
+    strong: Iterable[int] = (),
+    rules: Iterable[int] = (),
+    best: frozenset[tuple[int, int]] = frozenset(),
+) -> Table:
+    """Return a table whose rows are some leading cells and then `all_rates`."""
+    return Table(
+        key,
+        title,
+        (*leading, *(METRICS * (len(MEMORY_TYPES) + 1))),
+        rows,
+        note=note,
+        groups=(*(("", 1) for _ in leading), *((name, len(METRICS)) for name in (*MEMORY_TYPES, "average"))),
+        strong=frozenset(strong),
+        rules=frozenset(rules),
+        best=best,
+        intervals=False,
+    )
+
+
+# One method at several replan intervals: its tables, and which interval is best for what.
+
+
+def sweep(method: str, runs: Sequence[Run]) -> Section:
+    """Return the tables of one method at several replan intervals, and which interval is best for what."""
+    notes = []
+    if len({frozenset(run.summary.tasks) for run in runs}) > 1:
+        notes.append("the intervals were not evaluated on the same tasks; their averages do not compare")
+    return Section(
+        f"Replan sweep: {method}",
+        (_averages(method, runs), _memory_types(method, runs)),
+        (f"Best replan interval by average: {', '.join(_best(runs))}.",),
+        tuple(notes),
+    )
+
+
+def _averages(method: str, runs: Sequence[Run]) -> Table:
+    rows = tuple((run.replan_steps, *rate_row(None, run.summary.average)[1:]) for run in runs)
+    return Table(
+        f"replan-{_slug(method)}",
+        f"Average by replan interval: {method}",
+        ("replan interval", "n", *METRICS),
+        rows,
+        note=f"{HOW_TO_READ} {_seen(runs)}",
+        best=best_in_columns(rows),
+    )
+
+
+def _memory_types(method: str, runs: Sequence[Run]) -> Table:
+    rows = tuple((run.replan_steps, *all_rates(run.summary)) for run in runs)
+    return wide_table(
+        f"replan-types-{_slug(method)}",
+        f"Memory types by replan interval: {method}",
+        rows,
+        leading=("replan interval",),
+        note=_seen(runs),
+        best=best_in_columns(rows),
+    )
+
+
+def _seen(runs: Sequence[Run]) -> str:
+    return inputs_sentence(policy_inputs([record for run in runs for record in run.records]))
+
+
+def _best(runs: Sequence[Run]) -> list[str]:
+    """Return the best average of each metric and where it is reached, each as a phrase."""
+    return [
+        f"{metric} {figure(rate.value)} at {' and '.join(map(str, steps))}"
+        for metric in METRICS
+        for steps, rate in [best_interval(runs, metric)]
+        if rate is not None
+    ]
+
+
+def best_interval(runs: Sequence[Run], metric: str) -> tuple[list[int], Rate | None]:
+    """Return the replan intervals with the highest average of a metric as printed, and that average."""
+    found = [(percent(run.summary.average[metric].value), run) for run in runs]
+    known = [value for value, _ in found if value is not None]
+    if not known:
+        return [], None
+    best = [run for value, run in found if value == max(known)]
+    return [run.replan_steps for run in best if run.replan_steps is not None], best[0].summary.average[metric]
+
+
+def _slug(name: str) -> str:
+    return "-".join("".join(c if c.isalnum() and c.isascii() else " " for c in name).split()) or "policy"
+
+
+# The paper's tables with evaluations on top of each, and in what these depart from the paper's protocol.
+
+PAPER_PROTOCOL = {"referent": "fixed", "demonstration_prompt": True, "horizon": 1200, "seed_base": 7}
+PAPER_SAW = "pixels"
+PAPER_TASKS, PAPER_EPISODES = 30, 50
+
+TABLES = (
+    ("paper-main", "Beside the paper's main results", ("main",)),
+    ("paper-alignment", "Beside the paper's memory alignment results", ("alignment",)),
+    ("paper-reference", "Beside the paper's oracle memory and MemER", ("oracle", "memer")),
+)
+"""Key, title, and which of the paper's tables it holds."""
+
+
+def check_beside(runs: Sequence[Run], paper: bool) -> None:
+    """Refuse to stand the paper's figures (``paper``) beside those of other tasks than it published.
+
+    Raises:
+        MemobenchError: naming the first such evaluation.
+    """
+    other = next((run for run in runs if run.protocol.get("suite", PUBLISHED) != PUBLISHED), None)
+    if paper and other is not None:
+        raise MemobenchError(
+            f"{other.folder} is an evaluation of the {other.protocol['suite']} suite, the paper's figures are of the "
+            "published one; leave out --with paper"
+        )
+
+
+def beside_paper(runs: Sequence[Run]) -> Section:
+    """Return the paper's tables of rates with these evaluations on top of each, and in what they depart from it."""
+    tables = [_beside(runs, *each) for each in TABLES]
+    return Section("Beside the paper", (*tables, paper_failures()), notes=tuple(departure_notes(runs)))
+
+
+def departure_notes(runs: Sequence[Run]) -> list[str]:
+    """Return a sentence for each evaluation that was not run as the paper's were."""
+    return [f"{run.name} departs from the paper's protocol: {', '.join(d)}" for run in runs if (d := departures(run))]
+
+
+def beside_name(run: Run) -> str:
+    """Return what an evaluation is called beside the paper's rows of 30 tasks and 1,500 rollouts."""
+    return with_extent(run.name, [run])
+
+
+def with_extent(name: str, runs: Sequence[Run]) -> str:
+    """Return a name and behind it how much was run, where that is not what the paper ran."""
+    told = "; ".join(dict.fromkeys(filter(None, map(extent, runs))))
+    return f"{name} ({told})" if told else name
+
+
+def extent(run: Run) -> str:
+    """Return how many tasks and rollouts an evaluation is of, "" where it is as many as the paper's."""
+    summary = run.summary
+    if len(summary.tasks) == PAPER_TASKS and {row["SR"].n for row in summary.tasks.values()} == {PAPER_EPISODES}:
+        return ""
+    return f"{len(summary.tasks)} of {PAPER_TASKS} tasks, {count_of(summary.rollouts, 'rollout')}"
+
+
+def _beside(runs: Sequence[Run], key: str, title: str, sources: Sequence[str]) -> Table:
+    published = published_rows(*sources)
+    rows = (*((beside_name(run), *run_row(run)[1:]) for run in runs), *(_published_row(row) for row in published))
+    steps = [row.replan_steps for row in published]
+    changes = {len(runs) + k for k in range(1, len(steps)) if steps[k] != steps[k - 1]}
+    return wide_table(key, title, rows, strong=range(len(runs)), rules={len(runs), *changes})
+
+
+def _published_row(row: PublishedRow) -> tuple[Cell, ...]:
+    columns = [*(row.memory_types[name] for name in MEMORY_TYPES), row.average]
+    return (
+        f"paper: {row.label}",
+        PAPER_SAW,
+        row.replan_steps,
+        *(published_rate(c[m]) for c in columns for m in METRICS),
+    )
+
+
+def published_rate(value: float | None) -> Rate:
+    """Return a published percentage as a rate without interval: the paper gives none."""
+    return Rate(None if value is None else value / 100, 0)
+
+
+def paper_failures() -> Table:
+    """Return how the paper's rollouts of its temporal task ended."""
+    counts = failure_taxonomy()
+    total = counts.pop("rollouts")
+    rows = tuple((name.replace("_", " "), Count(count), Rate(count / total, total)) for name, count in counts.items())
+    return Table(
+        "paper-failures",
+        f"The paper's outcomes of {total} rollouts of a temporal task with the checkpoints S, U, U",
+        ("outcome", "rollouts", "of all"),
+        rows,
+    )
+
+
+def departures(run: Run) -> list[str]:
+    """Return in what an evaluation was not run as the paper's were, each as a phrase."""
+    found = []
+    if len(run.summary.tasks) != PAPER_TASKS:
+        found.append(f"{len(run.summary.tasks)} of {PAPER_TASKS} tasks")
+    counts = {row["SR"].n for row in run.summary.tasks.values()}
+    if counts != {PAPER_EPISODES}:
+        low, high = min(counts), max(counts)
+        found.append(f"{low if low == high else f'{low} to {high}'} episodes of each instead of {PAPER_EPISODES}")
+    for key, value in PAPER_PROTOCOL.items():
+        if key in run.protocol and run.protocol[key] != value:
+            found.append(f"{key.replace('_', ' ')} {run.protocol[key]} instead of {value}")
+    return found

@@ -1,0 +1,202 @@
+"""Tests and power for paired rollouts: the same episodes under two policies.
+
+A pair gives a difference d in [-1, 1]: of success (-1, 0, 1) or of the share of checkpoints satisfied. A difference of
+averages is the sum of w_i d_i, where the weights sum to 1 (equal for one task; for averages, each memory type, and in
+it each task, weighs the same).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.evaluation.metrics import Z95, percent, wilson
+from lerobot_memobench.evaluation.tables import NOT_APPLICABLE
+
+EXACT_UP_TO = 16
+"""Pairs that differ up to which all assignments of signs are enumerated: 2^16 = 65,536."""
+
+PERMUTATIONS = 10_000
+
+Z_POWER = 0.8416212335729143
+"""Quantile of the normal distribution for 80 % power."""
+
+FEWEST_PAIRS = 6
+"""2 / 2^6 is under 5 %, 2 / 2^5 is not."""
+
+_TOLERANCE = 1e-12
+
+
+def mcnemar(only_a: int, only_b: int) -> float:
+    """Return the exact two-sided p of McNemar's test: under the null, each discordant pair falls either way evenly.
+
+    Args:
+        only_a, only_b: pairs in which only one of both succeeded.
+    """
+    from scipy.stats import binomtest
+
+    discordant = only_a + only_b
+    return float(binomtest(min(only_a, only_b), discordant).pvalue) if discordant else 1.0
+
+
+def sign_flip(
+    differences: Sequence[float] | NDArray[np.float64],
+    weights: Sequence[float] | NDArray[np.float64],
+    rng: np.random.Generator,
+    permutations: int = PERMUTATIONS,
+) -> tuple[float, bool]:
+    """Return the two-sided p of the weighted sum of differences under random signs, and whether it is exact.
+
+    Under the null, who is who in a pair is arbitrary. With at most ``EXACT_UP_TO`` pairs that differ, every assignment
+    of signs is looked at; else ``permutations`` random ones and the one observed, p = (1 + as extreme) / (1 + drawn).
+
+    `scipy.stats.permutation_test` refuses a single pair, misses sums that are equal but for rounding, and takes seven
+    times as long.
+    """
+    terms = np.asarray(differences, dtype=np.float64) * np.asarray(weights, dtype=np.float64)
+    terms = terms[np.abs(terms) > _TOLERANCE]
+    observed = abs(float(terms.sum())) - _TOLERANCE
+    if terms.size == 0:
+        return 1.0, True
+    if terms.size <= EXACT_UP_TO:
+        codes = np.arange(2**terms.size)
+        signs = 1 - 2 * ((codes[:, None] >> np.arange(terms.size)) & 1)
+        return float(np.mean(np.abs(signs @ terms) >= observed)), True
+    extreme = 0
+    for start in range(0, permutations, 1000):  # in parts: 1,500 pairs by 10,000 signs would be 120 MB
+        count = min(1000, permutations - start)
+        signs = rng.integers(0, 2, (count, terms.size)) * 2 - 1
+        extreme += int(np.count_nonzero(np.abs(signs @ terms) >= observed))
+    return (1 + extreme) / (1 + permutations), False
+
+
+def detectable(
+    differences: Sequence[float] | NDArray[np.float64], weights: Sequence[float] | NDArray[np.float64]
+) -> float | None:
+    """Return the smallest true difference that so many pairs show with 80 % power at 5 % two-sided; None for none.
+
+    It is the δ with  n δ² = (1.96 √m + 0.84 √(m − δ²))²  (Connor 1987 for McNemar's test, where m is the share of
+    discordant pairs). Here m is the mean square of the differences, taken from the pairs with one more that differs
+    and one more that does not, so that it is not 0 where no pair differs (as in Agresti and Min 2005), and at least δ:
+    a mean difference δ of values in [-1, 1] cannot come with a smaller mean square than δ². n is 1 / Σ w_i², the
+    number of pairs of equal weight with the same standard error. With fewer than six pairs no outcome of an exact test
+    is under 5 %.
+    """
+    from scipy.optimize import brentq
+
+    d = np.asarray(differences, dtype=np.float64)
+    w = np.asarray(weights, dtype=np.float64)
+    if d.size < FEWEST_PAIRS:
+        return None
+    pairs = 1.0 / float(np.sum(w**2))
+    # The mean square that enters the variance of the weighted sum weighs pairs by the squares of their weights.
+    square = (float(np.sum(w**2 * d**2)) * pairs * d.size + 1.0) / (d.size + 2.0)
+
+    def missing(delta: float) -> float:
+        """How far a true difference is from being shown; 0 for the one that is looked for."""
+        m = max(square, delta)
+        spread = Z95 * math.sqrt(m) + Z_POWER * math.sqrt(max(0.0, m - delta * delta))
+        return delta * math.sqrt(pairs) - spread
+
+    if missing(1.0) < 0:
+        return None
+    return float(brentq(missing, 0.0, 1.0))
+
+
+def holm(values: Sequence[float]) -> list[float]:
+    """Return p-values adjusted for their number (Holm 1979), in the same order."""
+    if not values:
+        return []
+    from statsmodels.stats.multitest import multipletests
+
+    return [float(p) for p in multipletests(values, method="holm")[1]]
+
+
+# Figures with bootstrap intervals, and how they are written: in cells in per cent, in JSON with one decimal.
+#
+# Intervals are percentiles of a bootstrap that draws episodes within each task and keeps the pairs together, so that what
+# both share (an easy scene) does not widen them; `scipy.stats.bootstrap` draws from one sample and knows no tasks. Draws
+# from outcomes that are all equal are equal, as if nothing else could have happened: no interval is narrower than
+# Newcombe's of so many pairs. Rates are fractions here.
+
+DRAWS = 2000
+"""Bootstrap draws."""
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A figure and its 95 % interval; None where it does not apply."""
+
+    value: float | None
+    low: float | None = None
+    high: float | None = None
+
+
+def percentiles(values: Array) -> tuple[float, float]:
+    """Return the 95 % interval of draws."""
+    low, high = np.percentile(values, [2.5, 97.5])
+    return float(low), float(high)
+
+
+def difference_interval(draws: Array, a: Array, b: Array, weights: Array) -> tuple[float, float]:
+    """Return the 95 % interval of a weighted mean of b − a: that of the bootstrap's draws, or the wider bound.
+
+    Args:
+        draws: (D,) of that mean. a, b: (n,) outcomes in [0, 1] of the same episodes. weights: (n,), their sum is 1.
+    """
+    low, high = percentiles(draws)
+    least, most = newcombe(a, b, weights)
+    return min(low, least), max(high, most)
+
+
+def newcombe(a: Array, b: Array, weights: Array) -> tuple[float, float]:
+    """Return Newcombe's interval of a difference of paired rates, b − a (Statistics in Medicine 17, 1998, method 10).
+
+    It is made of both rates' Wilson intervals and the correlation of the pairs, which is corrected for continuity. The
+    number of trials is that of equal weights with the same standard error.
+    """
+    n = 1 / float(np.sum(weights**2))
+    p, q = float(weights @ a), float(weights @ b)
+    (low_p, high_p), (low_q, high_q) = (wilson(min(max(rate, 0.0), 1.0), n) for rate in (p, q))
+    together = float(weights @ ((a - p) * (b - q)))
+    spread = math.sqrt(float(weights @ (a - p) ** 2) * float(weights @ (b - q) ** 2))
+    together = max(together - 1 / (2 * n), 0.0) if together > 0 else together
+    phi = together / spread if spread > 0 else 0.0
+
+    def reach(x: float, y: float) -> float:
+        return math.sqrt(max(x * x - 2 * phi * x * y + y * y, 0.0))
+
+    return q - p - reach(q - low_q, high_p - p), q - p + reach(high_q - q, p - low_p)
+
+
+def number(value: float | None, sign: bool = False) -> str:
+    """Return a fraction as per cent with one decimal."""
+    if value is None:
+        return NOT_APPLICABLE
+    return f"{100.0 * value:+.1f}" if sign else f"{100.0 * value:.1f}"
+
+
+def estimate(found: Estimate, sign: bool = False) -> str:
+    """Return an estimate with its interval."""
+    if found.low is None or found.high is None:
+        return number(found.value, sign)
+    return f"{number(found.value, sign)} [{number(found.low, sign)}, {number(found.high, sign)}]"
+
+
+def as_percent(value: Any) -> Any:
+    """Return a dataclass, mapping, sequence or rate with every rate in per cent with one decimal, for JSON."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return as_percent(dataclasses.asdict(value))
+    if isinstance(value, Mapping):
+        return {key: as_percent(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [as_percent(item) for item in value]
+    return percent(value) if isinstance(value, float) else value

@@ -1,0 +1,488 @@
+"""Tables of a report, whatever they are written as; ``formats`` writes them."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from rich import box
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
+from rich.measure import Measurement
+from rich.table import Table as RichTable
+from rich.text import Text
+
+from lerobot_memobench.evaluation.metrics import Rate, percent
+
+NOT_APPLICABLE = "–"
+
+OPERATION_NAMES = {"S": "Storage", "U": "Update", "C": "Compression"}
+
+
+class Name(str):
+    """Text that is an identifier, such as a task's name: Markdown and LaTeX set it in typewriter."""
+
+
+class Numbers(str):
+    """Figures written out; set flush right like figures."""
+
+
+class Count(int):
+    """A number of things; other integers are labels."""
+
+
+Cell = Rate | str | int | None
+"""A rate (per cent, with its interval where it has one), text, a number; None where nothing applies."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table and what is said under it.
+
+    Attributes:
+        key: short name, unique in a report. header: names of the columns.
+        rows: each as long as the header. note: how to read it.
+        groups: (title, columns) over the header, from the left; "" for none.
+        strong: rows that sum up, by index. rules: rows before which a line is drawn.
+        best: (row, column) of the cells to be marked as best.
+        intervals: whether rates are followed by their interval.
+    """
+
+    key: str
+    title: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    note: str = ""
+    groups: tuple[tuple[str, int], ...] = ()
+    strong: frozenset[int] = frozenset()
+    rules: frozenset[int] = frozenset()
+    best: frozenset[tuple[int, int]] = frozenset()
+    intervals: bool = True
+
+    def __post_init__(self) -> None:
+        for row in self.rows:
+            if len(row) != len(self.header):
+                raise ValueError(f"a row of the table {self.key!r} has {len(row)} cells for {len(self.header)} columns")
+
+    @property
+    def titles(self) -> list[str]:
+        """The title of the group over each column, "" for none."""
+        return [title for title, span in self.groups for _ in range(span)] or [""] * len(self.header)
+
+    def is_text(self, column: int) -> bool:
+        """Return whether a column holds text and is therefore set flush left."""
+        return any(isinstance(row[column], str) and not isinstance(row[column], Numbers) for row in self.rows)
+
+
+@dataclass(frozen=True)
+class Section:
+    """Tables and sentences under one heading."""
+
+    title: str
+    tables: tuple[Table, ...] = ()
+    sentences: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Report:
+    """A report: sections, and the same figures as JSON values."""
+
+    title: str
+    sections: tuple[Section, ...]
+    data: Mapping[str, object] = field(default_factory=dict)
+
+    @property
+    def tables(self) -> list[Table]:
+        """The tables of all sections."""
+        return [table for section in self.sections for table in section.tables]
+
+
+def figure(value: float | None) -> str:
+    """Return a fraction as a percentage with one decimal."""
+    found = percent(value)
+    return NOT_APPLICABLE if found is None else f"{found:.1f}"
+
+
+def plain(cell: Cell) -> str:
+    """Return a cell that is no rate as text."""
+    return NOT_APPLICABLE if cell is None else str(cell)
+
+
+def bounds(rate: Rate) -> tuple[str, str] | None:
+    """Return the interval of a rate in per cent, None where it has none."""
+    interval = rate.interval if rate.trials else None
+    return None if interval is None else (figure(interval[0]), figure(interval[1]))
+
+
+def best_in_columns(rows: tuple[tuple[Cell, ...], ...]) -> frozenset[tuple[int, int]]:
+    """Return the cells that hold the highest rate of their column, all of them where they tie as printed."""
+    found = set()
+    for column in range(len(rows[0]) if rows else 0):
+        rates = {k: row[column] for k, row in enumerate(rows) if isinstance(row[column], Rate)}
+        printed = {k: percent(rate.value) for k, rate in rates.items() if isinstance(rate, Rate)}
+        known = [value for value in printed.values() if value is not None]
+        if len(printed) > 1 and known:
+            found |= {(k, column) for k, value in printed.items() if value == max(known)}
+    return frozenset(found)
+
+
+# Reports as GitHub's Markdown.
+
+
+def markdown(report: Report) -> str:
+    """Return a report as GitHub's Markdown."""
+    lines = [f"# {report.title}", ""]
+    for section in report.sections:
+        lines += markdown_section(section)
+    return "\n".join(lines).rstrip("\n") + "\n"
+
+
+def markdown_section(section: Section) -> list[str]:
+    """Return the lines of a section: heading, notes, sentences, tables."""
+    lines = [f"## {_escaped(section.title)}", ""] if section.title else []
+    for note in section.notes:
+        lines += [f"> {note}", ""]
+    for sentence in section.sentences:
+        lines += [_escaped(sentence), ""]
+    for table in section.tables:
+        lines += [f"### {_escaped(table.title)}", ""] if table.title else []
+        lines += [*markdown_table(table), ""]
+        lines += [table.note, ""] if table.note else []
+    return lines
+
+
+def markdown_table(table: Table) -> list[str]:
+    """Return the lines of a table in GitHub's Markdown."""
+    rule = "|".join("---" if table.is_text(column) else "---:" for column in range(len(table.header)))
+    lines = [_markdown_row(_header(table)), f"|{rule}|"]
+    for index, row in enumerate(table.rows):
+        cells = []
+        for column, cell in enumerate(row):
+            words = _markdown_cell(cell, table.intervals)
+            emphasised = (index in table.strong and isinstance(cell, str)) or (index, column) in table.best
+            cells.append(f"**{words}**" if emphasised and words else words)
+        lines.append(_markdown_row(cells))
+    return lines
+
+
+def _markdown_row(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def _markdown_cell(cell: Cell, intervals: bool) -> str:
+    if isinstance(cell, Rate):
+        interval = bounds(cell) if intervals else None
+        return figure(cell.value) + ("" if interval is None else f" [{interval[0]}, {interval[1]}]")
+    if isinstance(cell, Name):
+        return f"`{cell}`"
+    return _escaped(plain(cell))
+
+
+def _escaped(words: str) -> str:
+    return re.sub(r"([|*_`<>\\])", r"\\\1", words)
+
+
+def _header(table: Table) -> list[str]:
+    """Return the header with the groups' titles before the names."""
+    return [f"{title} {name}" if title else name for title, name in zip(table.titles, table.header, strict=True)]
+
+
+# Reports as LaTeX tables in the style of booktabs.
+
+_LATEX = {
+    "\\": r"\textbackslash{}",
+    "{": r"\{",
+    "}": r"\}",
+    "$": r"\$",
+    "&": r"\&",
+    "#": r"\#",
+    "%": r"\%",
+    "_": r"\_",
+    "^": r"\textasciicircum{}",
+    "~": r"\textasciitilde{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
+    '"': r"\textquotedbl{}",
+    "[": "{[}",  # after the end of a row it would be taken as an option, as would a star
+    "*": "{*}",
+    "–": "--",
+    "κ": r"$\kappa$",
+    "π": r"$\pi$",
+    "−": r"$-$",
+    "×": r"$\times$",
+    "±": r"$\pm$",
+    "≥": r"$\geq$",
+    "≤": r"$\leq$",
+    "…": r"\ldots{}",
+    "→": r"$\rightarrow$",
+    "’": "'",
+}
+
+
+def latex_text(words: str) -> str:
+    """Return text with every character that LaTeX would take as a command escaped."""
+    words = re.sub(r"π(\d(?:\.\d)?)", "\0\\1\0", words)  # the models π0 and π0.5, set with an index
+    escaped = "".join(_LATEX.get(character, character) for character in words)
+    return re.sub("\0(.*?)\0", r"$\\pi_{\1}$", escaped)
+
+
+def latex(report: Report) -> str:
+    """Return the report's tables as LaTeX, to be read by ``\\input``; the head says which packages they need."""
+    lines = [
+        f"% {' '.join(report.title.split())}, written by `memobench report`.",
+        r"% Needs \usepackage[T1]{fontenc}, \usepackage{booktabs} and \usepackage{graphicx}.",
+    ]
+    for section in report.sections:
+        if section.title:
+            lines += ["", f"% {' '.join(section.title.split())}"]
+        for table in section.tables:
+            lines += ["", *latex_table(table)]
+    return "\n".join(lines) + "\n"
+
+
+def latex_table(table: Table) -> list[str]:
+    """Return the lines of a table in the style of booktabs."""
+    columns = "".join("l" if table.is_text(column) else "r" for column in range(len(table.header)))
+    caption = ". ".join(part.rstrip(".") for part in (table.title, table.note) if part)
+    return [
+        r"\begin{table}",
+        r"\centering",
+        r"\small",
+        r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
+        rf"\begin{{tabular}}{{@{{}}{columns}@{{}}}}",
+        r"\toprule",
+        *(_latex_groups(table) if table.groups else []),
+        " & ".join(latex_text(name) for name in table.header) + r" \\",
+        r"\midrule",
+        *(line for index in range(len(table.rows)) for line in _latex_row(table, index)),
+        r"\bottomrule",
+        r"\end{tabular}}",
+        rf"\caption{{{latex_text(caption)}.}}",
+        rf"\label{{tab:{table.key}}}",
+        r"\end{table}",
+    ]
+
+
+def _latex_groups(table: Table) -> list[str]:
+    """Return the lines over the header: the groups' titles, and a rule under each."""
+    cells, rules, column = [], [], 1
+    for title, span in table.groups:
+        cells.append(rf"\multicolumn{{{span}}}{{c}}{{{latex_text(title)}}}" if title else " & " * (span - 1))
+        if title:
+            rules.append(rf"\cmidrule(lr){{{column}-{column + span - 1}}}")
+        column += span
+    return [" & ".join(cells) + r" \\", " ".join(rules)]
+
+
+def _latex_row(table: Table, index: int) -> list[str]:
+    """Return the line of a row, after a rule where one is drawn."""
+    cells = []
+    for column, cell in enumerate(table.rows[index]):
+        words = _latex_cell(cell, table.intervals)
+        strong = index in table.strong or (index, column) in table.best
+        cells.append(rf"\textbf{{{words}}}" if strong and words else words)
+    rule = [r"\midrule"] if index in table.rules else []
+    return [*rule, " & ".join(cells) + r" \\"]
+
+
+def _latex_cell(cell: Cell, intervals: bool) -> str:
+    if isinstance(cell, Rate):
+        interval = bounds(cell) if intervals else None
+        value = latex_text(figure(cell.value))
+        return value + ("" if interval is None else rf" {{\scriptsize [{interval[0]}, {interval[1]}]}}")
+    if isinstance(cell, Name):
+        return rf"\texttt{{{latex_text(cell)}}}"
+    return latex_text(plain(cell))
+
+
+# Reports as the terminal shows them, and the same as text for a file.
+
+WIDTH = 140
+"""Columns of a report that is written to a file."""
+
+MOST_COLUMNS = 15
+"""Columns of a table with groups that fit beside one another in a terminal."""
+
+
+def terminal(report: Report, headings: bool = True) -> RenderableType:
+    """Return a report for the terminal."""
+    parts: list[RenderableType] = []
+    for section in report.sections:
+        if headings and section.title:
+            parts.append(Text(f"\n{section.title}", style="bold underline"))
+        parts += [terminal_table(part) for table in section.tables for part in _in_parts(table)]
+        parts += [Text(sentence) for sentence in section.sentences]
+        parts += [Text(f"note: {note}") for note in section.notes]
+    return Group(*parts)
+
+
+def text(report: Report) -> str:
+    """Return what the terminal shows, as text for a file."""
+    out = io.StringIO()
+    Console(file=out, width=WIDTH, highlight=False, markup=False).print(terminal(report), crop=False)
+    return "\n".join(line.rstrip() for line in out.getvalue().splitlines()).strip("\n") + "\n"
+
+
+class Unbroken:
+    """A table in which no name is broken, however narrow the terminal is: to be printed with ``crop=False``.
+
+    In a terminal that is too narrow names stand on lines of their own, each over its row; a file has no edge.
+
+    Args:
+        table: not to be changed any more. column: that of the names.
+    """
+
+    def __init__(self, table: RichTable, column: int = 0) -> None:
+        self.table, self.column = table, column
+        names = table.columns[column]
+        names.no_wrap, names.overflow = True, "ignore"
+        widths = [Measurement.get(PLAIN, PLAIN.options, cell).maximum for cell in names.cells]
+        names.min_width = max(widths, default=1)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Render the table as it is where it fits."""
+        needed = Measurement.get(PLAIN, PLAIN.options, self.table)
+        if needed.minimum <= options.max_width:
+            yield self.table
+        elif not console.is_terminal:
+            yield from console.render(self.table, options.update(width=needed.maximum))
+        else:
+            yield from self._under_names(options.max_width)
+
+    def _under_names(self, room: int) -> RenderResult:
+        """Yield a row in two: what stands up to the name, and under it the rest."""
+        columns = self.table.columns
+        before, after = columns[: self.column + 1], columns[self.column + 1 :]
+        wished = [[Measurement.get(PLAIN, PLAIN.options, cell) for cell in (c.header, *c.cells)] for c in after]
+        least, most = ([max(one[end] for one in each) for each in wished] for end in (0, 1))
+        space = room - INDENT * len(after)
+        last = min(most[-1], space - sum(most[:-1]))  # text at the end of a row takes what is left
+        widths = [*most[:-1], last] if last >= least[-1] else least
+
+        def row(cells: Sequence[RenderableType], style: str = "") -> RichTable:
+            line = RichTable(box=None, show_header=False, padding=(0, 0, 0, INDENT))
+            for column, width in zip(after, widths, strict=True):
+                line.add_column(justify=column.justify, width=width, overflow="fold")
+            line.add_row(*cells, style=style)
+            return line
+
+        if self.table.title:
+            yield Text(str(self.table.title), style="italic")
+        yield row([column.header for column in after], "bold")
+        cells = [list(column.cells) for column in columns]
+        for k in range(self.table.row_count):
+            yield Text(" ", no_wrap=True, overflow="ignore").join(
+                cell if isinstance(cell, Text) else Text(str(cell))
+                for cell in (cells[c][k] for c in range(len(before)))
+            )
+            yield row([cells[c][k] for c in range(len(before), len(columns))])
+        if self.table.caption:
+            yield Text(str(self.table.caption))
+
+
+INDENT = 2
+
+PLAIN = Console(width=10_000, markup=False, highlight=False)
+"""What texts are measured with."""
+
+
+def terminal_table(table: Table) -> RichTable | Unbroken:
+    """Return a table for the terminal; an interval goes to a line of its own where it is narrow."""
+    result = RichTable(
+        title=table.title or None, title_justify="left", header_style="bold", pad_edge=False, box=box.SIMPLE_HEAD
+    )
+    for column, (title, name) in enumerate(zip(table.titles, table.header, strict=True)):
+        # Rates are so narrow that a group's whole title does not fit over them.
+        header = f"{title[:4]}.\n{name}" if title else name
+        result.add_column(header, justify="left" if table.is_text(column) else "right", overflow="fold")
+    for index in range(len(table.rows)):
+        if index in table.rules:
+            result.add_section()
+        result.add_row(*_terminal_row(table, index))
+    if table.best:
+        result.caption = "* best of its column"
+        result.caption_justify = "left"
+    named = next((k for k in range(len(table.header)) if any(isinstance(row[k], Name) for row in table.rows)), None)
+    return result if named is None else Unbroken(result, named)
+
+
+def _terminal_row(table: Table, index: int) -> list[Text]:
+    cells = []
+    for column, cell in enumerate(table.rows[index]):
+        best = (index, column) in table.best
+        style = "bold" if best or index in table.strong else ""
+        text = _terminal_cell(cell, table.intervals) + "*" * best
+        whole = isinstance(cell, Name)
+        cells.append(Text(text, style=style, no_wrap=whole or None, overflow="ignore" if whole else None))
+    return cells
+
+
+def _terminal_cell(cell: Cell, intervals: bool) -> str:
+    if isinstance(cell, Rate):
+        interval = bounds(cell) if intervals else None
+        return figure(cell.value) + ("" if interval is None else f" [{interval[0]}–{interval[1]}]")
+    return plain(cell)
+
+
+def _in_parts(table: Table) -> list[Table]:
+    """Cut a table with groups of columns into several that fit; each keeps the columns before the first group."""
+    leading = 0
+    for title, span in table.groups:
+        if title:
+            break
+        leading += span
+    parts: list[list[int]] = [[]]
+    column = leading
+    for _, span in [group for group in table.groups if group[0]]:
+        if parts[-1] and leading + len(parts[-1]) + span > MOST_COLUMNS:
+            parts.append([])
+        parts[-1] += range(column, column + span)
+        column += span
+    if len(parts) == 1:
+        return [table]
+    return [_columns(table, [*range(leading), *part], first=k == 0) for k, part in enumerate(parts)]
+
+
+def _columns(table: Table, chosen: Sequence[int], first: bool) -> Table:
+    """Return some columns of a table; the title is kept on the first part."""
+    return replace(
+        table,
+        title=table.title if first else f"{table.title}, continued",
+        header=tuple(table.header[column] for column in chosen),
+        rows=tuple(tuple(row[column] for column in chosen) for row in table.rows),
+        groups=tuple((table.titles[column], 1) for column in chosen),
+        best=frozenset((row, chosen.index(column)) for row, column in table.best if column in chosen),
+    )
+
+
+# What a report may be written as: the terminal's tables, text, Markdown, LaTeX, JSON; and rows as CSV.
+
+__all__ = ["WRITERS", "csv_text", "json_text", "latex", "markdown", "terminal", "text"]
+
+
+def json_text(report: Report) -> str:
+    """Return the figures of a report as JSON."""
+    return json.dumps(report.data, indent=2) + "\n"
+
+
+WRITERS: Mapping[str, Callable[[Report], str]] = {
+    "table": text,
+    "markdown": markdown,
+    "latex": latex,
+    "json": json_text,
+}
+"""Format -> what writes a report in it."""
+
+
+def csv_text(rows: Sequence[Sequence[object]], header: Sequence[str]) -> str:
+    """Return rows as CSV (RFC 4180, but lines end in a plain line feed); None is an empty field."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(["" if value is None else value for value in row] for row in rows)
+    return out.getvalue()

@@ -1,0 +1,424 @@
+"""The HTML report's builder: what the page is given, which videos it shows, what is written where."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import os
+import re
+import subprocess
+import sys
+from html import unescape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lerobot_memobench.cli.memobench import main
+from lerobot_memobench.envs.episode_log import write_episodes
+from lerobot_memobench.envs.video import OPERATION_COLOURS, VideoRecorder
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.html.data import page_data, read_runs, task_source
+from lerobot_memobench.evaluation.html.write import find_videos, frame_count, inline_json, page, write_html
+from lerobot_memobench.evaluation.records import folder_names
+from lerobot_memobench.tasks.catalogue import get_task, task_index
+
+STOVE = "turn_on_the_stove_and_turn_it_off"
+BUTTER = "put_the_butter_picked_up_in_the_prompt_video_on_the_plate"
+
+
+def record(task: str = STOVE, episode: int = 0, *, success: bool = True, **changes: Any) -> dict[str, Any]:
+    """A rollout of the stove's task (S, U): both checkpoints in order, or only the second one, too early."""
+    steps = [(6, 6), (12, 12)] if success else [(None, None), (9, None)]
+    return {
+        "task": task,
+        "memory_type": "temporal",
+        "episode": episode,
+        "seed": 7 + episode,
+        "referent": "fixed",
+        "variant": 0,
+        "replan_steps": None,
+        "prompt_steps": 0,
+        "steps": 12 if success else 20,
+        "success": success,
+        "checkpoints": [
+            {"operation": operation, "first_step": first, "ordered_step": ordered}
+            for operation, (first, ordered) in zip("SU", steps, strict=True)
+        ],
+        "failure": None if success else "storage_failure",
+        "scene_hash": "0123456789abcdef",
+        **changes,
+    }
+
+
+def evaluation(folder: Path, records: list[dict[str, Any]]) -> Path:
+    write_episodes(folder, records)
+    return folder
+
+
+def film(path: Path, frames: int) -> Path:
+    """A video of ``frames`` frames, the last one held for a second as the environment does it."""
+    strip = VideoRecorder(path)
+    for _ in range(frames):
+        strip.add(np.zeros((32, 48, 3), np.uint8))
+    strip.finish()
+    return path
+
+
+def content(text: str) -> dict[str, Any]:
+    """The data inside a page."""
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL)
+    assert found
+    return json.loads(found[1])
+
+
+# --- data ---
+
+
+def test_figures_are_those_of_the_report(tmp_path: Path) -> None:
+    evaluation(tmp_path, [record(episode=k, success=k > 0) for k in range(4)])
+    run = page_data(read_runs([tmp_path]), [{}], task_source(None))["runs"][0]
+    rates = run["tasks"][STOVE]["rates"]
+    assert rates["SR"] == [75.0, 30.1, 95.4, 4]  # Wilson, 3 of 4
+    assert rates["MSR"][0] == 75.0
+    assert rates["MUR"][0] == 100.0
+    assert rates["MCR"] is None
+    assert run["average"]["SR"] == run["memory_types"]["temporal"]["SR"] == rates["SR"]
+    assert [rate[0] for rate in run["tasks"][STOVE]["prefix"]] == [75.0, 75.0]
+    assert run["tasks"][STOVE]["outcomes"] == {
+        "success": 3,
+        "storage_failure": 1,
+        "stale_memory": 0,
+        "compression_collapse": 0,
+        "reference_drift": 0,
+        "execution_failure": 0,
+    }
+    assert run["facts"] == [
+        "4 rollouts",
+        "1 task",
+        "seeds 7 to 10",
+        "referent fixed",
+        "policy inputs: not recorded",
+    ]
+    assert run["commands"] == []
+
+
+def test_a_result_card_tells_policy_horizon_and_command(tmp_path: Path) -> None:
+    evaluation(tmp_path, [record()])
+    command = ["lerobot", "eval", "env=memobench", "output_dir=a folder"]
+    card = {"protocol": {"horizon": 200}, "policy": {"type": "memobench_random"}, "runs": [{"command": command}]}
+    (tmp_path / "card.json").write_text(json.dumps(card))
+    run = page_data(read_runs([tmp_path]), [{}], {})["runs"][0]
+    assert run["facts"][0] == "policy memobench_random"
+    assert run["facts"][-1] == "horizon 200"
+    assert run["commands"] == ["lerobot eval env=memobench 'output_dir=a folder'"]
+
+
+def test_rollouts_carry_what_the_timeline_needs(tmp_path: Path) -> None:
+    evaluation(tmp_path, [record(success=False, prompt_steps=5)])
+    (episode,) = page_data(read_runs([tmp_path]), [{0: "videos/a.mp4"}], {})["runs"][0]["episodes"]
+    assert (episode["prompt"], episode["steps"], episode["outcome"]) == (5, 20, "storage_failure")
+    assert episode["checkpoints"] == [["S", None, None], ["U", 9, None]]
+    assert episode["video"] == "videos/a.mp4"
+
+
+def test_what_broke_a_rollout_off_is_told(tmp_path: Path) -> None:
+    evaluation(
+        tmp_path, [record(success=False, failure="unstable_physics", fault="the physics broke down"), record(episode=1)]
+    )
+    data = page_data(read_runs([tmp_path]), [{}], task_source(None))
+    found = [(episode["outcome"], episode["fault"]) for episode in data["runs"][0]["episodes"]]
+    assert found[0] == ("unstable_physics", "the physics broke down")
+    assert found[1][1] is None
+    assert data["failures"][-1] == "unstable_physics"
+    assert "the physics broke down" in data["runs"][0]["notes"][0]
+
+
+def test_texts_are_the_tasks_own(tmp_path: Path) -> None:
+    evaluation(tmp_path, [record(), record("task_of_mine")])
+    data = page_data(read_runs([tmp_path]), [{}], task_source(None))
+    stove = data["tasks"][STOVE]
+    assert stove["language"] == get_task(STOVE).language
+    assert stove["variants"]["0"]["checkpoints"][1]["texts"] == list(get_task(STOVE).checkpoints[1].language)
+    assert data["tasks"]["task_of_mine"] == {"memory_type": "temporal", "language": "task of mine", "variants": {}}
+    assert data["operations"]["U"]["colour"] == "#{:02x}{:02x}{:02x}".format(*OPERATION_COLOURS["U"])
+
+
+def test_a_random_referent_has_its_own_texts(tmp_path: Path) -> None:
+    changes = {"memory_type": "object", "referent": "random", "checkpoints": record()["checkpoints"][:1]}
+    evaluation(tmp_path, [record(BUTTER, 0, variant=2, **changes)])
+    data = page_data(read_runs([tmp_path]), [{}], task_source(None))
+    assert list(data["tasks"][BUTTER]["variants"]) == ["2"]
+    texts = data["tasks"][BUTTER]["variants"]["2"]["checkpoints"][0]["texts"]
+    assert texts == list(get_task(BUTTER).variant(2).checkpoints[0].language)
+    assert data["runs"][0]["episodes"][0]["id"] == f"{BUTTER}.0.random"
+
+
+def test_texts_of_another_version_of_a_task_are_not_shown(tmp_path: Path) -> None:
+    evaluation(tmp_path, [record(checkpoints=record()["checkpoints"] * 2)])
+    assert page_data(read_runs([tmp_path]), [{}], task_source(None))["tasks"][STOVE]["variants"] == {}
+
+
+def test_a_folder_in_the_published_format_brings_its_texts(tmp_path: Path) -> None:
+    folder = get_task(STOVE).folder
+    mine = tmp_path / "tasks" / "task_of_mine"
+    mine.mkdir(parents=True)
+    for file in folder.iterdir():
+        (mine / file.name).write_bytes(file.read_bytes())
+    assert task_source(tmp_path / "tasks")["task_of_mine"].language == get_task(STOVE).language
+
+
+@pytest.mark.parametrize(
+    ("folders", "names"),
+    [(["/a/expert", "/a/random"], ["expert", "random"]), (["/a/x/eval", "/a/y/eval"], ["x/eval", "y/eval"])],
+)
+def test_runs_are_named_after_what_tells_them_apart(folders: list[str], names: list[str]) -> None:
+    assert folder_names(folders) == names
+
+
+def test_an_evaluation_is_given_once(tmp_path: Path) -> None:
+    with pytest.raises(MemobenchError, match="given twice"):
+        folder_names([tmp_path, tmp_path / "." / "x" / ".."])
+
+
+# --- page ---
+
+
+def test_text_cannot_leave_the_data() -> None:
+    nasty = {"a": "</script><script>alert(1)</script><!-- & \u2028 {{script}}"}
+    text = inline_json(nasty)
+    assert "<" not in text
+    assert json.loads(text) == nasty
+    data = {"version": "1", **nasty}
+    whole = page(data, title="<b>&\"'")
+    assert content(whole) == data
+    assert "<title>&lt;b&gt;&amp;&quot;&#x27; · MEMOBench</title>" in whole
+
+
+def test_only_the_pages_own_script_and_style_may_run() -> None:
+    text = page({"version": "1"}, title="t")
+    policy = unescape(re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1])  # type: ignore[index]
+    assert policy.startswith("default-src 'none';")
+    assert "unsafe" not in policy
+    for element, kind in ((r"<script>(.*)</script>", "script-src"), (r"<style>(.*?)</style>", "style-src")):
+        body = re.search(element, text, re.DOTALL)[1]  # type: ignore[index]
+        digest = base64.b64encode(hashlib.sha256(body.encode()).digest()).decode()
+        assert f"{kind} 'sha256-{digest}'" in policy
+    assert not re.search(r"https?://(?!www\.w3\.org/2000/svg)", text)
+
+
+# --- videos ---
+
+
+def test_a_film_belongs_to_the_rollout_that_is_as_long(tmp_path: Path) -> None:
+    evaluation(tmp_path, [record(episode=0), record(episode=1), record(episode=2, prompt_steps=4)])
+    videos = tmp_path / "videos"
+    film(videos / f"{STOVE}.0.mp4", 13)  # a frame at the start and one per step
+    film(videos / f"{STOVE}.1.mp4", 12)
+    film(videos / f"{STOVE}.2.mp4", 17)
+    (run,) = read_runs([tmp_path])
+    found, notes = find_videos(tmp_path, run.records)
+    assert found == {0: videos / f"{STOVE}.0.mp4", 2: videos / f"{STOVE}.2.mp4"}
+    assert len(notes) == 1
+    assert f"{STOVE}.1.mp4" in notes[0]
+
+
+def test_a_torn_film_is_no_video(tmp_path: Path) -> None:
+    torn = tmp_path / "a.mp4"
+    torn.write_bytes(film(tmp_path / "b.mp4", 5).read_bytes()[:200])
+    assert frame_count(torn) is None
+    assert frame_count(tmp_path / "b.mp4") == 25
+
+
+def test_a_film_that_could_be_of_two_rollouts_is_shown_with_neither(tmp_path: Path) -> None:
+    film(tmp_path / "videos" / f"{STOVE}.0.mp4", 13)
+    found, notes = find_videos(tmp_path, [record(), record(referent="random")])
+    assert found == {}
+    assert notes
+
+
+def test_lerobots_own_videos_serve_where_nothing_was_filmed(tmp_path: Path) -> None:
+    group = tmp_path / "videos" / f"temporal_{task_index(STOVE)}"
+    records = [record(episode=k, success=k == 1) for k in range(2)]
+    successes = [False, True]
+    for k, frames in enumerate((20, 12)):  # LeRobot leaves the last frame out
+        write_frames(group / f"eval_episode_{k}.mp4", frames)
+
+    def info(successes: list[bool]) -> None:
+        entry = {"task_group": "temporal", "task_id": task_index(STOVE), "metrics": {"successes": successes}}
+        (tmp_path / "eval_info.json").write_text(json.dumps({"per_task": [entry]}))
+
+    info(successes)
+    found, notes = find_videos(tmp_path, records)
+    assert found == {k: group / f"eval_episode_{k}.mp4" for k in range(2)}
+    assert not notes
+    info(successes[1:])  # a resumed run: LeRobot's first video is not of the first rollout
+    assert find_videos(tmp_path, records)[0] == {}
+
+
+def test_a_memory_type_that_is_a_path_leads_nowhere(tmp_path: Path) -> None:
+    """LeRobot's record of a run and our log agree on a group that is a path to somebody else's video."""
+    (tmp_path / "run" / "videos").mkdir(parents=True)
+    group = "../../outside/temporal"
+    write_frames(tmp_path / "outside" / f"temporal_{task_index(STOVE)}" / "eval_episode_0.mp4", 12)
+    entry = {"task_group": group, "task_id": task_index(STOVE), "metrics": {"successes": [True]}}
+    (tmp_path / "run" / "eval_info.json").write_text(json.dumps({"per_task": [entry]}))
+    assert find_videos(tmp_path / "run", [record(memory_type=group)]) == ({}, [])
+
+
+def write_frames(path: Path, count: int) -> None:
+    import av
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=20)
+        stream.width, stream.height, stream.pix_fmt = 48, 32, "yuv420p"
+        for _ in range(count):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((32, 48, 3), np.uint8), "rgb24")))
+        container.mux(stream.encode())
+
+
+def test_a_referent_that_is_a_path_leads_nowhere(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    evaluation(run, [record(referent="x/../../../outside")])
+    film(run / "videos" / f"{STOVE}.0.mp4", 13)
+    assert write_html([run], tmp_path / "out").videos == 0
+    assert not list(tmp_path.rglob("outside*"))
+
+
+@pytest.mark.parametrize("name", ["../outside", "/outside", "a\nb", "a/b"])
+def test_a_task_that_is_a_path_leads_nowhere(tmp_path: Path, name: str) -> None:
+    run = tmp_path / "run"
+    evaluation(run, [record(name)])
+    film(run / "outside.0.mp4", 13)
+    (run / "videos" / "a").mkdir(parents=True)
+    film(run / "videos" / "a" / "b.0.mp4", 13)
+    assert write_html([run], tmp_path / "out").videos == 0
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["index.html"]
+
+
+# --- the folder ---
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    folder = evaluation(tmp_path / "run", [record(episode=k) for k in range(2)])
+    film(folder / "videos" / f"{STOVE}.0.mp4", 13)
+    return folder
+
+
+def test_the_folder_holds_page_and_videos(run: Path, tmp_path: Path) -> None:
+    written = write_html([run], tmp_path / "out")
+    assert (written.rollouts, written.videos) == (2, 1)
+    video = tmp_path / "out" / "videos" / "run" / f"{STOVE}.0.mp4"
+    assert video.samefile(run / "videos" / f"{STOVE}.0.mp4")  # a hard link costs no space
+    episodes = content(written.page.read_text())["runs"][0]["episodes"]
+    assert [episode["video"] for episode in episodes] == [f"videos/run/{STOVE}.0.mp4", None]
+    assert not list((tmp_path / "out").rglob("*.part*"))
+
+
+def test_videos_are_copied_where_links_are_not_possible(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: Any) -> None:
+        raise OSError("another file system")
+
+    monkeypatch.setattr(os, "link", refuse)
+    write_html([run], tmp_path / "out")
+    source, copy = run / "videos" / f"{STOVE}.0.mp4", tmp_path / "out" / "videos" / "run" / f"{STOVE}.0.mp4"
+    assert copy.read_bytes() == source.read_bytes()
+    assert not copy.samefile(source)
+    before = copy.stat().st_ino
+    write_html([run], tmp_path / "out")
+    assert copy.stat().st_ino == before  # what is there is not copied again
+
+
+def test_links_on_request(run: Path, tmp_path: Path) -> None:
+    write_html([run], tmp_path / "out", link=True)
+    video = tmp_path / "out" / "videos" / "run" / f"{STOVE}.0.mp4"
+    assert video.is_symlink()
+    assert video.resolve() == run / "videos" / f"{STOVE}.0.mp4"
+    write_html([run], tmp_path / "out")
+    assert not video.is_symlink()
+
+
+def test_an_earlier_report_is_replaced(run: Path, tmp_path: Path) -> None:
+    write_html([run], tmp_path / "out")
+    other = evaluation(tmp_path / "other", [record(episode=5)])
+    write_html([other], tmp_path / "out")
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["index.html"]
+    assert (run / "videos" / f"{STOVE}.0.mp4").is_file()
+
+
+def test_an_unfinished_report_can_be_made_again(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    module = sys.modules[write_html.__module__]
+    place = module.place_videos  # type: ignore[attr-defined]
+
+    def killed(*arguments: Any) -> None:
+        place(*arguments)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, "place_videos", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_html([run], tmp_path / "out")
+    monkeypatch.undo()
+    assert "was not finished" in (tmp_path / "out" / "index.html").read_text()
+    assert write_html([run], tmp_path / "out").videos == 1
+    assert content((tmp_path / "out" / "index.html").read_text())["runs"]
+
+
+@pytest.mark.parametrize("name", ["index.html", "notes.txt"])
+def test_other_peoples_files_are_left_alone(run: Path, tmp_path: Path, name: str) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / name).write_text("mine")
+    with pytest.raises(MemobenchError, match="no earlier report"):
+        write_html([run], tmp_path / "out")
+    assert (tmp_path / "out" / name).read_text() == "mine"
+    with pytest.raises(MemobenchError, match="is a file"):
+        write_html([run], tmp_path / "out" / name)
+
+
+def test_runs_of_like_names_keep_their_videos_apart(run: Path, tmp_path: Path) -> None:
+    other = evaluation(tmp_path / "Run", [record()])
+    film(other / "videos" / f"{STOVE}.0.mp4", 13)
+    write_html([run, other], tmp_path / "out")
+    data = content((tmp_path / "out" / "index.html").read_text())
+    videos = [run["episodes"][0]["video"] for run in data["runs"]]
+    assert len({video.lower() for video in videos}) == 2
+    assert all((tmp_path / "out" / video).is_file() for video in videos)
+
+
+# --- the command ---
+
+
+def test_the_command(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["html", str(run), "--out", str(tmp_path / "out")]) == 0
+    assert "2 episodes, 1 with a video" in capsys.readouterr().out
+    assert main(["html", str(tmp_path), "--out", str(tmp_path / "other")]) == 2
+    assert "holds no episode log" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()
+
+
+def test_setup_looks_for_the_browsers_that_the_tests_use() -> None:
+    folder = Path(__file__)
+    script = (folder.parents[2] / "scripts" / "setup").read_text()
+    names = re.search(r"^NAMES = \((.*)\)$", (folder.parents[1] / "support" / "browser.py").read_text(), re.MULTILINE)
+    assert names
+    assert f"for name in {' '.join(re.findall('[a-z-]+', names[1]))}; do" in script
+
+
+def test_the_wheel_holds_the_template(tmp_path: Path) -> None:
+    import zipfile
+
+    root = Path(__file__).parents[2]
+    command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
+    subprocess.run(command, cwd=root, check=True, capture_output=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    names = set(zipfile.ZipFile(wheel).namelist())
+    folder = root / "src" / "lerobot_memobench" / "evaluation" / "html"
+    files = {path.relative_to(root / "src").as_posix() for path in folder.rglob("*") if path.suffix != ".pyc"}
+    wanted = {name for name in files if Path(name).suffix}
+    assert len(wanted) > 10
+    assert wanted <= names

@@ -1,0 +1,465 @@
+"""The HTML report in headless Chromium: what a person does with it, by real clicks and keys.
+
+The videos are made so that every frame says its number: its grey is 16 + 4 · k. A screenshot then tells which frame the
+browser really shows.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lerobot_memobench.envs.episode_log import write_episodes
+from lerobot_memobench.envs.video import OPERATION_COLOURS, VideoRecorder
+from lerobot_memobench.evaluation.html.write import write_html
+from lerobot_memobench.tasks.catalogue import get_task
+from tests.support import browser as chromium
+
+STOVE = "turn_on_the_stove_and_turn_it_off"
+DRAWER = "check_the_top_drawer_of_the_cabinet"
+BUTTER = "put_the_butter_picked_up_in_the_prompt_video_on_the_plate"
+NASTY = "</script><img src=x onerror=alert(1)><b>"
+FPS = 20
+
+
+pytestmark = pytest.mark.skipif(
+    chromium.find_chromium() is None,
+    reason="no Chromium is here; `make test` installs it where it may, else ask for: apt-get install chromium",
+)
+
+
+def rollout(task: str, episode: int, marks: list[tuple[str, int | None, int | None]], **changes: Any) -> dict[str, Any]:
+    return {
+        "task": task,
+        "memory_type": "temporal",
+        "episode": episode,
+        "seed": 7 + episode,
+        "referent": "fixed",
+        "variant": 0,
+        "prompt_steps": 0,
+        "steps": 40,
+        "success": changes.get("failure") is None,
+        "checkpoints": [{"operation": o, "first_step": first, "ordered_step": ordered} for o, first, ordered in marks],
+        "failure": None,
+        "scene_hash": "0123456789abcdef",
+        **changes,
+    }
+
+
+RECORDS = [
+    rollout(STOVE, 0, [("S", 10, 10), ("U", 4, 30)]),
+    rollout(STOVE, 1, [("S", None, None), ("U", 25, None)], failure="storage_failure"),
+    rollout(STOVE, 2, [("S", 10, 10), ("U", None, None)], failure="stale_memory"),
+    rollout(DRAWER, 0, [("S", 40, 40)]),
+    rollout(BUTTER, 0, [("S", 20, 20)], memory_type="object", prompt_steps=15, steps=20),
+    rollout(BUTTER, 1, [("S", None, None)], memory_type="object", prompt_steps=15, failure="reference_drift"),
+    rollout(NASTY, 0, [("C", 40, 40)], memory_type="procedural"),
+]
+
+
+def film(path: Path, frames: int) -> None:
+    strip = VideoRecorder(path)
+    for k in range(frames):
+        strip.add(np.full((80, 128, 3), 16 + 4 * k, np.uint8))
+    strip.finish()
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two runs: `mine` with films of the first stove and butter rollouts, `other` without any."""
+    root = tmp_path_factory.mktemp("report with spaces & #signs")
+    write_episodes(root / "mine", RECORDS)
+    film(root / "mine" / "videos" / f"{STOVE}.0.mp4", 41)
+    film(root / "mine" / "videos" / f"{BUTTER}.0.mp4", 36)
+    write_episodes(
+        root / "other", [rollout(STOVE, 0, [("S", None, None), ("U", None, None)], failure="storage_failure")]
+    )
+    written = write_html([root / "mine", root / "other"], root / "made")
+    assert written.videos == 2
+    (root / "made").rename(root / "moved")  # nothing in it may depend on where it was made
+    return root / "moved" / "index.html"
+
+
+@pytest.fixture(scope="module")
+def chrome(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    browser = chromium.Browser(tmp_path_factory.mktemp("chromium") / "profile")
+    yield browser
+    browser.close()
+
+
+@pytest.fixture
+def browser(chrome: Any) -> Iterator[Any]:
+    """The browser, which must have nothing to complain about and have asked for nothing but the report's own files."""
+    chrome.resize(1280, 900)
+    chrome.colours("light")
+    yield chrome
+    assert chrome.errors == []
+    strangers = [address for address in chrome.requests if not address.startswith(("file://", "data:"))]
+    assert strangers == []
+
+
+def show(browser: Any, report: Path, address: str = "") -> None:
+    browser.open(f"{report.as_uri()}#{address}")
+
+
+def shown_frame(browser: Any) -> int:
+    """The number of the frame on the screen, read off its grey."""
+    from PIL import Image
+
+    box = browser.box("video")
+    picture = Image.open(browser.screenshot(Path(browser._log.name).with_suffix(".png")))
+    grey = picture.convert("L").getpixel((int(box["x"] + box["width"] / 2), int(box["y"] + box["height"] / 2)))
+    return round((grey - 16) / 4)
+
+
+def settle(browser: Any) -> None:
+    """Wait until a seek has arrived on the screen: two frames of the browser after the video says so."""
+    browser.wait("!document.querySelector('video').seeking")
+    browser.js("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+
+
+def playhead(browser: Any) -> int:
+    return int(browser.js("document.querySelector('[role=slider]').getAttribute('aria-valuenow')"))
+
+
+def ready(browser: Any) -> None:
+    browser.wait("document.querySelector('video')?.readyState >= 2")
+
+
+def place(frame: int, end: int = 40) -> float:
+    return frame / end
+
+
+# --- overview ---
+
+
+def test_the_overview_shows_rates_outcomes_and_tasks(browser: Any, report: Path) -> None:
+    show(browser, report)
+    rows = [" ".join(row.split()) for row in browser.texts(".columns table.rates tbody tr")]
+    assert rows[0].startswith("Average mine 7")
+    assert any(row.startswith("Temporal mine 4 66.7") for row in rows)  # the mean of 1 of 3 and 1 of 1, not 2 of 4
+    assert browser.texts("#overview h2") == ["mine"]
+    assert browser.texts("#overview .key li")[:2] == ["✓\nsuccess\n4", "S\nstorage failure\n1"]
+    chips = browser.texts(".tasks tbody tr:nth-child(2) .chip")
+    assert [chip.split()[-1] for chip in chips] == ["67", "33"]
+
+
+def test_operations_have_the_colours_of_the_videos(browser: Any, report: Path) -> None:
+    show(browser, report)
+    for operation, colour in OPERATION_COLOURS.items():
+        fill = browser.js(f"getComputedStyle(document.querySelector('.shape.op-{operation}')).fill")
+        assert fill == "rgb({}, {}, {})".format(*colour)
+
+
+def test_a_part_of_a_bar_leads_to_its_rollouts(browser: Any, report: Path) -> None:
+    show(browser, report)
+    browser.click(".endings .part.is-stale_memory")
+    browser.wait("!document.querySelector('#episodes').hidden")
+    assert browser.texts("#count") == ["1 of 7 episodes, 0 succeeded"]
+    assert "outcome=stale_memory" in browser.js("location.hash")
+    browser.js("history.back()")
+    browser.wait("!document.querySelector('#overview').hidden")
+
+
+def test_names_are_shown_and_not_run(browser: Any, report: Path) -> None:
+    show(browser, report, "view=episodes&type=procedural")
+    assert browser.texts("#detail h2") == [NASTY.replace("_", " ")]
+    assert browser.js("document.querySelectorAll('img, #detail b b').length") == 0
+
+
+# --- video and timeline ---
+
+
+def test_a_click_on_the_timeline_seeks_the_video(browser: Any, report: Path) -> None:
+    show(browser, report, f"view=episodes&ep={STOVE}.0")
+    ready(browser)
+    assert playhead(browser) == 0
+    for frame in (23, 7, 40):
+        browser.click(".timeline .axis", across=min(place(frame), 0.999))
+        settle(browser)
+        assert playhead(browser) == frame
+        assert browser.js("document.querySelector('video').currentTime") == pytest.approx((frame + 0.5) / FPS)
+        assert shown_frame(browser) == frame
+
+
+def test_the_playhead_follows_a_drag(browser: Any, report: Path) -> None:
+    show(browser, report, f"view=episodes&ep={STOVE}.0")
+    ready(browser)
+    browser.drag(".lane.checkpoint .track", place(30), place(12))
+    settle(browser)
+    assert playhead(browser) == 12
+    assert browser.js("document.querySelector('video').currentTime") == pytest.approx(12.5 / FPS)
+
+
+def test_the_playhead_moves_with_the_video(browser: Any, report: Path) -> None:
+    show(browser, report, f"view=episodes&ep={STOVE}.0")
+    ready(browser)
+    browser.click(".play")
+    browser.wait("Number(document.querySelector('[role=slider]').getAttribute('aria-valuenow')) > 3")
+    browser.click(".play")
+    browser.wait("document.querySelector('video').paused")
+    time = browser.js("document.querySelector('video').currentTime")
+    assert abs(playhead(browser) - time * FPS) <= 2
+    at = browser.js("getComputedStyle(document.querySelector('.timeline')).getPropertyValue('--at')")
+    assert float(at.rstrip("%")) == pytest.approx(100 * playhead(browser) / 40)
+
+
+def test_marks_show_first_and_ordered_steps(browser: Any, report: Path) -> None:
+    show(browser, report, f"view=episodes&ep={STOVE}.0")
+    ready(browser)
+    fills = "[...document.querySelectorAll('.lane.checkpoint .mark')].map((m) => [Number(m.dataset.frame), "
+    fills += "m.querySelector('.shape').classList.contains('full')])"
+    assert browser.js(fills) == [[10, True], [4, False], [30, True]]
+    browser.click('.mark[data-frame="4"]')
+    settle(browser)
+    assert playhead(browser) == 4
+    assert shown_frame(browser) == 4
+
+
+def test_the_subgoal_changes_at_each_ordered_step(browser: Any, report: Path) -> None:
+    show(browser, report, f"view=episodes&ep={STOVE}.0")
+    ready(browser)
+    first, second = (checkpoint.language for checkpoint in get_task(STOVE).checkpoints)
+    seen = {}
+    for frame in (9, 10, 29, 30, 40):
+        browser.js("document.querySelector('[role=slider]').focus()")
+        browser.key("Home")
+        for _ in range(frame // 20):
+            browser.key("PageDown")
+        for _ in range(frame % 20):
+            browser.key("ArrowRight")
+        assert playhead(browser) == frame
+        seen[frame] = browser.texts("p.now")[0].split("\n")[-1]
+    assert first[1] in seen[9]
+    assert second[1] in seen[10]
+    assert second[1] in seen[29]
+    assert "every checkpoint is complete" in seen[30]
+    assert seen[40].endswith("done")
+    browser.choose("#level", "fine")
+    browser.wait(f"document.querySelector('.lane.checkpoint .words').textContent === {json.dumps(first[2])}")
+    assert browser.js("location.hash.includes('level=fine')")
+    browser.js("document.querySelector('[role=slider]').focus()")
+    browser.key("Home")
+    assert playhead(browser) == 0
+    assert browser.texts("p.now")[0].endswith(first[2])
+
+
+def test_prompt_and_failure_are_on_the_timeline(browser: Any, report: Path) -> None:
+    show(browser, report, f"view=episodes&ep={BUTTER}.0")
+    ready(browser)
+    widths = browser.js("[...document.querySelectorAll('.phases .span')].map((s) => s.style.width)")
+    assert [float(width.rstrip("%")) for width in widths] == pytest.approx([100 * 15 / 35, 100 * 20 / 35])
+    assert browser.texts("p.now") == ["watch the prompt"]
+    browser.click(".timeline .axis", across=15 / 35)
+    settle(browser)
+    assert shown_frame(browser) == 15
+    assert browser.texts("p.now")[0].endswith(get_task(BUTTER).checkpoints[0].language[1])
+    show(browser, report, f"view=episodes&ep={BUTTER}.1")
+    assert "never held: reference drift" in browser.js(
+        "document.querySelector('.cause.is-reference_drift').dataset.tip"
+    )
+
+
+def test_hover_and_focus_tell_the_texts_of_all_levels(browser: Any, report: Path) -> None:
+    show(browser, report, f"view=episodes&ep={STOVE}.0")
+    box = browser.box(".span.active")
+    browser.mouse("mouseMoved", box["x"] + box["width"] / 3, box["y"] + box["height"] / 2)
+    browser.wait("!document.querySelector('#tip').hidden")
+    (tip,) = browser.texts("#tip")
+    assert all(text in tip for text in get_task(STOVE).checkpoints[0].language)
+    browser.js("document.querySelector('.cause, .ending').focus()")
+    assert "Success at step 40" in browser.texts("#tip")[0]
+
+
+def test_without_a_video_the_timeline_still_works(browser: Any, report: Path) -> None:
+    show(browser, report, f"view=episodes&ep={STOVE}.2")
+    assert browser.texts(".stage [role=status]") == ["There is no video of this episode."]
+    browser.click(".timeline .axis", across=place(25))
+    assert playhead(browser) == 25
+    assert browser.js("document.querySelector('.stage .asked') !== null")
+
+
+def test_a_video_that_is_gone_is_named(chrome: Any, report: Path, tmp_path: Path) -> None:
+    (tmp_path / "index.html").write_text(report.read_text())
+    show(chrome, tmp_path / "index.html", f"view=episodes&ep={STOVE}.0")
+    chrome.wait("!document.querySelector('.stage .notice').hidden")
+    assert "cannot play" in chrome.texts(".stage .notice")[0]
+    assert "ERR_FILE_NOT_FOUND" in "".join(chrome.errors)
+    chrome.errors.clear()
+
+
+# --- finding ---
+
+
+@pytest.mark.parametrize(
+    ("filters", "found"),
+    [
+        ({"#type": "object"}, 2),
+        ({"#task": STOVE}, 3),
+        ({"#op": "U"}, 3),
+        ({"#op": "missed-U"}, 1),
+        ({"#op": "C"}, 1),
+        ({"#outcome": "failed"}, 3),
+        ({"#outcome": "storage_failure"}, 1),
+        ({"#outcome": "no-video"}, 5),
+        ({"#task": STOVE, "#outcome": "success"}, 1),
+        ({"#type": "object", "#op": "U"}, 0),
+    ],
+)
+def test_filters(browser: Any, report: Path, filters: dict[str, str], found: int) -> None:
+    show(browser, report, "view=episodes")
+    for selector, value in filters.items():
+        browser.choose(selector, value)
+    browser.wait(f"document.querySelector('#count').innerText.startsWith('{found} of 7')")
+    assert len(browser.texts("#list .row")) == found
+    address = browser.js("location.hash")
+    show(browser, report, address[1:])
+    assert browser.js("location.hash") == address
+    assert len(browser.texts("#list .row")) == found
+    assert all(browser.js(f"document.querySelector('{s}').value") == value for s, value in filters.items())
+    browser.click("#clear")
+    browser.wait("document.querySelector('#count').innerText.startsWith('7 of 7')")
+
+
+@pytest.mark.parametrize(("words", "found"), [("stove", 3), ("SEED 8", 2), ("butter drift", 1), ("zebra", 0)])
+def test_search(browser: Any, report: Path, words: str, found: int) -> None:
+    show(browser, report, "view=episodes")
+    browser.key("/")
+    assert browser.js("document.activeElement.id") == "q"
+    browser.write("#q", words)
+    browser.wait(f"document.querySelector('#count').innerText.startsWith('{found} of 7')")
+    if not found:
+        assert browser.texts("#detail") == ["No episode is selected."]
+
+
+def test_keys_go_through_the_episodes(browser: Any, report: Path) -> None:
+    show(browser, report, "view=episodes")
+    order = browser.js("[...document.querySelectorAll('.row')].map((row) => row.dataset.id)")
+    assert order[:2] == [f"{DRAWER}.0", f"{STOVE}.0"]
+    for key, place in (("j", 1), ("j", 2), ("k", 1)):
+        browser.key(key)
+        browser.wait(f"document.querySelector('.row[aria-current]').dataset.id === '{order[place]}'")
+    ready(browser)
+    browser.key("ArrowRight")
+    browser.key("ArrowRight", modifiers=8)
+    assert playhead(browser) == 21
+    browser.key("[")
+    assert playhead(browser) == 10
+    browser.key("]")
+    assert playhead(browser) == 30
+    browser.key(" ")
+    browser.wait("!document.querySelector('video').paused")
+    browser.key("o")
+    browser.wait("!document.querySelector('#overview').hidden")
+    browser.key("?")
+    assert browser.js("document.querySelector('dialog').open")
+    browser.key("Escape")
+    browser.wait("!document.querySelector('dialog').open")
+
+
+def test_another_run_keeps_the_episode(browser: Any, report: Path) -> None:
+    show(browser, report, f"view=episodes&ep={STOVE}.0")
+    browser.click(".others a")
+    browser.wait("document.querySelector('#detail .facts b').innerText === 'Storage failure'")
+    assert browser.js("location.hash.includes('run=other')")
+    assert browser.texts("#count") == ["1 of 1 episode, 0 succeeded"]
+    browser.choose("#run", "mine")
+    browser.wait("document.querySelector('#detail .facts b').innerText === 'Success'")
+
+
+def test_1500_episodes_are_added_to_the_list_as_they_are_needed(browser: Any, tmp_path: Path) -> None:
+    records = [rollout(STOVE, k, [("S", 10, 10), ("U", 30, 30)]) for k in range(1500)]
+    write_episodes(tmp_path / "run", records)
+    write_html([tmp_path / "run"], tmp_path / "out")
+    page = tmp_path / "out" / "index.html"
+    show(browser, page, "view=episodes")
+    assert browser.texts("#count") == ["1500 of 1500 episodes, 1500 succeeded"]
+    rows = "document.querySelectorAll('#list .row').length"
+    before = browser.js(rows)
+    assert before < 200
+    browser.js("document.querySelector('#list').scrollTo(0, 1e9)")
+    browser.wait(f"{rows} > {before}")
+    show(browser, page, f"view=episodes&ep={STOVE}.1499")
+    assert browser.js("document.querySelector('.row[aria-current]').dataset.id") == f"{STOVE}.1499"
+    box = browser.js("document.querySelector('.row[aria-current]').getBoundingClientRect().toJSON()")
+    assert 0 < box["top"] < 900
+
+
+# --- for everybody ---
+
+
+@pytest.mark.parametrize("address", ["", f"view=episodes&ep={STOVE}.0", f"view=episodes&ep={STOVE}.1"])
+def test_whatever_can_be_used_has_a_name(browser: Any, report: Path, address: str) -> None:
+    show(browser, report, address)
+    nodes = browser.call("Accessibility.getFullAXTree")["nodes"]
+    used = [
+        (node["role"]["value"], node.get("name", {}).get("value", ""))
+        for node in nodes
+        if node.get("role", {}).get("value") in ("button", "link", "combobox", "searchbox", "slider", "image", "Video")
+    ]
+    assert len(used) > 10
+    assert [role for role, name in used if not name.strip()] == []
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("address", ["", f"view=episodes&ep={STOVE}.1"])
+def test_text_stands_out_from_its_ground(browser: Any, report: Path, scheme: str, address: str) -> None:
+    """WCAG AA: contrast of 4.5 for every text, computed from the colours the browser paints."""
+    browser.colours(scheme)
+    show(browser, report, address)
+    weak = browser.js(CONTRAST)
+    assert weak == []
+    dark = browser.js("getComputedStyle(document.documentElement).backgroundColor")
+    browser.click("#theme")
+    assert browser.js("getComputedStyle(document.documentElement).backgroundColor") != dark
+    browser.js("localStorage.clear()")
+
+
+CONTRAST = """
+(() => {
+  const canvas = new OffscreenCanvas(1, 1).getContext("2d", { willReadFrequently: true });
+  const rgba = (colour) => {
+    canvas.clearRect(0, 0, 1, 1); canvas.fillStyle = colour; canvas.fillRect(0, 0, 1, 1);
+    return [...canvas.getImageData(0, 0, 1, 1).data];
+  };
+  const over = ([r, g, b, a], ground) => [r, g, b].map((v, k) => v * a / 255 + ground[k] * (1 - a / 255));
+  const ground = (e) => {
+    const colour = rgba(getComputedStyle(e).backgroundColor);
+    return colour[3] === 255 || !e.parentElement ? colour.slice(0, 3) : over(colour, ground(e.parentElement));
+  };
+  const light = (rgb) => rgb.map((v) => v / 255).map((v) => v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)
+    .reduce((sum, v, k) => sum + v * [0.2126, 0.7152, 0.0722][k], 0);
+  const weak = new Set();
+  for (const e of document.querySelectorAll("body *")) {
+    const text = [...e.childNodes].some((n) => n.nodeType === 3 && n.data.trim());
+    const apart = e.closest("svg, script, style, option, .ending, .skip, .visually-hidden");
+    if (!text || apart || !e.checkVisibility()) continue;
+    const back = ground(e), front = over(rgba(getComputedStyle(e).color), back);
+    const [a, b] = [light(back), light(front)].sort((x, y) => y - x);
+    if ((a + 0.05) / (b + 0.05) < 4.5) weak.add(`${e.tagName}.${e.className} ${((a + 0.05) / (b + 0.05)).toFixed(2)}`);
+  }
+  return [...weak];
+})()
+"""
+
+
+@pytest.mark.parametrize("address", ["", f"view=episodes&ep={STOVE}.0"])
+def test_a_telephone_needs_no_sideways_scrolling(browser: Any, report: Path, address: str) -> None:
+    browser.resize(360, 740)
+    show(browser, report, address)
+    assert browser.js("document.documentElement.scrollWidth") <= 360
+
+
+def test_the_page_may_not_reach_the_network(chrome: Any, report: Path) -> None:
+    show(chrome, report)
+    blocked = chrome.js(
+        "new Promise((done) => { document.addEventListener('securitypolicyviolation', (e) => "
+        "done(e.effectiveDirective)); fetch('https://example.invalid/').catch(() => {}); })"
+    )
+    assert blocked == "connect-src"
+    chrome.errors.clear()

@@ -1,0 +1,342 @@
+"""What an evaluation was run under: written with its first episode, read back, compared."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lerobot_memobench.cli.report import given_runs
+from lerobot_memobench.envs.episode_log import (
+    PROTOCOL_FILE,
+    EpisodeLog,
+    check_protocol,
+    has_log,
+    write_episodes,
+    write_protocol,
+)
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.comparison import compare
+from lerobot_memobench.evaluation.html.write import write_html
+from lerobot_memobench.evaluation.metrics import failure_counts, summarise
+from lerobot_memobench.evaluation.records import (
+    CARD_FILE,
+    by_method,
+    differences,
+    read_protocol,
+    read_rollouts,
+    read_runs,
+    sweeps,
+)
+from lerobot_memobench.evaluation.report import build, render, write_report
+from lerobot_memobench.evaluation.report_tables import failures_table
+from lerobot_memobench.run.merging import merge
+from lerobot_memobench.tasks.failures import FAILURES
+from tests.support import logs
+from tests.support.logs import evaluation, rollout
+
+SETTINGS: dict[str, Any] = {
+    "seed_base": 7,
+    "referent": "fixed",
+    "demonstration_prompt": True,
+    "horizon": 1200,
+    "replan_steps": None,
+    "render": "default",
+    "render_every": 1,
+    "oracle_memory": False,
+}
+
+
+def record(task: str = "a_task", episode: int = 0, **changes: Any) -> dict[str, Any]:
+    return {
+        "task": task,
+        "memory_type": "temporal",
+        "episode": episode,
+        "seed": 7 + episode,
+        "referent": "fixed",
+        "replan_steps": 20,
+        "success": True,
+        "checkpoints": [{"operation": "S", "first_step": 3, "ordered_step": 3}],
+        **changes,
+    }
+
+
+def test_the_environments_settings_stand_beside_the_log(tmp_path: Path) -> None:
+    log = EpisodeLog(tmp_path, SETTINGS)
+    assert not list(tmp_path.iterdir())  # nothing before an episode has ended
+    log.append(record())
+    log.append(record("b", 3))
+    assert read_protocol(tmp_path) == {**SETTINGS, "tasks": ["a_task", "b"], "episodes": 4, "policy": {}}
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+def test_another_protocol_is_refused_before_a_line_is_written(tmp_path: Path) -> None:
+    EpisodeLog(tmp_path, SETTINGS).append(record())
+    EpisodeLog(tmp_path, SETTINGS).append(record(episode=1))  # another worker
+    before = sorted((tmp_path / "episodes").iterdir()), (tmp_path / PROTOCOL_FILE).read_bytes()
+    with pytest.raises(MemobenchError, match="horizon: 1200 and 600"):
+        EpisodeLog(tmp_path, {**SETTINGS, "horizon": 600}).append(record("other"))
+    assert before == (sorted((tmp_path / "episodes").iterdir()), (tmp_path / PROTOCOL_FILE).read_bytes())
+
+
+def test_a_log_alone_tells_what_it_can(tmp_path: Path) -> None:
+    write_episodes(tmp_path, [record(), record(episode=1)])
+    assert read_protocol(tmp_path) == {
+        "tasks": ["a_task"],
+        "episodes": 2,
+        "seed_base": 7,
+        "referent": "fixed",
+        "replan_steps": 20,
+        "policy": {},
+    }
+    write_episodes(tmp_path, [record(), record(episode=1, referent="random", replan_steps=None)])
+    mixed = read_protocol(tmp_path)
+    assert mixed["referent"] == ["fixed", "random"]
+    assert mixed["replan_steps"] == [20, None]
+
+
+def test_what_was_asked_for_comes_from_the_card(tmp_path: Path) -> None:
+    EpisodeLog(tmp_path, SETTINGS).append(record())
+    card = {"protocol": {**SETTINGS, "tasks": ["a_task", "b"], "episodes": 50}, "policy": {"type": "act"}}
+    (tmp_path / CARD_FILE).write_text(json.dumps(card))
+    assert read_protocol(tmp_path) == {**card["protocol"], "policy": {"type": "act"}}
+
+
+def test_no_evaluation_at_all(tmp_path: Path) -> None:
+    with pytest.raises(MemobenchError, match="no episode log"):
+        read_protocol(tmp_path)
+    assert not has_log(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["{", "[1]"])
+def test_files_that_are_none_of_ours_are_named(tmp_path: Path, text: str) -> None:
+    write_episodes(tmp_path, [record()])
+    (tmp_path / PROTOCOL_FILE).write_text(text)
+    with pytest.raises(MemobenchError, match=PROTOCOL_FILE):
+        read_protocol(tmp_path)
+    (tmp_path / PROTOCOL_FILE).unlink()
+    (tmp_path / CARD_FILE).write_text(text)
+    with pytest.raises(MemobenchError, match=CARD_FILE):
+        read_protocol(tmp_path)
+
+
+def test_differences_are_named_with_both_values() -> None:
+    other = {**SETTINGS, "horizon": 600, "replan_steps": 5, "seed_base": 1000}
+    assert differences(SETTINGS, other) == [
+        "seed_base: 7 and 1000",
+        "horizon: 1200 and 600",
+        "replan_steps: None and 5",
+    ]
+    assert differences(SETTINGS, other, ignore={"replan_steps", "seed_base"}) == ["horizon: 1200 and 600"]
+    assert differences(SETTINGS, SETTINGS) == []
+
+
+def test_extent_and_policy_count_when_asked_for() -> None:
+    a = {**SETTINGS, "tasks": ["x"], "episodes": 5, "policy": {"type": "act", "settings": {"steps": 1}}}
+    b = {**SETTINGS, "tasks": ["x", "y"], "episodes": 5, "policy": {"type": "act", "settings": {"steps": 2}}}
+    assert differences(a, b) == []
+    assert differences(a, b, extent=True) == ["tasks: x and x, y"]
+    assert differences(a, b, policy=True) == ["policy.settings.steps: 1 and 2"]
+
+
+def test_what_one_side_does_not_tell_is_no_difference() -> None:
+    assert differences({"horizon": 600}, {"referent": "fixed"}) == []
+    assert differences({**SETTINGS, "policy": {"type": "act"}}, {**SETTINGS, "policy": {}}, policy=True) == []
+
+
+def test_a_difference_of_any_length_is_a_part_of_a_sentence() -> None:
+    (found,) = differences({"render": "a" * 5_000}, {"render": ["b" * 5_000]})
+    assert found == f"render: {'a' * 79}… and {'b' * 79}…"
+    (found,) = differences({"policy": {"k" * 5_000: 1}}, {"policy": {"k" * 5_000: 2}}, policy=True)
+    assert found.endswith("kkk…: 1 and 2")
+    assert len(found) < 100
+
+
+# How evaluations are named and grouped to methods.
+
+
+def card(folder: Path, **policy: object) -> None:
+    told = {"protocol": {"tasks": [], "episodes": 4}, "policy": policy}
+    (folder / "card.json").write_text(json.dumps(told))
+
+
+def test_named_evaluations_are_one_method_at_several_intervals(tmp_path: Path) -> None:
+    for k in (20, 5):
+        logs.evaluation(tmp_path / f"k{k}", replan_steps=k)
+    runs = read_runs([f"mine={tmp_path}/k20", f"mine={tmp_path}/k5"])
+    assert [(run.name, run.method, run.replan_steps) for run in runs] == [
+        ("mine k=20", "mine", 20),
+        ("mine k=5", "mine", 5),
+    ]
+    assert [run.replan_steps for run in sweeps(runs)["mine"]] == [5, 20]
+
+
+def test_unnamed_evaluations_are_grouped_by_policy(tmp_path: Path) -> None:
+    for name, k, digest in (("a", 5, "aaaaaaaaaaaa"), ("b", 20, "aaaaaaaaaaaa"), ("c", 5, "cccccccccccc")):
+        card(logs.evaluation(tmp_path / name, replan_steps=k), type="act", sha256=digest)
+    runs = read_runs([tmp_path / "a", tmp_path / "b", tmp_path / "c"])
+    assert {method: [run.name for run in group] for method, group in by_method(runs).items()} == {
+        "act aaaaaaaa": ["a", "b"],
+        "act cccccccc": ["c"],
+    }
+
+
+def test_the_policys_own_interval_is_known_from_its_card(tmp_path: Path) -> None:
+    folder = logs.evaluation(tmp_path / "a", replan_steps=None)
+    card(folder, type="act", settings={"n_action_steps": 35})
+    assert read_runs([folder])[0].replan_steps == 35
+
+
+def test_results_that_cannot_be_told_apart_are_named_after_folders(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        logs.evaluation(tmp_path / name)
+    assert [run.method for run in read_runs([tmp_path / "a", tmp_path / "b"])] == ["a", "b"]
+    with pytest.raises(MemobenchError, match="two evaluations named 'x'"):
+        read_runs([f"x={tmp_path}/a", f"x={tmp_path}/b"])
+
+
+def test_policies_that_nobody_knows_are_not_one_method(tmp_path: Path) -> None:
+    for k in (5, 20):
+        logs.evaluation(tmp_path / f"k{k}", replan_steps=k)
+    assert [run.method for run in read_runs([tmp_path / "k5", tmp_path / "k20"])] == ["k5", "k20"]
+
+
+def test_rollouts_beyond_those_asked_for_are_not_counted(tmp_path: Path) -> None:
+    """LeRobot runs whole batches; earlier versions logged what its last one held beyond."""
+    folder = logs.evaluation(tmp_path / "a")
+    told = {"protocol": {"tasks": ["one", "two_of_them"], "episodes": 3, "seed_base": 7}, "policy": {"seed": 7}}
+    (folder / "card.json").write_text(json.dumps(told))
+    (run,) = read_runs([folder])
+    assert [row["SR"].n for row in run.summary.tasks.values()] == [3, 3]
+    assert run.notes == ["2 rollouts beyond the 3 of each task that were asked for left out"]
+    assert write_report(folder)[0].tasks["one"]["SR"].n == 3
+    assert read_rollouts(folder)[1] == [], "and now they are gone"
+    (folder / "card.json").write_text(json.dumps({**told, "policy": {"seed": 9}}))
+    logs.evaluation(folder)
+    assert len(read_rollouts(folder)[0]) == 8, "episodes 2, 3 and 4 were asked for"
+
+
+def test_evaluations_that_were_not_run_alike_are_shown_with_a_notice(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = {"horizon": 1200, "referent": "fixed", "inputs": "pixels"}
+    for name, changes in (("a", {}), ("b", {"horizon": 600, "inputs": "privileged object state"}), ("c", {})):
+        folder = logs.evaluation(tmp_path / name, inputs={**settings, **changes}["inputs"])
+        write_protocol(folder, {**settings, **changes})
+    found = [f"{tmp_path}/{name}" for name in "abc"]
+    words = "b was not run as a was (horizon: 1200 and 600; inputs: pixels and privileged object state"
+    for name in ("markdown", "table", "latex", "json"):
+        told = " ".join(render(build(read_runs(found)), read_runs(found), name).split())
+        assert words in told.replace("\\_", "_"), name
+        assert "c was not run" not in told, name
+    assert words in (write_html(found, tmp_path / "page").page).read_text()
+    assert '"notices":[]' in (write_html([found[0], found[2]], tmp_path / "page").page).read_text()
+    given_runs(found, None)
+    assert f"note: {words}" in capsys.readouterr().err
+
+
+def test_folders_of_the_same_name_get_longer_ones(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        logs.evaluation(tmp_path / name / "eval")
+    assert [run.name for run in read_runs([tmp_path / "a" / "eval", tmp_path / "b" / "eval"])] == ["a/eval", "b/eval"]
+
+
+def test_a_folder_may_hold_an_equals_sign(tmp_path: Path) -> None:
+    (run,) = read_runs([str(logs.evaluation(tmp_path / "lr=3"))])
+    assert run.name == "lr=3"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"), [([], "no evaluation"), (["=x"], "NAME=FOLDER"), (["x="], "NAME=FOLDER")]
+)
+def test_what_is_no_evaluation(words: list[str], message: str) -> None:
+    with pytest.raises(MemobenchError, match=message):
+        read_runs(words)
+
+
+def test_the_same_folder_twice(tmp_path: Path) -> None:
+    folder = logs.evaluation(tmp_path / "a")
+    with pytest.raises(MemobenchError, match="given twice"):
+        read_runs([folder, folder])
+
+
+# Evaluations of two suites are never one report: every reader refuses them in a sentence.
+
+
+@pytest.fixture
+def strict(tmp_path: Path) -> Path:
+    """An evaluation of the strict suite whose failures are miscounts."""
+    return evaluation(tmp_path / "strict", suite="strict")
+
+
+@pytest.fixture
+def published(tmp_path: Path) -> Path:
+    """One of the time when there was no other suite."""
+    return evaluation(tmp_path / "published")
+
+
+REFUSED = "report each suite by itself"
+
+
+def test_reports_of_two_suites_are_refused(strict: Path, published: Path, tmp_path: Path) -> None:
+    with pytest.raises(MemobenchError, match=REFUSED):
+        read_runs([published, strict])
+    with pytest.raises(MemobenchError, match=REFUSED):
+        write_html([strict, published], tmp_path / "page")
+    with pytest.raises(MemobenchError, match="suite: published and strict"):
+        compare(*read_runs([published]), *read_runs([strict]))
+    with pytest.raises(MemobenchError, match="found --allow 'suite'"):
+        compare(*read_runs([published]), *read_runs([strict]), allow=["suite"])
+    assert len(read_runs([strict])) == 1
+
+
+def test_one_log_of_two_suites_is_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "mixed"
+    records = [rollout("one", "temporal", "S", [True], True, k, suite=["published", "strict"][k]) for k in range(2)]
+    folder.mkdir()
+    (folder / "episodes.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))
+    with pytest.raises(MemobenchError, match="of the suites published and strict"):
+        read_runs([folder])
+
+
+def test_the_papers_figures_stand_beside_the_published_suite_only(strict: Path, published: Path) -> None:
+    assert build(read_runs([published]), paper=True).sections
+    with pytest.raises(MemobenchError, match="leave out --with paper"):
+        build(read_runs([strict]), paper=True)
+
+
+def test_merging_two_suites_is_refused(strict: Path, published: Path, tmp_path: Path) -> None:
+    with pytest.raises(MemobenchError, match=r"\(suite: published and strict\); they are not one evaluation"):
+        merge(tmp_path / "joined", [published, strict])
+
+
+def test_an_earlier_folder_goes_on_as_published_and_not_as_strict(tmp_path: Path) -> None:
+    (tmp_path / PROTOCOL_FILE).write_text('{"horizon": 1200}')
+    assert check_protocol(tmp_path, {"horizon": 1200, "suite": "published"})
+    with pytest.raises(MemobenchError, match="suite: published and strict"):
+        check_protocol(tmp_path, {"horizon": 1200, "suite": "strict"})
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert not check_protocol(empty, {"suite": "strict"})
+
+
+def test_a_log_tells_its_suite(strict: Path, published: Path) -> None:
+    assert read_protocol(strict)["suite"] == "strict"
+    assert "suite" not in read_protocol(published)
+
+
+def test_failures_of_strict_tasks_join_the_published_rows() -> None:
+    def failed(failure: str, episode: int) -> dict[str, object]:
+        return rollout("one", "temporal", "SU", [True, False], False, episode, failure=failure)
+
+    plain = [failed("stale_memory", 0)]
+    assert list(failure_counts(plain)) == list(FAILURES)
+    counted = failure_counts([*plain, failed("miscount", 1), failed("miscount", 2), failed("wrong_place", 3)])
+    assert counted == {**failure_counts(plain), "miscount": 2, "wrong_place": 1}
+    published = [row[0] for row in failures_table(summarise(plain)).rows]
+    table = failures_table(summarise([*plain, failed("miscount", 1)]))
+    assert [row[0] for row in table.rows] == [*published, "miscount"]
+    assert "Miscount: the event was done too seldom or too often." in str(table.note)
+    assert "Miscount" not in str(failures_table(summarise(plain)).note)

@@ -1,0 +1,99 @@
+"""The paper's tables as shipped: the same as those handed over, and consistent with themselves and with the text."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from lerobot_memobench.datasets.lerobot_format.card import FAMILIES, LENGTH_BUCKETS
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.paper import METRICS, PublishedRow, failure_taxonomy, published_rows, raw_tables
+from lerobot_memobench.tasks.task import MEMORY_TYPES
+
+HANDED_OVER = Path(__file__).parents[2] / "shared" / "spec" / "paper_tables.json"
+ROWS = published_rows()
+
+
+@pytest.mark.skipif(not HANDED_OVER.is_file(), reason="the specification is not on this machine")
+def test_the_shipped_data_are_the_papers() -> None:
+    assert raw_tables() == json.loads(HANDED_OVER.read_text())
+
+
+def test_every_table_is_there() -> None:
+    sizes = {table: len(published_rows(table)) for table in ("main", "alignment", "oracle", "memer")}
+    assert sizes == {"main": 24, "alignment": 16, "oracle": 2, "memer": 1}
+    assert len(ROWS) == 43
+    assert published_rows("memer")[0].replan_steps is None
+    with pytest.raises(MemobenchError, match="'main'"):
+        published_rows("mian")
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.table}-{row.model}-{row.replan_steps}")
+def test_published_averages_are_the_mean_of_applicable_memory_types(row: PublishedRow) -> None:
+    assert tuple(row.memory_types) == MEMORY_TYPES
+    for metric in METRICS:
+        values = [value for figures in row.memory_types.values() if (value := figures[metric]) is not None]
+        # The paper rounds the memory types as well as their mean.
+        assert row.average[metric] == pytest.approx(sum(values) / len(values), abs=0.1 + 1e-9), metric
+
+
+def test_an_operation_is_published_where_the_catalogue_has_it() -> None:
+    from lerobot_memobench.tasks.catalogue import get_task, task_names
+
+    for memory_type in MEMORY_TYPES:
+        operations = {label for name in task_names(memory_type) for label in get_task(name).operations}
+        for row in ROWS:
+            published = {m for m, value in row.memory_types[memory_type].items() if value is not None}
+            assert published == {"SR"} | {f"M{operation}R" for operation in operations}
+
+
+def test_the_memory_module_is_the_same_row_in_both_tables() -> None:
+    main = [row for row in published_rows("main") if "Module" in row.model]
+    alignment = [row for row in published_rows("alignment") if row.model == "Memory module"]
+    assert [(row.replan_steps, row.memory_types) for row in main] == [
+        (row.replan_steps, row.memory_types) for row in alignment
+    ]
+    assert published_rows("oracle")[0].memory_types == ROWS[1].memory_types
+
+
+def test_the_text_quotes_the_tables() -> None:
+    """Sentences of the paper's section on results, each against the rows."""
+
+    def figure(model: str, replan: int, read: Callable[[PublishedRow], float | None], table: str = "main") -> object:
+        (row,) = [r for r in published_rows(table) if r.model == model and r.replan_steps == replan]
+        return read(row)
+
+    module = "pi05 + RoboMME Memory Module"
+    assert figure(module, 5, lambda r: r.average["SR"]) == 31.9
+    assert figure("pi05", 50, lambda r: r.average["SR"]) == 20.8
+    assert figure("pi0", 5, lambda r: r.memory_types["temporal"]["MSR"]) == 94.0
+    assert figure("MemoryVLA", 20, lambda r: r.average["MUR"]) == 49.9
+    assert figure("Contrastive Memory Alignment", 5, lambda r: r.average["SR"], "alignment") == 34.7
+
+
+def test_failures_add_up() -> None:
+    counts = failure_taxonomy()
+    assert counts.pop("rollouts") == sum(counts.values()) == 150
+
+
+def test_demonstration_statistics_add_up() -> None:
+    families = [FAMILIES[name] for name in MEMORY_TYPES]
+    total = FAMILIES["total"]
+    assert sum(f.steps for f in families) == total.steps == 927_444
+    assert sum(f.episodes for f in families) == sum(LENGTH_BUCKETS.values()) == total.episodes
+    assert sum(f.storage for f in families) == pytest.approx(total.storage, abs=0.01)
+    for family in families:
+        assert family.mean == pytest.approx(family.steps / family.episodes, abs=0.1)
+    assert next(iter(LENGTH_BUCKETS)) == (0, 200)
+    assert list(LENGTH_BUCKETS)[-1] == (1500, None)
+
+
+def test_a_wheel_holds_the_data() -> None:
+    from hatchling.builders.wheel import WheelBuilder
+
+    root = Path(__file__).parents[1]
+    shipped = {file.distribution_path for file in WheelBuilder(str(root)).recurse_included_files()}
+    assert "lerobot_memobench/paper/tables.json" in shipped
