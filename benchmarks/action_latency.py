@@ -25,7 +25,7 @@ from turns import medians
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 
 HORIZON = 1200
-SEEN = 200
+ENCODED = 200
 """Frames in the history when it is measured; any number above 32 costs the same."""
 
 
@@ -42,8 +42,8 @@ def main() -> None:
     result: dict[str, Any] = {"benchmark": "action_latency", "rows": asked.rows}
     for size in asked.size:
         actors = {
-            name: Actor(size, asked.rows, asked.device, integration)
-            for name, integration in (("memory", "modulation"), ("plain", "none"))
+            name: Actor(size, asked.rows, asked.device, memory_fusion)
+            for name, memory_fusion in (("memory", "modulation"), ("plain", "none"))
         }
         replan = medians({name: actor.replan for name, actor in actors.items()}, asked.repeats, 2, clock)
         between = medians({name: actor.between for name, actor in actors.items()}, asked.repeats, 2, clock)
@@ -60,14 +60,14 @@ def main() -> None:
 class Actor:
     """A policy in the middle of an episode."""
 
-    def __init__(self, size: str, rows: int, device: str, integration: str) -> None:
+    def __init__(self, size: str, rows: int, device: str, memory_fusion: str) -> None:
         torch.manual_seed(0)
-        settings = config(size, device=device, integration=integration)
+        settings = config(size, device=device, memory_fusion=memory_fusion)
         self.policy = MemobenchMemPolicy(settings).eval()
         self.batch = {key: value.to(device) for key, value in observation(settings, rows).items()}
         self.rows, self.step = rows, 0
         self.batch["observation.phase"] = torch.ones(rows, 1)
-        for _ in range(SEEN):
+        for _ in range(ENCODED):
             self._tick()
             self.policy.observe(self.batch)
 
@@ -77,7 +77,7 @@ class Actor:
 
     def replan(self) -> None:
         """One call that takes in an observation and plans."""
-        for queue in self.policy.plans.queues:
+        for queue in self.policy.queues.queues:
             queue.clear()
         self._tick()
         self.policy.select_action(self.batch)
@@ -86,7 +86,7 @@ class Actor:
 
     def between(self) -> None:
         """One call that acts by the plan it has."""
-        if not self.policy.plans.queues[0]:
+        if not self.policy.queues.queues[0]:
             self.replan()
         self._tick()
         self.policy.select_action(self.batch)

@@ -31,7 +31,7 @@ ARMS: dict[str, dict[str, Any]] = {
     "paper": {"gradient_checkpointing": True},
     "contrastive": {"gradient_checkpointing": True, "align": "contrastive"},
     "no checkpointing": {},
-    "no memory": {"gradient_checkpointing": True, "integration": "none"},
+    "no memory": {"gradient_checkpointing": True, "memory_fusion": "none"},
     "expert only": {"gradient_checkpointing": True, "train_expert_only": True},
 }
 """What is trained; ``paper`` is `config=train_paper`."""
@@ -65,8 +65,8 @@ def main() -> None:
         clear()
     table(rows)
     plans = []
-    for integration in ("modulation", "none") if asked.rows else ():
-        policy = random_policy(config(**shared, integration=integration)).eval()
+    for memory_fusion in ("modulation", "none") if asked.rows else ():
+        policy = random_policy(config(**shared, memory_fusion=memory_fusion)).eval()
         plans += [note(where, planning(policy, count, asked.steps)) for count in asked.rows]
         del policy
         clear()
@@ -157,7 +157,7 @@ def planning(policy: MemobenchMemPolicy, count: int, steps: int) -> dict[str, An
         frames.append(timed(policy.observe, seen))
         plans.append(timed(policy.predict_action_chunk, seen))
     return {
-        "memory": policy.config.integration,
+        "memory": policy.config.memory_fusion,
         "environments": count,
         "frame_ms": round(1e3 * statistics.median(frames[WARM_UP:]), 2),
         "plan_ms": round(1e3 * statistics.median(plans[WARM_UP:]), 1),

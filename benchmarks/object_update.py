@@ -46,8 +46,8 @@ def main() -> None:
     torch.set_num_threads(1)
     keep_freed_memory()  # as training does, on both sides
     result: dict[str, object] = {"benchmark": "object_update", "samples": asked.moments * asked.episodes}
-    for name, integration in {"memory": "modulation", "no_memory": "none"}.items():
-        settings = config("small", device="cpu", integration=integration, perception="objects")
+    for name, memory_fusion in {"memory": "modulation", "no_memory": "none"}.items():
+        settings = config("small", device="cpu", memory_fusion=memory_fusion, perception="objects")
         settings.input_features[OBS_ENV_STATE] = PolicyFeature(FeatureType.ENV, (SIZE,))
         batch = object_batch(settings, asked.episodes, asked.moments)
         made, plain = updater(settings, batch), updater(settings, batch)

@@ -24,7 +24,7 @@ from turns import medians
 from lerobot_memobench.computing.freed_memory import keep_freed_memory
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, WIDTH
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.encoders import seen_key
+from lerobot_memobench.policies.memobench_mem.encoders import encoded_key
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, MASK, STEPS, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.network import attend_fused
@@ -43,8 +43,8 @@ def main() -> None:
     torch.set_num_threads(1)
     keep_freed_memory()  # as training does, on both sides
     result: dict[str, object] = {"benchmark": "pixel_update", "samples": asked.moments * asked.episodes}
-    for name, integration in {"memory": "modulation", "no_memory": "none"}.items():
-        settings = config("small", device="cpu", integration=integration)
+    for name, memory_fusion in {"memory": "modulation", "no_memory": "none"}.items():
+        settings = config("small", device="cpu", memory_fusion=memory_fusion)
         batch = pixel_batch(settings, asked.episodes, asked.moments)
         sides = {"made": updater(settings, batch, quick=True), "plain": updater(settings, batch, quick=False)}
         seconds = medians(sides, asked.repeats, warm_up=2)
@@ -63,7 +63,7 @@ def pixel_batch(settings: MemobenchMemConfig, episodes: int, moments: int) -> di
     stored = torch.randn(episodes * SLOTS, POOLED**2, WIDTH).to(torch.bfloat16)
     batch = {key: value for key, value in training_batch(settings, rows).items() if "images" not in key}
     for camera in settings.image_features:
-        batch[seen_key(camera)] = torch.randn(rows, GRID**2, WIDTH).to(torch.bfloat16)
+        batch[encoded_key(camera)] = torch.randn(rows, GRID**2, WIDTH).to(torch.bfloat16)
     return batch | {
         TOKENS: stored[numbers.clamp(min=0)] * mask[..., None, None],
         STEPS: numbers.clamp(min=0) % SLOTS * settings.memory_stride,

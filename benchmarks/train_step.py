@@ -3,7 +3,7 @@
     python benchmarks/train_step.py [--size tiny middle] [--batch 4] [--repeats 7] [--align contrastive]
 
 A step is forward, backward, clipping, AdamW and the weight average; seconds are CPU seconds on a CPU. Plain pi0.5 is
-``integration=none``, which a test holds to LeRobot's own pi05 parameter for parameter. Prints one JSON line: seconds
+``memory_fusion=none``, which a test holds to LeRobot's own pi05 parameter for parameter. Prints one JSON line: seconds
 and ratio (memory / plain) per size that a CPU can train; and for the full size, which it cannot, the ratio of
 floating-point operations of forward and backward, counted on the meta device.
 """
@@ -25,7 +25,7 @@ from turns import medians
 
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 
-SIDES = {"memory": {"integration": "modulation"}, "plain": {"integration": "none"}}
+SIDES = {"memory": {"memory_fusion": "modulation"}, "plain": {"memory_fusion": "none"}}
 
 
 def main() -> None:
@@ -89,7 +89,7 @@ def count_operations(fields: dict[str, Any]) -> int:
     actions = torch.zeros(1, settings.chunk_size, settings.max_action_dim, device="meta")
     with FlopCounterMode(display=False) as counter:
         loss = torch.zeros((), device="meta")
-        if settings.integration != "none":
+        if settings.memory_fusion != "none":
             memory, mask = model.set_memory(batch["memory.tokens"], batch["memory.steps"], batch["memory.mask"])
             if head is not None:
                 loss = loss + head(memory, mask, batch["memory.text"])

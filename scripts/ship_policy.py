@@ -94,7 +94,7 @@ def card(
     lines = [
         f"# {name}",
         "",
-        f"`memobench_mem`, {count:.1f} million parameters, bfloat16; sees {policy['perception']}.",
+        f"`memobench_mem`, {count:.1f} million parameters, bfloat16; reads {policy['perception']}.",
         *([] if begun is None else [began_with(begun["folder"])]),
         *demonstrations(runs, training_facts(source) or {}, merged),
         *(f"The expert that made {place(part)} is that of commit `{commit}`." for part, commit in commits),

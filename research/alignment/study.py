@@ -33,8 +33,8 @@ from research.learning.study import Rolled, Say, train_and_roll_out
 ALIGNMENTS: dict[str, tuple[str, ...]] = {
     MEMORY: (),
     **{name: (f"align={name}",) for name in ("semantic", "contrastive", "framewise")},
-    "oracle text": ("policy.integration=none", "policy.oracle_memory=true"),
-    MEMORYLESS: ("policy.integration=none",),
+    "oracle text": ("policy.memory_fusion=none", "policy.oracle_memory=true"),
+    MEMORYLESS: ("policy.memory_fusion=none",),
 }
 """The paper's objectives beside a memory that is aligned with nothing, and the two ends: what was seen told in words,
 and nothing of it. Name -> words for `lerobot train`."""

@@ -46,7 +46,7 @@ def said(words: Sequence[str], key: str) -> str | None:
 
 def fake_training(work: Study, words: Sequence[str]) -> None:
     """Leave a checkpoint as `lerobot train` does, of a policy that has learned nothing."""
-    own = {"align": said(words, "align") or "none", "integration": said(words, "policy.integration") or "modulation"}
+    own = {"align": said(words, "align") or "none", "memory_fusion": said(words, "policy.memory_fusion") or "modulation"}
     own["oracle_memory"] = said(words, "policy.oracle_memory") == "true"
     config = MemobenchMemConfig(size="small", perception="objects", device="cpu", push_to_hub=False, **own)
     torch.manual_seed(int(said(words, "seed") or -1))

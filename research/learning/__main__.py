@@ -27,7 +27,7 @@ class Sight(StrEnum):
     """What policies see by (`studies.learning.experiments.PERCEPTIONS`)."""
 
     OBJECTS = "objects"
-    FOUND = "found"
+    DETECTED = "found"
     PIXELS = "pixels"
     BOTH = "both"
 

@@ -9,12 +9,12 @@ from lerobot_memobench.tasks.catalogue import BOWL, get_task, task_names
 from lerobot_memobench.tasks.task import PUBLISHED
 
 MEMORY, MEMORYLESS = "memory", "no memory"
-ARMS: dict[str, tuple[str, ...]] = {MEMORY: (), MEMORYLESS: ("policy.integration=none",)}
+ARMS: dict[str, tuple[str, ...]] = {MEMORY: (), MEMORYLESS: ("policy.memory_fusion=none",)}
 """Who is compared -> what is said of it to `lerobot train` beside what all share."""
 ALIGNED = {**ARMS, MEMORY: ("align=semantic",)}
 """The same, with a memory aligned with checkpoint language, which learns referents in fewer updates."""
 
-OBJECTS, FOUND, PIXELS = "objects", "found", "pixels"
+OBJECTS, DETECTED, PIXELS = "objects", "found", "pixels"
 
 
 @dataclass(frozen=True)
@@ -28,10 +28,10 @@ class Sight:
 
 PERCEPTIONS = {
     OBJECTS: Sight(("perception=objects",)),
-    FOUND: Sight(("perception=objects", "policy.sight_errors=1"), ("eyes=package",)),
+    DETECTED: Sight(("perception=objects", "policy.detection_noise=1"), ("detector=package",)),
     PIXELS: Sight(("perception=pixels",), pictures=True),
 }
-"""Ways to see. Who is to act by objects that eyes find learns by objects that are told with errors like theirs."""
+"""Ways to see. A policy that is to act by detections learns by privileged object state with their noise."""
 
 EVALUATION_SEEDS = 7
 TUNING_SEEDS = 20_000
@@ -88,7 +88,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         episodes=80,
         prompted_episodes=240,
         steps=36_000,
-        settings=("policy.prompted_weight=3",),
+        settings=("policy.task_weights={prompted: 3}",),
         arms=ALIGNED,
     ),
 }

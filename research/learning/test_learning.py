@@ -127,7 +127,7 @@ def test_an_experiment_runs_its_parts_in_order(tmp_path: Path, monkeypatch: pyte
     assert [words[1] for words in ran] == ["generate", *["train"] * 4, *["eval"] * 4]
     assert "--perturb" in ran[0]
     memoryless = [word for word in ran[2] if word not in ran[1]]
-    assert "policy.integration=none" in memoryless
+    assert "policy.memory_fusion=none" in memoryless
     assert all("seed=7" in words and "referent=random" in words for words in ran[5:])
     assert f"| {BOWL}, {MEMORY} | 20 | 90.0 |" in text
     assert f"| {BOWL}, {MEMORYLESS} | 20 | 30.0 |" in text
@@ -180,7 +180,7 @@ def test_what_is_told_in_training_is_told_in_rollouts(tmp_path: Path, monkeypatc
     ("perception", "trained", "rolled_out"),
     [
         ("objects", {"perception=objects", "steps=1600"}, set()),
-        ("found", {"perception=objects", "policy.sight_errors=1", "steps=1600"}, {"eyes=package"}),
+        ("found", {"perception=objects", "policy.detection_noise=1", "steps=1600"}, {"detector=package"}),
         ("pixels", {"perception=pixels", "steps=2000"}, set()),
     ],
 )
@@ -197,8 +197,8 @@ def test_policies_learn_and_act_by_what_they_see(
         "pictures are made for who learns from them"
     )
     assert trained | {"batch_size=32"} <= set(ran[1])
-    assert ("policy.sight_errors=1" in ran[1]) == (perception in ("found", "both"))
-    assert {word for word in ran[2] if word.startswith("eyes=")} == rolled_out
+    assert ("policy.detection_noise=1" in ran[1]) == (perception in ("found", "both"))
+    assert {word for word in ran[2] if word.startswith("detector=")} == rolled_out
 
 
 @pytest.mark.parametrize("name", ["prompted", "joint"])

@@ -99,7 +99,7 @@ LINES = {
 def looking_every(steps: int) -> Iterator[None]:
     """While this lasts, the random policy looks at every ``steps``-th observation, at none with 0."""
     calls = itertools.count(1)
-    with patch.object(MemobenchRandomPolicy, "looks_next", lambda self: bool(steps) and next(calls) % steps == 0):
+    with patch.object(MemobenchRandomPolicy, "needs_observation", lambda self: bool(steps) and next(calls) % steps == 0):
         yield
 
 

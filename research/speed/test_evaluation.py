@@ -29,7 +29,7 @@ def test_the_policy_looks_as_often_as_it_is_told() -> None:
     policy = MemobenchRandomPolicy(MemobenchRandomConfig())
     for every, looks in ((0, []), (1, [1, 2, 3, 4, 5, 6]), (3, [3, 6])):
         with looking_every(every):
-            assert [number for number in range(1, 7) if policy.looks_next()] == looks
+            assert [number for number in range(1, 7) if policy.needs_observation()] == looks
 
 
 @pytest.mark.usefixtures("gl")

@@ -109,7 +109,7 @@ ATTEND = Hook(
     "transformers.models.gemma.modeling_gemma",
     "eager_attention_forward",
     ("module", "query", "key", "value", "attention_mask", "scaling"),
-    "compute attention in one kernel where a policy with eyes learns",
+    "compute attention in one kernel where a policy with a visual encoder learns",
     "LeRobot's pi0.5 calls this function by its name, whatever `attn_implementation` says",
     version="transformers 5.5.4",
 )

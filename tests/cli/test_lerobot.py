@@ -315,14 +315,14 @@ def test_a_config_file_brings_its_own(training: Called, in_folder: Path) -> None
 # --- a training is gone on with ---
 
 
-def training_run(folder: Path, steps: int = 100, done: tuple[int, ...] = (40, 80), final_lr: float = 0.1) -> Path:
+def training_run(folder: Path, steps: int = 100, done: tuple[int, ...] = (40, 80), min_lr_ratio: float = 0.1) -> Path:
     """Write what matters of a training run of LeRobot's; return the folder of its last checkpoint."""
     from lerobot.configs.default import DatasetConfig
     from lerobot.configs.train import TrainPipelineConfig
 
     from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 
-    policy = MemobenchMemConfig(final_lr=final_lr, warmup_fraction=0.1, device="cpu", push_to_hub=False)
+    policy = MemobenchMemConfig(min_lr_ratio=min_lr_ratio, warmup_fraction=0.1, device="cpu", push_to_hub=False)
     config = TrainPipelineConfig(dataset=DatasetConfig(repo_id="a/b"), policy=policy, steps=steps, output_dir=folder)
     config.optimizer, config.scheduler = policy.get_optimizer_preset(), policy.get_scheduler_preset()
     for step in done:
@@ -384,7 +384,7 @@ def test_a_longer_schedule_is_told_of(training: Called, capsys: pytest.CaptureFi
     assert f"at step 80 it jumps from {rate(80, 100):.2e} to {rate(80, 200):.2e}" in told
     assert f"{rate(199, 200):.2e} at the end" in told
     shutil.rmtree("run")
-    training_run(Path("run"), final_lr=1.0)  # constant
+    training_run(Path("run"), min_lr_ratio=1.0)  # constant
     assert main(["train", "output_dir=run", "resume=true", "steps=200"]) == 0
     assert f"it stays at {peak:.2e} at step 80" in capsys.readouterr().err
 
@@ -417,7 +417,7 @@ def test_a_training_goes_on_as_it_was_begun(training: Called, capsys: pytest.Cap
     checkpoint = training_run(Path("run"))
     words = ["train", "output_dir=run", "resume=true"]
     free = ["steps=100", "save_freq=5", "num_workers=0", "device=cpu", "log_freq=1", "policy.n_action_steps=1"]
-    same = ["align=none", "size=tiny", "policy.memory_stride=1", "policy.final_lr=0.1", "policy.push_to_hub=false"]
+    same = ["align=none", "size=tiny", "policy.memory_stride=1", "policy.min_lr_ratio=0.1", "policy.push_to_hub=false"]
     assert main([*words, *free, *same, "--policy.memory_frames", "32"]) == 0
     assert capsys.readouterr().err == ""
     training.flags = None

@@ -359,7 +359,7 @@ def test_a_disk_without_room_is_one_sentence_and_nothing_is_left(
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1_000_000))
     frames = _WideFrames()
     with pytest.raises(
-        MemobenchError, match=r"1\.5 MiB are needed there and 976\.6 KiB are free.*memory_cache_dir"
+        MemobenchError, match=r"1\.5 MiB are needed there and 976\.6 KiB are free.*feature_cache_dir"
     ) as told:
         build_feature_cache(root, "test", frames, _Texts())
     assert "\n" not in str(told.value)

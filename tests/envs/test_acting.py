@@ -83,7 +83,11 @@ def lerobot_eval(policy: Path, out: Path, *more: str, episodes: int = 1, batch: 
         (MemobenchMemConfig(device="cpu"), PIXELS, "pixels"),
         (MemobenchMemConfig(device="cpu", size="small"), PIXELS, "pixels"),
         (MemobenchMemConfig(device="cpu", size="small", perception="objects"), OBJECTS, POSES),
-        (MemobenchMemConfig(device="cpu", size="small", perception="objects", eyes="package"), PIXELS, "detections"),
+        (
+            MemobenchMemConfig(device="cpu", size="small", perception="objects", detector="package"),
+            PIXELS,
+            "detections",
+        ),
         (MemobenchExpertConfig(), PIXELS, "privileged simulator state"),
         (MemobenchExpertConfig, PIXELS, "privileged simulator state"),
         (MemobenchBlindConfig(), PIXELS, "privileged simulator state"),

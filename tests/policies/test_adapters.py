@@ -16,14 +16,14 @@ def _whole(policy: object) -> set[str]:
     return {name for name, _ in policy.named_parameters() if any(name.startswith(f"{m}.") for m in modules)}  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("integration", ["modulation", "context", "none"])
-def test_memory_and_heads_are_trained_whole_and_nothing_else(dataset_root: Path, integration: str) -> None:
-    align = "none" if integration == "none" else "contrastive"
-    policy, *_ = made_for_training(dataset_root, integration=integration, align=align)
+@pytest.mark.parametrize("memory_fusion", ["modulation", "context", "none"])
+def test_memory_and_heads_are_trained_whole_and_nothing_else(dataset_root: Path, memory_fusion: str) -> None:
+    align = "none" if memory_fusion == "none" else "contrastive"
+    policy, *_ = made_for_training(dataset_root, memory_fusion=memory_fusion, align=align)
     own = {f"model.{name}" for name in policy.model.memory_parameters()}
     own |= {name for name, _ in policy.named_parameters() if name.startswith("alignment.")}
     assert _whole(policy) == own
-    assert bool(own) == (integration != "none")
+    assert bool(own) == (memory_fusion != "none")
 
 
 def test_what_is_asked_for_is_trained_whole_too(dataset_root: Path) -> None:

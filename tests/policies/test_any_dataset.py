@@ -205,7 +205,7 @@ def test_a_memory_camera_is_one_that_is_seen(tmp_path: Path) -> None:
 def test_no_memory_makes_no_feature_cache(size: str, tmp_path: Path) -> None:
     robot = Foreign()
     root = robot.write(tmp_path / "data")
-    policy, *pipelines = loaded(train(root, tmp_path / "run", "--policy.integration=none", size=size))
+    policy, *pipelines = loaded(train(root, tmp_path / "run", "--policy.memory_fusion=none", size=size))
     assert act(robot, policy, *pipelines).isfinite().all()
     # Eyes keep what they see of present pictures, with or without a memory; nothing is kept to be remembered.
     assert [file.name.split("-")[1] for file in root.glob("feature_cache/*/")] == (

@@ -58,9 +58,9 @@ def _actions(model: PI05Pytorch, inputs: dict) -> torch.Tensor:
     return model.sample_actions(**{key: inputs[key] for key in keys})
 
 
-def _pair(integration: str = "modulation") -> tuple[SizedPI05, MemoryPI05]:
+def _pair(memory_fusion: str = "modulation") -> tuple[SizedPI05, MemoryPI05]:
     """LeRobot's model at tiny dimensions with random weights, and the memory model with the same weights."""
-    config = _config(integration=integration)
+    config = _config(memory_fusion=memory_fusion)
     torch.manual_seed(0)
     plain, ours = SizedPI05(config).eval(), MemoryPI05(config).eval()
     with torch.no_grad():
@@ -70,7 +70,7 @@ def _pair(integration: str = "modulation") -> tuple[SizedPI05, MemoryPI05]:
     missing, unexpected = ours.load_state_dict(
         {
             name.replace("post_attention_layernorm.", "post_attention_layernorm.norm.")
-            if ".gemma_expert." in name and integration == "modulation"
+            if ".gemma_expert." in name and memory_fusion == "modulation"
             else name: tensor
             for name, tensor in weights.items()
         },
@@ -111,9 +111,9 @@ def test_modulation_reaches_both_paths() -> None:
     assert not torch.allclose(_actions(ours, inputs), actions)
 
 
-@pytest.mark.parametrize("integration", ["modulation", "context"])
-def test_all_masked_memory_is_finite(integration: str) -> None:
-    _, ours = _pair(integration)
+@pytest.mark.parametrize("memory_fusion", ["modulation", "context"])
+def test_all_masked_memory_is_finite(memory_fusion: str) -> None:
+    _, ours = _pair(memory_fusion)
     ours.train()
     inputs = _inputs(ours.config)
     tokens, steps, mask = _memory(ours.config)
@@ -211,10 +211,10 @@ def test_full_size_is_pi05_plus_the_stated_memory() -> None:
     assert all(4.7e6 < count < 4.75e6 for count in layers)
 
 
-@pytest.mark.parametrize("integration", ["modulation", "context"])
-def test_full_size_runs_in_shape(integration: str) -> None:
+@pytest.mark.parametrize("memory_fusion", ["modulation", "context"])
+def test_full_size_runs_in_shape(memory_fusion: str) -> None:
     """One training pass at 3.2 B parameters, on the meta device: shapes only."""
-    config = _config(size="pi05", integration=integration)
+    config = _config(size="pi05", memory_fusion=memory_fusion)
     with torch.device("meta"):
         ours = MemoryPI05(config)
     memory, mask = ours.set_memory(*_memory(config, "meta"))

@@ -12,8 +12,8 @@ import torch
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.datasets.feature_cache.layout import FOLDER
 from lerobot_memobench.datasets.feature_cache.reading import FeatureCache
-from lerobot_memobench.policies.memobench_mem.caching import cache_dataset, load_perception, open_cache
-from lerobot_memobench.policies.memobench_mem.encoders import PixelPerception
+from lerobot_memobench.policies.memobench_mem.caching import cache_dataset, load_image_tower, open_cache
+from lerobot_memobench.policies.memobench_mem.encoders import ImageTowerEncoder
 from tests.support.object_dataset import make_object_dataset
 from tests.support.small_policy import made_for_training, small_config
 
@@ -21,7 +21,7 @@ from tests.support.small_policy import made_for_training, small_config
 def _opened(root: Path, **fields: Any) -> FeatureCache:
     """The cache that a policy opens when it is made to train."""
     config = small_config(**fields)
-    return open_cache(root, config, load_perception(config))
+    return open_cache(root, config, load_image_tower(config))
 
 
 def _copy(dataset_root: Path, root: Path) -> Path:
@@ -40,7 +40,7 @@ def test_training_reads_the_cache_that_the_command_wrote(
     def refuse(*_: Any) -> None:
         raise AssertionError("it encodes again")
 
-    monkeypatch.setattr(PixelPerception, "__call__", refuse)
+    monkeypatch.setattr(ImageTowerEncoder, "__call__", refuse)
     made_for_training(root)  # the policy's own tower reads what `memobench cache` wrote
 
 
@@ -64,14 +64,14 @@ def test_training_finishes_a_cache_that_was_killed(
     root = _copy(dataset_root, tmp_path / "data")
     seen: list[int] = []
 
-    def killed_in_its_second_pass(perception: PixelPerception, images: torch.Tensor) -> torch.Tensor:
+    def killed_in_its_second_pass(perception: ImageTowerEncoder, images: torch.Tensor) -> torch.Tensor:
         if seen:
             raise KeyboardInterrupt
         seen.append(len(images))
         return torch.zeros(len(images), 16, perception.dim)
 
     with monkeypatch.context() as patched:
-        patched.setattr(PixelPerception, "__call__", killed_in_its_second_pass)
+        patched.setattr(ImageTowerEncoder, "__call__", killed_in_its_second_pass)
         with pytest.raises(KeyboardInterrupt):
             cache_dataset(root, small_config(), batch_size=40)
     cache = _opened(root)
@@ -93,7 +93,7 @@ def test_caches_of_other_cameras_and_resolutions_lie_side_by_side(dataset_root: 
 
 def test_a_cache_can_be_put_elsewhere(dataset_root: Path, tmp_path: Path) -> None:
     root = _copy(dataset_root, tmp_path / "data")
-    cache = _opened(root, memory_cache_dir=str(tmp_path / "caches"))
+    cache = _opened(root, feature_cache_dir=str(tmp_path / "caches"))
     assert not (root / FOLDER).exists()
     (folder,) = (path for path in (tmp_path / "caches").iterdir() if path.is_dir())
     assert folder.name.startswith("data-tiny-stride1-")

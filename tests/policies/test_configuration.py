@@ -54,7 +54,7 @@ def test_defaults_are_the_papers() -> None:
     [
         ({"align": "contrstive"}, "contrastive"),
         ({"size": "tny"}, "tiny"),
-        ({"integration": "modulate"}, "modulation"),
+        ({"memory_fusion": "modulate"}, "modulation"),
         ({"subgoal_level": "middle"}, "intermediate"),
         ({"memory_stride": 0}, "memory_stride"),
         ({"tokens_per_frame": 8}, "16"),

@@ -212,10 +212,10 @@ def test_a_dataset_without_the_columns_is_refused(dataset_root: Path, tmp_path: 
 # -- pi0.5 without a memory ----------------------------------------------------------------------------------------
 
 
-def test_without_integration_it_is_plain_pi05(dataset_root: Path, tmp_path: Path) -> None:
+def test_without_memory_fusion_it_is_plain_pi05(dataset_root: Path, tmp_path: Path) -> None:
     from lerobot_memobench.policies.memobench_mem.network import SizedPI05
 
-    policy, before, after, dataset = made_for_training(dataset_root, integration="none")
+    policy, before, after, dataset = made_for_training(dataset_root, memory_fusion="none")
     assert set(dict(policy.model.named_parameters())) == set(dict(SizedPI05(small_config()).named_parameters()))
     batch = before(batch_of(dataset, [EPISODE_1 + 1, EPISODE_1 + 22]))
     assert batch["phase"].tolist() == [0, 1]
@@ -237,7 +237,7 @@ def test_without_integration_it_is_plain_pi05(dataset_root: Path, tmp_path: Path
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"integration": "none", "align": "semantic"}, "no memory to align"),
+        ({"memory_fusion": "none", "align": "semantic"}, "no memory to align"),
         ({"shuffle_subgoals": True}, "changes nothing"),
     ],
 )

@@ -29,8 +29,8 @@ HORIZON = 12
         ({"align": "semantic"}, []),
         ({"align": "contrastive"}, []),
         ({"align": "framewise"}, []),
-        ({"integration": "context"}, []),
-        ({"integration": "none", "oracle_memory": True}, ["env.oracle_memory=true"]),
+        ({"memory_fusion": "context"}, []),
+        ({"memory_fusion": "none", "oracle_memory": True}, ["env.oracle_memory=true"]),
     ],
     ids=["none", "semantic", "contrastive", "framewise", "context", "oracle"],
 )
@@ -71,7 +71,7 @@ def test_an_oracle_checkpoint_is_refused_without_the_oracle(dataset_root: Path, 
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from lerobot.policies import make_policy, make_pre_post_processors
 
-    config = MemobenchMemConfig(device="cpu", push_to_hub=False, integration="none", oracle_memory=True)
+    config = MemobenchMemConfig(device="cpu", push_to_hub=False, memory_fusion="none", oracle_memory=True)
     meta = LeRobotDataset("memobench/synthetic", root=dataset_root).meta
     policy = make_policy(config, ds_meta=meta)
     folder = tmp_path / "pretrained_model"

@@ -1,4 +1,4 @@
-"""Seeing through eyes, by LeRobot's own doors: settings, caches, samples, training, rollouts, checkpoints."""
+"""Pictures through a visual encoder, by LeRobot's own doors: settings, caches, samples, training, rollouts, checkpoints."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from transformers.models.gemma import modeling_gemma
 from lerobot_memobench.datasets.feature_cache import building
 from lerobot_memobench.datasets.feature_cache.layout import FOLDER
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.perception.visual_encoder import GRID, POOLED, SIDE, WIDTH, VisualEncoder
 from lerobot_memobench.perception.detector import Detector
+from lerobot_memobench.perception.visual_encoder import GRID, POOLED, SIDE, WIDTH, VisualEncoder
 from lerobot_memobench.perception.weights import save_detector
 from lerobot_memobench.policies.memobench_mem import network
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.encoders import seen_key
+from lerobot_memobench.policies.memobench_mem.encoders import encoded_key
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, MASK, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from tests.support.picture_rollouts import (
@@ -43,20 +43,20 @@ ROUNDED = 2**-7
 """What bfloat16 may round off, as a share of a number."""
 
 
-def made_eyes(path: Path, seed: int) -> Path:
+def made_detector(path: Path, seed: int) -> Path:
     torch.manual_seed(seed)
     save_detector(Detector(VisualEncoder().eval(), ("cork",)), path)
     return path
 
 
 @pytest.fixture(scope="module")
-def eyes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return made_eyes(tmp_path_factory.mktemp("eyes") / "eyes.safetensors", 1)
+def detector(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made_detector(tmp_path_factory.mktemp("detector") / "detector.safetensors", 1)
 
 
 @pytest.fixture(scope="module")
-def seeing(eyes: Path) -> dict[str, Any]:
-    return {"size": "small", "eyes": str(eyes), "n_action_steps": 3, "memory_stride": 2}
+def seeing(detector: Path) -> dict[str, Any]:
+    return {"size": "small", "visual_encoder": str(detector), "n_action_steps": 3, "memory_stride": 2}
 
 
 @pytest.fixture(scope="module")
@@ -92,25 +92,28 @@ def apart(one: torch.Tensor, other: torch.Tensor) -> float:
 
 
 def test_the_packages_eyes_are_the_default_of_small_pixels(tmp_path: Path) -> None:
-    random = MemobenchMemConfig(device="cpu", size="small", eyes="random")
-    assert (random.memory_stride, random.moments_per_episode, random.balance_tasks) == (1, 1, False)
+    random = MemobenchMemConfig(device="cpu", size="small", visual_encoder="random")
+    assert (random.memory_stride, random.frames_per_episode, random.task_weights) == (1, 1, None)
     config = MemobenchMemConfig(device="cpu", size="small")
-    assert (config.eyes, config.image_size, config.tokens_per_frame) == ("package", (SIDE, SIDE), POOLED**2)
-    assert (config.memory_stride, config.moments_per_episode, config.balance_tasks) == (8, 6, True)
-    assert (config.objective, config.state_token, config.watches) == ("regression", True, True)
-    assert not random.has_eyes
+    assert (config.visual_encoder, config.image_size, config.tokens_per_frame) == ("package", (SIDE, SIDE), POOLED**2)
+    assert (config.memory_stride, config.frames_per_episode, config.task_weights) == (8, 6, {})
+    assert (config.objective, config.state_token) == ("regression", True)
+    assert not random.encodes_ahead
     for other in ({"size": "tiny"}, {"size": "pi05"}, {"size": "small", "perception": "objects"}):
-        assert MemobenchMemConfig(device="cpu", **other).eyes is None
+        assert MemobenchMemConfig(device="cpu", **other).visual_encoder is None
     config.save_pretrained(tmp_path)
-    assert PreTrainedConfig.from_pretrained(tmp_path).eyes == "package"
+    assert PreTrainedConfig.from_pretrained(tmp_path).visual_encoder == "package"
 
 
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"size": "tiny", "eyes": "package"}, r"size=small, or --policy\.perception=objects.*leave it out"),
-        ({"size": "small", "eyes": "package", "image_resolution": (96, 96)}, f"{SIDE} x {SIDE}.*eyes=random"),
-        ({"size": "small", "eyes": "package", "tokens_per_frame": 4}, "tokens_per_frame"),
+        ({"size": "tiny", "visual_encoder": "package"}, r"size=small --policy\.perception=pixels.*leave it out"),
+        (
+            {"size": "small", "visual_encoder": "package", "image_resolution": (96, 96)},
+            f"{SIDE} x {SIDE}.*visual_encoder=random",
+        ),
+        ({"size": "small", "visual_encoder": "package", "tokens_per_frame": 4}, "tokens_per_frame"),
     ],
 )
 def test_bad_settings_are_refused(fields: dict[str, Any], message: str) -> None:
@@ -120,10 +123,12 @@ def test_bad_settings_are_refused(fields: dict[str, Any], message: str) -> None:
 
 def test_eyes_that_are_none_are_refused(root: Path, tmp_path: Path) -> None:
     with pytest.raises(MemobenchError, match=r"there is no file.*python -m research.detector train"):
-        cache_dataset(root, small_config(size="small", eyes=str(tmp_path / "absent")))
-    save_detector(Detector(VisualEncoder((4, 4, 8, 8, 16), (0, 0, 0, 1, 0)), ("cork",)), tmp_path / "narrow.safetensors")
+        cache_dataset(root, small_config(size="small", visual_encoder=str(tmp_path / "absent")))
+    save_detector(
+        Detector(VisualEncoder((4, 4, 8, 8, 16), (0, 0, 0, 1, 0)), ("cork",)), tmp_path / "narrow.safetensors"
+    )
     with pytest.raises(MemobenchError, match=r"widths \(4, 4, 8, 8, 16\).*python -m research.detector train"):
-        cache_dataset(root, small_config(size="small", eyes=str(tmp_path / "narrow.safetensors")))
+        cache_dataset(root, small_config(size="small", visual_encoder=str(tmp_path / "narrow.safetensors")))
 
 
 # -- caches --------------------------------------------------------------------------------------------------------
@@ -216,7 +221,7 @@ def test_a_disk_without_room_for_all_is_told_before_any_is_made(
     root, usage = copy(dataset_root, tmp_path / "data"), shutil.disk_usage(tmp_path)
     room = 2 * sum(LENGTHS) * FRAME_BYTES  # for the present pictures, and not for the memory
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=room))
-    with pytest.raises(MemobenchError, match=r"4\.7 MiB are needed there and 4\.4 MiB are free.*memory_cache_dir"):
+    with pytest.raises(MemobenchError, match=r"4\.7 MiB are needed there and 4\.4 MiB are free.*feature_cache_dir"):
         cache_dataset(root, small_config(**seeing))
     assert looked == []
     assert not (root / FOLDER).exists()
@@ -226,9 +231,9 @@ def test_caches_of_other_eyes_lie_beside_and_elsewhere(
     dataset_root: Path, tmp_path: Path, seeing: dict[str, Any]
 ) -> None:
     root, place = copy(dataset_root, tmp_path / "data"), tmp_path / "caches"
-    others = made_eyes(tmp_path / "others.safetensors", 2)
-    for file in (seeing["eyes"], str(others)):
-        cache_dataset(root, small_config(**seeing | {"eyes": file, "memory_cache_dir": str(place)}))
+    others = made_detector(tmp_path / "others.safetensors", 2)
+    for file in (seeing["visual_encoder"], str(others)):
+        cache_dataset(root, small_config(**seeing | {"visual_encoder": file, "feature_cache_dir": str(place)}))
     assert len([path for path in place.iterdir() if path.is_dir()]) == 6
     assert not (root / FOLDER).exists()
 
@@ -244,7 +249,7 @@ def test_a_sample_has_tokens_in_the_place_of_pictures(root: Path, seeing: dict[s
     for key in sample.keys() & lerobots.keys():
         assert sample[key] == lerobots[key] if key == "task" else torch.equal(sample[key], lerobots[key]), key
     batch = before(batch_of(dataset, [45, 50]))
-    assert all(batch[seen_key(camera)].shape == (2, GRID**2, WIDTH) for camera in CAMERAS)
+    assert all(batch[encoded_key(camera)].shape == (2, GRID**2, WIDTH) for camera in CAMERAS)
     assert batch[TOKENS].shape[2:] == (POOLED**2, WIDTH)
     assert len(batch[FRAMES].unique()) < batch[MASK].sum(), "moments of an episode share frames"
 
@@ -254,7 +259,7 @@ def test_pictures_that_are_changed_are_refused(root: Path, seeing: dict[str, Any
 
     policy, _, _, dataset = made_for_training(root, **seeing)
     dataset.set_image_transforms(lambda picture: 1 - picture)
-    with pytest.raises(MemobenchError, match=r"image_transforms.*leave it out.*policy\.eyes=random"):
+    with pytest.raises(MemobenchError, match=r"image_transforms.*leave it out.*policy\.visual_encoder=random"):
         dataset[0]
 
     from lerobot.configs.train import DatasetConfig, TrainPipelineConfig
@@ -292,7 +297,7 @@ def test_a_rollout_sees_and_remembers_what_training_reads(root: Path, seeing: di
 
 
 @pytest.mark.parametrize(
-    "fields", [{"align": "framewise"}, {"integration": "context"}, {"integration": "none"}], ids=str
+    "fields", [{"align": "framewise"}, {"memory_fusion": "context"}, {"memory_fusion": "none"}], ids=str
 )
 def test_every_kind_trains_and_the_tower_does_not(root: Path, seeing: dict[str, Any], fields: dict[str, Any]) -> None:
     policy, before, _, dataset = made_for_training(root, **seeing | fields)
@@ -369,10 +374,10 @@ def test_an_observation_without_a_camera_is_told(root: Path, seeing: dict[str, A
 
 @pytest.fixture(scope="module")
 def saved(root: Path, seeing: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Any, Any, Path]:
-    """A policy whose eyes are gone since, as they are where a checkpoint is taken to."""
+    """A policy whose encoder's file is gone since, as they are where a checkpoint is taken to."""
     folder = tmp_path_factory.mktemp("checkpoint")
-    file = shutil.copy(seeing["eyes"], folder / "eyes.safetensors")
-    policy, before, after, dataset = made_for_training(root, **seeing | {"eyes": str(file)})
+    file = shutil.copy(seeing["visual_encoder"], folder / "detector.safetensors")
+    policy, before, after, dataset = made_for_training(root, **seeing | {"visual_encoder": str(file)})
     policy.train().forward(before(batch_of(dataset, [10, 30])))
     policy.update()
     for part in (policy, before, after):
@@ -397,9 +402,9 @@ def test_training_goes_on_through_the_tower_of_the_checkpoint(
     assert looked == [], "its caches are found by its tower"
 
 
-def test_other_eyes_than_a_checkpoint_was_trained_through_are_refused(saved: tuple[Any, ...], eyes: Path) -> None:
+def test_other_eyes_than_a_checkpoint_was_trained_through_are_refused(saved: tuple[Any, ...], detector: Path) -> None:
     folder = saved[3]
-    for other in (str(eyes), "package"):
-        config = PreTrainedConfig.from_pretrained(folder, cli_overrides=[f"--eyes={other}"])
-        with pytest.raises(MemobenchError, match=r"was trained through.*holds it; leave eyes out"):
+    for other in (str(detector), "package"):
+        config = PreTrainedConfig.from_pretrained(folder, cli_overrides=[f"--visual_encoder={other}"])
+        with pytest.raises(MemobenchError, match=r"was trained with.*holds it; leave visual_encoder out"):
             MemobenchMemPolicy.from_pretrained(folder, config=config)

@@ -1,4 +1,4 @@
-"""Objects that eyes find in pictures: settings, caches, samples, rollouts, and policies that never saw a picture."""
+"""Detections in pictures: settings, caches, samples, rollouts, and policies that never saw a picture."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, MASK, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.memobench_mem.objects import FOUND, VIEWS
+from lerobot_memobench.policies.memobench_mem.objects import DETECTED, VIEWS
 from lerobot_memobench.sim.object_layout import SIZE
 from tests.support.object_dataset import make_object_dataset
 from tests.support.picture_rollouts import (
-    made_eyes,
+    made_detector,
     observed,
     pictures_of,
     refuses_pictures_in_a_batch,
@@ -38,13 +38,19 @@ ROUNDED = 2**-15
 
 
 @pytest.fixture(scope="module")
-def eyes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return made_eyes(tmp_path_factory.mktemp("eyes") / "eyes.safetensors", 1)
+def detector(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made_detector(tmp_path_factory.mktemp("detector") / "detector.safetensors", 1)
 
 
 @pytest.fixture(scope="module")
-def finding(eyes: Path) -> dict[str, Any]:
-    return {"perception": "objects", "size": "small", "eyes": str(eyes), "n_action_steps": 3, "memory_stride": 2}
+def finding(detector: Path) -> dict[str, Any]:
+    return {
+        "perception": "objects",
+        "size": "small",
+        "detector": str(detector),
+        "n_action_steps": 3,
+        "memory_stride": 2,
+    }
 
 
 @pytest.fixture(scope="module")
@@ -59,23 +65,23 @@ def root(dataset_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_objects_are_found_where_eyes_are_named(tmp_path: Path) -> None:
     told = MemobenchMemConfig(device="cpu", size="small", perception="objects")
-    found = MemobenchMemConfig(device="cpu", size="small", perception="objects", eyes="package")
+    found = MemobenchMemConfig(device="cpu", size="small", perception="objects", detector="package")
     for config, finds in ((told, False), (found, True)):
-        assert (config.finds_objects, config.sees_pictures, config.watches) == (finds,) * 3
-        assert not config.sees_tokens
-        assert (config.memory_stride, config.moments_per_episode, config.tokens_per_frame) == (8, 6, 2)
+        assert (config.uses_detector, config.uses_pictures, config.encodes_ahead) == (finds,) * 3
+        assert not config.uses_visual_encoder
+        assert (config.memory_stride, config.frames_per_episode, config.tokens_per_frame) == (8, 6, 2)
     assert obs_type_of(found) == PIXELS
     assert obs_type_of(told) != PIXELS
     found.save_pretrained(tmp_path)
-    assert PreTrainedConfig.from_pretrained(tmp_path).finds_objects
-    with pytest.raises(MemobenchError, match="eyes=random finds no objects; name package or a file"):
-        MemobenchMemConfig(device="cpu", size="small", perception="objects", eyes="random")
+    assert PreTrainedConfig.from_pretrained(tmp_path).uses_detector
+    with pytest.raises(MemobenchError, match=r"detector=random cannot be used.*name package or a file"):
+        MemobenchMemConfig(device="cpu", size="small", perception="objects", detector="random")
 
 
 def test_eyes_that_are_none_are_refused(root: Path, finding: dict[str, Any], tmp_path: Path) -> None:
     with pytest.raises(MemobenchError, match=r"there is no file.*python -m research.detector train"):
-        made_for_training(root, **finding | {"eyes": str(tmp_path / "absent")})
-    with pytest.raises(MemobenchError, match="or name eyes that find them"):
+        made_for_training(root, **finding | {"detector": str(tmp_path / "absent")})
+    with pytest.raises(MemobenchError, match="or name a detector"):
         cache_dataset(root, small_config(size="small", perception="objects"))
 
 
@@ -100,7 +106,7 @@ def test_what_is_found_is_kept_for_every_frame(
             for row, index in enumerate((45, 50))]  # fmt: skip
     truth = torch.cat(seen)
     assert truth.any()
-    assert torch.allclose(batch[FOUND], truth, rtol=ROUNDED, atol=1e-7)
+    assert torch.allclose(batch[DETECTED], truth, rtol=ROUNDED, atol=1e-7)
     assert not torch.equal(seen[0], seen[1])
     assert len(batch[FRAMES].unique()) < batch[MASK].sum(), "moments of an episode share frames"
 
@@ -154,23 +160,23 @@ def loaded(checkpoint: Path, *overrides: str) -> tuple[MemobenchMemPolicy, Any]:
 
 
 def test_they_act_from_pictures_as_from_what_is_found_in_them(
-    blind: Path, eyes: Path, root: Path, finding: dict[str, Any]
+    blind: Path, detector: Path, root: Path, finding: dict[str, Any]
 ) -> None:
     _, _, _, dataset = made_for_training(root, **finding)
     given, told = loaded(blind)
-    finds, seeing = loaded(blind, f"--eyes={eyes}")
+    finds, seeing = loaded(blind, f"--detector={detector}")
     assert set(finds.config.image_features) == {*VIEWS}
     for frame in range(8):
         batch = observed(root, dataset, frame)
         slots = finds.perception.look(batch, batch[OBS_STATE])
         objects = {key: value for key, value in batch.items() if key not in VIEWS} | {OBS_ENV_STATE: slots}
         assert torch.equal(given.select_action(told(objects)), finds.select_action(seeing(batch)))
-    with pytest.raises(MemobenchError, match=r"no 'observation\.images\.wrist_image', which eyes look at"):
+    with pytest.raises(MemobenchError, match=r"no 'observation\.images\.wrist_image', which the detector reads"):
         finds.perception.look({next(iter(VIEWS)): torch.zeros(1, 3, 48, 48)}, torch.zeros(1, 8))
 
 
-def test_what_the_environment_tells_is_not_looked_at(blind: Path, eyes: Path, root: Path) -> None:
-    finds, before = loaded(blind, f"--eyes={eyes}")
+def test_what_the_environment_tells_is_not_looked_at(blind: Path, detector: Path, root: Path) -> None:
+    finds, before = loaded(blind, f"--detector={detector}")
     batch = {**pictures_of(root, 3), OBS_STATE: torch.zeros(1, 8), "task": ["put"], "observation.step": torch.zeros(1)}
     batch["observation.phase"] = torch.ones(1)
     found = []
@@ -181,14 +187,14 @@ def test_what_the_environment_tells_is_not_looked_at(blind: Path, eyes: Path, ro
 
 
 def test_a_checkpoint_names_its_eyes_and_takes_others(
-    root: Path, finding: dict[str, Any], eyes: Path, tmp_path: Path
+    root: Path, finding: dict[str, Any], detector: Path, tmp_path: Path
 ) -> None:
     policy, before, after, _ = made_for_training(root, **finding)
     for part in (policy, before, after):
         part.save_pretrained(tmp_path / "checkpoint")
     told, _ = loaded(tmp_path / "checkpoint")
-    assert told.config.eyes == str(eyes)
+    assert told.config.detector == str(detector)
     assert told.state_dict().keys() == policy.state_dict().keys()
     assert not any("tower" in name for name in told.state_dict())
-    others, _ = loaded(tmp_path / "checkpoint", f"--eyes={made_eyes(tmp_path / 'others.safetensors', 2)}")
+    others, _ = loaded(tmp_path / "checkpoint", f"--detector={made_detector(tmp_path / 'others.safetensors', 2)}")
     assert others.perception.key != told.perception.key

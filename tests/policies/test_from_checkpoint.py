@@ -149,7 +149,7 @@ def test_what_saved_steps_cannot_follow_is_refused(go_on: Any, start: Path, tmp_
     with pytest.raises(MemobenchError, match=r"tokenizer_name=google/some would have no effect.*words"):
         go_on("tokenizer_name=google/some", source=start)
     with pytest.raises(MemobenchError, match="do not fit this policy"):
-        go_on("integration=none")
+        go_on("memory_fusion=none")
     config = PreTrainedConfig.from_pretrained(start)
     config.oracle_memory = True  # type: ignore[attr-defined]
     with pytest.raises(MemobenchError, match=r"oracle_memory=True would have no effect"):

@@ -182,7 +182,7 @@ def test_the_expert_and_the_random_policy_never_look() -> None:
         # Every fourth frame is remembered. Plans begin at 3 and 5, the first frames of execution, and last three steps.
         # At 9 row 0 would plan again: that its episode has ended is known only then.
         ({"memory_stride": 4}, [0, 3, 4, 5, 6, 8, 9]),
-        ({"integration": "none"}, [0, 3, 5, 6, 8, 9]),
+        ({"memory_fusion": "none"}, [0, 3, 5, 6, 8, 9]),
     ],
     ids=["stride1", "stride4", "none"],
 )

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import INTEGRATIONS, MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MEMORY_FUSIONS, MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory import MECHANISMS, make_mechanism
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     MASK,
@@ -98,8 +98,8 @@ def test_frame_sampling_loads_no_more_than_it_reads() -> None:
 
 
 def test_what_the_configuration_names_is_there() -> None:
-    assert {MemobenchMemConfig(device="cpu", integration=name).memory for name in INTEGRATIONS} <= set(MECHANISMS)
-    assert {*FUSIONS, "none"} == set(INTEGRATIONS)
+    assert {MemobenchMemConfig(device="cpu", memory_fusion=name).memory for name in MEMORY_FUSIONS} <= set(MECHANISMS)
+    assert {*FUSIONS, "none"} == set(MEMORY_FUSIONS)
 
 
 @pytest.mark.parametrize("name", MECHANISMS)

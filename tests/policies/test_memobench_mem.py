@@ -87,11 +87,11 @@ def test_losses_and_what_is_logged(trained: Any) -> None:
     assert per_sample.shape == (3,)
 
 
-@pytest.mark.parametrize("integration", ["modulation", "context"])
-def test_half_precision_and_both_integrations_train_and_act(dataset_root: Path, integration: str) -> None:
+@pytest.mark.parametrize("memory_fusion", ["modulation", "context"])
+def test_half_precision_and_both_fusions_train_and_act(dataset_root: Path, memory_fusion: str) -> None:
     """The full size trains in bfloat16 under autocast, as LeRobot runs it."""
     policy, before, _, dataset = made_for_training(
-        dataset_root, align="framewise", integration=integration, dtype="bfloat16"
+        dataset_root, align="framewise", memory_fusion=memory_fusion, dtype="bfloat16"
     )
     policy.train()
     with torch.autocast("cpu", dtype=torch.bfloat16):
@@ -484,10 +484,10 @@ def test_pi05_weights_as_a_start(trained: Any, tmp_path: Path) -> None:
     for name, tensor in plain.named_parameters():
         assert torch.equal(own[name], tensor), name
     # The tower alone, as `memobench cache --weights` reads it, is the same tower.
-    from lerobot_memobench.policies.memobench_mem.caching import load_perception
+    from lerobot_memobench.policies.memobench_mem.caching import load_image_tower
 
-    assert load_perception(small_config(), tmp_path).key == policy.perception.key
-    assert load_perception(small_config()).key == trained[0].perception.key != policy.perception.key
+    assert load_image_tower(small_config(), tmp_path).key == policy.perception.key
+    assert load_image_tower(small_config()).key == trained[0].perception.key != policy.perception.key
 
 
 # -- words ---------------------------------------------------------------------------------------------------------

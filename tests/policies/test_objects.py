@@ -17,15 +17,15 @@ from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.constants import OBS_ENV_STATE
 
 from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
+from lerobot_memobench.datasets.lerobot_format.reading import list_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, MASK, STEPS, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.sampler import (
-    in_groups,
-    in_turns,
-    prompted_factors,
-    task_of_frames,
+    grouped_order,
+    task_weights,
+    weighted_order,
 )
 from lerobot_memobench.sim.object_layout import WIDTH as SLOT_WIDTH
 from tests.support import object_dataset
@@ -59,9 +59,9 @@ def test_small_brings_its_recipe_and_leaves_it_to_the_user(tmp_path: Path) -> No
     assert (config.chunk_size, config.n_action_steps, config.num_inference_steps) == (16, 6, 1)
     assert (config.objective, config.memory_stride) == ("regression", 8)
     assert (config.optimizer_lr, config.optimizer_weight_decay, config.ema_decay) == (1e-3, 1e-4, 0.995)
-    assert (config.tokens_per_frame, config.moments_per_episode, config.memory_frames) == (2, 6, 32)
+    assert (config.tokens_per_frame, config.frames_per_episode, config.memory_frames) == (2, 6, 32)
     assert config.normalization_mapping["ACTION"] is NormalizationMode.MEAN_STD
-    own = {"chunk_size": 8, "ema_decay": 0.0, "final_lr": 1.0, "tokens_per_frame": 4}
+    own = {"chunk_size": 8, "ema_decay": 0.0, "min_lr_ratio": 1.0, "tokens_per_frame": 4}
     other = MemobenchMemConfig(device="cpu", size="small", perception="objects", **own)
     assert {name: getattr(other, name) for name in own} == own
     assert other.n_action_steps == 6
@@ -69,7 +69,7 @@ def test_small_brings_its_recipe_and_leaves_it_to_the_user(tmp_path: Path) -> No
     assert dataclasses.asdict(PreTrainedConfig.from_pretrained(tmp_path)) == dataclasses.asdict(other)
     before = MemobenchMemConfig(device="cpu", size="tiny")
     assert (before.objective, before.num_inference_steps, before.memory_stride) == ("flow_matching", 10, 1)
-    assert (before.chunk_size, before.ema_decay, before.final_lr, before.moments_per_episode) == (50, 0.999, 1.0, 1)
+    assert (before.chunk_size, before.ema_decay, before.min_lr_ratio, before.frames_per_episode) == (50, 0.999, 1.0, 1)
     assert before.normalization_mapping["STATE"] is NormalizationMode.QUANTILES
 
 
@@ -78,13 +78,15 @@ def test_small_brings_its_recipe_and_leaves_it_to_the_user(tmp_path: Path) -> No
     [
         ({"perception": "object"}, "objects"),
         ({"perception": "objects", "tokens_per_frame": 0}, "tokens_per_frame"),
-        ({"moments_per_episode": 0}, "moments_per_episode"),
-        ({"final_lr": 2.0}, "final_lr"),
-        ({"size": "small", "perception": "objects", "prompted_weight": 0.0}, "prompted_weight=0.0 must be above 0"),
-        ({"prompted_weight": 3.0}, r"balance_tasks=0.0\)"),
-        ({"size": "small", "perception": "objects", "sight_errors": -1.0}, "sight_errors=-1.0 must not be negative"),
-        ({"sight_errors": 1.0}, "use --policy.perception=objects"),
-        ({"size": "small", "whole_plan_if_still": True}, "use --policy.perception=objects"),
+        ({"frames_per_episode": 0}, "frames_per_episode"),
+        ({"min_lr_ratio": 2.0}, "min_lr_ratio"),
+        ({"task_weights": {"prompted": -1.0}}, "must not hold negative weights"),
+        (
+            {"size": "small", "perception": "objects", "detection_noise": -1.0},
+            "detection_noise=-1.0 must not be negative",
+        ),
+        ({"detection_noise": 1.0}, "use --policy.perception=objects"),
+        ({"size": "small", "full_chunk_when_stalled": True}, "use --policy.perception=objects"),
     ],
 )
 def test_bad_values_are_refused(fields: dict[str, Any], message: str) -> None:
@@ -158,7 +160,7 @@ def test_a_dataset_without_objects_is_refused(dataset_root: Path) -> None:
 @pytest.mark.parametrize("moments", [1, 3, 6])
 def test_every_place_once_in_groups_of_an_episode(moments: int) -> None:
     ends = np.cumsum([7, 30, 1, 12])
-    order = in_groups(ends, moments, torch.Generator().manual_seed(1))
+    order = grouped_order(ends, moments, torch.Generator().manual_seed(1))
     assert sorted(order.tolist()) == list(range(50))
     episodes = np.searchsorted(ends, order.numpy(), "right").tolist()
     runs = [episodes[0:1]]
@@ -168,65 +170,83 @@ def test_every_place_once_in_groups_of_an_episode(moments: int) -> None:
         else:
             runs.append([episode])
     assert len(runs) <= 2 + -(-7 // moments) + -(-30 // moments) + -(-12 // moments)
-    assert not torch.equal(order, in_groups(ends, moments, torch.Generator().manual_seed(2)))
+    assert not torch.equal(order, grouped_order(ends, moments, torch.Generator().manual_seed(2)))
 
 
-def test_tasks_are_drawn_alike_however_long_their_episodes_are() -> None:
+@pytest.mark.parametrize("weights", [(1, 1, 1), (1, 3, 2)])
+def test_tasks_are_drawn_by_their_weights_however_long_their_episodes_are(weights: tuple[int, ...]) -> None:
     ends, tasks = np.cumsum([600, 30, 1, 1200, 20]), np.array([2, 0, 1, 2, 0])
-    order = in_turns(ends, tasks, 6, torch.Generator().manual_seed(1)).numpy()
+
+    def draw() -> np.ndarray:
+        chance = torch.Generator().manual_seed(1)
+        return weighted_order(ends, tasks, np.array(weights, float), 6, chance).numpy()
+
+    order = draw()
     assert len(order) == ends[-1]
     episodes = np.searchsorted(ends, order, "right")
     groups = episodes[: len(order) // 6 * 6].reshape(-1, 6)
-    assert (groups == groups[:, :1]).all(), "six moments of an episode follow one another"
+    assert (groups == groups[:, :1]).all(), "six frames of an episode follow one another"
     shares = np.bincount(episodes, minlength=5) / len(order)
-    assert shares == pytest.approx([1 / 6, 1 / 6, 1 / 3, 1 / 6, 1 / 6], abs=0.06)
+    first, second, third = np.array(weights) / sum(weights)
+    assert shares == pytest.approx([third / 2, first / 2, second, third / 2, first / 2], abs=0.06)
     assert len(set(order[episodes == 0].tolist())) > 150, "frames of an episode are drawn at random"
-    assert torch.equal(torch.from_numpy(order), in_turns(ends, tasks, 6, torch.Generator().manual_seed(1)))
+    assert (order == draw()).all()
 
 
-@pytest.mark.parametrize("balance", [0.0, 0.5])
-def test_tasks_are_drawn_by_a_power_of_their_frames(balance: float) -> None:
-    lengths, tasks = np.array([9000, 900, 3600, 4500]), np.array([7, 3, 5, 7])
-    order = in_turns(np.cumsum(lengths), tasks, 2, torch.Generator().manual_seed(1), balance).numpy()
-    shares = np.bincount(np.searchsorted(np.cumsum(lengths), order, "right"), minlength=4) / len(order)
-    power = np.array([13_500, 900, 3600]) ** (1 - balance)
-    long, short, middle = power / power.sum()
-    assert shares == pytest.approx([long / 2, short, middle, long / 2], abs=0.02)
-
-
-def test_tasks_with_a_prompt_are_drawn_more_often() -> None:
-    lengths, tasks = np.array([500, 300, 40, 600]), np.array([0, 1, 2, 0])
-    phase = np.ones(lengths.sum(), int)
-    phase[600:640] = 0  # of the second episode
-    factors = prompted_factors(np.repeat(tasks, lengths), phase, 3.0)
-    ends = np.cumsum(lengths)
-    assert factors[tasks].tolist() == [1, 3, 1, 1]
-    chance = torch.Generator().manual_seed(1)
-    order = torch.cat([in_turns(ends, tasks, 6, chance, 1.0, factors) for _ in range(5)]).numpy()
-    shares = np.bincount(np.searchsorted(ends, order, "right"), minlength=4) / len(order)
-    assert shares == pytest.approx([1 / 10, 3 / 5, 1 / 5, 1 / 10], abs=0.04)
-
-
-@pytest.mark.parametrize("records", [True, False])
+@pytest.mark.parametrize(
+    ("records", "weights", "expected"),
+    [
+        (True, {}, {"butter": 1, "drawer": 1}),
+        (True, {"prompted": 3}, {"butter": 3, "drawer": 3}),
+        (False, {"open the drawer": 0.5}, {"butter": 1, "drawer": 0.5}),
+    ],
+)
 def test_a_task_of_several_instructions_is_one_task(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, records: bool
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    records: bool,
+    weights: dict[str, float],
+    expected: dict[str, float],
 ) -> None:
     monkeypatch.setattr(object_dataset, "TASKS", ("butter twice", "open the drawer", "butter once"))
     meta = LeRobotDatasetMetadata("here/data", root=make_object_dataset(tmp_path / "data", records=records))
-    tasks = task_of_frames(meta, np.cumsum([0, *LENGTHS]))
+    phase = np.ones(sum(LENGTHS), int)
+    phase[[int(start) for start in STARTS[:-1]]] = 0
+    tasks, found = task_weights(meta, np.cumsum([0, *LENGTHS]), phase, weights)
     assert tasks.tolist() == np.repeat([0, 1, 0] if records else [1, 2, 0], LENGTHS).tolist()
+    assert found[tasks[[0, LENGTHS[0]]]].tolist() == [expected["butter"], expected["drawer"]]
+    with pytest.raises(MemobenchError, match="names 'open the drawr'"):
+        task_weights(meta, np.cumsum([0, *LENGTHS]), phase, {"open the drawr": 2.0})
+    with pytest.raises(MemobenchError, match="leaves no task"):
+        task_weights(meta, np.cumsum([0, *LENGTHS]), phase, {"prompted": 0.0})
 
 
-@pytest.mark.parametrize("balance", [True, False])
-def test_batches_hold_moments_of_few_episodes_and_no_prompt(root: Path, balance: bool) -> None:
-    policy, before, _, dataset = made_for_training(root, **OBJECTS, balance_tasks=balance)
-    sampler = EpisodeAwareSampler(
+def test_a_weight_is_of_the_task_then_of_its_memory_type(tmp_path: Path) -> None:
+    root = make_object_dataset(tmp_path / "data", records=True)
+    meta = LeRobotDatasetMetadata("here/data", root=root)
+    records = [place.record for place in list_episodes(root)]
+    kinds = {record.task_name: record.memory_type for record in records if record is not None}
+    name, kind = next(iter(kinds.items()))
+    phase = np.ones(sum(LENGTHS), int)
+    tasks, found = task_weights(meta, np.cumsum([0, *LENGTHS]), phase, {kind: 2.0, name: 5.0})
+    for record, task in zip(records, tasks[[int(start) for start in STARTS[:-1]]], strict=True):
+        assert record is not None
+        assert found[task] == (5.0 if record.task_name == name else 2.0 if record.memory_type == kind else 1.0)
+
+
+def sampled(policy: MemobenchMemPolicy, dataset: Any, **options: Any) -> EpisodeAwareSampler:
+    return EpisodeAwareSampler(
         dataset.meta.episodes["dataset_from_index"],
         dataset.meta.episodes["dataset_to_index"],
         drop_n_last_frames=policy.config.drop_n_last_frames,
         shuffle=True,
+        **options,
     )
-    loader = torch.utils.data.DataLoader(dataset, batch_size=12, sampler=sampler)
+
+
+def test_batches_hold_frames_of_few_episodes_and_no_prompt(root: Path) -> None:
+    policy, before, _, dataset = made_for_training(root, **OBJECTS)
+    loader = torch.utils.data.DataLoader(dataset, batch_size=12, sampler=sampled(policy, dataset))
     drawn = torch.cat([part["index"] for part in loader]).tolist()
     execution = {
         int(STARTS[episode]) + frame
@@ -234,46 +254,34 @@ def test_batches_hold_moments_of_few_episodes_and_no_prompt(root: Path, balance:
         for frame in range(prompt, length)
     }
     assert len(drawn) == len(execution)
-    assert set(drawn) <= execution if balance else set(drawn) == execution
+    assert set(drawn) <= execution
     batch = before(next(iter(loader)))
     assert len(batch["episode_index"].unique()) <= 3
-    assert len(batch[FRAMES].unique()) < batch[MASK].sum(), "moments of an episode share frames"
+    assert len(batch[FRAMES].unique()) < batch[MASK].sum(), "frames of an episode share their memory"
 
 
-@pytest.mark.parametrize("balance", [True, False])
-def test_of_some_episodes_no_other_frame_is_drawn(root: Path, balance: bool) -> None:
+def test_of_some_episodes_no_other_frame_is_drawn(root: Path) -> None:
     """`dataset.episodes` holds some out; rows of what is opened are not frames of the dataset then."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    policy, before, _, _ = made_for_training(root, **OBJECTS, balance_tasks=balance)
+    policy, before, _, _ = made_for_training(root, **OBJECTS)
     dataset = LeRobotDataset("memobench/objects", root=root, episodes=[1, 2])
-    sampler = EpisodeAwareSampler(
-        dataset.meta.episodes["dataset_from_index"],
-        dataset.meta.episodes["dataset_to_index"],
-        episode_indices_to_use=dataset.episodes,
-        drop_n_last_frames=policy.config.drop_n_last_frames,
-        shuffle=True,
-        absolute_to_relative_idx=dataset.absolute_to_relative_idx,
-    )
+    options = {
+        "episode_indices_to_use": dataset.episodes,
+        "absolute_to_relative_idx": dataset.absolute_to_relative_idx,
+    }
+    sampler = sampled(policy, dataset, **options)
     drawn = [int(dataset[row]["index"]) for _ in range(20) for row in sampler]
-    execution = {int(STARTS[k]) + frame for k in (1, 2) for frame in range(PROMPTS[k], LENGTHS[k])}
-    assert set(drawn) == execution
-    share = np.mean([frame < STARTS[2] for frame in drawn])
-    alike, by_frames = 1 / 2, (LENGTHS[1] - PROMPTS[1]) / len(execution)
-    assert share == pytest.approx(alike if balance else by_frames, abs=0.06)
+    assert set(drawn) == {int(STARTS[k]) + frame for k in (1, 2) for frame in range(PROMPTS[k], LENGTHS[k])}
+    assert np.mean([frame < STARTS[2] for frame in drawn]) == pytest.approx(1 / 2, abs=0.06)
     assert before(batch_of(dataset, list(range(4))))[MASK].any()
 
 
 def test_the_sampler_draws_prompted_tasks_more_often(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(object_dataset, "PROMPTS", (0, 8, 0))
     root = make_object_dataset(tmp_path / "data")
-    policy, _, _, dataset = made_for_training(root, **OBJECTS, prompted_weight=3.0)
-    sampler = EpisodeAwareSampler(
-        dataset.meta.episodes["dataset_from_index"],
-        dataset.meta.episodes["dataset_to_index"],
-        drop_n_last_frames=policy.config.drop_n_last_frames,
-        shuffle=True,
-    )
+    policy, _, _, dataset = made_for_training(root, **OBJECTS, task_weights={"prompted": 3.0})
+    sampler = sampled(policy, dataset)
     drawn = np.array([frame for _ in range(20) for frame in sampler])
     assert np.mean((drawn >= STARTS[1]) & (drawn < STARTS[2])) == pytest.approx(3 / 4, abs=0.06)
 
@@ -297,8 +305,8 @@ def test_statistics_are_those_of_execution_frames(root: Path) -> None:
         {"align": "semantic"},
         {"align": "contrastive"},
         {"align": "framewise"},
-        {"align": "framewise", "integration": "context", "tokens_per_frame": 3},
-        {"integration": "none", "oracle_memory": True},
+        {"align": "framewise", "memory_fusion": "context", "tokens_per_frame": 3},
+        {"memory_fusion": "none", "oracle_memory": True},
         {"size": "tiny", "memory_stride": 2},
     ],
     ids=lambda fields: "-".join(map(str, fields.values())),
@@ -377,7 +385,7 @@ def test_a_batch_to_learn_from_has_the_slots_of_its_fullest_sample(root: Path) -
 
 def test_no_memory_is_nothing_in_training_and_in_a_rollout(root: Path) -> None:
     """Whatever was seen before, and whatever a batch brings along, the same comes out, and no weight makes it."""
-    policy, before, _, dataset = made_for_training(root, **OBJECTS | {"integration": "none"})
+    policy, before, _, dataset = made_for_training(root, **OBJECTS | {"memory_fusion": "none"})
     assert not [name for name, _ in policy.named_parameters() if "memory" in name or "modulat" in name]
     batch = before(batch_of(dataset, [30]))
     assert TOKENS not in batch
@@ -416,14 +424,14 @@ def test_memory_that_is_masked_is_nothing(root: Path) -> None:
 
 def test_a_hand_that_stands_still_carries_out_a_whole_plan(root: Path) -> None:
     """Of the first plan three actions of six, then all of one where nothing moves, and three where the hand does."""
-    policy, before, _, dataset = made_for_training(root, **OBJECTS, whole_plan_if_still=True)
+    policy, before, _, dataset = made_for_training(root, **OBJECTS, full_chunk_when_stalled=True)
     policy.reset()
     left = []
     for step, index in enumerate([30] * 9 + [50] * 3):
         seen = observed(dataset, index, **{"observation.step": torch.tensor([float(step)])})
         seen["observation.state"] = seen["observation.state"] + 0.02 * (index > 30)
         policy.select_action(before(seen))
-        left.append(len(policy.plans.queues[0]))
+        left.append(len(policy.queues.queues[0]))
     assert left == [2, 1, 0, *reversed(range(6)), 2, 1, 0]
 
 
@@ -489,14 +497,13 @@ def test_an_environment_without_objects_is_told(saved: tuple[Any, Any, Any, Path
 
 def test_objects_are_looked_at_where_they_are_remembered_or_acted_upon(root: Path) -> None:
     """Old pictures are no matter: another policy may want them drawn rarely."""
-    for integration, wanted in (("modulation", [True] * 12), ("none", [*[False] * 8, True, False, False, True])):
-        policy, before, _, dataset = made_for_training(root, **OBJECTS | {"integration": integration})
-        assert not policy.config.watches
+    for memory_fusion, wanted in (("modulation", [True] * 12), ("none", [*[False] * 8, True, False, False, True])):
+        policy, before, _, dataset = made_for_training(root, **OBJECTS | {"memory_fusion": memory_fusion})
         looks = []
         for index in range(12):
             old = {"observation.picture_step": torch.tensor([0.0])}
             policy.select_action(before(observed(dataset, index, **old)))
-            looks.append(policy.looks_next())
+            looks.append(policy.needs_observation())
         assert looks == wanted
 
 

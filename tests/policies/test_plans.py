@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import RowPlans
+from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import ActionQueues
 
 STATE = torch.tensor([0.1, 0.2, 1.0, 3.13, 0.1, 0.0, 0.04, -0.04])
 AXIS = torch.tensor([0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0])
@@ -13,7 +13,7 @@ AXIS = torch.tensor([0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0])
 
 def carried_out(*states: torch.Tensor | None) -> list[int]:
     """Return how much is carried out of plans of 16 actions, made one after another where the robot is so."""
-    plans, counts = RowPlans(7), []
+    plans, counts = ActionQueues(7), []
     plans.resize(1)
     for state in states:
         plans.begin(0, torch.zeros(16, 7), 6, state)
@@ -41,7 +41,7 @@ def test_a_hand_or_a_finger_that_moves_carries_out_some(where: torch.Tensor) -> 
 
 def test_without_a_state_and_after_a_plan_was_dropped_it_is_some() -> None:
     assert carried_out(None, None) == [6, 6]
-    plans = RowPlans(7)
+    plans = ActionQueues(7)
     plans.resize(1)
     plans.begin(0, torch.zeros(16, 7), 6, STATE)
     plans.drop(0)

@@ -39,16 +39,16 @@ def chunking(policy: Any) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("objective", "integration", "supported"),
+    ("objective", "memory_fusion", "supported"),
     [("regression", "none", False), ("flow_matching", "modulation", False), ("flow_matching", "none", True)],
 )
-def test_what_is_supported_is_said(root: Path, objective: str, integration: str, supported: bool) -> None:
-    policy = made_for_training(root, **OBJECTS, objective=objective, integration=integration)[0]
+def test_what_is_supported_is_said(root: Path, objective: str, memory_fusion: str, supported: bool) -> None:
+    policy = made_for_training(root, **OBJECTS, objective=objective, memory_fusion=memory_fusion)[0]
     assert policy.supports_rtc() == supports_rtc_inference(policy) == supported
 
 
 def test_a_guided_plan_continues_the_last_one(root: Path) -> None:
-    fields = OBJECTS | {"objective": "flow_matching", "integration": "none", "num_inference_steps": 10}
+    fields = OBJECTS | {"objective": "flow_matching", "memory_fusion": "none", "num_inference_steps": 10}
     policy, before, _, dataset = made_for_training(root, **fields)
     policy.reset()
     batch = before(observation(dataset, 0))
@@ -63,7 +63,7 @@ def test_a_guided_plan_continues_the_last_one(root: Path) -> None:
 
 
 def test_regression_refuses_to_be_guided(root: Path) -> None:
-    policy, before, _, dataset = made_for_training(root, **OBJECTS, integration="none")
+    policy, before, _, dataset = made_for_training(root, **OBJECTS, memory_fusion="none")
     with pytest.raises(MemobenchError, match=r"denoising.*inference\.type=sync.*flow_matching"):
         chunking(policy).predict_action_chunk(before(observation(dataset, 0)), inference_delay=3)
 
@@ -79,7 +79,7 @@ def test_a_memory_that_is_offered_one_frame_per_plan_is_refused(root: Path) -> N
     policy.predict_action_chunk(before(observation(dataset, 0, step=0.0)))
     with pytest.raises(MemobenchError, match=r"every 2 control steps, and was not shown step 2 of this episode"):
         policy.predict_action_chunk(before(observation(dataset, 6, step=6.0)))
-    without = made_for_training(root, **OBJECTS, integration="none")[0]
+    without = made_for_training(root, **OBJECTS, memory_fusion="none")[0]
     without.reset()
     for index in (0, 6):
         without.predict_action_chunk(before(observation(dataset, index)))
@@ -102,7 +102,7 @@ def test_a_memory_that_is_offered_every_frame_is_that_of_training(root: Path, cl
     policy.reset()
     stepwise = []
     for step in range(13):  # as LeRobot's synchronous rollout
-        policy.plans.queues = []
+        policy.queues.queues = []
         action = policy.select_action(before(observation(dataset, step)))
         if step % 6 == 0:
             stepwise.append(action)

@@ -21,9 +21,9 @@ WEIGHTS = {"semantic": 0.1, "contrastive": 0.1, "framewise": 0.05}
 ROWS: dict[str, list[str]] = {
     "memory module": [],
     **{name: [f"policy.align={name}"] for name in WEIGHTS},
-    "pi05": ["policy.integration=none"],
-    "context": ["policy.integration=context"],
-    "oracle memory": ["policy.integration=none", "policy.oracle_memory=true"],
+    "pi05": ["policy.memory_fusion=none"],
+    "context": ["policy.memory_fusion=context"],
+    "oracle memory": ["policy.memory_fusion=none", "policy.oracle_memory=true"],
     "coarse": ["policy.align=contrastive", "policy.subgoal_level=coarse"],
     "fine": ["policy.align=contrastive", "policy.subgoal_level=fine"],
     "shuffled": ["policy.align=contrastive", "policy.subgoal_level=coarse", "policy.shuffle_subgoals=true"],

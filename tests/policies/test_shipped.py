@@ -76,7 +76,13 @@ def script() -> ModuleType:
 def test_a_card_tells_every_setting_that_is_not_the_sizes(script: ModuleType) -> None:
     import draccus
 
-    given = {"balance_tasks": False, "chunk_size": 8, "final_lr": 0.1, "integration": "context", "memory_frames": 16}
+    given = {
+        "task_weights": {"prompted": 2.0},
+        "chunk_size": 8,
+        "min_lr_ratio": 0.1,
+        "memory_fusion": "context",
+        "memory_frames": 16,
+    }
     usual = {"device": "cpu", "size": "small", "perception": "objects"}
     policy = encoded(MemobenchMemConfig(**usual, **given))
     words = script.settings(policy)
@@ -155,7 +161,7 @@ def test_the_card_tells_of_the_errors_of_eyes(
 ) -> None:
     source = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
     source.mkdir(parents=True)
-    config = MemobenchMemConfig(device="cpu", size="small", perception="objects", sight_errors=1.0)
+    config = MemobenchMemConfig(device="cpu", size="small", perception="objects", detection_noise=1.0)
     config.save_pretrained(source)
     save_file({"a": torch.zeros(3)}, source / "model.safetensors")
     told = {"policy": encoded(config), "dataset": {"root": "gone"}, "batch_size": 6, "steps": 5, "seed": 1}
@@ -163,4 +169,4 @@ def test_the_card_tells_of_the_errors_of_eyes(
     monkeypatch.setattr(script, "SHIPPED", tmp_path / "shipped")
     text = (script.ship(tmp_path / "run", "seeing", None, {}, []) / "README.md").read_text()
     assert "sees objects." in text
-    assert "policy.sight_errors=1.0" in text.partition("lerobot train")[2]
+    assert "policy.detection_noise=1.0" in text.partition("lerobot train")[2]

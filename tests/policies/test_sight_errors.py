@@ -1,4 +1,4 @@
-"""Slots with the errors of eyes: how large these are, and that only what learns sees them."""
+"""Detection noise: how large it is, and that it is added in training alone."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ from lerobot_memobench.policies.memobench_mem.detection_noise import (
     FALSE,
     KIND_MISSED,
     MISSED,
-    SightErrors,
-    as_found,
+    with_detection_noise,
 )
-from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE, FramePool, ObjectPerception
+from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE, ObjectEncoder, ObjectPool
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH, field
 from lerobot_memobench.sim.object_slots import classes, in_slots
 
@@ -41,7 +40,7 @@ FAR = torch.tensor([[0.0, -0.5, 1.3, 0.0, 0.0, 0.0]])
 def many(slots: torch.Tensor, hand: torch.Tensor, size: float = 1.0) -> torch.Tensor:
     """Return what is found of a scene in 500 batches of eight."""
     torch.manual_seed(3)
-    return torch.cat([as_found(slots.expand(8, -1, -1), hand.expand(8, -1), size) for _ in range(500)])
+    return torch.cat([with_detection_noise(slots.expand(8, -1, -1), hand.expand(8, -1), size) for _ in range(500)])
 
 
 def errors(seen: torch.Tensor, slots: torch.Tensor) -> torch.Tensor:
@@ -54,7 +53,7 @@ def errors(seen: torch.Tensor, slots: torch.Tensor) -> torch.Tensor:
 
 
 def test_without_errors_level_things_are_what_they_were() -> None:
-    assert torch.equal(as_found(TABLE, FAR, 0.0), TABLE)
+    assert torch.equal(with_detection_noise(TABLE, FAR, 0.0), TABLE)
 
 
 def test_things_are_found_as_eyes_find_them() -> None:
@@ -96,7 +95,7 @@ def test_how_things_lie_is_what_eyes_take_them_to() -> None:
         thing("drawer", (0.2, 0.0, 1.0), (0.8, -0.6, 0.0, 0.6, 0.8, 0.0)),
         thing("milk", (-0.1, 0.2, 0.95), tilted),
     )
-    axes = field(as_found(slots, FAR, 0.0), "rotation")[0]
+    axes = field(with_detection_noise(slots, FAR, 0.0), "rotation")[0]
     told = {name: axes[slots[0, :, 1] == KIND[name]][0].tolist() for name in ("akita_black_bowl", "butter", "drawer")}
     assert told["akita_black_bowl"] == [1.0, 0.0, 0.0, 0.0, 1.0, 0.0], "round"
     assert told["butter"] == pytest.approx([0.8, -0.6, 0.0, 0.6, 0.8, 0.0]), "its front away from the robot"
@@ -115,15 +114,15 @@ def test_slots_stay_in_order_and_empty_ones_empty() -> None:
         ~there, torch.inf
     )
     assert (order.diff(dim=1).nan_to_num() >= 0).all()
-    assert as_found(torch.zeros(2, SLOTS, WIDTH), FAR.expand(2, -1), 1.0).eq(0).all(), "of nothing, nothing"
+    assert with_detection_noise(torch.zeros(2, SLOTS, WIDTH), FAR.expand(2, -1), 1.0).eq(0).all(), "of nothing, nothing"
 
 
 def test_only_what_learns_sees_errors() -> None:
-    perception = ObjectPerception(classes(), 2, 32, SightErrors(1.0))
+    perception = ObjectEncoder(classes(), 2, 32, 1.0)
     batch = {"observation.environment_state": TABLE.reshape(1, SIZE), OBS_RAW_STATE: FAR}
     memory = perception.memory(torch.nn.Identity())
     pool = memory.pool
-    assert isinstance(pool, FramePool)
+    assert isinstance(pool, ObjectPool)
     row = perception.remember(batch, [0])[:, 0]
     assert torch.equal(row[:, :SIZE], TABLE.reshape(1, SIZE)), "what is kept is what was seen"
 

@@ -6,12 +6,12 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from lerobot_memobench.policies.memobench_mem.memory.encoder import MemoryEncoder, PooledMemory
+from lerobot_memobench.policies.memobench_mem.memory.encoder import MemoryEncoder, PooledMemoryEncoder
 from lerobot_memobench.policies.memobench_mem.objects import (
     FEATURES,
     OBS_RAW_STATE,
-    FramePool,
-    ObjectPerception,
+    ObjectEncoder,
+    ObjectPool,
     SlotEncoder,
     frame_row,
     rotation,
@@ -60,9 +60,9 @@ def test_what_is_told_from_the_hand_moves_and_turns_with_it() -> None:
 
 def test_a_millimetre_beside_the_hand_is_seen() -> None:
     """Through the whole of memory, where bfloat16 would hold places to 4 mm."""
-    perception = ObjectPerception(classes(), 2, 32)
+    perception = ObjectEncoder(classes(), 2, 32)
     memory = perception.memory(torch.nn.Identity())
-    assert isinstance(memory, PooledMemory)
+    assert isinstance(memory, PooledMemoryEncoder)
     moved = PLACES + np.array([0.001, 0, 0])
     rows = [
         perception.remember({"observation.environment_state": one[None], OBS_RAW_STATE: hand()[None]}, [0])
@@ -74,7 +74,7 @@ def test_a_millimetre_beside_the_hand_is_seen() -> None:
 
 
 def test_an_empty_slot_is_no_token_whatever_it_holds() -> None:
-    perception = ObjectPerception(classes(), 2, 32).eval()  # in training empty slots are left out
+    perception = ObjectEncoder(classes(), 2, 32).eval()  # in training empty slots are left out
     noisy = seen().clone().reshape(SLOTS, WIDTH)
     noisy[3:, 1:] = 7.0
     both = torch.stack([seen(), noisy.reshape(-1)])
@@ -85,7 +85,7 @@ def test_an_empty_slot_is_no_token_whatever_it_holds() -> None:
     assert torch.equal(tokens[0], tokens[1])
     assert not tokens[0, 3:].any()
     assert tokens[0, :3].abs().sum(dim=1).min() > 0
-    pool = FramePool(perception.order, perception.kinds, 2, 32)
+    pool = ObjectPool(perception.order, perception.kinds, 2, 32)
     pooled = pool(perception.remember(batch, [0, 1])[:, 0])
     assert torch.allclose(pooled[0], pooled[1], rtol=0, atol=1e-6), "the size of a token is rounded"
     nothing = pool(frame_row(torch.zeros(1, SIZE), hand()[None], torch.ones(1))[:, 0])
@@ -93,7 +93,7 @@ def test_an_empty_slot_is_no_token_whatever_it_holds() -> None:
 
 
 def test_frames_are_pooled_whatever_the_order_of_their_things() -> None:
-    pool = FramePool(range(KINDS), KINDS + 1, 2, 32)
+    pool = ObjectPool(range(KINDS), KINDS + 1, 2, 32)
     slots = seen(lit=1).reshape(SLOTS, WIDTH)
     rows = torch.stack([slots, slots[torch.randperm(SLOTS)]]).reshape(2, SIZE)
     pooled = pool(frame_row(rows, hand().expand(2, -1), torch.ones(2))[:, 0])
@@ -105,7 +105,7 @@ def test_frames_are_pooled_whatever_the_order_of_their_things() -> None:
 
 
 def test_a_frame_that_many_read_is_encoded_once() -> None:
-    class Counting(FramePool):
+    class Counting(ObjectPool):
         count = 0
 
         def forward(self, frames: torch.Tensor) -> torch.Tensor:
@@ -116,7 +116,7 @@ def test_a_frame_that_many_read_is_encoded_once() -> None:
         def forward(self, tokens: torch.Tensor, steps: torch.Tensor, mask: torch.Tensor) -> tuple[torch.Tensor, ...]:
             return tokens, mask
 
-    memory = PooledMemory(Counting(range(KINDS), KINDS + 1, 2, 16), Pass())
+    memory = PooledMemoryEncoder(Counting(range(KINDS), KINDS + 1, 2, 16), Pass())
     stored = torch.cat([frame_row(seen(seed=n)[None], hand()[None], torch.ones(1)) for n in range(5)])
     numbers = torch.tensor([[0, 1, 2, 3], [0, 2, 4, -1]])
     frames = stored[numbers] * (numbers >= 0)[..., None, None]
@@ -137,7 +137,7 @@ def test_a_frame_that_many_read_has_its_time_and_is_told_it_once() -> None:
             Counting.count += tokens.shape[0] * tokens.shape[1]
             return super().forward(tokens, *rest)
 
-    memory = PooledMemory(FramePool(range(KINDS), KINDS + 1, 2, 16), Counting(16, 24, grid=0))
+    memory = PooledMemoryEncoder(ObjectPool(range(KINDS), KINDS + 1, 2, 16), Counting(16, 24, grid=0))
     stored = torch.cat([frame_row(seen(seed=n)[None], hand()[None], torch.ones(1)) for n in range(5)])
     numbers = torch.tensor([[10, 11, 13, 14], [10, 12, -1, -1]])
     mask, steps = numbers >= 0, (numbers - 10).clamp(min=0) * 8
@@ -154,7 +154,7 @@ def test_a_frame_that_many_read_has_its_time_and_is_told_it_once() -> None:
 def test_classes_keep_their_meaning_when_others_come() -> None:
     """A policy knows the classes it was trained with by name; one it does not know is another, not its neighbour."""
     trained = [name for name in classes() if name != classes()[2]]
-    perception = ObjectPerception(trained, 2, 16)
+    perception = ObjectEncoder(trained, 2, 16)
     assert [perception.order[classes().index(name)] for name in trained] == list(range(len(trained)))
     assert perception.order[2] == len(trained)
     encoder = SlotEncoder(perception.order, perception.kinds, 8, 16)
@@ -165,7 +165,7 @@ def test_which_thing_was_lit_can_be_learned() -> None:
     """A scene in which nothing is lit now, remembered after frames in which one thing was: where is that one?"""
     torch.manual_seed(0)
     rng = np.random.default_rng(0)
-    memory = PooledMemory(FramePool(range(KINDS), KINDS + 1, 2, 32), MemoryEncoder(32, 32, grid=0))
+    memory = PooledMemoryEncoder(ObjectPool(range(KINDS), KINDS + 1, 2, 32), MemoryEncoder(32, 32, grid=0))
     head = torch.nn.Linear(32, 2)
     optimizer = torch.optim.Adam([*memory.parameters(), *head.parameters()], lr=3e-3)
     steps, real, losses = torch.arange(2).expand(32, 2), torch.ones(32, 2, dtype=torch.bool), []

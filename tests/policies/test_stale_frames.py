@@ -57,7 +57,7 @@ def test_a_frame_that_shows_an_earlier_step_is_not_remembered() -> None:
     _remember(policy, every)
     with pytest.raises(MemobenchError, match=r"frame of step 1 shows step 0 again; leave env.render_every at 1"):
         _remember(policy, third)
-    plain = _policy(integration="none")
+    plain = _policy(memory_fusion="none")
     for observation in third:
         plain.observe(observation)  # looks at nothing between its plans
     # Where the frames that are remembered are drawn, the memory is that of an environment that draws them all.

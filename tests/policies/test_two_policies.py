@@ -30,8 +30,8 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.lerobot_hooks import ATTEND, DRAW_FRAMES, MAKE_PROCESSORS, READ_SAMPLE
 from lerobot_memobench.policies.memobench_mem import network
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.memobench_mem.sampler import Drawn
-from tests.support.picture_rollouts import made_eyes, observed
+from lerobot_memobench.policies.memobench_mem.sampler import SamplerSpec
+from tests.support.picture_rollouts import made_detector, observed
 from tests.support.small_policy import batch_of, made_for_training, small_config
 
 INDICES = [10, 30, 50, 80]
@@ -47,9 +47,9 @@ def root(dataset_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def eyes(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    folder = tmp_path_factory.mktemp("eyes")
-    return made_eyes(folder / "one.safetensors", 1), made_eyes(folder / "other.safetensors", 2)
+def encoders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    folder = tmp_path_factory.mktemp("detectors")
+    return made_detector(folder / "one.safetensors", 1), made_detector(folder / "other.safetensors", 2)
 
 
 def training(root: Path, **fields: Any) -> Iterator[float]:
@@ -78,8 +78,8 @@ def alone(root: Path, updates: int = 3, **fields: Any) -> list[float]:
 
 
 KINDS = {
-    "other eyes on the same dataset": ({}, {}),
-    "tokens and pictures": ({}, {"eyes": "random", "image_resolution": (48, 48)}),
+    "other encoders on the same dataset": ({}, {}),
+    "tokens and pictures": ({}, {"visual_encoder": "random", "image_resolution": (48, 48)}),
     "shuffled texts, fewer frames": ({}, {"shuffle_subgoals": True, "memory_frames": 4, "align": "framewise"}),
     "memory text in the prompt": ({"oracle_memory": True}, {}),
 }
@@ -91,8 +91,12 @@ QUICK = ("tokens and pictures", "memory text in the prompt")
 @pytest.mark.parametrize(
     "kind", [kind if kind in QUICK else pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS]
 )
-def test_two_trainings_in_turns_learn_what_each_learns_alone(root: Path, eyes: tuple[Path, Path], kind: str) -> None:
-    settings = [SEEING | {"eyes": str(path)} | fields for path, fields in zip(eyes, KINDS[kind], strict=True)]
+def test_two_trainings_in_turns_learn_what_each_learns_alone(
+    root: Path, encoders: tuple[Path, Path], kind: str
+) -> None:
+    settings = [
+        SEEING | {"visual_encoder": str(path)} | fields for path, fields in zip(encoders, KINDS[kind], strict=True)
+    ]
     expected = [alone(root, **fields) for fields in settings]
     assert expected[0] != expected[1]
     runs = [training(root, **fields) for fields in settings]
@@ -100,8 +104,8 @@ def test_two_trainings_in_turns_learn_what_each_learns_alone(root: Path, eyes: t
     assert [list(losses) for losses in zip(*found, strict=True)] == expected
 
 
-def test_two_policies_may_be_trained_on_one_dataset_object(root: Path, eyes: tuple[Path, Path]) -> None:
-    settings = [SEEING | {"eyes": str(path)} for path in eyes]
+def test_two_policies_may_be_trained_on_one_dataset_object(root: Path, encoders: tuple[Path, Path]) -> None:
+    settings = [SEEING | {"visual_encoder": str(path)} for path in encoders]
     expected = [alone(root, **fields) for fields in settings]
     first = made_for_training(root, **settings[0])
     dataset = first[3]
@@ -114,8 +118,8 @@ def test_two_policies_may_be_trained_on_one_dataset_object(root: Path, eyes: tup
     assert [list(losses) for losses in zip(*found, strict=True)] == expected
 
 
-def test_who_looks_at_pictures_gets_them_from_a_dataset_that_is_shared(root: Path, eyes: tuple[Path, Path]) -> None:
-    policy, before, _, dataset = made_for_training(root, **SEEING | {"eyes": str(eyes[0])})
+def test_who_looks_at_pictures_gets_them_from_a_dataset_that_is_shared(root: Path, encoders: tuple[Path, Path]) -> None:
+    policy, before, _, dataset = made_for_training(root, **SEEING | {"visual_encoder": str(encoders[0])})
     assert "observation.images.image" not in dataset[45]
     looking = make_policy(small_config(size="tiny"), ds_meta=dataset.meta)
     batch = batch_of(dataset, INDICES)
@@ -130,10 +134,10 @@ def test_who_looks_at_pictures_gets_them_from_a_dataset_that_is_shared(root: Pat
 
 
 def test_a_policy_that_is_loaded_to_act_changes_no_training(
-    root: Path, eyes: tuple[Path, Path], tmp_path: Path
+    root: Path, encoders: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    settings = SEEING | {"eyes": str(eyes[0])}
-    saved, saved_before, saved_after, dataset = made_for_training(root, **SEEING | {"eyes": str(eyes[1])})
+    settings = SEEING | {"visual_encoder": str(encoders[0])}
+    saved, saved_before, saved_after, dataset = made_for_training(root, **SEEING | {"visual_encoder": str(encoders[1])})
     for part in (saved, saved_before, saved_after):
         part.save_pretrained(tmp_path)
     expected = alone(root, 4, **settings)
@@ -153,15 +157,15 @@ def test_a_policy_that_is_loaded_to_act_changes_no_training(
     assert found == expected
 
 
-def test_a_checkpoint_goes_on_by_its_own_run(root: Path, eyes: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_checkpoint_goes_on_by_its_own_run(root: Path, encoders: tuple[Path, Path], tmp_path: Path) -> None:
     """Its steps are rebuilt after another policy has begun a training of its own."""
-    made = made_for_training(root, **SEEING | {"eyes": str(eyes[0]), "oracle_memory": True})
+    made = made_for_training(root, **SEEING | {"visual_encoder": str(encoders[0]), "oracle_memory": True})
     for part in made[:3]:
         part.save_pretrained(tmp_path)
     config = PreTrainedConfig.from_pretrained(tmp_path)
     config.pretrained_path, config.subgoal_level = tmp_path, "coarse"
     policy = make_policy(config, ds_meta=made[3].meta)
-    made_for_training(root, **SEEING | {"eyes": str(eyes[1])})
+    made_for_training(root, **SEEING | {"visual_encoder": str(encoders[1])})
     before, _ = make_pre_post_processors(config, pretrained_path=str(tmp_path))
     gather, oracle = before.steps[2:4]
     assert (gather.subgoal_level, oracle.enabled) == ("coarse", True)
@@ -171,11 +175,11 @@ def test_a_checkpoint_goes_on_by_its_own_run(root: Path, eyes: tuple[Path, Path]
 # -- what of LeRobot's is changed, and for how long ----------------------------------------------------------------
 
 
-def test_nothing_of_lerobots_is_changed_once_a_training_is_over(root: Path, eyes: tuple[Path, Path]) -> None:
+def test_nothing_of_lerobots_is_changed_once_a_training_is_over(root: Path, encoders: tuple[Path, Path]) -> None:
     gc.collect()
     before = lerobot_hooks.installed()
     places = {hook: pkgutil.resolve_name(f"{hook.module}:{hook.name}") for hook in lerobot_hooks.HOOKS}
-    made = made_for_training(root, **SEEING | {"eyes": str(eyes[0])})
+    made = made_for_training(root, **SEEING | {"visual_encoder": str(encoders[0])})
     assert set(lerobot_hooks.installed()) >= {MAKE_PROCESSORS, DRAW_FRAMES, READ_SAMPLE, ATTEND}
     del made
     gc.collect()
@@ -187,8 +191,8 @@ def test_nothing_of_lerobots_is_changed_once_a_training_is_over(root: Path, eyes
 def frames(seed: int = 0) -> tuple[list[int], list[int]]:
     """What LeRobot's sampler draws, plain and in an order of ours."""
     starts, tasks = np.array([5, 15]), np.repeat([0, 1], 10)
-    plain = EpisodeAwareSampler([0, 10], [10, 20], drop_n_last_frames=Drawn.of(starts, 1))
-    ordered = EpisodeAwareSampler([0, 10], [10, 20], None, 0, Drawn(starts, 2, tasks), True, seed)
+    plain = EpisodeAwareSampler([0, 10], [10, 20], drop_n_last_frames=SamplerSpec(starts, 1))
+    ordered = EpisodeAwareSampler([0, 10], [10, 20], None, 0, SamplerSpec(starts, 2, tasks, np.ones(2)), True, seed)
     return list(plain), list(ordered)
 
 
@@ -207,7 +211,7 @@ def test_a_foreign_decorator_changes_nothing(monkeypatch: pytest.MonkeyPatch, wr
 
         return functools.wraps(function)(traced) if wraps else traced
 
-    kept = Drawn.of(np.array([0]), 1)  # ours stands
+    kept = SamplerSpec(np.array([0]), 1)  # ours stands
     monkeypatch.setattr(EpisodeAwareSampler, "__init__", foreign(EpisodeAwareSampler.__init__))
     assert frames() == expected
     del kept  # ours goes
@@ -227,8 +231,8 @@ def test_a_sampler_that_is_not_ours_is_refused(monkeypatch: pytest.MonkeyPatch) 
             return iter(range(20))
 
     with pytest.raises(MemobenchError, match=r"not LeRobot's EpisodeAwareSampler.*execution frames"):
-        Own([0, 10], [10, 20], drop_n_last_frames=Drawn(np.array([5, 15]), 2))
-    lerobots, drawn = inspect.unwrap(EpisodeAwareSampler.__init__), Drawn.of(np.array([5, 15]), 1)
+        Own([0, 10], [10, 20], drop_n_last_frames=SamplerSpec(np.array([5, 15]), 2))
+    lerobots, drawn = inspect.unwrap(EpisodeAwareSampler.__init__), SamplerSpec(np.array([5, 15]), 1)
     monkeypatch.setattr(EpisodeAwareSampler, "__init__", lerobots)  # somebody puts it back
     with pytest.raises(MemobenchError, match=r"something has taken its place"):
         EpisodeAwareSampler([0, 10], [10, 20], drop_n_last_frames=drawn)
@@ -239,11 +243,11 @@ def test_a_sampler_that_is_not_ours_is_refused(monkeypatch: pytest.MonkeyPatch) 
 def test_a_function_that_takes_something_else_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(EpisodeAwareSampler, "__init__", lambda self, begin, end: None)
     with pytest.raises(MemobenchError, match=r"takes \(self, begin, end\) and not .*lerobot 0\.6\.1.*make setup"):
-        Drawn.of(np.array([0]), 1)
+        SamplerSpec(np.array([0]), 1)
 
 
 def test_a_foreign_reader_and_foreign_attention_are_kept(
-    root: Path, eyes: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+    root: Path, encoders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The two other places that were marked by what a decorator copies."""
     calls: list[str] = []
@@ -264,7 +268,7 @@ def test_a_foreign_reader_and_foreign_attention_are_kept(
         return original(*tensors, **named)
 
     monkeypatch.setattr(network, "scaled_dot_product_attention", counting)
-    policy, before, _, dataset = made_for_training(root, **SEEING | {"eyes": str(eyes[0])})
+    policy, before, _, dataset = made_for_training(root, **SEEING | {"visual_encoder": str(encoders[0])})
     batch = batch_of(dataset, INDICES)
     assert "observation.images.image" not in batch
     policy.train().forward(before(batch))

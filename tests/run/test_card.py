@@ -121,13 +121,13 @@ def test_where_a_policy_runs_is_no_part_of_it() -> None:
 
 
 def test_eyes_that_find_objects_are_part_of_a_policy(tmp_path: Path) -> None:
-    file = tmp_path / "eyes.safetensors"
+    file = tmp_path / "detector.safetensors"
     file.write_bytes(b"one")
-    settings = {"type": "memobench_mem", "perception": "objects", "eyes": str(file)}
-    assert policy_facts(settings, 7)["eyes_sha256"] == hashlib.sha256(b"one").hexdigest()
-    assert "eyes_sha256" not in policy_facts({**settings, "eyes": None}, 7)
-    pixels = {**settings, "perception": "pixels"}
-    assert "eyes_sha256" not in policy_facts(pixels, 7), "a checkpoint holds its tower"
+    settings = {"type": "memobench_mem", "perception": "objects", "detector": str(file)}
+    assert policy_facts(settings, 7)["detector_sha256"] == hashlib.sha256(b"one").hexdigest()
+    assert "detector_sha256" not in policy_facts({**settings, "detector": None}, 7)
+    pixels = {**settings, "perception": "pixels", "detector": None, "visual_encoder": str(file)}
+    assert "detector_sha256" not in policy_facts(pixels, 7), "a checkpoint holds its encoder"
     file.unlink()
     with pytest.raises(MemobenchError, match="there is no file"):
         policy_facts(settings, 7)

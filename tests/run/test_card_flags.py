@@ -145,14 +145,14 @@ def test_a_checkpoint_that_the_card_does_not_identify_is_refused() -> None:
 
 
 def test_other_eyes_than_those_on_the_card_are_refused() -> None:
-    eyes = "--policy.eyes=package"
-    assert eyes in allowed_flags([*BENCHMARK[:2], "--policy.type=memobench_mem", eyes])
+    detector = "--policy.detector=package"
+    assert detector in allowed_flags([*BENCHMARK[:2], "--policy.type=memobench_mem", detector])
     told = card([*BENCHMARK[:2], "--policy.path=checkpoint"])
-    settings = {"perception": "objects", "eyes": "package"}
+    settings = {"perception": "objects", "detector": "package"}
     told["policy"] |= {"sha256": tree_hash(checkpoint_files(Path("checkpoint"))), "settings": settings}
-    check_policy(told | {"policy": told["policy"] | {"eyes_sha256": file_hash(SHIPPED)}})
-    for sha256 in ({"eyes_sha256": "0" * 64}, {}):
-        with pytest.raises(MemobenchError, match="eyes package are not those that were looked through"):
+    check_policy(told | {"policy": told["policy"] | {"detector_sha256": file_hash(SHIPPED)}})
+    for sha256 in ({"detector_sha256": "0" * 64}, {}):
+        with pytest.raises(MemobenchError, match="detector package is not the one that was used"):
             check_policy(told | {"policy": told["policy"] | sha256})
 
 

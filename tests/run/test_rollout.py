@@ -117,7 +117,7 @@ CASES: dict[str, tuple[str, dict[str, Any], list[int]]] = {
     "random": ("memobench_random", {}, [0, FIRST, LAST]),
     "memory": ("memobench_mem", MEMORY, list(range(LAST + 1))),
     "memory of every fourth": ("memobench_mem", {**MEMORY, "memory_stride": 4}, [0, 4, FIRST, 8, 10, 12, 14, LAST]),
-    "no memory": ("memobench_mem", {**MEMORY, "integration": "none"}, [0, FIRST, 10, 14, LAST]),
+    "no memory": ("memobench_mem", {**MEMORY, "memory_fusion": "none"}, [0, FIRST, 10, 14, LAST]),
 }
 
 

@@ -1,4 +1,4 @@
-"""What a rollout sees of the synthetic dataset's videos, beside what training reads; shared by tests of eyes."""
+"""What a rollout sees of the synthetic dataset's videos, beside what training reads; shared by tests of detector."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from lerobot.utils.constants import OBS_STATE
 
 from lerobot_memobench.datasets.feature_cache.frames import frame_reader
 from lerobot_memobench.errors import MemobenchError
-from research.detector.labels import kinds
-from lerobot_memobench.perception.visual_encoder import VisualEncoder
 from lerobot_memobench.perception.detector import Detector
+from lerobot_memobench.perception.visual_encoder import VisualEncoder
 from lerobot_memobench.perception.weights import save_detector
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MASK, STEPS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from research.detector.labels import kinds
 from tests.support.small_policy import batch_of, made_for_training
 from tests.support.synthetic_dataset import LENGTHS
 
@@ -28,12 +28,12 @@ STARTS = np.cumsum([0, *LENGTHS])
 """First frames of the episodes."""
 
 
-def made_eyes(path: Path, seed: int) -> Path:
-    """Write eyes that find something everywhere."""
+def made_detector(path: Path, seed: int) -> Path:
+    """Write detector that find something everywhere."""
     torch.manual_seed(seed)
-    eyes = Detector(VisualEncoder().eval(), kinds())
-    torch.nn.init.zeros_(eyes.fine_heads.heatmap.bias)
-    save_detector(eyes, path)
+    detector = Detector(VisualEncoder().eval(), kinds())
+    torch.nn.init.zeros_(detector.fine_heads.heatmap.bias)
+    save_detector(detector, path)
     return path
 
 
@@ -85,7 +85,5 @@ def refuses_pictures_in_a_batch(root: Path, settings: dict[str, Any]) -> None:
     """As LeRobot's loader processes make them, which know nothing of what was seen."""
     policy, before, _, dataset = made_for_training(root, **settings)
     batch = before(torch.utils.data.default_collate([DatasetReader.get_item.__wrapped__(dataset.reader, 45)]))
-    with pytest.raises(
-        MemobenchError, match=r"has pictures, which a policy with eyes does not look at.*--num_workers=0"
-    ):
+    with pytest.raises(MemobenchError, match=r"has pictures, which this policy does not read.*--num_workers=0"):
         policy.train().forward(batch)

@@ -208,13 +208,17 @@ def cache(
     dataset: Annotated[Path, typer.Argument(help="Folder of a LeRobotDataset with the benchmark's columns.")],
     size: Annotated[str, typer.Option(help="Size of the policy that reads it: tiny, small or pi05.")] = "tiny",
     stride: Annotated[
-        int | None, typer.Option(min=1, help="Keep every how many frames (policy.memory_stride); 8 with eyes, else 1.")
+        int | None,
+        typer.Option(min=1, help="Keep every how many frames (policy.memory_stride); 8 at size small, else 1."),
     ] = None,
     perception: Annotated[
-        str, typer.Option(help="pixels; or objects, which eyes find in the pictures (policy.perception).")
+        str, typer.Option(help="pixels; or objects, detected in the pictures (policy.perception).")
     ] = "pixels",
-    eyes: Annotated[
-        str | None, typer.Option(help="Eyes (policy.eyes): package or a file; at size small the package's by default.")
+    detector: Annotated[
+        str | None, typer.Option(help="With objects, the detector (policy.detector): package or a file.")
+    ] = None,
+    visual_encoder: Annotated[
+        str | None, typer.Option(help="At size small, the encoder of pictures (policy.visual_encoder); the package's.")
     ] = None,
     weights: Annotated[
         str | None, typer.Option(help="Folder or repository whose image tower is used (size pi05).")
@@ -224,7 +228,7 @@ def cache(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for feature caches (policy.memory_cache_dir); feature_cache in the dataset's by default."
+            help="Folder for feature caches (policy.feature_cache_dir); feature_cache in the dataset's by default."
         ),
     ] = None,
     workers: Annotated[
@@ -240,7 +244,13 @@ def cache(
         place = None if out is None else str(out)
         given: dict[str, Any] = {} if stride is None else {"memory_stride": stride}
         config = MemobenchMemConfig(
-            size=size, perception=perception, eyes=eyes, memory_cache_dir=place, device=device, **given
+            size=size,
+            perception=perception,
+            detector=detector,
+            visual_encoder=visual_encoder,
+            feature_cache_dir=place,
+            device=device,
+            **given,
         )
     screen = console()
     with counting(screen, "episodes") as count:

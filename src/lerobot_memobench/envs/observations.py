@@ -47,9 +47,9 @@ def obs_type_of(policy: Any) -> str | None:
     """Return the ``obs_type`` that a policy's configuration needs; None where that is not known, or none is needed.
 
     A policy that says by ``perception`` what it reads (`pixels`, `objects` or `any`) is taken at its word; one that
-    ``finds_objects`` does so in pictures.
+    ``uses_detector`` does so in pictures.
     """
-    if getattr(policy, "finds_objects", False):
+    if getattr(policy, "uses_detector", False):
         return PIXELS
     perception = getattr(policy, "perception", None)
     if policy is None or perception is not None:
@@ -83,11 +83,11 @@ def policy_inputs(policy: Any, obs_type: str, oracle_memory: bool = False) -> st
     """Return a policy's inputs beside the arm's state in words; all of ``obs_type`` where they are not known.
 
     Args:
-        policy: its configuration, or the class of it. One that names its ``sees`` is taken at its word.
+        policy: its configuration, or the class of it. One that names its ``inputs`` is taken at its word.
         obs_type: the environment's.
         oracle_memory: whether the instruction tells what was done so far.
     """
-    found = getattr(policy, "sees", None)
+    found = getattr(policy, "inputs", None)
     if not isinstance(found, tuple):
         features = getattr(policy, "input_features", None) or {}
         types = {getattr(feature.type, "value", feature.type) for feature in features.values()}

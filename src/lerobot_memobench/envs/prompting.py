@@ -1,6 +1,6 @@
 """Where does the prompt play: in steps that the policy sees, or within `reset`? It depends on what the policy knows.
 
-A policy that knows phases declares it on the class of its configuration, ``knows_phases: ClassVar[bool] = True``: it
+A policy that knows phases declares it on the class of its configuration, ``reads_prompt: ClassVar[bool] = True``: it
 waits while `observation.phase` is 0, and plans anew when it becomes 1. Any other policy would act on a recording, and
 its queue would still hold those actions when the scene is restored. To it an episode begins at its first execution
 frame.
@@ -25,14 +25,14 @@ PLACES = (AUTO, STEPS, RESET)
 """Values of ``env.prompt_in``."""
 
 
-def knows_phases(policy: object) -> bool:
+def reads_prompt(policy: object) -> bool:
     """Return whether a policy's configuration, or its class, declares that it knows phases."""
-    return bool(getattr(policy, "knows_phases", False))
+    return bool(getattr(policy, "reads_prompt", False))
 
 
 def prompt_in(policy: object | None) -> str:
     """Return `STEPS` or `RESET`, as suits a policy's configuration or its class; `STEPS` where none is known."""
-    return STEPS if policy is None or knows_phases(policy) else RESET
+    return STEPS if policy is None or reads_prompt(policy) else RESET
 
 
 def policy_being_run() -> type | None:

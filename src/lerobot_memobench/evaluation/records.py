@@ -36,7 +36,7 @@ class PolicySettings(TypedDict, total=False):
 
     n_action_steps: Count | None
     perception: str | None
-    eyes: str | None
+    detector: str | None
 
 
 class Policy(TypedDict, total=False):
@@ -46,7 +46,7 @@ class Policy(TypedDict, total=False):
     seed: Whole | None
     settings: PolicySettings
     sha256: str | None
-    eyes_sha256: str
+    detector_sha256: str
 
 
 class Checkpoint(TypedDict):

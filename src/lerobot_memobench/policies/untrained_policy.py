@@ -32,7 +32,7 @@ class UntrainedPolicy(PreTrainedPolicy):
             "--policy.type=memobench_mem."
         )
 
-    def looks_next(self) -> bool:
+    def needs_observation(self) -> bool:
         """Whether it looks at the pictures of the next observation: one that only acts by other signals never does."""
         return False
 

@@ -190,7 +190,8 @@ EVERYWHERE: dict[str, tuple[str, ...]] = {
     "align": ("policy.align",),
     "size": ("policy.size",),
     "perception": ("policy.perception",),
-    "eyes": ("policy.eyes",),
+    "detector": ("policy.detector",),
+    "visual_encoder": ("policy.visual_encoder",),
     "device": ("policy.device",),
     "replan": ("policy.n_action_steps", "env.replan_steps"),
     "tasks": ("env.tasks",),
@@ -267,8 +268,8 @@ MEANINGS: dict[str, tuple[Meaning, ...]] = {
             "what the policy was trained on, else pictures",
         ),
         Meaning(
-            "eyes=",
-            "with a policy that sees objects: package or a file, eyes that find them in pictures",
+            "detector=",
+            "with a policy that reads objects: package or a file, the detector that finds them in pictures",
             "none: the environment tells them",
         ),
         Meaning(
@@ -319,12 +320,11 @@ MEANINGS: dict[str, tuple[Meaning, ...]] = {
         Meaning("size=", "small and tiny: a few million parameters, from scratch, on a CPU; pi05: 3.2 billion"),
         Meaning(
             "perception=",
-            "pixels: pictures, through a frozen tower, at size=small through eyes; objects: what can be seen, as "
-            "numbers",
+            "pixels: pictures, through a frozen tower, at size=small a visual encoder; objects: their poses as numbers",
         ),
         Meaning(
-            "eyes=",
-            "with perception=objects: eyes that find them in pictures; with pixels, the eyes looked through",
+            "detector=",
+            "with perception=objects: package or a file, the detector that finds them in pictures",
         ),
         Meaning("replan=", "actions executed per prediction at evaluation"),
         Meaning(
@@ -338,7 +338,7 @@ MEANINGS: dict[str, tuple[Meaning, ...]] = {
         Meaning("output_dir=", "where everything goes; with resume=true, the training that is gone on with"),
         Meaning("resume=", "true: go on with the last checkpoint in output_dir="),
         Meaning("steps=", "updates of the weights, with resume=true those before included", "100000"),
-        Meaning("batch_size=", "frames per update", "8, of objects or through eyes 72"),
+        Meaning("batch_size=", "frames per update", "8, of objects or through a visual encoder 72"),
         Meaning("save_freq=", "updates from one checkpoint to the next; the last update always makes one", "20000"),
         Meaning("env=", "memobench: evaluate within the training, every env_eval_freq= updates", "no evaluation"),
         Meaning("tasks=", "with env=: those evaluated on, as in lerobot eval", "all"),

@@ -229,32 +229,32 @@ class TrainConfig(TypedDict):
 def policy_facts(settings: Mapping[str, Any], seed: int | None) -> dict[str, Any]:
     """Return what identifies a policy beside its weights: its configuration as LeRobot encodes it, the run's seed.
 
-    Of eyes that are no part of its checkpoint also the hash.
+    Of a detector, which is no part of its checkpoint, also the hash.
 
     Raises:
-        MemobenchError: there are no such eyes.
+        MemobenchError: there is no such detector.
     """
     kept = {key: value for key, value in settings.items() if key not in ELSEWHERE and key != "type"}
-    eyes = eyes_hash(kept)
+    detector = detector_hash(kept)
     return {
         "type": settings.get("type"),
         "seed": seed,
         "settings": kept,
-        **({} if eyes is None else {"eyes_sha256": eyes}),
+        **({} if detector is None else {"detector_sha256": detector}),
     }
 
 
-def eyes_hash(settings: Mapping[str, Any]) -> str | None:
-    """Return the hash of the eyes that a policy finds objects with, None where it has none.
+def detector_hash(settings: Mapping[str, Any]) -> str | None:
+    """Return the hash of the detector that a policy reads objects from, None where it has none.
 
     Raises:
-        MemobenchError: there are no such eyes.
+        MemobenchError: there is no such detector.
     """
-    if settings.get("perception") != "objects" or settings.get("eyes") is None:
+    if settings.get("detector") is None:
         return None
     from lerobot_memobench.perception.weights import detector_file
 
-    return file_hash(detector_file(settings["eyes"]))
+    return file_hash(detector_file(settings["detector"]))
 
 
 def training_facts(folder: Path) -> dict[str, Any] | None:
@@ -311,8 +311,8 @@ def _policy(card: Mapping[str, Any]) -> list[str]:
     if card["checkpoint"]:
         lines += [f"| checkpoint | {card['checkpoint']['path']} |"]
         lines += [f"| its sha256 | {policy.get('sha256', 'not known')} |"]
-    if "eyes_sha256" in policy:
-        lines += [f"| sha256 of its eyes | {policy['eyes_sha256']} |"]
+    if "detector_sha256" in policy:
+        lines += [f"| sha256 of its detector | {policy['detector_sha256']} |"]
     return lines + [f"| trained on: {key} | {value} |" for key, value in (card["trained_on"] or {}).items()]
 
 

@@ -16,7 +16,7 @@ from lerobot_memobench.evaluation.records import CARD_FILE, read_card
 from lerobot_memobench.policies.checkpoint import local_folder
 from lerobot_memobench.run import arguments as fields
 from lerobot_memobench.run.arguments import chosen_class, flag_value
-from lerobot_memobench.run.card import checkpoint_files, eyes_hash, tree_hash
+from lerobot_memobench.run.card import checkpoint_files, detector_hash, tree_hash
 from lerobot_memobench.run.lerobot_commands import config_class, load_command, register_plugins
 from lerobot_memobench.run.machine import gl_facts, versions
 from lerobot_memobench.run.plan import ENVIRONMENT, EvaluationPlan, plan_line
@@ -62,12 +62,12 @@ def check_policy(card: Mapping[str, Any]) -> None:
             f"the checkpoint {given} is not the one that was evaluated (sha256 {found[:12]}, on the card "
             f"{str(told)[:12]}); its results would be another policy's"
         )
-    settings, eyes = card["policy"].get("settings", {}), card["policy"].get("eyes_sha256")
-    here = eyes_hash(settings)
-    if here != eyes:
+    settings, detector = card["policy"].get("settings", {}), card["policy"].get("detector_sha256")
+    here = detector_hash(settings)
+    if here != detector:
         raise MemobenchError(
-            f"the eyes {settings.get('eyes')} are not those that were looked through (sha256 {str(here)[:12]}, on the "
-            f"card {str(eyes)[:12]}); the results would be another policy's"
+            f"the detector {settings.get('detector')} is not the one that was used (sha256 {str(here)[:12]}, on the "
+            f"card {str(detector)[:12]}); the results would be another policy's"
         )
 
 
@@ -107,8 +107,8 @@ REACHING_OUT = ("push_to_hub", "private", "use_peft", "trust_remote_code", "disc
 """Truth values of a policy by which more than its numbers changes."""
 WORDS = (
     *("job_name", "env.task", "env.tasks", "env.suite", "env.obs_type", "env.referent", "env.prompt_in", "env.render"),
-    *("policy.size", "policy.perception", "policy.align", "policy.subgoal_level", "policy.integration"),
-    *("policy.memory_camera", "policy.eyes"),
+    *("policy.size", "policy.perception", "policy.align", "policy.subgoal_level", "policy.memory_fusion"),
+    *("policy.memory_camera", "policy.detector"),
     *("policy.dtype", "policy.dialect", "policy.gripper"),
 )
 """Words, which name one of several known things."""

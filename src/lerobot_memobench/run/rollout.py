@@ -275,7 +275,7 @@ def _successes(info: dict[str, Any], rows: int) -> NDArray[np.bool_]:
 # ==== looking.py
 # Which policies look at the next observation: for those that do not, nothing is drawn and no objects are found.
 #
-# A policy of ours says so itself, by its method ``looks_next``. LeRobot's policies that plan chunks look when their queue
+# A policy of ours says so itself, by its method ``needs_observation``. LeRobot's policies that plan chunks look when their queue
 # of planned actions is empty; each is known by the very function that was read (tests/engine/test_lerobot_loop.py), so a
 # subclass that acts in another way, a wrapped policy, and any other always look. (`diffusion` queues pictures at every
 # step.)
@@ -304,7 +304,7 @@ KNOWN: dict[tuple[str, str], Callable[[Any], bool]] = {
 
 def looking(policy: Any) -> Callable[[], bool]:
     """Return what tells, before a step, whether a policy looks at pictures or objects of the observation after it."""
-    own = getattr(policy, "looks_next", None)
+    own = getattr(policy, "needs_observation", None)
     if own is not None:
         return own
     acts = getattr(type(policy), "select_action", None)

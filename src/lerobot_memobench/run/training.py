@@ -20,7 +20,7 @@ from lerobot_memobench.datasets.execution_frames import ExecutionFrames, leave_o
 from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, PRIVILEGED
 from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS as INPUT
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, OBS_TYPES, PIXELS
-from lerobot_memobench.envs.prompting import knows_phases, quiet
+from lerobot_memobench.envs.prompting import quiet, reads_prompt
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.lerobot_hooks import OPEN_DATASETS, check_version, install
@@ -317,7 +317,7 @@ def complete_training(settings: LerobotSettings) -> LerobotSettings:
     check_sight(policy, env_config(settings))
     if settings.get("resume") != "true":
         settings = with_logging(settings)
-    if not from_file and getattr(policy, "decodes_nothing", False):
+    if not from_file and getattr(policy, "decodes_no_video", False):
         settings = settings.default("batch_size", OBJECT_BATCH).default("num_workers", 0)
     if cores() < 4 and not from_file:  # LeRobot's default of 4 loaders would only wait for one another
         settings = settings.default("num_workers", cores())
@@ -410,7 +410,7 @@ def _steered(make: Callable[..., Any], prompt_frames: bool | None, obs_type: str
                 _take_for_input(dataset)
         _choose_inputs(config.policy, train.meta.features, obs_type)
         _check_environment(config, train)
-        wanted = config.policy is None or knows_phases(config.policy) if prompt_frames is None else prompt_frames
+        wanted = config.policy is None or reads_prompt(config.policy) if prompt_frames is None else prompt_frames
         if not wanted:
             count = leave_out_prompts(train)
             told = "the frames" if count is None else f"{count} frames"
@@ -437,7 +437,7 @@ def _check_streaming(config: Any) -> None:
 
 def _reads_objects(policy: Any, obs_type: str | None) -> bool:
     """Return whether a policy of LeRobot's is to see objects: as it was asked now, or when its training began."""
-    if policy is None or knows_phases(policy):
+    if policy is None or reads_prompt(policy):
         return False
     begun = policy.input_features or {}
     return INPUT in begun if begun else obs_type in (OBJECTS, BOTH)
@@ -468,7 +468,7 @@ def _check_environment(config: Any, dataset: Any) -> None:
     environment = getattr(config, "env", None)
     if config.policy is None or getattr(environment, "type", None) != "memobench":
         return
-    unseen = None if getattr(config.policy, "sees_pictures", True) else FeatureType.VISUAL
+    unseen = None if getattr(config.policy, "uses_pictures", True) else FeatureType.VISUAL
     features = dataset_to_policy_features(dataset.meta.features)
     policy = copy.copy(config.policy)
     policy.output_features = {key: one for key, one in features.items() if one.type is FeatureType.ACTION}
@@ -482,7 +482,7 @@ def _choose_inputs(policy: Any, features: dict[str, Any], obs_type: str | None) 
     """Tell a policy's configuration what it sees, as LeRobot would from all that a dataset holds."""
     from lerobot.utils.feature_utils import dataset_to_policy_features
 
-    if policy is None or policy.input_features or knows_phases(policy):
+    if policy is None or policy.input_features or reads_prompt(policy):
         return
     inputs = {key: f for key, f in dataset_to_policy_features(features).items() if f.type is not FeatureType.ACTION}
     pictures = any(feature.type is FeatureType.VISUAL for feature in inputs.values())

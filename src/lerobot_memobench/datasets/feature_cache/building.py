@@ -212,7 +212,7 @@ class _Work:
 # Is there room for a cache on the disk, and what is told when there is none?
 
 _CLOSED = (errno.EACCES, errno.EPERM, errno.EROFS)
-_ELSEWHERE = "put it elsewhere (`memobench cache --out`, --policy.memory_cache_dir)"
+_ELSEWHERE = "put it elsewhere (`memobench cache --out`, --policy.feature_cache_dir)"
 
 
 def reserve(path: Path, size: int) -> None:

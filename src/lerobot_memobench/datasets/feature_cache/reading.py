@@ -310,7 +310,7 @@ def _require(root: Path, names: Sequence[str], there: Sequence[str]) -> None:
     if missing:
         raise MemobenchError(
             f"The dataset {root} has no column '{missing[0]}', which this policy learns from; make it again with this "
-            "version's `memobench generate`, or train with --policy.perception=pixels and no --policy.sight_errors."
+            "version's `memobench generate`, or train with --policy.perception=pixels and no --policy.detection_noise."
         )
 
 

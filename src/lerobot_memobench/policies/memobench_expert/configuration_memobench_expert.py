@@ -16,5 +16,5 @@ from lerobot_memobench.policies.untrained import UntrainedConfig
 class MemobenchExpertConfig(UntrainedConfig):
     """Nothing to choose: the action comes from the environment's expert (``--env.expert_action=true``)."""
 
-    knows_phases: ClassVar[bool] = True
-    sees: ClassVar[tuple[str, ...]] = (SIMULATOR,)
+    reads_prompt: ClassVar[bool] = True
+    inputs: ClassVar[tuple[str, ...]] = (SIMULATOR,)

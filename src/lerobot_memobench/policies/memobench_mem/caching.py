@@ -39,11 +39,11 @@ from lerobot_memobench.policies.memobench_mem.checkpoints import load_exactly, r
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import (
     VISION_SEED,
-    EyePerception,
-    Perception,
-    PixelPerception,
+    ImageTowerEncoder,
+    ObservationEncoder,
+    VisualTokenEncoder,
+    encoded_key,
     seed_parameters,
-    seen_key,
 )
 from lerobot_memobench.policies.memobench_mem.language import (
     SiglipTextEncoder,
@@ -52,12 +52,12 @@ from lerobot_memobench.policies.memobench_mem.language import (
 )
 from lerobot_memobench.policies.memobench_mem.network import SizedPaliGemmaWithExpert
 from lerobot_memobench.policies.memobench_mem.objects import (
-    FOUND,
+    DETECTED,
     OBS_PHASE,
     OBS_RAW_STATE,
     VIEWS,
-    FoundObjects,
-    ObjectsInPictures,
+    DetectionEncoder,
+    ObjectsFromPictures,
 )
 from lerobot_memobench.sim.object_layout import SIZE
 
@@ -69,20 +69,20 @@ RECORDED = (OBS_STATE, OBS_ENV_STATE, ACTION, "timestamp", "frame_index", "episo
 _VISION_PREFIX = "paligemma_with_expert.paligemma.model."
 
 
-def load_sight(config: MemobenchMemConfig, weights: str | Path | None = None) -> EyePerception:
-    """Load the tower of ``config``'s eyes alone; arguments and errors as of `load_perception`."""
+def load_token_encoder(config: MemobenchMemConfig, weights: str | Path | None = None) -> VisualTokenEncoder:
+    """Load the tower of ``config``'s eyes alone; arguments and errors as of `load_image_tower`."""
     source = weights or config.base_weights
     if source is None:
-        assert config.eyes is not None  # asked of a configuration that has some
-        tower = load_visual_encoder(config.eyes)
+        assert config.visual_encoder is not None  # asked of a configuration that has one
+        tower = load_visual_encoder(config.visual_encoder)
     else:
         tower = VisualEncoder(folded=True).eval()
         load_exactly(tower, read_weights(source, _VISION_PREFIX + "vision_tower."), source, optional=set())
     width = config.dimensions.vlm.width
-    return EyePerception(tower.to(config.device), [*config.image_features], config.memory_camera or "", width)
+    return VisualTokenEncoder(tower.to(config.device), [*config.image_features], config.memory_camera or "", width)
 
 
-def load_perception(config: MemobenchMemConfig, weights: str | Path | None = None) -> PixelPerception:
+def load_image_tower(config: MemobenchMemConfig, weights: str | Path | None = None) -> ImageTowerEncoder:
     """Load the frozen image tower of ``config``'s size alone, without the rest of the model.
 
     Args:
@@ -92,7 +92,7 @@ def load_perception(config: MemobenchMemConfig, weights: str | Path | None = Non
     Raises:
         MemobenchError: the weights cannot be read or do not fit, or there is no tower.
     """
-    if config.sees_objects:
+    if config.uses_objects:
         raise MemobenchError(
             "perception=objects needs no feature cache where the environment tells the objects: training reads the "
             "dataset's columns; leave this command out, or name eyes that find them."
@@ -108,7 +108,7 @@ def load_perception(config: MemobenchMemConfig, weights: str | Path | None = Non
         else:
             load_exactly(part, read_weights(source, _VISION_PREFIX + name), source, optional=set())
         part.to(config.device)
-    return PixelPerception(tower, projector, config.image_size, config.memory_camera or "")
+    return ImageTowerEncoder(tower, projector, config.image_size, config.memory_camera or "")
 
 
 def cache_dataset(
@@ -125,45 +125,45 @@ def cache_dataset(
 
     Args:
         config: a policy configuration, for example ``MemobenchMemConfig(size="tiny", memory_stride=1)``.
-        weights: checkpoint whose image tower is used, see :func:`load_perception`.
+        weights: checkpoint whose image tower is used, see :func:`load_image_tower`.
         workers: threads that decode videos ahead of the tower; by the cores of the machine when None.
         progress: called with (episodes done, episodes in all).
         tell: told where it lies and how large it will be, before it is made.
 
     Returns:
-        The cache's folder, ``<root>/feature_cache/<size>-stride<n>-<hash>``, or below ``config.memory_cache_dir``; with
+        The cache's folder, ``<root>/feature_cache/<size>-stride<n>-<hash>``, or below ``config.feature_cache_dir``; with
         eyes that of the memory's, beside which those of the present lie.
     """
     config.memory_camera = config.memory_camera or next(iter(cameras_of(root)), None)
     how: dict[str, Any] = {"batch_size": batch_size, "workers": workers, "progress": progress, "tell": tell}
-    if config.finds_objects:
-        assert config.eyes is not None
-        return make_found(
-            root, config, ObjectsInPictures(load_detector(config.eyes)), _text_encoder(config), **how
+    if config.uses_detector:
+        assert config.detector is not None
+        return make_detections(
+            root, config, ObjectsFromPictures(load_detector(config.detector)), _text_encoder(config), **how
         ).folder
-    if config.has_eyes:
-        memory, present = make_caches(root, config, load_sight(config, weights), _text_encoder(config), **how)
+    if config.encodes_ahead:
+        memory, present = make_caches(root, config, load_token_encoder(config, weights), _text_encoder(config), **how)
         return (memory or next(iter(present.values()))).folder
-    perception = load_perception(config, weights)
+    perception = load_image_tower(config, weights)
     return _build(root, config, perception, **how)
 
 
-def open_frames(root: Path, config: MemobenchMemConfig, perception: Perception) -> FrameLookup:
+def open_frames(root: Path, config: MemobenchMemConfig, perception: ObservationEncoder) -> FrameLookup:
     """Open what training looks up of the dataset at ``root``.
 
     Raises:
         MemobenchError: the dataset lacks a column, or a cache cannot be made.
     """
-    if isinstance(perception, PixelPerception):
+    if isinstance(perception, ImageTowerEncoder):
         if config.memory == "none":
             return RecordedTexts(root, read_frame_table(root))
         return open_cache(root, config, perception)
-    names = [name for name in RECORDED if name != OBS_ENV_STATE] if config.sees_pictures else RECORDED
-    if isinstance(perception, EyePerception):
+    names = [name for name in RECORDED if name != OBS_ENV_STATE] if config.uses_pictures else RECORDED
+    if isinstance(perception, VisualTokenEncoder):
         return open_pictures(root, config, perception, _text_encoder(config), names)
     columns, table = read_recorded(root, names)
-    if isinstance(perception, FoundObjects):
-        columns[FOUND] = found_in(root, config, perception.look, _text_encoder(config))
+    if isinstance(perception, DetectionEncoder):
+        columns[DETECTED] = detections_of(root, config, perception.look, _text_encoder(config))
     phase = torch.from_numpy(table.phase)
     logger.info("%d frames of %s are read into memory", table.episodes[-1], root)
     return RecordedFrames(
@@ -179,7 +179,7 @@ def open_frames(root: Path, config: MemobenchMemConfig, perception: Perception) 
     )
 
 
-def open_cache(root: Path, config: MemobenchMemConfig, perception: PixelPerception) -> FeatureCache:
+def open_cache(root: Path, config: MemobenchMemConfig, perception: ImageTowerEncoder) -> FeatureCache:
     """Open the cache that ``config`` reads of the dataset at ``root``; make or finish it first where that is needed.
 
     Of several processes (the ranks of a training run) one makes it, and the others wait.
@@ -204,16 +204,16 @@ def open_cache(root: Path, config: MemobenchMemConfig, perception: PixelPercepti
     )
 
 
-def _build(root: Path, config: MemobenchMemConfig, perception: PixelPerception, **how: Any) -> Path:
+def _build(root: Path, config: MemobenchMemConfig, perception: ImageTowerEncoder, **how: Any) -> Path:
     """Make or finish the cache of what ``perception`` remembers, beside the dataset or where ``config`` says."""
     seen: dict[str, Any] = {"camera": _column(root, perception), "stride": config.memory_stride}
     folder = find_cache(root, config.cache_name, frames_key=perception.key, place=config.cache_place, **seen)
     return build_feature_cache(root, folder.name, perception, _text_encoder(config), place=folder.parent, **seen, **how)
 
 
-def _column(root: Path, perception: PixelPerception) -> str:
+def _column(root: Path, perception: ImageTowerEncoder) -> str:
     """Return the dataset's column that is remembered: its first camera, where the policy has not chosen yet."""
-    return name_in_data(perception.remembers) or next(iter(cameras_of(root)), "")
+    return name_in_data(perception.memory_input) or next(iter(cameras_of(root)), "")
 
 
 def _text_encoder(config: MemobenchMemConfig) -> WordTextEncoder | SiglipTextEncoder:
@@ -267,7 +267,7 @@ class Wanted:
 def make_caches(
     root: Path,
     config: MemobenchMemConfig,
-    eyes: EyePerception,
+    encoder: VisualTokenEncoder,
     texts: TextEncoder,
     *,
     tell: Callable[[str], None] = logger.info,
@@ -286,7 +286,7 @@ def make_caches(
         MemobenchError: the dataset lacks a camera, or the disk has no room for all of them.
     """
     frames = int(read_info(root).get("total_frames", 0))
-    wanted = _wanted(root, config, eyes, cameras_of(root))
+    wanted = _wanted(root, config, encoder, cameras_of(root))
     memory = wanted[-1] if config.memory != "none" else None
     present = wanted if memory is None else wanted[:-1]
     sizes = {cache.folder: _bytes(cache, frames) for cache in wanted}
@@ -335,7 +335,9 @@ def _make(root: Path, cache: Wanted, texts: TextEncoder, **how: Any) -> None:
     build_feature_cache(root, cache.folder.name, cache.tokens, texts, **named, **how)
 
 
-def _wanted(root: Path, config: MemobenchMemConfig, eyes: EyePerception, cameras: Sequence[str]) -> list[Wanted]:
+def _wanted(
+    root: Path, config: MemobenchMemConfig, encoder: VisualTokenEncoder, cameras: Sequence[str]
+) -> list[Wanted]:
     """Return the caches: of the present of each camera, and last the memory's, where something is remembered."""
 
     def wanted(name: str, stride: int, begins: str, tokens: Tokens) -> Wanted:
@@ -343,13 +345,13 @@ def _wanted(root: Path, config: MemobenchMemConfig, eyes: EyePerception, cameras
         where: dict[str, Any] = {"camera": camera, "stride": stride, "place": config.cache_place}
         return Wanted(name, camera, stride, tokens, find_cache(root, begins, frames_key=tokens.key, **where))
 
-    whole = Tokens(eyes.present_key, GRID**2, eyes.look)
-    pooled = Tokens(eyes.key, eyes.tokens_per_frame, eyes.pooled)
-    seen = dict.fromkeys(eyes.cameras or [*cameras, eyes.remembers])
+    whole = Tokens(encoder.present_key, GRID**2, encoder.encode)
+    pooled = Tokens(encoder.key, encoder.tokens_per_frame, encoder.pooled)
+    seen = dict.fromkeys(encoder.cameras or [*cameras, encoder.memory_input])
     present = [wanted(camera, 1, f"{config.size}-present", whole) for camera in seen]
     if config.memory == "none":
         return present
-    return [*present, wanted(eyes.remembers, config.memory_stride, config.cache_name, pooled)]
+    return [*present, wanted(encoder.memory_input, config.memory_stride, config.cache_name, pooled)]
 
 
 def _bytes(cache: Wanted, frames: int) -> int:
@@ -360,7 +362,7 @@ def _bytes(cache: Wanted, frames: int) -> int:
 def open_pictures(
     root: Path,
     config: MemobenchMemConfig,
-    eyes: EyePerception,
+    encoder: VisualTokenEncoder,
     texts: TextEncoder,
     names: Sequence[str],
 ) -> RecordedFrames:
@@ -370,19 +372,19 @@ def open_pictures(
         MemobenchError: the dataset lacks a column, or a cache cannot be made.
     """
     memory, present = make_caches(
-        root, config, eyes, texts, progress=lambda done, count: logger.info("seen: %d of %d episodes", done, count)
+        root, config, encoder, texts, progress=lambda done, count: logger.info("seen: %d of %d episodes", done, count)
     )
     columns, table = read_recorded(root, names)
-    columns |= {seen_key(camera): cache.all_tokens() for camera, cache in present.items()}
+    columns |= {encoded_key(camera): cache.all_tokens() for camera, cache in present.items()}
 
     def remember(_: Any, frames: Sequence[int]) -> Tensor:
         """Return what is remembered of frames of one episode, by their global numbers."""
         if memory is None:  # training asks for none; a sample's shape is asked for all the same
-            return torch.zeros(len(frames), eyes.tokens_per_frame, WIDTH)
+            return torch.zeros(len(frames), encoder.tokens_per_frame, WIDTH)
         episode, first = memory.locate(frames[0])
         return memory.tokens(episode, [(first + frame - frames[0]) // memory.meta.stride for frame in frames])
 
-    return RecordedFrames(root, columns, table, texts, remember=remember, key=eyes.key, stride=config.memory_stride)
+    return RecordedFrames(root, columns, table, texts, remember=remember, key=encoder.key, stride=config.memory_stride)
 
 
 # ==== found_in_pictures.py
@@ -397,10 +399,10 @@ Look = tuple[dict[str, Tensor], Tensor]
 
 
 @dataclass
-class SlotEncoder:
+class DetectionFeatures:
     """What makes a cache's numbers; a `FrameEncoder`."""
 
-    look: ObjectsInPictures
+    look: ObjectsFromPictures
     tokens_per_frame: int = 2
     dim: int = SIZE
 
@@ -416,8 +418,8 @@ class SlotEncoder:
         return torch.stack([rounded, (slots - rounded.float()).to(torch.bfloat16)], dim=1)
 
 
-def make_found(
-    root: Path, config: MemobenchMemConfig, look: ObjectsInPictures, texts: TextEncoder, **how: Any
+def make_detections(
+    root: Path, config: MemobenchMemConfig, look: ObjectsFromPictures, texts: TextEncoder, **how: Any
 ) -> FeatureCache:
     """Make or finish the cache of what is found in the pictures of the dataset at ``root``.
 
@@ -430,7 +432,7 @@ def make_found(
     where: dict[str, Any] = {"camera": next(iter(VIEWS)), "stride": 1}
     folder = find_cache(root, "objects", frames_key=look.key, place=config.cache_place, **where)
     where["place"] = folder.parent
-    build_feature_cache(root, folder.name, SlotEncoder(look), texts, read=_reader(root), **where, **how)
+    build_feature_cache(root, folder.name, DetectionFeatures(look), texts, read=_reader(root), **where, **how)
     return FeatureCache.open(root, folder.name, frames_key=look.key, **where)
 
 
@@ -449,10 +451,12 @@ def _reader(root: Path) -> FrameReader:
     return read
 
 
-def found_in(root: Path, config: MemobenchMemConfig, look: ObjectsInPictures, texts: TextEncoder, **how: Any) -> Tensor:
-    """Return what is found at every frame of the dataset at ``root``, (N, SIZE) float32; all else as `make_found`."""
+def detections_of(
+    root: Path, config: MemobenchMemConfig, look: ObjectsFromPictures, texts: TextEncoder, **how: Any
+) -> Tensor:
+    """Return what is found at every frame of the dataset at ``root``, (N, SIZE) float32; all else as `make_detections`."""
 
     def tell(done: int, count: int) -> None:
         logger.info("objects found in %d of %d episodes", done, count)
 
-    return make_found(root, config, look, texts, progress=tell, **how).all_tokens().sum(dim=1, dtype=torch.float32)
+    return make_detections(root, config, look, texts, progress=tell, **how).all_tokens().sum(dim=1, dtype=torch.float32)

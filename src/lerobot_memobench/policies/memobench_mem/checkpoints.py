@@ -27,7 +27,7 @@ def read_config(source: str | Path, config: PreTrainedConfig | None, revision: s
     """Return the configuration that a checkpoint is loaded with: ``config``, or its own.
 
     Raises:
-        MemobenchError: it is another policy's, or was trained through other eyes.
+        MemobenchError: it is another policy's, or was trained with another visual encoder.
     """
     found = PreTrainedConfig.from_pretrained(source, revision=revision) if config is None else config
     if not isinstance(found, MemobenchMemConfig):
@@ -36,11 +36,11 @@ def read_config(source: str | Path, config: PreTrainedConfig | None, revision: s
             "pass --policy.type=memobench_mem --policy.base_weights=<checkpoint>."
         )
     path = checkpoint_file(source, CONFIG_FILE, revision)
-    held = None if path is None else read_json(path).get("eyes")
-    if held and found.eyes and found.eyes != held and not found.sees_objects:
+    held = None if path is None else read_json(path).get("visual_encoder")
+    if held and found.visual_encoder and found.visual_encoder != held:
         raise MemobenchError(
-            f"--policy.eyes={found.eyes} cannot be followed: '{source}' was trained through the tower of '{held}' and "
-            "holds it; leave eyes out, or train anew."
+            f"--policy.visual_encoder={found.visual_encoder} cannot be followed: '{source}' was trained with that of "
+            f"'{held}' and holds it; leave visual_encoder out, or train anew."
         )
     return found
 

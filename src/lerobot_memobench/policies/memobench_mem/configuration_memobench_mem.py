@@ -1,4 +1,4 @@
-"""Configuration of ``memobench_mem``: its settings, with what size and perception decide, checked."""
+"""Configuration of ``memobench_mem``: dimensions of its sizes, its settings, their defaults and checks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
 from lerobot_memobench.envs.observations import DETECTIONS, SEEN_PIXELS
-from lerobot_memobench.envs.observations import PRIVILEGED as SEEN_OBJECTS
+from lerobot_memobench.envs.observations import PRIVILEGED as PRIVILEGED_INPUT
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.perception.visual_encoder import SIDE
 from lerobot_memobench.perception.weights import PACKAGE, RANDOM
@@ -28,11 +28,20 @@ from lerobot_memobench.protocol import CAMERAS, IMAGE_SIZE
 logger = logging.getLogger(__name__)
 
 FLOW_MATCHING, REGRESSION = "flow_matching", "regression"
-
-
 OBJECTIVES = (FLOW_MATCHING, REGRESSION)
+ALIGN_WEIGHTS = {"none": 0.0, "semantic": 0.1, "contrastive": 0.1, "framewise": 0.05}
+MEMORY_FUSIONS = ("modulation", "context", "none")
+PERCEPTIONS = ("pixels", "objects")
+SUBGOAL_LEVELS = ("coarse", "intermediate", "fine")
+PROMPTED = "prompted"
+"""Key of ``task_weights`` for tasks that begin with a demonstration prompt."""
 MEMORY_GRID = 4
 """A remembered picture is pooled to MEMORY_GRID x MEMORY_GRID tokens."""
+TOKENS_PER_FRAME = {"pixels": MEMORY_GRID**2, "objects": 2}
+MEMORY_STRIDE, FRAMES_PER_EPISODE = 8, 6
+"""Where training decodes no video; 1 elsewhere."""
+ORACLE_TOKENS = 128
+"""Room that oracle memory text needs in a prompt of the word tokenizer: six memory checkpoints of some ten words."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +74,7 @@ class Recipe:
 
     Attributes:
         chunk_size: actions of a plan. n_action_steps: how many of them are taken before the next plan.
-        final_lr: learning rate at the end, as a fraction of the highest; below 1 it falls there as a cosine.
+        min_lr_ratio: learning rate at the end, as a fraction of the highest; below 1 it falls there as a cosine.
         normalization: LeRobot's mode for states and actions.
         objective: how actions are learned (`action_objective`).
     """
@@ -74,7 +83,7 @@ class Recipe:
     n_action_steps: int = 50
     weight_decay: float = 0.0
     ema_decay: float = 0.999
-    final_lr: float = 1.0
+    min_lr_ratio: float = 1.0
     normalization: str = "QUANTILES"
     objective: str = "flow_matching"
 
@@ -124,7 +133,7 @@ SIZES = {
             n_action_steps=6,
             weight_decay=1e-4,
             ema_decay=0.995,
-            final_lr=0.02,
+            min_lr_ratio=0.02,
             normalization="MEAN_STD",
             objective="regression",
         ),
@@ -142,16 +151,6 @@ SIZES = {
     ),
 }
 
-ALIGN_WEIGHTS = {"none": 0.0, "semantic": 0.1, "contrastive": 0.1, "framewise": 0.05}
-INTEGRATIONS = ("modulation", "context", "none")
-PERCEPTIONS = ("pixels", "objects")
-SUBGOAL_LEVELS = ("coarse", "intermediate", "fine")
-TOKENS_PER_FRAME = {"pixels": MEMORY_GRID**2, "objects": 2}
-MEMORY_STRIDE, MOMENTS_PER_EPISODE = 8, 6
-"""Where samples are made of what was read before training; 1 elsewhere."""
-ORACLE_TOKENS = 128
-"""Room that oracle memory text needs in a prompt of the word tokenizer: six checkpoints of some ten words."""
-
 
 def _names(text: str) -> tuple[str, ...]:
     return tuple(text.split())
@@ -159,7 +158,7 @@ def _names(text: str) -> tuple[str, ...]:
 
 FIXED = _names(
     """
-    size perception object_classes integration oracle_memory memory_camera memory_frames
+    size perception object_classes memory_fusion oracle_memory memory_camera memory_frames
     tokens_per_frame memory_stride objective chunk_size normalization_mapping image_resolution tokenizer_name
     tokenizer_max_length input_features n_obs_steps paligemma_variant action_expert_variant max_state_dim max_action_dim
     min_period max_period use_relative_actions relative_exclude_joints action_feature_names empty_cameras
@@ -169,18 +168,18 @@ FIXED = _names(
 mean something else, mostly without a word. Those that decide others stand before them."""
 OF_ACTING = _names(
     """
-    n_action_steps whole_plan_if_still eyes num_inference_steps rtc_config device dtype use_amp
+    n_action_steps full_chunk_when_stalled detector visual_encoder num_inference_steps rtc_config device dtype use_amp
     compile_model compile_mode pretrained_path pretrained_revision use_peft output_features
     """
 )
-"""Fields that are free where a checkpoint acts. ``eyes`` that find objects are no part of it, and its own tower has a
+"""Fields that are free where a checkpoint acts. A ``detector`` is no part of it, and its own ``visual_encoder`` has a
 rule of its own (`checkpoints.read_config`); LeRobot makes ``output_features`` of the environment's, which
 `policies.shown` compares with the checkpoint's."""
 OF_TRAINING = _names(
     """
-    sight_errors base_weights align align_weight subgoal_level shuffle_subgoals
-    shuffle_seed text_encoder memory_cache_dir ema_decay moments_per_episode balance_tasks prompted_weight
-    train_expert_only warmup_fraction final_lr gradient_checkpointing time_sampling_beta_alpha
+    detection_noise base_weights align align_weight subgoal_level shuffle_subgoals
+    shuffle_seed text_encoder feature_cache_dir ema_decay frames_per_episode task_weights
+    train_expert_only warmup_fraction min_lr_ratio gradient_checkpointing time_sampling_beta_alpha
     time_sampling_beta_beta time_sampling_scale time_sampling_offset optimizer_lr optimizer_betas optimizer_eps
     optimizer_weight_decay optimizer_grad_clip_norm scheduler_warmup_steps scheduler_decay_steps scheduler_decay_lr
     push_to_hub repo_id private tags license
@@ -191,31 +190,23 @@ value is refused there, or its card would tell of a training that never was."""
 SINCE_BEGUN = _names(
     """
     align subgoal_level shuffle_subgoals shuffle_seed text_encoder base_weights train_expert_only
-    ema_decay warmup_fraction final_lr optimizer_lr optimizer_betas optimizer_eps optimizer_weight_decay
+    ema_decay warmup_fraction min_lr_ratio optimizer_lr optimizer_betas optimizer_eps optimizer_weight_decay
     optimizer_grad_clip_norm scheduler_warmup_steps scheduler_decay_steps scheduler_decay_lr
     """
 )
 """Those of `OF_TRAINING` that a training keeps where it is gone on with: they decide the model's parts and what these
 learn, or stand in the optimizer's saved state, which LeRobot makes from them once."""
 
-SIZES_OWN: Any = None
-"""Default of what the size or the perception decides once the rest is known; then it is a number."""
-
-
-def _choose(field: str, given: str, known: tuple[str, ...]) -> None:
-    if given not in known:
-        raise MemobenchError(
-            f"memobench_mem has no {field} '{given}': {nearest(str(given), known)} "
-            f"Pass --policy.{field}=<one of {', '.join(known)}>."
-        )
+FROM_SIZE: Any = None
+"""Default of a field that the size or the perception decides; after construction it is set."""
 
 
 @PreTrainedConfig.register_subclass("memobench_mem")
 @dataclass
 class MemobenchMemConfig(PI05Config):
-    """pi0.5's fields plus the memory's. Fields that are ``None`` here take the size's value after construction."""
+    """pi0.5's fields plus the memory's. Fields that are ``None`` here take the size's value in construction."""
 
-    knows_phases: ClassVar[bool] = True
+    reads_prompt: ClassVar[bool] = True
     execution_only: ClassVar[bool] = True
     fixed_by_training: ClassVar[tuple[str, ...]] = FIXED
     of_training_alone: ClassVar[tuple[str, ...]] = OF_TRAINING
@@ -225,18 +216,20 @@ class MemobenchMemConfig(PI05Config):
     """``small`` (from scratch, learns from objects in minutes on a CPU), ``tiny`` (from scratch, trains on a CPU) or
     ``pi05`` (3.2 B)."""
 
+    # -- observations
     perception: str = "pixels"
-    """How a moment is seen: ``pixels``, by the image tower, or ``objects``, by the slots of
-    ``observation.environment_state`` (`sim.object_slots`), without any picture, or as ``eyes`` find them."""
-    eyes: str | None = None
-    """What pictures are seen through: a file of `python -m research.detector train`, ``package``: the eyes that
-    come with the package, or ``random``: pi0.5's image tower with random weights.
-    With ``perception=objects``, the eyes that find
-    them in pictures; none: the environment tells them. With pixels at ``size=small``, whose tower's tokens are seen;
-    none: ``package``. A checkpoint of pixels holds its tower; there this only says where it was from."""
-    sight_errors: float = 0.0
-    """With which errors told objects are seen in training, so that the policy acts through ``eyes`` afterwards; 1: as
-    large as those of the package's eyes, 0: none."""
+    """Source of observation tokens: ``pixels``, through a frozen image tower, or ``objects``, the slots of
+    ``observation.environment_state`` (`sim.object_slots`): privileged object state, or detections."""
+    detector: str | None = None
+    """With ``perception=objects``, the detector whose detections in pictures stand for privileged object state: a file
+    of `python -m research.detector train`, or ``package``; none: the environment gives the state. No part of a
+    checkpoint, which only names it."""
+    visual_encoder: str | None = None
+    """With pixels at ``size=small``, the frozen encoder of pictures: that of a detector's file or of ``package`` (the
+    default), or ``random``: pi0.5's image tower with random weights. A checkpoint holds its weights."""
+    detection_noise: float = 0.0
+    """Size of the errors that are added to privileged object state in training, so that the policy acts by a
+    ``detector`` afterwards; 1: as large as those of the package's detector, 0: none."""
     object_classes: list[str] | None = None
     """Names of the classes that slots were trained with, in order of their indices; none: those of this version."""
 
@@ -252,60 +245,60 @@ class MemobenchMemConfig(PI05Config):
     """Control of the paper: the subgoal texts of an episode change places among themselves, or with those of other
     episodes where it has fewer than three."""
     shuffle_seed: int = 7
-    """Which shuffle; the same for every epoch and on every machine."""
+    """Seed of that shuffle; the result is the same for every epoch and on every machine."""
     text_encoder: str | None = None
 
     # -- memory
-    integration: str = "modulation"
+    memory_fusion: str = "modulation"
     """How actions read memory: ``modulation``, ``context`` (memory joins the prefix), or ``none``: plain pi0.5, the
-    baseline that never sees the past."""
+    baseline without a memory."""
     oracle_memory: bool = False
-    """Control of the paper: ground-truth memory text stands in the prompt, from the dataset's column ``memory`` in
+    """Control of the paper: ground-truth memory text stands in the text prompt, from the dataset's column ``memory`` in
     training and from the environment (``--env.oracle_memory=true``) at evaluation."""
     memory_camera: str | None = None
-    """Whose pictures are remembered; none: the first camera's that the policy sees."""
+    """Camera whose pictures are remembered; none: the first of the policy's."""
     memory_frames: int = 32
-    tokens_per_frame: int = SIZES_OWN
+    tokens_per_frame: int = FROM_SIZE
     """Memory tokens of a remembered frame: 16 of a picture; 2, or another number, of objects."""
-    memory_stride: int = SIZES_OWN
-    """Every how many control steps a frame enters the history (and the cache); none: 8 with objects and
-    with eyes, 1 with other pixels."""
-    memory_cache_dir: str | None = None
+    memory_stride: int = FROM_SIZE
+    """Control steps from one frame of the history (and the cache) to the next; none: 8 where training decodes no video
+    (objects, and pixels through a visual encoder), else 1."""
+    feature_cache_dir: str | None = None
     """Folder for feature caches, of several datasets perhaps; none: ``feature_cache`` in the dataset's folder."""
 
     # -- training
-    objective: str = SIZES_OWN
-    """How actions are learned: ``flow_matching``, as in pi0.5, or ``regression``, whose plan is one pass of the model
-    instead of ten (`action_objective`). None: the size's, ``regression`` at ``small``."""
-    ema_decay: float = SIZES_OWN
+    objective: str = FROM_SIZE
+    """How actions are learned: ``flow_matching``, as in pi0.5, or ``regression``, whose chunk is one pass of the model
+    instead of ten (`training`). None: the size's, ``regression`` at ``small``."""
+    ema_decay: float = FROM_SIZE
     """Decay of the weights' moving average, which evaluation uses; 0 turns it off. None: the size's, the paper's
     0.999 or 0.995 at ``small``."""
-    moments_per_episode: int = SIZES_OWN
-    """How many frames of an episode stand side by side in a batch, which shares what they remember; none: 6 with
-    objects and with eyes, and 1, LeRobot's order, with other pixels. ``batch_size`` counts frames all the same."""
-    balance_tasks: float = SIZES_OWN
-    """1: each task is drawn equally often, however long its episodes are; 0: each frame once per epoch; between: in
-    proportion to its frames to the power 1 - balance_tasks. None: 1 with objects and with eyes, else 0."""
-    prompted_weight: float = 1.0
-    """How many times as often as another a task that begins with a prompt is drawn, where tasks are balanced: to read a
-    prompt takes more updates than to act."""
+    frames_per_episode: int = FROM_SIZE
+    """Frames of an episode that stand side by side in a batch, and share memory; none: 6 where training decodes no
+    video, else 1, LeRobot's order. ``batch_size`` counts frames all the same."""
+    task_weights: dict[str, float] | None = None
+    """Tasks are drawn in proportion to these weights, however long their episodes are. Keys are task names, memory types
+    or ``prompted`` (tasks that begin with a demonstration prompt), of which the first that a task has counts; other
+    tasks weigh 1, and ``{}`` draws all alike. None: ``{}`` where training decodes no video, else frames alike."""
     warmup_fraction: float = 0.05
-    final_lr: float = SIZES_OWN
+    min_lr_ratio: float = FROM_SIZE
     """Learning rate at the end, as a fraction of the highest, to which it falls as a cosine; 1: it stays constant.
     None: the size's, 0.02 at ``small`` and the paper's 1 elsewhere."""
 
     # -- pi0.5's fields with this recipe's values, or the size's where they are None or empty
-    chunk_size: int = SIZES_OWN
-    n_action_steps: int = SIZES_OWN
-    whole_plan_if_still: bool = False
-    """Whether all of a plan is carried out, and not its first ``n_action_steps``, where the hand stands as it stood at
-    the plan before: on a rim it might stand for ever, and plan each time to let go a little later."""
+    chunk_size: int = FROM_SIZE
+    n_action_steps: int = FROM_SIZE
+    full_chunk_when_stalled: bool = False
+    """Whether a whole chunk is executed, and not its first ``n_action_steps``, where the hand stands as it stood at the
+    chunk before: on a rim it might stand for ever, and plan each time to let go a little later."""
     normalization_mapping: dict[str, NormalizationMode] = field(default_factory=dict)
     image_resolution: tuple[int, int] | None = None
     tokenizer_name: str | None = None
     tokenizer_max_length: int | None = None
     optimizer_lr: float | None = None
-    optimizer_weight_decay: float = SIZES_OWN
+    optimizer_weight_decay: float = FROM_SIZE
+
+    drop_n_last_frames = 0  # no field: LeRobot asks it of a configuration when it makes its sampler (see `sampler`)
 
     def __post_init__(self) -> None:
         try:
@@ -316,30 +309,43 @@ class MemobenchMemConfig(PI05Config):
             raise
 
     def _complete(self) -> None:
-        """Fill in what the size and the objective decide, and check every field."""
-        _choose("size", self.size, tuple(SIZES))
-        _choose("align", self.align, tuple(ALIGN_WEIGHTS))
-        _choose("perception", self.perception, PERCEPTIONS)
-        _choose("integration", self.integration, INTEGRATIONS)
-        _choose("subgoal_level", self.subgoal_level, SUBGOAL_LEVELS)
-        self._choose_eyes()
-        dims = self.dimensions
-        for name, value in self._defaults().items():
+        """Set the fields that the size and the perception decide, and check every field."""
+        self._choose("size", tuple(SIZES))
+        self._choose("align", tuple(ALIGN_WEIGHTS))
+        self._choose("perception", PERCEPTIONS)
+        self._choose("memory_fusion", MEMORY_FUSIONS)
+        self._choose("subgoal_level", SUBGOAL_LEVELS)
+        self._check_encoders()
+        dims, recipe = self.dimensions, self.dimensions.recipe
+        defaults = {
+            "chunk_size": recipe.chunk_size,
+            "n_action_steps": min(recipe.n_action_steps, self.chunk_size or recipe.chunk_size),
+            "ema_decay": recipe.ema_decay,
+            "min_lr_ratio": recipe.min_lr_ratio,
+            "objective": recipe.objective,
+            "optimizer_weight_decay": recipe.weight_decay,
+            "optimizer_lr": dims.learning_rate,
+            "tokens_per_frame": TOKENS_PER_FRAME[self.perception],
+            "memory_stride": MEMORY_STRIDE if self.decodes_no_video else 1,
+            "frames_per_episode": FRAMES_PER_EPISODE if self.decodes_no_video else 1,
+            "task_weights": {} if self.decodes_no_video else None,
+            "tokenizer_name": dims.tokenizer,
+            "text_encoder": dims.text_encoder,
+        }
+        for name, value in defaults.items():
             if getattr(self, name) is None:
                 setattr(self, name, value)
-        _choose("objective", self.objective, OBJECTIVES)
+        self._choose("objective", OBJECTIVES)
         if not self.normalization_mapping:
-            mode = NormalizationMode(dims.recipe.normalization)
+            mode = NormalizationMode(recipe.normalization)
             self.normalization_mapping = {"VISUAL": NormalizationMode.IDENTITY, "STATE": mode, "ACTION": mode}
         if self.image_resolution is None:
-            side = SIDE if self.sees_tokens else dims.vision.image
+            side = SIDE if self.uses_visual_encoder else dims.vision.image
             self.image_resolution = (side, side)
         # A checkpoint without oracle memory holds the length of prompts without it, which would cut the text off.
         if self.tokenizer_max_length in (None, dims.tokenizer_max_length):
             room = ORACLE_TOKENS if self.oracle_memory and dims.tokenizer == "words" else 0
             self.tokenizer_max_length = dims.tokenizer_max_length + room
-        self.tokenizer_name = self.tokenizer_name or dims.tokenizer
-        self.text_encoder = self.text_encoder or dims.text_encoder
         # A checkpoint with align=none holds a weight of 0, with which another objective would change nothing.
         if not self.align_weight:
             self.align_weight = ALIGN_WEIGHTS[self.align]
@@ -349,101 +355,91 @@ class MemobenchMemConfig(PI05Config):
         super().__post_init__()
         self._check_numbers()
         self._check_perception()
-        self._check_objective()
-        self._check_alignment()
+        self._check_objectives()
 
-    def _defaults(self) -> dict[str, Any]:
-        """Return what the size and the perception decide where nobody else does."""
-        recipe = self.dimensions.recipe
-        return {
-            "chunk_size": recipe.chunk_size,
-            "n_action_steps": min(recipe.n_action_steps, self.chunk_size or recipe.chunk_size),
-            "ema_decay": recipe.ema_decay,
-            "final_lr": recipe.final_lr,
-            "objective": recipe.objective,
-            "optimizer_weight_decay": recipe.weight_decay,
-            "optimizer_lr": self.dimensions.learning_rate,
-            "tokens_per_frame": TOKENS_PER_FRAME[self.perception],
-            "memory_stride": MEMORY_STRIDE if self.decodes_nothing else 1,
-            "balance_tasks": float(self.decodes_nothing),
-            "moments_per_episode": MOMENTS_PER_EPISODE if self.decodes_nothing else 1,
-        }
+    # -- checks ----------------------------------------------------------------------------------------------------
 
-    def _choose_eyes(self) -> None:
-        if self.size == "small" and not self.sees_objects:
-            self.eyes = self.eyes or PACKAGE
-        elif self.eyes is not None and not self.sees_objects:
+    def _choose(self, field: str, known: tuple[str, ...]) -> None:
+        given = getattr(self, field)
+        if given not in known:
             raise MemobenchError(
-                f"--policy.eyes={self.eyes} is for --policy.size=small, or --policy.perception=objects, and not for "
-                f"size={self.size} perception={self.perception}; leave it out."
+                f"memobench_mem has no {field} '{given}': {nearest(str(given), known)} "
+                f"Pass --policy.{field}=<one of {', '.join(known)}>."
             )
-        elif self.eyes == RANDOM:
+
+    def _check_encoders(self) -> None:
+        """Refuse a detector or a visual encoder where there is no use for it; set the default encoder."""
+        encodes = self.size == "small" and not self.uses_objects
+        if self.visual_encoder is not None and not encodes:
             raise MemobenchError(
-                f"--policy.eyes={RANDOM} finds no objects; name {PACKAGE} or a file of "
-                "`python -m research.detector train`, or leave it out: then objects are told by the environment."
+                f"--policy.visual_encoder={self.visual_encoder} is for --policy.size=small --policy.perception=pixels, "
+                f"and not for size={self.size} perception={self.perception}; leave it out."
             )
+        if self.detector is not None and (not self.uses_objects or self.detector == RANDOM):
+            raise MemobenchError(
+                f"--policy.detector={self.detector} cannot be used with perception={self.perception}: with "
+                f"--policy.perception=objects name {PACKAGE} or a file of `python -m research.detector train`; or "
+                "leave it out: then the environment gives the objects."
+            )
+        if encodes:
+            self.visual_encoder = self.visual_encoder or PACKAGE
 
     def _check_numbers(self) -> None:
-        counts = ("memory_frames", "memory_stride", "n_action_steps", "tokens_per_frame", "moments_per_episode")
+        counts = ("memory_frames", "memory_stride", "n_action_steps", "tokens_per_frame", "frames_per_episode")
         for name in counts:
             if getattr(self, name) < 1:
                 raise MemobenchError(f"--policy.{name}={getattr(self, name)} must be at least 1.")
-        if not 0.0 <= self.final_lr <= 1.0:
-            raise MemobenchError(f"--policy.final_lr={self.final_lr} must be in [0, 1]; 1 keeps the rate constant.")
-        if not 0.0 <= self.balance_tasks <= 1.0:
-            raise MemobenchError(f"--policy.balance_tasks={self.balance_tasks} must be in [0, 1]; 1 draws them alike.")
-        if self.prompted_weight <= 0.0 or (self.prompted_weight != 1.0 and not self.balance_tasks):
+        if not 0.0 <= self.min_lr_ratio <= 1.0:
             raise MemobenchError(
-                f"--policy.prompted_weight={self.prompted_weight} must be above 0, and 1 where tasks are not balanced "
-                f"(--policy.balance_tasks={self.balance_tasks})."
+                f"--policy.min_lr_ratio={self.min_lr_ratio} must be in [0, 1]; 1 keeps the rate constant."
             )
+        if any(weight < 0 for weight in (self.task_weights or {}).values()):
+            raise MemobenchError(f"--policy.task_weights={self.task_weights} must not hold negative weights.")
         if not 0.0 <= self.ema_decay < 1.0:
             raise MemobenchError(f"--policy.ema_decay={self.ema_decay} must be in [0, 1); 0 turns it off.")
         if self.align_weight is not None and self.align_weight < 0:
             raise MemobenchError(f"--policy.align_weight={self.align_weight} must not be negative.")
 
     def _check_perception(self) -> None:
-        if self.sight_errors < 0 or (self.sight_errors and not self.sees_objects):
+        if self.detection_noise < 0 or (self.detection_noise and not self.uses_objects):
             raise MemobenchError(
-                f"--policy.sight_errors={self.sight_errors} must not be negative, and are errors of objects: leave it "
-                "out, or use --policy.perception=objects."
+                f"--policy.detection_noise={self.detection_noise} must not be negative, and is noise of objects: leave "
+                "it out, or use --policy.perception=objects."
             )
-        if self.whole_plan_if_still and not self.sees_objects:
+        if self.full_chunk_when_stalled and not self.uses_objects:
             raise MemobenchError(
-                "--policy.whole_plan_if_still=true is for policies that see objects, which are told where the hand is; "
-                "leave it out, or use --policy.perception=objects."
+                "--policy.full_chunk_when_stalled=true is for policies that read objects, which are given the hand's "
+                "pose; leave it out, or use --policy.perception=objects."
             )
-        if self.perception == "pixels" and self.tokens_per_frame != MEMORY_GRID**2:
+        if not self.uses_objects and self.tokens_per_frame != MEMORY_GRID**2:
             raise MemobenchError(
-                f"--policy.tokens_per_frame={self.tokens_per_frame} is not supported: frames are pooled to a "
-                f"4x4 grid, so leave it at {MEMORY_GRID**2}."
+                f"--policy.tokens_per_frame={self.tokens_per_frame} is for objects: pictures are pooled to a 4x4 grid, "
+                f"{MEMORY_GRID**2} tokens; leave it out."
             )
-        if self.sees_tokens:
+        if self.uses_visual_encoder:
             if self.image_size != (SIDE, SIDE):
                 raise MemobenchError(
-                    f"--policy.image_resolution={self.image_resolution} cannot be used: eyes look at {SIDE} x {SIDE} "
-                    "pixels; leave it out, or use --policy.eyes=random."
+                    f"--policy.image_resolution={self.image_resolution} cannot be used: the visual encoder takes {SIDE} "
+                    f"x {SIDE} pixels; leave it out, or use --policy.visual_encoder={RANDOM}."
                 )
             return
-        patch = self.dimensions.vision.patch
-        if any(side % patch or (side // patch) % MEMORY_GRID for side in self.image_size):
+        multiple = MEMORY_GRID * self.dimensions.vision.patch
+        if any(side % multiple for side in self.image_size):
             raise MemobenchError(
-                f"--policy.image_resolution={self.image_resolution} must be a multiple of {MEMORY_GRID * patch} pixels at "
+                f"--policy.image_resolution={self.image_resolution} must be a multiple of {multiple} pixels at "
                 f"size {self.size}, so that its patches pool to a 4x4 grid."
             )
 
-    def _check_objective(self) -> None:
+    def _check_objectives(self) -> None:
         if self.objective == REGRESSION and self.rtc_config is not None:
             raise MemobenchError(
-                "--policy.rtc_config guides the denoising of a plan, which --policy.objective=regression lacks; "
+                "--policy.rtc_config guides the denoising of a chunk, which --policy.objective=regression lacks; "
                 "leave it out, or use --policy.objective=flow_matching."
             )
-
-    def _check_alignment(self) -> None:
         if self.align != "none" and self.memory == "none":
             raise MemobenchError(
-                f"--policy.align={self.align} has no memory to align with --policy.integration=none; use modulation or "
-                "context, or --policy.align=none."
+                f"--policy.align={self.align} has no memory to align with --policy.memory_fusion=none; use modulation "
+                "or context, or --policy.align=none."
             )
         if self.shuffle_subgoals and self.align == "none":
             raise MemobenchError(
@@ -451,8 +447,7 @@ class MemobenchMemConfig(PI05Config):
                 "name an alignment too."
             )
 
-    # No field: LeRobot asks it of a configuration when it makes its sampler (see `execution_frames`).
-    drop_n_last_frames = 0
+    # -- properties that follow ------------------------------------------------------------------------------------
 
     @property
     def dimensions(self) -> Dimensions:
@@ -460,46 +455,41 @@ class MemobenchMemConfig(PI05Config):
         return SIZES[self.size]
 
     @property
-    def sees_objects(self) -> bool:
-        """Whether a moment is seen as objects."""
+    def uses_objects(self) -> bool:
+        """Whether observations are object slots."""
         return self.perception == "objects"
 
     @property
-    def has_eyes(self) -> bool:
-        """Whether pictures are seen through `lerobot_memobench.perception`."""
-        return self.eyes not in (None, RANDOM)
+    def uses_detector(self) -> bool:
+        """Whether these are detections in pictures."""
+        return self.detector is not None
 
     @property
-    def sees_tokens(self) -> bool:
-        """Whether what is seen of pictures are the tokens of eyes."""
-        return self.has_eyes and not self.sees_objects
+    def uses_visual_encoder(self) -> bool:
+        """Whether pictures are read as tokens of `lerobot_memobench.perception`'s encoder."""
+        return self.visual_encoder not in (None, RANDOM)
 
     @property
-    def finds_objects(self) -> bool:
-        """Whether the objects that are seen are those that eyes find in pictures."""
-        return self.has_eyes and self.sees_objects
+    def uses_pictures(self) -> bool:
+        """Whether pictures are read."""
+        return self.uses_detector or not self.uses_objects
 
     @property
-    def sees(self) -> tuple[str, ...]:
-        """What it sees in a rollout, in the words of `envs.observations`."""
-        if not self.sees_objects:
+    def encodes_ahead(self) -> bool:
+        """Whether pictures are encoded, or detected in, once before training."""
+        return self.uses_detector or self.uses_visual_encoder
+
+    @property
+    def decodes_no_video(self) -> bool:
+        """Whether training samples are made of numbers and features in main memory."""
+        return self.uses_objects or self.encodes_ahead
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Policy inputs beside the robot's state, in the words of `envs.observations`."""
+        if not self.uses_objects:
             return (SEEN_PIXELS,)
-        return (DETECTIONS,) if self.finds_objects else (SEEN_OBJECTS,)
-
-    @property
-    def sees_pictures(self) -> bool:
-        """Whether pictures are looked at."""
-        return self.has_eyes or not self.sees_objects
-
-    @property
-    def cache_place(self) -> Path | None:
-        """Folder that holds feature caches; None: the one beside each dataset."""
-        return None if self.memory_cache_dir is None else Path(self.memory_cache_dir).expanduser()
-
-    @property
-    def decodes_nothing(self) -> bool:
-        """Whether training samples are made of what was read, or seen, before; no video is decoded for them."""
-        return self.sees_objects or self.has_eyes
+        return (DETECTIONS,) if self.uses_detector else (PRIVILEGED_INPUT,)
 
     @property
     def state_token(self) -> bool:
@@ -507,28 +497,30 @@ class MemobenchMemConfig(PI05Config):
 
         Words at full size, as in pi0.5, and in tiny policies of pixels, which were so from the beginning.
         """
-        return self.dimensions.tokenizer == "words" and (self.sees_objects or self.size != "tiny")
+        return self.dimensions.tokenizer == "words" and (self.uses_objects or self.size != "tiny")
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """Height and width of the images the policy sees; ``image_resolution``, known to be set."""
+        """Height and width of the policy's images, pixels: ``image_resolution``, known to be set."""
         assert self.image_resolution is not None
         return tuple(self.image_resolution)  # type: ignore[return-value]  # a checkpoint gives a list
 
     @property
     def memory(self) -> str:
-        """Name of the memory mechanism, one of ``memory.registry.MECHANISMS``."""
-        return "none" if self.integration == "none" else "frame_sampling"
+        """Name of the memory mechanism, one of ``memory.MECHANISMS``."""
+        return "none" if self.memory_fusion == "none" else "frame_sampling"
 
     @property
-    def watches(self) -> bool:
-        """Whether pictures count that are shown between two plans."""
-        return self.memory != "none" and self.sees_pictures
+    def cache_place(self) -> Path | None:
+        """Folder that holds feature caches; None: the one beside each dataset."""
+        return None if self.feature_cache_dir is None else Path(self.feature_cache_dir).expanduser()
 
     @property
     def cache_name(self) -> str:
-        """What the name of the feature cache begins with that this policy reads."""
+        """First part of the name of this policy's feature cache of the memory."""
         return f"{self.size}-stride{self.memory_stride}"
+
+    # -- LeRobot's questions ---------------------------------------------------------------------------------------
 
     def get_optimizer_preset(self) -> FusedAdamWConfig:
         """Return the optimizer that lerobot-train takes."""
@@ -536,14 +528,14 @@ class MemobenchMemConfig(PI05Config):
 
     def get_scheduler_preset(self) -> WarmupFractionSchedulerConfig:
         """Return the schedule that lerobot-train takes."""
-        return WarmupFractionSchedulerConfig(warmup_fraction=self.warmup_fraction, final=self.final_lr)
+        return WarmupFractionSchedulerConfig(warmup_fraction=self.warmup_fraction, final=self.min_lr_ratio)
 
     def set_dataset_feature_metadata(self, features: dict[str, Any]) -> None:
         """Take the objects of a dataset with pictures for the input that LeRobot does not take them for.
 
         LeRobot calls this with a dataset's ``features`` before it makes a policy for it.
         """
-        if not self.sees_pictures and PRIVILEGED in features:
+        if not self.uses_pictures and PRIVILEGED in features:
             shape = tuple(features[PRIVILEGED]["shape"])
             self.input_features.setdefault(OBS_ENV_STATE, PolicyFeature(FeatureType.ENV, shape))
 
@@ -556,15 +548,15 @@ class MemobenchMemConfig(PI05Config):
             MemobenchError: they lack the slots of objects or the camera that is remembered, or have more numbers than
                 the weights to start from.
         """
-        unseen = FeatureType.ENV if self.sees_pictures else FeatureType.VISUAL
+        unseen = FeatureType.ENV if self.uses_pictures else FeatureType.VISUAL
         for key in [key for key, feature in self.input_features.items() if feature.type is unseen]:
             del self.input_features[key]
-        if self.finds_objects and not self.image_features:
+        if self.uses_detector and not self.image_features:
             shape = (3, IMAGE_SIZE, IMAGE_SIZE)
             self.input_features |= {
                 f"{OBS_IMAGES}.{name}": PolicyFeature(FeatureType.VISUAL, shape) for name in CAMERAS
             }
-        if not self.sees_pictures and OBS_ENV_STATE not in self.input_features:
+        if not self.uses_pictures and OBS_ENV_STATE not in self.input_features:
             raise MemobenchError(
                 f"perception=objects sees by '{OBS_ENV_STATE}', which is not there; train on a dataset of this "
                 "version's `memobench generate`, and evaluate with --env.obs_type=environment_state_agent_pos."
@@ -577,7 +569,7 @@ class MemobenchMemConfig(PI05Config):
         cameras = [*self.image_features]
         if self.memory_camera is None and cameras:
             self.memory_camera = cameras[0]
-        if self.sees_pictures and not self.sees_objects and cameras and self.memory_camera not in cameras:
+        if self.uses_pictures and not self.uses_objects and cameras and self.memory_camera not in cameras:
             raise MemobenchError(
                 f"--policy.memory_camera={self.memory_camera} is none of the cameras that this policy sees "
                 f"({', '.join(cameras)}); name one of them, or leave it out for the first."

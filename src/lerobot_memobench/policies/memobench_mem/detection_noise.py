@@ -8,7 +8,6 @@ moved at random): 1.6 mm off in the median, 8 at the 90th percentile and 18 at t
 from __future__ import annotations
 
 from functools import cache
-from typing import NamedTuple
 
 import mujoco
 import torch
@@ -39,25 +38,7 @@ FALSE, SECOND_NAME, MISNAMED, ASTRAY = 0.6, 0.8, 0.015, 0.06
 that thing once more and elsewhere; and how far from it both are, m."""
 
 
-class SightErrors(NamedTuple):
-    """With which errors slots are seen in training.
-
-    Attributes:
-        size: of the errors; 1 is as the package's eyes err, 0 none.
-    """
-
-    size: float = 0.0
-
-    def seen(self, slots: Tensor, hand: Tensor) -> Tensor:
-        """Return slots (N, SLOTS, WIDTH) as they are seen beside a hand (N, >= 3)."""
-        return as_found(slots, hand, self.size) if self.size else slots
-
-
-TOLD = SightErrors()
-"""None: things are seen as they are told."""
-
-
-def as_found(slots: Tensor, hand: Tensor, size: float) -> Tensor:
+def with_detection_noise(slots: Tensor, hand: Tensor, size: float) -> Tensor:
     """Return slots (N, SLOTS, WIDTH) as eyes would find them.
 
     Args:

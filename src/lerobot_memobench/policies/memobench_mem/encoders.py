@@ -1,4 +1,8 @@
-"""What a perception is: what the present shows the policy, and what of a frame is remembered."""
+"""Encoders of pictures: present observations to prefix tokens, and remembered ones to a memory encoder's input.
+
+`ObservationEncoder` is the interface. `ImageTowerEncoder` is pi0.5's frozen image tower; `VisualTokenEncoder` reads
+tokens of the frozen encoder of `lerobot_memobench.perception`. Encoders of objects are in `objects`.
+"""
 
 from __future__ import annotations
 
@@ -17,27 +21,27 @@ from torch.nn.functional import rms_norm
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, SIDE, WIDTH, VisualEncoder, resized
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MEMORY_GRID
-from lerobot_memobench.policies.memobench_mem.memory.encoder import PooledMemory
+from lerobot_memobench.policies.memobench_mem.memory.encoder import PooledMemoryEncoder
 from lerobot_memobench.policies.shown import cure
 
 LOUD = 8.0
 """How much larger than a layer's output tokens are made; at 1 they learned slower."""
-Seen = tuple[list[Tensor], list[Tensor]]
+PrefixParts = tuple[list[Tensor], list[Tensor]]
 """What is seen now, in the place of LeRobot's images: parts (B, ...), and which of each one's tokens are real: (B,)
 for all of them, or (B, n)."""
 
 
-class Perception(ABC):
+class ObservationEncoder(ABC):
     """A way to see a moment. Training and a rollout use the same, so that what they remember agrees.
 
     Attributes:
-        remembers: the observation of which a frame's tokens are made, without which nothing is seen.
+        memory_input: the observation of which a frame's tokens are made, without which nothing is seen.
         dim: D, width of the tokens that the memory's encoder is given.
         grid: side of the square of a picture's tokens; 0 where tokens have no place in a picture.
         pictures: whether it looks at pictures, which an environment may repeat.
     """
 
-    remembers: str
+    memory_input: str
     dim: int
     grid: int
     pictures: bool
@@ -51,7 +55,7 @@ class Perception(ABC):
     def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
         """Return what is remembered of some rows of an observation, (n, P, D'); nothing in it learns."""
 
-    def present(self, batch: Mapping[str, Tensor]) -> Seen | None:
+    def present(self, batch: Mapping[str, Tensor]) -> PrefixParts | None:
         """Return what is seen now of a batch of observations; None where it is LeRobot's images."""
         return None
 
@@ -114,7 +118,7 @@ def pool_tokens(tokens: Tensor) -> Tensor:
     )
 
 
-class PixelPerception(Perception):
+class ImageTowerEncoder(ObservationEncoder):
     """The image tower, and the projection of its tokens to the language model's width.
 
     Args:
@@ -128,7 +132,7 @@ class PixelPerception(Perception):
 
     def __init__(self, tower: nn.Module, projector: nn.Module, resolution: tuple[int, int], camera: str) -> None:
         self.tower, self.projector, self.resolution = tower, projector, resolution
-        self.remembers = camera
+        self.memory_input = camera
         self.dim: int = projector.linear.out_features
 
     @cached_property
@@ -139,7 +143,7 @@ class PixelPerception(Perception):
 
     def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
         """Return the tokens (n, 16, D) of some rows' pictures."""
-        return self(batch[self.remembers][list(rows)])
+        return self(batch[self.memory_input][list(rows)])
 
     @torch.no_grad()
     def __call__(self, images: Tensor) -> Tensor:
@@ -166,17 +170,17 @@ class PixelPerception(Perception):
 # All tokens of a present picture enter the prefix; of a remembered one the pooled ones are kept. In a training sample the
 # tokens stand in the pictures' place, see `seen_pictures`.
 
-SEEN = "observation.seen."
+ENCODED = "observation.encoded."
 """What the names of pictures' tokens in training samples begin with."""
 
 
-def seen_key(camera: str) -> str:
+def encoded_key(camera: str) -> str:
     """Return the name in a training sample of the tokens (B, 64, WIDTH) of a camera's picture."""
-    return SEEN + camera.removeprefix(f"{OBS_IMAGES}.")
+    return ENCODED + camera.removeprefix(f"{OBS_IMAGES}.")
 
 
-class PicturePool(nn.Module):
-    """The pooled tokens of a remembered picture at the policy's width, of unit size as those of `FramePool`."""
+class PixelPool(nn.Module):
+    """The pooled tokens of a remembered picture at the policy's width, of unit size as those of `ObjectPool`."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -188,7 +192,7 @@ class PicturePool(nn.Module):
         return rms_norm(made, made.shape[-1:], eps=1e-6)
 
 
-class EyePerception(nn.Module, Perception):
+class VisualTokenEncoder(nn.Module, ObservationEncoder):
     """The tokens of all cameras' present pictures; pooled ones of one camera's are remembered.
 
     Args:
@@ -203,7 +207,7 @@ class EyePerception(nn.Module, Perception):
     def __init__(self, tower: VisualEncoder, cameras: Sequence[str], camera: str, width: int) -> None:
         super().__init__()
         self._tower = (tower,)
-        self.cameras, self.remembers, self.dim = list(cameras), camera, width
+        self.cameras, self.memory_input, self.dim = list(cameras), camera, width
         self.project = nn.Linear(WIDTH, width)
 
     @property
@@ -212,21 +216,21 @@ class EyePerception(nn.Module, Perception):
         return self._tower[0]
 
     @cached_property
-    def _sight(self) -> str:
-        return f"{fingerprint({'eyes': self.tower})}-{SIDE}x{SIDE}"
+    def _weights(self) -> str:
+        return f"{fingerprint({'visual_encoder': self.tower})}-{SIDE}x{SIDE}"
 
     @property
     def key(self) -> str:
         """Identity of the pooled tokens: weights, and size of the pictures."""
-        return f"{self._sight}-eyes{self.tokens_per_frame}"
+        return f"{self._weights}-tokens{self.tokens_per_frame}"
 
     @property
     def present_key(self) -> str:
         """Identity of the tokens of present pictures."""
-        return f"{self._sight}-eyes{GRID**2}"
+        return f"{self._weights}-tokens{GRID**2}"
 
     @torch.no_grad()
-    def look(self, pictures: Tensor) -> Tensor:
+    def encode(self, pictures: Tensor) -> Tensor:
         """Return the tokens (N, 64, WIDTH) bfloat16 of pictures (N, 3, H, W) in [0, 1]."""
         device = self.tower.grid_position.device
         with torch.autocast(device.type, enabled=False):  # mixed precision would see otherwise than the cache did
@@ -235,12 +239,12 @@ class EyePerception(nn.Module, Perception):
 
     @torch.no_grad()
     def pooled(self, tokens: Tensor) -> Tensor:
-        """Return what is remembered, (N, 16, WIDTH) bfloat16, of what `look` returns."""
+        """Return what is remembered, (N, 16, WIDTH) bfloat16, of what `encode` returns."""
         tower = self.tower
         with torch.autocast(tower.grid_position.device.type, enabled=False):
             return tower.pooled(tokens.to(tower.grid_position.device, torch.float32)).to(torch.bfloat16)
 
-    def present(self, batch: Mapping[str, Tensor]) -> Seen:
+    def present(self, batch: Mapping[str, Tensor]) -> PrefixParts:
         """Return each camera's tokens (B, 64, WIDTH), all of them real: those that the batch has, or of its pictures.
 
         Raises:
@@ -250,15 +254,15 @@ class EyePerception(nn.Module, Perception):
         return parts, [torch.ones(len(part), dtype=torch.bool) for part in parts]
 
     def _seen(self, batch: Mapping[str, Tensor], camera: str) -> Tensor:
-        if seen_key(camera) in batch:
-            return batch[seen_key(camera)]
+        if encoded_key(camera) in batch:
+            return batch[encoded_key(camera)]
         if camera not in batch:
             raise MemobenchError(f"The observation has no '{camera}', which this policy sees; {cure(camera, batch)}")
-        return self.look(batch[camera])
+        return self.encode(batch[camera])
 
     def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
         """Return the pooled tokens (n, 16, WIDTH) of some rows' pictures."""
-        return self.pooled(self.look(batch[self.remembers][list(rows)]))
+        return self.pooled(self.encode(batch[self.memory_input][list(rows)]))
 
     def prefix(self, observed: Tensor) -> Tensor:
         """Return prefix tokens (B, 64, d_vlm) of a camera's tokens."""
@@ -267,4 +271,4 @@ class EyePerception(nn.Module, Perception):
 
     def memory(self, encoder: nn.Module) -> nn.Module:
         """Return the encoder behind a projection of each frame's tokens."""
-        return PooledMemory(PicturePool(self.dim), encoder)
+        return PooledMemoryEncoder(PixelPool(self.dim), encoder)

@@ -1,4 +1,4 @@
-"""What an integration of memory into pi0.5 is."""
+"""How actions read memory: the interface `MemoryFusion`, and its two kinds, modulation and context."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Prefix = tuple[Tensor, Tensor, Tensor]
 """LeRobot's prefix: embeddings (B, N, D), which of them are real (B, N), and where attention blocks begin (B, N)."""
 
 
-class Integration(ABC):
+class MemoryFusion(ABC):
     """A way by which actions read memory tokens; made once for a model, to which it may add parameters."""
 
     @abstractmethod
@@ -33,7 +33,7 @@ class Integration(ABC):
         return prefix
 
     def owns(self, name: str) -> bool:
-        """Say whether a parameter of the model is this integration's, and no part of pi0.5."""
+        """Say whether a parameter of the model is this fusion's, and no part of pi0.5."""
         return False
 
     def place_of(self, name: str) -> str:
@@ -175,7 +175,7 @@ class ModulatedNorm(nn.Module):
         return (normed * (1.0 + scale) + shift).to(normed.dtype), gate
 
 
-class Modulation(Integration):
+class Modulation(MemoryFusion):
     """Memory at the expert's width, and a modulated norm in each of the expert's layers.
 
     Wrapped norms are one level deeper than in plain pi0.5.
@@ -208,7 +208,7 @@ class Modulation(Integration):
 # Context: memory tokens join the prefix, behind images and language.
 
 
-class Context(Integration):
+class Context(MemoryFusion):
     """Memory tokens are seen by the whole prefix and by the actions; nothing is added to the model."""
 
     def __init__(self, model: nn.Module, memory_dim: int, expert_dim: int) -> None:

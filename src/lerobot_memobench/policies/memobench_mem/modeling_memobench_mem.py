@@ -45,7 +45,7 @@ from lerobot_memobench.policies.memobench_mem.checkpoints import (
     weights_file,
 )
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import REGRESSION, MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.encoders import EyePerception, Perception, Seen
+from lerobot_memobench.policies.memobench_mem.encoders import ObservationEncoder, PrefixParts, VisualTokenEncoder
 from lerobot_memobench.policies.memobench_mem.memory import make_mechanism
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     FRAMES,
@@ -59,14 +59,11 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Precision, attend_fused
 from lerobot_memobench.policies.memobench_mem.objects import HAND_DIM, OBS_PHASE, OBS_RAW_STATE, rotation
 from lerobot_memobench.policies.memobench_mem.sampler import (
-    Drawn,
+    SamplerSpec,
     TrainingRun,
     begin_training,
-    count_drawn_only,
-    execution_starts,
-    prompted_factors,
     read_from_memory,
-    task_of_frames,
+    use_execution_statistics,
 )
 from lerobot_memobench.policies.memobench_mem.training import (
     TrainingCurve,
@@ -102,7 +99,7 @@ class MemobenchMemPolicy(PI05Policy):
         average: moving average of the trained weights, which evaluation uses; None before training, or without one.
         run: the dataset and its features that it is trained with; None where it only acts.
         curve: how its losses fell.
-        history: frames that the rows of a rollout remember. plans: their action queues. noise: for sampling chunks.
+        history: frames that the rows of a rollout remember. queues: their action chunks. noise: for sampling chunks.
         thread: the one that acts.
     """
 
@@ -146,9 +143,9 @@ class MemobenchMemPolicy(PI05Policy):
             source = config.base_weights
             path = weights_file(source, named=f"--policy.base_weights='{source}'", fix="give a pi0.5 checkpoint")
             load_base_weights(self.model, self._fix_pytorch_state_dict_keys(load_file(path), config), source)
-        elif isinstance(self.perception, EyePerception) and load_base:
-            assert config.eyes is not None
-            self.perception.tower.load_state_dict(load_visual_encoder(config.eyes).state_dict())
+        elif isinstance(self.perception, VisualTokenEncoder) and load_base:
+            assert config.visual_encoder is not None
+            self.perception.tower.load_state_dict(load_visual_encoder(config.visual_encoder).state_dict())
         if config.gradient_checkpointing:
             self.model.gradient_checkpointing_enable()
         self.to(config.device)
@@ -156,7 +153,7 @@ class MemobenchMemPolicy(PI05Policy):
         self.run: TrainingRun | None = None
         self.curve = TrainingCurve()
         self.history = RolloutMemory(make_mechanism(config.memory, config.memory_frames), config.memory_stride)
-        self.plans, self.noise = RowPlans(self._action_dim), EpisodeNoise()
+        self.queues, self.noise = ActionQueues(self._action_dim), EpisodeNoise()
         self.thread = OneThread()
         self.reset()
         self.thread.forget()
@@ -164,7 +161,7 @@ class MemobenchMemPolicy(PI05Policy):
             self._begin_training(dataset_meta)
 
     @property
-    def perception(self) -> Perception:
+    def perception(self) -> ObservationEncoder:
         """The encoder of observations."""
         return self.model.paligemma_with_expert.perception
 
@@ -181,7 +178,7 @@ class MemobenchMemPolicy(PI05Policy):
     def _remembers(self) -> bool:
         return self.history.mechanism.frames > 0
 
-    def _preprocess_images(self, batch: dict[str, Tensor]) -> Seen:
+    def _preprocess_images(self, batch: dict[str, Tensor]) -> PrefixParts:
         """Return what the model is given in the place of images: the observation's parts, and the state's token."""
         parts, masks = self.perception.present(batch) or super()._preprocess_images(batch)
         if self.config.state_token:
@@ -206,17 +203,12 @@ class MemobenchMemPolicy(PI05Policy):
         begin_training(self.run)
         if isinstance(cache, RecordedFrames):
             read_from_memory(self.run)
-            count_drawn_only(meta.stats, cache, cache.phase != 0)
-        if self.config.sees_tokens:
+            use_execution_statistics(meta.stats, cache, cache.phase != 0)
+        if self.config.uses_visual_encoder:
             attend_fused(self.model)
         if self._device.type == "cpu":
             keep_freed_memory()
-        starts = execution_starts(cache.episodes, cache.phase)
-        balance = self.config.balance_tasks
-        tasks = task_of_frames(meta, cache.episodes) if balance else None
-        factors = None if tasks is None else prompted_factors(tasks, cache.phase, self.config.prompted_weight)
-        order = Drawn(starts, self.config.moments_per_episode, tasks, balance, factors)
-        self.config.drop_n_last_frames = order  # type: ignore[assignment]  # a number to nobody but LeRobot's sampler
+        self.config.drop_n_last_frames = SamplerSpec.of_run(self.run)  # type: ignore[assignment]  # a number to nobody but LeRobot's sampler
 
     @property
     def _averages(self) -> bool:
@@ -258,7 +250,7 @@ class MemobenchMemPolicy(PI05Policy):
         if self._averages and self.average is None and self.training:
             self.average = WeightAverage(self._trained(), self.config.ema_decay)
         measures = not self.training and not torch.is_grad_enabled()
-        quick = self.training and self._device.type == "cpu" and not self.config.sees_tokens
+        quick = self.training and self._device.type == "cpu" and not self.config.uses_visual_encoder
         computing = self._acting() if measures else self.precision.computing(self._device)
         with computing, quick_products() if quick else contextlib.nullcontext():
             memory = self._read_memory(batch)
@@ -285,12 +277,12 @@ class MemobenchMemPolicy(PI05Policy):
                 f"The training batch has no '{needed}': the preprocessor lacks the step memobench_gather_memory; to "
                 "start from pi0.5's weights pass --policy.base_weights instead of --policy.pretrained_path."
             )
-        if self.config.has_eyes and self.training and any(key in batch for key in self.config.image_features):
+        if self.config.encodes_ahead and self.training and any(key in batch for key in self.config.image_features):
             raise MemobenchError(
-                "The training batch has pictures, which a policy with eyes does not look at (it reads what was once "
-                "seen in them), because a stream or loader processes made it, or because another policy is trained on "
-                "the same dataset object: pass --num_workers=0, which is quicker too, leave dataset.streaming out, and "
-                "open the dataset once for each policy."
+                "The training batch has pictures, which this policy does not read (they were encoded before training), "
+                "because a stream or loader processes made it, or because another policy is trained on the same dataset "
+                "object: pass --num_workers=0, which is quicker too, leave dataset.streaming out, and open the dataset "
+                "once for each policy."
             )
 
     def _read_memory(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor] | None:
@@ -318,7 +310,7 @@ class MemobenchMemPolicy(PI05Policy):
     def reset(self) -> None:
         """Forget histories and planned actions. LeRobot calls it once per batch of episodes."""
         super().reset()
-        for part in (self.history, self.plans, self.noise):
+        for part in (self.history, self.queues, self.noise):
             part.reset()
         self._calls = self._planned = 0
         self.thread.begin()
@@ -328,7 +320,7 @@ class MemobenchMemPolicy(PI05Policy):
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Return the next action of every row (B, A), normalised.
 
-        Every row uses up its own chunk: ``n_action_steps`` of it, or all (``whole_plan_if_still``). A chunk is planned
+        Every row uses up its own chunk: ``n_action_steps`` of it, or all (``full_chunk_when_stalled``). A chunk is planned
         from that row alone, so rows of a batch are independent, when the row's execution begins or its last chunk is
         used up. In the prompt phase, where actions have no effect, and for frozen rows nothing is planned.
         """
@@ -337,19 +329,19 @@ class MemobenchMemPolicy(PI05Policy):
             self.eval()
         steps, started, frozen = self.observe(batch)
         count = len(steps)
-        self.plans.resize(count)
+        self.queues.resize(count)
         prompt = [phase == PROMPT for phase in _column(batch, OBS_PHASE) or [EXECUTION] * count]
         for row in range(count):
             if started[row] or prompt[row]:
-                self.plans.drop(row)
+                self.queues.drop(row)
         acting = self._acting_rows = [row for row in range(count) if not prompt[row] and not frozen[row]]
-        wanting = self.plans.wanting(acting)
+        wanting = self.queues.wanting(acting)
         if wanting:
             plans = self.plan(batch, wanting, self._noise(wanting, steps))
-            states = batch[OBS_RAW_STATE] if self.config.whole_plan_if_still else None
+            states = batch[OBS_RAW_STATE] if self.config.full_chunk_when_stalled else None
             for row, plan in zip(wanting, plans.float().cpu(), strict=True):
-                self.plans.begin(row, plan, self.config.n_action_steps, None if states is None else states[row])
-        return self.plans.step(acting).to(self._device)
+                self.queues.begin(row, plan, self.config.n_action_steps, None if states is None else states[row])
+        return self.queues.step(acting).to(self._device)
 
     def observe(self, batch: dict[str, Tensor]) -> tuple[list[int], list[bool], list[bool]]:
         """Take the current frames of all rows into their histories.
@@ -357,7 +349,7 @@ class MemobenchMemPolicy(PI05Policy):
         Returns:
             Per row its control step since the episode began, whether a new episode began, and whether it is frozen.
         """
-        seen = self.perception.remembers
+        seen = self.perception.memory_input
         if seen not in batch:
             what = f"'{seen}'" if seen else "picture"
             raise MemobenchError(f"The observation has no {what}, which this policy remembers; {cure(seen, batch)}")
@@ -397,8 +389,8 @@ class MemobenchMemPolicy(PI05Policy):
     @property
     def _inputs(self) -> list[str]:
         """Observations of the present that the model is given, if they are there."""
-        images = [*self.config.image_features] if self.config.sees_pictures else []
-        objects = [OBS_ENV_STATE, OBS_RAW_STATE] if self.config.sees_objects else []
+        images = [*self.config.image_features] if self.config.uses_pictures else []
+        objects = [OBS_ENV_STATE, OBS_RAW_STATE] if self.config.uses_objects else []
         return [*images, *objects, OBS_STATE, OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK]
 
     def _require_history(self, rows: list[int]) -> None:
@@ -416,13 +408,13 @@ class MemobenchMemPolicy(PI05Policy):
             return torch.zeros(len(rows), *shape)
         return self.noise.draw(rows, steps, shape)
 
-    def looks_next(self) -> bool:
+    def needs_observation(self) -> bool:
         """Return whether the next observation's pictures or objects are read: it is remembered, or planned from.
 
         Asked after an action. Whether the next frame is the first of an execution, where chunks begin, only the
         environment knows: that one is to be shown in any case, as the first of an episode.
         """
-        return self.history.writes_next() or bool(self.plans.wanting(self._acting_rows))
+        return self.history.writes_next() or bool(self.queues.wanting(self._acting_rows))
 
     def supports_rtc(self) -> bool:
         """Return whether LeRobot's real-time chunking may ask this policy for its chunks.
@@ -467,7 +459,7 @@ class MemobenchMemPolicy(PI05Policy):
                 "This policy remembers what it saw at every control step, and was asked for two plans with no "
                 "observation between them: its memory would be another one than in training; let select_action see "
                 "every observation (--inference.type=sync), offer each to observe before planning, or train with "
-                "--policy.integration=none."
+                "--policy.memory_fusion=none."
             )
         self._planned = self._calls
         return steps
@@ -570,7 +562,7 @@ STILL, PER_RADIAN = 0.006, 0.1
 """How little a hand or a finger may move from one plan to the next to be still, m, and what a radian counts, m."""
 
 
-class RowPlans:
+class ActionQueues:
     """A queue of planned actions per row, and the action each row took last."""
 
     def __init__(self, action_dim: int) -> None:

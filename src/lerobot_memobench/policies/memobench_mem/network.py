@@ -27,19 +27,18 @@ from lerobot_memobench.lerobot_hooks import ATTEND, hooked_for
 from lerobot_memobench.perception.visual_encoder import VisualEncoder
 from lerobot_memobench.perception.weights import load_detector
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import Dimensions, Gemma, MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.detection_noise import SightErrors
 from lerobot_memobench.policies.memobench_mem.encoders import (
     LOUD,
     VISION_SEED,
-    EyePerception,
-    Perception,
-    PixelPerception,
+    ImageTowerEncoder,
+    ObservationEncoder,
+    VisualTokenEncoder,
     seed_parameters,
 )
-from lerobot_memobench.policies.memobench_mem.fusion import Context, Integration, Modulation, Prefix
+from lerobot_memobench.policies.memobench_mem.fusion import Context, MemoryFusion, Modulation, Prefix
 from lerobot_memobench.policies.memobench_mem.memory import make_mechanism
 from lerobot_memobench.policies.memobench_mem.memory.encoder import MemoryTokens
-from lerobot_memobench.policies.memobench_mem.objects import FoundObjects, ObjectPerception, ObjectsInPictures
+from lerobot_memobench.policies.memobench_mem.objects import DetectionEncoder, ObjectEncoder, ObjectsFromPictures
 from lerobot_memobench.sim.object_slots import classes
 
 MARK = "learns_fused"
@@ -100,7 +99,7 @@ def _resize(vlm: Any, dims: Dimensions, image_size: int) -> Any:
 class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
     """LeRobot's pair of transformers at this policy's dimensions, image tower and unused heads frozen."""
 
-    perception: Perception
+    perception: ObservationEncoder
 
     def __init__(self, config: MemobenchMemConfig) -> None:
         dims, image_size = config.dimensions, config.image_size[0]
@@ -130,27 +129,27 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
         self._set_requires_grad()
         self.perception = self._perception(config)
 
-    def _perception(self, config: MemobenchMemConfig) -> Perception:
+    def _perception(self, config: MemobenchMemConfig) -> ObservationEncoder:
         """Build the configuration's way of seeing; one without pictures leaves no image tower."""
         seeing = self.paligemma.model
-        if config.sees_tokens:
+        if config.uses_visual_encoder:
             # Where the frozen image tower lies in pi0.5; its weights are loaded by the policy.
             tower = seeing.vision_tower = VisualEncoder(folded=True).eval().requires_grad_(False)
             seeing.multi_modal_projector = nn.Identity()
-            return EyePerception(
+            return VisualTokenEncoder(
                 tower, [*config.image_features], config.memory_camera or "", config.dimensions.vlm.width
             )
-        if not config.sees_objects:
-            return PixelPerception(
+        if not config.uses_objects:
+            return ImageTowerEncoder(
                 seeing.vision_tower, seeing.multi_modal_projector, config.image_size, config.memory_camera or ""
             )
         seeing.vision_tower, seeing.multi_modal_projector = nn.Identity(), nn.Identity()
         config.object_classes = config.object_classes or list(classes())
         slots = config.object_classes, config.tokens_per_frame, config.dimensions.vlm.width
-        if config.eyes is not None:
+        if config.detector is not None:
             # A policy that learned of told objects with errors goes on, if it does, by what eyes find.
-            return FoundObjects(ObjectsInPictures(load_detector(config.eyes)), *slots)
-        return ObjectPerception(*slots, SightErrors(config.sight_errors))
+            return DetectionEncoder(ObjectsFromPictures(load_detector(config.detector)), *slots)
+        return ObjectEncoder(*slots, config.detection_noise)
 
     def _set_requires_grad(self) -> None:
         super()._set_requires_grad()
@@ -249,13 +248,13 @@ class SizedPI05(PI05Pytorch):
 
 
 # ==== memory_pi05.py
-# pi0.5 with a memory: an encoder makes memory tokens of the frames read, an integration lets actions read those.
+# pi0.5 with a memory: an encoder makes memory tokens of the frames read, a memory fusion lets actions read those.
 
-FUSIONS: dict[str, type[Integration]] = {"modulation": Modulation, "context": Context}
+FUSIONS: dict[str, type[MemoryFusion]] = {"modulation": Modulation, "context": Context}
 
 
 OWN = ("memory.", "state_token.", "instruction.", "paligemma_with_expert.perception.")
-"""What the names of parameters begin with that plain pi0.5 does not have; an integration has more."""
+"""What the names of parameters begin with that plain pi0.5 does not have; a memory fusion has more."""
 
 
 class MemoryPI05(SizedPI05):
@@ -263,32 +262,32 @@ class MemoryPI05(SizedPI05):
 
     def __init__(self, config: MemobenchMemConfig, rtc_processor: Any = None) -> None:
         super().__init__(config, rtc_processor=rtc_processor)
-        self.integration: Integration | None = None
-        if config.integration == "none":
+        self.fusion: MemoryFusion | None = None
+        if config.memory_fusion == "none":
             return
         dims = config.dimensions
         mechanism = make_mechanism(config.memory, config.memory_frames)
         seeing = self.paligemma_with_expert.perception
         self.memory = seeing.memory(mechanism.encoder(seeing.dim, dims.vlm.width, seeing.grid))
-        self.integration = FUSIONS[config.integration](self, dims.vlm.width, dims.expert.width)
+        self.fusion = FUSIONS[config.memory_fusion](self, dims.vlm.width, dims.expert.width)
 
     def memory_parameters(self) -> dict[str, nn.Parameter]:
         """Every parameter that plain pi0.5 does not have, by name."""
-        integration = self.integration
+        fusion = self.fusion
         return {
             name: parameter
             for name, parameter in self.named_parameters()
-            if name.startswith(OWN) or (integration is not None and integration.owns(name))
+            if name.startswith(OWN) or (fusion is not None and fusion.owns(name))
         }
 
     def place_of(self, name: str) -> str:
         """Return the name in this model of a parameter of plain pi0.5."""
-        return name if self.integration is None else self.integration.place_of(name)
+        return name if self.fusion is None else self.fusion.place_of(name)
 
     def set_memory(
         self, tokens: Tensor, steps: Tensor, frame_mask: Tensor, numbers: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Encode tokens (B, F, P, D) seen at steps (B, F) and hand them to the integration.
+        """Encode tokens (B, F, P, D) seen at steps (B, F) and hand them to the fusion.
 
         Args:
             numbers: (B, F), equal where frames are; only of a perception that learns to remember, which encodes each
@@ -297,18 +296,18 @@ class MemoryPI05(SizedPI05):
         Returns:
             H (B, F*P, d_m) and its mask (B, F*P), for the alignment objectives.
         """
-        assert self.integration is not None  # the policy asks no plain pi0.5
+        assert self.fusion is not None  # the policy asks no plain pi0.5
         if numbers is None:
             memory = MemoryTokens(*self.memory(tokens, steps, frame_mask))
         else:
             memory = self.memory.shared(tokens, steps, frame_mask, numbers)
-        self.integration.hand_over(memory)
+        self.fusion.hand_over(memory)
         return memory.rows(), memory.mask
 
     def embed_prefix(self, images: Any, img_masks: Any, tokens: Any, masks: Any) -> Prefix:
-        """LeRobot's prefix (what is seen now, language), as the integration changes it."""
+        """LeRobot's prefix (what is seen now, language), as the fusion changes it."""
         prefix: Prefix = super().embed_prefix(images, img_masks, tokens, masks)
-        return prefix if self.integration is None else self.integration.prefix(prefix)
+        return prefix if self.fusion is None else self.fusion.prefix(prefix)
 
 
 # ==== precision.py

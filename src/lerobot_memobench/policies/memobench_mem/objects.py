@@ -18,9 +18,15 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.detector import Detector
 from lerobot_memobench.perception.objects import ObjectLocalizer
 from lerobot_memobench.perception.visual_encoder import SIDE
-from lerobot_memobench.policies.memobench_mem.detection_noise import TOLD, SightErrors
-from lerobot_memobench.policies.memobench_mem.encoders import LOUD, SEEN, Perception, Seen, fingerprint
-from lerobot_memobench.policies.memobench_mem.memory.encoder import PooledMemory
+from lerobot_memobench.policies.memobench_mem.detection_noise import with_detection_noise
+from lerobot_memobench.policies.memobench_mem.encoders import (
+    ENCODED,
+    LOUD,
+    ObservationEncoder,
+    PrefixParts,
+    fingerprint,
+)
+from lerobot_memobench.policies.memobench_mem.memory.encoder import PooledMemoryEncoder
 from lerobot_memobench.policies.shown import cure
 from lerobot_memobench.protocol import CAMERAS
 from lerobot_memobench.sim.object_layout import FIELDS, SIZE, SLOTS, WIDTH, field
@@ -111,16 +117,16 @@ def in_slots(made: Tensor, there: Tensor, empty: float = 0.0) -> Tensor:
     return slots
 
 
-class FramePool(nn.Module):
+class ObjectPool(nn.Module):
     """A stored frame to a few tokens of unit size: its things, pooled by learned attention.
 
     As these layers begin, what was seen comes out several times smaller than when it was seen, which the encoder adds
     to it. At unit size, 400 updates chose the right one of three bowls at 85 % of moments, instead of at 58 %.
     """
 
-    def __init__(self, order: Sequence[int], kinds: int, tokens: int, width: int, errors: SightErrors = TOLD) -> None:
+    def __init__(self, order: Sequence[int], kinds: int, tokens: int, width: int, noise: float = 0.0) -> None:
         super().__init__()
-        self.errors = errors
+        self.noise = noise
         self.slot = SlotEncoder(order, kinds, width, width)
         self.score = nn.Linear(width, tokens)
         self.phase = nn.Linear(1, width)
@@ -130,8 +136,8 @@ class FramePool(nn.Module):
         """Return tokens (N, tokens, width) of frames (N, 1, SIZE + 6 + 1)."""
         slots, hand, phase = frames.flatten(1).split([SIZE, HAND_DIM, 1], dim=1)
         slots = slots.unflatten(1, (SLOTS, WIDTH))
-        if self.training:
-            slots = self.errors.seen(slots, hand)
+        if self.training and self.noise:
+            slots = with_detection_noise(slots, hand, self.noise)
         made, there = self.slot(slots, hand)
         score = self.score(made)
         # A finite score keeps a frame in which nothing is seen finite: it becomes zeros.
@@ -141,28 +147,28 @@ class FramePool(nn.Module):
         return rms_norm(kept, kept.shape[-1:], eps=1e-6)
 
 
-class ObjectPerception(nn.Module, Perception):
-    """A token per thing that is seen now; what is remembered are the numbers themselves, for `FramePool`.
+class ObjectEncoder(nn.Module, ObservationEncoder):
+    """A token per thing that is seen now; what is remembered are the numbers themselves, for `ObjectPool`.
 
     Args:
         trained: names of the classes that it knows, in order of their indices.
         tokens_per_frame: memory tokens of a frame. width: of all tokens.
-        errors: with which slots are seen while it learns.
+        noise: size of the detection noise that is added to slots while it learns; 0: none.
     """
 
-    remembers = OBS_ENV_STATE
+    memory_input = OBS_ENV_STATE
     key: str = f"objects-{SIZE}"
     grid = 0
     pictures = False
 
-    def __init__(self, trained: Sequence[str], tokens_per_frame: int, width: int, errors: SightErrors = TOLD) -> None:
+    def __init__(self, trained: Sequence[str], tokens_per_frame: int, width: int, noise: float = 0.0) -> None:
         super().__init__()
-        self.tokens_per_frame, self.dim, self.errors = tokens_per_frame, width, errors
+        self.tokens_per_frame, self.dim, self.noise = tokens_per_frame, width, noise
         self.order = [trained.index(name) if name in trained else len(trained) for name in classes()]
         self.kinds = len(trained) + 1
         self.slot = SlotEncoder(self.order, self.kinds, 2 * width, width)
 
-    def present(self, batch: Mapping[str, Tensor]) -> Seen:
+    def present(self, batch: Mapping[str, Tensor]) -> PrefixParts:
         """Return what is seen now: slots and hand (B, n WIDTH + 6), and which of the n slots hold something (B, n).
 
         A batch to learn from has as many slots as the fullest of its samples; elsewhere there are all of them, so that
@@ -171,7 +177,8 @@ class ObjectPerception(nn.Module, Perception):
         slots = batch[OBS_ENV_STATE].to(torch.float32).unflatten(1, (SLOTS, WIDTH))
         hand = batch[OBS_RAW_STATE][:, :HAND_DIM].to(slots)
         if self.training:
-            slots = self.errors.seen(slots, hand)
+            if self.noise:
+                slots = with_detection_noise(slots, hand, self.noise)
             slots = slots[:, : max(1, int((slots[..., 0] > 0).sum(dim=1).max()))]
         return [torch.cat([slots.flatten(1), hand], dim=1)], [slots[..., 0] > 0]
 
@@ -188,13 +195,13 @@ class ObjectPerception(nn.Module, Perception):
         made, there = self.slot(slots.unflatten(1, (-1, WIDTH)), hand)
         return in_slots(made * LOUD, there)
 
-    def pool(self) -> FramePool:
+    def pool(self) -> ObjectPool:
         """Return what makes a stored frame's tokens."""
-        return FramePool(self.order, self.kinds, self.tokens_per_frame, self.dim, self.errors)
+        return ObjectPool(self.order, self.kinds, self.tokens_per_frame, self.dim, self.noise)
 
     def memory(self, encoder: nn.Module) -> nn.Module:
         """Return the encoder behind a pool of each frame."""
-        return PooledMemory(self.pool(), encoder)
+        return PooledMemoryEncoder(self.pool(), encoder)
 
 
 # ==== found.py
@@ -203,22 +210,22 @@ class ObjectPerception(nn.Module, Perception):
 # All that learns is as in `objects`, so a policy that was trained on the environment's objects acts from pictures too.
 # Detector are no part of the policy: a checkpoint names them, and others may be given to it.
 
-FOUND = f"{SEEN}objects"
+DETECTED = f"{ENCODED}objects"
 """Name in a training sample of what was found in its pictures, (B, SIZE)."""
 VIEWS = {f"{OBS_IMAGES}.{name}": camera for name, camera in CAMERAS.items()}
 """Picture at the policy -> camera."""
 
 
-class ObjectsInPictures:
+class ObjectsFromPictures:
     """Find objects in pictures by the policy's names of these."""
 
-    def __init__(self, eyes: Detector) -> None:
-        self._eyes, self._find = eyes, ObjectLocalizer(eyes)
+    def __init__(self, detector: Detector) -> None:
+        self._detector, self._locate = detector, ObjectLocalizer(detector)
 
     @cached_property
     def key(self) -> str:
         """Identity of what is found: weights, and size of the pictures."""
-        return f"{fingerprint({'eyes': self._eyes})}-{SIDE}x{SIDE}-objects-{SIZE}"
+        return f"{fingerprint({'detector': self._detector})}-{SIDE}x{SIDE}-objects-{SIZE}"
 
     def __call__(self, pictures: Mapping[str, Tensor], states: Tensor) -> Tensor:
         """Return the slots (N, SIZE) float32 of pictures (N, 3, H, H) in [0, 1] and robots' states (N, >= 6).
@@ -228,39 +235,41 @@ class ObjectsInPictures:
         """
         for name in VIEWS:
             if name not in pictures:
-                raise MemobenchError(f"The observation has no '{name}', which eyes look at; {cure(name, pictures)}")
-        device = next(self._eyes.parameters()).device
+                raise MemobenchError(
+                    f"The observation has no '{name}', which the detector reads; {cure(name, pictures)}"
+                )
+        device = next(self._detector.parameters()).device
         views = {camera: pictures[name].to(device) for name, camera in VIEWS.items()}
         with torch.autocast(device.type, enabled=False):  # mixed precision would see otherwise than training did
-            return self._find(views, states).to(states.device)
+            return self._locate(views, states).to(states.device)
 
 
-class FoundObjects(ObjectPerception):
+class DetectionEncoder(ObjectEncoder):
     """A token per thing that is found now; what is remembered are its numbers.
 
     Args:
         look: no module, so that a checkpoint has no part of it.
-        trained, tokens_per_frame, width: as of `ObjectPerception`.
+        trained, tokens_per_frame, width: as of `ObjectEncoder`.
     """
 
-    remembers = next(iter(VIEWS))
+    memory_input = next(iter(VIEWS))
     pictures = True
 
-    def __init__(self, look: ObjectsInPictures, trained: Sequence[str], tokens_per_frame: int, width: int) -> None:
+    def __init__(self, look: ObjectsFromPictures, trained: Sequence[str], tokens_per_frame: int, width: int) -> None:
         super().__init__(trained, tokens_per_frame, width)
         self.look = look
         self.key = look.key
 
-    def present(self, batch: Mapping[str, Tensor]) -> Seen:
-        """Return what `ObjectPerception.present` does, of what was found in the batch's pictures, or is now."""
+    def present(self, batch: Mapping[str, Tensor]) -> PrefixParts:
+        """Return what `ObjectEncoder.present` does, of what was found in the batch's pictures, or is now."""
         return super().present(self._with_objects(batch))
 
     def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
         """Return the rows (n, 1, D') of frames; without a phase all is execution."""
-        wanted = {FOUND} if FOUND in batch else {*VIEWS}
+        wanted = {DETECTED} if DETECTED in batch else {*VIEWS}
         chosen = {key: value[list(rows)] for key, value in batch.items() if key in wanted | {OBS_RAW_STATE, OBS_PHASE}}
         return super().remember(self._with_objects(chosen), range(len(rows)))
 
     def _with_objects(self, batch: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
-        found = batch[FOUND] if FOUND in batch else self.look(batch, batch[OBS_RAW_STATE])
+        found = batch[DETECTED] if DETECTED in batch else self.look(batch, batch[OBS_RAW_STATE])
         return {**batch, OBS_ENV_STATE: found}

@@ -34,7 +34,7 @@ from lerobot_memobench.policies.memobench_mem.alignment import (
     texts_of_histories,
 )
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.encoders import SEEN
+from lerobot_memobench.policies.memobench_mem.encoders import ENCODED
 from lerobot_memobench.policies.memobench_mem.language import (
     PromptTokenizerProcessorStep,
     WordTokenizerProcessorStep,
@@ -94,7 +94,7 @@ def make_memobench_mem_pre_post_processors(
         GatherMemoryProcessorStep(**gathering(config)),
         OracleMemoryProcessorStep(enabled=config.oracle_memory),
         relative,
-        *([RawStateProcessorStep()] if config.sees_objects else []),
+        *([RawStateProcessorStep()] if config.uses_objects else []),
         steps.normalize,  # before the prompt, which may spell the normalised state out
         *([] if config.state_token else [Pi05PrepareStateTokenizerProcessorStep(max_state_dim=config.max_state_dim)]),
         _tokenizer(config, meta),
@@ -149,7 +149,7 @@ class GatherMemoryProcessorStep(ProcessorStep):
     Adds ``memory.tokens`` (B, F, P, D), ``memory.steps`` (B, F) int64, ``memory.mask`` (B, F) bool, ``phase`` (B,),
     what eyes saw in the frames (``observation.seen.*``), and with an alignment ``memory.text`` and
     ``memory.text_mask``: (B, d_t) and (B,) for the frame itself, or with ``framewise`` (B, F, d_t) and (B, F) for the
-    frames of the history. With ``frames`` 0 (``integration=none``) there is no history.
+    frames of the history. With ``frames`` 0 (``memory_fusion=none``) there is no history.
 
     A step that is rebuilt from a checkpoint has the settings of the run that wrote it, until it is told to ``follow``
     another one. One that is given a ``cache`` keeps its own.
@@ -198,7 +198,7 @@ class GatherMemoryProcessorStep(ProcessorStep):
         places = [cache.locate(index) for index in indices]  # refuses frames that the cache does not know
         phase = {PHASE: torch.from_numpy(cache.phase[np.asarray(indices)].astype(np.int64))}
         if isinstance(cache, RecordedFrames):
-            seen = [name for name in cache.columns if name.startswith(SEEN)]
+            seen = [name for name in cache.columns if name.startswith(ENCODED)]
             phase |= {name: cache.columns[name][torch.tensor(indices)] for name in seen}
         mechanism = self.mechanism
         if mechanism.frames == 0:

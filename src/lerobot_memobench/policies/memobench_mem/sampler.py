@@ -1,20 +1,14 @@
-"""Training samples are execution frames: the prompt, whose actions have no effect, takes no place in a batch.
+"""What a training reads: which frames LeRobot draws, in which order, and of what their samples are made.
 
-lerobot-train draws the frames of all episodes uniformly, each once per epoch, in an order that seed and epoch decide,
-and leaves no say in where an episode begins. What it does ask the configuration for is how many frames to drop at the
-end; our answer is none, and carries for its sampler where each episode's execution begins and how many of its frames
-follow one another in the order. The sampler is LeRobot's, and any other answer leaves it as it was; a sampler that
-takes ours for a number would draw prompts, and is refused. Histories still hold the prompt, because they come from the
-feature cache.
-
-Where tasks are balanced, an epoch has as many frames as otherwise, but not each of them once: tasks whose episodes are
-short would else be a small part of every batch, and they learned several times slower than the others.
+LeRobot is steered by three hooks (`lerobot_hooks`), each for as long as the training lives: the sampler that draws
+frames, the reader that makes a sample of one, and the function that makes a policy's processors. All that they need is
+a `TrainingRun` of the policy that is trained; nobody else in the process knows it.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,190 +24,14 @@ from torch import Tensor
 from lerobot_memobench.datasets.execution_frames import first_frames
 from lerobot_memobench.datasets.feature_cache.reading import FrameLookup, RecordedFrames
 from lerobot_memobench.datasets.lerobot_format.reading import list_episodes
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.lerobot_hooks import DRAW_FRAMES, MAKE_PROCESSORS, READ_SAMPLE, hooked_for
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.encoders import SEEN
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import PROMPTED, MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.encoders import ENCODED
 from lerobot_memobench.protocol import PROMPT
 from lerobot_memobench.tasks.memory_text import with_memory
 
-
-@dataclass(frozen=True, eq=False)
-class Drawn:
-    """No frames to drop at the end of each episode, and how the others are drawn by LeRobot's sampler while this lives.
-
-    Attributes:
-        starts: from which frame on (E,) to draw.
-        moments: how many frames of an episode to draw in a row.
-        tasks: (N,) number of each frame's task; None: each frame is drawn once. balance, factors: see `in_turns`.
-    """
-
-    starts: np.ndarray
-    moments: int
-    tasks: np.ndarray | None = None
-    balance: float = 1.0
-    factors: np.ndarray | None = None
-
-    @classmethod
-    def of(cls, *how: Any) -> Drawn:
-        """Return one; arguments as of this class."""
-        return cls(*how)
-
-    def __post_init__(self) -> None:
-        hooked_for(self, DRAW_FRAMES, _draws)
-
-    @property
-    def ordered(self) -> bool:
-        """Whether the order is ours, too."""
-        return self.moments > 1 or self.tasks is not None
-
-    def _refuse(self, *_: Any) -> Any:
-        """Be no number."""
-        raise MemobenchError(
-            "What draws the frames of this training is not LeRobot's EpisodeAwareSampler, or something has taken its "
-            "place: it knows nothing of execution frames and would draw those of prompts; leave out what replaces it."
-        )
-
-    __array_ufunc__ = None  # of an array minus this, numpy asks this
-    __lt__ = __le__ = __gt__ = __ge__ = __bool__ = __int__ = __index__ = __float__ = _refuse
-    __add__ = __radd__ = __sub__ = __rsub__ = __mul__ = __rmul__ = _refuse
-
-
-def execution_starts(episodes: np.ndarray, phase: np.ndarray) -> np.ndarray:
-    """Return the first execution frame of each episode (E,); its end where there is none.
-
-    Args:
-        episodes: (E + 1,) first frame of each episode, and the number of frames N. phase: (N,) 0 in the prompt.
-    """
-    return first_frames(episodes[:-1], episodes[1:], np.flatnonzero(phase != PROMPT))
-
-
-def task_of_frames(meta: Any, episodes: np.ndarray) -> np.ndarray:
-    """Return the number (N,) of each frame's task: of our records' task, else of the episode's instruction.
-
-    A task may have several instructions ("twice", "three times").
-
-    Args:
-        episodes: (E + 1,) first frame of each episode, and N.
-    """
-    said = [" / ".join(tasks) for tasks in meta.episodes["tasks"]]
-    records = (place.record for place in list_episodes(Path(meta.root)))
-    names = [words if record is None else record.task_name for record, words in zip(records, said, strict=True)]
-    numbers = np.unique(names, return_inverse=True)[1]
-    return np.repeat(numbers, np.diff(episodes))
-
-
-def prompted_factors(tasks: np.ndarray, phase: np.ndarray, weight: float) -> np.ndarray:
-    """Return (T,) ``weight`` for each task that has a prompt, else 1.
-
-    Args:
-        tasks: (N,) number of each frame's task, 0 ... T - 1. phase: (N,) 0 in the prompt.
-    """
-    return np.where(np.bincount(tasks, phase == PROMPT) > 0, weight, 1.0)
-
-
-def in_groups(ends: np.ndarray, moments: int, generator: torch.Generator) -> Tensor:
-    """Return all places 0 ... N - 1 in a random order in which ``moments`` of an episode follow one another.
-
-    Args:
-        ends: (E,) end of each episode's places, counted from the first's beginning; the last is N.
-    """
-    lengths = torch.from_numpy(np.diff(ends, prepend=0))
-    episode = torch.repeat_interleave(lengths)
-    mixed = torch.randperm(len(episode), generator=generator)
-    mixed = mixed[episode[mixed].argsort(stable=True)]  # within each episode
-    rank = torch.arange(len(mixed)) - (lengths.cumsum(0) - lengths)[episode]
-    groups = (lengths + moments - 1) // moments
-    group = (groups.cumsum(0) - groups)[episode] + rank // moments
-    return mixed[torch.randperm(int(groups.sum()), generator=generator)[group].argsort(stable=True)]
-
-
-def in_turns(
-    ends: np.ndarray,
-    tasks: np.ndarray,
-    moments: int,
-    generator: torch.Generator,
-    balance: float = 1.0,
-    factors: np.ndarray | None = None,
-) -> Tensor:
-    """Return N places at random, ``moments`` of an episode in a row: a task by ``balance``, in it each episode alike.
-
-    Args:
-        ends: (E,) as for `in_groups`. tasks: (E,) number of each episode's task.
-        balance: 1: each task equally often; 0: in proportion to its frames; between: to a power of them, 1 - balance,
-            as languages are drawn in multilingual models (Conneau et al. 2020, arXiv 1911.02116, section 3.1).
-        factors: (T,) how many times as often each task is drawn; None: 1.
-    """
-    first, count = torch.from_numpy(np.r_[0, ends[:-1]]), int(ends[-1])
-    order = torch.from_numpy(np.argsort(tasks, kind="stable"))
-    present, number, episodes = np.unique(tasks, return_inverse=True, return_counts=True)
-    of_task = torch.from_numpy(episodes)
-    groups = -(-count // moments)
-    weights = np.bincount(number, np.diff(ends, prepend=0)) ** (1 - balance)
-    if factors is not None:
-        weights *= factors[present]
-    task = torch.multinomial(torch.from_numpy(weights), groups, replacement=True, generator=generator)
-    rank = (torch.rand(groups, generator=generator) * of_task[task]).long()
-    episode = order[(of_task.cumsum(0) - of_task)[task] + rank].repeat_interleave(moments)
-    lengths = torch.from_numpy(ends) - first
-    offset = (torch.rand(len(episode), generator=generator, dtype=torch.float64) * lengths[episode]).long()
-    return (first[episode] + offset)[:count]
-
-
-def _draws(begin: Callable[..., None]) -> Callable[..., None]:
-    """Wrap the beginning of LeRobot's sampler: it draws as its ``drop_n_last_frames`` says, if that says so."""
-
-    @functools.wraps(begin)
-    def init(self: Any, *args: Any, **named: Any) -> None:
-        asked = dict(zip(DRAW_FRAMES.parameters[1:], args, strict=False)) | named
-        drawn = asked.get("drop_n_last_frames")
-        if isinstance(drawn, Drawn):
-            asked |= {"drop_n_last_frames": 0, "dataset_from_indices": drawn.starts}
-            if drawn.ordered and type(self).__iter__ is not EpisodeAwareSampler.__iter__:
-                drawn._refuse()
-            self.drawn = drawn
-        begin(self, **asked)
-        if isinstance(drawn, Drawn) and drawn.ordered and self.shuffle:
-            self._iter_epoch = functools.partial(_one_epoch, self, drawn)
-
-    return init
-
-
-def _one_epoch(sampler: Any, drawn: Drawn, epoch: int, start: int) -> Iterator[int]:
-    """Yield the frames of an epoch from its place ``start`` on."""
-    chance = sampler._epoch_generator(epoch)
-    if drawn.tasks is None:
-        order = in_groups(sampler._cum_lengths, drawn.moments, chance)
-    else:
-        tasks = drawn.tasks[sampler._starts]
-        order = in_turns(sampler._cum_lengths, tasks, drawn.moments, chance, drawn.balance, drawn.factors)
-    return (sampler._frame_index(position) for position in order[start:].tolist())
-
-
-# ==== drawn_statistics.py
-# Statistics of the frames that are drawn: prompts, in which nothing is done, do not count as actions of zero.
-
-STILL = 0.01
-"""Added to the standard deviations of actions, so that a number that hardly varies is not blown up to noise."""
-
-
-def count_drawn_only(stats: dict[str, dict[str, Any]], frames: RecordedFrames, drawn: np.ndarray) -> None:
-    """Replace LeRobot's statistics of states and actions by those of some of the frames (N,) bool, in place.
-
-    They are what LeRobot then hands to every normaliser: a new policy's, and one that goes on from a checkpoint.
-    """
-    for key in (OBS_STATE, ACTION):
-        stats[key] = get_feature_stats(frames.columns[key].numpy()[drawn], axis=0, keepdims=False)
-    stats[ACTION]["std"] = stats[ACTION]["std"] + STILL
-
-
-# ==== training_run.py
-# What a training reads: the policy's configuration, its dataset's feature cache and what its prompts say.
-#
-# It belongs to the policy that is trained, to its processors, and to nobody else in the process: a configuration and a
-# dataset know their trainings weakly. LeRobot rebuilds a saved pipeline (resume, starting from a checkpoint) without
-# telling it the dataset or what the configuration has become. So the steps are told as soon as they are rebuilt for a
-# configuration that is being trained, and follow it: a checkpoint's own settings are those of the run that wrote it.
+# -- the run ---------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,21 +123,201 @@ def require_cache(own: FrameLookup | None, run: TrainingRun | None) -> FrameLook
     return cache
 
 
-# ==== recorded_items.py
-# Training samples out of main memory: what LeRobot would read of a dataset, without pictures and without its disk.
-#
-# LeRobot's reader decodes the videos of every sample, wanted or not, and takes a millisecond per row for the rest. Where
-# the policies that are trained on a dataset object see objects, or what eyes saw before, the dataset's numbers are in
-# memory already, and samples are made of these: they hold nothing of a policy's. Every other reader stays as it was.
+# -- frames that are drawn -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class SamplerSpec:
+    """How LeRobot's sampler draws the frames of a training, as the answer to how many it drops at an episode's end.
+
+    lerobot-train draws the frames of all episodes uniformly, each once per epoch, and leaves no say in where an episode
+    begins. What it does ask the configuration for is how many frames to drop at the end; this answer is no number, and
+    is known to the sampler while it lives. Prompt frames, whose actions have no effect, then take no place in a batch;
+    histories still hold them. A sampler that takes it for a number would draw prompts, and is refused.
+
+    Attributes:
+        starts: (E,) first frame of each episode that is drawn.
+        frames_per_episode: frames of an episode that follow one another.
+        tasks: (N,) number of each frame's task; None: each frame is drawn once per epoch.
+        weights: (T,) how often each task is drawn, with ``tasks``; an epoch has as many frames as otherwise.
+    """
+
+    starts: np.ndarray
+    frames_per_episode: int
+    tasks: np.ndarray | None = None
+    weights: np.ndarray | None = None
+
+    @classmethod
+    def of_run(cls, run: TrainingRun) -> SamplerSpec:
+        """Return how the frames of a run are drawn by its configuration."""
+        cache, weights = run.cache, run.config.task_weights
+        starts = execution_starts(cache.episodes, cache.phase)
+        if weights is None:
+            return cls(starts, run.config.frames_per_episode)
+        return cls(starts, run.config.frames_per_episode, *task_weights(run.meta, cache.episodes, cache.phase, weights))
+
+    def __post_init__(self) -> None:
+        hooked_for(self, DRAW_FRAMES, _draws)
+
+    @property
+    def ordered(self) -> bool:
+        """Whether the order is not LeRobot's."""
+        return self.frames_per_episode > 1 or self.tasks is not None
+
+    def refuse(self, *_: Any) -> Any:
+        """Be no number."""
+        raise MemobenchError(
+            "What draws the frames of this training is not LeRobot's EpisodeAwareSampler, or something has taken its "
+            "place: it knows nothing of execution frames and would draw those of prompts; leave out what replaces it."
+        )
+
+    __array_ufunc__ = None  # of an array minus this, numpy asks this
+    __lt__ = __le__ = __gt__ = __ge__ = __bool__ = __int__ = __index__ = __float__ = refuse
+    __add__ = __radd__ = __sub__ = __rsub__ = __mul__ = __rmul__ = refuse
+
+
+def execution_starts(episodes: np.ndarray, phase: np.ndarray) -> np.ndarray:
+    """Return the first execution frame of each episode (E,); its end where there is none.
+
+    Args:
+        episodes: (E + 1,) first frame of each episode, and the number of frames N. phase: (N,) 0 in the prompt.
+    """
+    return first_frames(episodes[:-1], episodes[1:], np.flatnonzero(phase != PROMPT))
+
+
+def task_weights(
+    meta: Any, episodes: np.ndarray, phase: np.ndarray, weights: Mapping[str, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the number (N,) of each frame's task, and the weight (T,) of each task.
+
+    A task is that of our records, which may have several instructions ("twice", "three times"); of another dataset it
+    is the episode's instruction.
+
+    Args:
+        meta: the dataset's metadata. episodes: (E + 1,) first frame of each episode, and N. phase: (N,) 0 in the prompt.
+        weights: by task name, memory type or ``prompted``; the first of them that a task has counts, and else 1.
+
+    Raises:
+        MemobenchError: a name is none of the dataset's, or no task is left to draw.
+    """
+    records = [place.record for place in list_episodes(Path(meta.root))]
+    said = (" / ".join(tasks) for tasks in meta.episodes["tasks"])
+    names = [words if record is None else record.task_name for record, words in zip(records, said, strict=True)]
+    tasks, numbers = np.unique(names, return_inverse=True)
+    of_frames = np.repeat(numbers, np.diff(episodes))
+    types = {name: record.memory_type for name, record in zip(names, records, strict=True) if record is not None}
+    prompted = np.bincount(of_frames, phase == PROMPT) > 0
+    keys = [
+        (str(name), types.get(str(name), ""), PROMPTED * bool(begins))
+        for name, begins in zip(tasks, prompted, strict=True)
+    ]
+    known = sorted({key for row in keys for key in row if key} | {PROMPTED})
+    for name in weights:
+        if name not in known:
+            raise MemobenchError(
+                f"policy.task_weights names '{name}', which is no task, memory type or '{PROMPTED}' of the dataset "
+                f"{meta.root}; {nearest(name, known)}"
+            )
+    found = np.array([next((weights[key] for key in row if key in weights), 1.0) for row in keys])
+    if not found.any():
+        raise MemobenchError(f"policy.task_weights={dict(weights)} leaves no task of {meta.root} to draw.")
+    return of_frames, found
+
+
+def _draws(begin: Callable[..., None]) -> Callable[..., None]:
+    """Wrap the beginning of LeRobot's sampler: it draws as its ``drop_n_last_frames`` says, if that says so."""
+
+    @functools.wraps(begin)
+    def init(self: Any, *args: Any, **named: Any) -> None:
+        asked = dict(zip(DRAW_FRAMES.parameters[1:], args, strict=False)) | named
+        spec = asked.get("drop_n_last_frames")
+        if isinstance(spec, SamplerSpec):
+            asked |= {"drop_n_last_frames": 0, "dataset_from_indices": spec.starts}
+            if spec.ordered and type(self).__iter__ is not EpisodeAwareSampler.__iter__:
+                spec.refuse()
+            self.spec = spec
+        begin(self, **asked)
+        if isinstance(spec, SamplerSpec) and spec.ordered and self.shuffle:
+            self._iter_epoch = functools.partial(_one_epoch, self, spec)
+
+    return init
+
+
+def _one_epoch(sampler: Any, spec: SamplerSpec, epoch: int, start: int) -> Iterator[int]:
+    """Yield the frames of an epoch from its place ``start`` on."""
+    chance = sampler._epoch_generator(epoch)
+    if spec.tasks is None or spec.weights is None:
+        order = grouped_order(sampler._cum_lengths, spec.frames_per_episode, chance)
+    else:
+        tasks = spec.tasks[sampler._starts]
+        order = weighted_order(sampler._cum_lengths, tasks, spec.weights, spec.frames_per_episode, chance)
+    return (sampler._frame_index(position) for position in order[start:].tolist())
+
+
+def grouped_order(ends: np.ndarray, together: int, generator: torch.Generator) -> Tensor:
+    """Return all places 0 ... N - 1 in a random order in which ``together`` of an episode follow one another.
+
+    Args:
+        ends: (E,) end of each episode's places, counted from the first's beginning; the last is N.
+    """
+    lengths = torch.from_numpy(np.diff(ends, prepend=0))
+    episode = torch.repeat_interleave(lengths)
+    mixed = torch.randperm(len(episode), generator=generator)
+    mixed = mixed[episode[mixed].argsort(stable=True)]  # within each episode
+    rank = torch.arange(len(mixed)) - (lengths.cumsum(0) - lengths)[episode]
+    groups = (lengths + together - 1) // together
+    group = (groups.cumsum(0) - groups)[episode] + rank // together
+    return mixed[torch.randperm(int(groups.sum()), generator=generator)[group].argsort(stable=True)]
+
+
+def weighted_order(
+    ends: np.ndarray, tasks: np.ndarray, weights: np.ndarray, together: int, generator: torch.Generator
+) -> Tensor:
+    """Return N places at random, ``together`` of an episode in a row: tasks by their weights, in each episodes alike.
+
+    Args:
+        ends: (E,) as for `grouped_order`. tasks: (E,) number of each episode's task. weights: (T,) of the tasks.
+    """
+    first, count = torch.from_numpy(np.r_[0, ends[:-1]]), int(ends[-1])
+    order = torch.from_numpy(np.argsort(tasks, kind="stable"))
+    present, episodes = np.unique(tasks, return_counts=True)
+    of_task = torch.from_numpy(episodes)
+    groups = -(-count // together)
+    task = torch.multinomial(torch.from_numpy(weights[present]), groups, replacement=True, generator=generator)
+    rank = (torch.rand(groups, generator=generator) * of_task[task]).long()
+    episode = order[(of_task.cumsum(0) - of_task)[task] + rank].repeat_interleave(together)
+    lengths = torch.from_numpy(ends) - first
+    offset = (torch.rand(len(episode), generator=generator, dtype=torch.float64) * lengths[episode]).long()
+    return (first[episode] + offset)[:count]
+
+
+STILL = 0.01
+"""Added to the standard deviations of actions, so that a number that hardly varies is not blown up to noise."""
+
+
+def use_execution_statistics(stats: dict[str, dict[str, Any]], frames: RecordedFrames, drawn: np.ndarray) -> None:
+    """Replace LeRobot's statistics of states and actions by those of some of the frames (N,) bool, in place.
+
+    They are what LeRobot then hands to every normaliser: a new policy's, and one that goes on from a checkpoint.
+    """
+    for key in (OBS_STATE, ACTION):
+        stats[key] = get_feature_stats(frames.columns[key].numpy()[drawn], axis=0, keepdims=False)
+    stats[ACTION]["std"] = stats[ACTION]["std"] + STILL
+
+
+# -- samples ---------------------------------------------------------------------------------------------------------
 
 
 def read_from_memory(run: TrainingRun) -> None:
-    """Let the dataset that a run is on give samples out of its frames while it lasts."""
+    """Make the samples of a run's dataset out of main memory while the run lives."""
     hooked_for(run, READ_SAMPLE, _reads)
 
 
 def _reads(get_item: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap what makes a sample: of a dataset on which nobody is trained who looks at its pictures, out of memory."""
+    """Wrap LeRobot's reader: samples of a dataset on which no policy reads pictures are made out of main memory.
+
+    LeRobot's decodes the videos of every sample, wanted or not, and takes a millisecond per row for the rest.
+    """
 
     @functools.wraps(get_item)
     def read(self: Any, idx: int) -> Any:
@@ -337,16 +335,16 @@ def _reads(get_item: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def check_transforms(policy: Any, transformed: bool) -> None:
-    """Refuse changed pictures for a policy whose samples are made of what was seen in them before.
+    """Refuse changed pictures for a policy that reads features of the dataset's own.
 
     Raises:
-        MemobenchError: they are ``transformed``, and it has eyes.
+        MemobenchError: they are ``transformed``, and its pictures are encoded ahead.
     """
-    if transformed and getattr(policy, "has_eyes", False):
+    if transformed and getattr(policy, "encodes_ahead", False):
         raise MemobenchError(
-            "dataset.image_transforms.enable=true would change nothing: a policy with eyes learns from what was once "
-            "seen in the dataset's pictures; leave it out (eyes are trained on changed pictures), or use "
-            "policy.eyes=random, which looks at the pictures of each sample."
+            "dataset.image_transforms.enable=true would change nothing: this policy's pictures are encoded once, before "
+            "training; leave it out (detectors and visual encoders are trained on changed pictures), or use "
+            "policy.visual_encoder=random, which encodes the pictures of each sample."
         )
 
 
@@ -354,7 +352,7 @@ def item(frames: RecordedFrames, meta: Any, deltas: dict[str, list[int]], number
     """Return LeRobot's sample of a frame by its global number: its columns, those with deltas at all of their times."""
     episode, _ = frames.locate(number)
     first, end = frames.episodes[episode : episode + 2].tolist()
-    columns = {name: column for name, column in frames.columns.items() if not name.startswith(SEEN)}
+    columns = {name: column for name, column in frames.columns.items() if not name.startswith(ENCODED)}
     found: dict[str, Any] = {name: column[number] for name, column in columns.items()}
     for name in deltas.keys() & columns.keys():
         wanted = number + torch.tensor(deltas[name])

@@ -22,7 +22,7 @@ class MemobenchRandomConfig(UntrainedConfig):
             arm trembles about one place; towards 1 it wanders.
     """
 
-    sees: ClassVar[tuple[str, ...]] = ()
+    inputs: ClassVar[tuple[str, ...]] = ()
 
     seed: int = 0
     smoothing: float = 0.0

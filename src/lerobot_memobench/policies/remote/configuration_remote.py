@@ -39,7 +39,7 @@ class RemoteConfig(UntrainedConfig):
         label: what is served, in your words; it goes onto the result card, since a server does not tell it.
     """
 
-    knows_phases: ClassVar[bool] = True
+    reads_prompt: ClassVar[bool] = True
 
     host: str = "127.0.0.1"
     port: int | None = None
@@ -77,7 +77,7 @@ class RemoteConfig(UntrainedConfig):
         self.sent()
 
     @property
-    def sees(self) -> tuple[str, ...]:
+    def inputs(self) -> tuple[str, ...]:
         """What its server is sent, in the words of `envs.observations`."""
         sent = set(self.sent().values())
         told = {"environment_state": PRIVILEGED, "expert_action": SIMULATOR, "blind_action": SIMULATOR}

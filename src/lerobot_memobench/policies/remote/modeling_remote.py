@@ -69,7 +69,7 @@ class Actor:
             return EXECUTION, 0 if self._clock is None else self._clock[1] + 1
         return EXECUTION if phase is None else phase, told
 
-    def looks_next(self) -> bool:
+    def needs_observation(self) -> bool:
         """Whether the server is sent the pictures of the next observation; the first of an execution it always is."""
         if self._rests or self._clock is None:
             return not self._rests
@@ -113,9 +113,9 @@ class RemotePolicy(UntrainedPolicy):
         for actor in self._actors:
             actor.forget()
 
-    def looks_next(self) -> bool:
+    def needs_observation(self) -> bool:
         """Whether a server is sent the pictures of the next observation."""
-        return any(actor.looks_next() for actor in self._actors)
+        return any(actor.needs_observation() for actor in self._actors)
 
     def _add_actor(self) -> None:
         addresses = self.config.addresses()

@@ -69,7 +69,7 @@ class MemoryEncoder(nn.Module):
         """
         of_image, of_position = self.project.weight.split([tokens.shape[-1], self.position.out_features], dim=1)
         image = F.linear(tokens.to(of_image.dtype), of_image, self.project.bias)
-        # A training batch gives all its frames one by one (`PooledMemory.shared`), seen at a tenth as many steps.
+        # A training batch gives all its frames one by one (`PooledMemoryEncoder.shared`), seen at a tenth as many steps.
         at, places = steps.unique(return_inverse=True) if steps.shape[1] == 1 else (steps, None)
         positions = F.linear(F.silu(self._positions(at)), of_position)
         if places is not None:
@@ -123,7 +123,7 @@ class MemoryTokens(NamedTuple):
 # A memory of frames that are stored as they were seen, and of which it is learned what becomes of each.
 
 
-class PooledMemory(nn.Module):
+class PooledMemoryEncoder(nn.Module):
     """Stored frames to memory tokens: each through a pool, then the mechanism's encoder over the frames.
 
     Args:
