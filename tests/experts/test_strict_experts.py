@@ -111,7 +111,7 @@ def play(task: Task, seed: int) -> Episode:
     return episode
 
 
-@pytest.mark.parametrize(("name", "variant"), [(MICROWAVE, 2), (DRAWERS, 5), (STOVE, 0), (CHARGER, 2)])
+@pytest.mark.parametrize(("name", "variant"), [(MICROWAVE, 1), (DRAWERS, 5), (STOVE, 0), (CHARGER, 2)])
 def test_solves_a_task_of_each_family(name: str, variant: int) -> None:
     play(get_task(name).variant(variant), 20_000)
 
@@ -126,10 +126,10 @@ def test_leans_over_what_keeps_it_from_reaching() -> None:
     assert play(get_task(MILK), 20_034).exec_steps < 500
 
 
-def test_a_prompt_goes_on_until_what_it_shows_has_held() -> None:
+@pytest.mark.parametrize(("name", "seed"), [(WASTE, 20_043), pytest.param(WASTE_FIRST, 10_011, marks=pytest.mark.slow)])
+def test_a_prompt_goes_on_until_what_it_shows_has_held(name: str, seed: int) -> None:
     """The plan had ended at the ninth of the ten steps for which the goal has to hold."""
-    assert play(get_task(WASTE), 20_043).prompt_shown
-    assert play(get_task(WASTE_FIRST), 10_011).prompt_shown
+    assert play(get_task(name), seed).prompt_shown
 
 
 def test_comes_home_between_events_and_does_not_rest_there() -> None:

@@ -322,6 +322,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_workers_move_as_their_parent(tmp_path: Path) -> None:
     script = tmp_path / "workers.py"
     script.write_text(_WORKERS)

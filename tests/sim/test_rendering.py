@@ -388,7 +388,7 @@ def frame_hash(backend: str) -> tuple[str, str]:
     return done.stdout, done.stderr
 
 
-@pytest.mark.parametrize("backend", ["egl", "osmesa"])
+@pytest.mark.parametrize("backend", [pytest.param("egl", marks=pytest.mark.slow), "osmesa"])
 def test_backends_in_processes_of_their_own(backend: str) -> None:
     """Two processes draw the same, and go without a word."""
     if not ctypes.util.find_library(rendering.BACKENDS[backend]):

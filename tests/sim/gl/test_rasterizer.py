@@ -114,8 +114,14 @@ def states(sims: list[Simulation], joint: str, opened: float) -> Iterator[str]:
     yield "one reset"
 
 
-@pytest.mark.parametrize("quality", QUALITIES)
-@pytest.mark.parametrize("task", SCENES)
+@pytest.mark.parametrize(
+    ("task", "quality"),
+    [
+        pytest.param(task, quality, marks=() if quality == "default" or "drawer" in task else pytest.mark.slow)
+        for task in SCENES
+        for quality in QUALITIES
+    ],
+)
 def test_frames_equal_those_drawn_plainly(gl: str, monkeypatch: pytest.MonkeyPatch, task: str, quality: str) -> None:
     settings = RenderSettings(128, 128, quality)
     sims = [Simulation(get_task(task), settings) for _ in range(2)]
