@@ -11,11 +11,11 @@ import pytest
 import torch
 
 from lerobot_memobench.datasets.labels import digest, labels
-from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
+from lerobot_memobench.datasets.lerobot_format.assembling import numeric_stats, write_dataset
 from lerobot_memobench.datasets.lerobot_format.layout import dataset_features, is_dataset
 from lerobot_memobench.datasets.lerobot_format.reading import read_episode
-from lerobot_memobench.datasets.staging import image_stats, numeric_stats, stage_demonstration
-from lerobot_memobench.datasets.video import encode_video
+from lerobot_memobench.datasets.staging import stage_demonstration
+from lerobot_memobench.datasets.video import ImageHistograms, encode_video
 from lerobot_memobench.errors import MemobenchError
 
 SIZE = 64
@@ -151,7 +151,10 @@ def test_statistics_have_the_shapes_of_lerobots(dataset, demos):
         np.testing.assert_allclose(ours[key], value, atol=0.2 if key.startswith("q") else 1e-5)
     frames = demos[0].images["image"]
     reference = get_feature_stats(frames.transpose(0, 3, 1, 2), axis=(0, 2, 3), keepdims=True)
-    ours = image_stats(frames)
+    histograms = ImageHistograms()
+    for each in frames:
+        histograms.add(each)
+    ours = histograms.stats()
     assert set(ours) == set(reference)
     for key in set(reference) - {"count"}:
         np.testing.assert_allclose(ours[key], reference[key][0] / 255, atol=2 / 255)

@@ -52,6 +52,15 @@ from lerobot_memobench.tasks.task import Task, referent_told
 WEIGHTS = "model.safetensors"
 NEEDS = Needs(cores=1, memory_gb=4)
 """Of one job on Slurm, which makes one episode after another."""
+FRAMES = {
+    "published": {"temporal": 390, "spatial": 570, "object": 320, "procedural": 730},
+    "strict": {"temporal": 530, "spatial": 860, "object": 330, "procedural": 750},
+}
+"""Frames of a demonstration, prompt included, on average over the full runs (docs/demonstrations.md)."""
+FRAME_BYTES, PICTURES_BYTES, HDF5_BYTES = 800, 5_400, 130_000
+"""Of a frame in a LeRobotDataset without pictures; of both cameras' videos and of lossless pictures, at 256 × 256."""
+FRAME_SECONDS, PICTURES_SECONDS = 0.0045, 0.011
+"""Of one core: to make a frame, and to draw and encode both cameras at 256 × 256."""
 
 
 def generate(
@@ -134,81 +143,9 @@ def generate(
         return _assemble(plan, jobs, out, repo_id)
 
 
-FRAMES = {
-    "published": {"temporal": 390, "spatial": 570, "object": 320, "procedural": 730},
-    "strict": {"temporal": 530, "spatial": 860, "object": 330, "procedural": 750},
-}
-"""Frames of a demonstration, prompt included, on average over the full runs (docs/demonstrations.md)."""
-FRAME_BYTES, PICTURES_BYTES, HDF5_BYTES = 800, 5_400, 130_000
-"""Of a frame in a LeRobotDataset without pictures; of both cameras' videos and of lossless pictures, at 256 × 256."""
-FRAME_SECONDS, PICTURES_SECONDS = 0.0045, 0.011
-"""Of one core: to make a frame, and to draw and encode both cameras at 256 × 256."""
-
-
-def run_size(frames: int, formats: Collection[str], image_size: int | None) -> int:
-    """Return about how many bytes so many frames take; ``image_size`` is None without pictures."""
-    area = 0.0 if image_size is None else (image_size / 256) ** 2
-    lerobot = (FRAME_BYTES + PICTURES_BYTES * area) * (LEROBOT in formats)
-    return round(frames * (lerobot + HDF5_BYTES * area * (HDF5 in formats)))
-
-
-def check_room(out: Path, size: int, there: int, tell: Callable[[str], None], what: str) -> None:
-    """Tell what a run will take of the disk, and refuse one that cannot fit.
-
-    Finished episodes stand beside the dataset that is made of them until it is whole, so at its end a run needs twice
-    its size.
-
-    Args:
-        out: its destination. size: of the dataset, about. there: bytes of it that are staged already.
-        what: begins the sentence: how much will be made.
-
-    Raises:
-        MemobenchError: not even one copy has room.
-    """
-    free, most = free_bytes(out), max(2 * size - there, 0)
-    told = f"about {in_words(size)} in {out}, {in_words(most)} until it is finished; {in_words(free)} are free there"
-    if free < size - there:
-        raise MemobenchError(f"{what} would take {told}: make room, name a folder on another disk, or ask for less")
-    warning = "; THAT MAY NOT BE ENOUGH: a full disk ends the run, and the same command then goes on" * (free < most)
-    tell(f"{what}: {told}{warning}")
-
-
-def _tell_of_the_run(
-    plan: _Plan, jobs: Sequence[RecordingJob], out: Path, workers: int, tell: Callable[[str], None]
-) -> None:
-    """Tell size and time of what is to be made, before it is."""
-    missing = [job for job in jobs if not job.folder.exists()]
-    if not missing:
-        return
-    pictures = plan.settings.image_size if plan.settings.images else None
-    frames, left = (
-        sum(FRAMES[job.task.suite].get(job.task.memory_type, 600) for job in some) for some in (jobs, missing)
-    )
-    seconds = left * (FRAME_SECONDS + PICTURES_SECONDS * ((pictures or 0) / 256) ** 2)
-    minutes = seconds / 60 / max(min(workers, cores()), 1)
-    time = f"{minutes / 60:.1f} hours" if minutes > 90 else f"{max(round(minutes), 1)} min"
-    size = run_size(frames, plan.formats, pictures)
-    what = f"{len(missing)} demonstrations of some {left:,} frames, in about {time} with {workers} at a time"
-    check_room(out, size, size - run_size(left, plan.formats, pictures), tell, what)
-
-
-def episodes_of(task: Task, episodes: int, prompted_episodes: int | None) -> int:
-    """Return how many demonstrations of a task `generate` is asked for."""
-    return episodes if task.prompt is None or prompted_episodes is None else prompted_episodes
-
-
-def _check_prompts(tasks: Sequence[Task], demonstration_prompt: bool) -> None:
-    hiding = next((task for task in tasks if task.prompt is not None and not task.prompt.restores), None)
-    if hiding is not None and not demonstration_prompt:
-        raise MemobenchError(
-            f"demonstrations of {hiding.name} were asked for without its prompt video, which hides what is to be "
-            "found; leave out --no-demonstration-prompt"
-        )
-
-
 @dataclass(frozen=True)
 class _Plan:
-    """What a run is to make, wherever and however it is made."""
+    """Episodes and formats that a run is asked for, wherever and however they are made."""
 
     tasks: tuple[Task, ...]
     episodes: int
@@ -224,7 +161,7 @@ class _Plan:
 
     @property
     def request(self) -> dict[str, Any]:
-        """What must agree for two runs to be one."""
+        """Settings that must agree for two runs to be one."""
         return {
             "tasks": [task.name for task in self.tasks],
             "formats": list(self.formats),
@@ -262,6 +199,41 @@ class _Plan:
             RecordingJob(task, seed, self.settings, folder / f"{number:06d}", self.formats)
             for number, (task, seed) in enumerate(seeds)
         ]
+
+
+# --- the run ---
+
+
+def episodes_of(task: Task, episodes: int, prompted_episodes: int | None) -> int:
+    """Return how many demonstrations of a task `generate` is asked for."""
+    return episodes if task.prompt is None or prompted_episodes is None else prompted_episodes
+
+
+def _checked_formats(formats: Collection[str], settings: RecordingSettings) -> tuple[str, ...]:
+    """Return the formats in their order, each once."""
+    given = [formats] if isinstance(formats, str) else list(formats)
+    for name in given:
+        if name not in FORMATS:
+            raise MemobenchError(f"found format {name!r}, {nearest(name, FORMATS)}")
+    if not given:
+        raise MemobenchError(f"no format was asked for; name {' or '.join(FORMATS)}, or both")
+    if HDF5 in given and (settings.perturb or settings.policy is not None):
+        raise MemobenchError(
+            "format 'hdf5' was asked for with the arm moved off its way, but its layout has one action per frame, and "
+            "needs two: what is to be done and what was; write format lerobot alone"
+        )
+    if HDF5 in given and not settings.images:
+        raise MemobenchError("format 'hdf5' was asked for without images, which its layout holds; record them as well")
+    return tuple(name for name in FORMATS if name in given)
+
+
+def _check_prompts(tasks: Sequence[Task], demonstration_prompt: bool) -> None:
+    hiding = next((task for task in tasks if task.prompt is not None and not task.prompt.restores), None)
+    if hiding is not None and not demonstration_prompt:
+        raise MemobenchError(
+            f"demonstrations of {hiding.name} were asked for without its prompt video, which hides what is to be "
+            "found; leave out --no-demonstration-prompt"
+        )
 
 
 def _logs(out: Path, executor: str) -> Path:
@@ -305,24 +277,6 @@ def is_finished(out: Path) -> bool:
     except (FileNotFoundError, MemobenchError):
         return False
     return isinstance(formats, list) and LEROBOT not in formats and (out / HDF5_FOLDER).is_dir()
-
-
-def _checked_formats(formats: Collection[str], settings: RecordingSettings) -> tuple[str, ...]:
-    """Return the formats in their order, each once."""
-    given = [formats] if isinstance(formats, str) else list(formats)
-    for name in given:
-        if name not in FORMATS:
-            raise MemobenchError(f"found format {name!r}, {nearest(name, FORMATS)}")
-    if not given:
-        raise MemobenchError(f"no format was asked for; name {' or '.join(FORMATS)}, or both")
-    if HDF5 in given and (settings.perturb or settings.policy is not None):
-        raise MemobenchError(
-            "format 'hdf5' was asked for with the arm moved off its way, but its layout has one action per frame, and "
-            "needs two: what is to be done and what was; write format lerobot alone"
-        )
-    if HDF5 in given and not settings.images:
-        raise MemobenchError("format 'hdf5' was asked for without images, which its layout holds; record them as well")
-    return tuple(name for name in FORMATS if name in given)
 
 
 def _finished(out: Path, plan: _Plan) -> GenerationSummary:
@@ -388,8 +342,57 @@ def _versions() -> dict[str, str]:
     return found
 
 
-# ==== generation_summary.py
-# What a run of generation made.
+# --- size and time ---
+
+
+def run_size(frames: int, formats: Collection[str], image_size: int | None) -> int:
+    """Return about how many bytes so many frames take; ``image_size`` is None without pictures."""
+    area = 0.0 if image_size is None else (image_size / 256) ** 2
+    lerobot = (FRAME_BYTES + PICTURES_BYTES * area) * (LEROBOT in formats)
+    return round(frames * (lerobot + HDF5_BYTES * area * (HDF5 in formats)))
+
+
+def check_room(out: Path, size: int, there: int, tell: Callable[[str], None], what: str) -> None:
+    """Tell what a run will take of the disk, and refuse one that cannot fit.
+
+    Finished episodes stand beside the dataset that is made of them until it is whole, so at its end a run needs twice
+    its size.
+
+    Args:
+        out: its destination. size: of the dataset, about. there: bytes of it that are staged already.
+        what: begins the sentence: how much will be made.
+
+    Raises:
+        MemobenchError: not even one copy has room.
+    """
+    free, most = free_bytes(out), max(2 * size - there, 0)
+    told = f"about {in_words(size)} in {out}, {in_words(most)} until it is finished; {in_words(free)} are free there"
+    if free < size - there:
+        raise MemobenchError(f"{what} would take {told}: make room, name a folder on another disk, or ask for less")
+    warning = "; THAT MAY NOT BE ENOUGH: a full disk ends the run, and the same command then goes on" * (free < most)
+    tell(f"{what}: {told}{warning}")
+
+
+def _tell_of_the_run(
+    plan: _Plan, jobs: Sequence[RecordingJob], out: Path, workers: int, tell: Callable[[str], None]
+) -> None:
+    """Tell size and time of what is to be made, before it is."""
+    missing = [job for job in jobs if not job.folder.exists()]
+    if not missing:
+        return
+    pictures = plan.settings.image_size if plan.settings.images else None
+    frames, left = (
+        sum(FRAMES[job.task.suite].get(job.task.memory_type, 600) for job in some) for some in (jobs, missing)
+    )
+    seconds = left * (FRAME_SECONDS + PICTURES_SECONDS * ((pictures or 0) / 256) ** 2)
+    minutes = seconds / 60 / max(min(workers, cores()), 1)
+    time = f"{minutes / 60:.1f} hours" if minutes > 90 else f"{max(round(minutes), 1)} min"
+    size = run_size(frames, plan.formats, pictures)
+    what = f"{len(missing)} demonstrations of some {left:,} frames, in about {time} with {workers} at a time"
+    check_room(out, size, size - run_size(left, plan.formats, pictures), tell, what)
+
+
+# --- the outcome ---
 
 
 @dataclass(frozen=True)
@@ -403,7 +406,7 @@ class Failure:
 
 @dataclass(frozen=True)
 class TaskSummary:
-    """What became of one task: ``frames`` are those of its successful episodes, holding frames included."""
+    """Outcome of one task: ``frames`` are those of its successful episodes, holding frames included."""
 
     name: str
     memory_type: str
@@ -415,7 +418,7 @@ class TaskSummary:
 
 @dataclass(frozen=True)
 class GenerationSummary:
-    """What a run made.
+    """Outcome of a run.
 
     Attributes:
         folder: what was made, or None when no episode succeeded, or none is there yet.
@@ -439,7 +442,7 @@ class GenerationSummary:
 
 
 def summarise(rows: Sequence[dict[str, Any]], tasks: Sequence[Task], out: Path) -> GenerationSummary:
-    """Return what became of each task, from what is known of each episode."""
+    """Return the outcome of each task, from the rows of the manifest."""
     summaries = tuple(_summary(task, [row for row in rows if row["task_name"] == task.name]) for task in tasks)
     made = any(summary.solved for summary in summaries)
     return GenerationSummary(out if made else None, summaries)

@@ -1,7 +1,7 @@
-"""The one place where a demonstration's labels are computed.
+"""Labels of a demonstration: checkpoint columns, LeRobot's language rows, and the hash of the whole.
 
-Every checkpoint column of the dataset is a function of the demonstration, :func:`labels`, so that writers, validators
-and policies cannot disagree about what a column means.
+Every checkpoint column of a dataset is a function of the demonstration, `labels`, so that writers, validators and
+policies cannot disagree about its meaning.
 """
 
 from __future__ import annotations
@@ -22,6 +22,10 @@ from lerobot_memobench.tasks.task import LEVELS, OPERATIONS, Task
 
 MAX_CHECKPOINTS = 6
 """Width of ``checkpoint.completed``: no task of the benchmark has more checkpoints."""
+MIN_FRAMES_BETWEEN_ROWS = 5
+"""LeRobot's ``emitted_at`` looks 0.1 s to either side and raises when it finds two rows of a style, so rows
+of one style must be more than 0.2 s apart: at 20 frames/s, at least 5 frames."""
+LanguageRow = dict[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +43,7 @@ class Labels:
         grounded_subgoal, coarse_subgoal: the same at the fine and at the coarse level.
         memory: T strings, intermediate-level texts of the checkpoints completed in order before t, joined by
             "; "; empty at the start. The oracle memory of the paper (:mod:`lerobot_memobench.tasks.memory_text`).
-        subtask: T strings, what is to be done for the checkpoint worked on, as an instruction: in LeRobot's language
-            rows, and no column of its own.
+        subtask: T strings, the checkpoint worked on as an instruction: in LeRobot's language rows, and no column.
         key_frames: (K,) int64, the frame at which checkpoint k was completed in order, -1 if it never was.
     """
 
@@ -137,24 +140,16 @@ def _subgoals(task: Task, level: int) -> list[str]:
     return [*texts, texts[-1]]
 
 
-# ==== language.py
-# Checkpoint texts as LeRobot's persistent language rows, for its training recipes.
-#
-# LeRobot 0.6 keeps language beside the frames in the column ``language_persistent``: one list of rows per
-# episode, repeated on every frame, each row active from its timestamp until the next of its style
-# (``lerobot.datasets.language``). The styles written here are those its annotation pipeline writes: ``subtask``
-# (what to do, as an instruction) and ``memory`` (what has been done, in the past tense; none before the first
-# completion).
-
-MIN_FRAMES_BETWEEN_ROWS = 5
-"""LeRobot's ``emitted_at`` looks 0.1 s to either side and raises when it finds two rows of a style, so rows
-of one style must be more than 0.2 s apart: at 20 frames/s, at least 5 frames."""
-
-LanguageRow = dict[str, Any]
+# --- language rows ---
 
 
 def persistent_rows(found: Labels, fps: int = CONTROL_HZ) -> list[LanguageRow]:
-    """Return an episode's rows, sorted as LeRobot's own writer sorts them (timestamp, style, role).
+    """Return an episode's language rows for LeRobot's training recipes, sorted by timestamp, style, role.
+
+    LeRobot keeps them in the column ``language_persistent``: one list per episode, repeated on every frame, each row
+    active from its timestamp until the next of its style (``lerobot.datasets.language``). The styles are those of its
+    annotation pipeline: ``subtask`` (the next thing to do, as an instruction) and ``memory`` (the things done, in the
+    past tense; none before the first completion).
 
     A text that is replaced again within 0.2 s (checkpoints completed at nearly the same time) gets no row;
     the text before it stays active until the one after it begins, so a row never claims something too early.
@@ -194,8 +189,7 @@ def _row(style: str, text: str, frame: int, fps: int) -> LanguageRow:
     }
 
 
-# ==== digest.py
-# The hash of an episode: what manifest and HDF5 files hold to tell whether it is still the one that was written.
+# --- the hash ---
 
 
 def digest(demo: Demonstration) -> str:

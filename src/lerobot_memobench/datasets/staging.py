@@ -1,8 +1,8 @@
-"""Finished episodes on disk while a dataset is being made.
+"""Stage episodes: keep finished ones on disk while a dataset is being made.
 
-Each episode is one folder, complete or absent: it is written under a temporary name and renamed when every
-file has reached the disk, so a run killed at any moment leaves finished episodes and rubbish with a name of
-its own. An episode's file names and bytes depend on the episode alone, never on the worker that made it.
+Each episode is one folder, complete or absent: it is written under a temporary name and renamed when every file has
+reached the disk, so a run killed at any moment leaves finished episodes and rubbish with a name of its own. An
+episode's file names and bytes depend on the episode alone, never on the worker that made it.
 
 ::
 
@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.hdf5.writing import EpisodeFile, data_attributes
 from lerobot_memobench.datasets.labels import LanguageRow, digest, labels, persistent_rows
-from lerobot_memobench.datasets.video import VideoWriter
+from lerobot_memobench.datasets.video import ImageHistograms, Stats, VideoWriter
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import (
     Count,
@@ -53,200 +53,24 @@ from lerobot_memobench.io import (
 from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.protocol import CAMERAS
 
-# ==== folders.py
-# Folders that are whole or not there, and what killed workers leave of them.
-
 STAGING = ".staging"
 """Folder of a run within its destination."""
 TEMPORARY = ".tmp-"
-
-
-def clean_temporaries(folder: Path) -> None:
-    """Remove what this machine's killed workers left in the folder of episodes; others may still be working."""
-    for path in folder.glob(f"{TEMPORARY}{_host()}-*"):
-        pid = path.name.removeprefix(f"{TEMPORARY}{_host()}-").split("-")[0]
-        if not (pid.isdigit() and _alive(int(pid))):
-            shutil.rmtree(path, ignore_errors=True)
-
-
-def temporary_folder(folder: Path) -> Path:
-    """Make and return an empty folder beside ``folder``, to be renamed to it when it is whole."""
-    temporary = folder.parent / f"{TEMPORARY}{_host()}-{os.getpid()}-{folder.name}"
-    shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir(parents=True)
-    return temporary
-
-
-def flush_to_disk(paths: Iterable[Path]) -> None:
-    """Wait until the disk holds files, or the entries of folders."""
-    for path in paths:
-        descriptor = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-
-
-def _host() -> str:
-    return re.sub(r"[^A-Za-z0-9]", "_", socket.gethostname())
-
-
-def _alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return pid != os.getpid()  # what this process left behind earlier is rubbish too
-
-
-# ==== request.py
-# What keeps a run in a folder apart from later ones: the request that it answers.
-
 REQUEST_FILE = "request.json"
-
-
-@contextlib.contextmanager
-def episodes_folder(out: Path, request: dict[str, Any], advice: str, *, anew: bool = False) -> Iterator[Path]:
-    """Hold the destination ``out`` for a run that answers ``request``; yield the folder for its finished episodes.
-
-    Those of an unfinished run of the same request are there already, unless it is to begin ``anew``.
-
-    Raises:
-        MemobenchError: another run is writing there, or an unfinished one answers another request; ``advice`` ends
-            that sentence.
-    """
-    staging = out / STAGING
-    staging.mkdir(parents=True, exist_ok=True)
-    with locked(staging, out):
-        folder = staging / "episodes"
-        if anew:
-            shutil.rmtree(folder, ignore_errors=True)
-            (staging / REQUEST_FILE).unlink(missing_ok=True)
-        remove_drafts(staging)
-        _check_request(staging, request, out, advice)
-        folder.mkdir(exist_ok=True)
-        clean_temporaries(folder)
-        yield folder.absolute()
-
-
-def _check_request(staging: Path, request: dict[str, Any], out: Path, advice: str) -> None:
-    """Remember the request in an unfinished run's folder; raise where it was another one."""
-    path = staging / REQUEST_FILE
-    try:
-        earlier = read_json(path, dict[str, Any], "delete the folder that it is in to start anew")
-    except FileNotFoundError:
-        write_file(path, json.dumps(request, indent=1), durable=True)
-        return
-    compare_requests(earlier, request, f"{out} holds an unfinished run", advice)
-
-
-def compare_requests(earlier: dict[str, Any], request: dict[str, Any], what: str, advice: str) -> None:
-    """Raise with the first thing that was asked for differently."""
-    before = {"formats": [LEROBOT], "perturb": False, "policy": None, "prompted_episodes": None}
-    earlier = {**before, **earlier}  # written before there was a choice
-    for key, value in request.items():
-        if earlier.get(key) != value:
-            there = short(earlier.get(key))
-            raise MemobenchError(f"{what} with {key}={there}, now {short(value)} was asked for; {advice}")
-
-
-# ==== statistics.py
-# Statistics of images and numbers, by the names under which LeRobot keeps and uses them.
-
-QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
-
-BLOCK = 16
-"""Columns of which statistics are made at once: of all, a copy in float64 for thousands of episodes is gigabytes."""
-
-Stats = dict[str, NDArray]
-
-
-class ImageHistograms:
-    """Statistics of a video's frames, collected while they pass: a histogram of 256 bins per frame and channel.
-
-    LeRobot takes frames evenly spread over the episode, at least 100; which ones is known only at its end. A
-    frame's histograms are 3 kB, the frame itself 192 kB.
-    """
-
-    def __init__(self) -> None:
-        self._counts: list[NDArray[np.int32]] = []
-
-    def add(self, frame: NDArray[np.uint8]) -> None:
-        """Count one more frame, (H, W, 3) uint8."""
-        import cv2
-
-        counts = [cv2.calcHist([frame], [channel], None, [256], [0, 256])[:, 0] for channel in range(3)]
-        self._counts.append(np.array(counts, dtype=np.int32))
-
-    def stats(self) -> Stats:
-        """Return LeRobot's statistics: each (3, 1, 1), in [0, 1], and ``count`` (1,).
-
-        Over the frames that LeRobot samples, but exact over their pixels: eight bits need a histogram of 256
-        bins, not of 5,000 adaptive ones.
-        """
-        from lerobot.datasets.compute_stats import sample_indices
-
-        chosen = sample_indices(len(self._counts))
-        counts = np.stack([self._counts[index] for index in chosen]).sum(axis=0, dtype=np.int64)
-        levels, total = np.arange(256) / 255.0, counts[0].sum()
-        mean = counts @ levels / total
-        cumulative = counts.cumsum(axis=1)
-        stats = {
-            "min": levels[(counts > 0).argmax(axis=1)],
-            "max": levels[255 - (counts[:, ::-1] > 0).argmax(axis=1)],
-            "mean": mean,
-            "std": np.sqrt(np.maximum(counts @ levels**2 / total - mean**2, 0)),
-        }
-        for q in QUANTILES:
-            stats[f"q{int(q * 100):02d}"] = levels[(cumulative >= q * total).argmax(axis=1)]
-        return {name: value.reshape(3, 1, 1) for name, value in stats.items()} | {"count": np.array([len(chosen)])}
-
-
-def image_stats(frames: NDArray[np.uint8]) -> Stats:
-    """Return the statistics of (T, H, W, 3) uint8 frames, see :class:`ImageHistograms`."""
-    histograms = ImageHistograms()
-    for frame in frames:
-        histograms.add(frame)
-    return histograms.stats()
-
-
-def numeric_stats(values: NDArray) -> Stats:
-    """Return exact statistics of (T,) or (T, n) numbers over T: each (n,) (n = 1 for (T,)), and ``count``
-    (1,).
-
-    LeRobot averages the episodes' quantiles; over a whole dataset that is no quantile. pi0.5 normalises by
-    q01 and q99, so they are computed from all frames here.
-    """
-    flat = values.reshape(len(values), -1)
-    blocks = [_stats_of(flat[:, start : start + BLOCK].astype(np.float64)) for start in range(0, flat.shape[1], BLOCK)]
-    stats = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
-    return stats | {"count": np.array([len(values)])}
-
-
-def _stats_of(flat: NDArray[np.float64]) -> Stats:
-    stats = {"min": flat.min(0), "max": flat.max(0), "mean": flat.mean(0), "std": flat.std(0)}
-    quantiles = np.quantile(flat, QUANTILES, axis=0, overwrite_input=True)
-    return stats | {f"q{int(q * 100):02d}": row for q, row in zip(QUANTILES, quantiles, strict=True)}
-
-
-# ==== episode.py
-# A finished episode's folder, read back.
-
 RECORD_FILE = "episode.json"
 ARRAYS_FILE = "arrays.npz"
 HDF5_FILE = "demonstration.hdf5"
-
 LEROBOT, HDF5 = "lerobot", "hdf5"
 FORMATS = (LEROBOT, HDF5)
-"""What a run can make of its episodes."""
-
+"""Of a run's episodes."""
 ADVICE = "it is damaged; delete the folder that it is in and run the command again"
 
 
+# --- a finished episode ---
+
+
 class Info(TypedDict):
-    """What meta/episodes, manifest and card say of an episode (see ``episode_info``)."""
+    """Fields of an episode for meta/episodes, manifest and card (see ``episode_info``)."""
 
     task_name: str
     memory_type: str
@@ -266,14 +90,14 @@ class Info(TypedDict):
 
 
 class Identity(TypedDict):
-    """What is known of an episode that could not be made."""
+    """Fields of an episode that could not be made."""
 
     task_name: str
     seed: Whole
 
 
 class Row(TypedDict, total=False):
-    """One of LeRobot's persistent language rows; `datasets.language` writes them."""
+    """One of LeRobot's persistent language rows; `labels.persistent_rows` writes them."""
 
     role: str
     content: str | None
@@ -327,7 +151,7 @@ class StagedEpisode:
 
     @property
     def has_objects(self) -> bool:
-        """Whether what could be seen as objects was recorded."""
+        """Whether visible objects were recorded."""
         with np.load(self.folder / ARRAYS_FILE, allow_pickle=False) as data:
             return "objects" in data
 
@@ -378,20 +202,15 @@ def read_staged(folder: Path) -> StagedEpisode | None:
     except FileNotFoundError:
         return None
     if record["failure"] is None:
-        _check_info(folder, record["info"])
+        try:
+            checked(record["info"], Info)
+        except Malformed as error:
+            raise MemobenchError(f"{folder / RECORD_FILE}: {error} in info; {ADVICE}") from None
     return StagedEpisode(folder, record)
 
 
-def _check_info(folder: Path, info: dict[str, Any]) -> None:
-    """Refuse an episode of which not all is told that a dataset says of it."""
-    try:
-        checked(info, Info)
-    except Malformed as error:
-        raise MemobenchError(f"{folder / RECORD_FILE}: {error} in info; {ADVICE}") from None
-
-
 class StagedJob:
-    """What jobs have in common that make one episode, complete or absent: two workers at the same one do no harm."""
+    """A job that makes one episode, complete or absent: two workers at the same one do no harm."""
 
     folder: Path
 
@@ -412,30 +231,7 @@ def staged(job: StagedJob) -> StagedEpisode:
     return found
 
 
-# ==== stage.py
-# Write an episode: frame by frame while it is made, everything else at its end.
-
-
-def episode_info(demo: Demonstration) -> dict[str, Any]:
-    """Return what meta/episodes, manifest and card say about an episode."""
-    found = labels(demo)
-    return {
-        "task_name": demo.task.name,
-        "memory_type": demo.task.memory_type,
-        "family": demo.task.family,
-        "language": demo.task.language,
-        "operations": demo.task.operations,
-        "seed": int(demo.seed),
-        "referent": demo.referent,
-        "variant": int(demo.variant),
-        "success": bool(demo.success),
-        "frames": len(demo),
-        "exec_start_index": int(demo.exec_start),
-        "key_frames": found.key_frames.tolist(),
-        "scene_hash": demo.scene_hash,
-        "fixture_poses": {name: np.asarray(pose).tolist() for name, pose in demo.fixture_poses.items()},
-        "digest": digest(demo),
-    }
+# --- writing one ---
 
 
 class EpisodeStage:
@@ -521,6 +317,28 @@ class EpisodeStage:
         }
 
 
+def episode_info(demo: Demonstration) -> dict[str, Any]:
+    """Return the fields of an episode for meta/episodes, manifest and card."""
+    found = labels(demo)
+    return {
+        "task_name": demo.task.name,
+        "memory_type": demo.task.memory_type,
+        "family": demo.task.family,
+        "language": demo.task.language,
+        "operations": demo.task.operations,
+        "seed": int(demo.seed),
+        "referent": demo.referent,
+        "variant": int(demo.variant),
+        "success": bool(demo.success),
+        "frames": len(demo),
+        "exec_start_index": int(demo.exec_start),
+        "key_frames": found.key_frames.tolist(),
+        "scene_hash": demo.scene_hash,
+        "fixture_poses": {name: np.asarray(pose).tolist() for name, pose in demo.fixture_poses.items()},
+        "digest": digest(demo),
+    }
+
+
 def _check_storable(info: Mapping[str, Any], columns: Mapping[str, Any]) -> None:
     """Raise unless a dataset's tables can hold the episode: one that they cannot would end the others with it."""
     texts = [sorted(set(values)) for values in columns.values() if isinstance(values, list)]
@@ -570,3 +388,91 @@ def _publish(temporary: Path, folder: Path, record: dict[str, Any]) -> StagedEpi
         return staged
     flush_to_disk([folder.parent])
     return StagedEpisode(folder, record)
+
+
+def temporary_folder(folder: Path) -> Path:
+    """Make and return an empty folder beside ``folder``, to be renamed to it when it is whole."""
+    temporary = folder.parent / f"{TEMPORARY}{_host()}-{os.getpid()}-{folder.name}"
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir(parents=True)
+    return temporary
+
+
+def flush_to_disk(paths: Iterable[Path]) -> None:
+    """Wait until the disk holds files, or the entries of folders."""
+    for path in paths:
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+# --- the run that they belong to ---
+
+
+@contextlib.contextmanager
+def episodes_folder(out: Path, request: dict[str, Any], advice: str, *, anew: bool = False) -> Iterator[Path]:
+    """Hold the destination ``out`` for a run that answers ``request``; yield the folder for its finished episodes.
+
+    Those of an unfinished run of the same request are there already, unless it is to begin ``anew``.
+
+    Raises:
+        MemobenchError: another run is writing there, or an unfinished one answers another request; ``advice`` ends
+            that sentence.
+    """
+    staging = out / STAGING
+    staging.mkdir(parents=True, exist_ok=True)
+    with locked(staging, out):
+        folder = staging / "episodes"
+        if anew:
+            shutil.rmtree(folder, ignore_errors=True)
+            (staging / REQUEST_FILE).unlink(missing_ok=True)
+        remove_drafts(staging)
+        _check_request(staging, request, out, advice)
+        folder.mkdir(exist_ok=True)
+        clean_temporaries(folder)
+        yield folder.absolute()
+
+
+def _check_request(staging: Path, request: dict[str, Any], out: Path, advice: str) -> None:
+    """Remember the request in an unfinished run's folder; raise where it was another one."""
+    path = staging / REQUEST_FILE
+    try:
+        earlier = read_json(path, dict[str, Any], "delete the folder that it is in to start anew")
+    except FileNotFoundError:
+        write_file(path, json.dumps(request, indent=1), durable=True)
+        return
+    compare_requests(earlier, request, f"{out} holds an unfinished run", advice)
+
+
+def compare_requests(earlier: dict[str, Any], request: dict[str, Any], what: str, advice: str) -> None:
+    """Raise with the first thing that was asked for differently."""
+    before = {"formats": [LEROBOT], "perturb": False, "policy": None, "prompted_episodes": None}
+    earlier = {**before, **earlier}  # written before there was a choice
+    for key, value in request.items():
+        if earlier.get(key) != value:
+            there = short(earlier.get(key))
+            raise MemobenchError(f"{what} with {key}={there}, now {short(value)} was asked for; {advice}")
+
+
+def clean_temporaries(folder: Path) -> None:
+    """Remove what this machine's killed workers left in the folder of episodes; others may still be working."""
+    for path in folder.glob(f"{TEMPORARY}{_host()}-*"):
+        pid = path.name.removeprefix(f"{TEMPORARY}{_host()}-").split("-")[0]
+        if not (pid.isdigit() and _alive(int(pid))):
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return pid != os.getpid()  # what this process left behind earlier is rubbish too
+
+
+def _host() -> str:
+    return re.sub(r"[^A-Za-z0-9]", "_", socket.gethostname())

@@ -20,7 +20,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_memobench.datasets.feature_cache.frames import FrameReader, FrameTable, frame_reader, read_frame_table
+from lerobot_memobench.datasets.feature_cache.frames import (
+    FrameReader,
+    FrameTable,
+    TextEncoder,
+    frame_reader,
+    numbered,
+    numbered_memory,
+    read_frame_table,
+)
 from lerobot_memobench.datasets.feature_cache.layout import (
     DONE_FILE,
     FOLDER,
@@ -40,8 +48,25 @@ from lerobot_memobench.jobs.processes import taking_turns
 from lerobot_memobench.jobs.threads import cores
 
 logger = logging.getLogger(__name__)
-
 MOST_THREADS = 8
+_CLOSED = (errno.EACCES, errno.EPERM, errno.EROFS)
+_ELSEWHERE = "put it elsewhere (`memobench cache --out`, --policy.feature_cache_dir)"
+Progress = Callable[[int, int], None]
+"""Called as progress(episodes done, episodes in all)."""
+
+
+class FrameEncoder(Protocol):
+    """The frozen vision tower: images (N, 3, H, W) in [0, 1], or what else is read -> tokens (N, P, D) bfloat16."""
+
+    tokens_per_frame: int
+    dim: int
+
+    @property
+    def key(self) -> str:
+        """Identity of the tower: weights and input size."""
+
+    def __call__(self, images: Any, /) -> Tensor:
+        """Encode."""
 
 
 def _warn(folder: Path) -> None:
@@ -208,11 +233,150 @@ class _Work:
         return self.meta
 
 
-# ==== room.py
-# Is there room for a cache on the disk, and what is told when there is none?
+# --- tokens ---
 
-_CLOSED = (errno.EACCES, errno.EPERM, errno.EROFS)
-_ELSEWHERE = "put it elsewhere (`memobench cache --out`, --policy.feature_cache_dir)"
+
+@dataclass(frozen=True)
+class Encoding:
+    """A cache whose tokens are being written.
+
+    Attributes:
+        folder: of the cache; its file of tokens has its full size.
+        batch_size: frames per pass of the tower. workers: threads that decode videos ahead of it.
+    """
+
+    folder: Path
+    meta: CacheMeta
+    table: FrameTable
+    batch_size: int
+    workers: int
+
+    def run(self, frames: FrameEncoder, read: FrameReader, progress: Progress) -> None:
+        """Encode every episode that is not marked done; its mark is written after its tokens are on the disk.
+
+        Videos are decoded in threads, a few parts ahead; the tower takes the parts in their order, so that the file is
+        the same whatever the number of threads, and a killed build has finished the first so many episodes. Tokens
+        are written, not mapped: a disk that refuses a mapped page kills the process (SIGBUS).
+        """
+        done = read_done(self.folder, self.table.num_episodes)
+        progress(int(done.sum()), len(done))
+        with (
+            (self.folder / TOKENS_FILE).open("r+b") as file,
+            ThreadPoolExecutor(self.workers, thread_name_prefix="decode") as pool,
+        ):
+            parts = self._parts(np.flatnonzero(done == 0).tolist())
+            for part, images in _ahead(pool, 2 * self.workers, parts, lambda part: read(part.episode, part.frames)):
+                encoded = frames(images).to("cpu", torch.bfloat16).contiguous()
+                file.seek(part.slot * self.meta.frame_bytes)
+                file.write(encoded.view(torch.uint16).numpy().tobytes())
+                if part.last:
+                    file.flush()
+                    os.fsync(file.fileno())
+                    done[part.episode] = 1
+                    write_done(self.folder, done)
+                    progress(int(done.sum()), len(done))
+
+    def _parts(self, episodes: Sequence[int]) -> Iterator[_Part]:
+        slots = slot_starts(self.table.episodes, self.meta.stride)
+        lengths = np.diff(self.table.episodes)
+        for episode in episodes:
+            wanted = list(range(0, int(lengths[episode]), self.meta.stride))
+            for first in range(0, len(wanted), self.batch_size):
+                end = first + self.batch_size
+                yield _Part(episode, wanted[first:end], int(slots[episode]) + first, end >= len(wanted))
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Frames of one episode that the tower takes at once."""
+
+    episode: int
+    frames: list[int]
+    slot: int  # where the first one's tokens go
+    last: bool  # of its episode
+
+
+def _ahead[Item, Result](
+    pool: ThreadPoolExecutor, number: int, items: Iterator[Item], work: Callable[[Item], Result]
+) -> Iterator[tuple[Item, Result]]:
+    """Yield (item, work(item)) in order, with at most ``number`` items begun before they are asked for."""
+    waiting: deque[tuple[Item, Future[Result]]] = deque()
+    try:
+        for item in items:
+            waiting.append((item, pool.submit(work, item)))
+            if len(waiting) >= number:
+                oldest, future = waiting.popleft()
+                yield oldest, future.result()
+        while waiting:
+            oldest, future = waiting.popleft()
+            yield oldest, future.result()
+    finally:
+        for _, future in waiting:
+            future.cancel()
+
+
+# --- tables ---
+
+
+def write_tables(folder: Path, table: FrameTable, texts: TextEncoder) -> None:
+    """Write the tables of a cache none of whose episodes is done."""
+    write_done(folder, np.zeros(table.num_episodes, dtype=np.uint8))
+    _save_array(folder / "episodes.npy", table.episodes)
+    _save_array(folder / "phase.npy", table.phase)
+    unique, subgoals = numbered(table)
+    for level, rows in subgoals.items():
+        _save_array(folder / f"subgoal-{level}.npy", rows)
+    _write_json(folder / TEXTS_FILE, unique)
+    _save_embeddings(folder / texts_file(texts.key, texts.key), unique, texts)
+    if table.memory is not None:
+        memories, rows = numbered_memory(table.memory)
+        _save_array(folder / "memory.npy", rows)
+        _write_json(folder / "memory.json", memories)
+
+
+def add_embeddings(folder: Path, meta: CacheMeta, texts: TextEncoder) -> None:
+    """Write what another text encoder makes of the texts beside what the cache has; nothing if it is there."""
+    path = folder / texts_file(meta.texts_key, texts.key)
+    if not path.is_file():
+        unique = read_json(folder / TEXTS_FILE, list[str], f"delete {folder}, and it is made again")
+        _save_embeddings(path, unique, texts)
+
+
+def read_done(folder: Path, episodes: int) -> np.ndarray:
+    """Return which episodes (E,) are done, uint8; none, where the file is damaged or gone."""
+    try:
+        done = np.load(folder / DONE_FILE)
+    except Exception:  # NumPy answers damaged arrays with errors of every type
+        done = None
+    whole = isinstance(done, np.ndarray) and done.dtype == np.uint8 and done.shape == (episodes,)
+    return done if whole and (done <= 1).all() else np.zeros(episodes, dtype=np.uint8)
+
+
+def write_meta(folder: Path, meta: CacheMeta) -> None:
+    """Write the description of a cache, without which it is none."""
+    _write_json(folder / META_FILE, asdict(meta))
+
+
+def write_done(folder: Path, done: np.ndarray) -> None:
+    """Write which episodes (E,) are done; on the disk before this returns, as their tokens are."""
+    _save_array(folder / DONE_FILE, done, durable=True)
+
+
+def _save_embeddings(path: Path, unique: list[str], texts: TextEncoder) -> None:
+    embeddings = texts(unique).to(torch.float32).numpy() if unique else np.zeros((0, texts.dim), np.float32)
+    _save_array(path, embeddings)
+
+
+def _write_json(path: Path, value: Any) -> None:
+    write_file(path, json.dumps(value, indent=1))
+
+
+def _save_array(path: Path, array: np.ndarray, *, durable: bool = False) -> None:
+    with draft_of(path, durable=durable) as draft:
+        np.save(draft, array)
+
+
+# --- room on the disk ---
 
 
 def reserve(path: Path, size: int) -> None:
@@ -279,194 +443,3 @@ def telling_of_the_disk(folder: Path) -> Iterator[None]:
 def _is_of(path: Path, folder: Path) -> bool:
     """Whether a path is where a cache lies, or on the way to it; not a dataset's video."""
     return path.is_relative_to(folder.parent) or folder.is_relative_to(path)
-
-
-# ==== tables.py
-# Everything of a feature cache but its tokens: small tables, and the embeddings of the subgoal texts.
-
-
-class TextEncoder(Protocol):
-    """The frozen text encoder: texts -> embeddings (N, dim) float32."""
-
-    @property
-    def key(self) -> str:
-        """Identity of the encoder."""
-
-    @property
-    def dim(self) -> int:
-        """Width of an embedding."""
-
-    def __call__(self, texts: Sequence[str]) -> Tensor:
-        """Encode."""
-
-
-def write_tables(folder: Path, table: FrameTable, texts: TextEncoder) -> None:
-    """Write the tables of a cache none of whose episodes is done."""
-    write_done(folder, np.zeros(table.num_episodes, dtype=np.uint8))
-    _save_array(folder / "episodes.npy", table.episodes)
-    _save_array(folder / "phase.npy", table.phase)
-    unique, subgoals = numbered(table)
-    for level, rows in subgoals.items():
-        _save_array(folder / f"subgoal-{level}.npy", rows)
-    _write_json(folder / TEXTS_FILE, unique)
-    _save_embeddings(folder / texts_file(texts.key, texts.key), unique, texts)
-    if table.memory is not None:
-        memories, rows = numbered_memory(table.memory)
-        _save_array(folder / "memory.npy", rows)
-        _write_json(folder / "memory.json", memories)
-
-
-def numbered(table: FrameTable) -> tuple[list[str], dict[str, np.ndarray]]:
-    """Return the subgoals that there are, and for each level their rows (N,) int32, -1 for none."""
-    unique = sorted({text for values in table.subgoals.values() for text in values if text})
-    number = {text: row for row, text in enumerate(unique)}
-    rows = {level: [number.get(text, -1) for text in values] for level, values in table.subgoals.items()}
-    return unique, {level: np.array(found, np.int32) for level, found in rows.items()}
-
-
-def numbered_memory(memory: Sequence[str]) -> tuple[list[str], np.ndarray]:
-    """Return the oracle memory texts that there are, and the row (N,) int32 of each frame's."""
-    memories, rows = np.unique(np.array(memory, dtype=object), return_inverse=True)
-    return memories.tolist(), rows.astype(np.int32)
-
-
-def add_embeddings(folder: Path, meta: CacheMeta, texts: TextEncoder) -> None:
-    """Write what another text encoder makes of the texts beside what the cache has; nothing if it is there."""
-    path = folder / texts_file(meta.texts_key, texts.key)
-    if not path.is_file():
-        unique = read_json(folder / TEXTS_FILE, list[str], f"delete {folder}, and it is made again")
-        _save_embeddings(path, unique, texts)
-
-
-def read_done(folder: Path, episodes: int) -> np.ndarray:
-    """Return which episodes (E,) are done, uint8; none, where the file is damaged or gone."""
-    try:
-        done = np.load(folder / DONE_FILE)
-    except Exception:  # NumPy answers damaged arrays with errors of every type
-        done = None
-    whole = isinstance(done, np.ndarray) and done.dtype == np.uint8 and done.shape == (episodes,)
-    return done if whole and (done <= 1).all() else np.zeros(episodes, dtype=np.uint8)
-
-
-def write_meta(folder: Path, meta: CacheMeta) -> None:
-    """Write the description of a cache, without which it is none."""
-    _write_json(folder / META_FILE, asdict(meta))
-
-
-def write_done(folder: Path, done: np.ndarray) -> None:
-    """Write which episodes (E,) are done; on the disk before this returns, as their tokens are."""
-    _save_array(folder / DONE_FILE, done, durable=True)
-
-
-def _save_embeddings(path: Path, unique: list[str], texts: TextEncoder) -> None:
-    embeddings = texts(unique).to(torch.float32).numpy() if unique else np.zeros((0, texts.dim), np.float32)
-    _save_array(path, embeddings)
-
-
-def _write_json(path: Path, value: Any) -> None:
-    write_file(path, json.dumps(value, indent=1))
-
-
-def _save_array(path: Path, array: np.ndarray, *, durable: bool = False) -> None:
-    with draft_of(path, durable=durable) as draft:
-        np.save(draft, array)
-
-
-# ==== encoding.py
-# The tokens of a feature cache: every stored frame through the frozen vision tower, episode by episode.
-
-Progress = Callable[[int, int], None]
-"""Called as progress(episodes done, episodes in all)."""
-
-
-class FrameEncoder(Protocol):
-    """The frozen vision tower: images (N, 3, H, W) in [0, 1], or what else is read -> tokens (N, P, D) bfloat16."""
-
-    tokens_per_frame: int
-    dim: int
-
-    @property
-    def key(self) -> str:
-        """Identity of the tower: weights and input size."""
-
-    def __call__(self, images: Any, /) -> Tensor:
-        """Encode."""
-
-
-@dataclass(frozen=True)
-class _Part:
-    """Frames of one episode that the tower takes at once."""
-
-    episode: int
-    frames: list[int]
-    slot: int  # where the first one's tokens go
-    last: bool  # of its episode
-
-
-@dataclass(frozen=True)
-class Encoding:
-    """A cache whose tokens are being written.
-
-    Attributes:
-        folder: of the cache; its file of tokens has its full size.
-        batch_size: frames per pass of the tower. workers: threads that decode videos ahead of it.
-    """
-
-    folder: Path
-    meta: CacheMeta
-    table: FrameTable
-    batch_size: int
-    workers: int
-
-    def run(self, frames: FrameEncoder, read: FrameReader, progress: Progress) -> None:
-        """Encode every episode that is not marked done; its mark is written after its tokens are on the disk.
-
-        Videos are decoded in threads, a few parts ahead; the tower takes the parts in their order, so that the file is
-        the same whatever the number of threads, and a killed build has finished the first so many episodes. Tokens
-        are written, not mapped: a disk that refuses a mapped page kills the process (SIGBUS).
-        """
-        done = read_done(self.folder, self.table.num_episodes)
-        progress(int(done.sum()), len(done))
-        with (
-            (self.folder / TOKENS_FILE).open("r+b") as file,
-            ThreadPoolExecutor(self.workers, thread_name_prefix="decode") as pool,
-        ):
-            parts = self._parts(np.flatnonzero(done == 0).tolist())
-            for part, images in _ahead(pool, 2 * self.workers, parts, lambda part: read(part.episode, part.frames)):
-                encoded = frames(images).to("cpu", torch.bfloat16).contiguous()
-                file.seek(part.slot * self.meta.frame_bytes)
-                file.write(encoded.view(torch.uint16).numpy().tobytes())
-                if part.last:
-                    file.flush()
-                    os.fsync(file.fileno())
-                    done[part.episode] = 1
-                    write_done(self.folder, done)
-                    progress(int(done.sum()), len(done))
-
-    def _parts(self, episodes: Sequence[int]) -> Iterator[_Part]:
-        slots = slot_starts(self.table.episodes, self.meta.stride)
-        lengths = np.diff(self.table.episodes)
-        for episode in episodes:
-            wanted = list(range(0, int(lengths[episode]), self.meta.stride))
-            for first in range(0, len(wanted), self.batch_size):
-                end = first + self.batch_size
-                yield _Part(episode, wanted[first:end], int(slots[episode]) + first, end >= len(wanted))
-
-
-def _ahead[Item, Result](
-    pool: ThreadPoolExecutor, number: int, items: Iterator[Item], work: Callable[[Item], Result]
-) -> Iterator[tuple[Item, Result]]:
-    """Yield (item, work(item)) in order, with at most ``number`` items begun before they are asked for."""
-    waiting: deque[tuple[Item, Future[Result]]] = deque()
-    try:
-        for item in items:
-            waiting.append((item, pool.submit(work, item)))
-            if len(waiting) >= number:
-                oldest, future = waiting.popleft()
-                yield oldest, future.result()
-        while waiting:
-            oldest, future = waiting.popleft()
-            yield oldest, future.result()
-    finally:
-        for _, future in waiting:
-            future.cancel()

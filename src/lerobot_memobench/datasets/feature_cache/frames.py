@@ -1,13 +1,13 @@
-"""What a dataset says of each of its frames, in the order of its global index."""
+"""Frames of a dataset: phase and texts of each, in the order of its global index; pictures of a camera, decoded."""
 
 from __future__ import annotations
 
 import itertools
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import pyarrow as pa
@@ -21,15 +21,21 @@ from lerobot_memobench.errors import MemobenchError
 if TYPE_CHECKING:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
-
 LEVEL_COLUMNS = {"coarse": "coarse_subgoal", "intermediate": "simple_subgoal", "fine": "grounded_subgoal"}
 MEMORY_COLUMN = "memory"
 _PLACE = ("index", "episode_index", "frame_index")
+TOLERANCE = 1e-4
+"""Seconds by which a decoded frame may miss its time."""
+FrameReader = Callable[[int, list[int]], Any]
+"""From (episode, frame numbers) to images (n, 3, H, W) float32 in [0, 1], or to what an encoder is given for them."""
+
+
+# --- phase and texts ---
 
 
 @dataclass
 class FrameTable:
-    """The columns that a cache keeps.
+    """Columns of a dataset that a cache keeps.
 
     Attributes:
         episodes: (E + 1,) int64, first frame of each episode.
@@ -131,14 +137,36 @@ def resolve_subgoals(rows: np.ndarray, episodes: np.ndarray) -> np.ndarray:
     return resolved
 
 
-# ==== decoding.py
-# Frames of one camera by episode and number, decoded from any thread.
+def numbered(table: FrameTable) -> tuple[list[str], dict[str, np.ndarray]]:
+    """Return the subgoals that there are, and for each level their rows (N,) int32, -1 for none."""
+    unique = sorted({text for values in table.subgoals.values() for text in values if text})
+    number = {text: row for row, text in enumerate(unique)}
+    rows = {level: [number.get(text, -1) for text in values] for level, values in table.subgoals.items()}
+    return unique, {level: np.array(found, np.int32) for level, found in rows.items()}
 
-TOLERANCE = 1e-4
-"""Seconds by which a decoded frame may miss its time."""
 
-FrameReader = Callable[[int, list[int]], Any]
-"""From (episode, frame numbers) to images (n, 3, H, W) float32 in [0, 1], or to what an encoder is given for them."""
+def numbered_memory(memory: Sequence[str]) -> tuple[list[str], np.ndarray]:
+    """Return the oracle memory texts that there are, and the row (N,) int32 of each frame's."""
+    memories, rows = np.unique(np.array(memory, dtype=object), return_inverse=True)
+    return memories.tolist(), rows.astype(np.int32)
+
+
+class TextEncoder(Protocol):
+    """The frozen text encoder: texts -> embeddings (N, dim) float32."""
+
+    @property
+    def key(self) -> str:
+        """Identity of the encoder."""
+
+    @property
+    def dim(self) -> int:
+        """Width of an embedding."""
+
+    def __call__(self, texts: Sequence[str]) -> Tensor:
+        """Encode."""
+
+
+# --- pictures ---
 
 
 def frame_reader(root: Path, camera: str) -> FrameReader:

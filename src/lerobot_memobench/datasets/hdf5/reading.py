@@ -22,9 +22,53 @@ from lerobot_memobench.protocol import ACTION_DIM
 if TYPE_CHECKING:
     import h5py
 
-
+IMAGE_NAMES = {"image": "agentview_image", "wrist_image": "robot0_eye_in_hand_image"}
+"""Camera of this package -> dataset of the published layout."""
+Image = NDArray[np.uint8]
+EXTRAS = ("seed", "referent", "variant", "success", "fixture_poses", "scene_hash", "satisfied_intervals", "digest")
+"""Attributes of a demonstration that only this package writes."""
+AS_JSON = ("fixture_poses", "satisfied_intervals")
+"""Attributes that hold JSON text."""
+SUFFIX = "_demo.hdf5"
 SLICE = 32
 """Frames read at a time."""
+LARGEST = 1e10
+"""MuJoCo takes a state with a larger number for an unstable simulation, and puts the initial one in its place."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Something that cannot be used: ``file``, ``group`` ("" for the file as a whole) and why."""
+
+    file: str
+    group: str
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.file}{', ' + self.group if self.group else ''}: {self.reason}"
+
+
+class Unusable(MemobenchError):
+    """A file or group that is not in the layout; the message is the reason alone."""
+
+
+def usable_or_named() -> AbstractContextManager[None]:
+    """As `refusing`: whatever a file says, it ends only itself."""
+    return refusing(lambda why: Unusable(f"what it says cannot be used ({why})"))
+
+
+def find_files(source: Path) -> list[Path]:
+    """Return the HDF5 files of a path: itself, or all below it, sorted.
+
+    Raises:
+        MemobenchError: there is none.
+    """
+    if source.is_file():
+        return [source]
+    found = sorted(path for path in source.rglob("*") if path.suffix in (".hdf5", ".h5") and path.is_file())
+    if not found:
+        raise MemobenchError(f"found no HDF5 file (.hdf5, .h5) at {source}; name a file or a folder of them")
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,6 +215,9 @@ class PublishedFile:
         return {camera: obs[name][list(frames)] for camera, name in IMAGE_NAMES.items()}
 
 
+# --- parts of a file, each checked ---
+
+
 def _check_layout(data: h5py.Group) -> None:
     """Say of a file of LIBERO or robomimic, whose layouts are near to the published one, what it lacks."""
     import h5py
@@ -214,77 +261,6 @@ def _image_size(images: Iterable[h5py.Dataset]) -> tuple[int, int]:
     return sizes.pop()
 
 
-def find_files(source: Path) -> list[Path]:
-    """Return the HDF5 files of a path: itself, or all below it, sorted.
-
-    Raises:
-        MemobenchError: there is none.
-    """
-    if source.is_file():
-        return [source]
-    found = sorted(path for path in source.rglob("*") if path.suffix in (".hdf5", ".h5") and path.is_file())
-    if not found:
-        raise MemobenchError(f"found no HDF5 file (.hdf5, .h5) at {source}; name a file or a folder of them")
-    return found
-
-
-# ==== layout.py
-# Names of the published layout, and what is said of a file that does not keep to it.
-
-IMAGE_NAMES = {"image": "agentview_image", "wrist_image": "robot0_eye_in_hand_image"}
-"""Camera of this package -> dataset of the published layout."""
-
-EXTRAS = ("seed", "referent", "variant", "success", "fixture_poses", "scene_hash", "satisfied_intervals", "digest")
-"""Attributes of a demonstration that only this package writes."""
-
-SUFFIX = "_demo.hdf5"
-
-Image = NDArray[np.uint8]
-
-
-@dataclass(frozen=True)
-class Problem:
-    """Something that cannot be used: ``file``, ``group`` ("" for the file as a whole) and why."""
-
-    file: str
-    group: str
-    reason: str
-
-    def __str__(self) -> str:
-        return f"{self.file}{', ' + self.group if self.group else ''}: {self.reason}"
-
-
-class Unusable(MemobenchError):
-    """A file or group that is not in the layout; the message is the reason alone."""
-
-
-def usable_or_named() -> AbstractContextManager[None]:
-    """As `refusing`: whatever a file says, it ends only itself."""
-    return refusing(lambda why: Unusable(f"what it says cannot be used ({why})"))
-
-
-def truth_to_intervals(satisfied: NDArray[np.bool_]) -> list[list[list[int]]]:
-    """Return where each column of a (T, K) truth is true, as [start, stop) pairs."""
-    edges = np.diff(satisfied.astype(np.int8), axis=0, prepend=0, append=0)
-    return [np.flatnonzero(column).reshape(-1, 2).tolist() for column in edges.T]
-
-
-def truth_from_intervals(intervals: Sequence[Sequence[Sequence[int]]], length: int) -> NDArray[np.bool_]:
-    """Undo `truth_to_intervals` for K checkpoints: (T, K)."""
-    truth = np.zeros((length, len(intervals)), dtype=np.bool_)
-    for k, pairs in enumerate(intervals):
-        for start, stop in pairs:
-            truth[start:stop, k] = True
-    return truth
-
-
-# ==== checks.py
-# Parts of an HDF5 file, each of the type that the layout says, or a sentence that says what was found.
-
-LARGEST = 1e10
-"""MuJoCo takes a state with a larger number for an unstable simulation, and puts the initial one in its place."""
-
-
 def demo_number(name: str) -> int | None:
     """Return k of a group demo_k, None for other names."""
     found = re.fullmatch(r"demo_(\d+)", name)
@@ -293,15 +269,11 @@ def demo_number(name: str) -> int | None:
 
 def text_attribute(group: h5py.Group, key: str, required: bool = False) -> Any:
     """Return a text, None where there is none and none is required."""
-    value = group.attrs.get(key)
+    value = _plain(group.attrs.get(key))
     if value is None:
         if required:
             raise Unusable(f"the attribute {key!r} is missing")
         return None
-    if isinstance(value, np.ndarray) and value.shape == (1,):
-        value = value[0]
-    if isinstance(value, bytes):
-        value = value.decode("utf-8", errors="replace")
     if not isinstance(value, str):
         raise Unusable(f"the attribute {key!r} is of type {type(value).__name__}, expected text")
     return value
@@ -353,13 +325,6 @@ def first_line(error: BaseException) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
-# ==== attributes.py
-# The attributes of a demonstration that only this package writes, each of the type that it was written as.
-
-AS_JSON = ("fixture_poses", "satisfied_intervals")
-"""Attributes that hold JSON text."""
-
-
 class Extras(TypedDict, total=False):
     """`EXTRAS`, with what the JSON texts among them say: fixture to pose (7,), checkpoint to [start, stop) pairs."""
 
@@ -399,3 +364,21 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.generic):
         value = value.item()
     return value.decode("utf-8", errors="replace") if isinstance(value, bytes) else value
+
+
+# --- truth as intervals ---
+
+
+def truth_to_intervals(satisfied: NDArray[np.bool_]) -> list[list[list[int]]]:
+    """Return where each column of a (T, K) truth is true, as [start, stop) pairs."""
+    edges = np.diff(satisfied.astype(np.int8), axis=0, prepend=0, append=0)
+    return [np.flatnonzero(column).reshape(-1, 2).tolist() for column in edges.T]
+
+
+def truth_from_intervals(intervals: Sequence[Sequence[Sequence[int]]], length: int) -> NDArray[np.bool_]:
+    """Undo `truth_to_intervals` for K checkpoints: (T, K)."""
+    truth = np.zeros((length, len(intervals)), dtype=np.bool_)
+    for k, pairs in enumerate(intervals):
+        for start, stop in pairs:
+            truth[start:stop, k] = True
+    return truth

@@ -1,15 +1,17 @@
-"""A demonstration from a group of the published layout: where execution starts, what was satisfied when.
+"""Restore a demonstration from a group of the published layout: its task, its execution, its checkpoints.
 
-The layout holds states, not what the arm felt or which predicates held. Proprioception is read off the states in
-the simulator, and so is what could be seen as objects; where a stranger's prompt video highlights something is not
-known. Checkpoint columns come from the key frames where all are there; where one is missing (-1) the
-predicates are evaluated on the states, with the latches and orders that a rollout has.
+The layout holds states, not what the arm felt or which predicates held. Proprioception and visible objects are read off
+the states in the simulator; where a stranger's demonstration prompt highlights something is not known. Checkpoint
+columns come from the key frames where all are there; where one is missing (-1) the predicates are evaluated on the
+states, with the latches and orders that a rollout has.
 """
 
 from __future__ import annotations
 
 import json
 import tempfile
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
@@ -19,7 +21,7 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.hdf5.reading import SUFFIX, PublishedDemo, PublishedFile, Unusable, truth_from_intervals
-from lerobot_memobench.datasets.hdf5.writing import Pose, read_fixture_poses
+from lerobot_memobench.datasets.hdf5.writing import Pose
 from lerobot_memobench.datasets.labels import digest
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.demonstration_prompt import highlights_at
@@ -34,6 +36,9 @@ from lerobot_memobench.tasks.task import BDDL_FILE, MEMORY_TYPES, METADATA_FILE,
 
 NO_SEED = -1
 """Seed of a demonstration that does not say it."""
+UNKNOWN = "tasks"
+"""Folder of a task whose memory type nothing tells."""
+IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
 
 def restore(task: Task, demo: PublishedDemo) -> Demonstration:
@@ -156,6 +161,43 @@ def _middle(sim: Simulation, task: Task, name: str) -> Pose:
     return np.array([(x1 + x2) / 2, (y1 + y2) / 2, height, np.cos(half), 0.0, 0.0, np.sin(half)])
 
 
+def read_fixture_poses(xml: str, names: Iterable[str]) -> dict[str, Pose]:
+    """Return where the named fixtures stand in an MJCF text; those it does not have are left out.
+
+    A fixture is the body of its name, or of its name with robosuite's suffix ``_main``.
+
+    Raises:
+        MemobenchError: the text is no XML, or a pose in it is no pose.
+    """
+    try:
+        root = ElementTree.fromstring(xml)
+    except ElementTree.ParseError as error:
+        raise MemobenchError(f"model_file is no XML ({error})") from None
+    bodies = {body.get("name"): body for body in root.iter("body")}
+    found: dict[str, Pose] = {}
+    for name in names:
+        body = bodies.get(name, bodies.get(f"{name}_main"))
+        if body is None:
+            continue
+        found[name] = np.concatenate([_numbers(body, "pos", (0.0, 0.0, 0.0)), _numbers(body, "quat", IDENTITY)])
+    return found
+
+
+def _numbers(body: ElementTree.Element, key: str, default: tuple[float, ...]) -> Pose:
+    text = body.get(key)
+    if text is None:
+        return np.array(default)
+    try:
+        values = np.array([float(word) for word in text.split()])
+    except ValueError:
+        values = np.array([])
+    if values.shape != (len(default),) or not np.isfinite(values).all():
+        raise MemobenchError(
+            f"model_file gives the body {body.get('name')} {key}={text!r}, expected {len(default)} numbers"
+        )
+    return values
+
+
 @dataclass(frozen=True, eq=False)
 class _ReadOff:
     proprio: NDArray[np.float32]
@@ -224,11 +266,7 @@ def _simulation(task: Task) -> Simulation:
     return sim
 
 
-# ==== published_task.py
-# The task that a demonstration in the published layout shows.
-
-UNKNOWN = "tasks"
-"""Folder of a task whose memory type nothing tells."""
+# --- the task ---
 
 
 def task_of(file: PublishedFile, demo: PublishedDemo) -> Task:

@@ -1,11 +1,11 @@
-"""Write demonstrations in the published layout."""
+"""Write demonstrations in the published layout, and their scenes as MJCF for its attribute ``model_file``."""
 
 from __future__ import annotations
 
 import json
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.hdf5.reading import IMAGE_NAMES, Image, truth_to_intervals
 from lerobot_memobench.datasets.labels import digest, labels
-from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import CONTROL_HZ
 from lerobot_memobench.tasks.formula import to_lists
 from lerobot_memobench.tasks.task import BDDL_FILE, Task
@@ -24,7 +23,11 @@ from lerobot_memobench.tasks.task import BDDL_FILE, Task
 if TYPE_CHECKING:
     import h5py
 
-    from lerobot_memobench.tasks.task import Task
+Pose = NDArray[np.float64]
+"""Position and quaternion wxyz, (7,)."""
+
+
+# --- a demonstration ---
 
 
 class EpisodeFile:
@@ -106,6 +109,9 @@ def demo_metadata(demo: Demonstration) -> dict[str, Any]:
     return metadata
 
 
+# --- a task's file ---
+
+
 def data_attributes(task: Task) -> dict[str, Any]:
     """Return the attributes of a task's ``data`` group."""
     task = task.variant(0)
@@ -156,22 +162,16 @@ def write_task_file(path: Path, attributes: Mapping[str, Any], episodes: Sequenc
         data.attrs["num_demos"], data.attrs["total"] = len(episodes), total
 
 
-# ==== mjcf.py
-# A scene as MJCF text, for the attribute ``model_file`` of the published layout; and where fixtures stand in one.
-#
-# MuJoCo can write a scene that was built in memory, except for pictures: it has no text form for textures that
-# are not files. They are written as flat ones here, so the text has every body, joint, site, inertia and
-# collision shape of the scene, at its real place, and plain colours. Meshes of the arm are named by their
-# files, as robosuite's own ``model_file`` names them.
-
-Pose = NDArray[np.float64]
-"""Position and quaternion wxyz, (7,)."""
-
-IDENTITY = (1.0, 0.0, 0.0, 0.0)
+# --- the scene ---
 
 
 def model_file(task: Task, fixture_poses: Mapping[str, Pose]) -> str:
-    """Return a task's scene as MJCF, its fixtures at ``fixture_poses`` (written exactly)."""
+    """Return a task's scene as MJCF, its fixtures at ``fixture_poses`` (written exactly).
+
+    MuJoCo has no text form for textures that are not files; they are written as flat ones. So the text has every body,
+    joint, site, inertia and collision shape of the scene, at its real place, and plain colours. Meshes of the arm are
+    named by their files, as robosuite's own ``model_file`` names them.
+    """
     root = ElementTree.fromstring(_scene_xml(task))
     bodies = {body.get("name"): body for body in root.iterfind("worldbody/body")}
     for name, pose in fixture_poses.items():
@@ -198,40 +198,3 @@ def _scene_xml(task: Task) -> str:
             mesh.userfacetexcoord = []
     spec.compile()
     return str(spec.to_xml())
-
-
-def read_fixture_poses(xml: str, names: Iterable[str]) -> dict[str, Pose]:
-    """Return where the named fixtures stand in an MJCF text; those it does not have are left out.
-
-    A fixture is the body of its name, or of its name with robosuite's suffix ``_main``.
-
-    Raises:
-        MemobenchError: the text is no XML, or a pose in it is no pose.
-    """
-    try:
-        root = ElementTree.fromstring(xml)
-    except ElementTree.ParseError as error:
-        raise MemobenchError(f"model_file is no XML ({error})") from None
-    bodies = {body.get("name"): body for body in root.iter("body")}
-    found: dict[str, Pose] = {}
-    for name in names:
-        body = bodies.get(name, bodies.get(f"{name}_main"))
-        if body is None:
-            continue
-        found[name] = np.concatenate([_numbers(body, "pos", (0.0, 0.0, 0.0)), _numbers(body, "quat", IDENTITY)])
-    return found
-
-
-def _numbers(body: ElementTree.Element, key: str, default: tuple[float, ...]) -> Pose:
-    text = body.get(key)
-    if text is None:
-        return np.array(default)
-    try:
-        values = np.array([float(word) for word in text.split()])
-    except ValueError:
-        values = np.array([])
-    if values.shape != (len(default),) or not np.isfinite(values).all():
-        raise MemobenchError(
-            f"model_file gives the body {body.get('name')} {key}={text!r}, expected {len(default)} numbers"
-        )
-    return values

@@ -40,13 +40,11 @@ from lerobot_memobench.datasets.staging import (
     STAGING,
     TEMPORARY,
     StagedEpisode,
-    Stats,
     clean_temporaries,
     flush_to_disk,
-    numeric_stats,
     stage_demonstration,
 )
-from lerobot_memobench.datasets.video import join_videos, video_info
+from lerobot_memobench.datasets.video import QUANTILES, Stats, join_videos, video_info
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_name, write_file
 from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ
@@ -55,8 +53,11 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
-
 ROBOT_TYPE = "panda"
+STATES_PATH = "states/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+EPISODES_PER_STATES_FILE = 100
+BLOCK = 16
+"""Columns of which statistics are made at once: of all, a copy in float64 for thousands of episodes is gigabytes."""
 
 
 def write_dataset(
@@ -128,8 +129,9 @@ def assemble(
 def _write_lerobot(
     written: Sequence[StagedEpisode], build: Path, repo_id: str, versions: dict[str, str] | None
 ) -> dict[str, dict[str, Any]]:
-    """Write the LeRobotDataset of the episodes into ``build``; return its features."""
+    """Write the LeRobotDataset of the episodes into ``build``, ``versions`` of packages noted; return its features."""
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+    from lerobot.datasets.io_utils import write_stats
 
     part = build.with_name(f"{build.name}-lerobot")  # LeRobot wants a folder that is not there yet
     shutil.rmtree(part, ignore_errors=True)
@@ -142,7 +144,11 @@ def _write_lerobot(
         use_videos=written[0].has_images,
         metadata_buffer_size=len(written) + 1,  # one table: types of its columns come from all episodes
     )
-    write_frames(meta, written, write_videos(meta, written), versions)
+    frames = _FrameWriter(meta, versions)
+    for episode, place in zip(written, write_videos(meta, written), strict=True):
+        frames.add(episode, place)
+    meta.stats = frames.finish() | _image_statistics(written)
+    write_stats(meta.stats, meta.root)
     meta.finalize()
     for path in part.iterdir():
         path.replace(build / path.name)
@@ -199,38 +205,14 @@ def _move(build: Path, out: Path) -> None:
     clean_temporaries(out / STAGING)
 
 
-# ==== frames.py
-# Frames, simulator states and LeRobot's metadata of a dataset that is being written.
-
-STATES_PATH = "states/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-EPISODES_PER_STATES_FILE = 100
-
-
-def write_frames(
-    meta: LeRobotDatasetMetadata,
-    episodes: Sequence[StagedEpisode],
-    places: Sequence[dict[str, Any]],
-    versions: Mapping[str, str] | None = None,
-) -> None:
-    """Write data/, states/ and the metadata; one row group per episode, files of LeRobot's size.
-
-    Args:
-        meta: of the dataset to be.
-        episodes: its episodes, in their order.
-        places: where each one's videos are (`write_videos`).
-        versions: of the packages that made them.
-    """
-    from lerobot.datasets.io_utils import write_stats
-
-    frames = _FrameWriter(meta, versions)
-    for episode, place in zip(episodes, places, strict=True):
-        frames.add(episode, place)
-    meta.stats = frames.finish() | _image_statistics(episodes)
-    write_stats(meta.stats, meta.root)
+# --- frames, states and metadata ---
 
 
 class _FrameWriter:
-    """Writes episode after episode and keeps their numbers for the statistics of the whole."""
+    """Writes data/, states/ and the metadata, one row group per episode, in files of LeRobot's size.
+
+    The episodes' numbers are kept for the statistics of the whole.
+    """
 
     def __init__(self, meta: LeRobotDatasetMetadata, versions: Mapping[str, str] | None) -> None:
         self._meta, self._versions = meta, versions
@@ -240,7 +222,7 @@ class _FrameWriter:
         self._episodes = self._frames = 0
 
     def add(self, episode: StagedEpisode, place: dict[str, Any]) -> None:
-        """Write an episode's rows and its metadata."""
+        """Write an episode's rows and its metadata; ``place`` is that of its videos."""
         meta, number, start = self._meta, self._episodes, self._frames
         if self._data.size() >= meta.data_files_size_in_mb * 1024**2:
             self._data.next(meta.chunks_size)
@@ -298,6 +280,25 @@ class _FrameWriter:
         return {key: numeric_stats(np.concatenate(values)) for key, values in self._numbers.items()}
 
 
+def numeric_stats(values: NDArray) -> Stats:
+    """Return exact statistics of (T,) or (T, n) numbers over T: each (n,) (n = 1 for (T,)), and ``count``
+    (1,).
+
+    LeRobot averages the episodes' quantiles; over a whole dataset that is no quantile. pi0.5 normalises by
+    q01 and q99, so they are computed from all frames here.
+    """
+    flat = values.reshape(len(values), -1)
+    blocks = [_stats_of(flat[:, start : start + BLOCK].astype(np.float64)) for start in range(0, flat.shape[1], BLOCK)]
+    stats = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
+    return stats | {"count": np.array([len(values)])}
+
+
+def _stats_of(flat: NDArray[np.float64]) -> Stats:
+    stats = {"min": flat.min(0), "max": flat.max(0), "mean": flat.mean(0), "std": flat.std(0)}
+    quantiles = np.quantile(flat, QUANTILES, axis=0, overwrite_input=True)
+    return stats | {f"q{int(q * 100):02d}": row for q, row in zip(QUANTILES, quantiles, strict=True)}
+
+
 def _camera_statistics(episode: StagedEpisode) -> dict[str, Stats]:
     return {image_key(camera): episode.image_stats(camera) for camera in CAMERAS} if episode.has_images else {}
 
@@ -310,8 +311,7 @@ def _image_statistics(episodes: Sequence[StagedEpisode]) -> dict[str, Stats]:
     return aggregate_stats(found) if found else {}
 
 
-# ==== tables.py
-# An episode's frames as tables, and the files that they go to.
+# --- tables and their files ---
 
 
 def frames_table(columns: dict[str, NDArray], episode: StagedEpisode, features: dict[str, Any]) -> pa.Table:
@@ -413,8 +413,7 @@ class ParquetFiles:
             self._writer = None
 
 
-# ==== video_files.py
-# Episodes' videos joined into files of LeRobot's size.
+# --- videos ---
 
 
 def write_videos(meta: LeRobotDatasetMetadata, episodes: Sequence[StagedEpisode]) -> list[dict[str, Any]]:

@@ -15,25 +15,22 @@ from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, list_epi
 from lerobot_memobench.datasets.staging import StagedEpisode
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.paper import raw_tables
+from lerobot_memobench.tasks.task import MEMORY_TYPES
 
 CARD_FILE = "README.md"
 LICENSE = "apache-2.0"
-
 MADE_BY = "## How it was made"
 """Heading of a card of ours; LeRobot's has none."""
-
 EDITED = (
     "A tool that knows nothing of this benchmark, such as `lerobot-edit-dataset`, has edited this dataset: its card, "
     "tables and hashes are made from its frames. Lost are which seeds had failed, and the simulator's states: "
     "`memobench validate` makes those again from seed and actions and compares their hash, but cannot where an episode "
     "has no seed."
 )
-
 SCRIPTED = (
     "Scripted experts act in a MuJoCo simulation; nothing was collected from people or robots. Actions were recorded "
     "as applied (`executed_action`), so that replaying them from the seed gives the same states."
 )
-
 LIMITATIONS = """\
 - It is one simulated kitchen with one Panda arm and one scripted expert: each task is done in one way, by one
   instruction, and nothing is known of real pictures.
@@ -41,7 +38,6 @@ LIMITATIONS = """\
   carton, which bowl, which drawer, which order. A policy that reads them where it acts is not tested for memory.
 - Visible objects, states, seeds and checkpoint columns are the simulator's: no camera tells them.
 - Frames of prompt videos are demonstrations of what to remember, not of what to do."""
-
 COLUMNS = {
     "observation.images.image": "third-person camera",
     "observation.images.wrist_image": "wrist camera",
@@ -65,7 +61,6 @@ COLUMNS = {
     "episode_info": "JSON at an episode's first frame, else empty: all of the table below, and versions, because "
     "LeRobot's dataset tools keep the columns of frames alone",
 }
-
 EPISODE_COLUMNS = {
     "task_name": "task of the catalogue",
     "memory_type": "temporal, spatial, object or procedural",
@@ -81,6 +76,33 @@ EPISODE_COLUMNS = {
     "fixture_poses": "JSON, fixture to position and quaternion wxyz",
     "digest": "sha256 of states, actions and labels",
 }
+
+
+@dataclass(frozen=True)
+class FamilyFigures:
+    """A row of the paper's appendix, "Family level statistics"; storage is that of its HDF5 files, GiB."""
+
+    tasks: int
+    episodes: int
+    steps: int
+    mean: float
+    median: float
+    p95: float
+    max: int
+    storage: float
+
+
+FAMILIES: dict[str, FamilyFigures] = {
+    name: FamilyFigures(**{key: value for key, value in row.items() if key != "gib"}, storage=row["gib"])
+    for name in (*MEMORY_TYPES, "total")
+    for row in [raw_tables()["demo_statistics"][name]]
+}
+LENGTH_BUCKETS: dict[tuple[int, int | None], int] = {
+    (int(low), int(high) + 1 if high else None): count
+    for name, count in raw_tables()["length_buckets"].items()
+    for low, _, high in [name.removesuffix("+").partition("-")]
+}
+"""Steps [from, to) -> episodes of 1,500; the paper writes ranges as ``200-399`` and ``1500+``."""
 
 
 def write_card(
@@ -222,6 +244,43 @@ def _introduction(infos: Sequence[Mapping[str, Any]], loading: str) -> list[str]
     ]
 
 
+def _columns(features: Mapping[str, dict[str, Any]]) -> list[str]:
+    return [
+        markdown(
+            ["column", "type", "meaning"],
+            [[f"`{key}`", _type(ft), COLUMNS[key]] for key, ft in features.items() if key in COLUMNS],
+        ),
+        "LeRobot's own columns are there too: `task`, `timestamp`, `frame_index`, `episode_index`, `index`, "
+        "`task_index`.",
+        "Per episode, in `meta/episodes` (after LeRobot's dataset tools: `episodes=episodes_where(folder, "
+        'memory_type="spatial")` with `from lerobot_memobench.datasets.lerobot_format.reading import episodes_where`):',
+        markdown(["column", "meaning"], [[f"`{key}`", meaning] for key, meaning in EPISODE_COLUMNS.items()]),
+        "`meta/stats.json` holds mean, standard deviation, range and the quantiles q01, q10, q50, q90, q99; those of "
+        "numbers are exact over all frames, those of images over sampled frames.",
+    ]
+
+
+def _type(feature: dict[str, Any]) -> str:
+    shape = tuple(feature["shape"])
+    return feature["dtype"] if shape == (1,) else f"{feature['dtype']} {'×'.join(map(str, shape))}"
+
+
+def _failures(failed: Sequence[StagedEpisode], asked: int) -> str:
+    if not failed:
+        return f"All {asked} seeds asked for were solved; none was left out."
+    lines = [f"- {e.info['task_name']}, seed {e.info['seed']}: {e.failure}" for e in failed]
+    return f"**{len(failed)} of {asked} seeds asked for have no demonstration here:**\n\n" + "\n".join(lines)
+
+
+def _left_out(problems: Sequence[str]) -> str:
+    if not problems:
+        return ""
+    return f"**Left out ({len(problems)}):**\n\n" + "\n".join(f"- {problem}" for problem in problems)
+
+
+# --- statistics, beside the paper's ---
+
+
 def statistics_section(
     written: Sequence[dict[str, Any]], failed: Sequence[StagedEpisode], storage: dict[str, float]
 ) -> list[str]:
@@ -246,44 +305,6 @@ def _prompts(infos: Sequence[dict[str, Any]]) -> str:
         if any(lengths):
             parts.append(f"{np.mean(lengths):.1f} in {name} tasks")
     return f"Of these steps the prompt video takes, on average, {' and '.join(parts)}." if parts else ""
-
-
-def _columns(features: Mapping[str, dict[str, Any]]) -> list[str]:
-    return [
-        markdown(
-            ["column", "type", "meaning"],
-            [[f"`{key}`", _type(ft), COLUMNS[key]] for key, ft in features.items() if key in COLUMNS],
-        ),
-        "LeRobot's own columns are there too: `task`, `timestamp`, `frame_index`, `episode_index`, `index`, "
-        "`task_index`.",
-        "Per episode, in `meta/episodes` (after LeRobot's dataset tools: `episodes=episodes_where(folder, "
-        'memory_type="spatial")` with `from lerobot_memobench.datasets.lerobot_format import episodes_where`):',
-        markdown(["column", "meaning"], [[f"`{key}`", meaning] for key, meaning in EPISODE_COLUMNS.items()]),
-        "`meta/stats.json` holds mean, standard deviation, range and the quantiles q01, q10, q50, q90, q99; those of "
-        "numbers are exact over all frames, those of images over sampled frames.",
-    ]
-
-
-def _failures(failed: Sequence[StagedEpisode], asked: int) -> str:
-    if not failed:
-        return f"All {asked} seeds asked for were solved; none was left out."
-    lines = [f"- {e.info['task_name']}, seed {e.info['seed']}: {e.failure}" for e in failed]
-    return f"**{len(failed)} of {asked} seeds asked for have no demonstration here:**\n\n" + "\n".join(lines)
-
-
-def _left_out(problems: Sequence[str]) -> str:
-    if not problems:
-        return ""
-    return f"**Left out ({len(problems)}):**\n\n" + "\n".join(f"- {problem}" for problem in problems)
-
-
-def _type(feature: dict[str, Any]) -> str:
-    shape = tuple(feature["shape"])
-    return feature["dtype"] if shape == (1,) else f"{feature['dtype']} {'×'.join(map(str, shape))}"
-
-
-# ==== card_tables.py
-# The statistics of a dataset as its card shows them, beside the paper's.
 
 
 def storage_of(folder: Path, episodes: Sequence[StagedEpisode]) -> dict[str, float]:
@@ -390,52 +411,3 @@ def markdown(header: list[str], rows: list[list[str]]) -> str:
     """Return a table in Markdown."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
-
-
-# ==== paper_figures.py
-# Figures that the MEMOBench paper gives of its demonstrations, to stand beside those of a generated dataset.
-#
-# Source: the paper's appendix on dataset statistics, the tables "Family level statistics for the expert
-# demonstrations" and "Distribution of expert demonstration lengths in action steps"; the numbers are in
-# ``lerobot_memobench.paper``.
-
-
-@dataclass(frozen=True)
-class FamilyFigures:
-    """A row of the first table; steps are control steps, storage is that of the published HDF5 files, GiB."""
-
-    tasks: int
-    episodes: int
-    steps: int
-    mean: float
-    median: float
-    p95: float
-    max: int
-    storage: float
-
-
-def _families() -> dict[str, FamilyFigures]:
-    rows = raw_tables()["demo_statistics"]
-    order = ("temporal", "spatial", "object", "procedural", "total")
-    return {
-        name: FamilyFigures(
-            **{key: value for key, value in rows[name].items() if key != "gib"}, storage=rows[name]["gib"]
-        )
-        for name in order
-    }
-
-
-def _bucket(name: str) -> tuple[int, int | None]:
-    """Return [from, to) of a range as the paper writes it, ``200-399`` or ``1500+``."""
-    if name.endswith("+"):
-        return int(name[:-1]), None
-    low, _, high = name.partition("-")
-    return int(low), int(high) + 1
-
-
-FAMILIES: dict[str, FamilyFigures] = _families()
-
-LENGTH_BUCKETS: dict[tuple[int, int | None], int] = {
-    _bucket(name): count for name, count in raw_tables()["length_buckets"].items()
-}
-"""Steps [from, to) -> episodes of 1,500."""

@@ -1,4 +1,4 @@
-"""What a dataset's folder and its columns are called, and whether a folder holds one."""
+"""A dataset's folder: names of files and columns, its metadata, and whether all of it is there and whole."""
 
 from __future__ import annotations
 
@@ -23,23 +23,48 @@ from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, PROPRIO_DIM
 DEFAULT_REPO_ID = "memobench/memobench"
 HDF5_FOLDER = "hdf5"
 MANIFEST_FILE = "manifest.json"
-NO_MANIFEST = "it is no manifest that this package wrote; take the dataset from its source again"
-LANGUAGE = "language_persistent"
-"""LeRobot's column of language rows."""
-
-PROPRIO_NAMES = ["x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z", "finger_left", "finger_right"]
-ACTION_NAMES = ["x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z", "gripper"]
-
-OBJECTS = "observation.environment_state"
-"""What could be seen as objects, in datasets without pictures: LeRobot takes a column of this name for an input."""
-PRIVILEGED = "privileged.environment_state"
-"""The same in datasets with pictures: who trains on these by LeRobot's own commands learns from no object poses."""
-EXECUTED_ACTION = "executed_action"
-"""What moved the arm; `action` is what the expert would have done, which differs where the arm was moved off its way.
-LeRobot takes every column that begins with `action` for something to be learned."""
-
+INFO_FILE = Path("meta") / "info.json"
 TOP_LEVEL = (HDF5_FOLDER, "videos", "states", "data", "README.md", MANIFEST_FILE, "meta")
 """Moved into place in this order; with `meta` the folder becomes a dataset, without it the manifest is the last."""
+EPISODE_INFO = "episode_info"
+"""The frames' column; empty but at an episode's first frame."""
+LANGUAGE = "language_persistent"
+"""LeRobot's column of language rows."""
+OBJECTS = "observation.environment_state"
+"""Visible objects, in datasets without pictures: LeRobot takes a column of this name for an input."""
+PRIVILEGED = "privileged.environment_state"
+"""The same in datasets with pictures, so that LeRobot's own commands train on no object poses there."""
+EXECUTED_ACTION = "executed_action"
+"""The action that moved the arm; `action` is the expert's, which differs where the arm was moved off its way. LeRobot
+takes every column that begins with `action` for something to be learned."""
+PROPRIO_NAMES = ["x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z", "finger_left", "finger_right"]
+ACTION_NAMES = ["x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z", "gripper"]
+ADVICE = "the dataset is damaged; generate it or take it from its source again"
+NO_MANIFEST = "it is no manifest that this package wrote; take the dataset from its source again"
+MOST_NUMBERS = 50_000_000
+"""Of a feature in one frame: a picture of 4096 x 4096. LeRobot takes memory for as many as a dataset tells."""
+
+
+def is_dataset(folder: Path) -> bool:
+    """Whether ``folder`` holds a finished LeRobotDataset."""
+    return (folder / "meta" / "info.json").is_file()
+
+
+def check_destination(out: Path) -> None:
+    """Raise unless ``out`` is absent, empty, or holds nothing but an unfinished run."""
+    if is_dataset(out):
+        raise MemobenchError(f"{out} already holds a finished dataset; name another folder or delete this one first")
+    if out.exists() and not out.is_dir():
+        raise MemobenchError(f"{out} is a file, expected a folder to write a dataset to; name another path")
+    # What an interrupted move left beside the staging folder will be replaced.
+    strangers = [p.name for p in out.iterdir() if p.name != STAGING] if out.is_dir() else []
+    if strangers and not ((out / STAGING).is_dir() and set(strangers) <= set(TOP_LEVEL)):
+        raise MemobenchError(
+            f"{out} holds {', '.join(sorted(strangers)[:3])}, no part of a dataset being made; name an empty folder"
+        )
+
+
+# --- columns ---
 
 
 def image_key(camera: str) -> str:
@@ -87,38 +112,66 @@ def dataset_features(image_size: tuple[int, int] | None, *, objects: bool = Fals
     }
 
 
-def is_dataset(folder: Path) -> bool:
-    """Whether ``folder`` holds a finished LeRobotDataset."""
-    return (folder / "meta" / "info.json").is_file()
+# --- metadata ---
 
 
-def check_destination(out: Path) -> None:
-    """Raise unless ``out`` is absent, empty, or holds nothing but an unfinished run."""
-    if is_dataset(out):
-        raise MemobenchError(f"{out} already holds a finished dataset; name another folder or delete this one first")
-    if out.exists() and not out.is_dir():
-        raise MemobenchError(f"{out} is a file, expected a folder to write a dataset to; name another path")
-    # What an interrupted move left beside the staging folder will be replaced.
-    strangers = [p.name for p in out.iterdir() if p.name != STAGING] if out.is_dir() else []
-    if strangers and not ((out / STAGING).is_dir() and set(strangers) <= set(TOP_LEVEL)):
+class Info(TypedDict):
+    """A dataset as a whole. Each of its episodes is looked at, so their number is no arbitrary one."""
+
+    codebase_version: str
+    total_episodes: Annotated[int, Ge(0), Le(10_000_000)]
+    total_frames: NotRequired[Count]
+    fps: NotRequired[Annotated[int, Ge(1), Le(10_000)]]
+    features: dict[str, dict[str, Any]]
+
+
+def read_info(folder: Path) -> dict[str, Any]:
+    """Return ``meta/info.json`` of the dataset in ``folder``.
+
+    Raises:
+        MemobenchError: there is none, it is none of LeRobot's, or a feature is too large.
+    """
+    try:
+        found: dict[str, Any] = read_json(folder / INFO_FILE, Info, ADVICE)
+    except FileNotFoundError:
+        raise MemobenchError(f"{folder} is no dataset (there is no {INFO_FILE}); name one that was generated") from None
+    for name, feature in found["features"].items():
+        shape = feature.get("shape")
+        sizes = [size for size in shape if isinstance(size, int)] if isinstance(shape, list) else []
+        if abs(math.prod(sizes)) > MOST_NUMBERS:
+            raise MemobenchError(
+                f"{folder / INFO_FILE} tells of more than {MOST_NUMBERS:,} numbers of {name[:80]} a frame; {ADVICE}"
+            )
+    return found
+
+
+def episode_count(folder: Path) -> int:
+    """Return how many episodes the dataset in ``folder`` has, as ``meta/info.json`` and ``meta/episodes`` both say.
+
+    Raises:
+        MemobenchError: they cannot be read, or disagree.
+    """
+    import pyarrow.parquet as pq
+
+    told = int(read_info(folder)["total_episodes"])
+    rows = 0
+    for path in sorted((folder / "meta" / "episodes").rglob("*.parquet")):
+        with undamaged(path):
+            rows += pq.read_metadata(path).num_rows
+    if rows != told:
         raise MemobenchError(
-            f"{out} holds {', '.join(sorted(strangers)[:3])}, no part of a dataset being made; name an empty folder"
+            f"{folder / INFO_FILE} tells of {count_of(told, 'episode')}, {folder}/meta/episodes of {rows}; {ADVICE}"
         )
-
-
-# ==== record.py
-# What a dataset says of an episode as a whole: its task, seed, placement, hashes.
-#
-# It stands twice. In ``meta/episodes``, where ``LeRobotDataset(…, episode_filter=…)`` looks; and as JSON in the frames'
-# column ``episode_info``, at each episode's first frame, because LeRobot's dataset tools (``lerobot
-# the frames' columns and drop every column of ``meta/episodes`` and every file that LeRobot does not know.
-
-EPISODE_INFO = "episode_info"
-"""The frames' column; empty but at an episode's first frame."""
+    return told
 
 
 class EpisodeRecord(BaseModel):
-    """An episode as a whole.
+    """Fields of an episode as a whole: its task, seed, placement, hashes.
+
+    It stands twice. In ``meta/episodes``, where ``LeRobotDataset(…, episode_filter=…)`` looks; and as JSON in the
+    frames' column `EPISODE_INFO`, at each episode's first frame, because LeRobot's dataset tools
+    (``lerobot-edit-dataset``) keep the frames' columns and drop every column of ``meta/episodes`` and every file that
+    LeRobot does not know.
 
     Attributes:
         seed: of the scene; -1 where it is not known.
@@ -185,43 +238,56 @@ def from_meta(row: Mapping[str, Any]) -> EpisodeRecord | None:
         return None
 
 
-# ==== info.py
-# What LeRobot keeps of a dataset in ``meta/info.json``, as far as it is used here; and reading what may be damaged.
+class Asked(TypedDict):
+    """An episode that was asked for."""
 
-INFO_FILE = Path("meta") / "info.json"
-ADVICE = "the dataset is damaged; generate it or take it from its source again"
-MOST_NUMBERS = 50_000_000
-"""Of a feature in one frame: a picture of 4096 x 4096. LeRobot takes memory for as many as a dataset tells."""
-
-
-class Info(TypedDict):
-    """A dataset as a whole. Each of its episodes is looked at, so their number is no arbitrary one."""
-
-    codebase_version: str
-    total_episodes: Annotated[int, Ge(0), Le(10_000_000)]
-    total_frames: NotRequired[Count]
-    fps: NotRequired[Annotated[int, Ge(1), Le(10_000)]]
-    features: dict[str, dict[str, Any]]
+    task_name: str
+    seed: Whole
+    digest: NotRequired[str | None]
 
 
-def read_info(folder: Path) -> dict[str, Any]:
-    """Return ``meta/info.json`` of the dataset in ``folder``.
+class Made(Asked):
+    """An episode that is there."""
+
+    failure: None
+    frames: Count
+
+
+class Failed(Asked):
+    """One that is not, and why."""
+
+    failure: str
+
+
+class LeftOut(TypedDict):
+    """A `Problem` of a conversion."""
+
+    file: str
+    group: str
+    reason: str
+
+
+class Manifest(TypedDict):
+    """``manifest.json``: the request of a run, and the hash of every episode."""
+
+    episodes: list[Made | Failed]
+    request: NotRequired[dict[str, Any]]
+    left_out: NotRequired[list[LeftOut]]
+    notes: NotRequired[list[LeftOut]]
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """Return the manifest of the dataset in ``folder``.
 
     Raises:
-        MemobenchError: there is none, it is none of LeRobot's, or a feature is too large.
+        FileNotFoundError: there is none.
+        MemobenchError: it is none of this package's.
     """
-    try:
-        found: dict[str, Any] = read_json(folder / INFO_FILE, Info, ADVICE)
-    except FileNotFoundError:
-        raise MemobenchError(f"{folder} is no dataset (there is no {INFO_FILE}); name one that was generated") from None
-    for name, feature in found["features"].items():
-        shape = feature.get("shape")
-        sizes = [size for size in shape if isinstance(size, int)] if isinstance(shape, list) else []
-        if abs(math.prod(sizes)) > MOST_NUMBERS:
-            raise MemobenchError(
-                f"{folder / INFO_FILE} tells of more than {MOST_NUMBERS:,} numbers of {name[:80]} a frame; {ADVICE}"
-            )
+    found: dict[str, Any] = read_json(folder / MANIFEST_FILE, Manifest, NO_MANIFEST)
     return found
+
+
+# --- is it whole? ---
 
 
 def undamaged(folder: Path) -> AbstractContextManager[None]:
@@ -337,76 +403,3 @@ def naming_damage(folder: Path | None) -> Iterator[None]:
             check_whole(folder)
             raise
         raise MemobenchError(told) from error
-
-
-def episode_count(folder: Path) -> int:
-    """Return how many episodes the dataset in ``folder`` has, as ``meta/info.json`` and ``meta/episodes`` both say.
-
-    Raises:
-        MemobenchError: they cannot be read, or disagree.
-    """
-    import pyarrow.parquet as pq
-
-    told = int(read_info(folder)["total_episodes"])
-    rows = 0
-    for path in sorted((folder / "meta" / "episodes").rglob("*.parquet")):
-        with undamaged(path):
-            rows += pq.read_metadata(path).num_rows
-    if rows != told:
-        raise MemobenchError(
-            f"{folder / INFO_FILE} tells of {count_of(told, 'episode')}, {folder}/meta/episodes of {rows}; {ADVICE}"
-        )
-    return told
-
-
-# ==== manifest.py
-# What stands beside a dataset of this package, its request and the hash of every episode: checked when it is read.
-
-
-class Asked(TypedDict):
-    """An episode that was asked for."""
-
-    task_name: str
-    seed: Whole
-    digest: NotRequired[str | None]
-
-
-class Made(Asked):
-    """An episode that is there."""
-
-    failure: None
-    frames: Count
-
-
-class Failed(Asked):
-    """One that is not, and why."""
-
-    failure: str
-
-
-class LeftOut(TypedDict):
-    """A `Problem` of a conversion."""
-
-    file: str
-    group: str
-    reason: str
-
-
-class Manifest(TypedDict):
-    """What all manifests hold, and what those of `generate` and of `convert` do."""
-
-    episodes: list[Made | Failed]
-    request: NotRequired[dict[str, Any]]
-    left_out: NotRequired[list[LeftOut]]
-    notes: NotRequired[list[LeftOut]]
-
-
-def read_manifest(folder: Path) -> dict[str, Any]:
-    """Return the manifest of the dataset in ``folder``.
-
-    Raises:
-        FileNotFoundError: there is none.
-        MemobenchError: it is none of this package's.
-    """
-    found: dict[str, Any] = read_json(folder / MANIFEST_FILE, Manifest, NO_MANIFEST)
-    return found

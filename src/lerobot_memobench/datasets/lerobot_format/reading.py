@@ -1,6 +1,6 @@
-"""Read a dataset of this package back: what it says of each episode, and an episode's frames.
+"""Read a dataset of this package back: the record of each episode, and an episode's frames.
 
-LeRobot's dataset tools may have edited it since; what they leave is read from the frames (`record`).
+LeRobot's dataset tools may have edited it since; what they leave is read from the frames (`layout.EpisodeRecord`).
 """
 
 from __future__ import annotations
@@ -30,14 +30,23 @@ from lerobot_memobench.tasks.catalogue import suite_of
 if TYPE_CHECKING:
     import pyarrow as pa
 
-
 Columns = dict[str, Any]
-
 STRANGER = (
     "it tells neither task nor seed: another program made it, or LeRobot's tools edited a dataset that was written "
     f"before its frames had the column {EPISODE_INFO}, and dropped what meta/episodes said; generate it again"
 )
 """Of an episode without a record."""
+WHOLE = {
+    "memory_type",
+    "family",
+    "operations",
+    "success",
+    "key_frames",
+    "scene_hash",
+    "fixture_poses",
+    "digest",
+}
+"""Fields of a record that follow from task, seed and actions."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +57,7 @@ class EpisodePlace:
         index: its number in the dataset.
         start: its first frame in the dataset's global index.
         length: frames.
-        record: what the dataset says of it; None where it says nothing that this package wrote.
+        record: None where this package wrote none.
     """
 
     index: int
@@ -58,7 +67,7 @@ class EpisodePlace:
 
 
 def list_episodes(folder: Path) -> list[EpisodePlace]:
-    """Return what a dataset says of each of its episodes, in their order.
+    """Return each of a dataset's episodes with its record, in their order.
 
     Raises:
         MemobenchError: the folder is no dataset, or a record in it is damaged.
@@ -88,6 +97,21 @@ def episodes_where(folder: Path | str, **wanted: Any) -> list[int]:
         told = ", ".join(f"{key}={value!r}" for key, value in wanted.items())
         raise MemobenchError(f"{folder} has no episode with {told}; see `memobench describe {folder}` for what it has")
     return found
+
+
+def check_suite_of(folder: Path, suite: str) -> None:
+    """Refuse a LeRobotDataset that holds a task of another suite; tasks outside the catalogue belong to none.
+
+    Raises:
+        MemobenchError: naming the first such task.
+    """
+    for place in list_episodes(folder) if is_dataset(folder) else ():
+        name = place.record.task_name if place.record is not None else ""
+        found = suite_of(name)
+        if found not in (None, suite):
+            raise MemobenchError(
+                f"{folder} holds demonstrations of {name!r}, a task of the {found} suite; say --suite {found}"
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,19 +167,6 @@ def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
         whole,
         place.start,
     )
-
-
-WHOLE = {
-    "memory_type",
-    "family",
-    "operations",
-    "success",
-    "key_frames",
-    "scene_hash",
-    "fixture_poses",
-    "digest",
-}
-"""What of a record follows from task, seed and actions."""
 
 
 def _check_record(row: dict[str, Any], record: EpisodeRecord, texts: list[str | None], length: int) -> None:
@@ -232,22 +243,3 @@ def _read_columns(root: Path, episode_index: int) -> Columns:
         states = _read(root / "states", None, chosen).sort_by("frame_index")
         columns["states"] = np.array(states.column("state").to_pylist(), dtype=np.float64)
     return columns
-
-
-# ==== suites.py
-# Is a dataset of the suite that is meant?
-
-
-def check_suite_of(folder: Path, suite: str) -> None:
-    """Refuse a LeRobotDataset that holds a task of another suite; tasks outside the catalogue belong to none.
-
-    Raises:
-        MemobenchError: naming the first such task.
-    """
-    for place in list_episodes(folder) if is_dataset(folder) else ():
-        name = place.record.task_name if place.record is not None else ""
-        found = suite_of(name)
-        if found not in (None, suite):
-            raise MemobenchError(
-                f"{folder} holds demonstrations of {name!r}, a task of the {found} suite; say --suite {found}"
-            )

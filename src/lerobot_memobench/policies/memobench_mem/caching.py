@@ -13,14 +13,8 @@ import torch
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
-from lerobot_memobench.datasets.feature_cache.building import (
-    FrameEncoder,
-    Progress,
-    TextEncoder,
-    build_feature_cache,
-    require_room,
-)
-from lerobot_memobench.datasets.feature_cache.frames import FrameReader, frame_reader, read_frame_table
+from lerobot_memobench.datasets.feature_cache.building import FrameEncoder, Progress, build_feature_cache, require_room
+from lerobot_memobench.datasets.feature_cache.frames import FrameReader, TextEncoder, frame_reader, read_frame_table
 from lerobot_memobench.datasets.feature_cache.layout import find_cache
 from lerobot_memobench.datasets.feature_cache.reading import (
     FeatureCache,
