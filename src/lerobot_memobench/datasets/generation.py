@@ -46,7 +46,7 @@ from lerobot_memobench.io import file_hash, file_name, free_bytes, in_words, tel
 from lerobot_memobench.jobs.executors import Needs, check_executor, options_told, run_jobs
 from lerobot_memobench.jobs.processes import ProgressCallback
 from lerobot_memobench.jobs.threads import cores
-from lerobot_memobench.protocol import DEMONSTRATION_SEED
+from lerobot_memobench.protocol import DEMONSTRATION_SEED, IMAGE_SIZE
 from lerobot_memobench.tasks.task import Task, referent_told
 
 WEIGHTS = "model.safetensors"
@@ -72,7 +72,7 @@ def generate(
     seed_base: int = DEMONSTRATION_SEED,
     referent: str = "fixed",
     images: bool = True,
-    image_size: int = 256,
+    image_size: int = IMAGE_SIZE,
     demonstration_prompt: bool = True,
     hold_frames: int = HOLD_FRAMES,
     perturb: bool = False,
@@ -347,7 +347,7 @@ def _versions() -> dict[str, str]:
 
 def run_size(frames: int, formats: Collection[str], image_size: int | None) -> int:
     """Return about how many bytes so many frames take; ``image_size`` is None without pictures."""
-    area = 0.0 if image_size is None else (image_size / 256) ** 2
+    area = 0.0 if image_size is None else (image_size / IMAGE_SIZE) ** 2
     lerobot = (FRAME_BYTES + PICTURES_BYTES * area) * (LEROBOT in formats)
     return round(frames * (lerobot + HDF5_BYTES * area * (HDF5 in formats)))
 
@@ -384,7 +384,7 @@ def _tell_of_the_run(
     frames, left = (
         sum(FRAMES[job.task.suite].get(job.task.memory_type, 600) for job in some) for some in (jobs, missing)
     )
-    seconds = left * (FRAME_SECONDS + PICTURES_SECONDS * ((pictures or 0) / 256) ** 2)
+    seconds = left * (FRAME_SECONDS + PICTURES_SECONDS * ((pictures or 0) / IMAGE_SIZE) ** 2)
     minutes = seconds / 60 / max(min(workers, cores()), 1)
     time = f"{minutes / 60:.1f} hours" if minutes > 90 else f"{max(round(minutes), 1)} min"
     size = run_size(frames, plan.formats, pictures)

@@ -18,7 +18,7 @@ from lerobot_memobench.datasets.perturbation import Perturbation
 from lerobot_memobench.datasets.staging import HDF5, LEROBOT, EpisodeStage, StagedJob, stage_failure
 from lerobot_memobench.envs.episode import Episode, generator
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.protocol import EXECUTION
+from lerobot_memobench.protocol import EXECUTION, IMAGE_SIZE
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.tasks.task import Task
 
@@ -43,7 +43,7 @@ class RecordingSettings:
 
     referent: str = "fixed"
     images: bool = True
-    image_size: int = 256
+    image_size: int = IMAGE_SIZE
     demonstration_prompt: bool = True
     hold_frames: int = HOLD_FRAMES
     perturb: bool = False
@@ -59,7 +59,7 @@ def record_demonstration(
     images: bool = True,
     demonstration_prompt: bool = True,
     hold_frames: int = HOLD_FRAMES,
-    image_size: int = 256,
+    image_size: int = IMAGE_SIZE,
     perturb: bool = False,
     policy: str | None = None,
 ) -> Demonstration:

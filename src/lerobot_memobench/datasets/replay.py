@@ -20,7 +20,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import EXECUTED_ACTION, OB
 from lerobot_memobench.datasets.lerobot_format.reading import Columns, RecordedEpisode
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.demonstration_prompt import highlights_at
-from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ
+from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ, IMAGE_SIZE
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import Simulation
@@ -122,7 +122,7 @@ class _Watch:
     @property
     def settings(self) -> RenderSettings:
         """In what size to draw."""
-        height, width = next((frames.shape[1:3] for frames in self._recorded.values()), (256, 256))
+        height, width = next((frames.shape[1:3] for frames in self._recorded.values()), (IMAGE_SIZE, IMAGE_SIZE))
         return RenderSettings(height=height, width=width)
 
     def look(self, sim: Simulation, frame: int) -> None:

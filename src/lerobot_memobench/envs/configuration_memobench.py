@@ -46,7 +46,7 @@ from lerobot_memobench.envs.prompting import (
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.jobs.threads import ACTING, limit_torch, use_threads
 from lerobot_memobench.lerobot_hooks import ROLLOUT, installed
-from lerobot_memobench.protocol import EVALUATION_SEED
+from lerobot_memobench.protocol import CONTROL_HZ, EVALUATION_SEED, HORIZON
 from lerobot_memobench.tasks.task import DRAWN, PUBLISHED, REFERENTS, STRICT, SUITES, referent_told
 
 PolicyCheck = Callable[[str, PreTrainedConfig, dict[str, PolicyFeature], dict[str, str]], None]
@@ -98,12 +98,12 @@ class MemobenchEnvConfig(EnvConfig):
     task: str | None = None
     tasks: str = "all"
     task_dir: str | None = None
-    fps: int = 20
+    fps: int = CONTROL_HZ
     obs_type: str = PIXELS
     referent: str = "fixed"
     demonstration_prompt: bool = True
     prompt_in: str = AUTO
-    horizon: int = 1200
+    horizon: int = HORIZON
     render: str = "default"
     render_every: int = 1
     replan_steps: int | None = None
@@ -118,8 +118,8 @@ class MemobenchEnvConfig(EnvConfig):
     features_map: dict[str, str] = field(default_factory=policy_names)
 
     def __post_init__(self) -> None:
-        if self.fps != 20:
-            raise MemobenchError(f"fps is {self.fps}; the benchmark's control rate is 20, leave it out")
+        if self.fps != CONTROL_HZ:
+            raise MemobenchError(f"fps is {self.fps}; the benchmark's control rate is {CONTROL_HZ}, leave it out")
         for name, value, known in (
             ("obs_type", self.obs_type, OBS_TYPES),
             ("suite", self.suite, SUITES),

@@ -21,7 +21,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import draft_of
-from lerobot_memobench.protocol import PROMPT
+from lerobot_memobench.protocol import CONTROL_HZ, PROMPT
 
 if TYPE_CHECKING:
     from av import VideoFrame
@@ -158,7 +158,7 @@ class VideoRecorder:
         fps: frames per second.
     """
 
-    def __init__(self, path: Path, fps: int = 20) -> None:
+    def __init__(self, path: Path, fps: int = CONTROL_HZ) -> None:
         self._path, self._fps = path, fps
         self._writing = ExitStack()
         self._container: Any = None
