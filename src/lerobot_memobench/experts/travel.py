@@ -38,8 +38,8 @@ SETTLING = 18
 HAND_BESIDE = 0.05
 """How far the hand reaches sideways on its way, m."""
 PRESSED = 2
-"""Steps for which what has a stop is pushed on against it: fewer than the six that a policy executes of a plan, or
-whoever does not see the difference would plan them again and again."""
+"""Steps for which what has a stop is pushed on against it: fewer than the six that a policy executes of a plan, or a
+policy that does not see the difference would plan them again and again."""
 
 FINGER_REACH = 0.0095
 """How far the finger tips stand out under the grip site, m."""

@@ -1,9 +1,9 @@
 """Operational-space control of the arm, with the numbers of robosuite's OSC_POSE controller.
 
 One control step sets a goal from a 7-D action and then holds it over the physics steps. The torques are those that
-robosuite 1.4.1 would command (a test holds them equal to its controller's along a trajectory); what is gone is the
-work that the published stack does around them: a second `mj_forward` per physics step, string look-ups, full-model
-Jacobians and mass matrix copies, pseudo-inverses of matrices that are never singular in reach.
+robosuite 1.4.1 would command (a test holds them equal to its controller's along a trajectory), without the work that
+the published stack does around them: a second `mj_forward` per physics step, string look-ups, full-model Jacobians and
+mass matrix copies, pseudo-inverses of matrices that are never singular in reach.
 
 `make_controller` takes a control step as one compiled call where that gives the numpy controller's bits: Python and
 numpy take a third of a control step's time. What numba compiles calls the same libraries in the same order, and the

@@ -29,7 +29,7 @@ BACKENDS = {"egl": "EGL", "osmesa": "OSMesa"}
 DEVICE_ID = "MUJOCO_EGL_DEVICE_ID"
 """MuJoCo's variable for EGL's number of the device to draw on; a user's own choice stays."""
 RANKS = ("MEMOBENCH_WORKER", "LOCAL_RANK", "SLURM_LOCALID", "OMPI_COMM_WORLD_LOCAL_RANK")
-"""Variables that may tell the rank of a process on its node: a worker of ours, or whoever started the ranks."""
+"""Variables that may tell the rank of a process on its node: a worker of ours, or a launcher of ranks."""
 CUDA_DEVICE = 0x323A
 """EGL_CUDA_DEVICE_NV: CUDA's number of an EGL device."""
 

@@ -42,7 +42,7 @@ CACHED_SCENES = 4
 
 @dataclass(frozen=True)
 class Scene:
-    """A compiled scene. The model is shared: whoever changes it works on a copy."""
+    """A compiled scene. The model is shared: change a copy only."""
 
     key: tuple[str, str, str]
     model: mujoco.MjModel

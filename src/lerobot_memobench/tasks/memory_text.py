@@ -47,7 +47,7 @@ IMPERATIVES = {
     "threw": "throw",
     "took": "take",
 }
-"""Past tense of the catalogue's checkpoint texts -> what is said to whoever has still to do it."""
+"""Past tense of the catalogue's checkpoint texts -> the imperative of an instruction."""
 
 _VERB = re.compile(r"(?:^|(?<= and )|(?<= then ))(" + "|".join(IMPERATIVES) + r")\b")
 _TIMES = {"once": "first", "twice": "second", "three times": "third"}

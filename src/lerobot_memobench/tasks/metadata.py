@@ -167,7 +167,7 @@ class Metadata:
     # --- prompt ---
 
     def prompt(self) -> Prompt | None:
-        """Return what the prompt video shows; the file must say it, with null for no prompt."""
+        """Return what the demonstration prompt shows; the file must say it, with null for no prompt."""
         value = self.data["prompt"]
         return None if value is None else self._prompt(value, "prompt")
 

@@ -66,7 +66,7 @@ class Checkpoint:
 
 @dataclass(frozen=True)
 class Prompt:
-    """What the prompt video shows: a routine, ``target`` being picked up, pointed at or highlighted, or a hiding.
+    """What the demonstration prompt shows: a routine, ``target`` being picked up, pointed at or highlighted, or a hiding.
 
     Attributes:
         places: of a hiding, thing -> drawer in the order shown. The execution begins from the scene as it left it.
@@ -95,7 +95,7 @@ class Variant:
         goal: goal in place of the substituted one.
         demo_summary: what the demonstration does.
         language: instruction in place of the task's.
-        prompt: what the prompt video shows in place of the substituted one.
+        prompt: what the demonstration prompt shows in place of the substituted one.
         replaces_published: the published goal is looser than this variant's (it would accept another order),
             so variant 0 is not drawn.
     """
@@ -120,7 +120,7 @@ class Task:
         objects, fixtures: instance -> class, in the file's order.
         regions: full name (``<target>_<region>``) -> region.
         init: starting state; objects in regions are sampled, others rest on what they name.
-        prompt: what the prompt video shows; None for the published temporal and spatial tasks.
+        prompt: what the demonstration prompt shows; None for the published temporal and spatial tasks.
         variants: the alternatives to the published task: ``variant(k)`` for k >= 1.
         variant_index: which variant this is.
         bddl_text, metadata: the files as read.

@@ -422,7 +422,7 @@ class ShadowMap:
         call.glBindFramebuffer(GL.GL_READ_FRAMEBUFFER, self._still)
         call.glBindFramebuffer(GL.GL_DRAW_FRAMEBUFFER, self._all)
         call.glBlitFramebuffer(0, 0, size, size, 0, 0, size, size, GL.GL_DEPTH_BUFFER_BIT, GL.GL_NEAREST)
-        # The nearest depth of a texel is the same whoever is drawn first.
+        # The nearest depth of a texel is the same in any order of drawing.
         self._draw(self._first + self._list.still.size, self._list.moving.size)
         call.glDisable(GL.GL_POLYGON_OFFSET_FILL)
 
