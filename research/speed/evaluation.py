@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.jobs.threads import by_the_libraries, by_the_rule, cores
-from lerobot_memobench.policies.memobench_random.modeling_memobench_random import MemobenchRandomPolicy
+from lerobot_memobench.policies.baselines.modeling_baselines import MemobenchRandomPolicy
 from lerobot_memobench.protocol import EVALUATION_EPISODES, EVALUATION_SEED, HORIZON
 from lerobot_memobench.run.plan import plan_line
 from lerobot_memobench.run.run import run_evaluation
@@ -146,8 +146,8 @@ def evaluate_stock(stock: Any, films: int, steps: int) -> Cost:
     from lerobot.envs.utils import freeze_after_episode_end
     from lerobot.scripts import lerobot_eval
 
-    from lerobot_memobench.policies.memobench_random.configuration_memobench_random import MemobenchRandomConfig
-    from lerobot_memobench.policies.pass_through import pass_through
+    from lerobot_memobench.policies.baselines.configuration_baselines import MemobenchRandomConfig
+    from lerobot_memobench.policies.baselines.processor_baselines import pass_through
 
     logging.disable(logging.WARNING)
     env = gym.vector.SyncVectorEnv([freeze_after_episode_end(lambda: StockEnv(stock, steps))])

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from lerobot_memobench.envs.episode import Episode
-from lerobot_memobench.policies.memobench_random.configuration_memobench_random import MemobenchRandomConfig
-from lerobot_memobench.policies.memobench_random.modeling_memobench_random import MemobenchRandomPolicy
+from lerobot_memobench.policies.baselines.configuration_baselines import MemobenchRandomConfig
+from lerobot_memobench.policies.baselines.modeling_baselines import MemobenchRandomPolicy
 from research.speed import evaluation
 from research.speed.claims import BENCHMARKS
 from research.speed.evaluation import Cost, Stopwatch, evaluate_once, looking_every, step_bare

@@ -4,12 +4,10 @@ The configuration modules register themselves when imported; they import neither
 """
 
 import lerobot_memobench.envs.configuration_memobench
-import lerobot_memobench.policies.memobench_blind.configuration_memobench_blind
-import lerobot_memobench.policies.memobench_expert.configuration_memobench_expert
+import lerobot_memobench.policies.baselines.configuration_baselines
 import lerobot_memobench.policies.memobench_mem.configuration_memobench_mem
-import lerobot_memobench.policies.memobench_random.configuration_memobench_random
 import lerobot_memobench.policies.remote.configuration_remote  # noqa: F401
 from lerobot_memobench.envs.configuration_memobench import POLICY_CHECKS
-from lerobot_memobench.policies.shown import check_policy
+from lerobot_memobench.policies.compatibility import check_policy
 
 POLICY_CHECKS.append(check_policy)

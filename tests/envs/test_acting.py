@@ -23,10 +23,12 @@ from lerobot_memobench.envs.episode_log import read_episodes, read_protocol_file
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS, policy_inputs
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import read_protocol, read_runs
-from lerobot_memobench.policies.memobench_blind.configuration_memobench_blind import MemobenchBlindConfig
-from lerobot_memobench.policies.memobench_expert.configuration_memobench_expert import MemobenchExpertConfig
+from lerobot_memobench.policies.baselines.configuration_baselines import (
+    MemobenchBlindConfig,
+    MemobenchExpertConfig,
+    MemobenchRandomConfig,
+)
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_random.configuration_memobench_random import MemobenchRandomConfig
 from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
 from lerobot_memobench.run.lerobot_commands import call_lerobot
 from lerobot_memobench.run.merging import merge

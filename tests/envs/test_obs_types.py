@@ -20,7 +20,7 @@ from lerobot_memobench.envs.observations import BOTH, OBJECTS, OBS_TYPES, PIXELS
 from lerobot_memobench.envs.video import LAST_FRAMES
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.html.write import frame_count
-from lerobot_memobench.policies.untrained import UntrainedConfig
+from lerobot_memobench.policies.baselines.configuration_baselines import UntrainedConfig
 from lerobot_memobench.protocol import EXECUTION, PROMPT
 from lerobot_memobench.sim import rendering
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, STARTS, WIDTH

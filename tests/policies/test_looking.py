@@ -11,10 +11,8 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from torch import Tensor
 
-from lerobot_memobench.policies.memobench_expert.configuration_memobench_expert import MemobenchExpertConfig
-from lerobot_memobench.policies.memobench_expert.modeling_memobench_expert import MemobenchExpertPolicy
-from lerobot_memobench.policies.memobench_random.configuration_memobench_random import MemobenchRandomConfig
-from lerobot_memobench.policies.memobench_random.modeling_memobench_random import MemobenchRandomPolicy
+from lerobot_memobench.policies.baselines.configuration_baselines import MemobenchExpertConfig, MemobenchRandomConfig
+from lerobot_memobench.policies.baselines.modeling_baselines import MemobenchExpertPolicy, MemobenchRandomPolicy
 from lerobot_memobench.run.rollout import looking
 from tests.policies.test_other_policies import _tiny_paligemma, tiny_smolvlm  # noqa: F401 - fixtures
 from tests.support.policy_server import PolicyServer

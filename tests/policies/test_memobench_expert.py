@@ -9,8 +9,7 @@ from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_blind.configuration_memobench_blind import MemobenchBlindConfig
-from lerobot_memobench.policies.memobench_expert.configuration_memobench_expert import MemobenchExpertConfig
+from lerobot_memobench.policies.baselines.configuration_baselines import MemobenchBlindConfig, MemobenchExpertConfig
 
 
 class _EnvConfig:

@@ -114,7 +114,7 @@ def test_the_first_plan_is_made_from_the_first_execution_frame(
 def test_a_policy_that_knows_phases_sees_the_prompt(
     lerobot_eval: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from lerobot_memobench.policies.memobench_expert.modeling_memobench_expert import MemobenchExpertPolicy
+    from lerobot_memobench.policies.baselines.modeling_baselines import MemobenchExpertPolicy
 
     seen: list[list[int]] = []
     select = MemobenchExpertPolicy.select_action

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.remote import wire
+from lerobot_memobench.policies.remote import transports as wire
 from tests.support.policy_server import RestServer
 from tests.support.remote_case import IMPATIENT, batch, free_port, make, pictures
 

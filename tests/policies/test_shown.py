@@ -27,6 +27,7 @@ from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.prompting import read_rename_map
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint, check_weights, shipped_policies
+from lerobot_memobench.policies.compatibility import SIZE_COUNTS, check_features, check_policy
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import (
     FIXED,
     OF_ACTING,
@@ -35,7 +36,6 @@ from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import
     MemobenchMemConfig,
 )
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.shown import SIZE_COUNTS, check_features, check_policy
 from lerobot_memobench.run.lerobot_commands import call_lerobot
 
 TASK = "turn_on_the_stove_and_turn_it_off"

@@ -15,8 +15,7 @@ from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
-from lerobot_memobench.policies.remote.observations import Row
-from lerobot_memobench.policies.remote.session import Session
+from lerobot_memobench.policies.remote.session import Row, Session
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support.small_policy import small_config
 

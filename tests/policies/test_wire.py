@@ -7,8 +7,8 @@ import hashlib
 import numpy as np
 import pytest
 
-from lerobot_memobench.policies.remote import wire
-from lerobot_memobench.policies.remote.observations import fit
+from lerobot_memobench.policies.remote import transports as wire
+from lerobot_memobench.policies.remote.session import fit
 from tests.support.policy_server import PolicyServer
 from tests.support.remote_case import batch, counting, make
 

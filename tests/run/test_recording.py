@@ -16,7 +16,7 @@ from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_random.modeling_memobench_random import MemobenchRandomPolicy
+from lerobot_memobench.policies.baselines.modeling_baselines import MemobenchRandomPolicy
 
 TASK = "put_the_butter_into_the_bowl_from_the_prompt_video"
 STEPS = 4

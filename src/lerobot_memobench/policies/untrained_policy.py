@@ -11,7 +11,7 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor, nn
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.untrained import UntrainedConfig
+from lerobot_memobench.policies.baselines.configuration_baselines import UntrainedConfig
 
 
 class UntrainedPolicy(PreTrainedPolicy):

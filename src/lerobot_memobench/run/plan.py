@@ -16,8 +16,7 @@ from lerobot_memobench.evaluation.records import CARD_FILE, read_card
 from lerobot_memobench.jobs.executors import ELSEWHERE
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint
-from lerobot_memobench.policies.freshness import REFUSAL
-from lerobot_memobench.policies.shown import check_features
+from lerobot_memobench.policies.compatibility import REFUSAL, check_features
 from lerobot_memobench.protocol import EVALUATION_EPISODES, EVALUATION_SEED
 from lerobot_memobench.run.arguments import (
     EVALUATION_WORDS,

@@ -15,8 +15,8 @@ from lerobot_memobench.evaluation.records import CARD_FILE, POLICY, differences,
 from lerobot_memobench.evaluation.report import REPORT_MARKDOWN, write_report
 from lerobot_memobench.io import count_of, remove_drafts
 from lerobot_memobench.jobs.processes import locked
+from lerobot_memobench.policies.baselines.configuration_baselines import UntrainedConfig
 from lerobot_memobench.policies.checkpoint import check_weights, portable_path
-from lerobot_memobench.policies.untrained import UntrainedConfig
 from lerobot_memobench.run.card import card_of, extended, remove_card, with_checkpoint, with_episodes, write_card
 from lerobot_memobench.run.lerobot_commands import call_lerobot, without_chatter
 from lerobot_memobench.run.plan import EvaluationPlan, Range, task_names

@@ -31,7 +31,7 @@ from lerobot_memobench.policies.checkpoint import (
     differing,
     read_json,
 )
-from lerobot_memobench.policies.shown import check_features
+from lerobot_memobench.policies.compatibility import check_features
 from lerobot_memobench.run.arguments import (
     TRAINING_WORDS,
     LerobotSettings,

@@ -8,7 +8,7 @@ from typing import ClassVar
 from lerobot.configs import PreTrainedConfig
 
 from lerobot_memobench.envs.observations import SIMULATOR
-from lerobot_memobench.policies.untrained import UntrainedConfig
+from lerobot_memobench.policies.baselines.configuration_baselines import UntrainedConfig
 
 
 @PreTrainedConfig.register_subclass("memobench_expert")

@@ -31,7 +31,7 @@ from lerobot_memobench.datasets.feature_cache.reading import RecordedFrames
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.weights import load_visual_encoder
 from lerobot_memobench.policies.checkpoint import check_as_trained
-from lerobot_memobench.policies.freshness import PICTURE_STEP, require_fresh
+from lerobot_memobench.policies.compatibility import PICTURE_STEP, cure, require_fresh
 from lerobot_memobench.policies.memobench_mem.alignment import alignment_loss, make_alignment, require_texts
 from lerobot_memobench.policies.memobench_mem.caching import open_frames
 from lerobot_memobench.policies.memobench_mem.checkpoints import (
@@ -74,7 +74,6 @@ from lerobot_memobench.policies.memobench_mem.training import (
     means_over_ranks,
     noise_and_time,
 )
-from lerobot_memobench.policies.shown import cure
 from lerobot_memobench.protocol import EXECUTION, PROMPT
 
 # A saved pipeline is built right after its policy, by the names under which its steps register when imported.

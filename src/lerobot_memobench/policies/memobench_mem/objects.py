@@ -27,7 +27,7 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
     fingerprint,
 )
 from lerobot_memobench.policies.memobench_mem.memory.encoder import PooledMemoryEncoder
-from lerobot_memobench.policies.shown import cure
+from lerobot_memobench.policies.compatibility import cure
 from lerobot_memobench.protocol import CAMERAS
 from lerobot_memobench.sim.object_layout import FIELDS, SIZE, SLOTS, WIDTH, field
 from lerobot_memobench.sim.object_slots import classes

@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.remote.answers import ACTION_SIZE
+from lerobot_memobench.policies.baselines.modeling_baselines import UntrainedPolicy
 from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
-from lerobot_memobench.policies.remote.observations import EXECUTION, Row
-from lerobot_memobench.policies.remote.session import Session
-from lerobot_memobench.policies.untrained_policy import UntrainedPolicy
+from lerobot_memobench.policies.remote.session import Row, Session
+from lerobot_memobench.protocol import ACTION_DIM, EXECUTION
 
 Action = NDArray[np.float32]
 
@@ -47,7 +46,7 @@ class Actor:
         last, self._clock = self._clock, self._now(told, phase)
         self._rests = self._clock == last or (told is not None and row.blank)
         if self._rests:
-            return np.zeros(ACTION_SIZE, np.float32)  # the episode has ended, or was never run
+            return np.zeros(ACTION_DIM, np.float32)  # the episode has ended, or was never run
         if last is None or self._clock < last:
             self.session.begin()
             self._queue.clear()
@@ -88,7 +87,7 @@ class Actor:
         if self._shows_prompt(step):
             show = self.session.watch if self.config.spoken.buffers else self.session.ask
             show(row)
-        return np.zeros(ACTION_SIZE, np.float32)
+        return np.zeros(ACTION_DIM, np.float32)
 
 
 class RemotePolicy(UntrainedPolicy):

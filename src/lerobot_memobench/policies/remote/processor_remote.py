@@ -1,10 +1,10 @@
-"""The server normalises for itself: the processors pass everything through."""
+"""A policy server normalises by itself: the processors pass everything through."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from lerobot_memobench.policies.pass_through import Processors, pass_through
+from lerobot_memobench.policies.baselines.processor_baselines import Processors, pass_through
 from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
 
 

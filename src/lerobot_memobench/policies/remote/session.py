@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
+from lerobot.utils.constants import OBS_IMAGES, OBS_STATE, OBS_STR
 from numpy.typing import NDArray
+from PIL import Image
+from torch import Tensor
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.freshness import PICTURE_STEP, require_fresh
-from lerobot_memobench.policies.remote.answers import read_actions
-from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
-from lerobot_memobench.policies.remote.dialects import IMAGE, STATE
-from lerobot_memobench.policies.remote.observations import Row, fit
-from lerobot_memobench.policies.remote.transport import ServerAway, Transport
-from lerobot_memobench.policies.remote.transports import TRANSPORTS
+from lerobot_memobench.policies.compatibility import PICTURE_STEP, require_fresh
+from lerobot_memobench.policies.remote.configuration_remote import IMAGE, RLDS, STATE, TASK, RemoteConfig
+from lerobot_memobench.policies.remote.transports import TRANSPORTS, ServerAway, Transport
+from lerobot_memobench.protocol import ACTION_DIM
 
 logger = logging.getLogger(__name__)
 
@@ -214,3 +215,101 @@ class Session:
                 on_wait(reason)
                 on_wait = None
             time.sleep(min(PAUSE, max(0.0, left)))
+
+
+def read_actions(answer: Mapping[str, Any], config: RemoteConfig, address: str) -> NDArray[np.float32]:
+    """Return the actions (H, 7) in an answer, their gripper in the environment's terms.
+
+    One that is not finite is passed on: the environment ends the episode with it, and the others go on.
+
+    Raises:
+        MemobenchError: there are none, too few for a plan, or something else.
+    """
+    actions = _numbers(answer, address)
+    if len(actions) < config.n_action_steps:
+        raise MemobenchError(
+            f"the policy server at {address} answers {len(actions)} actions at a time, fewer than the "
+            f"{config.n_action_steps} to be executed; choose replan={len(actions)} or less"
+        )
+    if (config.gripper or config.spoken.gripper) == RLDS:
+        gripper = actions[:, -1]
+        actions[:, -1] = np.where(np.isfinite(gripper), -np.sign(2 * gripper - 1), gripper)
+    return actions
+
+
+def _numbers(answer: Mapping[str, Any], address: str) -> NDArray[np.float32]:
+    if "actions" not in answer:
+        raise _wrong(address, f"an answer without 'actions' (it holds {', '.join(map(str, answer)) or 'nothing'})")
+    try:
+        actions = np.array(answer["actions"], dtype=np.float32, ndmin=2)
+    except (TypeError, ValueError) as error:
+        raise _wrong(address, "actions that are no numbers") from error
+    if actions.ndim != 2 or actions.shape[1] != ACTION_DIM:
+        raise _wrong(address, f"actions of shape {actions.shape}")
+    return actions
+
+
+def _wrong(address: str, what: str) -> MemobenchError:
+    return MemobenchError(
+        f"the policy server at {address} gave {what}; expected finite numbers of shape "
+        f"(steps, {ACTION_DIM}): six of the end effector's displacement and one of the gripper"
+    )
+
+
+@dataclass(frozen=True)
+class Row:
+    """One environment's part of a batch; nothing is copied until it is asked for."""
+
+    batch: Mapping[str, Any]
+    number: int
+
+    def scalar(self, name: str) -> int | None:
+        """Return an observation that is one whole number, None where the environment does not tell it."""
+        value = self.batch.get(f"{OBS_STR}.{name}")
+        return None if value is None else round(float(value[self.number].reshape(-1)[0]))
+
+    @property
+    def blank(self) -> bool:
+        """Whether this row is not simulated: an episode that the log holds already observes nothing but zeros."""
+        found = [value[self.number] for key, value in self.batch.items() if key == OBS_STATE or OBS_IMAGES in key]
+        return bool(found) and not any(bool(value.any()) for value in found)
+
+    def get(self, name: str) -> Any:
+        """Return an observation by our name: an image (H, W, 3) uint8, a vector float32, or the instruction."""
+        if name == TASK:
+            return str(self.batch[TASK][self.number])
+        for key in (f"{OBS_IMAGES}.{name}", OBS_STATE if name == STATE else f"{OBS_STR}.{name}"):
+            if key in self.batch:
+                value = self.batch[key][self.number]
+                return to_image(value) if OBS_IMAGES in key else value.float().cpu().numpy()
+        known = [key.removeprefix(f"{OBS_IMAGES}.").removeprefix(f"{OBS_STR}.") for key in self.batch if OBS_STR in key]
+        raise MemobenchError(
+            f"policy.keys names {name!r}, which the environment does not observe; known are "
+            f"{', '.join(sorted([*known, TASK]))}"
+        )
+
+
+def to_image(value: Tensor) -> NDArray[np.uint8]:
+    """Return LeRobot's image (3, H, W) in [0, 1] as it was rendered, (H, W, 3) uint8."""
+    pixels = (value.float() * 255).round().clamp(0, 255).to(torch.uint8)
+    array: NDArray[np.uint8] = pixels.permute(1, 2, 0).contiguous().cpu().numpy()
+    return array
+
+
+def fit(image: NDArray[np.uint8], side: int | None, mirror: bool = False) -> NDArray[np.uint8]:
+    """Return an image of (side, side, 3), scaled bilinearly and padded with black; as it is where side is None.
+
+    Equal to openpi-client's ``resize_with_pad``, pixel for pixel.
+    """
+    if mirror:
+        image = np.ascontiguousarray(image[:, ::-1])
+    height, width = image.shape[:2]
+    if side is None or (height, width) == (side, side):
+        return image
+    ratio = max(width, height) / side
+    size = int(width / ratio), int(height / ratio)
+    padded = Image.new("RGB", (side, side))
+    padded.paste(
+        Image.fromarray(image).resize(size, Image.Resampling.BILINEAR), ((side - size[0]) // 2, (side - size[1]) // 2)
+    )
+    return np.asarray(padded)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from lerobot.configs import PolicyFeature
     from lerobot.configs.policies import PreTrainedConfig
 
+
 SIZE_COUNTS = {
     "act": None,
     "diffusion": "resize_shape",
@@ -31,6 +32,9 @@ SIZE_COUNTS = {
 they have one. All others bring every picture to a size of their own."""
 EMPTY_CAMERA = f"{OBS_IMAGES}.empty_camera_"
 """What the names of the cameras begin with that LeRobot's ``policy.empty_cameras`` adds: nobody has them."""
+PICTURE_STEP = "picture_step"
+"""Observation: the step whose pictures are shown; told by an environment that does not draw every step."""
+REFUSAL = "leave env.render_every at 1 for a policy that remembers the frames between its plans"
 
 
 def cure(missing: str, observed: Collection[str]) -> str:
@@ -166,3 +170,13 @@ def _check_sizes(path: str, policy: PreTrainedConfig, there: Mapping[str, Policy
                 f"the policy {path} was trained on pictures {name} of {seen} pixels and takes them as they come, and "
                 f"the environment shows {here}; train it on pictures of that size{also}"
             )
+
+
+def require_fresh(step: int | None, picture_step: int | None) -> None:
+    """Refuse a frame that is to be remembered and shows an earlier step; None where the environment tells no step.
+
+    Raises:
+        MemobenchError: it does.
+    """
+    if None not in (step, picture_step) and step != picture_step:
+        raise MemobenchError(f"the frame of step {step} shows step {picture_step} again; {REFUSAL}")

@@ -1,7 +1,4 @@
-"""Processors of policies whose actions are in the environment's units already.
-
-Apart from the configurations, which are imported whenever LeRobot starts.
-"""
+"""Processors of policies whose actions are in the environment's units already: nothing is normalised."""
 
 from __future__ import annotations
 
@@ -15,6 +12,8 @@ from lerobot.processor import (
     RenameObservationsProcessorStep,
     make_policy_processor_pipelines,
 )
+
+from lerobot_memobench.policies.baselines.configuration_baselines import UntrainedConfig
 
 Processors = tuple[
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
@@ -32,3 +31,13 @@ def pass_through(device: str) -> Processors:
         ],
         output_steps=[DeviceProcessorStep(device="cpu")],
     )
+
+
+def make_processors(config: UntrainedConfig, dataset_stats: dict[str, dict[str, Any]] | None = None) -> Processors:
+    """Return the processors of a baseline, on its device."""
+    return pass_through(config.device or "cpu")
+
+
+make_memobench_expert_pre_post_processors = make_processors
+make_memobench_blind_pre_post_processors = make_processors
+make_memobench_random_pre_post_processors = make_processors

@@ -1,0 +1,1 @@
+"""Baselines without weights: the scripted expert, the published routine repeated blindly, and random actions."""

@@ -1,1 +1,0 @@
-"""The published routine, repeated blindly, seen as a LeRobot policy."""

@@ -1,1 +1,0 @@
-"""The scripted expert, seen as a LeRobot policy."""
