@@ -176,7 +176,7 @@ def expert_states(episode: Episode, seed: int, count: int) -> list[ExpertState]:
     while not (episode.done or episode.expert_done):
         if episode.step_index % EVERY == 0:
             states.append(_state(episode))
-        episode.step(perturbation.moved(episode.expert_action()))
+        episode.step(perturbation.executed(episode.expert_action()))
     weights = np.array([NEAR_WEIGHT if state.near else 1.0 for state in states])
     chosen = rng.choice(len(states), min(count, len(states)), replace=False, p=weights / weights.sum())
     return [states[index] for index in sorted(chosen)]

@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from lerobot_memobench.datasets import dagger
-from lerobot_memobench.datasets.dagger import SPELL, load_driver
+from lerobot_memobench.datasets.dagger import TURN_STEPS, load_learner
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.generation import generate
 from lerobot_memobench.datasets.labels import digest, labels
@@ -186,33 +186,33 @@ def test_an_arm_that_was_pushed_comes_to_rest_at_home():
     assert np.abs(counted.applied - counted.actions)[:, :6].max(axis=1).any(), "it was pushed"
 
 
-def test_a_policy_drives_for_some_steps_at_a_time(butter):
+def test_expert_and_learner_act_in_turns(butter):
     small = str(checkpoint_folder("memobench_small"))
-    driven = record_demonstration(get_task(BUTTER), SEED, images=False, policy=small)
-    assert driven.success
-    off = np.abs(driven.applied - driven.actions)
-    np.testing.assert_array_equal(butter.states[: driven.exec_start], driven.states[: driven.exec_start])
+    demo = record_demonstration(get_task(BUTTER), SEED, images=False, policy=small)
+    assert demo.success
+    off = np.abs(demo.applied - demo.actions)
+    np.testing.assert_array_equal(butter.states[: demo.exec_start], demo.states[: demo.exec_start])
     late = off[:, 6] > 0
-    assert (driven.applied[late, 6] > 0).all(), "fingers open as the expert says, or later"
-    assert (driven.applied[np.flatnonzero(late) - 1, 6] > 0).all()
-    driving = off[driven.exec_start : -HOLD_FRAMES, :6].max(axis=1) > 0
-    assert 0.2 < dagger.mean() < 0.9
-    changes = int(np.abs(np.diff(dagger.astype(int))).sum())
-    assert 2 <= changes <= len(driving) // SPELL[0] + 1, "in spells"
-    assert replay(driven) is None
+    assert (demo.applied[late, 6] > 0).all(), "fingers open as the expert says, or later"
+    assert (demo.applied[np.flatnonzero(late) - 1, 6] > 0).all()
+    learner_acts = off[demo.exec_start : -HOLD_FRAMES, :6].max(axis=1) > 0
+    assert 0.2 < learner_acts.mean() < 0.9
+    changes = int(np.abs(np.diff(learner_acts.astype(int))).sum())
+    assert 2 <= changes <= len(learner_acts) // TURN_STEPS[0] + 1, "in turns"
+    assert replay(demo) is None
 
 
-def test_a_driver_that_needs_more_than_is_recorded_is_refused(tmp_path, monkeypatch):
+def test_a_learner_that_needs_more_than_is_recorded_is_refused(tmp_path, monkeypatch):
     folder = shutil.copytree(checkpoint_folder("memobench_small"), tmp_path / "told")
     config = json.loads((folder / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps({**config, "oracle_memory": True}))
     with pytest.raises(MemobenchError, match="reads in its instruction what has been done"):
-        load_driver(str(folder))
+        load_learner(str(folder))
     sees = SimpleNamespace(
         config=SimpleNamespace(input_features={"observation.images.image": None}), reset=lambda: None
     )
-    monkeypatch.setattr(dagger, "load_driver", lambda checkpoint: dagger.Loaded(sees, None, None))
-    with pytest.raises(MemobenchError, match=r"looks at observation\.images\.image, which is not recorded; leave out"):
+    monkeypatch.setattr(dagger, "load_learner", lambda checkpoint: dagger.Loaded(sees, None, None))
+    with pytest.raises(MemobenchError, match=r"reads observation\.images\.image, which is not recorded; leave out"):
         record_demonstration(get_task(STOVE), SEED, images=False, policy="pictures")
 
 
@@ -226,7 +226,7 @@ def test_who_moves_the_arm_is_one(tmp_path):
 
 def test_a_third_of_the_episodes_stays_clean():
     action = np.zeros(7, np.float32)
-    clean = [not Perturbation(np.random.default_rng(seed)).moved(action).any() for seed in range(600)]
+    clean = [not Perturbation(np.random.default_rng(seed)).executed(action).any() for seed in range(600)]
     assert 150 < sum(clean) < 250
 
 
@@ -239,8 +239,8 @@ def test_some_grasps_miss_and_some_are_lost():
     up, late, lost, shut = 0, 0, 0, 0
     for seed in range(1500):
         moves = Perturbation(np.random.default_rng(seed))
-        assert moves.moved(opens)[6] < 0
-        done = np.array([moves.moved(closes) for _ in range(60)])
+        assert moves.executed(opens)[6] < 0
+        done = np.array([moves.executed(closes) for _ in range(60)])
         up += done[:4, 2].mean() > 0.5
         late += (waits := int((done[:6, 6] < 0).sum())) > 0
         assert waits == 0 or (3 <= waits < 6 and (done[:waits, 6] < 0).all())
@@ -248,7 +248,7 @@ def test_some_grasps_miss_and_some_are_lost():
         lost += len(let_go) > 0
         assert len(let_go) in (0, 8)
         assert not (let_go < 8).any(), "once it holds"
-        stays = np.flatnonzero([moves.moved(opens)[6] > 0 for _ in range(20)])
+        stays = np.flatnonzero([moves.executed(opens)[6] > 0 for _ in range(20)])
         shut += len(stays) > 0
         assert len(stays) == 0 or (3 <= len(stays) < 16 and stays[-1] == len(stays) - 1)
     assert 0.08 < up / 1500 < 0.2

@@ -1,8 +1,7 @@
-"""A trained policy drives for some steps at a time: demonstrations of how to go on from where it brings the arm.
+"""DAgger (Ross et al. 2011): the learner and the expert act in turn, and the expert labels every frame.
 
-What is learned at each frame is what the expert does there (DAgger, Ross et al. 2011); what was executed is kept for
-replay. The policy moves the arm, and fingers that are shut stay so while it keeps them shut. Else they do as the expert
-says, or its plan would be left behind.
+The executed actions are kept for replay. The learner moves the arm, and fingers that are shut stay so while it keeps
+them shut. Else they do as the expert says, or its plan would be left behind.
 """
 
 from __future__ import annotations
@@ -16,24 +15,24 @@ from numpy.typing import NDArray
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.errors import MemobenchError
 
-SPELL = (8, 48)
-"""The expert, or the policy, drives at least the first, and less than the second, number of steps at a time."""
+TURN_STEPS = (8, 48)
+"""A turn of the expert, or of the learner, takes at least the first, and less than the second, number of steps."""
 
 
 class Loaded(NamedTuple):
-    """A policy, and what LeRobot puts before and behind it."""
+    """A policy with its processors of LeRobot's."""
 
     policy: Any
-    before: Any
-    behind: Any
+    preprocessor: Any
+    postprocessor: Any
 
 
 @lru_cache(maxsize=1)
-def load_driver(checkpoint: str) -> Loaded:
+def load_learner(checkpoint: str) -> Loaded:
     """Return the policy of a checkpoint folder, as LeRobot loads it, to act on one core.
 
     Raises:
-        MemobenchError: it is told by its instruction what has been done, which nobody tells it here.
+        MemobenchError: it reads the oracle memory, which demonstrations do not have.
     """
     import torch
     from lerobot.configs import PreTrainedConfig
@@ -54,28 +53,30 @@ def load_driver(checkpoint: str) -> Loaded:
     return Loaded(policy, *make_pre_post_processors(config, checkpoint, preprocessor_overrides=override))
 
 
-class Driver:
-    """A policy in one episode, prompt included; when it drives is a function of the generator's numbers alone."""
+class Learner:
+    """A policy in one episode, prompt included; its turns are a function of the generator's numbers alone."""
 
     def __init__(self, checkpoint: str, rng: np.random.Generator) -> None:
-        self._policy, self._before, self._behind = load_driver(checkpoint)
+        self._policy, self._preprocessor, self._postprocessor = load_learner(checkpoint)
         self._policy.reset()
         self._rng = rng
-        self._drives, self._left = bool(rng.random() < 0.5), 0
+        self._acts, self._left = bool(rng.random() < 0.5), 0
         self._wanted: NDArray[np.float32] = np.zeros(7, np.float32)
         self._shut = False  # the fingers were last told to close
 
-    def look(self, episode: Episode, seen: NDArray[np.float32], pictures: dict[str, NDArray[np.uint8]] | None) -> None:
-        """Show the policy the present frame: the visible objects, and the cameras where they are recorded.
+    def observe(
+        self, episode: Episode, objects: NDArray[np.float32], pictures: dict[str, NDArray[np.uint8]] | None
+    ) -> None:
+        """Give the policy the present frame: visible objects (SIZE,), and the cameras where they are recorded.
 
         Raises:
-            MemobenchError: it wants to see what is not recorded.
+            MemobenchError: it needs an observation that is not recorded.
         """
         import torch
         from lerobot.envs import preprocess_observation
 
         observation: dict[str, Any] = {
-            "environment_state": seen[None],
+            "environment_state": objects[None],
             "agent_pos": episode.sim.proprio()[None],
             "phase": np.array([[episode.phase]], np.float32),
             "step": np.array([[episode.clock]], np.float32),
@@ -86,23 +87,23 @@ class Driver:
         missing = [key for key in self._policy.config.input_features if key not in batch]
         if missing:
             raise MemobenchError(
-                f"the policy looks at {', '.join(missing)}, which is not recorded; leave out --no-images, or name a "
-                "policy that sees objects"
+                f"the policy reads {', '.join(missing)}, which is not recorded; leave out --no-images, or name a policy "
+                "that reads objects"
             )
         batch["task"] = [episode.task.language]
         with torch.inference_mode():
-            action = self._policy.select_action(self._before(batch))
-        self._wanted = np.clip(self._behind(action)[0].numpy(), -1.0, 1.0)
+            action = self._policy.select_action(self._preprocessor(batch))
+        self._wanted = np.clip(self._postprocessor(action)[0].numpy(), -1.0, 1.0)
 
-    def moved(self, action: NDArray[np.float32], at_detent: bool = False) -> NDArray[np.float32]:
-        """Return what is executed in place of the expert's action (7,). Ask once per step, after `look`.
+    def executed(self, action: NDArray[np.float32], at_detent: bool = False) -> NDArray[np.float32]:
+        """Return the action (7,) to execute in place of the expert's. Call once per step, after `observe`.
 
         Args:
             at_detent: makes no difference: a policy may leave home too soon.
         """
         if not self._left:
-            self._drives, self._left = not self._drives, int(self._rng.integers(*SPELL))
+            self._acts, self._left = not self._acts, int(self._rng.integers(*TURN_STEPS))
         self._left -= 1
-        fingers = self._wanted[6] if self._drives and self._shut and self._wanted[6] > 0 else action[6]
+        fingers = self._wanted[6] if self._acts and self._shut and self._wanted[6] > 0 else action[6]
         self._shut = bool(fingers > 0)
-        return np.append((self._wanted if self._drives else action)[:6], fingers).astype(np.float32)
+        return np.append((self._wanted if self._acts else action)[:6], fingers).astype(np.float32)

@@ -89,7 +89,7 @@ def generate(
     """Make ``episodes`` demonstrations of each task (with a prompt: ``prompted_episodes``) into the folder ``out``.
 
     With ``perturb`` the arm is moved off its way at random (`datasets.perturbation`), with ``policy``, the folder of a
-    checkpoint, by that policy (`datasets.driving`), and ``action`` is what the expert does there. ``formats`` says what
+    checkpoint, by that policy (`datasets.dagger`), and ``action`` is what the expert does there. ``formats`` says what
     becomes of them: ``lerobot`` is a LeRobotDataset in ``out``, ``hdf5`` a file per task in the published layout in
     ``out``/hdf5. The seeds are ``seed_base`` + i. An unfinished run of the same request in ``out`` is continued
     (``resume=False`` starts anew), a finished one is only reported. Failed episodes are in no dataset, but in the

@@ -1,7 +1,7 @@
 """Recovery data: the arm is moved off its way at random, and the expert, who is closed-loop, finds back.
 
-What a policy learns at each frame is what the expert does there; what was executed instead is kept for replay. A third
-of the episodes stays as the expert made it.
+The labels of a frame are the expert's actions; the executed ones are kept for replay. A third of the episodes stays as
+the expert made it.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ PUSH = np.array([0.6, 0.6, 0.6, 0.1, 0.1, 0.3])
 PUSH_STEPS = (3, 8)
 """A push lasts at least the first, and less than the second, number of steps."""
 MISS_CHANCE = 0.2
-"""Probability that the hand is pushed away when its fingers begin to close: they meet, and the expert goes back. Who
-never saw that brings nothing to where the thing should go."""
+"""Probability that the hand is pushed away when its fingers begin to close: they meet, and the expert goes back. A
+policy without such frames brings nothing to where the thing should go."""
 MISS, MISS_SPREAD = np.array([0.0, 0.0, 0.8, 0.0, 0.0, 0.0]), np.array([0.25, 0.25, 0.25, 0.0, 0.0, 0.0])
 """Such a push, upwards, and its standard deviations."""
 MISS_STEPS = (6, 10)
 """It lasts at least the first, and less than the second, number of steps: about as long as fingers take to close."""
 TWIST_CHANCE = 0.15
-"""Probability that it is turned away first, with open fingers: they then stop at another width than along a side. Who
-never saw that waits for them to go on."""
+"""Probability that it is turned away first, with open fingers: they then stop at another width than along a side. A
+policy without such frames waits for them to go on."""
 TWIST = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.25])
 """Standard deviations of such a push, per step."""
 TWIST_STEPS = (3, 6)
@@ -39,7 +39,7 @@ DROP_AFTER, DROP_STEPS = (15, 50), 8
 """That begins at least the first, and less than the second, number of steps after they began to close, and lasts."""
 LATE_CHANCE, LATE_STEPS = 0.2, (3, 16)
 """Probability that fingers stay shut, told to open: for at least the first, and less than the second, number
-of steps. Who never saw a hand that stands where it should have let go stands there for ever."""
+of steps. A policy without such frames stands for ever where it should have let go."""
 COMING_TO_REST = 0.4
 """Largest component of a displacement, at home's detent, by which an expert means to stay there (2 cm)."""
 
@@ -47,7 +47,7 @@ Array = NDArray[np.float64]
 
 
 class Perturbation:
-    """What moves the arm off its way in one episode; a function of the generator's numbers alone."""
+    """Disturbances of the arm in one episode; a function of the generator's numbers alone."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
@@ -58,8 +58,8 @@ class Perturbation:
         self._open = range(0)  # the steps, counted so, in which they are open all the same
         self._late = 0  # steps for which they stay shut, told to open
 
-    def moved(self, action: NDArray[np.float32], at_detent: bool = False) -> NDArray[np.float32]:
-        """Return what is executed in place of an action (7,). Ask once per step.
+    def executed(self, action: NDArray[np.float32], at_detent: bool = False) -> NDArray[np.float32]:
+        """Return the action (7,) to execute in place of the expert's. Call once per step.
 
         Args:
             at_detent: the hand is where home catches what rests; who means to stay is let be, or it never would.

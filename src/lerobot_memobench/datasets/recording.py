@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.datasets.dagger import Driver
+from lerobot_memobench.datasets.dagger import Learner
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.hdf5.writing import model_file
 from lerobot_memobench.datasets.perturbation import Perturbation
@@ -39,7 +39,7 @@ Images = dict[str, NDArray[np.uint8]]
 
 @dataclass(frozen=True)
 class RecordingSettings:
-    """What one demonstration depends on besides task and seed."""
+    """Settings of a demonstration beside task and seed."""
 
     referent: str = "fixed"
     images: bool = True
@@ -106,10 +106,10 @@ def record(
     reached = False
     held = idle = 0
     while held < settings.hold_frames:
-        tape.look(episode)
+        tape.take(episode)
         pictures = episode.images() if settings.images else None
-        if isinstance(disturb, Driver):
-            disturb.look(episode, tape.objects[-1], pictures)
+        if isinstance(disturb, Learner):
+            disturb.observe(episode, tape.objects[-1], pictures)
         if pictures is not None:
             (show or tape.keep)(pictures)
         reached = reached or episode.success
@@ -120,24 +120,24 @@ def record(
         acting = disturb is not None and episode.phase == EXECUTION
         done = wanted
         if disturb is not None and acting and not over:
-            done = disturb.moved(wanted, episode.sim.at_detent)
+            done = disturb.executed(wanted, episode.sim.at_detent)
         episode.step(done)
         tape.executed.append(episode.applied_action)
         tape.actions.append(np.clip(wanted, -1.0, 1.0) if acting else episode.applied_action)
     return tape.demonstration(episode, fixture_poses, success=reached and episode.prompt_shown is not False)
 
 
-def _disturbance(episode: Episode, seed: int, settings: RecordingSettings) -> Perturbation | Driver | None:
-    """Return what moves the arm off the expert's way, if anything does."""
+def _disturbance(episode: Episode, seed: int, settings: RecordingSettings) -> Perturbation | Learner | None:
+    """Return the disturbance or the learner that moves the arm off the expert's way, if any."""
     rng = generator(episode.published, seed, PERTURBATION)
     if settings.policy is not None:
-        return Driver(settings.policy, rng)
+        return Learner(settings.policy, rng)
     return Perturbation(rng) if settings.perturb else None
 
 
 @dataclass
 class _Tape:
-    """What is kept of each frame."""
+    """Columns of the frames so far."""
 
     states: list[NDArray[np.float64]] = field(default_factory=list)
     actions: list[NDArray[np.float32]] = field(default_factory=list)
@@ -147,8 +147,8 @@ class _Tape:
     satisfied: list[tuple[bool, ...]] = field(default_factory=list)
     images: dict[str, list[NDArray[np.uint8]]] = field(default_factory=dict)
 
-    def look(self, episode: Episode) -> None:
-        """Take down what is before the next action."""
+    def take(self, episode: Episode) -> None:
+        """Append the frame before the next action."""
         self.states.append(episode.sim.state())
         self.proprio.append(episode.sim.proprio())
         self.objects.append(episode.objects())
@@ -188,7 +188,7 @@ def _failure_reason(demo: Demonstration, episode: Episode) -> str | None:
     if episode.fault is not None:
         return episode.fault.why
     if episode.prompt_shown is False:
-        return "the prompt video did not show what it had to"
+        return "the demonstration prompt did not show what it had to"
     if not demo.success:
         index, count = episode.progress.index, len(demo.task.checkpoints)
         steps = episode.progress.steps
