@@ -54,7 +54,7 @@ from lerobot_memobench.jobs.processes import ProgressCallback
 
 @dataclass(frozen=True)
 class ConversionSummary:
-    """What a conversion made.
+    """Outcome of a conversion.
 
     Attributes:
         folder: the dataset, or None when nothing could be converted.

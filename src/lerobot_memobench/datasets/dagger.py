@@ -87,8 +87,8 @@ class Learner:
         missing = [key for key in self._policy.config.input_features if key not in batch]
         if missing:
             raise MemobenchError(
-                f"the policy reads {', '.join(missing)}, which is not recorded; leave out --no-images, or name a policy "
-                "that reads objects"
+                f"the policy reads {', '.join(missing)}, which is not recorded; leave out --no-images, or name a "
+                "policy that reads objects"
             )
         batch["task"] = [episode.task.language]
         with torch.inference_mode():

@@ -1,6 +1,6 @@
-"""What can be kept of a dataset without its data: pictures, the card's tables, the hash of every episode.
+"""Describe a dataset without its data: pictures, the card's tables, the hash of every episode.
 
-The pictures show how long episodes are beside the paper's, and what a camera saw at each checkpoint.
+The pictures show the lengths of episodes beside the paper's, and a camera's frame at each checkpoint.
 """
 
 from __future__ import annotations
@@ -204,7 +204,7 @@ def storyboard(folder: Path, rows: Sequence[Mapping[str, Any]]) -> Picture:
         top = line * height
         name = row["task_name"].replace("_", " ")
         draw.text((2, top + 3), f"{row['memory_type']}: {name}", fill="black", font=bold)
-        for column, (frame, text) in enumerate(_moments(dataset, row)):
+        for column, (frame, text) in enumerate(_key_frames(dataset, row)):
             image = dataset[row["start"] + frame][camera].numpy()
             pixels = (image.transpose(1, 2, 0) * 255).round().astype(np.uint8)
             picture = Image.fromarray(pixels).resize((FRAME, FRAME), Image.Resampling.LANCZOS)
@@ -215,11 +215,11 @@ def storyboard(folder: Path, rows: Sequence[Mapping[str, Any]]) -> Picture:
     return sheet
 
 
-def _moments(dataset: Any, row: Mapping[str, Any]) -> list[tuple[int, str]]:
-    """Return frames of an episode worth seeing, each with what has just happened."""
+def _key_frames(dataset: Any, row: Mapping[str, Any]) -> list[tuple[int, str]]:
+    """Return the frames of an episode to draw, each with the text of the checkpoint just completed."""
     begin, found = int(row["exec_start_index"]), []
     if begin:
-        found.append((begin // 2, "prompt video"))
+        found.append((begin // 2, "demonstration prompt"))
     found.append((begin, "execution begins"))
     last = begin
     for frame in sorted(int(frame) for frame in row["key_frames"] if frame >= 0):

@@ -88,17 +88,20 @@ def generate(
 ) -> GenerationSummary:
     """Make ``episodes`` demonstrations of each task (with a prompt: ``prompted_episodes``) into the folder ``out``.
 
-    With ``perturb`` the arm is moved off its way at random (`datasets.perturbation`), with ``policy``, the folder of a
-    checkpoint, by that policy (`datasets.dagger`), and ``action`` is what the expert does there. ``formats`` says what
-    becomes of them: ``lerobot`` is a LeRobotDataset in ``out``, ``hdf5`` a file per task in the published layout in
-    ``out``/hdf5. The seeds are ``seed_base`` + i. An unfinished run of the same request in ``out`` is continued
-    (``resume=False`` starts anew), a finished one is only reported. Failed episodes are in no dataset, but in the
-    summary, the manifest and the card.
+    Failed episodes are in no dataset, but in the summary, the manifest and the card.
 
-    ``executor`` says where ``workers`` episodes at a time are made (`jobs.executors`); it changes nothing of
-    the result. On Slurm the call returns when the jobs are submitted, the last of which writes the dataset.
-
-    ``tell`` is told, before the first episode, about how large the dataset will be and how long it will take.
+    Args:
+        tasks: to demonstrate. episodes, prompted_episodes: of each, without and with a prompt. out: destination.
+        seed_base: episode i has the scene of seed ``seed_base`` + i.
+        perturb: move the arm off its way at random (`datasets.perturbation`); ``action`` is the expert's.
+        policy: the folder of a checkpoint that moves the arm in turn with the expert (`datasets.dagger`).
+        formats: ``lerobot``, a LeRobotDataset in ``out``; ``hdf5``, a file per task in the published layout in
+            ``out``/hdf5; or both.
+        workers: episodes made at a time. executor, executor_options: where (`jobs.executors`); the result is the same.
+            On Slurm the call returns when the jobs are submitted, the last of which writes the dataset.
+        resume: continue an unfinished run of the same request in ``out``, and only report a finished one.
+        tell: called, before the first episode, with about how large the dataset will be and how long it will take.
+        referent, images, image_size, demonstration_prompt, hold_frames: see `recording.RecordingSettings`.
 
     Raises:
         MemobenchError: nothing to do, ``out`` holds something else or a damaged dataset, another run is writing there,

@@ -1,4 +1,4 @@
-"""Do recorded actions, played again in the simulator, give the recorded states, success and labels?
+"""Replay an episode: recorded actions, played again in the simulator, give the recorded states, success and labels.
 
 The scene is reset to the episode's seed and the actions are applied as they were recorded, in the prompt
 video too; no expert and no gym environment is asked. Everything is compared exactly, bit for bit, but pictures: of each
@@ -70,7 +70,7 @@ def replay(
         MemobenchError: no such task, the actions are gone, or there are pictures and nothing to draw them with.
     """
     if isinstance(recorded, Demonstration):
-        watch = _Watch(recorded.exec_start, len(recorded), pictures)
+        watch = _PictureCheck(recorded.exec_start, len(recorded), pictures)
         again = resimulate(recorded.task, recorded.seed, recorded.applied, recorded.exec_start, watch)
         again = _labelled(again, recorded.actions, referent=recorded.referent, variant=recorded.variant)
         return (
@@ -83,7 +83,7 @@ def replay(
         raise MemobenchError("its frames have no column 'action' (a tool removed it), so nothing can be played again")
     wanted = recorded.columns["action"]
     executed = recorded.columns[EXECUTED_ACTION if EXECUTED_ACTION in recorded.columns else "action"]
-    watch = _Watch(recorded.exec_start, len(wanted), pictures)
+    watch = _PictureCheck(recorded.exec_start, len(wanted), pictures)
     again = resimulate(task, recorded.seed, executed, recorded.exec_start, watch)
     again = _labelled(again, wanted, referent=recorded.referent)
     columns = demonstration_columns(again, objects_column(recorded.columns))
@@ -105,7 +105,7 @@ def _numbering(task: Task, length: int, start: int) -> Columns:
     }
 
 
-class _Watch:
+class _PictureCheck:
     """Draws some frames while an episode is played again, and keeps the first that was recorded otherwise.
 
     Args:
@@ -125,8 +125,8 @@ class _Watch:
         height, width = next((frames.shape[1:3] for frames in self._recorded.values()), (IMAGE_SIZE, IMAGE_SIZE))
         return RenderSettings(height=height, width=width)
 
-    def look(self, sim: Simulation, frame: int) -> None:
-        """Compare what the cameras see now, where this frame is one of those chosen."""
+    def compare(self, sim: Simulation, frame: int) -> None:
+        """Compare the present pictures, where this frame is one of those chosen."""
         if frame not in self._frames or self.difference is not None:
             return
         for camera, frames in self._recorded.items():
@@ -151,7 +151,7 @@ def _unlike(drawn: NDArray[np.uint8], seen: NDArray[np.uint8]) -> str:
 
 
 def resimulate(
-    task: Task, seed: int, actions: NDArray[np.float32], exec_start: int, watch: _Watch | None = None
+    task: Task, seed: int, actions: NDArray[np.float32], exec_start: int, watch: _PictureCheck | None = None
 ) -> Demonstration:
     """Apply (T, 7) float32 actions, starting in the scene of ``seed``; return the demonstration they make.
 
@@ -171,7 +171,7 @@ def resimulate(
             sim.begin_execution()
         sim.highlights = highlights_at(task, sim, frame) if frame < exec_start else ()
         if watch is not None:
-            watch.look(sim, frame)
+            watch.compare(sim, frame)
         states.append(sim.state())
         proprio.append(sim.proprio())
         objects.append(look.observe())

@@ -1,4 +1,4 @@
-"""Replay every episode of a folder and say which do not come out as they were recorded.
+"""Validate a folder: replay every episode and name those that do not come out as they were recorded.
 
 The folder may hold a LeRobotDataset, HDF5 files of this package in the published layout, or both.
 """
@@ -29,7 +29,7 @@ from lerobot_memobench.tasks.task import Task
 
 @dataclass(frozen=True)
 class Verdict:
-    """What replaying one episode showed.
+    """Outcome of replaying one episode.
 
     Attributes:
         episode: ``episode 3`` of the dataset, or a file and its group.
