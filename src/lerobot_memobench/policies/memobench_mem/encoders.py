@@ -20,9 +20,9 @@ from torch.nn.functional import rms_norm
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, SIDE, WIDTH, VisualEncoder, resized
+from lerobot_memobench.policies.compatibility import cure
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MEMORY_GRID
 from lerobot_memobench.policies.memobench_mem.memory.encoder import PooledMemoryEncoder
-from lerobot_memobench.policies.compatibility import cure
 
 LOUD = 8.0
 """How much larger than a layer's output tokens are made; at 1 they learned slower."""

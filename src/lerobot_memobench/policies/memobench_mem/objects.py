@@ -18,6 +18,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.detector import Detector
 from lerobot_memobench.perception.objects import ObjectLocalizer
 from lerobot_memobench.perception.visual_encoder import SIDE
+from lerobot_memobench.policies.compatibility import cure
 from lerobot_memobench.policies.memobench_mem.detection_noise import with_detection_noise
 from lerobot_memobench.policies.memobench_mem.encoders import (
     ENCODED,
@@ -27,7 +28,6 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
     fingerprint,
 )
 from lerobot_memobench.policies.memobench_mem.memory.encoder import PooledMemoryEncoder
-from lerobot_memobench.policies.compatibility import cure
 from lerobot_memobench.protocol import CAMERAS
 from lerobot_memobench.sim.object_layout import FIELDS, SIZE, SLOTS, WIDTH, field
 from lerobot_memobench.sim.object_slots import classes
