@@ -58,8 +58,8 @@ class UntrainedConfig(PreTrainedConfig):
 class MemobenchExpertConfig(UntrainedConfig):
     """Nothing to choose: the action comes from the environment's expert (``--env.expert_action=true``)."""
 
-    knows_phases: ClassVar[bool] = True
-    sees: ClassVar[tuple[str, ...]] = (SIMULATOR,)
+    reads_prompt: ClassVar[bool] = True
+    inputs: ClassVar[tuple[str, ...]] = (SIMULATOR,)
 
 
 @PreTrainedConfig.register_subclass("memobench_blind")
@@ -79,7 +79,7 @@ class MemobenchRandomConfig(UntrainedConfig):
             arm trembles about one place; towards 1 it wanders.
     """
 
-    sees: ClassVar[tuple[str, ...]] = ()
+    inputs: ClassVar[tuple[str, ...]] = ()
 
     seed: int = 0
     smoothing: float = 0.0

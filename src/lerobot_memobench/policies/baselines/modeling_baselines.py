@@ -39,7 +39,7 @@ class UntrainedPolicy(PreTrainedPolicy):
             "--policy.type=memobench_mem."
         )
 
-    def looks_next(self) -> bool:
+    def needs_observation(self) -> bool:
         """Whether it needs the images of the next observation: never."""
         return False
 
