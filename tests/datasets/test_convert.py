@@ -157,7 +157,7 @@ def test_a_prompt_video_whose_end_is_not_told(butter, tmp_path):
     np.testing.assert_array_equal(restored.satisfied, butter.satisfied)
     assert restored.success
     moved = replace(found, states=found.states + np.linspace(0, 1, len(found.states))[:, None])
-    with pytest.raises(MemobenchError, match="timestep_exec_start_idx is -1 for a task with a prompt video"):
+    with pytest.raises(MemobenchError, match="timestep_exec_start_idx is -1 for a task with a demonstration prompt"):
         restore(restored.task, moved)
 
 

@@ -198,7 +198,7 @@ def test_digest_sees_every_part(make_demo, make_task):
         ({"actions": np.zeros((4, 6), dtype=np.float32)}, "actions"),
         ({"proprio": np.zeros((4, 8))}, "proprio has type float64"),
         ({"satisfied": np.zeros((4, 3), dtype=np.bool_)}, "satisfied"),
-        ({"satisfied": np.ones((4, 2), dtype=np.bool_), "exec_start": 1}, "prompt video"),
+        ({"satisfied": np.ones((4, 2), dtype=np.bool_), "exec_start": 1}, "demonstration prompt"),
         ({"exec_start": 4}, "execution starts at frame 4 of 4"),
         ({"images": {"image": np.zeros((4, 8, 8, 3), dtype=np.uint8)}}, "images"),
         ({"images": {"image": np.zeros((4, 8, 8), dtype=np.uint8)}}, "images"),

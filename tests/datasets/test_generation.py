@@ -125,7 +125,7 @@ def test_failures_are_reported_everywhere(tasks, recorded, tmp_path):
 def test_the_card_says_whether_prompts_are_in_it(tasks, recorded, tmp_path, demonstration_prompt):
     run(tasks, tmp_path / "ds", demonstration_prompt=demonstration_prompt)
     card = (tmp_path / "ds" / "README.md").read_text()
-    assert ("referent fixed, prompt videos left out." in card) == (not demonstration_prompt)
+    assert ("referent fixed, demonstration prompts left out." in card) == (not demonstration_prompt)
 
 
 def test_nothing_but_failures_makes_no_dataset(tasks, recorded, tmp_path):

@@ -24,7 +24,7 @@ REPO = "local/test"
 
 @pytest.fixture
 def demos(make_demo, make_task):
-    """Three episodes of two tasks; the last two begin with a prompt video of 5 frames."""
+    """Three episodes of two tasks; the last two begin with a demonstration prompt of 5 frames."""
     second = make_task("SU", name="other_task", memory_type="object")
     a = ["0" * 8 + "1" * 17, "0" * 20 + "1" * 5]
     b = ["0" * 9 + "1" * 21, "0" * 29 + "1"]

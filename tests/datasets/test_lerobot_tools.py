@@ -39,7 +39,7 @@ REPO = "local/ours"
 
 @pytest.fixture(scope="module")
 def demos() -> list[Demonstration]:
-    """Stove, butter (with a prompt video), stove; without images."""
+    """Stove, butter (with a demonstration prompt), stove; without images."""
     kinds = [(STOVE, 10_000), (BUTTER, 10_000), (STOVE, 10_001)]
     return [record_demonstration(get_task(task), seed, images=False) for task, seed in kinds]
 

@@ -108,7 +108,7 @@ def test_every_kind_of_policy_says_what_it_saw(policy: Any, shown: str, seen: st
 def test_object_poses_are_refused_or_named(tmp_path: Path) -> None:
     """By `lerobot-eval`, which ended in a KeyError, and by `lerobot eval`, which showed them without a word."""
     policy = checkpoint(tmp_path / "policy", PICTURE | OBJECT_POSES)
-    with pytest.raises(MemobenchError, match=r"does not show what the policy sees \(privileged .* set it to both"):
+    with pytest.raises(MemobenchError, match=r"lacks inputs of the policy \(privileged .* set it to both"):
         lerobot_eval(policy, tmp_path / "plain")
     assert not (tmp_path / "plain" / "episodes").exists()
     assert lerobot_eval(policy, tmp_path / "plain", "--env.obs_type=both") == 0

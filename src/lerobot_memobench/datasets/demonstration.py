@@ -19,7 +19,7 @@ from lerobot_memobench.tasks.task import Task
 
 @dataclass(frozen=True, eq=False)
 class Demonstration:
-    """One episode, T frames of it; frame t shows what was seen before ``actions[t]`` was applied.
+    """One episode, T frames of it; frame t is the observation before ``actions[t]`` was applied.
 
     Attributes:
         task: the task as it was carried out; with ``variant`` k > 0 this is ``task.variant(k)`` already.
@@ -27,18 +27,18 @@ class Demonstration:
         referent: ``"fixed"`` or ``"random"``; of a strict task ``"drawn"``.
         variant: which admissible referent or order was asked for; 0 is the published one.
         states: (T, D) float64, the simulator's flattened state (1 + nq + nv).
-        actions: (T, 7) float32, OSC pose deltas and gripper: what is to be done at this frame.
+        actions: (T, 7) float32, OSC pose deltas and gripper: the label of this frame.
         proprio: (T, 8) float32, end-effector position 3, axis-angle 3, gripper joints 2.
         images: ``{"image", "wrist_image"}`` to (T, H, W, 3) uint8, or None.
-        exec_start: the frame at which execution starts; the frames before it are the prompt video.
+        exec_start: the frame at which execution starts; the frames before it are the demonstration prompt.
         satisfied: (T, K) bool, predicate of checkpoint k true at frame t; false throughout the prompt. The
             world is evaluated after a control step, so frame ``exec_start`` (step 0) is false as well.
         success: whether the goal was reached.
         fixture_poses: fixture name to (7,) position and quaternion wxyz.
         model_xml: the scene as MJCF, or empty.
         scene_hash: hash of the initial scene, or empty.
-        objects: (T, SIZE) float32, what could be seen as objects (`sim.object_slots`), or None.
-        executed: (T, 7) float32, what was really applied where the arm was moved off its way; None: ``actions``.
+        objects: (T, SIZE) float32, the visible objects (`sim.object_slots`), or None.
+        executed: (T, 7) float32, the actions really applied where the arm was moved off its way; None: ``actions``.
 
     Raises:
         MemobenchError: arrays of different length, or of another type or width than stated above.
@@ -90,8 +90,8 @@ class Demonstration:
             )
         if self.satisfied[: self.exec_start].any():
             raise MemobenchError(
-                f"{self._where()}: a checkpoint is satisfied in the prompt video, before frame {self.exec_start}; "
-                "checkpoints count from the start of execution only"
+                f"{self._where()}: a checkpoint is satisfied in the demonstration prompt, before frame "
+                f"{self.exec_start}; checkpoints count from the start of execution only"
             )
 
     def _where(self) -> str:
@@ -109,7 +109,7 @@ class Demonstration:
             )
 
     def __len__(self) -> int:
-        """Return T, the number of frames, prompt video included."""
+        """Return T, the number of frames, demonstration prompt included."""
         return len(self.states)
 
     @property

@@ -182,7 +182,7 @@ class _Plan:
         """A sentence for the card."""
         referent, prompts = (
             self.settings.referent,
-            "" if self.settings.demonstration_prompt else ", prompt videos left out",
+            "" if self.settings.demonstration_prompt else ", demonstration prompts left out",
         )
         more = "" if self.prompted_episodes is None else f" ({self.prompted_episodes} of those with a prompt)"
         seeds = f"{self.episodes} seeds per task{more} from {self.seed_base} on"
@@ -234,8 +234,8 @@ def _check_prompts(tasks: Sequence[Task], demonstration_prompt: bool) -> None:
     hiding = next((task for task in tasks if task.prompt is not None and not task.prompt.restores), None)
     if hiding is not None and not demonstration_prompt:
         raise MemobenchError(
-            f"demonstrations of {hiding.name} were asked for without its prompt video, which hides what is to be "
-            "found; leave out --no-demonstration-prompt"
+            f"demonstrations of {hiding.name} were asked for without its demonstration prompt, which hides what is to "
+            "be found; leave out --no-demonstration-prompt"
         )
 
 

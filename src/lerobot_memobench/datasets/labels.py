@@ -196,7 +196,7 @@ def digest(demo: Demonstration) -> str:
     """Return the sha256 (hex) of an episode: identity, states, actions and the label columns.
 
     Images are left out: they follow from the states, and a renderer may differ in a pixel where physics does
-    not. So are the objects that could be seen, and ``coarse_subgoal`` and ``subtask``, which the other columns and the
+    not. So are the visible objects, and ``coarse_subgoal`` and ``subtask``, which the other columns and the
     task decide: they came later than the first datasets, and their hashes stay what they are.
     """
     found = labels(demo)

@@ -130,18 +130,18 @@ class _PictureCheck:
         if frame not in self._frames or self.difference is not None:
             return
         for camera, frames in self._recorded.items():
-            drawn, seen = sim.render(CAMERAS[camera]), frames[self._frames.index(frame)]
-            told = _unlike(drawn, seen)
+            drawn, recorded = sim.render(CAMERAS[camera]), frames[self._frames.index(frame)]
+            told = _unlike(drawn, recorded)
             if told:
                 self.difference = Disagreement(image_key(camera), frame, told, "what the simulator draws")
                 return
 
 
-def _unlike(drawn: NDArray[np.uint8], seen: NDArray[np.uint8]) -> str:
+def _unlike(drawn: NDArray[np.uint8], recorded: NDArray[np.uint8]) -> str:
     """Return how far a recorded picture is from one that was drawn, "" where a codec explains it."""
-    if drawn.shape != seen.shape:
-        return f"a picture of {seen.shape[0]}×{seen.shape[1]} pixels"
-    off = drawn.astype(np.float32) - seen
+    if drawn.shape != recorded.shape:
+        return f"a picture of {recorded.shape[0]}×{recorded.shape[1]} pixels"
+    off = drawn.astype(np.float32) - recorded
     psnr = 10 * np.log10(255**2 / max(float((off**2).mean()), 1e-9))
     rows, columns = (np.linspace(0, size, BLOCKS + 1).astype(int)[:-1] for size in off.shape[:2])
     sums = np.add.reduceat(np.add.reduceat(off, rows, axis=0), columns, axis=1)
@@ -156,7 +156,7 @@ def resimulate(
     """Apply (T, 7) float32 actions, starting in the scene of ``seed``; return the demonstration they make.
 
     It has no images; ``watch`` looks at each frame. At frame ``exec_start`` the scene goes back to where it began, as
-    after a prompt video that hides nothing.
+    after a demonstration prompt that hides nothing.
     """
     sim = Simulation(task, None if watch is None else watch.settings)
     sim.reset(seed)
@@ -207,8 +207,8 @@ def _labelled(again: Demonstration, wanted: NDArray[np.float32], **identity: Any
 
 def demonstration_columns(demo: Demonstration, objects: str = OBJECTS) -> Columns:
     """Return states, proprioception and labels under the dataset's column names; ``objects`` is that of the objects."""
-    seen = {} if demo.objects is None else {objects: demo.objects}
-    return {"states": demo.states, "observation.state": demo.proprio, **seen, **labels(demo).columns()}
+    found = {} if demo.objects is None else {objects: demo.objects}
+    return {"states": demo.states, "observation.state": demo.proprio, **found, **labels(demo).columns()}
 
 
 def _whole(demo: Demonstration) -> dict[str, Any]:

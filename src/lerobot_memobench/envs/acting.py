@@ -1,4 +1,4 @@
-"""Who acts, what does it see, and which episodes were asked for? What LeRobot's command line tells an environment.
+"""Who acts, on what inputs, and which episodes were asked for: what LeRobot's command line tells an environment.
 
 An environment's configuration holds nothing of the policy, and it is the environment that writes the log: what a line
 leaves out, such as whose episode it is, nobody can tell afterwards.
@@ -44,7 +44,7 @@ class Acting:
 
     Attributes:
         policy: ``type``, ``identity`` and, of a checkpoint in a folder, ``sha256``; {} where nobody knows.
-        inputs: what it sees, in words; None where nobody knows.
+        inputs: of the policy, in words; None where nobody knows.
         run: names this run of LeRobot's evaluation; a log may hold several, of one policy.
         seeds: of the episodes that were asked for; None where nobody knows. LeRobot runs whole batches, and what it
             runs beyond these is no part of the evaluation.

@@ -69,13 +69,13 @@ class MemobenchEnvConfig(EnvConfig):
         task: the same, for those used to LeRobot's field.
         task_dir: a folder in the published format to run instead of the catalogue (one task, or a tree of them), all
             of it.
-        obs_type: what is seen beside the arm's state: `pixels_agent_pos`, pictures; `environment_state_agent_pos`, what
+        obs_type: observations beside the arm's state: `pixels_agent_pos`, pictures; `environment_state_agent_pos`, what
             they would show as object slots (`observation.environment_state`), and nothing is drawn; or `both`.
         referent: `fixed`, the published goals, or `random`: by seed another admissible referent or order. Strict tasks
             are drawn by seed whatever is said here: `drawn`.
-        demonstration_prompt: whether object and procedural tasks begin with their prompt video.
-        prompt_in: `steps`, the policy sees the prompt step by step, with `phase` 0; `reset`, it plays before the first
-            observation; `auto`: in steps for a policy that knows phases, in reset for any other (`envs.prompting`).
+        demonstration_prompt: whether object and procedural tasks begin with their demonstration prompt.
+        prompt_in: `steps`, the policy observes the prompt step by step, with `phase` 0; `reset`, it plays before the
+            first observation; `auto`: in steps for a policy that reads prompts, in reset for any other (`envs.prompting`).
         horizon: execution steps per episode.
         render: `fast` (no shadows), `default`, or `high` (four samples per pixel, finer shadows).
         render_every: draw images every so many execution steps and repeat the last in between. Set it to the number

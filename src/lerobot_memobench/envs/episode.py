@@ -1,7 +1,7 @@
 """One episode of one seed: settle, show the prompt, let the policy act, keep the books.
 
-The gym environment and the recorder of demonstrations both run on this class, so what a dataset holds and what a
-policy sees at evaluation cannot drift apart.
+The gym environment and the recorder of demonstrations both run on this class, so datasets and a policy's
+observations at evaluation cannot drift apart.
 """
 
 from __future__ import annotations

@@ -74,9 +74,7 @@ def check_obs_type(policy: Any, obs_type: str) -> None:
     if needed is not None and obs_type not in (needed, BOTH):
         wanted = BOTH if needed == BOTH else f"{needed} or {BOTH}"
         told = "" if needed == PIXELS else f" ({PRIVILEGED} among it)"
-        raise MemobenchError(
-            f"env.obs_type is {obs_type}, which does not show what the policy sees{told}; set it to {wanted}"
-        )
+        raise MemobenchError(f"env.obs_type is {obs_type}, which lacks inputs of the policy{told}; set it to {wanted}")
 
 
 def policy_inputs(policy: Any, obs_type: str, oracle_memory: bool = False) -> str:

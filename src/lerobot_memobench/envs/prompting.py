@@ -1,6 +1,6 @@
-"""Where does the prompt play: in steps that the policy sees, or within `reset`? It depends on what the policy knows.
+"""Where does the demonstration prompt play: in steps that the policy observes, or within `reset`?
 
-A policy that knows phases declares it on the class of its configuration, ``reads_prompt: ClassVar[bool] = True``: it
+A policy that reads prompts declares it on the class of its configuration, ``reads_prompt: ClassVar[bool] = True``: it
 waits while `observation.phase` is 0, and plans anew when it becomes 1. Any other policy would act on a recording, and
 its queue would still hold those actions when the scene is restored. To it an episode begins at its first execution
 frame.
@@ -26,7 +26,7 @@ PLACES = (AUTO, STEPS, RESET)
 
 
 def reads_prompt(policy: object) -> bool:
-    """Return whether a policy's configuration, or its class, declares that it knows phases."""
+    """Return whether a policy's configuration, or its class, declares that it reads prompts."""
     return bool(getattr(policy, "reads_prompt", False))
 
 

@@ -10,7 +10,7 @@
 
 ``meta_data`` is the task's metadata as JSON, with ``key_frame`` (for each checkpoint the frame at which it was
 completed in order) and ``timestep_exec_start_idx`` (the frame at which execution starts) filled in. Frame t shows
-what was seen before ``actions[t]``.
+the observation before ``actions[t]``.
 
 What this package knows beyond the layout is in further attributes, so that every reader of the layout finds what
 it expects and nothing else among the arrays: of ``data`` ``task_metadata``; of a demonstration ``seed``,

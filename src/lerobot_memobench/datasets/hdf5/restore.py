@@ -97,8 +97,8 @@ def _told_truth(task: Task, demo: PublishedDemo, exec_start: int) -> NDArray[np.
 def execution_start(task: Task, demo: PublishedDemo) -> int:
     """Return the frame at which execution starts.
 
-    Where ``timestep_exec_start_idx`` is missing (-1) it is 0 for a task without prompt video, else the last frame
-    at which the scene is back exactly where it began.
+    Where ``timestep_exec_start_idx`` is missing (-1) it is 0 for a task without demonstration prompt, else the last
+    frame at which the scene is back exactly where it began.
     """
     value = demo.metadata.get("timestep_exec_start_idx", -1)
     values = value if isinstance(value, list) else [value]
@@ -115,8 +115,8 @@ def execution_start(task: Task, demo: PublishedDemo) -> int:
     if back.size:
         return int(back[-1])
     raise Unusable(
-        "timestep_exec_start_idx is -1 for a task with a prompt video, and no later frame shows the scene back at its "
-        "start: write the frame at which execution starts into meta_data"
+        "timestep_exec_start_idx is -1 for a task with a demonstration prompt, and no later frame shows the scene back "
+        "at its start: write the frame at which execution starts into meta_data"
     )
 
 
@@ -217,7 +217,7 @@ def _read_off(
     prompt: int,
 ) -> _ReadOff:
     """Show the states to the simulator one after the other and note what it says; the first ``prompt`` frames are of
-    this package's prompt video.
+    this package's demonstration prompt.
     """
     progress = Progress(task)
     look = ObjectSlots(sim)

@@ -34,10 +34,10 @@ SCRIPTED = (
 LIMITATIONS = """\
 - It is one simulated kitchen with one Panda arm and one scripted expert: each task is done in one way, by one
   instruction, and nothing is known of real pictures.
-- In tasks with a prompt video the texts of subgoals, memory and language rows name what only the prompt shows: which
-  carton, which bowl, which drawer, which order. A policy that reads them where it acts is not tested for memory.
+- In tasks with a demonstration prompt the texts of subgoals, memory and language rows name what only the prompt shows:
+  which carton, which bowl, which drawer, which order. A policy that reads them where it acts is not tested for memory.
 - Visible objects, states, seeds and checkpoint columns are the simulator's: no camera tells them.
-- Frames of prompt videos are demonstrations of what to remember, not of what to do."""
+- Frames of demonstration prompts are demonstrations of what to remember, not of what to do."""
 COLUMNS = {
     "observation.images.image": "third-person camera",
     "observation.images.wrist_image": "wrist camera",
@@ -47,7 +47,7 @@ COLUMNS = {
     "privileged.environment_state": "the same where there are pictures: true poses, which LeRobot's own training takes "
     "for no input; `memobench_mem` with `perception=objects` reads them, others by `lerobot train obs_type=both`",
     "executed_action": "what moved the arm: `action`, but where it was moved off its way (`generate --perturb`)",
-    "phase": "0 prompt video (the policy does not act), 1 execution",
+    "phase": "0 demonstration prompt (the policy does not act), 1 execution",
     "checkpoint.index": "number of checkpoints completed in order before this frame",
     "checkpoint.operation": "of the next one: 0 Storage, 1 Update, 2 Compression; −1 when none is left",
     "checkpoint.completed": "checkpoint k has been satisfied by now; false beyond the task's count",
@@ -67,7 +67,7 @@ EPISODE_COLUMNS = {
     "family": "group of similar tasks",
     "operations": "labels of the checkpoints in order, e.g. SUC",
     "seed": "seed of the scene",
-    "referent": "fixed; random: the prompt video decides what the goal is; drawn: so is every strict task, by seed",
+    "referent": "fixed; random: the demonstration prompt decides the goal; drawn: so is every strict task, by seed",
     "variant": "which admissible referent or order; 0 is the published one",
     "success": "the goal was reached",
     "exec_start_index": "frame at which execution starts",
@@ -237,8 +237,8 @@ def _introduction(infos: Sequence[Mapping[str, Any]], loading: str) -> list[str]
         "which of them are done, because the simulator wrote the labels. Benchmark and metrics: MEMOBench; generator, "
         "environment and policies: `lerobot_memobench`.",
         loading,
-        "`execution` leaves out the frames of prompt videos, in which the policy does not act; `lerobot train` of "
-        "`lerobot_memobench` leaves them out by itself. One memory type alone: `episode_filter=lambda episode: "
+        "`execution` leaves out the frames of demonstration prompts, in which the policy does not act; `lerobot train` "
+        "of `lerobot_memobench` leaves them out by itself. One memory type alone: `episode_filter=lambda episode: "
         'episode["memory_type"] == "spatial"`. Pass `collate_fn=lerobot.utils.collate.lerobot_collate_fn` to a '
         "DataLoader of your own: language rows differ in number between episodes. `lerobot-train` does so by itself.",
     ]
@@ -287,7 +287,7 @@ def statistics_section(
     """Return the paragraphs of the card's statistics, from what is known of each episode."""
     return [
         "## Statistics",
-        "Steps are frames: control steps of 50 ms, prompt video included. The paper's rows are those of its "
+        "Steps are frames: control steps of 50 ms, demonstration prompt included. The paper's rows are those of its "
         "demonstrations (appendix, family level statistics), stored as HDF5; storage here is that of the "
         "LeRobotDataset: videos as they are, everything else in proportion to the frames.",
         lengths_table(written, storage),
@@ -304,7 +304,7 @@ def _prompts(infos: Sequence[dict[str, Any]]) -> str:
         lengths = [info["exec_start_index"] for info in infos if info["memory_type"] == name]
         if any(lengths):
             parts.append(f"{np.mean(lengths):.1f} in {name} tasks")
-    return f"Of these steps the prompt video takes, on average, {' and '.join(parts)}." if parts else ""
+    return f"Of these steps the demonstration prompt takes, on average, {' and '.join(parts)}." if parts else ""
 
 
 def storage_of(folder: Path, episodes: Sequence[StagedEpisode]) -> dict[str, float]:

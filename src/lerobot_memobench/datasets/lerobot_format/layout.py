@@ -116,7 +116,7 @@ def dataset_features(image_size: tuple[int, int] | None, *, objects: bool = Fals
 
 
 class Info(TypedDict):
-    """A dataset as a whole. Each of its episodes is looked at, so their number is no arbitrary one."""
+    """A dataset as a whole. Each of its episodes is read, so their number is bounded."""
 
     codebase_version: str
     total_episodes: Annotated[int, Ge(0), Le(10_000_000)]
@@ -298,7 +298,7 @@ def undamaged(folder: Path) -> AbstractContextManager[None]:
 def check_whole(folder: Path) -> None:
     """Raise unless the dataset in ``folder`` has all of its frames, as far as that can be told without reading them.
 
-    Looked at are the ends of tables and their numbers of rows, and the boxes of videos and their numbers of frames.
+    Checked are the ends of tables and their numbers of rows, and the boxes of videos and their numbers of frames.
 
     Raises:
         MemobenchError: naming the first file that is cut off or gone, or what is missing of all.
