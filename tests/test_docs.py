@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_memobench.run.arguments import MEANINGS
+from lerobot_memobench.run.arguments import HELP
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("src/**/*.md")])
@@ -58,4 +58,4 @@ def test_the_table_of_short_forms_is_the_help(command: str) -> None:
     lines = text[text.index("| short form |") :].split("\n\n")[0].splitlines()[2:]
     plain = [re.sub(r"\[([^][]*)\]\([^)]*\)", r"\1", line).replace("`", "") for line in lines]
     rows = [tuple(cell.strip() for cell in line.strip("| ").split(" | ")) for line in plain]
-    assert rows == [tuple(meaning)[: len(rows[0])] for meaning in MEANINGS[command]]
+    assert rows == [tuple(meaning)[: len(rows[0])] for meaning in HELP[command]]

@@ -15,7 +15,7 @@ from pathlib import Path
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import read_json, write_file
 from lerobot_memobench.jobs.threads import sharing
-from lerobot_memobench.run.arguments import split_words
+from lerobot_memobench.run.arguments import split_arguments
 from lerobot_memobench.tasks.catalogue import suite_of
 from lerobot_memobench.tasks.task import STRICT
 from research.learning.experiments import PERCEPTIONS, Experiment, Sight
@@ -151,14 +151,14 @@ class Stages:
         Raises:
             MemobenchError: an unknown setting or value, named with the nearest known one.
         """
-        from lerobot_memobench.run.arguments import read_settings
-        from lerobot_memobench.run.training import take_training_words
+        from lerobot_memobench.run.arguments import read_arguments
+        from lerobot_memobench.run.training import take_training_options
 
         for arm in self.experiment.arms if self.experiment.settings else ():
             # All but the dataset, which is not there yet.
             told = [word for word in self.training_words(arm, 0)[2:] if not word.startswith("dataset=")]
-            *_, words = take_training_words(split_words(told))
-            read_settings("train", words)
+            *_, words = take_training_options(split_arguments(told))
+            read_arguments("train", words)
 
     def training_words(self, arm: str, seed: int) -> list[str]:
         """Return the command that trains an arm's policy with one seed."""

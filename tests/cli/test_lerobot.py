@@ -26,7 +26,7 @@ from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID
 from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.run.arguments import EVALUATION_WORDS, MEANINGS, SHORT_FORMS, TRAINING_WORDS, flag_value
+from lerobot_memobench.run.arguments import HELP, RUN_OPTIONS, SHORT_FORMS, TRAINING_OPTIONS, flag_value
 
 TASK = "turn_on_the_stove_and_turn_it_off"
 
@@ -259,12 +259,12 @@ def test_help_explains_every_short_form(
     assert main([command, "--help"]) == 0
     assert (evaluation if command == "eval" else training).flags == ["--help"]
     told = capsys.readouterr().out
-    explained = {word for meaning in MEANINGS[command] for word in meaning.words.split(", ")}
-    known = {"eval": EVALUATION_WORDS, "train": TRAINING_WORDS}[command]
+    explained = {word for row in HELP[command] for word in row.typed.split(", ")}
+    known = {"eval": RUN_OPTIONS, "train": TRAINING_OPTIONS}[command]
     assert {f"{word}=" for word in (*SHORT_FORMS[command], *known, "policy")} <= explained
-    for meaning in MEANINGS[command]:
-        assert f"  {meaning.words}\n" in told
-        assert meaning.sets in " ".join(told.split())
+    for row in HELP[command]:
+        assert f"  {row.typed}\n" in told
+        assert row.sets in " ".join(told.split())
 
 
 # --- train ---
@@ -351,7 +351,7 @@ def test_a_training_goes_on_by_its_folder(training: Called, capsys: pytest.Captu
     assert capsys.readouterr().err == ""
     for flag in ("--resume=True", "--resume"):
         training.flags = None
-        assert main(["train", "config=train_paper", "output_dir=run", flag]) == 0
+        assert main(["train", "output_dir=run", flag]) == 0
         assert training.value("config_path") == "run/checkpoints/last/pretrained_model/train_config.json"
         assert training.value("resume") == "true"
     for stated in ("run/checkpoints/000040/pretrained_model/train_config.json", "somebody/repository"):
@@ -403,6 +403,8 @@ def test_a_training_that_is_over(training: Called, capsys: pytest.CaptureFixture
         (["output_dir=empty"], "output_dir=empty holds no whole checkpoint"),
         ([], "resume=true needs the folder of the training to go on with: output_dir=<folder>"),
         (["output_dir=run", "policy=act"], "the training in run is of policy=memobench_mem, and policy=act was asked"),
+        (["output_dir=run", "config=train_paper"], "config=train_paper is given beside resume=true"),
+        (["output_dir=run", "--config_path=recipe.yaml"], "config_path=recipe.yaml is given beside resume=true"),
     ],
 )
 def test_nothing_to_go_on_with(
@@ -410,6 +412,7 @@ def test_nothing_to_go_on_with(
 ) -> None:
     training_run(Path("run"))
     Path("empty/checkpoints/000010").mkdir(parents=True)
+    Path("recipe.yaml").write_text("steps: 100")
     assert message in refused(["train", "resume=true", *words], training, capsys)
 
 

@@ -150,7 +150,7 @@ def here(fake_lerobot: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
     """Parts run in the process that asks for them."""
 
     def run(job: shards.ShardJob) -> None:
-        assert lerobot(job.words) == 0
+        assert lerobot(job.arguments) == 0
 
     monkeypatch.setattr(shards.ShardJob, "run", run)
     return fake_lerobot

@@ -13,7 +13,7 @@ from safetensors.numpy import save_file
 from lerobot_memobench.policies.checkpoint import check_checkpoint, checkpoint_type
 from lerobot_memobench.policies.memobench_mem.checkpoints import require_agreement, require_statistics
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.run.arguments import read_settings, split_words
+from lerobot_memobench.run.arguments import read_arguments, split_arguments
 from lerobot_memobench.run.card import training_facts
 from tests.support import mutations
 
@@ -60,7 +60,7 @@ def check(tmp_path: Path, files: list[str], count: int) -> tuple[int, int]:
 
     def use(_: random.Random) -> None:
         if files == ["recipe.yaml"]:
-            read_settings("train", split_words([f"config_path={folder / 'recipe.yaml'}"]))
+            read_arguments("train", split_arguments([f"config_path={folder / 'recipe.yaml'}"]))
             return
         training_facts(folder)
         check_checkpoint(str(folder))

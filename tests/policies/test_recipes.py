@@ -14,7 +14,7 @@ from safetensors import safe_open
 
 import lerobot_policy_memobench  # noqa: F401  (registers the policy and the environment)
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.run.arguments import recipe_file, recipes, resolve_recipe, split_words
+from lerobot_memobench.run.arguments import recipe_file, recipes, resolve_recipe, split_arguments
 
 RECIPE = "train_paper"
 WEIGHTS = {"semantic": 0.1, "contrastive": 0.1, "framewise": 0.05}
@@ -108,8 +108,8 @@ def test_every_row_trains(row: str, dataset_root: Path, tmp_path: Path) -> None:
 
 
 def test_names_and_files_are_resolved(tmp_path: Path) -> None:
-    words = resolve_recipe(split_words(["config=train_paper", "steps=3", "--batch_size=2"]))
-    assert words.settings == [("config_path", str(recipes()["train_paper"])), ("steps", "3")]
+    words = resolve_recipe(split_arguments(["config=train_paper", "steps=3", "--batch_size=2"]))
+    assert words.pairs == [("config_path", str(recipes()["train_paper"])), ("steps", "3")]
     assert words.flags == ["--batch_size=2"]
     own = tmp_path / "mine.yaml"
     own.write_text("steps: 1\n")
@@ -119,7 +119,7 @@ def test_names_and_files_are_resolved(tmp_path: Path) -> None:
     with pytest.raises(MemobenchError, match="no such file"):
         recipe_file("nowhere/mine.yaml")
     with pytest.raises(MemobenchError, match="one recipe"):
-        resolve_recipe(split_words(["config=train_paper", "config_path=x.yaml"]))
+        resolve_recipe(split_arguments(["config=train_paper", "config_path=x.yaml"]))
 
 
 def test_an_unknown_recipe_costs_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:

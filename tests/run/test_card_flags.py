@@ -246,9 +246,9 @@ def command_lines(draw: st.DrawFn) -> list[str]:
 @given(command_lines())
 def test_a_card_that_we_write_is_repeated(line: list[str]) -> None:
     plan = plan_line([*line, "output_dir=out"])
-    shard = None if plan.orders.shard is None else str(plan.orders.shard)
+    shard = None if plan.options.shard is None else str(plan.options.shard)
     write_card(Path(), card(plan.portable_flags, shard=shard))
     again = plan_of_card(repeatable_card(Path("card.json")), Path("out"))
     assert sorted(again.portable_flags) == sorted(plan.portable_flags)
-    assert (again.orders, again.policy, again.environment) == (plan.orders, plan.policy, plan.environment)
+    assert (again.options, again.policy, again.environment) == (plan.options, plan.policy, plan.environment)
     assert (again.seed, again.batch, again.grid) == (plan.seed, plan.batch, plan.grid)

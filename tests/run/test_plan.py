@@ -1,31 +1,357 @@
-"""A plan: complete, typed, and what LeRobot is called with by it."""
+"""From a command line to a plan: complete, typed, and unchanged by what is left of it."""
 
 from __future__ import annotations
 
 import dataclasses
+import json
+import shlex
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from lerobot_memobench.run.arguments import LerobotSettings
-from lerobot_memobench.run.plan import EvaluationPlan, Orders
+import lerobot_memobench.registration  # noqa: F401
+from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.envs.episode_log import EpisodeLog
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.run.arguments import LerobotArguments, flag_value, split_arguments
+from lerobot_memobench.run.card import card_of
+from lerobot_memobench.run.plan import EvaluationPlan, Grid, PlannedTask, RunOptions, Shard, plan_line, take_run_options
+from lerobot_memobench.run.run import remainder
+from lerobot_memobench.run.shards import executor_options, plan_shards
+
+STOVE, DRAWER = "turn_on_the_stove_and_turn_it_off", "check_the_top_drawer_of_the_cabinet"
+LINE = ["env=memobench", f"tasks={STOVE},{DRAWER}", "episodes=4", "policy=memobench_random"]
+
+
+@pytest.fixture(autouse=True)
+def in_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("lerobot_memobench.run.arguments.register_plugins", lambda: None)
+
+
+def test_a_plan_says_everything() -> None:
+    plan = plan_line([*LINE, "output_dir=out", "batch_size=2", "shard=2/3"])
+    assert plan.output == plan.log == Path("out/shard-2-of-3")
+    assert (plan.seed, plan.batch, plan.options.shard) == (7, 2, Shard(2, 3))
+    assert plan.command == ("lerobot", "eval", *LINE, "output_dir=out", "batch_size=2", "shard=2/3")
+    assert isinstance(plan.environment, MemobenchEnvConfig)
+    assert plan.policy is not None
+    assert plan.policy.type == "memobench_random"
+    assert plan.grid is not None
+    assert [task.name for task in plan.grid.tasks] == [STOVE, DRAWER]
+    assert (plan.grid.runs, plan.grid.batch, plan.grid.first) == (4, 2, 0)
+    assert flag_value(plan.lerobot_flags, "output_dir") == "out/shard-2-of-3"
+    assert not any("out" in flag for flag in plan.portable_flags)
+    assert not any(Path().iterdir())  # planning writes nothing
+
+
+@pytest.mark.parametrize(
+    ("words", "base"), [([], 7), (["seed=20000"], 20_000), (["seed=20000", "env.seed_base=19990"], 19_990)]
+)
+def test_episodes_are_counted_from_the_first_seed(words: list[str], base: int) -> None:
+    plan = plan_line([*LINE, *words])
+    assert plan.environment is not None
+    assert plan.grid is not None
+    assert plan.environment.seed_base == base
+    assert plan.grid.first == plan.seed - base
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        (["policy=act"], "reset"),
+        (["policy=memobench_random"], "reset"),
+        (["policy=memobench_mem"], "steps"),
+        ([], "steps"),
+        (["policy=act", "prompt_in=steps"], "steps"),
+    ],
+)
+def test_the_prompt_plays_where_the_policy_can_take_it(words: list[str], found: str) -> None:
+    plan = plan_line([*LINE[:-1], *words])
+    assert "--env.prompt_in=" + found in plan.portable_flags
+    assert plan.environment is not None
+    assert plan.environment.protocol["prompt_in"] == found
+
+
+@pytest.mark.parametrize("policy", [["policy=memobench_mem"], ["policy=remote", "policy.dialect=robomme"]])
+def test_repeated_pictures_are_refused_for_policies_that_remember(policy: list[str]) -> None:
+    with pytest.raises(MemobenchError, match=r"env.render_every is 5; leave env.render_every at 1"):
+        plan_line(["env=memobench", f"tasks={STOVE}", *policy, "env.render_every=5"])
+    assert plan_line([*LINE, "env.render_every=5"]).grid is not None
+
+
+OBJECTS = "environment_state_agent_pos"
+
+
+def checkpoint(folder: Path, *seen: str) -> str:
+    """A checkpoint of LeRobot's act as far as planning looks at one."""
+    inputs = {
+        "pictures": {"observation.images.image": {"type": "VISUAL", "shape": [3, 256, 256]}},
+        "objects": {"observation.environment_state": {"type": "ENV", "shape": [208]}},
+    }
+    features = {key: value for name in seen for key, value in inputs[name].items()}
+    folder.mkdir()
+    (folder / "config.json").write_text(json.dumps({"type": "act", "input_features": features}))
+    (folder / "model.safetensors").touch()
+    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
+        (folder / name).write_text(json.dumps({"steps": []}))
+    return f"policy={folder}"
+
+
+@pytest.mark.parametrize(
+    ("seen", "shown"),
+    [(("pictures",), "pixels_agent_pos"), (("objects",), OBJECTS), (("objects", "pictures"), "both")],
+)
+def test_a_checkpoint_is_shown_what_it_was_trained_on(seen: tuple[str, ...], shown: str, tmp_path: Path) -> None:
+    line = [*LINE[:-1], checkpoint(tmp_path / "act", *seen)]
+    plan = plan_line(line)
+    assert plan.environment is not None
+    assert plan.environment.protocol["obs_type"] == shown
+    other = OBJECTS if shown != OBJECTS else "pixels_agent_pos"
+    with pytest.raises(MemobenchError, match=rf"env.obs_type is {other}, which does not show what the policy sees"):
+        plan_line([*line, f"obs_type={other}"])
+
+
+def test_objects_alone_need_nothing_to_draw_with(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Unless films are asked for."""
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    plan = plan_line([*LINE, f"obs_type={OBJECTS}"])
+    assert flag_value(plan.lerobot_flags, "env.videos") == "0"
+    assert card_of(plan)["runs"][0]["gl"] == {}
+    for words in (
+        [],
+        ["obs_type=both"],
+        [f"obs_type={OBJECTS}", "videos=1"],
+        [f"obs_type={OBJECTS}", "env.videos=-1"],
+    ):
+        with pytest.raises(MemobenchError, match="MUJOCO_GL"):
+            plan_line([*LINE, *words])
+
+
+def test_going_on_keeps_the_earlier_batch_size() -> None:
+    Path("out").mkdir()
+    card = {"protocol": {}, "runs": [{"batch_size": 4}]}
+    Path("out/card.json").write_text(json.dumps(card))
+    assert plan_line([*LINE, "output_dir=out", "resume=true"]).batch == 4
+    assert plan_line([*LINE, "output_dir=out", "resume=true", "batch_size=2"]).batch == 2
+    assert plan_line([*LINE, "output_dir=new", "shards=2"]).batch == 1
+
+
+def test_ten_episodes_are_filmed_unless_another_number_is_given() -> None:
+    for words, videos in (([], 10), (["videos=0"], 0), (["env.videos=3"], 3)):
+        environment = plan_line([*LINE, *words]).environment
+        assert environment is not None
+        assert environment.videos == videos
+
+
+def test_what_is_left_is_a_plan_of_its_own() -> None:
+    plan = plan_line([*LINE, "output_dir=out", "resume=true"])
+    before = dataclasses.replace(plan)
+    record = {"task": STOVE, "memory_type": "temporal", "episode": 0, "success": True, "checkpoints": []}
+    EpisodeLog("out").append(record)
+    assert plan.grid is not None
+    drawer = plan.grid.tasks[1]
+    left = remainder(plan, {drawer.key: [(0, 4)]})
+    assert left.output == Path("out/continued-1")
+    assert left.log == Path("out")
+    assert flag_value(left.lerobot_flags, "env.tasks") == DRAWER
+    assert flag_value(left.lerobot_flags, "env.resume") == "true"
+    assert plan == before
+    assert remainder(plan, None) is plan
+
+
+def test_going_on_needs_a_folder() -> None:
+    with pytest.raises(MemobenchError, match="output_dir=<folder>"):
+        plan_line([*LINE, "resume=true"])
+
+
+@pytest.mark.parametrize("here", [False, True], ids=["without a GPU", "with one"])
+def test_the_device_is_decided_where_the_episodes_are_run(here: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not on the login node that hands the parts to Slurm; each part decides on its own machine."""
+    monkeypatch.setattr("torch.cuda.is_available", lambda: here)
+    monkeypatch.setattr("torch.backends.mps.is_available", lambda: False)
+    slurm = ["shards=2", "executor=slurm", "executor_option=partition=a", "executor_option=time=1:00"]
+    for parts in (slurm, ["shards=2"]):
+        (job, _) = plan_shards(plan_line([*LINE, "output_dir=out", *parts]), ("-m", "part"), print)
+        assert not any("policy.device" in word for word in job.arguments)
+        assert (job.beside == 2) is (parts != slurm)  # a node of its own, or this one
+    assert plan_line([*LINE, "shard=1/2", "output_dir=out"]).arguments.get("policy.device") == (None if here else "cpu")
+    (job, _) = plan_shards(plan_line([*LINE, "output_dir=out", "device=cuda", *slurm]), ("-m", "part"), print)
+    assert "--policy.device=cuda" in job.arguments  # what a user says stays
+
+
+def test_a_login_node_needs_no_gl_library(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setattr("ctypes.util.find_library", lambda name: None)
+    slurm = ["executor=slurm", "executor_option=partition=a", "executor_option=time=1:00"]
+    assert plan_line([*LINE, "output_dir=out", "shards=2", *slurm]).draws
+    with pytest.raises(MemobenchError, match="libegl1"):
+        plan_line([*LINE, "output_dir=out", "shards=2"])
+
+
+@pytest.mark.parametrize(
+    ("parameters", "words", "needs"),
+    [
+        (900_000, [], (2, 4, 0)),
+        (3_500_000_000, [], (2, 18, 1)),  # 14 GB of weights, twice, beside 8 GB
+        (900_000, ["device=cuda"], (2, 4, 1)),
+        (3_500_000_000, ["device=cpu"], (2, 18, 0)),
+    ],
+)
+def test_a_part_on_slurm_asks_for_what_its_policy_needs(
+    parameters: int, words: list[str], needs: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("lerobot_memobench.run.shards.parameters_of", lambda path: parameters)
+    slurm = ["executor=slurm", "executor_option=partition=a", "executor_option=time=1:00"]
+    line = [*LINE[:3], "policy=memobench_small", "obs_type=environment_state_agent_pos", *words]
+    options = executor_options(plan_line([*line, "output_dir=out", "shards=2", *slurm]))
+    assert (options["cpus_per_task"], options["mem_per_cpu_gb"], options["gpus_per_task"]) == needs
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        (["shard=2/4", "output_dir=out"], ["shard=2/4", "resume=true", "output_dir=out"]),
+        (["--output_dir", "my out", "resume=false"], ["resume=true", "output_dir=my out"]),
+    ],
+)
+def test_the_command_that_goes_on(words: list[str], found: list[str]) -> None:
+    plan = plan_line([*LINE, *words])
+    assert shlex.split(plan.going_on) == ["lerobot", "eval", *LINE, *found]
+    again = plan_line(shlex.split(plan.going_on)[2:])
+    assert (again.log, again.options.resume) == (plan.log, True)
+
+
+# --- the plan itself ---
 
 
 def evaluation(*flags: str) -> EvaluationPlan:
-    settings = LerobotSettings(flags)
-    return EvaluationPlan(settings, None, None, None, Path("out"), Path("log"), 7, 1, Orders(), ("lerobot", "eval"))
+    return EvaluationPlan(
+        LerobotArguments(flags), None, None, None, Path("out"), Path("log"), 7, 1, RunOptions(), ("lerobot", "eval")
+    )
 
 
 def test_flags_are_complete_but_for_what_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("checkpoint").mkdir()
-    asked = evaluation("--policy.path=checkpoint", "--seed", "7", "--env.videos=-1")
+    asked = evaluation("--policy.path=checkpoint", "--seed=7", "--env.videos=-1")
     assert asked.portable_flags == ["--seed=7", "--env.videos=-1", f"--policy.path={tmp_path / 'checkpoint'}"]
     assert evaluation("--policy.path=user/name").portable_flags == ["--policy.path=user/name"]  # a repository stays one
-    given = ["--policy.path=checkpoint", "--seed", "7", "--env.videos=-1"]
+    given = ["--policy.path=checkpoint", "--seed=7", "--env.videos=-1"]
     assert asked.lerobot_flags == [*given, "--output_dir=out", "--env.log_dir=log"]
 
 
 def test_a_plan_never_changes() -> None:
     with pytest.raises(dataclasses.FrozenInstanceError):
         evaluation().output = Path("elsewhere")  # type: ignore[misc]
+
+
+# --- how it is run ---
+
+
+def run_options(*given: str) -> RunOptions:
+    return take_run_options(split_arguments(given))[0]
+
+
+def test_run_options_are_taken_out_of_the_arguments() -> None:
+    taken, rest = take_run_options(split_arguments(["env=memobench", "resume=true", "episodes=3", "shard=2/3"]))
+    assert rest.pairs == [("env", "memobench"), ("episodes", "3")]
+    assert (taken.resume, taken.shard, taken.any) == (True, Shard(2, 3), True)
+    assert not run_options().any
+
+
+def test_executors_and_their_options() -> None:
+    taken = run_options(
+        "shards=8", "workers=2", "executor=slurm", "executor_option=partition=gpu", "executor_option=mem=4"
+    )
+    assert (taken.shards, taken.workers, taken.executor) == (8, 2, "slurm")
+    assert taken.executor_options == {"partition": "gpu", "mem": 4}
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("shard=0/4", "i from 1 to n"),
+        ("shard=5/4", "i from 1 to n"),
+        ("shard=2", "i from 1 to n"),
+        ("shard=a/b", "i from 1 to n"),
+        ("shard=-1/4", "i from 1 to n"),
+        ("shards=0", "from 1 on"),
+        ("shards=many", "from 1 on"),
+        ("resume=yes", "true or false"),
+        ("executor=slurm", "shards=8"),
+        ("workers=3", "shards=8"),
+    ],
+)
+def test_run_options_that_cannot_be_obeyed(word: str, message: str) -> None:
+    with pytest.raises(MemobenchError, match=message):
+        run_options(word)
+
+
+def test_one_part_or_all_of_them() -> None:
+    with pytest.raises(MemobenchError, match="one part"):
+        run_options("shard=1/2", "shards=2")
+
+
+# --- which episodes are run, in which batches ---
+
+
+def grid(tasks: str = "ab", runs: int = 10, batch: int = 4, first: int = 0) -> Grid:
+    return Grid(tuple(PlannedTask("temporal", k, Path(name)) for k, name in enumerate(tasks)), runs, batch, first)
+
+
+def test_a_whole_evaluation_is_one_range_per_task() -> None:
+    assert grid().ranges(grid().cells()) == {("temporal", 0): [(0, 10)], ("temporal", 1): [(0, 10)]}
+
+
+def test_batches_are_not_taken_apart() -> None:
+    done = {("a", k) for k in range(10)} - {("a", 5)} | {("b", k) for k in range(4)}
+    left = grid().missing(done)
+    assert [(task.name, number) for task, number in left] == [("a", 1), ("b", 1), ("b", 2)]
+    assert grid().ranges(left) == {("temporal", 0): [(4, 4)], ("temporal", 1): [(4, 6)]}
+
+
+def test_holes_are_ranges_of_their_own() -> None:
+    done = {("a", k) for k in range(4, 8)}
+    assert grid("a").ranges(grid("a").missing(done)) == {("temporal", 0): [(0, 4), (8, 2)]}
+
+
+def test_nothing_is_left_of_a_complete_evaluation() -> None:
+    whole = {(name, k) for name in "ab" for k in range(10)}
+    assert grid().missing(whole) == []
+    assert grid().missing(whole | {("c", 0), ("a", 11)}) == []
+
+
+def test_episodes_count_from_the_first() -> None:
+    later = grid("a", runs=3, batch=2, first=5)
+    assert [later.episodes(cell) for cell in later.cells()] == [[("a", 5), ("a", 6)], [("a", 7)]]
+
+
+@given(
+    tasks=st.integers(1, 5), runs=st.integers(1, 60), batch=st.integers(1, 70), count=st.integers(1, 12), data=st.data()
+)
+def test_parts_make_up_the_whole(tasks: int, runs: int, batch: int, count: int, data: st.DataObject) -> None:
+    whole = grid("abcde"[:tasks], runs, min(batch, runs))
+    parts = [whole.cells(Shard(k, count)) for k in range(1, count + 1)]
+    assert [cell for part in parts for cell in part] == whole.cells()
+    assert max(map(len, parts)) - min(map(len, parts)) <= 1
+    episodes = [episode for part in parts for cell in part for episode in whole.episodes(cell)]
+    assert episodes == [(name, k) for name in "abcde"[:tasks] for k in range(runs)]
+    done = data.draw(st.sets(st.sampled_from(episodes)))
+    run = {
+        (whole.tasks[key[1]].name, k)
+        for number in range(1, count + 1)
+        for key, ranges in whole.ranges(whole.missing(done, Shard(number, count))).items()
+        for start, length in ranges
+        for k in range(start, start + length)
+    }
+    assert run | done == set(episodes)
+    assert all(start % whole.batch == 0 for ranges in whole.ranges(whole.missing(done)).values() for start, _ in ranges)
+
+
+def test_parts_have_folders_that_sort() -> None:
+    assert Shard.parse("3/12").folder == "shard-3-of-12"

@@ -1,4 +1,4 @@
-"""``lerobot eval``: parse the words, make the plan, run it, print what it found."""
+"""``lerobot eval``: parse the arguments, make the plan, run it, print what it found."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from lerobot_memobench.evaluation.report_tables import failure_line, inputs_phra
 from lerobot_memobench.io import count_of
 from lerobot_memobench.jobs.executors import asked_for
 from lerobot_memobench.jobs.processes import saying_how_to_go_on
-from lerobot_memobench.run.arguments import Words, read_settings
+from lerobot_memobench.run.arguments import Arguments, read_arguments
 from lerobot_memobench.run.lerobot_commands import call_lerobot
 from lerobot_memobench.run.merging import merge_and_report
-from lerobot_memobench.run.plan import EvaluationPlan, is_benchmark, make_plan, take_orders
+from lerobot_memobench.run.plan import EvaluationPlan, is_benchmark, make_plan, take_run_options
 from lerobot_memobench.run.run import EvaluationReport, run_evaluation
 from lerobot_memobench.run.shards import executor_options, plan_shards, run_shards
 
@@ -28,19 +28,19 @@ SHARD_PROGRAM = ("-m", "lerobot_memobench.cli.lerobot", WITH_PARENT)
 """Arguments of Python that start the process of one part."""
 
 
-def evaluate(words: Words, command: Sequence[str]) -> int:
+def evaluate(given: Arguments, command: Sequence[str]) -> int:
     """Run ``lerobot eval``; an environment of LeRobot's own gets nothing but the checks.
 
     Args:
         command: the whole command line, for the card.
     """
-    orders, words = take_orders(words)
-    settings = read_settings("eval", words)
-    if words.wants_help or not is_benchmark(settings, orders):
-        return call_lerobot("eval", settings.flags)
-    plan = make_plan(settings, orders, command)
+    options, given = take_run_options(given)
+    arguments = read_arguments("eval", given)
+    if given.wants_help or not is_benchmark(arguments, options):
+        return call_lerobot("eval", arguments.flags)
+    plan = make_plan(arguments, options, command)
     with saying_how_to_go_on(lambda: f"lerobot: ended by SIGTERM; go on with: {plan.going_on}"):
-        return evaluate_in_parts(plan) if orders.shards else evaluate_here(plan)
+        return evaluate_in_parts(plan) if options.shards else evaluate_here(plan)
 
 
 def evaluate_here(plan: EvaluationPlan, say_where: bool = True) -> int:
@@ -55,7 +55,7 @@ def evaluate_here(plan: EvaluationPlan, say_where: bool = True) -> int:
         if say_where:
             print(f"report: {ended.report.page}")
     elif not ended.status:
-        print(f"part {plan.orders.shard} holds no episode: there are fewer batches than parts")
+        print(f"part {plan.options.shard} holds no episode: there are fewer batches than parts")
     return ended.status
 
 

@@ -2,7 +2,7 @@
 
 ``key=value`` becomes ``--key=value`` after a check against the command's settings; whatever starts with
 ``--`` is passed on untouched. ``lerobot eval env=memobench`` and ``lerobot train policy=…`` also get the
-defaults that make them work as they stand (``engine.planning``, ``settings.training``).
+defaults that make them work as they stand (``run.plan``, ``run.training``).
 """
 
 from __future__ import annotations
@@ -19,14 +19,13 @@ from lerobot_memobench.cli.console import WITH_PARENT, one_sentence
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.jobs.processes import saying_how_to_go_on
 from lerobot_memobench.run.arguments import (
-    MEANINGS,
-    Words,
+    HELP,
+    Arguments,
     check_task_names,
-    flag_value,
     help_text,
-    read_settings,
+    read_arguments,
     resolve_recipe,
-    split_words,
+    split_arguments,
 )
 from lerobot_memobench.run.lerobot_commands import call_lerobot, lerobot_commands, without_configuration
 
@@ -37,11 +36,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status. Errors a user can mend are one sentence on stderr, status
     2.
     """
-    words = list(sys.argv[1:] if argv is None else argv)
-    again = f"lerobot: ended by SIGTERM; begin anew with: {shlex.join(['lerobot', *words])}"
+    line = list(sys.argv[1:] if argv is None else argv)
+    again = f"lerobot: ended by SIGTERM; begin anew with: {shlex.join(['lerobot', *line])}"
     try:
         with saying_how_to_go_on(lambda: again):
-            return run(words)
+            return run(line)
     except KeyboardInterrupt:
         return 130
     except Exception as error:
@@ -52,66 +51,58 @@ def main(argv: Sequence[str] | None = None) -> int:
         return USAGE_ERROR
 
 
-def run(words: Sequence[str]) -> int:
+def run(line: Sequence[str]) -> int:
     """Run the command line."""
     commands = lerobot_commands()
-    if not words or words[0] in ("-h", "--help", "help"):
+    if not line or line[0] in ("-h", "--help", "help"):
         print(overview(commands))
         return 0
-    name, rest = words[0], split_words(words[1:])
+    name, given = line[0], split_arguments(line[1:])
     if name not in commands:
         raise MemobenchError(f"there is no command {name!r}, {nearest(name, commands)}")
-    if rest.wants_help and name in MEANINGS:
+    if given.wants_help and name in HELP:
         print(help_text(name), flush=True)
     if name == "train":
-        return train(rest, words[1:])
-    check_task_names(rest)
+        return train(given, line[1:])
+    check_task_names(given)
     if name == "eval":
         from lerobot_memobench.cli.evaluate import evaluate
 
-        return evaluate(rest, ("lerobot", *words))
-    return call_lerobot(name, read_settings(name, rest).flags)
+        return evaluate(given, ("lerobot", *line))
+    return call_lerobot(name, read_arguments(name, given).flags)
 
 
-def train(words: Words, line: Sequence[str]) -> int:
+def train(given: Arguments, line: Sequence[str]) -> int:
     """Run ``lerobot train`` with the benchmark's defaults, checked.
 
     Args:
-        line: the words as they were given, for who is to go on with it.
+        line: the arguments as they were typed, for who is to go on with it.
     """
-    from lerobot_memobench.run.training import (
-        complete_training,
-        going_on,
-        how_to_go_on,
-        take_training_words,
-        told_of_going_on,
-        told_of_starting_from,
-    )
+    from lerobot_memobench.run import training
 
     begun = time.time()
-    prompt_frames, obs_type, words = take_training_words(resolve_recipe(going_on(words)))
-    check_task_names(words)
-    settings = read_settings("train", words)
-    if words.wants_help:
-        return call_lerobot("train", settings.flags)
+    prompt_frames, obs_type, given = training.take_training_options(resolve_recipe(training.resumed(given)))
+    check_task_names(given)
+    arguments = read_arguments("train", given)
+    if given.wants_help:
+        return call_lerobot("train", arguments.flags)
     from lerobot_memobench.datasets.lerobot_format.layout import naming_damage
-    from lerobot_memobench.run.training import trained_on
 
-    settings = complete_training(settings)
-    root = flag_value(settings.flags, "dataset.root")
-    note, left = told_of_going_on(settings)
-    for told in (note, told_of_starting_from(settings)):
-        if told is not None:
-            print(told, file=sys.stderr)
+    arguments = training.complete_training(arguments)
+    root = arguments.get("dataset.root")
+    note, left = training.note_on_resume(arguments)
+    for noted in (note, training.note_on_start(arguments)):
+        if noted is not None:
+            print(noted, file=sys.stderr)
     if not left:
         return 0
     with (
-        saying_how_to_go_on(lambda: f"lerobot: {how_to_go_on(settings, line, begun)}"),
-        trained_on(prompt_frames, obs_type),
+        saying_how_to_go_on(lambda: f"lerobot: {training.how_to_go_on(arguments, line, begun)}"),
+        training.trained_on(prompt_frames, obs_type),
         naming_damage(Path(root) if root else None),
         without_configuration(),
     ):
-        return call_lerobot("train", settings.flags)
+        return call_lerobot("train", arguments.flags)
 
 
 def overview(commands: Iterable[str]) -> str:
@@ -146,8 +137,8 @@ def end_with_the_parent() -> None:
 
 
 if __name__ == "__main__":
-    words = sys.argv[1:]
-    if words[:1] == [WITH_PARENT]:
+    typed = sys.argv[1:]
+    if typed[:1] == [WITH_PARENT]:
         end_with_the_parent()
-        words = words[1:]
-    sys.exit(main(words))
+        typed = typed[1:]
+    sys.exit(main(typed))

@@ -178,7 +178,7 @@ class MemobenchEnvConfig(EnvConfig):
 
     def selected(self) -> list[tuple[str, int, Path]]:
         """Return memory type, task id and folder of each chosen task; unknown names raise `MemobenchError`."""
-        from lerobot_memobench.tasks.catalogue import find_tasks, get_task, load_task, resolve_tasks, task_index
+        from lerobot_memobench.tasks.catalogue import find_tasks, load_task, resolve_tasks, task_folder, task_index
 
         if self.task_dir is not None:
             loaded = [load_task(folder) for folder in find_tasks(self.task_dir)]
@@ -190,8 +190,8 @@ class MemobenchEnvConfig(EnvConfig):
                     )
             return [(task.memory_type, index, task.folder) for index, task in enumerate(loaded)]
         spec = self.task if self.task is not None else self.tasks
-        tasks = [get_task(name) for name in resolve_tasks(spec, self.suite)]
-        return [(task.memory_type, task_index(task.name), task.folder) for task in tasks]
+        folders = [task_folder(name) for name in resolve_tasks(spec, self.suite)]
+        return [(folder.parent.name, task_index(folder.name), folder) for folder in folders]
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """Return `{memory type: {task id: vector env}}`; nothing is simulated before an env's first reset."""

@@ -146,7 +146,7 @@ def card_of(plan: EvaluationPlan, *, here: bool = True) -> dict[str, Any]:
     Args:
         here: whether it is run on this machine, whose GL then counts.
     """
-    shard = plan.orders.shard
+    shard = plan.options.shard
     card = new_card(
         protocol=_plan_protocol(plan),
         policy={} if plan.policy is None else policy_facts(encoded(plan.policy), plan.seed),
@@ -171,7 +171,7 @@ def _plan_flags(plan: EvaluationPlan) -> list[str]:
 def _plan_protocol(plan: EvaluationPlan) -> dict[str, Any]:
     if plan.grid is None or plan.environment is None:
         return {}
-    names = sorted(place.task.name for place in plan.grid.places)
+    names = sorted(task.name for task in plan.grid.tasks)
     environment = plan.environment
     found = {"tasks": names, "episodes": plan.grid.runs, **environment.protocol}
     if plan.policy is not None:
@@ -181,8 +181,9 @@ def _plan_protocol(plan: EvaluationPlan) -> dict[str, Any]:
 
 def _task_files(plan: EvaluationPlan) -> dict[str, str]:
     from lerobot_memobench.datasets.generation import task_hash
+    from lerobot_memobench.tasks.catalogue import load_task
 
-    return {} if plan.grid is None else {place.task.name: task_hash(place.task) for place in plan.grid.places}
+    return {} if plan.grid is None else {task.name: task_hash(load_task(task.folder)) for task in plan.grid.tasks}
 
 
 def with_checkpoint(card: dict[str, Any], path: str | None) -> dict[str, Any]:

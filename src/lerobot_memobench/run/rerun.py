@@ -14,8 +14,7 @@ from typing import Any
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import CARD_FILE, read_card
 from lerobot_memobench.policies.checkpoint import local_folder
-from lerobot_memobench.run import arguments as fields
-from lerobot_memobench.run.arguments import chosen_class, flag_value
+from lerobot_memobench.run.arguments import annotation_of, checked_value, chosen_class, flag_value
 from lerobot_memobench.run.card import checkpoint_files, detector_hash, tree_hash
 from lerobot_memobench.run.lerobot_commands import config_class, load_command, register_plugins
 from lerobot_memobench.run.machine import gl_facts, versions
@@ -211,7 +210,7 @@ def _number(config: type, chosen: Mapping[str, type], key: str, value: str) -> s
     if key not in NUMBERS and not of_policy:
         raise _refused(key, value, "which no card sets that is repeated")
     try:
-        annotation = fields.annotation_of(config, key, chosen.get)
+        annotation = annotation_of(config, key, chosen)
     except KeyError:
         raise _refused(key, value, "which is no setting of this policy's") from None
     if value in NOTHING:
@@ -220,7 +219,7 @@ def _number(config: type, chosen: Mapping[str, type], key: str, value: str) -> s
         raise _refused(key, value, "which may name a file or a repository")
     if not _is_closed(annotation) and not _holds_numbers(value):
         raise _refused(key, value, "expected numbers")
-    return fields.checked_value(key, annotation, value)
+    return checked_value(key, annotation, value)
 
 
 def _may_be_text(annotation: Any) -> bool:
@@ -229,7 +228,7 @@ def _may_be_text(annotation: Any) -> bool:
 
 
 def _is_closed(annotation: Any) -> bool:
-    """Whether `fields.checked_value` takes known values only."""
+    """Whether `checked_value` takes known values only."""
     is_enum = isinstance(annotation, type) and issubclass(annotation, enum.Enum)
     return annotation in (bool, int, float) or is_enum or typing.get_origin(annotation) is typing.Literal
 

@@ -19,7 +19,7 @@ from lerobot_memobench.policies.baselines.configuration_baselines import Untrain
 from lerobot_memobench.policies.checkpoint import check_weights, portable_path
 from lerobot_memobench.run.card import card_of, extended, remove_card, with_checkpoint, with_episodes, write_card
 from lerobot_memobench.run.lerobot_commands import call_lerobot, without_chatter
-from lerobot_memobench.run.plan import EvaluationPlan, Range, task_names
+from lerobot_memobench.run.plan import EvaluationPlan, Range
 from lerobot_memobench.run.rollout import calm_output, steered
 
 
@@ -48,11 +48,11 @@ def run_evaluation(plan: EvaluationPlan, tell: Tell, begin: Tell = lambda text: 
     """
     if plan.policy is not None and plan.policy_path is not None:
         check_weights(plan.policy_path, plan.policy)
-    if not plan.orders.resume:
+    if not plan.options.resume:
         check_new(plan.output)
         check_new(plan.log)
     card = card_of(plan)
-    if plan.orders.resume:
+    if plan.options.resume:
         card = resumed_card(plan.log, card, tell)
     ranges = missing(plan)
     if ranges != {}:
@@ -64,7 +64,7 @@ def run_evaluation(plan: EvaluationPlan, tell: Tell, begin: Tell = lambda text: 
 def _what_is_run(plan: EvaluationPlan) -> str:
     who = portable_path(plan.policy_path) if plan.policy_path else getattr(plan.policy, "type", "the policy")
     grid = plan.grid
-    what = "" if grid is None else f" on {count_of(len(grid.places), 'task')}, {count_of(grid.runs, 'episode')} each"
+    what = "" if grid is None else f" on {count_of(len(grid.tasks), 'task')}, {count_of(grid.runs, 'episode')} each"
     return f"evaluating {who}{what}, into {plan.output}"
 
 
@@ -73,7 +73,7 @@ def _run_lerobot(plan: EvaluationPlan, card: dict[str, Any], ranges: Ranges | No
     status, trained = 1, not isinstance(plan.policy, UntrainedConfig)
     try:
         with (
-            nullcontext() if plan.orders.verbose else without_chatter(trained),
+            nullcontext() if plan.options.verbose else without_chatter(trained),
             held(plan),
             calm_output(),
             steered(plan.seed, ranges),
@@ -159,25 +159,25 @@ def _run_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list
 
 def missing(plan: EvaluationPlan) -> Ranges | None:
     """Return the runs that are to be made, in whole batches; None for all of them."""
-    orders = plan.orders
-    if plan.grid is None or plan.environment is None or not (orders.resume or orders.shard is not None):
+    options = plan.options
+    if plan.grid is None or plan.environment is None or not (options.resume or options.shard is not None):
         return None
     done = logged(plan.log, plan.environment.referent)
-    return plan.grid.ranges(plan.grid.missing(done, orders.shard))
+    return plan.grid.ranges(plan.grid.missing(done, options.shard))
 
 
 def remainder(plan: EvaluationPlan, ranges: Ranges | None) -> EvaluationPlan:
     """Return the plan of what is left: tasks that are done are not opened, episodes that are there are left out."""
     if ranges is None or plan.grid is None:
         return plan
-    settings, output = plan.settings, plan.output
-    names = task_names(plan.grid.places, ranges)
-    if len(names) < len(plan.grid.places) and not settings.has("env.task_dir"):
-        settings = settings.changed("env.task" if settings.has("env.task") else "env.tasks", ",".join(names))
+    arguments, output = plan.arguments, plan.output
+    names = [task.name for task in plan.grid.tasks if task.key in ranges]
+    if len(names) < len(plan.grid.tasks) and not arguments.has("env.task_dir"):
+        arguments = arguments.changed("env.task" if arguments.has("env.task") else "env.tasks", ",".join(names))
     if has_log(plan.log):
-        settings = settings.changed("env.resume", True)
+        arguments = arguments.changed("env.resume", True)
         output = unused_subfolder(plan.output)
-    return replace(plan, settings=settings, output=output)
+    return replace(plan, arguments=arguments, output=output)
 
 
 def unused_subfolder(output: Path) -> Path:

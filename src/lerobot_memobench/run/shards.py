@@ -33,7 +33,7 @@ class ShardJob:
     """One part of an evaluation, as a job.
 
     Attributes:
-        program: words after Python's name that start ``lerobot`` in a process which ends when its standard input does.
+        program: arguments of Python that start ``lerobot`` in a process which ends when its standard input does.
         flags: LeRobot's, without folders.
         out: folder of the evaluation.
         episodes: (task, episode) of those that the part consists of.
@@ -66,8 +66,8 @@ class ShardJob:
         return self.shard.number
 
     @property
-    def words(self) -> list[str]:
-        """The command line of the part."""
+    def arguments(self) -> list[str]:
+        """The command line of the part, after ``lerobot``."""
         return ["eval", f"output_dir={self.out}", f"shard={self.shard}", "resume=true", *self.flags]
 
     @property
@@ -92,7 +92,7 @@ class ShardJob:
         self.messages.parent.mkdir(parents=True, exist_ok=True)
         with self.messages.open("ab") as file:
             process = subprocess.Popen(
-                [sys.executable, *self.program, *self.words],
+                [sys.executable, *self.program, *self.arguments],
                 cwd=self.directory,
                 stdin=subprocess.PIPE,
                 stdout=file,
@@ -128,14 +128,14 @@ def plan_shards(plan: EvaluationPlan, program: Sequence[str], tell: Tell) -> lis
     Raises:
         MemobenchError: the executor, the number of parts or what is in the folders forbids it.
     """
-    orders, grid, out = plan.orders, plan.grid, plan.output.absolute()
+    options, grid, out = plan.options, plan.grid, plan.output.absolute()
     assert grid is not None
     assert plan.environment is not None
-    check_executor(orders.executor, orders.executor_options)
-    if orders.shards > len(grid.cells()):
+    check_executor(options.executor, options.executor_options)
+    if options.shards > len(grid.cells()):
         raise MemobenchError(
-            f"shards={orders.shards} is more than the {len(grid.cells())} batches that the evaluation consists of; ask "
-            "for fewer"
+            f"shards={options.shards} is more than the {len(grid.cells())} batches that the evaluation consists of; "
+            "ask for fewer"
         )
     jobs = [
         ShardJob(
@@ -146,9 +146,9 @@ def plan_shards(plan: EvaluationPlan, program: Sequence[str], tell: Tell) -> lis
             episodes=frozenset(episode for cell in grid.cells(shard) for episode in grid.episodes(cell)),
             referent=plan.environment.referent,
             directory=Path.cwd(),
-            beside=1 if orders.executor == "slurm" else min(orders.workers or orders.shards, orders.shards),
+            beside=1 if options.executor == "slurm" else min(options.workers or options.shards, options.shards),
         )
-        for shard in (Shard(k + 1, orders.shards) for k in range(orders.shards))
+        for shard in (Shard(k + 1, options.shards) for k in range(options.shards))
     ]
     _check_folders(plan, out, jobs, tell)
     return jobs
@@ -157,8 +157,8 @@ def plan_shards(plan: EvaluationPlan, program: Sequence[str], tell: Tell) -> lis
 def _check_folders(plan: EvaluationPlan, out: Path, jobs: Sequence[ShardJob], tell: Tell) -> None:
     """Refuse to mix an evaluation with another one in its folder or in those of its parts."""
     check_folder(out)
-    if plan.orders.resume:
-        card = card_of(plan, here=plan.orders.executor not in ELSEWHERE)
+    if plan.options.resume:
+        card = card_of(plan, here=plan.options.executor not in ELSEWHERE)
         for folder in (out, *(job.folder for job in jobs)):
             resumed_card(folder, card, tell)
     else:
@@ -168,11 +168,11 @@ def _check_folders(plan: EvaluationPlan, out: Path, jobs: Sequence[ShardJob], te
 
 def executor_options(plan: EvaluationPlan) -> dict[str, Any]:
     """Return the executor's options, complete: a large policy is given a GPU, and room for its weights twice."""
-    orders, device = plan.orders, plan.settings.get("policy.device")
+    options, device = plan.options, plan.arguments.get("policy.device")
     parameters = parameters_of(plan.policy_path) or 0 if plan.policy_path is not None else 0
     on_gpu = device.startswith("cuda") if device else parameters >= LARGE
     needs = Needs(cores=2, memory_gb=8 + 2 * 4 * parameters // 10**9, gpus=int(on_gpu))
-    return options_told(orders.executor, orders.executor_options, needs)
+    return options_told(options.executor, options.executor_options, needs)
 
 
 def run_shards(
@@ -186,12 +186,12 @@ def run_shards(
     Args:
         finish: what Slurm's last job calls with the evaluation's folder and those of its parts. It is pickled.
     """
-    orders, out, folders = plan.orders, plan.output.absolute(), [job.folder for job in jobs]
+    options, out, folders = plan.options, plan.output.absolute(), [job.folder for job in jobs]
     complete = run_jobs(
         jobs,
-        workers=orders.workers or len(jobs),
+        workers=options.workers or len(jobs),
         progress=progress,
-        executor=orders.executor,
+        executor=options.executor,
         options=executor_options(plan),
         logs=out / LOGS,
         finish=partial(finish, out, folders),

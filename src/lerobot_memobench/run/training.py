@@ -1,4 +1,10 @@
-"""``lerobot train policy=…``: the defaults and checks before LeRobot's training."""
+"""``lerobot train policy=…``: defaults and checks before LeRobot's training, and what is added to it while it lasts.
+
+Whether frames of demonstration prompts are trained on is decided where the policy is known for sure: when LeRobot, its
+configuration complete, has opened the datasets. So are a policy's inputs: our datasets hold pictures and, beside them,
+the privileged object state of what shows in them, and LeRobot would give both to its own policies. What this relies on
+is listed in tests/run/test_lerobot_training.py; how it gets there, and out again: `lerobot_hooks`.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from lerobot.configs import FeatureType
-from lerobot.utils.constants import OBS_STATE
 
-from lerobot_memobench.datasets.execution_frames import ExecutionFrames, leave_out_prompts
 from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, PRIVILEGED
 from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS as INPUT
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, OBS_TYPES, PIXELS
@@ -31,22 +34,21 @@ from lerobot_memobench.policies.checkpoint import (
     differing,
     read_json,
 )
-from lerobot_memobench.policies.compatibility import check_features
 from lerobot_memobench.run.arguments import (
-    TRAINING_WORDS,
-    LerobotSettings,
-    Words,
+    CONFIG_FILE,
+    RECIPE,
+    TRAINING_OPTIONS,
+    Arguments,
+    LerobotArguments,
     checked_value,
-    has_flag,
-    joined_flags,
     whole_number,
-    without_flag,
 )
-from lerobot_memobench.run.plan import check_sight, env_config, policy_config
+
+logger = logging.getLogger(__name__)
 
 INFO_FILE = Path("meta") / "info.json"
 OBJECT_BATCH = 72
-"""Frames per update of a policy that sees objects, or through eyes: a dozen episodes, six moments of each. They lie in
+"""Frames per update of a policy that sees objects, or through a visual encoder: a dozen episodes, six frames of each. They lie in
 main memory, where no loader would be quicker."""
 TRAIN_CONFIG = "train_config.json"
 """LeRobot's file of a training's whole configuration, in each of its checkpoints."""
@@ -55,52 +57,128 @@ TRAINED = ("policy.type", "policy.path", "reward_model.type", "reward_model.path
 """What may say what is trained."""
 
 
-def take_training_words(words: Words) -> tuple[bool | None, str | None, Words]:
-    """Return whether prompt frames are trained on, and what a policy is to see, each None where it is not said; and the
-    words without these.
+def take_training_options(given: Arguments) -> tuple[bool | None, str | None, Arguments]:
+    """Return the options of a command line that LeRobot does not have, and the arguments without them.
+
+    Returns:
+        Whether frames of demonstration prompts are trained on, the kind of observation (each None where it is not
+        said), and the rest.
 
     Raises:
         MemobenchError: the first is neither true nor false, or the second no kind of observation.
     """
-    given = dict(item for item in words.settings if item[0] in TRAINING_WORDS)
-    of_env = {"obs_type"} if any(key == "env" for key, _ in words.settings) else set()  # it is a setting of it, too
-    rest = [item for item in words.settings if item[0] in of_env or item[0] not in TRAINING_WORDS]
-    known = {"true": True, "false": False}
-    prompt_frames, obs_type = given.get("prompt_frames"), given.get("obs_type")
+    found = {key: value for key, value in given.pairs if key in TRAINING_OPTIONS}
+    of_env = {"obs_type"} if any(key == "env" for key, _ in given.pairs) else set()  # it is a setting of it, too
+    rest = [pair for pair in given.pairs if pair[0] in of_env or pair[0] not in TRAINING_OPTIONS]
+    prompt_frames, obs_type = found.get("prompt_frames"), found.get("obs_type")
     if obs_type is not None and obs_type not in OBS_TYPES:
         raise MemobenchError(f"found obs_type={obs_type}, {nearest(obs_type, OBS_TYPES)}")
-    wanted = None if prompt_frames is None else known.get(checked_value("prompt_frames", bool, prompt_frames))
-    return wanted, obs_type, replace(words, settings=rest)
+    if prompt_frames is not None:
+        prompt_frames = checked_value("prompt_frames", bool, prompt_frames)
+    return {"true": True, "false": False}.get(str(prompt_frames)), obs_type, replace(given, pairs=rest)
 
 
-def going_on(words: Words) -> Words:
-    """Return what LeRobot goes on with a training by, where ``output_dir=<run> resume=true`` asks for that.
-
-    LeRobot wants the configuration in the run's last checkpoint named. That holds all that was set when the run began;
-    what is given again, or changed, on the line counts before it.
+def complete_training(arguments: LerobotArguments) -> LerobotArguments:
+    """Return a training run's arguments with the benchmark's defaults; what is wrong with them is told here.
 
     Raises:
-        MemobenchError: there is nothing to go on with, or another policy is named than that of the run.
+        MemobenchError: no policy is named, or the dataset or the model checkpoint is none.
     """
-    bare = words.value("resume") is None and has_flag(words.flags, "resume")
-    wanted = "true" if bare else words.value("resume")
+    from lerobot_memobench.run.plan import check_observations, env_config, policy_config
+
+    from_file = arguments.has(CONFIG_FILE)
+    if not from_file:
+        if not any(arguments.has(key) for key in TRAINED):
+            raise MemobenchError("name a policy: policy=memobench_mem")
+        arguments = arguments.default("dataset.repo_id", DEFAULT_REPO_ID)
+        named = arguments.has("policy.type") or arguments.has("policy.path")
+        if named and not arguments.has("policy.repo_id"):  # LeRobot would ask for one
+            arguments = arguments.default("policy.push_to_hub", False)
+    check_dataset(arguments)
+    check_as_begun(arguments)
+    policy = policy_config(arguments)
+    check_observations(policy, env_config(arguments))
+    steps = whole_number(arguments.get("steps"))
+    if steps is not None and 0 <= steps < 2000 and arguments.get("resume") != "true":
+        # To see the loss of a short run: LeRobot's default is every 200 steps.
+        arguments = arguments.default("log_freq", max(1, steps // 10))
+    if not from_file and getattr(policy, "decodes_no_video", False):
+        arguments = arguments.default("batch_size", OBJECT_BATCH).default("num_workers", 0)
+    if cores() < 4 and not from_file:  # LeRobot's default of 4 loaders would only wait for one another
+        arguments = arguments.default("num_workers", cores())
+    return arguments
+
+
+def check_dataset(arguments: LerobotArguments) -> None:
+    """Refuse a dataset folder that is none."""
+    root = arguments.get("dataset.root")
+    if root is None:
+        return
+    folder = Path(root).expanduser()
+    local_only = (arguments.get("dataset.repo_id") or "").startswith("local/")
+    if not folder.exists() and not local_only:
+        return  # LeRobot downloads the repository into it
+    if not folder.is_dir():
+        raise MemobenchError(
+            f"the dataset folder {root} does not exist; make one with `memobench generate --out {root}`"
+        )
+    if not (folder / INFO_FILE).is_file():
+        raise MemobenchError(
+            f"the folder {root} is not a LeRobot dataset ({INFO_FILE} is missing); make one with "
+            "`memobench generate --out <folder>`"
+        )
+
+
+def note_on_start(arguments: LerobotArguments) -> str | None:
+    """Return a note on a training that begins from a model checkpoint under other settings than its weights were
+    trained for, which fine-tuning may mean; None: there is nothing to note.
+    """
+    from lerobot_memobench.run.plan import policy_config
+
+    path = arguments.get("policy.path")
+    policy = None if path is None else policy_config(arguments)
+    if path is None or policy is None:
+        return None
+    fixed = getattr(policy, "fixed_by_training", ())
+    with quiet():
+        changed = list(differing(policy, as_trained(path, policy), fixed)) if fixed else []
+    if not changed:
+        return None
+    was, now = (", ".join(f"{item[0]}={item[part]}" for item in changed) for part in (2, 1))
+    return f"note: '{path}' was trained with {was}, and its weights are now trained on with {now}"
+
+
+# --- going on with a training: resume=true ---
+
+
+def resumed(given: Arguments) -> Arguments:
+    """Return what LeRobot goes on with a training by, where ``output_dir=<run> resume=true`` asks for that.
+
+    LeRobot wants the configuration in the run's last model checkpoint named. That holds all that was set when the run
+    began; what is given again, or changed, on the line counts before it.
+
+    Raises:
+        MemobenchError: there is nothing to go on with, a recipe is named, or another policy than that of the run.
+    """
+    wanted = "true" if "--resume" in given.flags and given.value("resume") is None else given.value("resume")
     if wanted is None or checked_value("resume", bool, wanted) != "true":
-        return words
-    stated = words.value("config_path")
-    if stated is not None and not (Path(stated).is_file() and Path(stated).name != TRAIN_CONFIG):
-        return words  # LeRobot's own form, by a checkpoint or a repository; another file is the recipe that it began by
-    folder = words.value("output_dir")
+        return given
+    recipe, stated = given.value(RECIPE), given.value(CONFIG_FILE)
+    if recipe is None and stated is not None and not (Path(stated).is_file() and Path(stated).name != TRAIN_CONFIG):
+        return given  # LeRobot's own form, by a checkpoint or a repository
+    named = f"{RECIPE}={recipe}" if recipe is not None else f"{CONFIG_FILE}={stated}"
+    if recipe is not None or stated is not None:
+        raise MemobenchError(
+            f"{named} is given beside resume=true, and a training goes on by the configuration in its last checkpoint; "
+            "leave the recipe out, and say what is to change as key=value"
+        )
+    folder = given.value("output_dir")
     if folder is None:
         raise MemobenchError("resume=true needs the folder of the training to go on with: output_dir=<folder>")
     checkpoint = last_checkpoint(Path(folder).expanduser())
-    _check_same_policy(words, checkpoint, folder)
-    known = ("config_path", "config", "policy", "policy.path", "policy.type", "resume")
-    flags = list(words.flags)
-    for key in known:
-        flags = without_flag(flags, key)
-    settings = [(key, value) for key, value in words.settings if key not in known]
-    begun = [("config_path", str(checkpoint / TRAIN_CONFIG)), ("resume", "true")]
-    return replace(words, settings=[*begun, *settings], flags=flags)
+    _check_same_policy(given, checkpoint, folder)
+    rest = given.without("policy", "policy.path", "policy.type", "resume")
+    return replace(rest, pairs=[(CONFIG_FILE, str(checkpoint / TRAIN_CONFIG)), ("resume", "true"), *rest.pairs])
 
 
 def last_checkpoint(run: Path) -> Path:
@@ -124,20 +202,104 @@ def last_checkpoint(run: Path) -> Path:
     )
 
 
-def _check_same_policy(words: Words, checkpoint: Path, folder: str) -> None:
+def _check_same_policy(given: Arguments, checkpoint: Path, folder: str) -> None:
     """Refuse to go on with another type of policy than the run's."""
     begun = (read_json(checkpoint / TRAIN_CONFIG).get("policy") or {}).get("type")
-    named = words.value("policy") or words.value("policy.type")
+    named = given.value("policy") or given.value("policy.type")
     where = None if named is None else checkpoint_folder(named)
     kind = named if where is None else checkpoint_type(str(where))
     if kind is not None and begun is not None and "/" not in kind and kind != begun:
         raise MemobenchError(f"the training in {folder} is of policy={begun}, and policy={named} was asked for")
 
 
-def schedule_told(checkpoint: Path, steps: int | None) -> str | None:
-    """Return what another number of steps does to the learning rate of a training that goes on; None: nothing.
+def check_as_begun(arguments: LerobotArguments) -> None:
+    """Refuse to go on with a training under settings, or on a dataset, that it was not begun with.
 
-    LeRobot makes the schedule anew for the new number and goes on in it at the step that was reached.
+    Which settings these are the policy's configuration says, by ``kept_since_begun: ClassVar[tuple[str, ...]]``.
+
+    Raises:
+        MemobenchError: one of them is another.
+    """
+    checkpoint = _gone_on_with(arguments)
+    if checkpoint is None:
+        return
+    _check_same_dataset(arguments, checkpoint)
+    chosen = ("--policy.path", "--policy.type", "--policy.discover_packages_path")
+    given = [flag for flag in arguments.flags if flag.startswith("--policy.")]
+    given = [flag for flag in given if flag.partition("=")[0] not in chosen]
+    if not given:
+        return
+    from lerobot.configs.train import TrainPipelineConfig
+
+    with quiet():
+        begun = TrainPipelineConfig.from_pretrained(checkpoint).policy
+        asked = TrainPipelineConfig.from_pretrained(checkpoint, cli_args=given).policy
+    if begun is None or asked is None:
+        return
+    for name, value, held in differing(asked, begun, getattr(begun, "kept_since_begun", ())):
+        raise MemobenchError(
+            f"this training was begun with {name}={held}, and goes on with nothing else than that: found {value}; "
+            f"leave {name} out, or train a new run from the checkpoint: policy={checkpoint} policy.{name}={value} "
+            "output_dir=<new folder>"
+        )
+
+
+def _check_same_dataset(arguments: LerobotArguments, checkpoint: Path) -> None:
+    """Refuse to go on with a training on another dataset, or on other episodes of it."""
+    begun = read_json(checkpoint / TRAIN_CONFIG).get("dataset") or {}
+    root, repository = arguments.get("dataset.root"), arguments.get("dataset.repo_id")
+    held = str(begun.get("root") or begun.get("repo_id"))
+    advice = f"leave that out, or train a new run from the checkpoint: policy={checkpoint} output_dir=<new folder>"
+    same = root is not None and begun.get("root") is not None and _same_place(root, begun["root"])
+    if not same and (root is not None or repository not in (None, begun.get("repo_id"))):
+        moved = begun.get("root") is not None and not Path(held).expanduser().exists()
+        raise MemobenchError(
+            f"this training was begun on the dataset {held}, and {root or repository} was asked for; "
+            + (f"if that is the same, put it or a link to it at {held}; else " if moved else "")
+            + advice
+        )
+    for name in ("episodes", "revision"):
+        asked = arguments.get(f"dataset.{name}")
+        if asked is not None and yaml.safe_load(asked) != begun.get(name):
+            raise MemobenchError(
+                f"this training was begun with dataset.{name}={begun.get(name)}, and {asked} was asked for; {advice}"
+            )
+
+
+def _same_place(a: str, b: str) -> bool:
+    return Path(a).expanduser().resolve() == Path(b).expanduser().resolve()
+
+
+def _gone_on_with(arguments: LerobotArguments) -> Path | None:
+    """Return the checkpoint that a training goes on with; None where it begins, or is not on this machine."""
+    path, resume = arguments.get(CONFIG_FILE), arguments.get("resume")
+    wanted = arguments.has("resume") if resume is None else resume.lower() == "true"  # LeRobot takes a bare --resume
+    if not wanted or path is None or not Path(path).exists():
+        return None
+    return Path(path) if Path(path).is_dir() else Path(path).parent
+
+
+def note_on_resume(arguments: LerobotArguments) -> tuple[str | None, bool]:
+    """Return a note on a training that goes on (None: there is none), and whether anything is left to be done."""
+    checkpoint = _gone_on_with(arguments)
+    if checkpoint is None:
+        return None, True
+    steps = whole_number(arguments.get("steps"))
+    total = steps or whole_number(str(read_json(checkpoint / TRAIN_CONFIG).get("steps")))
+    done = step_reached(checkpoint)
+    if total is not None and done >= total:
+        return (
+            f"the training in {checkpoint.parents[2]} has made all of its {done} steps; ask for more by steps=",
+            False,
+        )
+    return note_on_schedule(checkpoint, steps), True
+
+
+def note_on_schedule(checkpoint: Path, steps: int | None) -> str | None:
+    """Return a note on what another number of steps does to the learning rate of a training that goes on.
+
+    LeRobot makes the schedule anew for the new number and goes on in it at the step that was reached. None: it does
+    nothing to it.
 
     Args:
         checkpoint: the folder ``pretrained_model`` that is gone on with.
@@ -162,136 +324,12 @@ def schedule_told(checkpoint: Path, steps: int | None) -> str | None:
         return f"note: {begun.scheduler.type} is made anew for {steps} steps instead of {begun.steps}"
     old, new, last = (peak * rate(step) for rate, step in ((before, done), (after, done), (after, steps - 1)))
     if f"{old:.2e}" == f"{new:.2e}":
-        told = f"it stays at {new:.2e} at step {done}"
+        what = f"it stays at {new:.2e} at step {done}"
     else:
-        told = f"at step {done} it jumps from {old:.2e} to {new:.2e}"
+        what = f"at step {done} it jumps from {old:.2e} to {new:.2e}"
     return (
         f"note: {steps} steps instead of {begun.steps} make the schedule of the learning rate "
-        f"({begun.scheduler.type}) anew: {told} and is {last:.2e} at the end"
-    )
-
-
-def _gone_on_with(settings: LerobotSettings) -> Path | None:
-    """Return the checkpoint that a training goes on with; None where it begins, or is not on this machine."""
-    path, resume = settings.get("config_path"), settings.get("resume")
-    wanted = settings.has("resume") if resume is None else resume.lower() == "true"  # LeRobot takes a bare --resume
-    if not wanted or path is None or not Path(path).exists():
-        return None
-    return Path(path) if Path(path).is_dir() else Path(path).parent
-
-
-def check_as_begun(settings: LerobotSettings) -> None:
-    """Refuse to go on with a training under settings, or on a dataset, that it was not begun with.
-
-    Which settings these are the policy's configuration says, by ``kept_since_begun: ClassVar[tuple[str, ...]]``.
-
-    Raises:
-        MemobenchError: one of them is another.
-    """
-    checkpoint = _gone_on_with(settings)
-    if checkpoint is None:
-        return
-    _check_same_dataset(settings, checkpoint)
-    chosen = ("--policy.path", "--policy.type", "--policy.discover_packages_path")
-    given = [flag for flag in joined_flags(settings.flags) if flag.startswith("--policy.")]
-    given = [flag for flag in given if flag.partition("=")[0] not in chosen]
-    if not given:
-        return
-    from lerobot.configs.train import TrainPipelineConfig
-
-    with quiet():
-        begun = TrainPipelineConfig.from_pretrained(checkpoint).policy
-        asked = TrainPipelineConfig.from_pretrained(checkpoint, cli_args=given).policy
-    if begun is None or asked is None:
-        return
-    for name, value, held in differing(asked, begun, getattr(begun, "kept_since_begun", ())):
-        raise MemobenchError(
-            f"this training was begun with {name}={held}, and goes on with nothing else than that: found {value}; "
-            f"leave {name} out, or train a new run from the checkpoint: policy={checkpoint} policy.{name}={value} "
-            "output_dir=<new folder>"
-        )
-
-
-def _check_same_dataset(settings: LerobotSettings, checkpoint: Path) -> None:
-    """Refuse to go on with a training on another dataset, or on other episodes of it."""
-    begun = read_json(checkpoint / TRAIN_CONFIG).get("dataset") or {}
-    root, repository = settings.get("dataset.root"), settings.get("dataset.repo_id")
-    held = str(begun.get("root") or begun.get("repo_id"))
-    advice = f"leave that out, or train a new run from the checkpoint: policy={checkpoint} output_dir=<new folder>"
-    same = root is not None and begun.get("root") is not None and _place(root) == _place(begun["root"])
-    if not same and (root is not None or repository not in (None, begun.get("repo_id"))):
-        moved = begun.get("root") is not None and not Path(held).expanduser().exists()
-        raise MemobenchError(
-            f"this training was begun on the dataset {held}, and {root or repository} was asked for; "
-            + (f"if that is the same, put it or a link to it at {held}; else " if moved else "")
-            + advice
-        )
-    for name in ("episodes", "revision"):
-        told = settings.get(f"dataset.{name}")
-        if told is not None and yaml.safe_load(told) != begun.get(name):
-            raise MemobenchError(
-                f"this training was begun with dataset.{name}={begun.get(name)}, and {told} was asked for; {advice}"
-            )
-
-
-def _place(folder: str) -> Path:
-    return Path(folder).expanduser().resolve()
-
-
-def told_of_starting_from(settings: LerobotSettings) -> str | None:
-    """Return what is said of a training that begins from a checkpoint under other settings than its weights were
-    trained for, which fine-tuning may mean; None: nothing.
-    """
-    path = settings.get("policy.path")
-    policy = None if path is None else policy_config(settings)
-    if path is None or policy is None:
-        return None
-    fixed = getattr(policy, "fixed_by_training", ())
-    with quiet():
-        changed = list(differing(policy, as_trained(path, policy), fixed)) if fixed else []
-    if not changed:
-        return None
-    was, now = (", ".join(f"{item[0]}={item[part]}" for item in changed) for part in (2, 1))
-    return f"note: '{path}' was trained with {was}, and its weights are now trained on with {now}"
-
-
-def told_of_going_on(settings: LerobotSettings) -> tuple[str | None, bool]:
-    """Return what is said of a training that goes on (None: nothing), and whether anything is left to be done."""
-    checkpoint = _gone_on_with(settings)
-    if checkpoint is None:
-        return None, True
-    steps = whole_number(settings.get("steps"))
-    total, done = (
-        steps or whole_number(str(read_json(checkpoint / TRAIN_CONFIG).get("steps"))),
-        step_reached(checkpoint),
-    )
-    if total is not None and done >= total:
-        return (
-            f"the training in {checkpoint.parents[2]} has made all of its {done} steps; ask for more by steps=",
-            False,
-        )
-    return schedule_told(checkpoint, steps), True
-
-
-def how_to_go_on(settings: LerobotSettings, words: Sequence[str], begun: float) -> str:
-    """Return what is said when a training is ended from outside: the command that goes on with its last checkpoint.
-
-    Args:
-        words: of its command line, after ``lerobot train``.
-        begun: when it began, seconds since the epoch: LeRobot itself names a folder that was not named.
-    """
-    given = settings.get("output_dir")
-    runs = [Path(given)] if given is not None else list(Path("outputs/train").glob("*/*"))
-    links = [run / "checkpoints" / "last" for run in runs]
-    saved = [link for link in links if link.exists() and (given is not None or link.lstat().st_mtime >= begun)]
-    if not saved:
-        again = shlex.join(["lerobot", "train", *words])
-        return f"ended by SIGTERM before a checkpoint was saved; begin anew with: {again}"
-    run = max(saved, key=lambda link: link.lstat().st_mtime).parents[1]
-    # LeRobot's configuration has no place for these.
-    kept = [word for word in words if word.partition("=")[0] in TRAINING_WORDS]
-    return (
-        f"ended by SIGTERM; go on with: {shlex.join(['lerobot', 'train', f'output_dir={run}', 'resume=true', *kept])}"
+        f"({begun.scheduler.type}) anew: {what} and is {last:.2e} at the end"
     )
 
 
@@ -300,83 +338,38 @@ def step_reached(checkpoint: Path) -> int:
     return int(read_json(checkpoint.parent / TRAINING_STEP)["step"])
 
 
-def complete_training(settings: LerobotSettings) -> LerobotSettings:
-    """Return a training run's settings with the benchmark's defaults; what is wrong with them is told here.
+def how_to_go_on(arguments: LerobotArguments, line: Sequence[str], begun: float) -> str:
+    """Return what is said when a training is ended from outside: the command that goes on with its last checkpoint.
 
-    Raises:
-        MemobenchError: no policy is named, or the dataset or the checkpoint is none.
+    Args:
+        line: its command line after ``lerobot train``.
+        begun: when it began, seconds since the epoch: LeRobot itself names a folder that was not named.
     """
-    from_file = settings.has("config_path")
-    if not from_file:
-        if not any(settings.has(key) for key in TRAINED):
-            raise MemobenchError("name a policy: policy=memobench_mem")
-        settings = with_places(settings)
-    check_dataset(settings)
-    check_as_begun(settings)
-    policy = policy_config(settings)
-    check_sight(policy, env_config(settings))
-    if settings.get("resume") != "true":
-        settings = with_logging(settings)
-    if not from_file and getattr(policy, "decodes_no_video", False):
-        settings = settings.default("batch_size", OBJECT_BATCH).default("num_workers", 0)
-    if cores() < 4 and not from_file:  # LeRobot's default of 4 loaders would only wait for one another
-        settings = settings.default("num_workers", cores())
-    return settings
+    given = arguments.get("output_dir")
+    runs = [Path(given)] if given is not None else list(Path("outputs/train").glob("*/*"))
+    links = [run / "checkpoints" / "last" for run in runs]
+    saved = [link for link in links if link.exists() and (given is not None or link.lstat().st_mtime >= begun)]
+    if not saved:
+        again = shlex.join(["lerobot", "train", *line])
+        return f"ended by SIGTERM before a checkpoint was saved; begin anew with: {again}"
+    run = max(saved, key=lambda link: link.lstat().st_mtime).parents[1]
+    # LeRobot's configuration has no place for these.
+    kept = [word for word in line if word.partition("=")[0] in TRAINING_OPTIONS]
+    again = shlex.join(["lerobot", "train", f"output_dir={run}", "resume=true", *kept])
+    return f"ended by SIGTERM; go on with: {again}"
 
 
-def with_places(settings: LerobotSettings) -> LerobotSettings:
-    """Return settings that name the dataset; without a repository to push to, which LeRobot would ask for."""
-    settings = settings.default("dataset.repo_id", DEFAULT_REPO_ID)
-    if not settings.has("policy.repo_id") and (settings.has("policy.type") or settings.has("policy.path")):
-        settings = settings.default("policy.push_to_hub", False)
-    return settings
-
-
-def check_dataset(settings: LerobotSettings) -> None:
-    """Refuse a dataset folder that is none."""
-    root = settings.get("dataset.root")
-    if root is None:
-        return
-    folder = Path(root).expanduser()
-    local_only = (settings.get("dataset.repo_id") or "").startswith("local/")
-    if not folder.exists() and not local_only:
-        return  # LeRobot downloads the repository into it
-    if not folder.is_dir():
-        raise MemobenchError(
-            f"the dataset folder {root} does not exist; make one with `memobench generate --out {root}`"
-        )
-    if not (folder / INFO_FILE).is_file():
-        raise MemobenchError(
-            f"the folder {root} is not a LeRobot dataset ({INFO_FILE} is missing); make one with "
-            "`memobench generate --out <folder>`"
-        )
-
-
-def with_logging(settings: LerobotSettings) -> LerobotSettings:
-    """Return settings that log a short run often enough to see its loss: LeRobot's default is every 200 steps."""
-    steps = settings.get("steps")
-    if steps is not None and steps.isdigit() and int(steps) < 2000:
-        return settings.default("log_freq", max(1, int(steps) // 10))
-    return settings
-
-
-# ==== lerobot_training.py
-# What LeRobot's training is made to do beside its own: leave the frames of prompts out, and say what a policy sees.
-#
-# What it relies on is listed in tests/engine/test_lerobot_training.py; how it gets there, and out again: `lerobot_hooks`.
-# Whether prompt frames are wanted is decided where the policy is known for sure: when LeRobot, its configuration
-# complete, has opened the datasets. So is what a policy sees: our datasets hold pictures and, beside them, what shows in
-# them as objects, and LeRobot would give both to its own policies.
-
-logger = logging.getLogger(__name__)
+# --- what is added to LeRobot's training: which frames are trained on, and what a policy's inputs are ---
 
 
 @contextmanager
 def trained_on(prompt_frames: bool | None, obs_type: str | None = None) -> Iterator[None]:
-    """While this lasts, LeRobot trains on prompt frames too, or on none; None: on none unless the policy knows phases.
+    """While this lasts, steer LeRobot's training.
 
-    ``obs_type`` is what a policy that does not know phases sees (`envs.observations.OBS_TYPES`); None: pictures where
-    the dataset has them, else objects.
+    Args:
+        prompt_frames: whether frames of demonstration prompts are trained on; None: where the policy reads prompts.
+        obs_type: kind of observation (`envs.observations.OBS_TYPES`) of a policy that does not; None: pictures where
+            the dataset has them, else objects.
 
     Raises:
         MemobenchError: the installed LeRobot is another than the one whose training is known here.
@@ -399,6 +392,7 @@ def _steered(make: Callable[..., Any], prompt_frames: bool | None, obs_type: str
 
     @functools.wraps(make)
     def run(config: Any) -> Any:
+        from lerobot_memobench.datasets.execution_frames import ExecutionFrames, leave_out_prompts
         from lerobot_memobench.policies.memobench_mem.sampler import check_transforms
 
         if prompt_frames is not False:
@@ -413,8 +407,8 @@ def _steered(make: Callable[..., Any], prompt_frames: bool | None, obs_type: str
         wanted = config.policy is None or reads_prompt(config.policy) if prompt_frames is None else prompt_frames
         if not wanted:
             count = leave_out_prompts(train)
-            told = "the frames" if count is None else f"{count} frames"
-            logger.info("%s of prompts are left out of the %d to train on", told, train.num_frames)
+            frames = "the frames" if count is None else f"{count} frames"
+            logger.info("%s of prompts are left out of the %d to train on", frames, train.num_frames)
         # A policy that draws execution frames alone sees to what it trains on, and not to what it is tested on.
         tested = wanted and not getattr(config.policy, "execution_only", False)
         if held_out is not None:
@@ -445,6 +439,8 @@ def _reads_objects(policy: Any, obs_type: str | None) -> bool:
 
 def _take_for_input(dataset: Any) -> None:
     """Give the objects of an opened dataset with pictures the name that LeRobot takes for an input's."""
+    from lerobot.utils.constants import OBS_STATE
+
     if dataset is None or PRIVILEGED not in dataset.meta.features:
         return
 
@@ -460,26 +456,9 @@ def _take_for_input(dataset: Any) -> None:
             setattr(holder, name, {**deltas, INPUT: deltas[OBS_STATE]})
 
 
-def _check_environment(config: Any, dataset: Any) -> None:
-    """Refuse to evaluate between updates on the benchmark what is trained on other cameras, numbers or sizes."""
-    from lerobot.envs.utils import env_to_policy_features
-    from lerobot.utils.feature_utils import dataset_to_policy_features
-
-    environment = getattr(config, "env", None)
-    if config.policy is None or getattr(environment, "type", None) != "memobench":
-        return
-    unseen = None if getattr(config.policy, "uses_pictures", True) else FeatureType.VISUAL
-    features = dataset_to_policy_features(dataset.meta.features)
-    policy = copy.copy(config.policy)
-    policy.output_features = {key: one for key, one in features.items() if one.type is FeatureType.ACTION}
-    policy.input_features = policy.input_features or {
-        key: one for key, one in features.items() if one.type not in (FeatureType.ACTION, unseen)
-    }
-    check_features(f"that learns from {dataset.root}", policy, env_to_policy_features(environment), config.rename_map)
-
-
 def _choose_inputs(policy: Any, features: dict[str, Any], obs_type: str | None) -> None:
-    """Tell a policy's configuration what it sees, as LeRobot would from all that a dataset holds."""
+    """Tell a policy's configuration its inputs, as LeRobot would from all that a dataset holds."""
+    from lerobot.configs import FeatureType
     from lerobot.utils.feature_utils import dataset_to_policy_features
 
     if policy is None or policy.input_features or reads_prompt(policy):
@@ -497,3 +476,24 @@ def _choose_inputs(policy: Any, features: dict[str, Any], obs_type: str | None) 
             "generate a dataset that has it"
         )
     policy.input_features = chosen
+
+
+def _check_environment(config: Any, dataset: Any) -> None:
+    """Refuse to evaluate between updates on the benchmark what is trained on other cameras, numbers or sizes."""
+    from lerobot.configs import FeatureType
+    from lerobot.envs.utils import env_to_policy_features
+    from lerobot.utils.feature_utils import dataset_to_policy_features
+
+    from lerobot_memobench.policies.compatibility import check_features
+
+    environment = getattr(config, "env", None)
+    if config.policy is None or getattr(environment, "type", None) != "memobench":
+        return
+    unseen = None if getattr(config.policy, "uses_pictures", True) else FeatureType.VISUAL
+    features = dataset_to_policy_features(dataset.meta.features)
+    policy = copy.copy(config.policy)
+    policy.output_features = {key: one for key, one in features.items() if one.type is FeatureType.ACTION}
+    policy.input_features = policy.input_features or {
+        key: one for key, one in features.items() if one.type not in (FeatureType.ACTION, unseen)
+    }
+    check_features(f"that learns from {dataset.root}", policy, env_to_policy_features(environment), config.rename_map)

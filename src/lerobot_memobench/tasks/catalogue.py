@@ -98,21 +98,25 @@ def task_names(memory_types: str | Iterable[str] | None = None, suite: str | Non
 
 def task_index(name: str) -> int:
     """Return the stable number of a task: its position in ``task_names(suite=None)``."""
-    get_task(name)
-    return list(_folders()).index(name)
+    return list(_folders()).index(task_folder(name).name)
 
 
 def task_number(name: str) -> int:
     """Return the short number of a task: its place in its own suite's catalogue order, from 1 on."""
-    return task_names(suite=_suite_of(get_task(name).name)).index(name) + 1
+    return task_names(suite=task_folder(name).parent.parent.name).index(name) + 1
+
+
+def task_folder(name: str) -> Path:
+    """Return the folder of a task of the catalogue; an unknown name is an error that tells the nearest known ones."""
+    if name not in _folders():
+        raise MemobenchError(f"found no task named {name!r} in the catalogue, {nearest(name, _folders())}")
+    return _folders()[name]
 
 
 @cache
 def get_task(name: str) -> Task:
-    """Return a task of the catalogue; an unknown name is an error that tells the nearest known ones."""
-    if name not in _folders():
-        raise MemobenchError(f"found no task named {name!r} in the catalogue, {nearest(name, _folders())}")
-    return load_task(_folders()[name])
+    """Return a task of the catalogue; errors as of `task_folder`."""
+    return load_task(task_folder(name))
 
 
 def resolve_tasks(spec: str | Iterable[str], suite: str = PUBLISHED) -> list[str]:

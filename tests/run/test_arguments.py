@@ -1,25 +1,78 @@
-"""key=value becomes LeRobot's flags; what is unknown is named with what is near."""
+"""A command line becomes LeRobot's flags; what is unknown is named with what is near."""
 
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
+import lerobot.scripts.lerobot_eval
+import lerobot.scripts.lerobot_train
 import pytest
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.configs.train import TrainPipelineConfig
 
 import lerobot_memobench.registration  # noqa: F401
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.run.arguments import LerobotSettings, recipe_file, recipes, split_words, translate
+from lerobot_memobench.run.arguments import (
+    LerobotArguments,
+    check_task_names,
+    flag_value,
+    read_executor_options,
+    recipe_file,
+    recipes,
+    split_arguments,
+    translate,
+    whole_number,
+    without_flags,
+)
+from lerobot_memobench.run.lerobot_commands import config_class, lerobot_commands, load_command
+
+
+def test_a_line_is_taken_apart() -> None:
+    given = split_arguments(["env=memobench", "--policy.type", "act", "-v", "--seed=3", "tasks=a=b", "--resume"])
+    assert given.pairs == [("env", "memobench"), ("tasks", "a=b")]
+    assert given.flags == ["--policy.type=act", "-v", "--seed=3", "--resume"]
+    assert not given.wants_help
+
+
+@pytest.mark.parametrize("word", ["memobench", "=x", "", "a b=c", "=="])
+def test_a_word_that_is_neither_is_refused(word: str) -> None:
+    with pytest.raises(MemobenchError, match="expected key=value"):
+        split_arguments(["env=memobench", word])
+
+
+def test_executor_options() -> None:
+    assert read_executor_options(["partition=cpu", "mem_per_cpu_gb=4", "env_command=a=b"]) == {
+        "partition": "cpu",
+        "mem_per_cpu_gb": 4,
+        "env_command": "a=b",
+    }
+    told = read_executor_options(["requeue=false", "with_srun=True", "condaenv=none", "qos="])
+    assert told == {"requeue": False, "with_srun": True, "condaenv": None, "qos": ""}
+    with pytest.raises(MemobenchError, match="expected key=value"):
+        read_executor_options(["partition"])
+
+
+def test_flags_are_found() -> None:
+    flags = ["--a.b=1", "--c=2", "--d", "--a.b=3", "--ab=4"]
+    assert flag_value(flags, "a.b") == "3"
+    assert flag_value(flags, "d") is None
+    assert LerobotArguments(tuple(flags)).has("d")
+    assert not LerobotArguments(tuple(flags)).has("a")
+    assert without_flags(flags, "a.b", "d") == ["--c=2", "--ab=4"]
+
+
+def test_numbers() -> None:
+    assert [whole_number(text) for text in ("7", "-1", "null", None)] == [7, -1, None, None]
 
 
 def evaluated(*words: str) -> list[str]:
-    return list(translate("eval", split_words(words), EvalPipelineConfig, {}).flags)
+    return list(translate("eval", split_arguments(words), EvalPipelineConfig, {}).flags)
 
 
 def trained(*words: str) -> list[str]:
-    return list(translate("train", split_words(words), TrainPipelineConfig, {}).flags)
+    return list(translate("train", split_arguments(words), TrainPipelineConfig, {}).flags)
 
 
 def test_the_commands_of_the_readme() -> None:
@@ -73,8 +126,7 @@ def test_dotted_keys_and_untouched_flags() -> None:
     )
     assert flags == [
         "--env.type=memobench",
-        "--policy.type",
-        "act",
+        "--policy.type=act",
         "--eval.use_async_envs=false",
         "--policy.chunk_size=10",
     ]
@@ -179,20 +231,73 @@ def test_a_dataset_that_can_only_be_a_folder_must_be_there(name: str) -> None:
 
 def test_a_config_file_may_hold_the_choices() -> None:
     file = {"policy": {"type": "memobench_mem"}, "env": {"type": "memobench"}}
-    settings = translate("train", split_words(["align=semantic", "env.horizon=3"]), TrainPipelineConfig, file)
+    settings = translate("train", split_arguments(["align=semantic", "env.horizon=3"]), TrainPipelineConfig, file)
     assert list(settings.flags) == ["--policy.align=semantic", "--env.horizon=3"]
 
 
 def test_a_command_without_a_configuration_takes_any_key() -> None:
-    assert list(translate("dataset-viz", split_words(["repo-id=a/b"]), None, {}).flags) == ["--repo-id=a/b"]
+    assert list(translate("dataset-viz", split_arguments(["repo-id=a/b"]), None, {}).flags) == ["--repo-id=a/b"]
 
 
 def test_what_is_added_never_overrides() -> None:
-    given = LerobotSettings(("--seed", "3"))
+    given = LerobotArguments(("--seed=3",))
     settings = given.default("seed", 7).default("env.expert_action", True)
-    assert list(settings.flags) == ["--seed", "3", "--env.expert_action=true"]
-    assert list(given.flags) == ["--seed", "3"]
+    assert list(settings.flags) == ["--seed=3", "--env.expert_action=true"]
+    assert list(given.flags) == ["--seed=3"]
 
 
-def test_what_is_changed_replaces_both_spellings() -> None:
-    assert list(LerobotSettings(("--seed", "3", "--x=1")).changed("seed", 5).flags) == ["--x=1", "--seed=5"]
+def test_what_is_changed_replaces() -> None:
+    assert list(LerobotArguments(("--seed=3", "--x=1")).changed("seed", 5).flags) == ["--x=1", "--seed=5"]
+
+
+STRICT, PUBLISHED = "open_and_close_the_microwave_a_given_number_of_times", "open_and_close_the_microwave"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["env=memobench", "suite=strict"],
+        ["env=memobench", "suite=strict", f"tasks={STRICT},spatial"],
+        ["--env.type=memobench", "--env.suite=strict", f"--env.tasks={STRICT}"],
+        ["env=memobench", f"tasks={PUBLISHED}"],
+        ["env=memobench", "--config_path=settings.yaml", f"tasks={STRICT}"],
+    ],
+)
+def test_tasks_of_the_suite_are_known(words: list[str]) -> None:
+    check_task_names(split_arguments(words))
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["env=memobench", f"tasks={STRICT}"], "task of the strict suite; say suite=strict"),
+        (["env=memobench", "suite=strict", f"tasks={PUBLISHED}"], "task of the published suite"),
+        (["env=memobench", "suite=strikt"], "suite is 'strikt'; did you mean 'strict'"),
+    ],
+)
+def test_others_are_refused_in_a_sentence(words: list[str], said: str) -> None:
+    with pytest.raises(MemobenchError) as error:
+        check_task_names(split_arguments(words))
+    assert said in str(error.value)
+
+
+def test_every_command_of_lerobot_is_there() -> None:
+    assert {"train", "eval", "record", "dataset-viz", "edit-dataset", "info"} <= set(lerobot_commands())
+
+
+def test_their_configurations_are_found() -> None:
+    assert config_class(lerobot.scripts.lerobot_eval.main) is EvalPipelineConfig
+    assert config_class(lerobot.scripts.lerobot_train.main) is TrainPipelineConfig
+
+
+@pytest.mark.parametrize("chosen", [None, "OMP_WAIT_POLICY", "GOMP_SPINCOUNT"])
+def test_torch_waits_briefly_in_evaluations_unless_told_otherwise(
+    chosen: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = {"HOME": "/nowhere"} | ({chosen: "ACTIVE"} if chosen else {})
+    monkeypatch.setattr(os, "environ", dict(before))
+    load_command("train")
+    assert os.environ.get("GOMP_SPINCOUNT") == before.get("GOMP_SPINCOUNT")
+    load_command("eval")
+    assert os.environ.get("GOMP_SPINCOUNT") == (before.get("GOMP_SPINCOUNT") if chosen else "2000")
+    assert os.environ.get("OMP_WAIT_POLICY") == before.get("OMP_WAIT_POLICY")
