@@ -355,7 +355,7 @@ def check_observations(policy: PreTrainedConfig | None, environment: EnvConfig |
     """
     if environment is not None and environment.type == ENVIRONMENT:
         check_obs_type(policy, environment.obs_type)
-    remembers_pictures = getattr(policy, "watches", False) and obs_type_of(policy) != OBJECTS
+    remembers_pictures = getattr(policy, "needs_every_frame", False) and obs_type_of(policy) != OBJECTS
     if remembers_pictures and getattr(environment, "render_every", 1) > 1:
         raise MemobenchError(f"env.render_every is {getattr(environment, 'render_every', 1)}; {REFUSAL}")
 

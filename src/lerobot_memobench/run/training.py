@@ -48,8 +48,8 @@ logger = logging.getLogger(__name__)
 
 INFO_FILE = Path("meta") / "info.json"
 OBJECT_BATCH = 72
-"""Frames per update of a policy that sees objects, or through a visual encoder: a dozen episodes, six frames of each. They lie in
-main memory, where no loader would be quicker."""
+"""Frames per update of a policy that reads objects or tokens of a visual encoder: a dozen episodes, six frames of each.
+They lie in main memory, where no loader would be quicker."""
 TRAIN_CONFIG = "train_config.json"
 """LeRobot's file of a training's whole configuration, in each of its checkpoints."""
 TRAINING_STEP = Path("training_state") / "training_step.json"

@@ -511,6 +511,11 @@ class MemobenchMemConfig(PI05Config):
         return "none" if self.memory_fusion == "none" else "frame_sampling"
 
     @property
+    def needs_every_frame(self) -> bool:
+        """Whether pictures between two action chunks count."""
+        return self.memory != "none" and self.uses_pictures
+
+    @property
     def cache_place(self) -> Path | None:
         """Folder that holds feature caches; None: the one beside each dataset."""
         return None if self.feature_cache_dir is None else Path(self.feature_cache_dir).expanduser()

@@ -160,7 +160,7 @@ class RemoteConfig(UntrainedConfig):
         return self.spoken.memory if self.memory is None else self.memory
 
     @property
-    def watches(self) -> bool:
+    def needs_every_frame(self) -> bool:
         """Whether frames count that are seen between two plans: a server that buffers frames gets all of them."""
         return self.spoken.buffers
 
