@@ -213,10 +213,12 @@ def test_a_dataset_without_the_columns_is_refused(dataset_root: Path, tmp_path: 
 
 
 def test_without_memory_fusion_it_is_plain_pi05(dataset_root: Path, tmp_path: Path) -> None:
-    from lerobot_memobench.policies.memobench_mem.network import SizedPI05
+    from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 
     policy, before, after, dataset = made_for_training(dataset_root, memory_fusion="none")
-    assert set(dict(policy.model.named_parameters())) == set(dict(SizedPI05(small_config()).named_parameters()))
+    assert set(dict(policy.model.named_parameters())) == set(
+        dict(MemoryPI05(small_config(memory_fusion="none")).named_parameters())
+    )
     batch = before(batch_of(dataset, [EPISODE_1 + 1, EPISODE_1 + 22]))
     assert batch["phase"].tolist() == [0, 1]
     assert not any(key.startswith("memory.") for key in batch)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import resource
 import time
 from types import MethodType
@@ -17,7 +18,7 @@ from torch import Tensor
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import Frame, Row
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.memobench_mem.network import SizedPI05
+from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 from lerobot_memobench.policies.memobench_mem.random_weights import fill_buffers, random_policy
 
 CAMERA = "observation.images.image"
@@ -63,7 +64,7 @@ def _lerobots(policy: MemobenchMemPolicy) -> PI05Pytorch:
         if config.size == "pi05":
             theirs = PI05Pytorch(PI05Config(device="cpu", dtype="bfloat16", train_expert_only=True))
         else:
-            theirs = SizedPI05(config)
+            theirs = MemoryPI05(dataclasses.replace(config, memory_fusion="none", align="none"))
             pair = theirs.paligemma_with_expert
             pair.embed_image = MethodType(PaliGemmaWithExpertModel.embed_image, pair)
     own = dict(policy.model.named_parameters())

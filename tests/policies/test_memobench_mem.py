@@ -462,10 +462,10 @@ def test_weights_that_do_not_fit_are_refused(trained: Any, tmp_path: Path) -> No
 
 def test_pi05_weights_as_a_start(trained: Any, tmp_path: Path) -> None:
     """A file named as pi0.5's own, at tiny dimensions: everything but the memory comes from it."""
-    from lerobot_memobench.policies.memobench_mem.network import SizedPI05
+    from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 
     torch.manual_seed(11)
-    plain = SizedPI05(small_config())
+    plain = MemoryPI05(small_config(memory_fusion="none"))
     with torch.no_grad():
         for parameter in plain.parameters():
             parameter.add_(0.1)

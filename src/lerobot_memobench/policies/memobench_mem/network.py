@@ -1,8 +1,8 @@
-"""Attention in one kernel, for the passes in which a policy with eyes learns.
+"""pi0.5 with a memory, at a chosen size: LeRobot's classes with our dimensions, encoders and memory.
 
-LeRobot's pi0.5 attends by Hugging Face's ``eager_attention_forward``, which keeps a weight for each pair of tokens: of
-72 samples with two pictures 56 MB in a layer, which come from the system page by page. torch's kernel keeps none and
-takes a third of the time. It rounds otherwise, so what acts goes on with LeRobot's.
+LeRobot fixes vocabulary, image tower and widths inside constructors. These subclasses run those constructors on the
+meta device (no memory, no time), and then build the few sized modules again at a policy's dimensions, so every other
+attribute and every method stays LeRobot's.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import functools
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from copy import deepcopy
 from typing import Any
 
@@ -41,59 +40,103 @@ from lerobot_memobench.policies.memobench_mem.memory.encoder import MemoryTokens
 from lerobot_memobench.policies.memobench_mem.objects import DetectionEncoder, ObjectEncoder, ObjectsFromPictures
 from lerobot_memobench.sim.object_slots import classes
 
-MARK = "learns_fused"
-"""Attribute of the attention modules that it is for."""
+FUSIONS: dict[str, type[MemoryFusion]] = {"modulation": Modulation, "context": Context}
+OWN = ("memory.", "state_token.", "instruction.", "paligemma_with_expert.perception.")
+"""First parts of the names of parameters that plain pi0.5 does not have; a fusion has more."""
 
 
-def attend_fused(model: nn.Module) -> None:
-    """Let the attention of a model's layers be computed in one kernel wherever gradients are wanted, while it lives."""
-    for module in model.modules():
-        if isinstance(module, modeling_gemma.GemmaAttention):
-            setattr(module, MARK, True)
-    hooked_for(model, ATTEND, _fused)
+class MemoryPI05(PI05Pytorch):
+    """LeRobot's pi0.5 model at a policy's dimensions, with a memory: `set_memory`, then ``forward`` or ``sample_actions``.
 
+    Attributes:
+        memory: encoder of remembered frames to memory tokens. fusion: how actions read these; None: plain pi0.5.
+        state_token: of the robot's state, where it enters as numbers; None: it enters as words of the text prompt.
+        instruction: with a token of the state, the condition that tells the action expert's norms the instruction.
+    """
 
-def _fused(attend: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap transformers' attention: modules that are marked learn in one kernel."""
+    def __init__(self, config: MemobenchMemConfig, rtc_processor: Any = None) -> None:
+        with torch.device("meta"):
+            super().__init__(config, rtc_processor=rtc_processor)
+        dims = config.dimensions
+        width, vlm_width = dims.expert.width, dims.vlm.width
+        self.paligemma_with_expert = SizedPaliGemmaWithExpert(config)
+        self.action_in_proj = nn.Linear(config.max_action_dim, width)
+        self.action_out_proj = nn.Linear(width, config.max_action_dim)
+        self.time_mlp_in = nn.Linear(width, width)
+        self.time_mlp_out = nn.Linear(width, width)
+        self.state_token = StateToken(config.max_state_dim, vlm_width) if config.state_token else None
+        self.instruction = InstructionCondition(vlm_width, width) if config.state_token else None
+        self.fusion: MemoryFusion | None = None
+        if config.memory_fusion == "none":
+            return
+        observations = self.paligemma_with_expert.perception
+        mechanism = make_mechanism(config.memory, config.memory_frames)
+        self.memory = observations.memory(mechanism.encoder(observations.dim, vlm_width, observations.grid))
+        self.fusion = FUSIONS[config.memory_fusion](self, vlm_width, width)
 
-    @functools.wraps(attend)
-    def attention(
-        module: nn.Module, query: Tensor, key: Tensor, value: Tensor, mask: Tensor | None, scaling: float, **more: Any
-    ) -> tuple[Tensor, Tensor | None]:
-        if not (hasattr(module, MARK) and torch.is_grad_enabled()):
-            weighed: tuple[Tensor, Tensor] = attend(module, query, key, value, mask, scaling, **more)
-            return weighed
-        key, value = (modeling_gemma.repeat_kv(kept, module.num_key_value_groups) for kept in (key, value))
-        read = scaled_dot_product_attention(query, key, value, attn_mask=mask, scale=scaling)
-        return read.transpose(1, 2).contiguous(), None
+    def set_memory(
+        self, tokens: Tensor, steps: Tensor, frame_mask: Tensor, numbers: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Encode remembered frames and hand them to the fusion.
 
-    return attention
+        Args:
+            tokens: (B, F, P, D) of the frames. steps: (B, F), control steps. frame_mask: (B, F) bool, which are real.
+            numbers: (B, F), equal where frames are; with an encoder that learns what it keeps, each is encoded once.
 
+        Returns:
+            H (B, F*P, d_m) and its mask (B, F*P), for the alignment objectives.
+        """
+        assert self.fusion is not None  # the policy asks no plain pi0.5
+        if numbers is None:
+            memory = MemoryTokens(*self.memory(tokens, steps, frame_mask))
+        else:
+            memory = self.memory.shared(tokens, steps, frame_mask, numbers)
+        self.fusion.hand_over(memory)
+        return memory.rows(), memory.mask
 
-# ==== backbone.py
-# pi0.5 at a chosen size. LeRobot's classes do the work; only the dimensions and the way of seeing are ours.
-#
-# LeRobot fixes vocabulary, image tower and widths inside constructors. These subclasses run those constructors on the
-# meta device (no memory, no time), and then build the few sized modules again at this policy's dimensions, so every
-# other attribute and every method stays LeRobot's.
+    def embed_prefix(self, images: Any, img_masks: Any, tokens: Tensor, masks: Tensor) -> Prefix:
+        """Return LeRobot's prefix (observation, then words), as the fusion changes it.
 
+        With a token of the state, the last of the ``images`` is the state (B, dim), and the masks of the others may be
+        of their tokens (B, n), which LeRobot's are not.
+        """
+        if self.state_token is None or self.instruction is None:
+            prefix: Prefix = super().embed_prefix(images, img_masks, tokens, masks)
+        else:
+            longest = int(masks.sum(dim=1).max())  # padding would be most of so short a prefix
+            words, real, _ = super().embed_prefix([], [], tokens[:, :longest], masks[:, :longest])
+            self.instruction.read(words, real)
+            *parts, state = images
+            embedded = [*(self.paligemma_with_expert.embed_image(part) for part in parts), self.state_token(state)]
+            of_tokens = [
+                repeat(mask, "b -> b n", n=part.shape[1]) if mask.ndim == 1 else mask
+                for mask, part in zip(img_masks, embedded, strict=True)
+            ]
+            real = torch.cat([*of_tokens, real], dim=1)
+            prefix = (
+                torch.cat([*(part.to(words.dtype) for part in embedded), words], dim=1),
+                real,
+                torch.zeros_like(real),
+            )
+        return prefix if self.fusion is None else self.fusion.prefix(prefix)
 
-def _gemma(size: Gemma) -> GemmaConfig:
-    return GemmaConfig(size.width, size.depth, size.mlp_dim, size.num_heads, size.num_kv_heads, size.head_dim)
+    def embed_suffix(self, noisy_actions: Tensor, timestep: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return LeRobot's action tokens, their masks, and the condition of the expert's norms."""
+        *tokens, condition = super().embed_suffix(noisy_actions, timestep)
+        return *tokens, condition if self.instruction is None else condition + self.instruction()
 
+    def memory_parameters(self) -> dict[str, nn.Parameter]:
+        """Return every parameter that plain pi0.5 does not have, by name."""
+        fusion = self.fusion
+        return {
+            name: parameter
+            for name, parameter in self.named_parameters()
+            if name.startswith(OWN) or (fusion is not None and fusion.owns(name))
+        }
 
-def _resize(vlm: Any, dims: Dimensions, image_size: int) -> Any:
-    """Copy of LeRobot's PaliGemma configuration with this size's vocabulary and image tower."""
-    config = deepcopy(vlm)
-    config._vocab_size = config.image_token_index = dims.vocabulary
-    config.vocab_size = config.text_config.vocab_size = dims.vocabulary
-    config.hidden_size = config.projection_dim = dims.vlm.width
-    vision = config.vision_config
-    vision.hidden_size, vision.intermediate_size = dims.vision.width, dims.vision.mlp_dim
-    vision.num_hidden_layers, vision.num_attention_heads = dims.vision.depth, dims.vision.num_heads
-    vision.patch_size, vision.image_size = dims.vision.patch, image_size
-    vision.projection_dim = dims.vlm.width
-    return config
+    def place_of(self, name: str) -> str:
+        """Return the name in this model of a parameter of plain pi0.5."""
+        return name if self.fusion is None else self.fusion.place_of(name)
 
 
 class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
@@ -118,7 +161,7 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
             expert = deepcopy(lerobots.gemma_expert.config)
             expert.vocab_size = dims.vocabulary
         # pi0.5's weights replace all of these.
-        with no_init_weights() if config.base_weights else nullcontext():
+        with no_init_weights() if config.base_weights else contextlib.nullcontext():
             self.paligemma = PaliGemmaForConditionalGenerationWithPiGemma(config=vlm)
             self.gemma_expert = PiGemmaForCausalLM(config=expert)
         self.gemma_expert.model.embed_tokens = None
@@ -130,24 +173,24 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
         self.perception = self._perception(config)
 
     def _perception(self, config: MemobenchMemConfig) -> ObservationEncoder:
-        """Build the configuration's way of seeing; one without pictures leaves no image tower."""
-        seeing = self.paligemma.model
+        """Build the configuration's encoder of observations, in the place of pi0.5's image tower where it is another."""
+        vlm = self.paligemma.model
         if config.uses_visual_encoder:
-            # Where the frozen image tower lies in pi0.5; its weights are loaded by the policy.
-            tower = seeing.vision_tower = VisualEncoder(folded=True).eval().requires_grad_(False)
-            seeing.multi_modal_projector = nn.Identity()
+            # The policy loads its weights.
+            tower = vlm.vision_tower = VisualEncoder(folded=True).eval().requires_grad_(False)
+            vlm.multi_modal_projector = nn.Identity()
             return VisualTokenEncoder(
                 tower, [*config.image_features], config.memory_camera or "", config.dimensions.vlm.width
             )
         if not config.uses_objects:
             return ImageTowerEncoder(
-                seeing.vision_tower, seeing.multi_modal_projector, config.image_size, config.memory_camera or ""
+                vlm.vision_tower, vlm.multi_modal_projector, config.image_size, config.memory_camera or ""
             )
-        seeing.vision_tower, seeing.multi_modal_projector = nn.Identity(), nn.Identity()
+        vlm.vision_tower, vlm.multi_modal_projector = nn.Identity(), nn.Identity()
         config.object_classes = config.object_classes or list(classes())
         slots = config.object_classes, config.tokens_per_frame, config.dimensions.vlm.width
         if config.detector is not None:
-            # A policy that learned of told objects with errors goes on, if it does, by what eyes find.
+            # Noise is for privileged object state alone: a policy that was trained by it goes on by detections as they are.
             return DetectionEncoder(ObjectsFromPictures(load_detector(config.detector)), *slots)
         return ObjectEncoder(*slots, config.detection_noise)
 
@@ -160,24 +203,24 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
         self.gemma_expert.lm_head.requires_grad_(False)
 
     def embed_image(self, image: Tensor) -> Tensor:
-        """Prefix tokens (B, n, D) of what LeRobot calls an image: one part of what is seen now."""
+        """Return prefix tokens (B, n, D) of what LeRobot calls an image: one part of the observation."""
         return self.perception.prefix(image)
 
 
 class StateToken(nn.Module):
-    """The robot's state, normalised, as one token (B, 1, width)."""
+    """The robot's normalised state as one token."""
 
     def __init__(self, dim: int, width: int) -> None:
         super().__init__()
         self.mlp = nn.Sequential(nn.Linear(dim, width), nn.GELU(), nn.Linear(width, width))
 
     def forward(self, state: Tensor) -> Tensor:
-        """Token of a state (B, dim)."""
+        """Return the token (B, 1, width) of a state (B, dim)."""
         return rearrange(self.mlp(state) * LOUD, "b d -> b 1 d")
 
 
 class InstructionCondition(nn.Module):
-    """The instruction's mean word, for the adaptive norms of the action expert, which are told the time by it.
+    """The instruction's mean word, as a condition of the action expert's adaptive norms, beside the time of denoising.
 
     Attention alone has to find the one word that tells two tasks apart. On six tasks of one cabinet, one microwave and
     one stove, 2,000 updates, the loss was 2 % lower with it and 28 of 30 rollouts were solved, not 24 (one training
@@ -187,139 +230,46 @@ class InstructionCondition(nn.Module):
     def __init__(self, words_dim: int, width: int) -> None:
         super().__init__()
         self.mlp = nn.Sequential(nn.Linear(words_dim, width), nn.SiLU(), nn.Linear(width, width))
-        self.said: Tensor | None = None
+        self.mean: Tensor | None = None
 
     def read(self, words: Tensor, real: Tensor) -> None:
         """Begin a pass with these words (B, n, D), of which ``real`` (B, n) are no padding."""
         weights = real.unsqueeze(-1).to(words.dtype)
-        self.said = (words * weights).sum(dim=1) / weights.sum(dim=1).clamp(min=1)
+        self.mean = (words * weights).sum(dim=1) / weights.sum(dim=1).clamp(min=1)
 
     def forward(self) -> Tensor:
         """Return what is added to the condition (B, width)."""
-        added: Tensor = self.mlp(self.said)
+        added: Tensor = self.mlp(self.mean)
         return added
 
 
-class SizedPI05(PI05Pytorch):
-    """LeRobot's pi0.5 model at this policy's dimensions.
-
-    A policy that has a token of the state also tells the action expert's norms what the instruction is.
-    """
-
-    def __init__(self, config: MemobenchMemConfig, rtc_processor: Any = None) -> None:
-        with torch.device("meta"):
-            super().__init__(config, rtc_processor=rtc_processor)
-        width = config.dimensions.expert.width
-        self.paligemma_with_expert = SizedPaliGemmaWithExpert(config)
-        self.action_in_proj = nn.Linear(config.max_action_dim, width)
-        self.action_out_proj = nn.Linear(width, config.max_action_dim)
-        self.time_mlp_in = nn.Linear(width, width)
-        self.time_mlp_out = nn.Linear(width, width)
-        seen = config.dimensions.vlm.width
-        self.state_token = StateToken(config.max_state_dim, seen) if config.state_token else None
-        self.instruction = InstructionCondition(seen, width) if config.state_token else None
-
-    def embed_suffix(self, noisy_actions: Tensor, timestep: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """LeRobot's action tokens, their masks, and the condition of the expert's norms."""
-        *tokens, condition = super().embed_suffix(noisy_actions, timestep)
-        return *tokens, condition if self.instruction is None else condition + self.instruction()
-
-    def embed_prefix(self, images: Any, img_masks: Any, tokens: Tensor, masks: Tensor) -> Prefix:
-        """LeRobot's prefix: what is seen now, then words.
-
-        With a token of the state, the last of the ``images`` is the state (B, dim), and the masks of the others may be
-        of their tokens (B, n), which LeRobot's are not.
-        """
-        if self.state_token is None or self.instruction is None:
-            prefix: Prefix = super().embed_prefix(images, img_masks, tokens, masks)
-            return prefix
-        longest = int(masks.sum(dim=1).max())  # padding would be most of so short a prefix
-        words, real, _ = super().embed_prefix([], [], tokens[:, :longest], masks[:, :longest])
-        self.instruction.read(words, real)
-        *parts, state = images
-        seen = [*(self.paligemma_with_expert.embed_image(part) for part in parts), self.state_token(state)]
-        shown = [
-            repeat(mask, "b -> b n", n=part.shape[1]) if mask.ndim == 1 else mask
-            for mask, part in zip(img_masks, seen, strict=True)
-        ]
-        embeddings = torch.cat([*(part.to(words.dtype) for part in seen), words], dim=1)
-        real = torch.cat([*shown, real], dim=1)
-        return embeddings, real, torch.zeros_like(real)
+def _gemma(size: Gemma) -> GemmaConfig:
+    return GemmaConfig(size.width, size.depth, size.mlp_dim, size.num_heads, size.num_kv_heads, size.head_dim)
 
 
-# ==== memory_pi05.py
-# pi0.5 with a memory: an encoder makes memory tokens of the frames read, a memory fusion lets actions read those.
-
-FUSIONS: dict[str, type[MemoryFusion]] = {"modulation": Modulation, "context": Context}
-
-
-OWN = ("memory.", "state_token.", "instruction.", "paligemma_with_expert.perception.")
-"""What the names of parameters begin with that plain pi0.5 does not have; a memory fusion has more."""
-
-
-class MemoryPI05(SizedPI05):
-    """pi0.5 with a memory: ``set_memory`` first, then LeRobot's ``forward`` or ``sample_actions``."""
-
-    def __init__(self, config: MemobenchMemConfig, rtc_processor: Any = None) -> None:
-        super().__init__(config, rtc_processor=rtc_processor)
-        self.fusion: MemoryFusion | None = None
-        if config.memory_fusion == "none":
-            return
-        dims = config.dimensions
-        mechanism = make_mechanism(config.memory, config.memory_frames)
-        seeing = self.paligemma_with_expert.perception
-        self.memory = seeing.memory(mechanism.encoder(seeing.dim, dims.vlm.width, seeing.grid))
-        self.fusion = FUSIONS[config.memory_fusion](self, dims.vlm.width, dims.expert.width)
-
-    def memory_parameters(self) -> dict[str, nn.Parameter]:
-        """Every parameter that plain pi0.5 does not have, by name."""
-        fusion = self.fusion
-        return {
-            name: parameter
-            for name, parameter in self.named_parameters()
-            if name.startswith(OWN) or (fusion is not None and fusion.owns(name))
-        }
-
-    def place_of(self, name: str) -> str:
-        """Return the name in this model of a parameter of plain pi0.5."""
-        return name if self.fusion is None else self.fusion.place_of(name)
-
-    def set_memory(
-        self, tokens: Tensor, steps: Tensor, frame_mask: Tensor, numbers: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Encode tokens (B, F, P, D) seen at steps (B, F) and hand them to the fusion.
-
-        Args:
-            numbers: (B, F), equal where frames are; only of a perception that learns to remember, which encodes each
-                once.
-
-        Returns:
-            H (B, F*P, d_m) and its mask (B, F*P), for the alignment objectives.
-        """
-        assert self.fusion is not None  # the policy asks no plain pi0.5
-        if numbers is None:
-            memory = MemoryTokens(*self.memory(tokens, steps, frame_mask))
-        else:
-            memory = self.memory.shared(tokens, steps, frame_mask, numbers)
-        self.fusion.hand_over(memory)
-        return memory.rows(), memory.mask
-
-    def embed_prefix(self, images: Any, img_masks: Any, tokens: Any, masks: Any) -> Prefix:
-        """LeRobot's prefix (what is seen now, language), as the fusion changes it."""
-        prefix: Prefix = super().embed_prefix(images, img_masks, tokens, masks)
-        return prefix if self.fusion is None else self.fusion.prefix(prefix)
+def _resize(vlm: Any, dims: Dimensions, image_size: int) -> Any:
+    """Return a copy of LeRobot's PaliGemma configuration with this size's vocabulary and image tower."""
+    config = deepcopy(vlm)
+    config._vocab_size = config.image_token_index = dims.vocabulary
+    config.vocab_size = config.text_config.vocab_size = dims.vocabulary
+    config.hidden_size = config.projection_dim = dims.vlm.width
+    vision = config.vision_config
+    vision.hidden_size, vision.intermediate_size = dims.vision.width, dims.vision.mlp_dim
+    vision.num_hidden_layers, vision.num_attention_heads = dims.vision.depth, dims.vision.num_heads
+    vision.patch_size, vision.image_size = dims.vision.patch, image_size
+    vision.projection_dim = dims.vlm.width
+    return config
 
 
-# ==== precision.py
-# Numbers of a bfloat16 policy: what learns is kept in float32, and computed with in bfloat16.
-#
-# A bfloat16 weight near 1 has steps of 1/128, so an update at a learning rate of 5e-5 rounds to none. As pi0.5's
-# reference implementation does, trained weights are float32 and autocast rounds them for each pass; what is frozen, and
-# all of a policy that only acts, stays in the bfloat16 that LeRobot gives it.
+# -- precision and attention -----------------------------------------------------------------------------------------
 
 
 class Precision:
-    """The parameters of a module that are bfloat16 while nothing learns.
+    """Precision of a bfloat16 policy's parameters: what learns is kept in float32, and computed with in bfloat16.
+
+    A bfloat16 weight near 1 has steps of 1/128, so an update at a learning rate of 5e-5 rounds to none. As pi0.5's
+    reference implementation does, trained weights are float32 and autocast rounds them for each pass; frozen weights,
+    and all of a policy that only acts, stay in the bfloat16 that LeRobot gives them.
 
     Args:
         parameters: all of the module's, as LeRobot has cast them.
@@ -342,3 +292,38 @@ class Precision:
         if any(parameter.dtype == torch.float32 for parameter in self._narrow):
             return torch.autocast(device.type, dtype=torch.bfloat16)
         return contextlib.nullcontext()
+
+
+MARK = "learns_fused"
+"""Attribute of attention modules that compute in one kernel where gradients are wanted."""
+
+
+def attend_fused(model: nn.Module) -> None:
+    """Compute the attention of a model's layers in one kernel wherever gradients are wanted, while it lives.
+
+    LeRobot's pi0.5 attends by Hugging Face's ``eager_attention_forward``, called by its name, whatever
+    ``attn_implementation`` says. It keeps a weight for each pair of tokens: of 72 samples with two pictures 56 MB in a
+    layer, which come from the system page by page. torch's kernel keeps none, and an update of such a policy takes 1.1
+    instead of 2.0 s on one core. It rounds otherwise, so rollouts go on with LeRobot's.
+    """
+    for module in model.modules():
+        if isinstance(module, modeling_gemma.GemmaAttention):
+            setattr(module, MARK, True)
+    hooked_for(model, ATTEND, _fused)
+
+
+def _fused(attend: Callable[..., Any]) -> Callable[..., Any]:
+    """Wrap transformers' attention for the modules that are marked."""
+
+    @functools.wraps(attend)
+    def attention(
+        module: nn.Module, query: Tensor, key: Tensor, value: Tensor, mask: Tensor | None, scaling: float, **more: Any
+    ) -> tuple[Tensor, Tensor | None]:
+        if not (hasattr(module, MARK) and torch.is_grad_enabled()):
+            weighed: tuple[Tensor, Tensor] = attend(module, query, key, value, mask, scaling, **more)
+            return weighed
+        key, value = (modeling_gemma.repeat_kv(kept, module.num_key_value_groups) for kept in (key, value))
+        read = scaled_dot_product_attention(query, key, value, attn_mask=mask, scale=scaling)
+        return read.transpose(1, 2).contiguous(), None
+
+    return attention
