@@ -20,9 +20,9 @@ from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.envs.video import OPERATION_COLOURS, VideoRecorder
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.html.data import page_data, read_runs, task_source
+from lerobot_memobench.evaluation.html.data import page_data, task_source
 from lerobot_memobench.evaluation.html.write import find_videos, frame_count, inline_json, page, write_html
-from lerobot_memobench.evaluation.records import folder_names
+from lerobot_memobench.evaluation.records import folder_names, read_runs
 from lerobot_memobench.tasks.catalogue import get_task, task_index
 
 STOVE = "turn_on_the_stove_and_turn_it_off"

@@ -1,4 +1,7 @@
-"""Which episodes do two evaluations share? Their rollouts in pairs: the same task, number and referent under both."""
+"""Two evaluations of the same episodes, compared pair by pair, with tests of each difference.
+
+Episodes are paired by task, number and referent. Rates are fractions.
+"""
 
 from __future__ import annotations
 
@@ -22,6 +25,9 @@ ALLOWED = (*(name for name in SETTINGS if name != "suite"), SCENES)
 """What may differ between both when asked for by name."""
 
 Pair = tuple[Record, Record]
+
+
+# --- pairs of rollouts ---
 
 
 def common_episodes(a: Run, b: Run, allow: Collection[str] = ()) -> list[Pair]:
@@ -109,7 +115,7 @@ def paired(a: Sequence[Record], b: Sequence[Record]) -> tuple[list[Record], list
     return [tables[0][key] for key in common], [tables[1][key] for key in common], alone
 
 
-# Two evaluations of the same episodes, compared pair by pair.
+# --- differences ---
 
 
 @dataclass(frozen=True)
@@ -295,7 +301,7 @@ def _adjusted(rows: Sequence[Difference]) -> list[Difference]:
     return result
 
 
-# A comparison of two evaluations as tables and as JSON values.
+# --- the report ---
 
 NOTE = (
     "Difference is the second less the first, in points. p: exact McNemar for SR (pairs of which only one succeeded "

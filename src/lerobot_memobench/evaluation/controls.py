@@ -1,4 +1,7 @@
-"""Two sets of evaluations, made comparable: rollouts of the same episodes at the same replan interval, side by side."""
+"""What the paper's controls share: evaluations of the same episodes side by side, and annotation granularity.
+
+Rollouts are paired by episode within each replan interval.
+"""
 
 from __future__ import annotations
 
@@ -148,7 +151,7 @@ def with_labels_of_level(levels: Mapping[str, Sequence[Record]]) -> dict[str, li
     return own
 
 
-# What the tables of the controls share: titles, and rows of prefix completion as wide as the widest task asks for.
+# --- tables ---
 
 PAPER = "paper"
 PAPER_TASK = "paper, stove task of three checkpoints"
@@ -170,12 +173,12 @@ def prefix_row(task: str, second: str, cells: Sequence[Cell], width: int) -> tup
     return (task, second, *checkpoints, *([None] * (width - len(checkpoints))), success)
 
 
-# Does it matter how finely subgoals are told? Metrics by the language level that a policy was taught with.
+# --- annotation granularity: metrics by the language level that a policy was taught with ---
 
 PAPER_GRANULARITY = {"coarse": (4, 50), "intermediate": (3, 50), "fine": (3, 50)}
 """Successful rollouts of that task by subgoal level (paper, annotation granularity; said in its text only)."""
 
-SENTENCE = (
+GRANULARITY_SENTENCE = (
     "Per cent with Wilson's 95 % interval over rollouts. MSR, MUR and MCR are averages over memory types, under "
     "the evaluated (intermediate) labels and under those of the level itself."
 )
@@ -222,7 +225,7 @@ def granularity_report(levels: Levels, own_labels: Levels, paper: bool = False) 
     own = {level: summarise(records) for level, records in own_labels.items()}
     tables = (_rates(summaries, own), _prefixes(summaries, paper))
     data = {level: _data(summary, own[level]) for level, summary in summaries.items()}
-    return Report("Annotation granularity", (Section("", tables, sentences=(SENTENCE,)),), data)
+    return Report("Annotation granularity", (Section("", tables, sentences=(GRANULARITY_SENTENCE,)),), data)
 
 
 def _rates(summaries: Summaries, own: Summaries) -> Table:

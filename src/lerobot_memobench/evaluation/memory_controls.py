@@ -1,7 +1,8 @@
-"""What a perfect memory would recover: rates with and without oracle memory text, and the share of the gap it closes.
+"""Oracle and shuffled memory, each against the policy as it is, episode by episode.
 
-Two evaluations are compared episode by episode. A memory type is the mean over its applicable tasks, the average the
-mean over applicable memory types, as in every table of the benchmark. Rates are fractions.
+Oracle memory: what a perfect memory would recover, as the share of the gap to 100 % that it closes. Shuffled memory:
+does a policy need its subgoals in order? A memory type is the mean over its applicable tasks, the average the mean over
+applicable memory types, as in every table of the benchmark. Rates are fractions.
 """
 
 from __future__ import annotations
@@ -180,7 +181,7 @@ def _published(standard: float | None, oracle: float | None) -> Contrast:
     return Contrast(a, b, Estimate(difference), Estimate(gap_closed(a, b)))
 
 
-# --- the report ---
+# --- oracle memory: the report ---
 
 ORACLE_SENTENCE = (
     "Cells are standard/oracle in per cent. Gap closed is (oracle − standard)/(100 − standard), with "
@@ -229,7 +230,7 @@ def _cells(metrics: Mapping[str, Contrast]) -> list[Cell]:
     return [*pairs, *(estimate(metrics[m].closed) for m in METRICS)]
 
 
-# Does a policy need its subgoals in order? How far rollouts come with normal and with shuffled memory.
+# --- shuffled memory: prefix completion ---
 
 
 @dataclass(frozen=True)
@@ -284,7 +285,7 @@ def _prefixes(group: Sequence[Record]) -> Array:
     return np.array([[*prefix(satisfied(record)), bool(record["success"])] for record in group], dtype=float)
 
 
-# --- the report ---
+# --- shuffled memory: the report ---
 
 SHUFFLED_SENTENCE = (
     "Rollouts in which a checkpoint and all before it were satisfied, per cent, with Wilson's 95 % interval. The "

@@ -1,4 +1,9 @@
-"""What rollouts did: checkpoint by checkpoint, task by task, under one protocol or several."""
+"""SR, MSR, MUR and MCR of rollouts with their intervals, prefix completion, and classes of failure.
+
+A rollout is one line of the episode log. Rates are fractions in [0, 1]; `report_values` turns them into percentages
+with one decimal. None stands for not applicable: a task without checkpoints of an operation has no rate for it and leaves
+that average.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +20,9 @@ from lerobot_memobench.tasks.task import MEMORY_TYPES, OPERATIONS, STRICT_FAILUR
 
 Record = Mapping[str, Any]
 """A rollout: one line of the episode log."""
+
+
+# --- what rollouts did ---
 
 
 def operations(record: Record) -> str:
@@ -65,6 +73,8 @@ def _check_one_version(name: str, group: Sequence[Record]) -> None:
             + ", ".join(MEMORY_TYPES)
         )
 
+
+# --- under which protocol ---
 
 NOT_RECORDED = "not recorded"
 """What is said of a policy of which nobody wrote down its inputs."""
@@ -121,10 +131,7 @@ def faults(records: Iterable[Record]) -> list[str]:
     ]
 
 
-# SR, MSR, MUR and MCR of rollouts, and their intervals (paper, section on metrics).
-#
-# Rates are fractions in [0, 1]; `summary.report` turns them into percentages with one decimal. None stands for not
-# applicable: a task without checkpoints of an operation has no rate for it and leaves that average.
+# --- rates ---
 
 PROCESS_METRICS: dict[str, str] = {"MSR": "S", "MUR": "U", "MCR": "C"}
 """Metric -> operation of the checkpoints it looks at."""
@@ -185,7 +192,7 @@ def percent(value: float | None) -> float | None:
     return None if value is None else round(100.0 * value, 1)
 
 
-# --- of rollouts ---
+# --- rates of rollouts ---
 
 
 def success_rate(records: Sequence[Record]) -> Rate:
@@ -231,7 +238,7 @@ def column_rates(rows: Sequence[Sequence[bool]]) -> list[Rate]:
     return [Rate(sum(column) / len(rows), len(rows)) for column in zip(*rows, strict=True)]
 
 
-# --- means ---
+# --- means of rates ---
 
 
 def mean_row(rows: Iterable[Row]) -> Row:
@@ -258,7 +265,7 @@ def mean_rate(rates: Iterable[Rate]) -> Rate:
     return Rate(mean, n, None if math.isclose(effective, n) else effective)
 
 
-# How often each failure class occurs among rollouts; the rule itself is ``tasks.failures``.
+# --- failures; the rule itself is `tasks.failures` ---
 
 _ALL = (*FAILURES, *REFINED_FAILURES, *STRICT_FAILURES, *FAULTS)
 
@@ -288,7 +295,7 @@ def failure_counts(records: Iterable[Record]) -> dict[str, int]:
     return {name: found[name] for name in _ALL if name in FAILURES or found[name]}
 
 
-# Every figure of a set of rollouts, and what of it stands in ``report.json``.
+# --- every figure of a set of rollouts ---
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,8 @@
-"""Of which types is a result card? What its parts mean, `engine.card` says."""
+"""Evaluations read back from their folders: result card, protocol, rollouts, names.
+
+An evaluation is given as its folder, or as ``NAME=FOLDER``. Evaluations of the same name are one method at several
+replan intervals; without names, those of the same policy are.
+"""
 
 from __future__ import annotations
 
@@ -29,6 +33,8 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import Record, Summary, faults, mixtures, summarise
 from lerobot_memobench.io import LARGEST, Count, Name, Whole, count_of, read_json
 from lerobot_memobench.tasks.task import PUBLISHED
+
+# --- types of the result card; what its parts mean, `run.card` says ---
 
 
 class PolicySettings(TypedDict, total=False):
@@ -113,7 +119,7 @@ class WholeCard(TypedDict):
     episodes: list[Found]
 
 
-# What an evaluation was run under, read back from its folder, and in what two of them differ.
+# --- the protocol ---
 
 __all__ = [
     "CARD_FILE",
@@ -188,7 +194,7 @@ def _note(found: dict[str, Any], key: str, values: list[Any]) -> None:
 
 
 def read_card(path: Path, *, whole: bool = False) -> dict[str, Any]:
-    """Return a result card (see ``engine.card``).
+    """Return a result card (see `run.card`).
 
     Args:
         whole: nothing of it may be left out, as reports allow.
@@ -207,10 +213,7 @@ def read_card(path: Path, *, whole: bool = False) -> dict[str, Any]:
     return found
 
 
-# Evaluations as reports and figures see them: what each is called, its rollouts, its rates, whose they are.
-#
-# An evaluation is given as its folder, or as ``NAME=FOLDER``. Evaluations of the same name are one method at several
-# replan intervals; without names, those of the same policy are.
+# --- evaluations ---
 
 HASH_DIGITS = 8
 

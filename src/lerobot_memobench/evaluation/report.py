@@ -1,4 +1,8 @@
-"""The figures of evaluations as JSON values: the keys of ``report.json``, and more beside them."""
+"""The report of evaluations: for the terminal, Markdown, CSV, LaTeX, and JSON for programs.
+
+``report.json`` beside an evaluation's log holds exactly the keys of the benchmark's specification. As JSON among the
+formats the same keys stand with more beside them: intervals, prefix completion in order, pooled rates, protocol.
+"""
 
 from __future__ import annotations
 
@@ -45,166 +49,6 @@ from lerobot_memobench.evaluation.report_tables import (
 from lerobot_memobench.evaluation.tables import WRITERS, Report, Section, csv_text, markdown, terminal_table
 from lerobot_memobench.io import write_file
 from lerobot_memobench.paper import PublishedRow, published_rows
-
-
-def report_data(runs: Sequence[Run], paper: bool) -> dict[str, Any]:
-    """Return the figures of one or several evaluations, and the published ones where asked for."""
-    found: dict[str, Any]
-    if len(runs) == 1:
-        found = run_data(runs[0])
-    else:
-        found = {
-            "evaluations": {run.name: run_data(run) for run in runs},
-            "notes": unlike({run.name: run.protocol for run in runs}),
-        }
-    if swept := sweeps(runs):
-        found["replan_sweep"] = {method: _sweep_data(group) for method, group in swept.items()}
-    if paper:
-        found["departs_from_paper"] = {run.name: departures(run) for run in runs}
-        found["paper"] = [_published_data(row) for row in published_rows()]
-    return found
-
-
-def run_data(run: Run) -> dict[str, Any]:
-    """Return the figures of one evaluation: the keys of ``report.json``, and more beside them."""
-    summary = run.summary
-    policy = run.protocol.get(POLICY) or {}
-    return {
-        **report_values(summary),
-        "name": run.name,
-        "method": run.method,
-        "replan_steps": run.replan_steps,
-        "protocol": {key: value for key, value in run.protocol.items() if key != POLICY},
-        "policy": {key: policy.get(key) for key in ("type", "sha256", "seed")},
-        "intervals": {
-            "tasks": {name: _intervals(row) for name, row in summary.tasks.items()},
-            "memory_types": {name: _intervals(row) for name, row in summary.memory_types.items()},
-            "average": _intervals(summary.average),
-        },
-        "ordered_prefix": {
-            name: [percent(rate.value) for rate in rates] for name, rates in summary.ordered_prefix.items()
-        },
-        "pooled": {
-            "checkpoints": _pooled(summary.pooled_checkpoints),
-            **{metric: _pooled(rate) for metric, rate in summary.pooled.items()},
-        },
-        "failures_by_task": {name: dict(counts) for name, counts in summary.failures_of.items()},
-        "notes": list(run.notes),
-    }
-
-
-def _intervals(row: Row) -> dict[str, list[float | None] | None]:
-    return {metric: interval_of(row[metric]) for metric in METRICS}
-
-
-def interval_of(rate: Rate) -> list[float | None] | None:
-    """Return the interval of a rate in per cent, None where it has none."""
-    interval = rate.interval if rate.trials else None
-    return None if interval is None else [percent(bound) for bound in interval]
-
-
-def _pooled(rate: Rate) -> dict[str, Any]:
-    return {"percent": percent(rate.value), "n": rate.n}
-
-
-def _sweep_data(runs: Sequence[Run]) -> dict[str, Any]:
-    return {
-        "best": {metric: best_interval(runs, metric)[0] for metric in METRICS},
-        "average": {
-            str(run.replan_steps): {metric: percent(run.summary.average[metric].value) for metric in METRICS}
-            for run in runs
-        },
-    }
-
-
-def _published_data(row: PublishedRow) -> dict[str, Any]:
-    return {
-        "table": row.table,
-        "model": row.model,
-        "replan_steps": row.replan_steps,
-        "memory_types": {name: dict(figures) for name, figures in row.memory_types.items()},
-        "average": dict(row.average),
-    }
-
-
-# The figures of evaluations as rows of CSV, one figure a row.
-
-HEADER = ("evaluation", "replan_steps", "table", "name", "figure", "percent", "low", "high", "n", "inputs")
-"""``table`` is tasks, memory_types, average, pooled, prefix, ordered_prefix, failures, or extent beside the paper's."""
-
-CsvRow = tuple[object, ...]
-
-
-def csv_rows(runs: Sequence[Run], paper: bool) -> list[CsvRow]:
-    """Return every figure of evaluations, and the published ones where asked for."""
-    rows = [row for run in runs for row in _run_rows(run)]
-    if paper:
-        rows += [row for run in runs for row in _extent(run)]
-        rows += [row for published in published_rows() for row in _published_rows(published)]
-    return rows
-
-
-def _run_rows(run: Run) -> Iterator[CsvRow]:
-    for place, name, figure, rate in _figures(run.summary):
-        # Records of one rollout are not independent: an interval over them would be too narrow.
-        interval = None if place == "pooled" and figure != "SR" else interval_of(rate)
-        low, high = interval or (None, None)
-        yield (
-            run.name,
-            run.replan_steps,
-            place,
-            name,
-            figure,
-            percent(rate.value),
-            low,
-            high,
-            rate.n or None,
-            run.summary.inputs,
-        )
-
-
-def _extent(run: Run) -> Iterator[CsvRow]:
-    """Yield how much was run: beside rows of 30 tasks and 1,500 rollouts."""
-    for figure, count in (("tasks", len(run.summary.tasks)), ("rollouts", run.summary.rollouts)):
-        yield (run.name, run.replan_steps, "extent", "", figure, None, None, None, count, run.summary.inputs)
-
-
-def _published_rows(published: PublishedRow) -> Iterator[CsvRow]:
-    method = f"paper, {published.table}: {published.model}"
-    groups: list[tuple[str, str, Mapping[str, float | None]]] = [
-        *(("memory_types", name, figures) for name, figures in published.memory_types.items()),
-        ("average", "", published.average),
-    ]
-    for place, name, figures in groups:
-        for metric in METRICS:
-            yield (method, published.replan_steps, place, name, metric, figures[metric], None, None, None, PAPER_SAW)
-
-
-def _figures(summary: Summary) -> Iterator[tuple[str, str, str, Rate]]:
-    """Yield (table, name, figure, rate) of everything in a summary."""
-    rows: list[tuple[str, str, Row]] = [
-        *(("tasks", name, row) for name, row in summary.tasks.items()),
-        *(("memory_types", name, row) for name, row in summary.memory_types.items()),
-        ("average", "", summary.average),
-        ("pooled", "", summary.pooled),
-    ]
-    for place, name, row in rows:
-        for metric in METRICS:
-            yield place, name, metric, row[metric]
-    yield "pooled", "", "checkpoints", summary.pooled_checkpoints
-    for place, prefixes in (("prefix", summary.prefix), ("ordered_prefix", summary.ordered_prefix)):
-        for name, rates in prefixes.items():
-            for k, rate in enumerate(rates):
-                yield place, name, f"c{k + 1}", rate
-    total = summary.rollouts
-    for failure, count in summary.failures.items():
-        yield "failures", "", failure, Rate(count / total, total)
-
-
-# The report of evaluations: for the terminal, Markdown, CSV, LaTeX, and JSON for programs.
-#
-# ``report.json`` beside an evaluation's log holds exactly the keys of the benchmark's specification. As JSON among the
-# formats the same keys stand with more beside them: intervals, prefix completion in order, pooled rates, protocol.
 
 REPORT_JSON = "report.json"
 REPORT_MARKDOWN = "report.md"
@@ -340,3 +184,160 @@ def _numbered(section: Section, number: int) -> Section:
         title = f"{each.title}: {section.title}" if section.title and each.key in OF_EACH_EVALUATION else each.title
         numbered.append(replace(each, key=f"{each.key}-{number}", title=title))
     return replace(section, tables=tuple(numbered))
+
+
+# --- JSON ---
+
+
+def report_data(runs: Sequence[Run], paper: bool) -> dict[str, Any]:
+    """Return the figures of one or several evaluations, and the published ones where asked for."""
+    found: dict[str, Any]
+    if len(runs) == 1:
+        found = run_data(runs[0])
+    else:
+        found = {
+            "evaluations": {run.name: run_data(run) for run in runs},
+            "notes": unlike({run.name: run.protocol for run in runs}),
+        }
+    if swept := sweeps(runs):
+        found["replan_sweep"] = {method: _sweep_data(group) for method, group in swept.items()}
+    if paper:
+        found["departs_from_paper"] = {run.name: departures(run) for run in runs}
+        found["paper"] = [_published_data(row) for row in published_rows()]
+    return found
+
+
+def run_data(run: Run) -> dict[str, Any]:
+    """Return the figures of one evaluation: the keys of ``report.json``, and more beside them."""
+    summary = run.summary
+    policy = run.protocol.get(POLICY) or {}
+    return {
+        **report_values(summary),
+        "name": run.name,
+        "method": run.method,
+        "replan_steps": run.replan_steps,
+        "protocol": {key: value for key, value in run.protocol.items() if key != POLICY},
+        "policy": {key: policy.get(key) for key in ("type", "sha256", "seed")},
+        "intervals": {
+            "tasks": {name: _intervals(row) for name, row in summary.tasks.items()},
+            "memory_types": {name: _intervals(row) for name, row in summary.memory_types.items()},
+            "average": _intervals(summary.average),
+        },
+        "ordered_prefix": {
+            name: [percent(rate.value) for rate in rates] for name, rates in summary.ordered_prefix.items()
+        },
+        "pooled": {
+            "checkpoints": _pooled(summary.pooled_checkpoints),
+            **{metric: _pooled(rate) for metric, rate in summary.pooled.items()},
+        },
+        "failures_by_task": {name: dict(counts) for name, counts in summary.failures_of.items()},
+        "notes": list(run.notes),
+    }
+
+
+def _intervals(row: Row) -> dict[str, list[float | None] | None]:
+    return {metric: interval_of(row[metric]) for metric in METRICS}
+
+
+def interval_of(rate: Rate) -> list[float | None] | None:
+    """Return the interval of a rate in per cent, None where it has none."""
+    interval = rate.interval if rate.trials else None
+    return None if interval is None else [percent(bound) for bound in interval]
+
+
+def _pooled(rate: Rate) -> dict[str, Any]:
+    return {"percent": percent(rate.value), "n": rate.n}
+
+
+def _sweep_data(runs: Sequence[Run]) -> dict[str, Any]:
+    return {
+        "best": {metric: best_interval(runs, metric)[0] for metric in METRICS},
+        "average": {
+            str(run.replan_steps): {metric: percent(run.summary.average[metric].value) for metric in METRICS}
+            for run in runs
+        },
+    }
+
+
+def _published_data(row: PublishedRow) -> dict[str, Any]:
+    return {
+        "table": row.table,
+        "model": row.model,
+        "replan_steps": row.replan_steps,
+        "memory_types": {name: dict(figures) for name, figures in row.memory_types.items()},
+        "average": dict(row.average),
+    }
+
+
+# --- CSV: one figure a row ---
+
+HEADER = ("evaluation", "replan_steps", "table", "name", "figure", "percent", "low", "high", "n", "inputs")
+"""``table`` is tasks, memory_types, average, pooled, prefix, ordered_prefix, failures, or extent beside the paper's."""
+
+CsvRow = tuple[object, ...]
+
+
+def csv_rows(runs: Sequence[Run], paper: bool) -> list[CsvRow]:
+    """Return every figure of evaluations, and the published ones where asked for."""
+    rows = [row for run in runs for row in _run_rows(run)]
+    if paper:
+        rows += [row for run in runs for row in _extent(run)]
+        rows += [row for published in published_rows() for row in _published_rows(published)]
+    return rows
+
+
+def _run_rows(run: Run) -> Iterator[CsvRow]:
+    for place, name, figure, rate in _figures(run.summary):
+        # Records of one rollout are not independent: an interval over them would be too narrow.
+        interval = None if place == "pooled" and figure != "SR" else interval_of(rate)
+        low, high = interval or (None, None)
+        yield (
+            run.name,
+            run.replan_steps,
+            place,
+            name,
+            figure,
+            percent(rate.value),
+            low,
+            high,
+            rate.n or None,
+            run.summary.inputs,
+        )
+
+
+def _extent(run: Run) -> Iterator[CsvRow]:
+    """Yield how much was run: beside rows of 30 tasks and 1,500 rollouts."""
+    for figure, count in (("tasks", len(run.summary.tasks)), ("rollouts", run.summary.rollouts)):
+        yield (run.name, run.replan_steps, "extent", "", figure, None, None, None, count, run.summary.inputs)
+
+
+def _published_rows(published: PublishedRow) -> Iterator[CsvRow]:
+    method = f"paper, {published.table}: {published.model}"
+    groups: list[tuple[str, str, Mapping[str, float | None]]] = [
+        *(("memory_types", name, figures) for name, figures in published.memory_types.items()),
+        ("average", "", published.average),
+    ]
+    for place, name, figures in groups:
+        for metric in METRICS:
+            yield (method, published.replan_steps, place, name, metric, figures[metric], None, None, None, PAPER_SAW)
+
+
+def _figures(summary: Summary) -> Iterator[tuple[str, str, str, Rate]]:
+    """Yield (table, name, figure, rate) of everything in a summary."""
+    rows: list[tuple[str, str, Row]] = [
+        *(("tasks", name, row) for name, row in summary.tasks.items()),
+        *(("memory_types", name, row) for name, row in summary.memory_types.items()),
+        ("average", "", summary.average),
+        ("pooled", "", summary.pooled),
+    ]
+    for place, name, row in rows:
+        for metric in METRICS:
+            yield place, name, metric, row[metric]
+    yield "pooled", "", "checkpoints", summary.pooled_checkpoints
+    for place, prefixes in (("prefix", summary.prefix), ("ordered_prefix", summary.ordered_prefix)):
+        for name, rates in prefixes.items():
+            for k, rate in enumerate(rates):
+                yield place, name, f"c{k + 1}", rate
+    total = summary.rollouts
+    for failure, count in summary.failures.items():
+        yield "failures", "", failure, Rate(count / total, total)

@@ -1,4 +1,4 @@
-"""What a report says in sentences."""
+"""Tables, sections and sentences of a report: of one evaluation, of several, and beside the paper's."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def failure_line(summary: Summary) -> str:
     return "failed rollouts: " + ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in failed.items())
 
 
-# The tables of one evaluation: rates, prefix completion, how rollouts ended.
+# --- tables of one evaluation ---
 
 AVERAGE = "average of memory types"
 
@@ -73,9 +73,6 @@ HOW_TO_READ = (
     "SR is success, MSR, MUR and MCR the rates at which checkpoints of Storage, Update and Compression were satisfied "
     "at some step. Per cent, with the Wilson 95 % interval; n counts rollouts; – is not applicable."
 )
-
-
-# --- rates ---
 
 
 def rates_table(summary: Summary) -> Table:
@@ -127,9 +124,6 @@ def rate_row(name: Cell, row: Row) -> tuple[Cell, ...]:
     return (name, Count(row["SR"].n), *(row[metric] for metric in METRICS))
 
 
-# --- prefix completion ---
-
-
 def prefix_table(summary: Summary) -> Table:
     """Return per task how many rollouts came as far as each checkpoint, in any order and in order."""
     width = max((len(found) for found in summary.prefix.values()), default=0)
@@ -151,9 +145,6 @@ def prefix_table(summary: Summary) -> Table:
             "per cent."
         ),
     )
-
-
-# --- failures ---
 
 
 FURTHER_NOTES = {
@@ -203,7 +194,7 @@ def _tasks_of(summary: Summary, memory_type: str) -> list[str]:
     return [name for name, its_type in summary.memory_type_of.items() if its_type == memory_type]
 
 
-# Several evaluations side by side, in the layout of the paper's main table: every memory type's rates in one row.
+# --- several evaluations, in the layout of the paper's main table: every memory type's rates in one row ---
 
 LEADING = ("evaluation", "inputs", "k")
 """Columns before the rates."""
@@ -254,7 +245,7 @@ def wide_table(
     )
 
 
-# One method at several replan intervals: its tables, and which interval is best for what.
+# --- one method at several replan intervals ---
 
 
 def sweep(method: str, runs: Sequence[Run]) -> Section:
@@ -322,7 +313,7 @@ def _slug(name: str) -> str:
     return "-".join("".join(c if c.isalnum() and c.isascii() else " " for c in name).split()) or "policy"
 
 
-# The paper's tables with evaluations on top of each, and in what these depart from the paper's protocol.
+# --- beside the paper's tables ---
 
 PAPER_PROTOCOL = {"referent": "fixed", "demonstration_prompt": True, "horizon": 1200, "seed_base": 7}
 PAPER_SAW = "pixels"

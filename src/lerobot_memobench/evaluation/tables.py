@@ -1,4 +1,4 @@
-"""Tables of a report, whatever they are written as; ``formats`` writes them."""
+"""Tables of a report, and what they are written as: terminal, text, Markdown, LaTeX, JSON, CSV."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def best_in_columns(rows: tuple[tuple[Cell, ...], ...]) -> frozenset[tuple[int, 
     return frozenset(found)
 
 
-# Reports as GitHub's Markdown.
+# --- GitHub's Markdown ---
 
 
 def markdown(report: Report) -> str:
@@ -191,7 +191,7 @@ def _header(table: Table) -> list[str]:
     return [f"{title} {name}" if title else name for title, name in zip(table.titles, table.header, strict=True)]
 
 
-# Reports as LaTeX tables in the style of booktabs.
+# --- LaTeX in the style of booktabs ---
 
 _LATEX = {
     "\\": r"\textbackslash{}",
@@ -300,7 +300,7 @@ def _latex_cell(cell: Cell, intervals: bool) -> str:
     return latex_text(plain(cell))
 
 
-# Reports as the terminal shows them, and the same as text for a file.
+# --- the terminal ---
 
 WIDTH = 140
 """Columns of a report that is written to a file."""
@@ -460,7 +460,7 @@ def _columns(table: Table, chosen: Sequence[int], first: bool) -> Table:
     )
 
 
-# What a report may be written as: the terminal's tables, text, Markdown, LaTeX, JSON; and rows as CSV.
+# --- JSON, CSV, and all formats ---
 
 __all__ = ["WRITERS", "csv_text", "json_text", "latex", "markdown", "terminal", "text"]
 

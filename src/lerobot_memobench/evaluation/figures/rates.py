@@ -1,4 +1,4 @@
-"""Radar: per method the best value over replan intervals, each axis normalised by its highest (paper, appendix)."""
+"""Figures of rates: radar, process metrics against success, curves over replan intervals."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def _name_axis(place: Any, angle: float, axis: Axis, top: float) -> None:
     )
 
 
-# Process metrics against success: one point per method, replan interval and memory type (paper, main results).
+# --- process metrics against success: a point per method, replan interval and memory type (paper, main results) ---
 
 Point = tuple[float, float, str]
 """(process metric, SR, memory type), per cent."""
@@ -291,7 +291,7 @@ def _correlations_text(found: Sequence[Point], before: str) -> str:
     return f"{before}{value} ({len(found)} points)"
 
 
-# Rates by replan interval: one line per method, with Wilson's intervals where n is known (paper, main results).
+# --- rates by replan interval: a line per method, with Wilson's intervals where n is known (paper, main results) ---
 
 AVERAGE = "average"
 

@@ -1,4 +1,4 @@
-"""How rollouts ended: one bar per evaluation and memory type, filled by outcome (paper, failure mode taxonomy)."""
+"""Figures of rollouts: how they ended, and how many got as far as each checkpoint."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ def _failures_label(found: Sequence[Bar], k: int) -> str:
     return "   ".join(part for part in parts if part)
 
 
-# Prefix completion: how many rollouts got as far as each checkpoint, one panel per task (paper, ablations).
+# --- prefix completion: one panel per task (paper, ablations) ---
 
 COLUMNS = 5
 

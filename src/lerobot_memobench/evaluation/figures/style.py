@@ -188,7 +188,7 @@ def save(figure: Figure, out: Path, name: str) -> list[Path]:
     return paths
 
 
-# The rows that figures are drawn from: one method at one replan interval, ours or the paper's alike.
+# --- the rows that figures are drawn from: one method at one replan interval, ours or the paper's alike ---
 
 Identity = tuple[str, bool]
 """(method, whether it is the paper's)."""

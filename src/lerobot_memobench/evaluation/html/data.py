@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,16 +21,12 @@ from lerobot_memobench.evaluation.metrics import (
     failure_of,
     operations,
     percent,
-    summarise,
 )
 from lerobot_memobench.evaluation.records import (
     CARD_FILE,
     POLICY,
-    check_one_suite,
-    folder_names,
+    Run,
     read_card,
-    read_protocol,
-    read_rollouts,
     unlike,
 )
 from lerobot_memobench.evaluation.report_tables import outcomes, settings_phrases
@@ -42,32 +37,6 @@ from lerobot_memobench.tasks.catalogue import find_tasks, get_task, load_task, t
 from lerobot_memobench.tasks.failures import FAILURES
 from lerobot_memobench.tasks.formula import format_formula
 from lerobot_memobench.tasks.task import LEVELS, MEMORY_TYPES, Task
-
-
-@dataclass(frozen=True)
-class Run:
-    """One evaluation: its name in the report, where it lies, its rollouts, what a reader must know of them, its
-    protocol, and its result card ({} where there is none).
-    """
-
-    name: str
-    folder: Path
-    records: list[dict[str, Any]]
-    notes: list[str] = field(default_factory=list)
-    protocol: dict[str, Any] = field(default_factory=dict)
-    card: dict[str, Any] = field(default_factory=dict)
-
-
-def read_runs(folders: Sequence[str | Path]) -> list[Run]:
-    """Read the logs of several evaluations and name them after their folders."""
-    runs = []
-    for folder, name in zip(folders, folder_names(folders), strict=True):
-        records, notes = read_rollouts(folder)
-        path = Path(folder) / CARD_FILE
-        card = read_card(path) if path.is_file() else {}
-        runs.append(Run(name, Path(folder), records, notes, read_protocol(folder), card))
-    check_one_suite({run.folder: run.records for run in runs})
-    return runs
 
 
 def task_source(task_dir: str | Path | None) -> dict[str, Task]:
@@ -144,13 +113,15 @@ def _variant(record: Record) -> int:
 
 def run_data(run: Run, videos: Mapping[int, str]) -> dict[str, Any]:
     """Return one evaluation: protocol, rates, failures and rollouts."""
-    summary = summarise(run.records)
+    summary = run.summary
+    card = run.folder / CARD_FILE
+    starts = read_card(card).get("runs", []) if card.is_file() else []
     return {
         "name": run.name,
         "folder": str(run.folder),
         "facts": facts(run.records, run.protocol),
-        "commands": [shlex.join(it["command"]) for it in run.card.get("runs", []) if it.get("command")],
-        "notes": run.notes,
+        "commands": [shlex.join(start["command"]) for start in starts if start.get("command")],
+        "notes": list(run.notes),
         "average": row_data(summary.average),
         "memory_types": {name: row_data(row) for name, row in summary.memory_types.items()},
         "tasks": {name: task_data(name, summary) for name in summary.tasks},

@@ -23,8 +23,9 @@ from typing import Any
 
 from lerobot_memobench.envs.video import LAST_FRAMES
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.html.data import Run, episode_id, page_data, read_runs, task_source
+from lerobot_memobench.evaluation.html.data import episode_id, page_data, task_source
 from lerobot_memobench.evaluation.metrics import Record
+from lerobot_memobench.evaluation.records import Run, read_runs
 from lerobot_memobench.io import draft_of, file_name, parsed, write_file
 
 PAGE = "index.html"
@@ -66,12 +67,13 @@ def write_html(
     runs: list[Run] = []
     chosen: dict[Path, Path] = {}
     addresses: list[dict[int, str]] = []
-    for run, slug in zip(*_with_slugs(read_runs(folders)), strict=True):
+    evaluations = read_runs([Path(folder) for folder in folders])
+    for run, slug in zip(evaluations, _slugs([run.name for run in evaluations]), strict=True):
         found, notes = find_videos(run.folder, run.records)
         names = {k: f"{VIDEOS}/{slug}/{episode_id(run.records[k])}.mp4" for k in found}
         chosen |= {out / name: found[k] for k, name in names.items()}
         addresses.append(names)
-        runs.append(replace(run, notes=run.notes + notes))
+        runs.append(replace(run, notes=(*run.notes, *notes)))
     text = page(page_data(runs, addresses, task_source(task_dir)), title=", ".join(run.name for run in runs))
     out.mkdir(parents=True, exist_ok=True)
     if not (out / PAGE).exists():
@@ -87,17 +89,17 @@ def write_html(
     )
 
 
-def _with_slugs(runs: list[Run]) -> tuple[list[Run], list[str]]:
-    """Return the runs, and for each a folder name made of plain characters that no other run has."""
+def _slugs(names: Sequence[str]) -> list[str]:
+    """Return for each name that of a folder: plain characters, no two alike."""
     slugs: list[str] = []
-    for run in runs:
-        base = re.sub(r"[^A-Za-z0-9._-]+", "_", run.name).strip("._") or "run"
+    for name in names:
+        base = re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("._") or "run"
         slug, k = base, 1
         while slug.lower() in (other.lower() for other in slugs):  # file systems may not tell A from a
             k += 1
             slug = f"{base}_{k}"
         slugs.append(slug)
-    return runs, slugs
+    return slugs
 
 
 def _check_target(out: Path) -> None:
