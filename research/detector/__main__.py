@@ -80,7 +80,8 @@ def _count(count: Callable[..., None], at: Advance) -> None:
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return the exit status."""
     name, *rest = (sys.argv[1:] if argv is None else argv) or [""]
-    command = {"train": train, "test": measure}.get(name)
+    commands: dict[str, Callable[..., None]] = {"train": train, "test": measure}
+    command = commands.get(name)
     if command is None:
         print("python -m research.detector: name `train` or `test` (each has --help)", file=sys.stderr)
         return 2

@@ -30,6 +30,7 @@ from lerobot_memobench.perception.detector import (
     Detector,
     DetectorOutput,
     Heads,
+    PyramidLevel,
     peaks,
 )
 from lerobot_memobench.perception.geometry import projected
@@ -139,7 +140,7 @@ class _Trainer:
 
     def __init__(self, detector: Detector, settings: Training, pictures: int) -> None:
         self.detector, self._settings, self._pictures = detector, settings, pictures
-        detector.to(memory_format=torch.channels_last)
+        detector.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._optimizer = torch.optim.AdamW(detector.parameters(), settings.rate, weight_decay=settings.decay)
         self._schedule = torch.optim.lr_scheduler.OneCycleLR(
             self._optimizer, settings.rate, settings.updates, pct_start=0.05, cycle_momentum=False
@@ -223,7 +224,12 @@ def train_last(
         [{"params": part.requires_grad_(True).parameters(), "lr": rate} for part, rate in parts]
     )
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, updates)
-    kept = {"uncertainty": uncertainty, "refinement": refinement, "optimizer": optimizer, "schedule": schedule}
+    kept: dict[str, Any] = {
+        "uncertainty": uncertainty,
+        "refinement": refinement,
+        "optimizer": optimizer,
+        "schedule": schedule,
+    }
     if checkpoint is not None and checkpoint.is_file():
         state: dict[str, Any] = torch.load(checkpoint, weights_only=True)
         for name, part in kept.items():
@@ -431,10 +437,13 @@ def whiten(detector: Detector, batches: Iterable[Tensor]) -> None:
         ours.add(tokens)
         pooled.add(encoder.pooled(tokens))
     mean, whitening = ours.whitening()
+    assert isinstance(encoder.decorrelate, nn.Linear)
     _whiten_output(encoder.decorrelate, whitening, mean)
     near = encoder.pool.in_features // encoder.width
     _undo_in_input(encoder.pool, torch.block_diag(*[whitening] * near), mean.repeat(near))
-    for linear in (*_linears(detector.token_heads), detector.fpn.levels[0].upsample):
+    coarsest = detector.fpn.levels[0]
+    assert isinstance(coarsest, PyramidLevel)
+    for linear in (*_linears(detector.token_heads), coarsest.upsample):
         _undo_in_input(linear, whitening, mean)
     mean, whitening = pooled.whitening()
     _whiten_output(encoder.pool, whitening, mean)

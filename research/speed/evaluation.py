@@ -99,7 +99,9 @@ LINES = {
 def looking_every(steps: int) -> Iterator[None]:
     """While this lasts, the random policy looks at every ``steps``-th observation, at none with 0."""
     calls = itertools.count(1)
-    with patch.object(MemobenchRandomPolicy, "needs_observation", lambda self: bool(steps) and next(calls) % steps == 0):
+    with patch.object(
+        MemobenchRandomPolicy, "needs_observation", lambda self: bool(steps) and next(calls) % steps == 0
+    ):
         yield
 
 
@@ -123,6 +125,7 @@ def step_bare(every: int, steps: int, task: str = TASK) -> Cost:
     watched = True
     with tempfile.TemporaryDirectory() as out, stopwatch() as watch:
         config = MemobenchEnvConfig(tasks=task, demonstration_prompt=False, horizon=steps, log_dir=out)
+        env: Any  # gymnasium's stub of a vector environment knows no list of seeds, and no `call`
         ((env,),) = (suite.values() for suite in config.create_envs(1).values())
         env.reset(seed=[EVALUATION_SEED])
         for number, action in enumerate(_moves(steps), start=1):

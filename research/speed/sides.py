@@ -114,6 +114,7 @@ class Vectored:
         self._logs = TemporaryDirectory()
         config = MemobenchEnvConfig(task=task, demonstration_prompt=False, log_dir=self._logs.name)
         [suite] = config.create_envs(1).values()
+        self.env: Any  # gymnasium's stub of a vector environment knows no list of seeds
         [self.env] = suite.values()
         self.reset(0)
 

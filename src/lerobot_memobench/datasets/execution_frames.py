@@ -8,14 +8,17 @@ downloaded datasets, and LeRobot's dataset tools keep it.
 from __future__ import annotations
 
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from torch.utils.data import Dataset, Subset
+from torch.utils.data import Subset
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import EXECUTION
+
+if TYPE_CHECKING:
+    from lerobot.datasets import LeRobotDataset
 
 PHASE = "phase"
 COLUMNS = {PHASE, "simple_subgoal"}
@@ -88,7 +91,7 @@ class ExecutionFrames(Subset[Any]):
         hf_dataset: the tasks of these frames, where LeRobot looks for them.
     """
 
-    def __init__(self, dataset: Dataset[Any]) -> None:
+    def __init__(self, dataset: LeRobotDataset) -> None:
         acting = np.flatnonzero(_column(dataset, PHASE) == EXECUTION)
         super().__init__(dataset, acting.tolist())
         tasks = dataset.hf_dataset.data.table.select(["task_index"])

@@ -156,7 +156,7 @@ def observation_space(
     return spaces.Dict(parts)
 
 
-def action_space() -> spaces.Box:
+def action_space() -> spaces.Space[NDArray[np.float32]]:
     """Return the space of actions."""
     return spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
 

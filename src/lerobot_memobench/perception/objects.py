@@ -117,9 +117,9 @@ class ObjectLocalizer:
         found = detections(self.detector.detect(both))
         hands = states.cpu().numpy().astype(np.float64)
         slots = []
-        for row, hand in enumerate(hands):
+        for row in range(len(hands)):
             by_camera = dict(zip(MJCF_CAMERAS, found[row :: len(hands)], strict=True))
-            slots.append(self.slots(by_camera, views_of(hand)))
+            slots.append(self.slots(by_camera, views_of(hands[row])))
         return torch.stack(slots)
 
     def slots(self, found: Mapping[str, Detections], views: Mapping[str, View]) -> Tensor:

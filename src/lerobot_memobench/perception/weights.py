@@ -64,7 +64,7 @@ def load_detector(name: str | Path) -> Detector:
         raise MemobenchError(
             f"{path} holds no detector ({reason}); name a file of `python -m research.detector train`"
         ) from None
-    return detector.eval().to(memory_format=torch.channels_last)
+    return detector.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
 
 def load_visual_encoder(name: str) -> VisualEncoder:

@@ -244,7 +244,7 @@ class Simulation:
         mujoco.mj_step1(self.model, self.data)
 
     def end_prompt(self, start: Snapshot, hidden: Sequence[tuple[str, str]] = ()) -> None:
-        """Undo what a demonstration prompt has done since ``start``, but for what it hid: that lies at rest in its drawer.
+        """Undo what a demonstration prompt has done since ``start``; what it hid lies at rest in its drawer.
 
         Drawers and bystanders go back to the bit as well: a drawer that holds something settles a nanometre from an
         empty one, and a bottle that was brushed tells which way the hand went.

@@ -66,7 +66,7 @@ class Checkpoint:
 
 @dataclass(frozen=True)
 class Prompt:
-    """What the demonstration prompt shows: a routine, ``target`` being picked up, pointed at or highlighted, or a hiding.
+    """A demonstration prompt: a routine, ``target`` being picked up, pointed at or highlighted, or a hiding.
 
     Attributes:
         places: of a hiding, thing -> drawer in the order shown. The execution begins from the scene as it left it.

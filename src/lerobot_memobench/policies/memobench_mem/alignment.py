@@ -76,7 +76,9 @@ class SemanticAlignment(Alignment):
         """Normalised projection (B, d_t) of the masked mean over memory tokens."""
         return F.normalize(self.project(masked_mean(memory, memory_mask)), dim=-1)
 
-    def pairs(self, memory: Tensor, memory_mask: Tensor, text: Tensor) -> tuple[Tensor, Tensor]:
+    def pairs(  # type: ignore[override]  # the tensors of `usable`
+        self, memory: Tensor, memory_mask: Tensor, text: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Pooled memories and their texts."""
         return self.embed(memory, memory_mask), F.normalize(text, dim=-1)
 
@@ -141,7 +143,9 @@ class FramewiseAlignment(Alignment):
         rank = valid.cumsum(dim=1) - 1
         return (0.5 + 0.5 * rank / (count - 1).clamp(min=1)) * valid
 
-    def pairs(self, memory: Tensor, memory_mask: Tensor, text: Tensor, text_mask: Tensor) -> tuple[Tensor, Tensor]:
+    def pairs(  # type: ignore[override]  # the tensors of `usable`
+        self, memory: Tensor, memory_mask: Tensor, text: Tensor, text_mask: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Valid frames and their texts."""
         z, valid = self._frames(memory, memory_mask, text_mask)
         return z[valid], F.normalize(text, dim=-1)[valid]
@@ -216,7 +220,7 @@ def alignment_loss(
     text, text_mask = batch[TEXT].to(memory), batch[TEXT_MASK].to(memory.device)
     if not bool(mean_over_ranks(text_mask.any().float())):
         # Still touch every parameter, so that distributed training sees the same graph on all ranks.
-        return 0.0 * sum(parameter.sum() for parameter in alignment.parameters()), {}
+        return 0.0 * torch.stack([parameter.sum() for parameter in alignment.parameters()]).sum(), {}
     usable = alignment.usable(memory, mask, text, text_mask)
     with torch.autocast(memory.device.type, enabled=False):
         loss = alignment(*usable)

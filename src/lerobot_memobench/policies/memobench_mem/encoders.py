@@ -10,6 +10,7 @@ import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import torch
 from einops import reduce
@@ -23,6 +24,9 @@ from lerobot_memobench.perception.visual_encoder import GRID, POOLED, SIDE, WIDT
 from lerobot_memobench.policies.compatibility import cure
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MEMORY_GRID
 from lerobot_memobench.policies.memobench_mem.memory.encoder import PooledMemoryEncoder
+
+if TYPE_CHECKING:
+    from transformers.models.paligemma.modeling_paligemma import PaliGemmaMultiModalProjector
 
 LOUD = 8.0
 """How much larger than a layer's output tokens are made; at 1 they learned slower."""
@@ -130,7 +134,9 @@ class ImageTowerEncoder(ObservationEncoder):
     grid = MEMORY_GRID
     pictures = True
 
-    def __init__(self, tower: nn.Module, projector: nn.Module, resolution: tuple[int, int], camera: str) -> None:
+    def __init__(
+        self, tower: nn.Module, projector: PaliGemmaMultiModalProjector, resolution: tuple[int, int], camera: str
+    ) -> None:
         self.tower, self.projector, self.resolution = tower, projector, resolution
         self.memory_input = camera
         self.dim: int = projector.linear.out_features

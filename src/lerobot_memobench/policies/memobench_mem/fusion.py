@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, cast
 
 import torch
 import torch.nn.functional as F
@@ -12,6 +13,9 @@ from einops import rearrange, repeat
 from torch import Tensor, nn
 
 from lerobot_memobench.policies.memobench_mem.memory.encoder import MemoryTokens
+
+if TYPE_CHECKING:
+    from lerobot.policies.pi05.modeling_pi05 import PI05Pytorch
 
 Prefix = tuple[Tensor, Tensor, Tensor]
 """LeRobot's prefix: embeddings (B, N, D), which of them are real (B, N), and where attention blocks begin (B, N)."""
@@ -181,7 +185,7 @@ class Modulation(MemoryFusion):
     Wrapped norms are one level deeper than in plain pi0.5.
     """
 
-    def __init__(self, model: nn.Module, memory_dim: int, expert_dim: int) -> None:
+    def __init__(self, model: PI05Pytorch, memory_dim: int, expert_dim: int) -> None:
         self.model, self.shared = model, SharedMemory()
         model.memory_to_expert = nn.Linear(memory_dim, expert_dim)
         for layer in model.paligemma_with_expert.gemma_expert.model.layers:
@@ -191,7 +195,7 @@ class Modulation(MemoryFusion):
 
     def hand_over(self, memory: MemoryTokens) -> None:
         """Begin a pass over this memory in every layer."""
-        self.shared.set(memory.through(self.model.memory_to_expert))
+        self.shared.set(memory.through(cast(nn.Linear, self.model.memory_to_expert)))
 
     def owns(self, name: str) -> bool:
         """Say whether a parameter is the projection's or a modulator's."""

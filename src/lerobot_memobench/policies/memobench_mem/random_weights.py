@@ -6,6 +6,8 @@ policy is built without weights (on torch's meta device), and each weight is the
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
@@ -52,7 +54,7 @@ def fill_buffers(model: nn.Module, device: torch.device) -> None:
             setattr(module, key, _buffer(module, key).to(device, buffer.dtype))
 
 
-def _buffer(module: nn.Module, name: str) -> Tensor:
+def _buffer(module: Any, name: str) -> Tensor:
     """Return the content that one of pi0.5's modules gives to a buffer of its own."""
     if name in ("inv_freq", "original_inv_freq"):
         fresh: Tensor = type(module)(config=module.config).inv_freq
