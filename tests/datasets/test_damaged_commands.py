@@ -28,7 +28,8 @@ from lerobot_memobench.cli.lerobot import main as lerobot
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.hdf5.writing import model_file, write_task_file
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
-from lerobot_memobench.datasets.replay import resimulate
+from lerobot_memobench.datasets.lerobot_format.reading import read_episode
+from lerobot_memobench.datasets.replay import replay, resimulate
 from lerobot_memobench.datasets.staging import stage_demonstration
 from lerobot_memobench.datasets.validate import validate as validation
 from lerobot_memobench.datasets.video import encode_video
@@ -176,7 +177,7 @@ def convert(whole: Path) -> None:
     commands.convert(whole / FILES, whole / "out")
 
 
-COUNTS = {describe: (24, 2_000), validate: (20, 8_000), convert: (20, 5_000), validate_files: (20, 5_000)}
+COUNTS = {describe: (6, 2_000), validate: (10, 8_000), convert: (8, 5_000), validate_files: (8, 5_000)}
 """Command -> how often it meets each damage, and how often in the slow test: 10,000 times each damage."""
 
 KINDS: dict[str, tuple[Callable[[Path], None], Damage, str]] = {
@@ -206,7 +207,7 @@ def check(source: Path, tmp_path: Path, kind: str, slow: bool, monkeypatch: pyte
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_damaged_data(source: Path, tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert check(source, tmp_path, kind, False, monkeypatch)["result"] > 3
+    assert check(source, tmp_path, kind, False, monkeypatch)["result"]
 
 
 def test_what_is_whole_gives_a_result(source: Path, tmp_path: Path) -> None:
@@ -257,11 +258,19 @@ def change(path: Path, name: str, row: int) -> None:
 
 
 def found(folder: Path) -> str:
-    """Return what is said of the second episode; the first one agrees."""
+    """Return the verdict on the second episode; the first one agrees."""
     first, second = validation(folder)
     assert first.disagreement is None, first
     assert second.episode == "episode 1"
     return str(second.disagreement)
+
+
+def found_without_pictures(folder: Path) -> str:
+    """Return the verdict on the second episode, of which nothing is drawn; the first one is not replayed."""
+    try:
+        return str(replay(read_episode(folder, 1)))
+    except MemobenchError as error:
+        return str(error)
 
 
 FRAME = 3
@@ -298,7 +307,8 @@ def test_every_column_of_frames_is_compared(two: Path, tmp_path: Path) -> None:
     for name, begins in {**COLUMNS, **dict.fromkeys(objects, "")}.items():
         folder = Path(shutil.copytree(two, tmp_path / name))
         change(folder / path.relative_to(two), name, FRAMES + FRAME)
-        assert found(folder).startswith(begins or f"{name} at frame {FRAME}"), name
+        verdict = (found if name == "memory" else found_without_pictures)(folder)
+        assert verdict.startswith(begins or f"{name} at frame {FRAME}"), name
 
 
 EPISODES = """task_name memory_type family operations seed referent variant success exec_start_index key_frames
@@ -310,7 +320,7 @@ def test_every_column_of_episodes_is_compared(two: Path, tmp_path: Path, name: s
     folder = Path(shutil.copytree(two, tmp_path / "ds"))
     (path,) = (folder / "meta" / "episodes").rglob("*.parquet")
     change(path, name, 1)
-    assert found(folder).startswith(f"meta/episodes says {name}=")
+    assert found_without_pictures(folder).startswith(f"meta/episodes says {name}=")
 
 
 def test_states_and_instruction_are_compared(two: Path, tmp_path: Path) -> None:
@@ -332,10 +342,13 @@ def decoded(path: Path) -> np.ndarray:
         return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
 
 
-@pytest.mark.parametrize("camera", ["image", "wrist_image"])
 @pytest.mark.parametrize(
-    ("frames", "first"),
-    [(slice(FRAMES, None), 0), (slice(-1, None), FRAMES - 1), (slice(FRAMES, FRAMES + 1), 0)],
+    ("camera", "frames", "first"),
+    [
+        ("image", slice(FRAMES, None), 0),
+        ("wrist_image", slice(-1, None), FRAMES - 1),
+        ("wrist_image", slice(FRAMES, FRAMES + 1), 0),
+    ],
     ids=["all", "last", "first"],
 )
 def test_a_video_of_something_else_is_named(two: Path, tmp_path: Path, camera: str, frames: slice, first: int) -> None:
@@ -410,7 +423,7 @@ def cut(path: Path) -> None:
     ],
     ids=["table cut", "table zeroed", "episodes cut", "video cut", "video gone"],
 )
-@pytest.mark.parametrize("workers", [0, 1])
+@pytest.mark.parametrize("workers", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_training_names_the_damaged_file(
     two: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], pattern: str, damage: Any, workers: int
 ) -> None:

@@ -75,7 +75,7 @@ class MemobenchEnvConfig(EnvConfig):
             are drawn by seed whatever is said here: `drawn`.
         demonstration_prompt: whether object and procedural tasks begin with their demonstration prompt.
         prompt_in: `steps`, the policy observes the prompt step by step, with `phase` 0; `reset`, it plays before the
-            first observation; `auto`: in steps for a policy that reads prompts, in reset for any other (`envs.prompting`).
+            first observation; `auto`: in steps for a policy that reads prompts, else in reset (`envs.prompting`).
         horizon: execution steps per episode.
         render: `fast` (no shadows), `default`, or `high` (four samples per pixel, finer shadows).
         render_every: draw images every so many execution steps and repeat the last in between. Set it to the number
