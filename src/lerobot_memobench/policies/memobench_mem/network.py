@@ -90,6 +90,7 @@ class MemoryPI05(PI05Pytorch):
         if numbers is None:
             memory = MemoryTokens(*self.memory(tokens, steps, frame_mask))
         else:
+            assert isinstance(self.memory, PooledMemoryEncoder)
             memory = self.memory.shared(tokens, steps, frame_mask, numbers)
         self.fusion.hand_over(memory)
         return memory.rows(), memory.mask
