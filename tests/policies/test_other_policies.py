@@ -7,6 +7,8 @@ smaller numbers or a tokenizer built here; the policy's own code runs unchanged.
 from __future__ import annotations
 
 import json
+import sys
+from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +20,15 @@ from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.envs.episode_log import read_episodes, read_protocol_file
+from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.policies.memobench_mem.language import make_vocabulary, make_word_tokenizer
+from lerobot_memobench.protocol import EXECUTION, PROMPT
+from lerobot_memobench.run.lerobot_commands import call_lerobot
 from lerobot_memobench.sim.object_layout import SIZE
 from lerobot_memobench.tasks.catalogue import get_task
 
 TASK = "turn_on_the_stove_and_turn_it_off"
-LENGTH, PROMPT, SIDE = 12, 4, 256
+LENGTH, PROMPT_LENGTH, SIDE = 12, 4, 256
 STATE, OBJECTS, PRIVILEGED = "observation.state", "observation.environment_state", "privileged.environment_state"
 PICTURES = {"observation.images.image", "observation.images.wrist_image"}
 INPUTS = {*PICTURES, STATE}
@@ -55,7 +60,7 @@ def written(folder: Path, *, pictures: bool, objects: bool) -> Path:
             proprio=rng.normal(size=(LENGTH, 8)).astype(np.float32),
             images=dict.fromkeys(("image", "wrist_image"), frames) if pictures else None,
             objects=rng.normal(size=(LENGTH, SIZE)).astype(np.float32) if objects else None,
-            exec_start=PROMPT,
+            exec_start=PROMPT_LENGTH,
             satisfied=satisfied,
             success=True,
             fixture_poses={},
@@ -256,3 +261,143 @@ def test_smolvla(dataset: Path, tmp_path: Path, tiny_smolvlm: Path) -> None:
         *("policy=smolvla", f"policy.vlm_model_name={tiny_smolvlm}", "policy.num_vlm_layers=2", "policy.num_steps=2"),
         *("policy.chunk_size=4", "policy.n_action_steps=4"),
     )
+
+
+# --- demonstration prompts ---
+
+MILK = "find_the_specific_milk_pointed_out_in_the_prompt_video_and_put_it_on_the_plate"
+PROMPTS = [147, 165]
+"""Steps of the prompt in the episodes of seeds 7 and 8."""
+HORIZON = 20
+
+
+def flags(words: tuple[str, ...], **other: int) -> list[str]:
+    """Return our words as LeRobot's flags, with other values."""
+    pairs = dict(word.split("=", 1) for word in words) | {f"policy.{name}": str(value) for name, value in other.items()}
+    return [f"--{'policy.type' if name == 'policy' else name}={value}" for name, value in pairs.items()]
+
+
+class Watched:
+    """What a policy plans in a rollout, and what its environments are given."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, policy: type) -> None:
+        self.plans: list[tuple[list[int], list[int], np.ndarray]] = []
+        """Of each plan: phase and step of every row's observation, actions (rows, chunk, 7)."""
+        self.applied: dict[int, list[np.ndarray]] = defaultdict(list)
+        """Seed -> actions that were given in the execution."""
+        self._seen: Any = None
+        plan, select, step = policy.predict_action_chunk, policy.select_action, MemobenchEnv.step  # type: ignore[attr-defined]
+
+        def selected(this: Any, batch: Any, **options: Any) -> Any:
+            self._seen = batch
+            return select(this, batch, **options)
+
+        def planned(this: Any, batch: Any, **options: Any) -> Any:
+            actions = plan(this, batch, **options)
+            rows = [self._seen[f"observation.{name}"].flatten().int().tolist() for name in ("phase", "step")]
+            self.plans.append((rows[0], rows[1], actions.numpy().copy()))
+            return actions
+
+        def stepped(this: MemobenchEnv, action: Any) -> Any:
+            if this.episode.phase == EXECUTION:
+                self.applied[this.episode.seed].append(np.array(action))
+            return step(this, action)
+
+        monkeypatch.setattr(policy, "select_action", selected)
+        monkeypatch.setattr(policy, "predict_action_chunk", planned)
+        monkeypatch.setattr(MemobenchEnv, "step", stepped)
+
+
+@pytest.fixture
+def lerobot_eval(gl: str, tmp_path: Path) -> Any:
+    """Two episodes with prompts of different lengths in one batch, by LeRobot's own command."""
+    import lerobot_policy_memobench  # noqa: F401 - as LeRobot finds it
+
+    def run(*policy: str) -> None:
+        line = [
+            *("--env.type=memobench", f"--env.tasks={MILK}", f"--env.horizon={HORIZON}", "--env.render=fast"),
+            *("--eval.n_episodes=2", "--eval.batch_size=2", "--eval.use_async_envs=false", "--seed=7"),
+            *("--policy.device=cpu", f"--output_dir={tmp_path}"),
+        ]
+        assert call_lerobot("eval", [*line, *policy]) == 0
+
+    return run
+
+
+def act() -> tuple[type, list[str], int]:
+    from lerobot.policies.act.modeling_act import ACTPolicy
+
+    return ACTPolicy, flags(ACT, chunk_size=50, n_action_steps=50), 50
+
+
+def diffusion() -> tuple[type, list[str], int]:
+    from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
+
+    return DiffusionPolicy, flags(DIFFUSION, horizon=16, n_action_steps=8), 8
+
+
+@pytest.mark.parametrize("kind", [act, diffusion])
+def test_the_first_plan_is_made_from_the_first_execution_frame(
+    kind: Any, lerobot_eval: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy, words, interval = kind()
+    watched = Watched(monkeypatch, policy)
+    lerobot_eval(*words)
+    records = read_episodes(tmp_path)
+    assert [(record["prompt_steps"], record["steps"]) for record in records] == [(steps, HORIZON) for steps in PROMPTS]
+    assert [record["prompt_shown"] for record in records] == [True, True]
+    phases, steps, _ = watched.plans[0]
+    assert phases == [EXECUTION, EXECUTION]
+    assert steps == [0, 0], "the clock of the execution, whatever the prompts took"
+    for row, seed in enumerate((7, 8)):
+        planned = np.concatenate([actions[row, :interval] for _, _, actions in watched.plans])[:HORIZON]
+        np.testing.assert_array_equal(np.stack(watched.applied[seed]), planned)  # none of them is stale
+    assert read_protocol_file(tmp_path)["prompt_in"] == "reset"
+
+
+def test_a_policy_that_knows_phases_sees_the_prompt(
+    lerobot_eval: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from lerobot_memobench.policies.baselines.modeling_baselines import MemobenchExpertPolicy
+
+    seen: list[list[int]] = []
+    select = MemobenchExpertPolicy.select_action
+
+    def selected(this: Any, batch: Any, **options: Any) -> Any:
+        seen.append(batch["observation.phase"].flatten().int().tolist())
+        return select(this, batch, **options)
+
+    monkeypatch.setattr(MemobenchExpertPolicy, "select_action", selected)
+    lerobot_eval("--policy.type=memobench_expert", "--env.expert_action=true", "--env.horizon=2")
+    assert [sum(row == PROMPT for row in rows) for rows in zip(*seen, strict=True)] == PROMPTS
+    assert read_protocol_file(tmp_path)["prompt_in"] == "steps"
+
+
+@pytest.mark.parametrize(
+    ("line", "found"),
+    [
+        (["--policy.type=act"], "reset"),
+        (["--policy.type", "memobench_mem"], "steps"),
+        (["--policy.type=remote"], "steps"),
+        (["--policy.type=memobench_random"], "reset"),
+        (["--policy.path=checkpoint"], "reset"),
+        (["--config_path=train.yaml"], "reset"),
+        (["--config_path=run"], "steps"),
+        ([], "steps"),
+    ],
+)
+def test_auto_is_by_the_policy_that_lerobot_runs(
+    line: list[str], found: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import lerobot_policy_memobench  # noqa: F401
+    from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+
+    monkeypatch.chdir(tmp_path)
+    for folder in ("checkpoint", "run"):
+        Path(folder).mkdir()
+    Path("checkpoint/config.json").write_text('{"type": "act", "device": "cpu"}')
+    Path("train.yaml").write_text("policy:\n  type: diffusion\n")
+    Path("run/train_config.json").write_text('{"policy": {"type": "memobench_mem"}}')
+    monkeypatch.setattr(sys, "argv", ["lerobot-eval", *line])
+    assert MemobenchEnvConfig().resolved_prompt_in() == found
+    assert MemobenchEnvConfig(prompt_in="steps").resolved_prompt_in() == "steps"

@@ -14,16 +14,19 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
+import numpy as np
 import pytest
 import torch
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
-from lerobot.envs.utils import env_to_policy_features
+from lerobot.envs.utils import env_to_policy_features, preprocess_observation
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.factory import get_policy_class, make_policy_config
 from safetensors.torch import load_file, save_file
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.envs.prompting import read_rename_map
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint, check_weights, shipped_policies
@@ -36,7 +39,11 @@ from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import
     MemobenchMemConfig,
 )
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
+from lerobot_memobench.policies.remote.session import Row, Session
 from lerobot_memobench.run.lerobot_commands import call_lerobot
+from lerobot_memobench.tasks.catalogue import get_task
+from tests.support.small_policy import small_config
 
 TASK = "turn_on_the_stove_and_turn_it_off"
 IMAGES, STATE, ACTION = "observation.images.", "observation.state", "action"
@@ -115,7 +122,7 @@ def refused_by_both(checkpoint: Path, capsys: pytest.CaptureFixture[str], *more:
 
 
 @pytest.mark.parametrize(
-    ("seen", "said"),
+    ("inputs", "said"),
     [
         ({"cameras": ("front", "wrist")}, '"observation.images.image": "observation.images.front"'),
         ({"cameras": ("wrist_image", "front")}, '{"observation.images.image": "observation.images.front"}'),
@@ -125,11 +132,14 @@ def refused_by_both(checkpoint: Path, capsys: pytest.CaptureFixture[str], *more:
         ({"side": 128}, "observation.images.image of 128 x 128 pixels .* shows 256 x 256"),
     ],
 )
-def test_what_sees_something_else_is_refused(
-    seen: dict[str, Any], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    found = refused_by_both(saved(tmp_path / "it", config(**seen)), capsys)
-    assert re.search(said if ".*" in said else re.escape(said), found)
+def test_other_inputs_than_in_training_are_refused(inputs: dict[str, Any], said: str, tmp_path: Path) -> None:
+    save_processors(tmp_path, config(**inputs))
+    with pytest.raises(MemobenchError, match=said if ".*" in said else re.escape(said)):
+        check_features(str(tmp_path), config(**inputs), SHOWN, {})
+
+
+def test_both_commands_refuse_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "of 7 numbers" in refused_by_both(saved(tmp_path / "it", config(state=7)), capsys)
 
 
 def test_what_the_sentence_says_to_do_is_enough(tmp_path: Path) -> None:
@@ -312,25 +322,21 @@ def test_what_is_fixed_by_training_stays(name: str) -> None:
         check_as_trained(checkpoint, policy)
 
 
-@pytest.mark.parametrize("word", ["memory_frames=4", "memory_stride=2", "memory_camera=observation.images.wrist_image"])
-def test_a_memory_is_not_changed_where_a_checkpoint_acts(
-    word: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    checkpoint = tmp_path / "it"
-    shutil.copytree(shipped_policies()["memobench_small"], checkpoint)
-    sight = ("--env.obs_type=environment_state_agent_pos",)
-    assert f"--policy.{word} cannot be followed" in refused_by_both(checkpoint, capsys, *sight, f"--policy.{word}")
-
-
-@pytest.mark.parametrize("word", ["align=contrastive", "subgoal_level=fine", "ema_decay=0.5"])
-def test_a_training_is_not_told_anew_where_a_checkpoint_acts(
-    word: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("word", "why"),
+    [
+        ("memory_frames=4", "its weights mean nothing else"),
+        ("align=contrastive", "nothing of this setting acts at evaluation"),
+    ],
+)
+def test_neither_command_changes_what_is_fixed(
+    word: str, why: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     checkpoint = tmp_path / "it"
     shutil.copytree(shipped_policies()["memobench_small"], checkpoint)
     said = refused_by_both(checkpoint, capsys, "--env.obs_type=environment_state_agent_pos", f"--policy.{word}")
     assert f"--policy.{word} cannot be followed" in said
-    assert "nothing of this setting acts at evaluation" in said
+    assert why in said
 
 
 def test_what_is_loaded_by_hand_acts_as_it_was_trained() -> None:
@@ -340,3 +346,59 @@ def test_what_is_loaded_by_hand_acts_as_it_was_trained() -> None:
     policy = PreTrainedConfig.from_pretrained(checkpoint, cli_overrides=["--device=cpu", "--memory_frames=2"])
     with pytest.raises(MemobenchError, match=r"--policy.memory_frames=2 cannot be followed: .* was trained with"):
         MemobenchMemPolicy.from_pretrained(checkpoint, config=policy)
+
+
+# --- environments that repeat images, and policies that remember them ---
+
+FOLDER = str(get_task("turn_on_the_stove_and_turn_it_off").folder)
+
+
+def _policy(**fields: Any) -> MemobenchMemPolicy:
+    image = PolicyFeature(type=FeatureType.VISUAL, shape=(3, 256, 256))
+    seen = {
+        "observation.images.image": image,
+        "observation.state": PolicyFeature(type=FeatureType.STATE, shape=(8,)),
+    }
+    acts = {"action": PolicyFeature(type=FeatureType.ACTION, shape=(7,))}
+    torch.manual_seed(0)
+    return MemobenchMemPolicy(small_config(input_features=seen, output_features=acts, **fields)).eval()
+
+
+def _observations(steps: int, **settings: Any) -> list[dict[str, Any]]:
+    """What plain ``lerobot-eval`` hands on of an episode."""
+    env = gym.vector.SyncVectorEnv([lambda: MemobenchEnv(FOLDER, render="fast", **settings)])
+    found = [preprocess_observation(env.reset(seed=[7])[0])]
+    for _ in range(steps):
+        found.append(preprocess_observation(env.step(np.full((1, 7), 0.5, np.float32))[0]))
+    env.close()
+    return found
+
+
+def _remember(policy: MemobenchMemPolicy, observations: list[dict[str, Any]]) -> Any:
+    policy.reset()
+    for observation in observations:
+        policy.observe(observation)
+    return policy.history.gather([0])
+
+
+def test_a_frame_that_shows_an_earlier_step_is_not_remembered() -> None:
+    every, third = _observations(7), _observations(7, render_every=3)
+    policy = _policy()
+    _remember(policy, every)
+    with pytest.raises(MemobenchError, match=r"frame of step 1 shows step 0 again; leave env.render_every at 1"):
+        _remember(policy, third)
+    plain = _policy(memory_fusion="none")
+    for observation in third:
+        plain.observe(observation)  # looks at nothing between its plans
+    # Where the frames that are remembered are drawn, the memory is that of an environment that draws them all.
+    spread = _policy(memory_stride=3)
+    for one, two in zip(_remember(spread, third), _remember(spread, every), strict=True):
+        assert torch.equal(one, two)
+
+
+def test_a_server_that_buffers_frames_is_not_sent_them_either() -> None:
+    session = Session(RemoteConfig(dialect="robomme"), "ws://nowhere:1")
+    first, second = _observations(1, render_every=3)
+    session.watch(Row(first, 0))
+    with pytest.raises(MemobenchError, match=r"step 1 shows step 0"):
+        session.watch(Row(second, 0))
