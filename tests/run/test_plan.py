@@ -110,7 +110,7 @@ def test_a_checkpoint_is_shown_what_it_was_trained_on(seen: tuple[str, ...], sho
     assert plan.environment is not None
     assert plan.environment.protocol["obs_type"] == shown
     other = OBJECTS if shown != OBJECTS else "pixels_agent_pos"
-    with pytest.raises(MemobenchError, match=rf"env.obs_type is {other}, which does not show what the policy sees"):
+    with pytest.raises(MemobenchError, match=rf"env.obs_type is {other}, which lacks inputs of the policy"):
         plan_line([*line, f"obs_type={other}"])
 
 
