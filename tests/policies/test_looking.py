@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lerobot_memobench.policies.baselines.configuration_baselines import MemobenchExpertConfig, MemobenchRandomConfig
 from lerobot_memobench.policies.baselines.modeling_baselines import MemobenchExpertPolicy, MemobenchRandomPolicy
-from lerobot_memobench.run.rollout import looking
+from lerobot_memobench.run.rollout import needs_observation
 from tests.policies.test_other_policies import _tiny_paligemma, tiny_smolvlm  # noqa: F401 - fixtures
 from tests.support.policy_server import PolicyServer
 from tests.support.remote_case import counting, make
@@ -59,7 +59,7 @@ def acted(
     """
     torch.manual_seed(0)
     policy.reset()
-    looks, seen, actions = looking(policy), [], []
+    looks, seen, actions = needs_observation(policy), [], []
     shown, phases = True, None
     for time in range(STEPS):
         rows = clock(time)
@@ -158,13 +158,13 @@ def test_who_acts_in_a_way_of_its_own_always_looks() -> None:
     assert not looking_after_a_plan(policy)
     policy.__class__ = Watchful
     assert looking_after_a_plan(policy)
-    assert looking(object())()
+    assert needs_observation(object())()
 
 
 def looking_after_a_plan(policy: Any) -> bool:
     policy.reset()
     policy.select_action(observation(execution(0), 0))
-    return looking(policy)()
+    return needs_observation(policy)()
 
 
 def test_the_expert_and_the_random_policy_never_look() -> None:

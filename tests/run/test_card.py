@@ -8,12 +8,14 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
+import huggingface_hub
 import pytest
 
 from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import read_card
 from lerobot_memobench.run.card import (
+    with_checkpoint,
     checkpoint_files,
     disagreement,
     extended,
@@ -228,3 +230,25 @@ def test_a_file_that_is_no_card(tmp_path: Path) -> None:
     (tmp_path / "card.json").write_text('{"a": 1}')
     with pytest.raises(MemobenchError, match="no result card"):
         read_card(tmp_path / "card.json")
+
+
+# --- what is known of a model checkpoint before anything has been found ---
+
+COMMIT = "0123456789abcdef0123456789abcdef01234567"
+
+
+def test_a_repository_is_known_once_it_has_been_fetched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    snapshot = tmp_path / "models--user--name" / "snapshots" / COMMIT
+    snapshot.mkdir(parents=True)
+    cached = lambda repo, name: str(snapshot / name) if (snapshot / name).exists() else None  # noqa: E731
+    monkeypatch.setattr(huggingface_hub, "try_to_load_from_cache", cached)
+    card: dict[str, Any] = {"policy": {"type": "act"}, "checkpoint": None, "trained_on": None}
+    assert with_checkpoint(card, None) == card
+    assert with_checkpoint(card, "user/name") == card
+    (snapshot / "config.json").write_text("{}")  # the configuration comes first, the weights when the policy is made
+    assert with_checkpoint(card, "user/name") == card
+    (snapshot / "model.safetensors").write_bytes(b"weights")
+    found = with_checkpoint(card, "user/name")
+    assert sorted(found["checkpoint"]["files"]) == ["config.json", "model.safetensors"]
+    assert found["checkpoint"]["revision"] == COMMIT
+    assert len(found["policy"]["sha256"]) == 64

@@ -34,110 +34,11 @@ from lerobot_memobench.run.plan import EvaluationPlan
 
 FORMAT = 1
 CARD_MARKDOWN = "card.md"
+OUTCOME = ("success", "steps", "prompt_steps", "variant", "checkpoints", "failure", "fault", "not_run", "scene_hash")
+"""What two runs of the same episode must agree in."""
 
 
-def new_card(
-    *,
-    protocol: Mapping[str, Any],
-    policy: Mapping[str, Any],
-    checkpoint: Mapping[str, Any] | None,
-    trained_on: Mapping[str, Any] | None,
-    task_files: Mapping[str, str],
-    flags: Sequence[str],
-    runs: Sequence[Mapping[str, Any]],
-    shard: str | None = None,
-) -> dict[str, Any]:
-    """Return the card of an evaluation that has found nothing yet."""
-    return {
-        "format": FORMAT,
-        "written": dt.datetime.now(dt.UTC).isoformat(timespec="seconds"),
-        "protocol": dict(protocol),
-        "policy": dict(policy),
-        "checkpoint": checkpoint,
-        "trained_on": trained_on,
-        "task_files": dict(task_files),
-        "flags": list(flags),
-        "shard": shard,
-        "runs": joined_runs(runs),
-        "episodes": [],
-    }
-
-
-def extended(card: Mapping[str, Any], other: Mapping[str, Any], *, again: bool = True) -> dict[str, Any]:
-    """Return a card for both of two runs of one evaluation: extent, runs and tasks' hashes of both.
-
-    Args:
-        again: whether an equal run is one more start, or the same start told twice.
-    """
-    a, b = card["protocol"], other["protocol"]
-    extent = {"tasks": sorted({*a["tasks"], *b["tasks"]}), "episodes": max(a["episodes"], b["episodes"])}
-    return {
-        **card,
-        "protocol": {**b, **a, **extent},
-        "policy": card["policy"] or other["policy"],
-        "checkpoint": card["checkpoint"] or other["checkpoint"],
-        "trained_on": card["trained_on"] or other["trained_on"],
-        "task_files": {**card["task_files"], **other["task_files"]},
-        "flags": _flags(card, extent),
-        "shard": card["shard"] if card["shard"] == other["shard"] else None,
-        "runs": joined_runs([*card["runs"], *other["runs"]], again),
-    }
-
-
-def _flags(card: Mapping[str, Any], extent: Mapping[str, Any]) -> list[str]:
-    """Return a card's flags, changed to a wider extent where it is wider."""
-    flags = list(card["flags"])
-    if extent["episodes"] != card["protocol"]["episodes"]:
-        flags = [flag for flag in flags if not flag.startswith("--eval.n_episodes=")]
-        flags.append(f"--eval.n_episodes={extent['episodes']}")
-    if extent["tasks"] != sorted(card["protocol"]["tasks"]):
-        flags = [flag for flag in flags if not flag.startswith(("--env.task=", "--env.tasks="))]
-        flags.append(f"--env.tasks={','.join(extent['tasks'])}")
-    return flags
-
-
-def joined_runs(runs: Iterable[Mapping[str, Any]], again: bool = True) -> list[dict[str, Any]]:
-    """Return runs without repetitions; ``times`` says how often one was started."""
-    found: list[dict[str, Any]] = []
-    for run in runs:
-        same = next((r for r in found if all(r.get(key) == run.get(key) for key in {*r, *run} - {"times"})), None)
-        if same is None:
-            found.append({**run, "times": run.get("times", 1)})
-        else:
-            times = run.get("times", 1)
-            same["times"] = same["times"] + times if again else max(same["times"], times)
-    return found
-
-
-def with_episodes(card: Mapping[str, Any], records: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return a card that holds what was found."""
-    return {**card, "episodes": [outcome(record) for record in records]}
-
-
-def write_card(folder: Path, card: Mapping[str, Any]) -> None:
-    """Write ``card.json`` and ``card.md``, each whole or not at all."""
-    write_file(folder / CARD_FILE, _json(card), durable=True)
-    write_file(folder / CARD_MARKDOWN, markdown(card), durable=True)
-
-
-def remove_card(folder: Path) -> None:
-    """Remove the card of a folder, if there is one."""
-    for name in (CARD_FILE, CARD_MARKDOWN):
-        (folder / name).unlink(missing_ok=True)
-
-
-def _json(card: Mapping[str, Any]) -> str:
-    """Return the card as JSON with one episode a line: there may be 1,500."""
-    episodes = ",\n".join(f"  {json.dumps(episode)}" for episode in card["episodes"])
-    text = json.dumps({**card, "episodes": []}, indent=1)
-    return (
-        text.replace('"episodes": []\n}', f'"episodes": [\n{episodes}\n ]\n}}' if episodes else '"episodes": []\n}')
-        + "\n"
-    )
-
-
-# ==== plan_card.py
-# The card of a plan: what is known of an evaluation before it has found anything.
+# --- the card of a plan, before anything has been found ---
 
 
 def card_of(plan: EvaluationPlan, *, here: bool = True) -> dict[str, Any]:
@@ -148,19 +49,19 @@ def card_of(plan: EvaluationPlan, *, here: bool = True) -> dict[str, Any]:
     """
     shard = plan.options.shard
     card = new_card(
-        protocol=_plan_protocol(plan),
+        protocol=_protocol_of(plan),
         policy={} if plan.policy is None else policy_facts(encoded(plan.policy), plan.seed),
         checkpoint=None,
         trained_on=None,
         task_files=_task_files(plan),
-        flags=_plan_flags(plan),
+        flags=_flags_of(plan),
         runs=[run_facts(plan.command, plan.batch, gl_facts() if plan.draws and here else {})],
         shard=None if shard is None else str(shard),
     )
     return with_checkpoint(card, plan.policy_path)
 
 
-def _plan_flags(plan: EvaluationPlan) -> list[str]:
+def _flags_of(plan: EvaluationPlan) -> list[str]:
     """Return the plan's flags as another machine may use them: a policy of this package goes by its name."""
     key = "--policy.path="
     return [
@@ -168,7 +69,7 @@ def _plan_flags(plan: EvaluationPlan) -> list[str]:
     ]
 
 
-def _plan_protocol(plan: EvaluationPlan) -> dict[str, Any]:
+def _protocol_of(plan: EvaluationPlan) -> dict[str, Any]:
     if plan.grid is None or plan.environment is None:
         return {}
     names = sorted(task.name for task in plan.grid.tasks)
@@ -197,18 +98,16 @@ def with_checkpoint(card: dict[str, Any], path: str | None) -> dict[str, Any]:
     return {
         **card,
         "policy": {**card["policy"], "sha256": tree_hash(files)},
-        "checkpoint": {"path": portable_path(str(path)), "revision": _revision(folder), "files": files},
+        "checkpoint": {
+            "path": portable_path(str(path)),
+            "revision": folder.name if folder.parent.name == "snapshots" else None,  # a copy in the hub's cache
+            "files": files,
+        },
         "trained_on": training_facts(folder),
     }
 
 
-def _revision(folder: Path) -> str | None:
-    """Return the commit of a repository's copy in the hub's cache, None for any other folder."""
-    return folder.name if folder.parent.name == "snapshots" else None
-
-
-# ==== policy_identity.py
-# What identifies a policy beyond its name: settings, seed, the hash of its checkpoint, what it was trained on.
+# --- what identifies a policy beyond its name: settings, seed, hash of its checkpoint, what it was trained on ---
 
 
 class TrainedOn(TypedDict, total=False):
@@ -278,20 +177,119 @@ def training_facts(folder: Path) -> dict[str, Any] | None:
     return found
 
 
-# ==== card_markdown.py
-# The result card as a page for people.
+# --- cards put together and written ---
+
+
+def new_card(
+    *,
+    protocol: Mapping[str, Any],
+    policy: Mapping[str, Any],
+    checkpoint: Mapping[str, Any] | None,
+    trained_on: Mapping[str, Any] | None,
+    task_files: Mapping[str, str],
+    flags: Sequence[str],
+    runs: Sequence[Mapping[str, Any]],
+    shard: str | None = None,
+) -> dict[str, Any]:
+    """Return the card of an evaluation that has found nothing yet."""
+    return {
+        "format": FORMAT,
+        "written": dt.datetime.now(dt.UTC).isoformat(timespec="seconds"),
+        "protocol": dict(protocol),
+        "policy": dict(policy),
+        "checkpoint": checkpoint,
+        "trained_on": trained_on,
+        "task_files": dict(task_files),
+        "flags": list(flags),
+        "shard": shard,
+        "runs": joined_runs(runs),
+        "episodes": [],
+    }
+
+
+def extended(card: Mapping[str, Any], other: Mapping[str, Any], *, again: bool = True) -> dict[str, Any]:
+    """Return a card for both of two runs of one evaluation: extent, runs and tasks' hashes of both.
+
+    Args:
+        again: whether an equal run is one more start, or the same start told twice.
+    """
+    a, b = card["protocol"], other["protocol"]
+    extent = {"tasks": sorted({*a["tasks"], *b["tasks"]}), "episodes": max(a["episodes"], b["episodes"])}
+    return {
+        **card,
+        "protocol": {**b, **a, **extent},
+        "policy": card["policy"] or other["policy"],
+        "checkpoint": card["checkpoint"] or other["checkpoint"],
+        "trained_on": card["trained_on"] or other["trained_on"],
+        "task_files": {**card["task_files"], **other["task_files"]},
+        "flags": _widened_flags(card, extent),
+        "shard": card["shard"] if card["shard"] == other["shard"] else None,
+        "runs": joined_runs([*card["runs"], *other["runs"]], again),
+    }
+
+
+def _widened_flags(card: Mapping[str, Any], extent: Mapping[str, Any]) -> list[str]:
+    """Return a card's flags, changed to a wider extent where it is wider."""
+    flags = list(card["flags"])
+    if extent["episodes"] != card["protocol"]["episodes"]:
+        flags = [flag for flag in flags if not flag.startswith("--eval.n_episodes=")]
+        flags.append(f"--eval.n_episodes={extent['episodes']}")
+    if extent["tasks"] != sorted(card["protocol"]["tasks"]):
+        flags = [flag for flag in flags if not flag.startswith(("--env.task=", "--env.tasks="))]
+        flags.append(f"--env.tasks={','.join(extent['tasks'])}")
+    return flags
+
+
+def joined_runs(runs: Iterable[Mapping[str, Any]], again: bool = True) -> list[dict[str, Any]]:
+    """Return runs without repetitions; ``times`` says how often one was started."""
+    found: list[dict[str, Any]] = []
+    for run in runs:
+        same = next((r for r in found if all(r.get(key) == run.get(key) for key in {*r, *run} - {"times"})), None)
+        if same is None:
+            found.append({**run, "times": run.get("times", 1)})
+        else:
+            times = run.get("times", 1)
+            same["times"] = same["times"] + times if again else max(same["times"], times)
+    return found
+
+
+def with_episodes(card: Mapping[str, Any], records: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return a card that holds what was found."""
+    return {**card, "episodes": [outcome(record) for record in records]}
+
+
+def write_card(folder: Path, card: Mapping[str, Any]) -> None:
+    """Write ``card.json`` and ``card.md``, each whole or not at all."""
+    write_file(folder / CARD_FILE, _json(card), durable=True)
+    write_file(folder / CARD_MARKDOWN, markdown(card), durable=True)
+
+
+def remove_card(folder: Path) -> None:
+    """Remove the card of a folder, if there is one."""
+    for name in (CARD_FILE, CARD_MARKDOWN):
+        (folder / name).unlink(missing_ok=True)
+
+
+def _json(card: Mapping[str, Any]) -> str:
+    """Return the card as JSON with one episode a line: there may be 1,500."""
+    episodes = ",\n".join(f"  {json.dumps(episode)}" for episode in card["episodes"])
+    text = json.dumps({**card, "episodes": []}, indent=1)
+    return (
+        text.replace('"episodes": []\n}', f'"episodes": [\n{episodes}\n ]\n}}' if episodes else '"episodes": []\n}')
+        + "\n"
+    )
 
 
 def markdown(card: Mapping[str, Any]) -> str:
     """Return the card as Markdown."""
-    lines = ["# Result card", "", *_protocol(card), "", *_policy(card)]
+    lines = ["# Result card", "", *_protocol_lines(card), "", *_policy_lines(card)]
     for number, run in enumerate(card["runs"], start=1):
-        lines += ["", *_run(number, run)]
+        lines += ["", *_run_lines(number, run)]
     lines += ["", f"`memobench rerun {CARD_FILE}` repeats the evaluation and compares every episode.", ""]
     return "\n".join(lines)
 
 
-def _protocol(card: Mapping[str, Any]) -> list[str]:
+def _protocol_lines(card: Mapping[str, Any]) -> list[str]:
     protocol = card["protocol"]
     tasks = protocol.get("tasks", [])
     settings = {name: protocol[name] for name in SETTINGS if name in protocol}
@@ -305,7 +303,7 @@ def _protocol(card: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _policy(card: Mapping[str, Any]) -> list[str]:
+def _policy_lines(card: Mapping[str, Any]) -> list[str]:
     policy = card["policy"]
     lines = ["| policy | |", "|---|---|"]
     lines += [f"| type | {policy.get('type', 'not known')} |", f"| seed | {policy.get('seed')} |"]
@@ -317,7 +315,7 @@ def _policy(card: Mapping[str, Any]) -> list[str]:
     return lines + [f"| trained on: {key} | {value} |" for key, value in (card["trained_on"] or {}).items()]
 
 
-def _run(number: int, run: Mapping[str, Any]) -> list[str]:
+def _run_lines(number: int, run: Mapping[str, Any]) -> list[str]:
     times = run.get("times", 1)
     lines = [f"## Run {number}" + (f" (started {times} times)" if times > 1 else ""), ""]
     lines += ["```", " ".join(run["command"]), "```", "", "| | |", "|---|---|"]
@@ -327,11 +325,7 @@ def _run(number: int, run: Mapping[str, Any]) -> list[str]:
     return lines + [f"| {name} | {value} |" for name, value in run["gl"].items()]
 
 
-# ==== outcomes.py
-# What an episode came to, as a card keeps it, and whether two runs of it agree.
-
-OUTCOME = ("success", "steps", "prompt_steps", "variant", "checkpoints", "failure", "fault", "not_run", "scene_hash")
-"""What two runs of the same episode must agree in."""
+# --- whether two runs of an episode agree ---
 
 
 def outcome(record: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The commands of the installed LeRobot: which there are, where they begin, what configures them."""
+"""The commands of the installed LeRobot: which there are, what configures them, how they are called in this process."""
 
 from __future__ import annotations
 
@@ -20,6 +20,15 @@ from lerobot_memobench.jobs.threads import ACTING, LEARNING, use_threads
 PREFIX = "lerobot-"
 ROLES = {"eval": ACTING, "train": LEARNING}
 """What the processes of commands do that compute: `jobs.threads`."""
+OF_NO_CONCERN = ("No job name provided",)
+OF_WEIGHTS = (
+    "No pretrained path was provided",
+    "You are instantiating a policy from scratch and its features are parsed from an environment",
+)
+OF_THE_CPU = ("Using CPU, this will be slow",)
+"""How LeRobot's warnings begin that are none to who evaluates; that are none of a policy without weights; and that is
+none to who has nothing but a CPU.
+"""
 
 
 def lerobot_commands() -> dict[str, metadata.EntryPoint]:
@@ -53,6 +62,44 @@ def register_plugins() -> None:
 
     with quiet():
         register_third_party_plugins()
+
+
+def config_class(entry: Callable[[], Any]) -> type | None:
+    """Return the configuration dataclass of a LeRobot command, None where it uses plain argparse.
+
+    LeRobot wraps the function that takes the configuration, in the module of the command's main function.
+    """
+    for function in vars(sys.modules[entry.__module__]).values():
+        inner = getattr(function, "__wrapped__", None)
+        if inner is None or getattr(function, "__module__", None) != entry.__module__:
+            continue
+        try:
+            hints = typing.get_type_hints(inner)
+        except NameError:  # a type that is imported for checkers only
+            hints = getattr(inner, "__annotations__", {})
+        first = next(iter(hints.values()), None)
+        if dataclasses.is_dataclass(first):
+            return typing.cast(type, first)
+    return None
+
+
+def call_lerobot(command: str, flags: Sequence[str]) -> int:
+    """Run ``lerobot-<command>`` with these flags; return its exit status. Its main function reads ``sys.argv``."""
+    entry = load_command(command)
+    before = sys.argv
+    sys.argv = [f"{PREFIX}{command}", *flags]
+    try:
+        status = entry()
+    except SystemExit as stop:
+        status = stop.code
+    finally:
+        sys.argv = before
+    if status is None:
+        return 0
+    if isinstance(status, int):
+        return status
+    print(status, file=sys.stderr)  # as Python does with such a status
+    return 1
 
 
 @contextmanager
@@ -109,56 +156,3 @@ def _filtered(matters: Callable[[logging.LogRecord], bool], *names: str | None) 
     finally:
         for logger in loggers:
             logger.removeFilter(matters)
-
-
-OF_NO_CONCERN = ("No job name provided",)
-OF_WEIGHTS = (
-    "No pretrained path was provided",
-    "You are instantiating a policy from scratch and its features are parsed from an environment",
-)
-OF_THE_CPU = ("Using CPU, this will be slow",)
-"""How LeRobot's warnings begin that are none to who evaluates; that are none of a policy without weights; and that is
-none to who has nothing but a CPU.
-"""
-
-
-def config_class(entry: Callable[[], Any]) -> type | None:
-    """Return the configuration dataclass of a LeRobot command, None where it uses plain argparse.
-
-    LeRobot wraps the function that takes the configuration, in the module of the command's main function.
-    """
-    for function in vars(sys.modules[entry.__module__]).values():
-        inner = getattr(function, "__wrapped__", None)
-        if inner is None or getattr(function, "__module__", None) != entry.__module__:
-            continue
-        try:
-            hints = typing.get_type_hints(inner)
-        except NameError:  # a type that is imported for checkers only
-            hints = getattr(inner, "__annotations__", {})
-        first = next(iter(hints.values()), None)
-        if dataclasses.is_dataclass(first):
-            return typing.cast(type, first)
-    return None
-
-
-# ==== lerobot_command.py
-# LeRobot's own commands, called in this process.
-
-
-def call_lerobot(command: str, flags: Sequence[str]) -> int:
-    """Run ``lerobot-<command>`` with these flags; return its exit status. Its main function reads ``sys.argv``."""
-    entry = load_command(command)
-    before = sys.argv
-    sys.argv = [f"{PREFIX}{command}", *flags]
-    try:
-        status = entry()
-    except SystemExit as stop:
-        status = stop.code
-    finally:
-        sys.argv = before
-    if status is None:
-        return 0
-    if isinstance(status, int):
-        return status
-    print(status, file=sys.stderr)  # as Python does with such a status
-    return 1

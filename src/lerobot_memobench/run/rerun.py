@@ -1,4 +1,10 @@
-"""Put a card to the test: run the evaluation that it describes once more and compare every episode."""
+"""Put a card to the test: run the evaluation that it describes once more and compare every episode.
+
+A card is data, and anybody may have written it. Its flags go to LeRobot, which would import packages, run code from the
+hub and read and write files by them. So only those are taken that a card of ours can hold and that name no code, no
+place to write to, no machine but this one, and of places to read from only folders that are here. Anything else is
+refused by name.
+"""
 
 from __future__ import annotations
 
@@ -20,6 +26,35 @@ from lerobot_memobench.run.lerobot_commands import config_class, load_command, r
 from lerobot_memobench.run.machine import gl_facts, versions
 from lerobot_memobench.run.plan import ENVIRONMENT, EvaluationPlan, plan_line
 
+ENV, POLICY_TYPE, POLICY_PATH, TASK_DIR = "env.type", "policy.type", "policy.path", "env.task_dir"
+
+NUMBERS = (
+    *("seed", "eval.n_episodes", "eval.batch_size", "eval.use_async_envs", "eval.recording"),
+    *("env.fps", "env.demonstration_prompt", "env.horizon", "env.render_every", "env.replan_steps", "env.seed_base"),
+    *("env.expert_action", "env.blind_action", "env.oracle_memory", "env.videos", "env.resume"),
+    *("env.max_parallel_tasks", "env.disable_env_checker"),
+)
+"""Numbers and truth values of the run and the environment. Of a policy's, all are taken but `REACHING_OUT`."""
+REACHING_OUT = ("push_to_hub", "private", "use_peft", "trust_remote_code", "discover_packages_path")
+"""Truth values of a policy by which more than its numbers changes."""
+WORDS = (
+    *("job_name", "env.task", "env.tasks", "env.suite", "env.obs_type", "env.referent", "env.prompt_in", "env.render"),
+    *("policy.size", "policy.perception", "policy.align", "policy.subgoal_level", "policy.memory_fusion"),
+    *("policy.memory_camera", "policy.detector"),
+    *("policy.dtype", "policy.dialect", "policy.gripper"),
+)
+"""Words, which name one of several known things."""
+NOTES = ("policy.label", "policy.keys")
+"""Text that stands on a card, or in a message to the policy's server."""
+SERVERS = ("policy.host", "policy.servers")
+
+FLAG = re.compile(r"--([\w.]+)=(.*)", re.DOTALL)
+WORD = re.compile(r"[\w.,+' ()-]*")
+DEVICE = re.compile(r"cpu|mps|(cuda|xpu)(:\d+)?")
+SERVER = re.compile(r"(?:\w+://)?(?:127\.0\.0\.1|localhost)(?::\d+)?")
+OBSERVATION = re.compile(r"[\w./-]+")
+NOTHING = ("null", "none", "None", "~")
+
 
 def repeatable_card(path: Path, server: str | None = None) -> dict[str, Any]:
     """Return the card of an evaluation that has ended, from its file or its folder, with flags that may be repeated.
@@ -28,7 +63,7 @@ def repeatable_card(path: Path, server: str | None = None) -> dict[str, Any]:
         server: where the policy's server is here (``host:port``, or several with commas); as on the card when None.
 
     Raises:
-        MemobenchError: there is none, it holds nothing to compare with, or what no card may ask for (`card_flags`).
+        MemobenchError: there is none, it holds nothing to compare with, or what no card may ask for (`allowed_flags`).
     """
     path = path / CARD_FILE if path.is_dir() else path
     card = read_card(path, whole=True)
@@ -86,41 +121,7 @@ def differences_here(card: Mapping[str, Any]) -> list[str]:
     return list(dict.fromkeys(notes))
 
 
-# ==== card_flags.py
-# What may a card ask for when it is repeated? A card is data, and anybody may have written it.
-#
-# Its flags go to LeRobot, which would import packages, run code from the hub and read and write files by them. So only
-# those are taken that a card of ours can hold and that name no code, no place to write to, no machine but this one, and
-# of places to read from only folders that are here. Anything else is refused by name.
-
-ENV, POLICY_TYPE, POLICY_PATH, TASK_DIR = "env.type", "policy.type", "policy.path", "env.task_dir"
-
-NUMBERS = (
-    *("seed", "eval.n_episodes", "eval.batch_size", "eval.use_async_envs", "eval.recording"),
-    *("env.fps", "env.demonstration_prompt", "env.horizon", "env.render_every", "env.replan_steps", "env.seed_base"),
-    *("env.expert_action", "env.blind_action", "env.oracle_memory", "env.videos", "env.resume"),
-    *("env.max_parallel_tasks", "env.disable_env_checker"),
-)
-"""Numbers and truth values of the run and the environment. Of a policy's, all are taken but `REACHING_OUT`."""
-REACHING_OUT = ("push_to_hub", "private", "use_peft", "trust_remote_code", "discover_packages_path")
-"""Truth values of a policy by which more than its numbers changes."""
-WORDS = (
-    *("job_name", "env.task", "env.tasks", "env.suite", "env.obs_type", "env.referent", "env.prompt_in", "env.render"),
-    *("policy.size", "policy.perception", "policy.align", "policy.subgoal_level", "policy.memory_fusion"),
-    *("policy.memory_camera", "policy.detector"),
-    *("policy.dtype", "policy.dialect", "policy.gripper"),
-)
-"""Words, which name one of several known things."""
-NOTES = ("policy.label", "policy.keys")
-"""Text that stands on a card, or in a message to the policy's server."""
-SERVERS = ("policy.host", "policy.servers")
-
-FLAG = re.compile(r"--([\w.]+)=(.*)", re.DOTALL)
-WORD = re.compile(r"[\w.,+' ()-]*")
-DEVICE = re.compile(r"cpu|mps|(cuda|xpu)(:\d+)?")
-SERVER = re.compile(r"(?:\w+://)?(?:127\.0\.0\.1|localhost)(?::\d+)?")
-OBSERVATION = re.compile(r"[\w./-]+")
-NOTHING = ("null", "none", "None", "~")
+# --- what a card that is repeated may ask for ---
 
 
 def allowed_flags(flags: Any, server: str | None = None) -> list[str]:

@@ -1,14 +1,16 @@
-"""What LeRobot's evaluation loop is made to do beside its own: run parts of a task, seed each batch, draw what is seen.
-
-Written against the loop of one version: what it relies on is listed in tests/engine/test_lerobot_loop.py, whose
-failures say what to look at when LeRobot moves on. How it gets there, and out again: `lerobot_hooks`.
+"""What LeRobot's evaluation loop is made to do beside its own: run parts of a task, seed batches, draw what is needed.
 
 LeRobot seeds Python, NumPy and torch once per run, so what a sampling policy draws in an episode depends on all that
 ran before it. Here each batch is seeded from the run's seed, the task and the batch's first episode: an evaluation
 that is resumed or shared among machines draws what an undisturbed one draws.
 
-Frames are drawn for those who look at them (``rollout``), and the environment records videos (``env.videos``): LeRobot
-would render ten episodes of each task a second time.
+LeRobot draws every picture. Here a picture is drawn and converted only for a policy that needs the observation; between
+two of these a policy is handed the pictures and objects of the last one, which it has said it will not read. All else
+of an observation is of the present. The environment records videos itself (``env.videos``): LeRobot would render ten
+episodes of each task a second time. What a dataset is asked for of a rollout, `recording` writes.
+
+Written against the loop of one version: what it relies on is listed in tests/run/test_lerobot_loop.py, whose failures
+say what to look at when LeRobot moves on. How it gets there, and out again: `lerobot_hooks`.
 """
 
 from __future__ import annotations
@@ -35,8 +37,23 @@ from lerobot_memobench.lerobot_hooks import INSIDE_SLURM, ROLLOUT, RUN_ONE, chec
 from lerobot_memobench.run.plan import Range
 from lerobot_memobench.run.recording import Recorder
 
+PIXELS, PHASE = "pixels", "phase"
+"""Of an observation: what is left out where nobody needs it; 0 in the demonstration prompt, 1 in execution."""
+KEEPS_FRAMES = ("return_observations", "render_callback", "predicted_latents_callback")
+"""Settings of LeRobot's rollout that make use of every frame, or of what only its own loop does."""
+RECORDS = ("recording_dir", "env_features", "recording_repo_id", "recording_private")
+"""Settings by which a rollout is recorded as a dataset; see `recording`."""
 KEEPS_ITS_NOISE = ("memobench_mem",)
 """Policies that seed each episode's noise themselves, from torch's initial seed: it must stay the run's."""
+KNOWN: dict[tuple[str, str], Callable[[Any], bool]] = {
+    ("lerobot.policies.act.modeling_act", "ACTPolicy"): lambda policy: (
+        policy.config.temporal_ensemble_coeff is not None or not policy._action_queue
+    ),
+    ("lerobot.policies.pi0.modeling_pi0", "PI0Policy"): lambda policy: not policy._action_queue,
+    ("lerobot.policies.pi05.modeling_pi05", "PI05Policy"): lambda policy: not policy._action_queue,
+    ("lerobot.policies.smolvla.modeling_smolvla", "SmolVLAPolicy"): lambda policy: not policy._queues[ACTION],
+}
+"""Module and class of LeRobot's policies that plan action chunks -> whether one of them needs the next observation."""
 
 
 @contextmanager
@@ -65,7 +82,7 @@ def steered(seed: int | None, ranges: Mapping[tuple[str, int], list[Range]] | No
     from lerobot.scripts import lerobot_eval
 
     def one(run_one: Callable[..., Any]) -> Callable[..., Any]:
-        return _unfilmed(run_one) if ranges is None else _only(_unfilmed(run_one), ranges)
+        return _unrecorded(run_one) if ranges is None else _only(_unrecorded(run_one), ranges)
 
     def rolled(rollout: Callable[..., Any]) -> Callable[..., Any]:
         spared = sparing(rollout, lambda: lerobot_eval.inside_slurm())
@@ -75,7 +92,7 @@ def steered(seed: int | None, ranges: Mapping[tuple[str, int], list[Range]] | No
         yield
 
 
-def _unfilmed(run_one: Callable[..., Any]) -> Callable[..., Any]:
+def _unrecorded(run_one: Callable[..., Any]) -> Callable[..., Any]:
     """Wrap LeRobot's evaluation of one task: it renders no episode, and makes no folder for videos."""
 
     @functools.wraps(run_one)
@@ -139,61 +156,13 @@ def batch_seed(seed: int, task: str, first: int, *more: int) -> int:
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=4).digest(), "big")
 
 
-# ==== rollout.py
-# LeRobot's loop over control steps, in which pictures are drawn and converted only for a policy that looks at them.
-#
-# It takes the same steps in the same order as ``lerobot_eval.rollout`` and returns the same tensors, and records what a
-# dataset is asked for of (`recording`). Between two looks a
-# policy is handed the pictures and objects that it saw last, which it has said it will not read; everything else of an
-# observation is of the present.
-
-PIXELS, PHASE = "pixels", "phase"
-"""Of an observation: what is left out when nobody looks; 0 while the prompt plays, 1 in execution."""
-KEEPS_FRAMES = ("return_observations", "render_callback", "predicted_latents_callback")
-"""Settings of LeRobot's rollout that make use of every frame, or of what only its own loop does."""
-RECORDS = ("recording_dir", "env_features", "recording_repo_id", "recording_private")
-"""Settings by which a rollout is recorded as a dataset; see `recording`."""
-
-Processor = Callable[[Any], Any]
-
-
-class Eyes:
-    """The observations of a rollout as its policy gets them.
-
-    Args:
-        env: the vector environment, told by ``need_observation`` whether its next frames are seen.
-        looks: tells, after an action, whether the policy looks at the next observation.
-    """
-
-    def __init__(self, env: Any, looks: Callable[[], bool]) -> None:
-        self._env, self._looks = env, looks
-        self._watched = True  # since the environment's reset
-        self._pictures: dict[str, torch.Tensor] = {}
-        self._phase: NDArray[np.float32] | None = None
-
-    def announce(self) -> None:
-        """Tell the environment, before its step, whether anybody looks at what comes of it."""
-        looks = self._looks()
-        if looks != self._watched:
-            self._env.call("need_observation", looks)
-            self._watched = looks
-
-    def see(self, observation: dict[str, Any]) -> dict[str, Any]:
-        """Return LeRobot's form of an observation, with the pictures seen last where nobody looks."""
-        begins = self._phase is None or bool((observation[PHASE] != self._phase).any())
-        self._phase = np.array(observation[PHASE])
-        if begins or self._watched:  # the first frame of an execution is seen by all: none can know when it comes
-            seen = preprocess_observation(observation)
-            self._pictures = {key: value for key, value in seen.items() if key.startswith(OBS_IMAGES)}
-            return seen
-        seen = preprocess_observation({key: value for key, value in observation.items() if key != PIXELS})
-        return {**self._pictures, **seen}
+# --- the loop over control steps: the same steps in the same order as LeRobot's, and the same tensors ---
 
 
 def sparing(
     rollout: Callable[..., dict[str, Any]], hides_progress: Callable[[], bool]
 ) -> Callable[..., dict[str, Any]]:
-    """Wrap LeRobot's rollout: where nothing but the policy sees the frames, only those that it looks at are drawn.
+    """Wrap LeRobot's rollout: where nothing but the policy takes the frames, only those that it needs are drawn.
 
     Args:
         hides_progress: whether the bar over a rollout's steps is left out.
@@ -219,18 +188,18 @@ def _roll(env: Any, policy: Any, settings: dict[str, Any], quiet: bool) -> dict[
     steps: list[tuple[NDArray[Any], ...]] = []
     bar = trange(limit, desc=f"Running rollout with at most {limit} steps", disable=quiet, leave=False)
     with bar, _recorder(env, settings) as recorder:
-        eyes = Eyes(env, looking(policy) if recorder is None else lambda: True)
+        inputs = Inputs(env, needs_observation(policy) if recorder is None else lambda: True)
         while not done.all() and len(steps) < limit:
-            before, seen = observation, eyes.see(observation)
-            action = _act(env, policy, settings, seen)
-            eyes.announce()
+            before, batch = observation, inputs.of(observation)
+            action = _act(env, policy, settings, batch)
+            inputs.announce()
             observation, reward, terminated, truncated, info = env.step(action)
             success = _successes(info, env.num_envs)
             done = terminated | truncated | done | (len(steps) + 1 == limit)
             ever = ever | success
             if recorder is not None:
                 broken = np.broadcast_to(info.get("_fault", False), done.shape)  # gymnasium's mark of rows that tell it
-                recorder.add(before, action, reward, success, done, seen["task"], broken)
+                recorder.add(before, action, reward, success, done, batch["task"], broken)
             steps.append((action, reward, success, done))
             bar.set_postfix({"running_success_rate": f"{ever.mean() * 100:.1f}%"}, refresh=False)
             bar.update()
@@ -255,12 +224,12 @@ def _recorder(env: Any, settings: Mapping[str, Any]) -> Iterator[Recorder | None
         recorder.close()
 
 
-def _act(env: Any, policy: Any, through: Mapping[str, Processor], seen: dict[str, Any]) -> NDArray[np.float32]:
+def _act(env: Any, policy: Any, through: Mapping[str, Any], batch: dict[str, Any]) -> NDArray[np.float32]:
     """Return the actions (batch, A) of a policy for an observation, both ``through`` the processors of each."""
-    seen["task"] = list(env.call("task_description"))
-    batch = through["preprocessor"](through["env_preprocessor"](seen))
+    batch["task"] = list(env.call("task_description"))
+    processed = through["preprocessor"](through["env_preprocessor"](batch))
     with torch.inference_mode():
-        action = policy.select_action(batch)
+        action = policy.select_action(processed)
     action = through["env_postprocessor"]({ACTION: through["postprocessor"](action)})[ACTION]
     found: NDArray[np.float32] = action.to("cpu").numpy()
     return found
@@ -268,48 +237,56 @@ def _act(env: Any, policy: Any, through: Mapping[str, Processor], seen: dict[str
 
 def _successes(info: dict[str, Any], rows: int) -> NDArray[np.bool_]:
     """Return which rows' goals hold (rows,)."""
-    told = info.get("final_info", info).get("is_success", False)
-    return np.broadcast_to(np.asarray(told, bool), rows)
+    holds = info.get("final_info", info).get("is_success", False)
+    return np.broadcast_to(np.asarray(holds, bool), rows)
 
 
-# ==== looking.py
-# Which policies look at the next observation: for those that do not, nothing is drawn and no objects are found.
-#
-# A policy of ours says so itself, by its method ``needs_observation``. LeRobot's policies that plan chunks look when their queue
-# of planned actions is empty; each is known by the very function that was read (tests/engine/test_lerobot_loop.py), so a
-# subclass that acts in another way, a wrapped policy, and any other always look. (`diffusion` queues pictures at every
-# step.)
+class Inputs:
+    """The observations of a rollout as its policy gets them.
+
+    Args:
+        env: the vector environment, told whether its next pictures and objects are needed.
+        needed: tells, after an action, whether the policy needs the next observation.
+    """
+
+    def __init__(self, env: Any, needed: Callable[[], bool]) -> None:
+        self._env, self._needed = env, needed
+        self._drawn = True  # since the environment's reset
+        self._pictures: dict[str, torch.Tensor] = {}
+        self._phase: NDArray[np.float32] | None = None
+
+    def announce(self) -> None:
+        """Tell the environment, before its step, whether anybody needs the observation after it."""
+        needed = self._needed()
+        if needed != self._drawn:
+            self._env.call("need_observation", needed)
+            self._drawn = needed
+
+    def of(self, observation: dict[str, Any]) -> dict[str, Any]:
+        """Return LeRobot's form of an observation, with the last pictures where nobody needs new ones."""
+        begins = self._phase is None or bool((observation[PHASE] != self._phase).any())
+        self._phase = np.array(observation[PHASE])
+        if begins or self._drawn:  # the first frame of an execution is always drawn: none can know when it comes
+            converted = preprocess_observation(observation)
+            self._pictures = {key: value for key, value in converted.items() if key.startswith(OBS_IMAGES)}
+            return converted
+        converted = preprocess_observation({key: value for key, value in observation.items() if key != PIXELS})
+        return {**self._pictures, **converted}
 
 
-def _looks_act(policy: Any) -> bool:
-    return policy.config.temporal_ensemble_coeff is not None or not policy._action_queue
+def needs_observation(policy: Any) -> Callable[[], bool]:
+    """Return what tells, before a step, whether a policy needs pictures or objects of the observation after it.
 
-
-def _pi(policy: Any) -> bool:
-    return not policy._action_queue
-
-
-def _smolvla(policy: Any) -> bool:
-    return not policy._queues[ACTION]
-
-
-KNOWN: dict[tuple[str, str], Callable[[Any], bool]] = {
-    ("lerobot.policies.act.modeling_act", "ACTPolicy"): _looks_act,
-    ("lerobot.policies.pi0.modeling_pi0", "PI0Policy"): _pi,
-    ("lerobot.policies.pi05.modeling_pi05", "PI05Policy"): _pi,
-    ("lerobot.policies.smolvla.modeling_smolvla", "SmolVLAPolicy"): _smolvla,
-}
-"""Module and class of LeRobot's policies -> whether one of them looks next."""
-
-
-def looking(policy: Any) -> Callable[[], bool]:
-    """Return what tells, before a step, whether a policy looks at pictures or objects of the observation after it."""
+    A policy of ours says so itself, by its method of that name. LeRobot's policies that plan action chunks need one
+    when their queue is empty; each is known by the very function that was read, so a subclass that acts in another way,
+    a wrapped policy, and any other need every observation. (`diffusion` queues pictures at every step.)
+    """
     own = getattr(policy, "needs_observation", None)
     if own is not None:
         return own
     acts = getattr(type(policy), "select_action", None)
-    for (module, name), looks in KNOWN.items():
+    for (module, name), needs in KNOWN.items():
         # A policy of a module that nobody has imported is not here.
         if acts is not None and acts is getattr(getattr(sys.modules.get(module), name, None), "select_action", None):
-            return lambda: looks(policy)
+            return lambda: needs(policy)
     return lambda: True

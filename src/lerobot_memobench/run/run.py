@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.envs.episode_log import PROTOCOL_FILE, has_log, read_episodes, read_log, read_protocol_file
+from lerobot_memobench.envs.episode_log import has_log, read_episodes, read_log, read_protocol_file
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import Summary
 from lerobot_memobench.evaluation.records import CARD_FILE, POLICY, differences, read_card, read_protocol
@@ -21,6 +21,37 @@ from lerobot_memobench.run.card import card_of, extended, remove_card, with_chec
 from lerobot_memobench.run.lerobot_commands import call_lerobot, without_chatter
 from lerobot_memobench.run.plan import EvaluationPlan, Range
 from lerobot_memobench.run.rollout import calm_output, steered
+
+VIDEOS = "videos"
+"""Folder of the videos, in that of the log."""
+
+Tell = Callable[[str], None]
+"""Told what a user should know and what stops nothing."""
+
+Ranges = Mapping[tuple[str, int], list[Range]]
+"""LeRobot's name of a task -> the runs of it that are made."""
+
+
+@dataclass(frozen=True)
+class EvaluationReport:
+    """What an evaluation found.
+
+    Attributes:
+        folder: holds the log, and the report's files.
+        summary: its figures.
+        notes: what a reader must know, such as lines of the log that could not be read.
+        absent: (task, episode) of those that were asked for and are missing.
+    """
+
+    folder: Path
+    summary: Summary
+    notes: Sequence[str]
+    absent: Sequence[tuple[str, int]] = ()
+
+    @property
+    def page(self) -> Path:
+        """The report as a file to read."""
+        return self.folder / REPORT_MARKDOWN
 
 
 @dataclass(frozen=True)
@@ -105,14 +136,17 @@ def _finish(plan: EvaluationPlan, card: dict[str, Any]) -> EvaluationReport:
     return report
 
 
-# ==== resume.py
-# Going on with an evaluation: whether it is the same one, which episodes are left, what is then run.
+def report_on(folder: Path, episodes: int | None = None, absent: Sequence[tuple[str, int]] = ()) -> EvaluationReport:
+    """Write the report of the log in ``folder`` beside it and return it.
 
-Tell = Callable[[str], None]
-"""Told what a user should know and what stops nothing."""
+    Args:
+        episodes: report those below this number; None for all.
+    """
+    summary, notes = write_report(folder, episodes)
+    return EvaluationReport(folder, summary, notes, absent)
 
-Ranges = Mapping[tuple[str, int], list[Range]]
-"""LeRobot's name of a task -> the runs of it that are made."""
+
+# --- going on: whether it is the same evaluation, which episodes are left, what is then run ---
 
 
 def resumed_card(folder: Path, card: dict[str, Any], tell: Tell) -> dict[str, Any]:
@@ -188,12 +222,7 @@ def unused_subfolder(output: Path) -> Path:
     return output / f"continued-{k}"
 
 
-# ==== folder.py
-# The folder of an evaluation: whether it may be written to, held while a run lasts, left clean behind it.
-
-VIDEOS = "videos"
-EARLIER_DRAFTS = (".*.part", "*.part", f".{PROTOCOL_FILE}.*", f"{VIDEOS}/.*.part")
-"""What earlier versions of this package called files that were being written."""
+# --- the folder: whether it may be written to, held while a run lasts, left clean behind it ---
 
 
 def check_new(folder: Path) -> None:
@@ -255,9 +284,6 @@ def _clean(folder: Path) -> None:
     """Remove what a killed run was writing: whole files have names of their own."""
     for place in (folder, folder / VIDEOS):
         remove_drafts(place)
-    for pattern in EARLIER_DRAFTS:
-        for draft in folder.glob(pattern):
-            draft.unlink(missing_ok=True)
 
 
 def _remove_empty(folder: Path) -> None:
@@ -269,39 +295,3 @@ def _remove_empty(folder: Path) -> None:
             child.rmdir()
     if not any(folder.iterdir()):
         folder.rmdir()
-
-
-# ==== reporting.py
-# The report of an evaluation that has been run or merged, as the engine hands it back.
-
-
-@dataclass(frozen=True)
-class EvaluationReport:
-    """What an evaluation found.
-
-    Attributes:
-        folder: holds the log, and the report's files.
-        summary: its figures.
-        notes: what a reader must know, such as lines of the log that could not be read.
-        absent: (task, episode) of those that were asked for and are missing.
-    """
-
-    folder: Path
-    summary: Summary
-    notes: Sequence[str]
-    absent: Sequence[tuple[str, int]] = ()
-
-    @property
-    def page(self) -> Path:
-        """The report as a file to read."""
-        return self.folder / REPORT_MARKDOWN
-
-
-def report_on(folder: Path, episodes: int | None = None, absent: Sequence[tuple[str, int]] = ()) -> EvaluationReport:
-    """Write the report of the log in ``folder`` beside it and return it.
-
-    Args:
-        episodes: report those below this number; None for all.
-    """
-    summary, notes = write_report(folder, episodes)
-    return EvaluationReport(folder, summary, notes, absent)

@@ -18,7 +18,7 @@ from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash
 from lerobot_memobench.perception.weights import SHIPPED
-from lerobot_memobench.run import rerun as card_flags
+from lerobot_memobench.run import rerun
 from lerobot_memobench.run.card import checkpoint_files, new_card, tree_hash, with_episodes, write_card
 from lerobot_memobench.run.machine import run_facts
 from lerobot_memobench.run.plan import plan_line
@@ -157,7 +157,7 @@ def test_other_eyes_than_those_on_the_card_are_refused() -> None:
 
 
 def test_a_repository_is_its_copy_in_the_cache(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(card_flags, "local_folder", lambda path: Path("checkpoint") if path == "user/name" else None)
+    monkeypatch.setattr(rerun, "local_folder", lambda path: Path("checkpoint") if path == "user/name" else None)
     assert f"--policy.path={Path('checkpoint').absolute()}" in allowed_flags(
         [*BENCHMARK[:2], "--policy.path=user/name"]
     )
@@ -179,7 +179,7 @@ REFUSED = {
 
 @pytest.mark.parametrize(("section", "config"), [("env", MemobenchEnvConfig), ("eval", EvalConfig)])
 def test_every_setting_is_allowed_or_refused_on_purpose(section: str, config: type) -> None:
-    taken = {*card_flags.NUMBERS, *card_flags.WORDS, card_flags.TASK_DIR}
+    taken = {*rerun.NUMBERS, *rerun.WORDS, rerun.TASK_DIR}
     for field in dataclasses.fields(config):
         assert (f"{section}.{field.name}" in taken) != (field.name in REFUSED[config]), field.name
 
