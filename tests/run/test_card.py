@@ -15,7 +15,6 @@ from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import read_card
 from lerobot_memobench.run.card import (
-    with_checkpoint,
     checkpoint_files,
     disagreement,
     extended,
@@ -26,6 +25,7 @@ from lerobot_memobench.run.card import (
     policy_facts,
     training_facts,
     tree_hash,
+    with_checkpoint,
     with_episodes,
     write_card,
 )
