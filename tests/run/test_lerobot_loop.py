@@ -18,7 +18,6 @@ from lerobot.scripts import lerobot_eval
 
 from lerobot_memobench import lerobot_hooks
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.run import rollout
 from lerobot_memobench.run.rollout import KEEPS_FRAMES, KNOWN, RECORDS, batch_seed, steered
 
 
@@ -198,7 +197,7 @@ def draws(first: int, history: int = 0, seed: int | None = 7, name: str = "diffu
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lerobot_eval, "rollout", rollout)
-        patch.setattr(rollout, "sparing", lambda theirs, _: theirs)
+        patch.setattr("lerobot_memobench.run.rollout.sparing", lambda theirs, _: theirs)
         torch.manual_seed(7)
         torch.rand(history)
         with steered(seed):
@@ -222,7 +221,7 @@ def test_a_policy_that_seeds_its_noise_itself_keeps_the_runs_seed() -> None:
     kept: list[int] = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lerobot_eval, "rollout", lambda env, policy, seeds: kept.append(torch.initial_seed()))
-        patch.setattr(rollout, "sparing", lambda theirs, _: theirs)
+        patch.setattr("lerobot_memobench.run.rollout.sparing", lambda theirs, _: theirs)
         torch.manual_seed(7)
         with steered(7):
             lerobot_eval.rollout(env=Env(), policy=SimpleNamespace(name="memobench_mem"), seeds=[9])

@@ -73,7 +73,7 @@ def configured(name: str, config: MemobenchEnvConfig, **fields: Any) -> tuple[An
 
 
 def rolled(
-    rollout: Any, rows: int, log: Path, name: str, films: int = 0, obs_type: str = PIXELS, **fields: Any
+    rollout: Any, rows: int, log: Path, name: str, videos: int = 0, obs_type: str = PIXELS, **fields: Any
 ) -> dict[str, torch.Tensor]:
     """Return what a rollout of a fresh policy in fresh environments returns."""
     torch.manual_seed(7)
@@ -83,7 +83,7 @@ def rolled(
         render="fast",
         expert_action=name == "memobench_expert",
         log_dir=str(log),
-        videos=films,
+        videos=videos,
         obs_type=obs_type,
     )
     ((env,),) = (suite.values() for suite in config.create_envs(rows).values())
@@ -209,19 +209,19 @@ def test_what_nobody_watches_is_not_drawn(use_async: bool, tmp_path: Path) -> No
         env.close()
 
 
-def test_a_filmed_episode_is_drawn_whole(drawn: list[int], tmp_path: Path) -> None:
-    """Two of three episodes are filmed, whoever looks."""
+def test_a_recorded_episode_is_drawn_whole(drawn: list[int], tmp_path: Path) -> None:
+    """Two of three episodes are recorded, whoever needs frames."""
     from lerobot_memobench.envs.video import LAST_FRAMES
     from lerobot_memobench.evaluation.html.write import frame_count
 
     rolled(sparing(lerobot_eval.rollout, lambda: True), 3, tmp_path, "memobench_random", videos=2)
-    films = sorted((tmp_path / "videos").iterdir())
-    assert [film.name for film in films] == [f"{HIGHLIGHT}.0.mp4", f"{HIGHLIGHT}.1.mp4"]
-    assert {frame_count(film) for film in films} == {LAST + 1 + LAST_FRAMES}
+    recorded = sorted((tmp_path / "videos").iterdir())
+    assert [video.name for video in recorded] == [f"{HIGHLIGHT}.0.mp4", f"{HIGHLIGHT}.1.mp4"]
+    assert {frame_count(video) for video in recorded} == {LAST + 1 + LAST_FRAMES}
     assert len(drawn) == 2 * (LAST + 1) + 3
 
 
-def test_the_command_draws_and_films_no_more_than_asked(drawn: list[int], tmp_path: Path) -> None:
+def test_the_command_draws_and_records_no_more_than_asked(drawn: list[int], tmp_path: Path) -> None:
     from lerobot_memobench.cli.lerobot import main
 
     words = [f"tasks={HIGHLIGHT}", "episodes=2", "batch_size=1", f"horizon={HORIZON}", "env.render=fast", "videos=1"]
