@@ -48,5 +48,5 @@ def test_sheets(gl: str) -> None:
 
 
 def test_all_classes_of_the_catalogue_are_drawn() -> None:
-    assert len(gallery._classes("object")) == 29
-    assert set(gallery._classes("fixture")) == set(gallery.FRONTS)
+    assert len(gallery.catalogue_classes("objects")) == 29
+    assert set(gallery.catalogue_classes("fixtures")) == set(gallery.FRONTS)

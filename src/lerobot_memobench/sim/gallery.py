@@ -1,15 +1,11 @@
-"""Figures of the benchmark's world: the tasks' initial scenes, every object from all sides, fixtures open and closed.
-
-`memobench gallery` writes them; the pictures of the documentation are made by it.
-"""
+"""`memobench gallery`: the tasks' initial scenes, every object from all sides, fixtures open and closed."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
+from typing import Literal, NamedTuple
 
 import mujoco
 import numpy as np
@@ -36,14 +32,13 @@ FOVY = 30.0
 """Field of view of the turntable's cameras, degrees."""
 FRONTS = {"flat_stove": 0.0, "microwave": -90.0, "wooden_cabinet": -90.0, "wooden_two_layer_shelf": -90.0}
 """Azimuth of the side with handles or openings, degrees."""
-_BACKGROUND, _TEXT = (250, 250, 248), (30, 30, 34)
-_GROUND = (0.80, 0.79, 0.77, 1.0)
+BACKGROUND, INK = (250, 250, 248), (30, 30, 34)
+GROUND = (0.80, 0.79, 0.77, 1.0)
 """Plain: the grain of the table would cost more bytes than the things on it."""
 
 
-@dataclass(frozen=True)
-class View:
-    """Where a picture is taken from: degrees, azimuth 0 from the agentview's side; distance in sizes of the thing."""
+class View(NamedTuple):
+    """A camera's place: degrees, azimuth 0 from the agentview's side; distance in sizes of the thing."""
 
     azimuth: float
     elevation: float = 32.0
@@ -54,24 +49,101 @@ TURNTABLE = tuple(View(azimuth) for azimuth in (25.0, 115.0, 205.0, 295.0))
 FRONT, SIDE = View(20.0, 30.0, 5.6), View(-40.0, 42.0, 5.6)
 
 
-@cache
-def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    return ImageFont.load_default(size=size)
+def write_gallery(folder: str | Path, suite: str = PUBLISHED) -> list[Path]:
+    """Write ``tasks.png`` of a suite, ``objects.png`` and ``fixtures.png`` into a folder and return their paths."""
+    folder = Path(folder)
+    return [
+        save(draw_tasks(task_names(suite=suite)), folder / "tasks.png"),
+        save(draw_objects(), folder / "objects.png"),
+        save(draw_fixtures(), folder / "fixtures.png"),
+    ]
 
 
-def _wrapped(text: str, size: int, width: int, lines: int) -> list[str]:
-    """Return a text broken at spaces into lines of a width, pixels; what does not fit ends in an ellipsis."""
-    draw = ImageDraw.Draw(Image.new("RGB", (1, 1)))
-    rows = [""]
-    for word in text.split():
-        longer = f"{rows[-1]} {word}".strip()
-        if draw.textlength(longer, font=_font(size)) <= width or not rows[-1]:
-            rows[-1] = longer
-        else:
-            rows.append(word)
-    if len(rows) > lines:
-        rows = [*rows[: lines - 1], rows[lines - 1] + " …"]
-    return rows
+def draw_tasks(names: Sequence[str] | None = None, seed: int = SEED, size: int = 256, columns: int = 6) -> Image.Image:
+    """Return the initial scenes of tasks as the agentview camera sees them, all of the catalogue by default."""
+    cells = []
+    for name in names or task_names():
+        task = get_task(name)
+        sim = Simulation(task, RenderSettings(size, size, "high"))
+        sim.reset(seed)
+        cells.append((f"{task.memory_type}: {task.title}", sim.render("agentview")))
+    return grid(cells, min(columns, len(cells)), label=11, lines=3)
+
+
+def draw_objects(classes: Sequence[str] | None = None, size: int = 112, columns: int = 3) -> Image.Image:
+    """Return each class from four sides, all object classes of the catalogue by default."""
+    cells = [_cells(name, TURNTABLE, size)[0] for name in classes or catalogue_classes("objects")]
+    return grid(cells, min(columns, len(cells)), label=13, lines=1)
+
+
+def draw_fixtures(classes: Sequence[str] | None = None, size: int = 224) -> Image.Image:
+    """Return each fixture from two sides, closed or off and then open or on."""
+    cells = []
+    for name in classes or catalogue_classes("fixtures"):
+        cells += _cells(name, [v._replace(azimuth=v.azimuth + FRONTS.get(name, 0.0)) for v in (FRONT, SIDE)], size)
+    return grid(cells, 2, label=14, lines=1)
+
+
+def catalogue_classes(kind: Literal["objects", "fixtures"]) -> list[str]:
+    """Return the classes of the published tasks' objects or fixtures, without the table, sorted."""
+    found = {name for task in task_names() for name in getattr(get_task(task), kind).values()}
+    return sorted(found - {"kitchen_table"})
+
+
+def _cells(class_name: str, views: Sequence[View], size: int) -> list[tuple[str, Pixels]]:
+    """Return labels and pictures of an instance on plain ground: closed or off, and open or on where it moves."""
+    spec = _plain_ground()
+    asset = build_asset(spec, spec.worldbody, "thing", class_name)
+    spec.body("thing").pos = [0.0, 0.0, TABLE_TOP - asset.bottom]
+    low, high = np.array(asset.low), np.array(asset.high)
+    middle = (low + high) / 2 + [0.0, 0.0, TABLE_TOP - asset.bottom]
+    cameras = [f"view_{index}" for index in range(len(views))]
+    for camera, view in zip(cameras, views, strict=True):
+        _add_camera(spec, camera, middle, view, view.distance * float(np.linalg.norm(high - low)) / 2)
+    model = spec.compile()
+    data, renderer = mujoco.MjData(model), Renderer(model, RenderSettings(size, size, "high"))
+    words = ("off", "on") if asset.glow else ("closed", "open")
+    labels = [f"{class_name}, {word}" for word in words] if asset.articulations else [class_name]
+    cells = []
+    for label, opened in zip(labels, (False, True), strict=False):
+        _open(asset, model, data, opened)
+        cells.append((label, np.hstack([renderer.render(model, data, camera) for camera in cameras])))
+    renderer.close()
+    return cells
+
+
+def _open(asset: Asset, model: mujoco.MjModel, data: mujoco.MjData, opened: bool) -> None:
+    """Open or close everything that can be, and switch on or off."""
+    for articulation in asset.articulations.values():
+        data.joint(articulation.joint).qpos[0] = articulation.open_q if opened else articulation.closed_q
+    for geom in asset.glow:
+        model.geom(geom).rgba = asset.glow_on if opened else asset.glow_off
+    mujoco.mj_forward(model, data)
+
+
+def _plain_ground() -> mujoco.MjSpec:
+    """Return the kitchen with its room and table out of sight and plain ground at the table's height."""
+    spec = mujoco.MjSpec()
+    build_kitchen(spec)
+    for geom in [*spec.body("room").geoms, *spec.body("kitchen_table").geoms]:
+        geom.group = COLLISION_GROUP
+    ground = spec.body("kitchen_table").add_geom(
+        type=mujoco.mjtGeom.mjGEOM_BOX, size=[9, 9, 0.01], pos=[0, 0, -0.0101], rgba=list(GROUND)
+    )
+    ground.group, ground.contype, ground.conaffinity = VISUAL_GROUP, 0, 0
+    return spec
+
+
+def _add_camera(spec: mujoco.MjSpec, name: str, target: NDArray[np.float64], view: View, distance: float) -> None:
+    azimuth, elevation = np.radians(view.azimuth), np.radians(view.elevation)
+    back = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    frame, quaternion = np.stack([right, np.cross(back, right), back], axis=1), np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, frame.ravel())
+    spec.worldbody.add_camera(name=name, pos=list(target + distance * back), quat=list(quaternion), fovy=FOVY)
+
+
+# --- sheets ---
 
 
 def grid(cells: Sequence[tuple[str, Pixels]], columns: int, label: int = 12, lines: int = 2) -> Image.Image:
@@ -81,14 +153,23 @@ def grid(cells: Sequence[tuple[str, Pixels]], columns: int, label: int = 12, lin
     height, width = cells[0][1].shape[:2]
     gap, text_height = 6, lines * (label + 3) + 4
     rows = -(-len(cells) // columns)
-    sheet = Image.new("RGB", (columns * (width + gap) + gap, rows * (height + text_height + gap) + gap), _BACKGROUND)
-    draw = ImageDraw.Draw(sheet)
+    sheet = Image.new("RGB", (columns * (width + gap) + gap, rows * (height + text_height + gap) + gap), BACKGROUND)
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(label)
     for index, (name, picture) in enumerate(cells):
         x = gap + index % columns * (width + gap)
         y = gap + index // columns * (height + text_height + gap)
         sheet.paste(Image.fromarray(picture), (x, y))
-        for row, line in enumerate(_wrapped(name, label, width, lines)):
-            draw.text((x + 1, y + height + 2 + row * (label + 3)), line, fill=_TEXT, font=_font(label))
+        words = [""]
+        for word in name.split():
+            longer = f"{words[-1]} {word}".strip()
+            if draw.textlength(longer, font=font) <= width or not words[-1]:
+                words[-1] = longer
+            else:
+                words.append(word)
+        if len(words) > lines:
+            words = [*words[: lines - 1], words[lines - 1] + " …"]
+        for row, line in enumerate(words):
+            draw.text((x + 1, y + height + 2 + row * (label + 3)), line, fill=INK, font=font)
     return sheet
 
 
@@ -120,123 +201,3 @@ def _png(sheet: Image.Image) -> bytes:
         if buffer.tell() <= LARGEST_FILE:
             break
     return buffer.getvalue()
-
-
-# --- tasks ------------------------------------------------------------------------------------------------------
-
-
-def draw_tasks(names: Sequence[str] | None = None, seed: int = SEED, size: int = 256, columns: int = 6) -> Image.Image:
-    """Return the initial scenes of tasks as the agentview camera sees them, all of the catalogue by default."""
-    cells = []
-    for name in names or task_names():
-        task = get_task(name)
-        sim = Simulation(task, RenderSettings(size, size, "high"))
-        sim.reset(seed)
-        cells.append((f"{task.memory_type}: {task.title}", sim.render("agentview")))
-    return grid(cells, min(columns, len(cells)), label=11, lines=3)
-
-
-# --- assets -----------------------------------------------------------------------------------------------------
-
-
-class Stand:
-    """One instance of a class on plain ground in the kitchen's light, and cameras around it."""
-
-    def __init__(self, class_name: str, views: Sequence[View], size: int) -> None:
-        spec = _plain_ground()
-        self.asset: Asset = build_asset(spec, spec.worldbody, "thing", class_name)
-        spec.body("thing").pos = [0.0, 0.0, TABLE_TOP - self.asset.bottom]
-        low, high = np.array(self.asset.low), np.array(self.asset.high)
-        middle = (low + high) / 2 + [0.0, 0.0, TABLE_TOP - self.asset.bottom]
-        reach = float(np.linalg.norm(high - low)) / 2
-        self._cameras = [f"view_{index}" for index in range(len(views))]
-        for name, view in zip(self._cameras, views, strict=True):
-            _add_camera(spec, name, middle, view, view.distance * reach)
-        self.model = spec.compile()
-        self.data = mujoco.MjData(self.model)
-        self.opened(False)
-        self._renderer = Renderer(self.model, RenderSettings(size, size, "high"))
-
-    def opened(self, opened: bool) -> None:
-        """Open or close everything that can be, and switch on or off."""
-        for articulation in self.asset.articulations.values():
-            q = articulation.open_q if opened else articulation.closed_q
-            self.data.joint(articulation.joint).qpos[0] = q
-        for geom in self.asset.glow:
-            self.model.geom(geom).rgba = self.asset.glow_on if opened else self.asset.glow_off
-        mujoco.mj_forward(self.model, self.data)
-
-    def pictures(self) -> list[Pixels]:
-        """Return what each camera sees."""
-        return [self._renderer.render(self.model, self.data, camera) for camera in self._cameras]
-
-    def close(self) -> None:
-        """Free the renderer."""
-        self._renderer.close()
-
-
-def _plain_ground() -> mujoco.MjSpec:
-    """Return the kitchen with its room and table out of sight and plain ground at the table's height."""
-    spec = mujoco.MjSpec()
-    build_kitchen(spec)
-    for geom in [*spec.body("room").geoms, *spec.body("kitchen_table").geoms]:
-        geom.group = COLLISION_GROUP
-    ground = spec.body("kitchen_table").add_geom(
-        type=mujoco.mjtGeom.mjGEOM_BOX, size=[9, 9, 0.01], pos=[0, 0, -0.0101], rgba=list(_GROUND)
-    )
-    ground.group, ground.contype, ground.conaffinity = VISUAL_GROUP, 0, 0
-    return spec
-
-
-def _add_camera(spec: mujoco.MjSpec, name: str, target: NDArray[np.float64], view: View, distance: float) -> None:
-    azimuth, elevation = np.radians(view.azimuth), np.radians(view.elevation)
-    back = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
-    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-    frame, quaternion = np.stack([right, np.cross(back, right), back], axis=1), np.empty(4)
-    mujoco.mju_mat2Quat(quaternion, frame.ravel())
-    spec.worldbody.add_camera(name=name, pos=list(target + distance * back), quat=list(quaternion), fovy=FOVY)
-
-
-def _classes(kind: str) -> list[str]:
-    """Return the classes of the catalogue's tasks, objects or fixtures without the table, sorted."""
-    found: set[str] = set()
-    for name in task_names():
-        task = get_task(name)
-        found |= set((task.objects if kind == "object" else task.fixtures).values())
-    return sorted(found - {"kitchen_table"})
-
-
-def draw_objects(classes: Sequence[str] | None = None, size: int = 112, columns: int = 3) -> Image.Image:
-    """Return each class from four sides, all object classes of the catalogue by default."""
-    cells = []
-    for class_name in classes or _classes("object"):
-        stand = Stand(class_name, TURNTABLE, size)
-        cells.append((class_name, np.hstack(stand.pictures())))
-        stand.close()
-    return grid(cells, min(columns, len(cells)), label=13, lines=1)
-
-
-def draw_fixtures(classes: Sequence[str] | None = None, size: int = 224) -> Image.Image:
-    """Return each fixture from two sides, closed or off and then open or on."""
-    cells = []
-    for class_name in classes or _classes("fixture"):
-        front = FRONTS.get(class_name, 0.0)
-        views = [replace(view, azimuth=view.azimuth + front) for view in (FRONT, SIDE)]
-        stand = Stand(class_name, views, size)
-        words = ("off", "on") if stand.asset.glow else ("closed", "open")
-        for opened in (False, True) if stand.asset.articulations else (False,):
-            stand.opened(opened)
-            label = f"{class_name}, {words[opened]}" if stand.asset.articulations else class_name
-            cells.append((label, np.hstack(stand.pictures())))
-        stand.close()
-    return grid(cells, 2, label=14, lines=1)
-
-
-def write_gallery(folder: str | Path, suite: str = PUBLISHED) -> list[Path]:
-    """Write ``tasks.png`` of a suite, ``objects.png`` and ``fixtures.png`` into a folder and return their paths."""
-    folder = Path(folder)
-    return [
-        save(draw_tasks(task_names(suite=suite)), folder / "tasks.png"),
-        save(draw_objects(), folder / "objects.png"),
-        save(draw_fixtures(), folder / "fixtures.png"),
-    ]
