@@ -96,7 +96,7 @@ def test_the_papers_methods_keep_their_looks(runs: list[Run]) -> None:
 
 
 def test_how_much_was_run_is_said_beside_the_papers_rows(runs: list[Run]) -> None:
-    told = "(2 of 30 tasks, 8 rollouts)"
+    told = "(2 of 30 tasks, 8 rollouts;\ninputs: not recorded)"
     ours, theirs = style.entries_of(runs), style.published_entries("main")
     assert style.labels_of([*ours, *theirs])["mine_$", False] == f"mine_$\n{told}"
     assert style.labels_of([*ours, *theirs])["π0", True] == "paper: π0"
@@ -106,6 +106,14 @@ def test_how_much_was_run_is_said_beside_the_papers_rows(runs: list[Run]) -> Non
         assert any("2 of 30 tasks, 8 rollouts" in text.get_text() for text in figure.legends[0].get_texts())
     for figure in (rates.draw_replan(runs), rates.draw_correlations(ours)):
         assert not any("of 30 tasks" in text.get_text() for text in figure.legends[0].get_texts())
+
+
+def test_inputs_are_told_where_evaluations_differ_in_them(tmp_path: Path) -> None:
+    pixels = logs.evaluation(tmp_path / "a", 2, inputs="pixels")
+    objects = logs.evaluation(tmp_path / "b", 2, inputs="privileged object state")
+    found = style.labels_of(style.entries_of(read_runs([f"a={pixels}", f"b={objects}"])))
+    assert found["a", False] == "a\n(2 of 30 tasks, 8 rollouts)"
+    assert found["b", False] == "b\n(2 of 30 tasks, 8 rollouts;\ninputs: privileged object state)"
 
 
 def test_axes_that_apply_to_nobody_are_left_out() -> None:

@@ -83,7 +83,10 @@ def exact_power(n: int, delta: float, discordant: float) -> float:
     return power
 
 
-@pytest.mark.parametrize(("n", "discordant"), [(50, 15), (100, 20), (200, 60)])
+@pytest.mark.parametrize(
+    ("n", "discordant"),
+    [(50, 15), pytest.param(100, 20, marks=pytest.mark.slow), pytest.param(200, 60, marks=pytest.mark.slow)],
+)
 def test_the_detectable_difference_is_detected_four_times_in_five(n: int, discordant: int) -> None:
     differences = [1.0] * (discordant // 2) + [-1.0] * (discordant - discordant // 2) + [0.0] * (n - discordant)
     delta = detectable(differences, equal(n))

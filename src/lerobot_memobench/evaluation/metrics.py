@@ -1,8 +1,8 @@
 """SR, MSR, MUR and MCR of rollouts with their intervals, prefix completion, and classes of failure.
 
 A rollout is one line of the episode log. Rates are fractions in [0, 1]; `report_values` turns them into percentages
-with one decimal. None stands for not applicable: a task without checkpoints of an operation has no rate for it and leaves
-that average.
+with one decimal. None stands for not applicable: a task without checkpoints of an operation has no rate for it and
+leaves that average.
 """
 
 from __future__ import annotations

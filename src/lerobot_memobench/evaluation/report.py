@@ -30,7 +30,7 @@ from lerobot_memobench.evaluation.metrics import (
 )
 from lerobot_memobench.evaluation.records import POLICY, Run, asked_for, sweeps, unlike
 from lerobot_memobench.evaluation.report_tables import (
-    PAPER_SAW,
+    PAPER_INPUTS,
     beside_paper,
     best_interval,
     check_beside,
@@ -319,7 +319,7 @@ def _published_rows(published: PublishedRow) -> Iterator[CsvRow]:
     ]
     for place, name, figures in groups:
         for metric in METRICS:
-            yield (method, published.replan_steps, place, name, metric, figures[metric], None, None, None, PAPER_SAW)
+            yield (method, published.replan_steps, place, name, metric, figures[metric], None, None, None, PAPER_INPUTS)
 
 
 def _figures(summary: Summary) -> Iterator[tuple[str, str, str, Rate]]:

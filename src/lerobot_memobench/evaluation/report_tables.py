@@ -316,7 +316,7 @@ def _slug(name: str) -> str:
 # --- beside the paper's tables ---
 
 PAPER_PROTOCOL = {"referent": "fixed", "demonstration_prompt": True, "horizon": 1200, "seed_base": 7}
-PAPER_SAW = "pixels"
+PAPER_INPUTS = "pixels"
 PAPER_TASKS, PAPER_EPISODES = 30, 50
 
 TABLES = (
@@ -354,13 +354,8 @@ def departure_notes(runs: Sequence[Run]) -> list[str]:
 
 def beside_name(run: Run) -> str:
     """Return what an evaluation is called beside the paper's rows of 30 tasks and 1,500 rollouts."""
-    return with_extent(run.name, [run])
-
-
-def with_extent(name: str, runs: Sequence[Run]) -> str:
-    """Return a name and behind it how much was run, where that is not what the paper ran."""
-    told = "; ".join(dict.fromkeys(filter(None, map(extent, runs))))
-    return f"{name} ({told})" if told else name
+    told = extent(run)
+    return f"{run.name} ({told})" if told else run.name
 
 
 def extent(run: Run) -> str:
@@ -383,7 +378,7 @@ def _published_row(row: PublishedRow) -> tuple[Cell, ...]:
     columns = [*(row.memory_types[name] for name in MEMORY_TYPES), row.average]
     return (
         f"paper: {row.label}",
-        PAPER_SAW,
+        PAPER_INPUTS,
         row.replan_steps,
         *(published_rate(c[m]) for c in columns for m in METRICS),
     )

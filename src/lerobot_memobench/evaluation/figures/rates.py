@@ -25,10 +25,12 @@ from lerobot_memobench.evaluation.figures.style import (
     looks_of,
     new_figure,
     paper_style,
+    remark_on,
+    with_remarks,
 )
 from lerobot_memobench.evaluation.metrics import METRICS, PROCESS_METRICS, Rate
 from lerobot_memobench.evaluation.records import Run, sweeps
-from lerobot_memobench.evaluation.report_tables import published_rate, with_extent
+from lerobot_memobench.evaluation.report_tables import published_rate
 from lerobot_memobench.paper import published_rows
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 
@@ -243,16 +245,16 @@ def _correlations_legend(figure: Figure, entries: Sequence[Entry], memory_types:
         handles[name] = Line2D([], [], ls="", color=colour, marker=marker, ms=5, mfc=fill)
     if _both(entries):
         handles["paper"] = Line2D([], [], ls="", marker="o", ms=5, mec=INK, mfc="none")
-        handles["\n".join(["here", *_extents(entries)])] = Line2D([], [], ls="", marker="o", ms=5, mec=INK, mfc=INK)
+        handles["\n".join(["here", *_remarks(entries)])] = Line2D([], [], ls="", marker="o", ms=5, mec=INK, mfc=INK)
     if shaded:
         handles["high MSR, low SR"] = Patch(facecolor=SHADE)
     wide = sum(max(map(len, name.splitlines())) + 8 for name in handles) > 40 * figure.get_size_inches()[0] / 2.45
     legend_below(figure, list(handles.values()), list(handles), 4 if wide else len(handles))
 
 
-def _extents(entries: Sequence[Entry]) -> list[str]:
-    """Return how much of ours was run, where it is less than the paper's."""
-    told = dict.fromkeys(f"{entry.method}: {entry.extent}" for entry in entries if entry.extent)
+def _remarks(entries: Sequence[Entry]) -> list[str]:
+    """Return the remarks on ours."""
+    told = dict.fromkeys(f"{entry.method}: {entry.remark}" for entry in entries if entry.remark)
     alone = len({entry.method for entry in entries if not entry.published}) == 1
     return [literal(one.partition(": ")[2] if alone else one) for one in told]
 
@@ -350,7 +352,7 @@ def draw_replan(runs: Sequence[Run], paper: bool = False, by_type: bool = False)
             if not below:
                 place.set_xlabel("replan interval, steps")
                 place.tick_params(labelbottom=True)
-        _replan_legend(figure, looks, sweeps(runs) if paper else {})
+        _replan_legend(figure, looks, sweeps(runs) if paper or len(set(map(remark_on, runs))) > 1 else {})
         return figure
 
 
@@ -364,13 +366,13 @@ def _draw_replan_panel(place: Any, found: Sequence[Curve], looks: Mapping[Identi
 
 
 def _replan_legend(figure: Figure, looks: Mapping[Identity, Line], ours: Mapping[str, Sequence[Run]]) -> None:
-    """Name the lines; ``ours`` (method -> runs) say how much was run."""
+    """Name the lines; ``ours`` (method -> runs) say how they were run."""
     from matplotlib.lines import Line2D
 
     handles = [Line2D([], [], **look.drawn, ms=4, lw=_width(not theirs)) for (_, theirs), look in looks.items()]
     alone = all(published for _, published in looks)
     marks = [
-        f"paper: {name}" if published and not alone else with_extent(name, ours.get(name, ())).replace(" (", "\n(")
+        f"paper: {name}" if published and not alone else with_remarks(name, map(remark_on, ours.get(name, ())))
         for name, published in looks
     ]
     longest = max(len(line) for mark in marks for line in mark.splitlines())

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import METRICS, Row
 from lerobot_memobench.evaluation.records import Run
-from lerobot_memobench.evaluation.report_tables import extent
+from lerobot_memobench.evaluation.report_tables import PAPER_INPUTS, extent
 from lerobot_memobench.io import draft_of
 from lerobot_memobench.paper import published_rows, shuffled_control
 from lerobot_memobench.tasks.task import MEMORY_TYPES
@@ -203,7 +203,7 @@ class Entry:
 
     Attributes:
         memory_types, tasks: name -> figures; the paper publishes none per task. published: whether it is the paper's.
-        extent: how much was run, where that is less than the paper ran, "" else.
+        remark: what a legend says of it beside others (`remark_on`).
     """
 
     method: str
@@ -213,7 +213,7 @@ class Entry:
     tasks: Mapping[str, Figures]
     memory_type_of: Mapping[str, str]
     published: bool = False
-    extent: str = ""
+    remark: str = ""
 
     @property
     def identity(self) -> Identity:
@@ -236,10 +236,22 @@ def entries_of(runs: Sequence[Run]) -> list[Entry]:
                 _figures(summary.average),
                 tasks,
                 summary.memory_type_of,
-                extent=extent(run),
+                remark=remark_on(run),
             )
         )
     return found
+
+
+def remark_on(run: Run) -> str:
+    """Return how much was run and the policy's inputs, each where it is not the paper's; "" for neither."""
+    inputs = "" if run.summary.inputs == PAPER_INPUTS else f"inputs: {run.summary.inputs}"
+    return ";\n".join(filter(None, (extent(run), inputs)))
+
+
+def with_remarks(name: str, remarks: Iterable[str]) -> str:
+    """Return a name for a legend, and on further lines what is to be said of it."""
+    told = ";\n".join(dict.fromkeys(filter(None, remarks)))
+    return f"{name}\n({told})" if told else name
 
 
 def published_entries(*tables: str) -> list[Entry]:
@@ -282,14 +294,19 @@ def type_axes() -> list[Axis]:
 
 
 def labels_of(entries: Sequence[Entry]) -> dict[Identity, str]:
-    """Return what a row is called in a legend; beside one another, the paper's say so and ours how much was run."""
+    """Return what a row is called in a legend.
+
+    Beside one another the paper's say so. Ours carry their remarks where these differ: beside the paper's, or when
+    evaluations were run unlike.
+    """
     beside = len({entry.published for entry in entries}) > 1
-    extents: dict[Identity, list[str]] = {}
+    remarks: dict[Identity, list[str]] = {}
     for entry in entries:
-        extents.setdefault(entry.identity, []).append(entry.extent)
-    found = {}
-    for (method, published), told in extents.items():
-        all_told = "; ".join(dict.fromkeys(filter(None, told)))
-        ours = f"{method}\n({all_told})" if beside and all_told else method
-        found[method, published] = f"paper: {method}" if published and beside else ours
-    return found
+        remarks.setdefault(entry.identity, []).append(entry.remark)
+    differ = len({remark for told in remarks.values() for remark in told}) > 1
+    return {
+        (method, published): f"paper: {method}"
+        if published and beside
+        else with_remarks(method, told if differ else ())
+        for (method, published), told in remarks.items()
+    }
