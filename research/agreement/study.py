@@ -1,4 +1,10 @@
-"""Agreement beyond chance: Fleiss' and Cohen's kappa, None where only one label is ever used."""
+"""Do annotators agree on which operation a checkpoint is? Figures of a relabelling study (paper, appendix).
+
+Labels are "S", "U", "C". A template is one checkpoint; every rater labels every template. The sheet has one row per
+template. Columns: ``template``, or ``task`` and ``checkpoint`` (counted from 1); ``released``, which may be left out
+where task and checkpoint name one of the catalogue; ``memory_type``, ``language``, ``predicate`` and ``notes``, which
+are for people; every other column is a rater.
+"""
 
 from __future__ import annotations
 
@@ -30,6 +36,8 @@ from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import format_formula
 from lerobot_memobench.tasks.task import DEFAULT_LEVEL, OPERATIONS
 
+# --- agreement beyond chance: kappa, None where only one label is ever used ---
+
 
 def kappa(observed: float, expected: float) -> float | None:
     """Return (observed − expected) / (1 − expected)."""
@@ -58,6 +66,9 @@ def confusion_kappa(table: Sequence[Sequence[int]]) -> float | None:
     if counts.diagonal().max() == counts.sum():
         return None
     return float(cohens_kappa(counts, return_results=False))
+
+
+# --- figures of a study ---
 
 
 @dataclass(frozen=True)
@@ -144,6 +155,8 @@ def _against_released(labels: Labels) -> dict[str, Any]:
         "confusion": table,
     }
 
+
+# --- the sheet ---
 
 IDENTITY = ("template", "task", "checkpoint")
 FOR_PEOPLE = ("memory_type", "language", "predicate", "notes")
@@ -276,6 +289,9 @@ def blank_sheet(raters: int = 3) -> str:
             text, predicate = checkpoint.language[DEFAULT_LEVEL], format_formula(checkpoint.goal)
             rows.append((name, k, task.memory_type, text, predicate, *[""] * raters))
     return csv_text(rows, ("task", "checkpoint", "memory_type", "language", "predicate", *columns))
+
+
+# --- the report ---
 
 
 def report(found: Agreement) -> Report:

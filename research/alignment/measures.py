@@ -1,4 +1,9 @@
-"""Of which tasks are a dataset's episodes, which of them are held out, and on which frames is a memory asked?"""
+"""How well a policy's memory tells the active subgoal, and how far its actions are off.
+
+A readout is fitted in closed form on frozen vectors of training episodes, for every policy alike, so that policies
+trained without an alignment can be compared with those that have a head of their own. It has the form of the heads: a
+linear map to the text embedding, answered by the nearest candidate text.
+"""
 
 from __future__ import annotations
 
@@ -24,6 +29,8 @@ from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import Memo
 from lerobot_memobench.policies.memobench_mem.sampler import TrainingRun, item
 from lerobot_memobench.protocol import PROMPT
 from lerobot_memobench.tasks.catalogue import suite_of
+
+# --- episodes: their tasks, and which are held out ---
 
 
 @dataclass(frozen=True)
@@ -95,6 +102,9 @@ def _spaced(frames: np.ndarray, count: int) -> np.ndarray:
     """At most ``count`` of these frames, evenly spaced."""
     places = np.linspace(0, len(frames) - 1, min(count, len(frames)))
     return frames[places.round().astype(int)]
+
+
+# --- questions: which subgoal is active at a frame ---
 
 
 @dataclass(frozen=True)
@@ -172,6 +182,8 @@ def guesses(questions: Questions) -> dict[str, Any]:
     }
 
 
+# --- readouts ---
+
 PENALTIES = tuple(10.0**k for k in range(-4, 3))
 FOLDS = 3
 
@@ -244,6 +256,8 @@ def mean_and_deviation(values: Sequence[float]) -> tuple[float, float | None]:
     tensor = torch.tensor(values, dtype=torch.float64)
     return float(tensor.mean()), float(tensor.std()) if len(values) > 1 else None
 
+
+# --- measures of a policy ---
 
 EVALUATION_BATCH = 32
 

@@ -1,4 +1,4 @@
-"""What the policies of a study know, in one table: mean and spread over training seeds, beside the baselines."""
+"""The policies of a study in one table and one figure: mean and spread over training seeds, beside the baselines."""
 
 from __future__ import annotations
 

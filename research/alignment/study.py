@@ -1,4 +1,9 @@
-"""What a study does, and the folder that belongs to it."""
+"""The alignment study: policies that differ in what their memory is aligned with, what they solve, what they know.
+
+Everything is held equal but the arm: demonstrations, held-out episodes, seeds (weights, order of samples), updates,
+rollouts. Policies are trained and rolled out by `research.learning`. Then their averaged, frozen weights are asked, on
+episodes never trained on, which subgoal is active and how far their actions are off (`measures`).
+"""
 
 from __future__ import annotations
 
@@ -82,6 +87,9 @@ def claim_folder(out: Path, root: Path, settings: StudySettings) -> None:
     write_file(path, json.dumps(wanted, indent=1))
 
 
+# --- what is kept ---
+
+
 class Scores(TypedDict):
     """Top-1 among all subgoals, and among those of the frame's task."""
 
@@ -124,6 +132,9 @@ def kept_or_made(path: Path, schema: Any, make: Callable[[], dict[str, Any]]) ->
         path.parent.mkdir(exist_ok=True)
         write_file(path, json.dumps(kept, indent=1))
     return kept
+
+
+# --- the study ---
 
 
 class Study:

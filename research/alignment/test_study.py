@@ -32,7 +32,7 @@ from tests.support.object_dataset import NAMES, TASKS
 
 SETTINGS = StudySettings(steps=2, seeds=1, held_out=1, rollouts=10, frames_per_episode=6)
 BOWL, MILK = NAMES[:2]
-TWIN = "open_and_close_the_microwave_a_given_number_of_times"
+STRICT_TASK = "open_and_close_the_microwave_a_given_number_of_times"
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,10 @@ def said(words: Sequence[str], key: str) -> str | None:
 
 def fake_training(work: Study, words: Sequence[str]) -> None:
     """Leave a checkpoint as `lerobot train` does, of a policy that has learned nothing."""
-    own = {"align": said(words, "align") or "none", "memory_fusion": said(words, "policy.memory_fusion") or "modulation"}
+    own = {
+        "align": said(words, "align") or "none",
+        "memory_fusion": said(words, "policy.memory_fusion") or "modulation",
+    }
     own["oracle_memory"] = said(words, "policy.oracle_memory") == "true"
     config = MemobenchMemConfig(size="small", perception="objects", device="cpu", push_to_hub=False, **own)
     torch.manual_seed(int(said(words, "seed") or -1))
@@ -171,7 +174,7 @@ def test_a_dataset_of_nobody_knows_what_is_refused(twice_root: Path, tmp_path: P
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(("name", "referent"), [(BOWL, "fixed"), (TWIN, "random")])
+@pytest.mark.parametrize(("name", "referent"), [(BOWL, "fixed"), (STRICT_TASK, "random")])
 def test_demonstrations_of_two_kinds_are_refused(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str, referent: str
 ) -> None:

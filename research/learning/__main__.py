@@ -23,13 +23,12 @@ class Name(StrEnum):
     JOINT = "joint"
 
 
-class Sight(StrEnum):
-    """What policies see by (`studies.learning.experiments.PERCEPTIONS`)."""
+class Perception(StrEnum):
+    """What policies observe by (`experiments.PERCEPTIONS`)."""
 
     OBJECTS = "objects"
-    DETECTED = "found"
+    DETECTIONS = "detections"
     PIXELS = "pixels"
-    BOTH = "both"
 
 
 def learning(
@@ -50,13 +49,12 @@ def learning(
         int | None, typer.Option(help="First seed of the rollouts; choose settings by 20000.")
     ] = None,
     perception: Annotated[
-        Sight,
+        Perception,
         typer.Option(
-            help="objects: told by the environment; found: in rollouts by the package's eyes, in training told with "
-            "errors like theirs; pixels: the tokens of these eyes, from demonstrations with pictures; both: tokens "
-            "and found objects."
+            help="objects: privileged object state; detections: in rollouts the detector's, in training privileged "
+            "object state with their noise; pixels: tokens of the visual encoder, from demonstrations with pictures."
         ),
-    ] = Sight.OBJECTS,
+    ] = Perception.OBJECTS,
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="One more word for `lerobot train` of all policies; repeatable.")
     ] = None,

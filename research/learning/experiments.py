@@ -14,12 +14,12 @@ ARMS: dict[str, tuple[str, ...]] = {MEMORY: (), MEMORYLESS: ("policy.memory_fusi
 ALIGNED = {**ARMS, MEMORY: ("align=semantic",)}
 """The same, with a memory aligned with checkpoint language, which learns referents in fewer updates."""
 
-OBJECTS, DETECTED, PIXELS = "objects", "found", "pixels"
+OBJECTS, DETECTIONS, PIXELS = "objects", "detections", "pixels"
 
 
 @dataclass(frozen=True)
-class Sight:
-    """How policies see: words of it for `lerobot train` and `lerobot eval`, and whether they learn from pictures."""
+class Perception:
+    """What policies observe: words for `lerobot train` and `lerobot eval`, and whether they learn from pictures."""
 
     training: tuple[str, ...]
     evaluation: tuple[str, ...] = ()
@@ -27,11 +27,11 @@ class Sight:
 
 
 PERCEPTIONS = {
-    OBJECTS: Sight(("perception=objects",)),
-    DETECTED: Sight(("perception=objects", "policy.detection_noise=1"), ("detector=package",)),
-    PIXELS: Sight(("perception=pixels",), pictures=True),
+    OBJECTS: Perception(("perception=objects",)),
+    DETECTIONS: Perception(("perception=objects", "policy.detection_noise=1"), ("detector=package",)),
+    PIXELS: Perception(("perception=pixels",), pictures=True),
 }
-"""Ways to see. A policy that is to act by detections learns by privileged object state with their noise."""
+"""A policy that is to act by detections learns by privileged object state with their noise."""
 
 EVALUATION_SEEDS = 7
 TUNING_SEEDS = 20_000
@@ -48,7 +48,7 @@ class Experiment:
         steps: updates. pixel_steps: updates from pixels, where these are others.
         settings: more words for `lerobot train`, of all arms.
         arms: name -> words for `lerobot train`.
-        perception: by what policies see, of `PERCEPTIONS`.
+        perception: by what policies observe, of `PERCEPTIONS`.
         seeds: of training; the first ``seeds`` numbers.
         rollouts: of each task and policy. first_seed: of the rollouts. referent: of demonstrations and rollouts.
     """
@@ -73,7 +73,7 @@ def prompted() -> tuple[str, ...]:
 
 
 def experiment(name: str, perception: str = OBJECTS, suite: str = PUBLISHED) -> Experiment:
-    """Return the experiment of a name in `EXPERIMENTS`, by policies that see in this way, on a suite's tasks."""
+    """Return the experiment of a name in `EXPERIMENTS`, by policies with this perception, on a suite's tasks."""
     named = EXPERIMENTS[name]
     steps = (named.pixel_steps if PERCEPTIONS[perception].pictures else None) or named.steps
     tasks = tuple(task for task in task_names(suite=suite) if get_task(task).scene_name in named.tasks)

@@ -1,9 +1,9 @@
-"""Does one arm solve more than another? The same episodes paired, over all training seeds.
+"""Success of each arm, of its failures those at a wrong referent, order, place or count, and differences between arms.
 
-The interval is of a bootstrap that draws training seeds and, within each task, episodes: a difference that depends on
-how a training began is not a difference of arms. It is at least as wide as so few episodes allow (`estimates`). With
-few training seeds it is still too narrow, and the test holds for these trainings only; the table says how many there
-were.
+A difference pairs the same episodes, over all training seeds. Its interval is of a bootstrap that draws training seeds
+and, within each task, episodes: a difference that depends on how a training began is not a difference of arms. It is at
+least as wide as so few episodes allow (`statistics`). With few training seeds it is still too narrow, and the test
+holds for these trainings only; the table says how many there were.
 """
 
 from __future__ import annotations
@@ -116,6 +116,8 @@ def _interval(
     return difference_interval(draws, before, before + gap.mean(axis=0), weights)
 
 
+# --- outcomes ---
+
 WRONG = (REFERENCE_DRIFT, WRONG_ORDER, *STRICT_FAILURES)
 """Failures that are a memory's and no hand's: a wrong referent, order, place or count."""
 
@@ -205,6 +207,8 @@ def _figures(outcome: Outcome) -> dict[str, Any]:
     }
 
 
+# --- figure ---
+
 COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#7f7f7f")
 """Okabe and Ito's palette, apart for the colour-blind too; one per arm."""
 WRONG_COLOUR = "#d55e00"
@@ -259,6 +263,8 @@ def _draw_bar(axis: Any, at: float, height: float, outcome: Outcome, place: int)
     axis.plot([low, high], [at, at], color="black", linewidth=1.2)
     axis.text(1, at, f"{solved:.0f}", va="center", fontsize=8, color="white" if solved > 6 else "black")
 
+
+# --- tables in Markdown ---
 
 COLUMNS = (
     *("", "rollouts", "success", "95 % interval", "training seeds"),

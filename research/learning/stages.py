@@ -1,4 +1,7 @@
-"""A command of ours, run as a user would, its output in a file and its cost known."""
+"""The three parts of an experiment, each a command of the product: demonstrations, policies, rollouts.
+
+A command is run as a user would; its output is in a file and its cost known.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,7 @@ from lerobot_memobench.jobs.threads import sharing
 from lerobot_memobench.run.arguments import split_arguments
 from lerobot_memobench.tasks.catalogue import suite_of
 from lerobot_memobench.tasks.task import STRICT
-from research.learning.experiments import PERCEPTIONS, Experiment, Sight
+from research.learning.experiments import PERCEPTIONS, Experiment, Perception
 
 MODULES = {"lerobot": "lerobot_memobench.cli.lerobot", "memobench": "lerobot_memobench.cli.memobench"}
 
@@ -119,7 +122,7 @@ class Stages:
     workers: int = 1
 
     @property
-    def _sight(self) -> Sight:
+    def _perception(self) -> Perception:
         return PERCEPTIONS[self.experiment.perception]
 
     @property
@@ -141,7 +144,7 @@ class Stages:
         words += [] if more is None else ["--prompted-episodes", str(more)]
         words += ["--suite", STRICT] if self._is_strict else []
         words += ["--perturb", "--out", str(self.data)]
-        words += [] if self._sight.pictures else ["--no-images"]
+        words += [] if self._perception.pictures else ["--no-images"]
         how = ["--workers", str(self.workers)]
         return run_once(words, self.out / "data.log", how=how, accept=(0, 1))
 
@@ -162,7 +165,7 @@ class Stages:
 
     def training_words(self, arm: str, seed: int) -> list[str]:
         """Return the command that trains an arm's policy with one seed."""
-        words = ["lerobot", "train", *SHARED, *self._sight.training]
+        words = ["lerobot", "train", *SHARED, *self._perception.training]
         words += [f"dataset={self.data}", f"steps={self.experiment.steps}"]
         words += [f"seed={seed}", f"output_dir={self.policy(arm, seed)}"]
         return [*words, *self.experiment.settings, *self.experiment.arms[arm]]
@@ -180,7 +183,7 @@ class Stages:
     def evaluate(self, arm: str, seed: int) -> Cost:
         """Roll a trained policy out on the experiment's evaluation seeds."""
         words = ["lerobot", "eval", "env=memobench", f"policy={self.policy(arm, seed)}"]
-        words += [*self._sight.evaluation, f"referent={self.experiment.referent}", "videos=0"]
+        words += [*self._perception.evaluation, f"referent={self.experiment.referent}", "videos=0"]
         words += [f"tasks={','.join(self.experiment.tasks)}"]
         words += [f"episodes={self.experiment.rollouts}", f"seed={self.experiment.first_seed}"]
         words += [f"output_dir={self.rollouts(arm, seed)}", "resume=true"]

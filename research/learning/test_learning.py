@@ -26,7 +26,7 @@ from research.learning.stages import Cost, Stages, run_once
 from research.learning.study import learn
 from tests.support.scripts import load_script
 
-TWIN = "open_and_close_the_microwave_a_given_number_of_times"
+STRICT_TASK = "open_and_close_the_microwave_a_given_number_of_times"
 
 
 def test_a_command_that_ended_well_is_not_run_again(tmp_path: Path) -> None:
@@ -180,11 +180,11 @@ def test_what_is_told_in_training_is_told_in_rollouts(tmp_path: Path, monkeypatc
     ("perception", "trained", "rolled_out"),
     [
         ("objects", {"perception=objects", "steps=1600"}, set()),
-        ("found", {"perception=objects", "policy.detection_noise=1", "steps=1600"}, {"detector=package"}),
+        ("detections", {"perception=objects", "policy.detection_noise=1", "steps=1600"}, {"detector=package"}),
         ("pixels", {"perception=pixels", "steps=2000"}, set()),
     ],
 )
-def test_policies_learn_and_act_by_what_they_see(
+def test_policies_learn_and_act_by_the_perception_asked_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, perception: str, trained: set[str], rolled_out: set[str]
 ) -> None:
     ran: list[list[str]] = []
@@ -193,11 +193,11 @@ def test_policies_learn_and_act_by_what_they_see(
     stages.generate()
     stages.train(MEMORY, 0)
     stages.evaluate(MEMORY, 0)
-    assert ("--no-images" in ran[0]) == (perception in ("objects", "found")), (
+    assert ("--no-images" in ran[0]) == (perception in ("objects", "detections")), (
         "pictures are made for who learns from them"
     )
     assert trained | {"batch_size=32"} <= set(ran[1])
-    assert ("policy.detection_noise=1" in ran[1]) == (perception in ("found", "both"))
+    assert ("policy.detection_noise=1" in ran[1]) == (perception == "detections")
     assert {word for word in ran[2] if word.startswith("detector=")} == rolled_out
 
 
@@ -216,7 +216,7 @@ def test_prompts_are_learned_from_more_demonstrations_by_an_aligned_memory(
     assert ["align=semantic" in words for words in ran[1:]] == [True, False]
 
 
-@pytest.mark.parametrize(("task", "referent", "strict"), [(BOWL, "random", False), (TWIN, "drawn", True)])
+@pytest.mark.parametrize(("task", "referent", "strict"), [(BOWL, "random", False), (STRICT_TASK, "drawn", True)])
 def test_rollouts_are_of_the_demonstrations_kind(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, task: str, referent: str, strict: bool
 ) -> None:
@@ -254,15 +254,15 @@ def test_the_command_takes_some_of_the_tasks(tmp_path: Path, monkeypatch: pytest
 
 
 @pytest.mark.parametrize("name", ["bowl", "prompted", "joint"])
-def test_the_command_takes_the_strict_twins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_the_command_takes_the_strict_tasks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     asked: list[Experiment] = []
     monkeypatch.setattr(study_module, "learn", lambda which, *_, **__: asked.append(which) or "")
-    for told in ([], ["--suite", "strict"], ["--suite", "strict", "--tasks", TWIN]):
+    for told in ([], ["--suite", "strict"], ["--suite", "strict", "--tasks", STRICT_TASK]):
         assert main([name, "--out", str(tmp_path / "out"), *told]) == 0
-    published, twins, one = (which.tasks for which in asked)
-    assert sorted(get_task(twin).derived_from for twin in twins) == sorted(published)
-    assert one == (TWIN,)
-    assert main([name, "--out", str(tmp_path / "out"), "--tasks", TWIN]) == 2
+    published, strict_tasks, one = (which.tasks for which in asked)
+    assert sorted(get_task(strict_task).derived_from for strict_task in strict_tasks) == sorted(published)
+    assert one == (STRICT_TASK,)
+    assert main([name, "--out", str(tmp_path / "out"), "--tasks", STRICT_TASK]) == 2
 
 
 def test_how_many_processes_work_decides_nothing_that_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -52,11 +52,11 @@ def necessity(
     beside: Annotated[
         Path | None,
         typer.Option(
-            help="necessity.json of the published tasks; the page's table then shows them beside their twins."
+            help="necessity.json of the published tasks; the page's table then shows them beside their strict tasks."
         ),
     ] = None,
 ) -> None:
-    """Find moments that look the same and need different answers. They tell what a policy without memory can reach."""
+    """Find frames that look the same and need different answers. They tell what a policy without memory can reach."""
     from lerobot_memobench.tasks.task import REFERENTS
     from research.necessity.report import (
         around_table,

@@ -1,4 +1,7 @@
-"""How an execution begins: as the scene was drawn, or as a hiding left it."""
+"""The expert's decisions from one start, photographed twice: as it happens, and with the arm put back to its start.
+
+Two pictures look the same where what moved by a pixel or two, or is a shade darker, is the only difference.
+"""
 
 from __future__ import annotations
 
@@ -25,6 +28,8 @@ if TYPE_CHECKING:
     from lerobot_memobench.sim.simulation import Simulation, Snapshot
 
 
+# --- the start of an execution: as the scene was drawn, or as a hiding left it ---
+
 HIDINGS = 12
 """Hidings kept per process: a demonstration and a search begin at the same ones."""
 
@@ -49,6 +54,8 @@ def _after_hiding(task: Task, prompt: Prompt, seed: int) -> Snapshot:
         episode.step(np.zeros(ACTION_DIM))
     return episode.sim.snapshot()
 
+
+# --- pictures ---
 
 Picture = NDArray[np.uint8]
 """(height, width, 3)."""
@@ -111,7 +118,7 @@ def _like(here: NDArray[np.int16], y: int, x: int, there: NDArray[np.int16], v: 
 
 
 def difference(a: Sequence[Picture], b: Sequence[Picture]) -> float:
-    """Return how much two moments differ to the eye: the larger `unmatched` of the cameras."""
+    """Return how much two frames differ to the eye: the larger `unmatched` of the cameras."""
     return max(unmatched(x, y) for x, y in zip(a, b, strict=True))
 
 
@@ -120,9 +127,9 @@ def largest_pixel_difference(a: Sequence[Picture], b: Sequence[Picture]) -> int:
     return max(int(np.abs(x.astype(np.int16) - y).max()) for x, y in zip(a, b, strict=True))
 
 
-def differences(moments: Sequence[Sequence[Picture]]) -> NDArray[np.float64]:
+def differences(frames: Sequence[Sequence[Picture]]) -> NDArray[np.float64]:
     """Return `difference` of all pairs, (n, n)."""
-    return pairwise_table(moments, difference)
+    return pairwise_table(frames, difference)
 
 
 def pairwise_table[Item](items: Sequence[Item], measure: Callable[[Item, Item], float]) -> NDArray[np.float64]:
@@ -132,6 +139,8 @@ def pairwise_table[Item](items: Sequence[Item], measure: Callable[[Item, Item], 
         table[i, j] = table[j, i] = measure(items[i], items[j])
     return table
 
+
+# --- the arm at home ---
 
 SETTLE = 12
 """Steps for which the world comes to rest before a picture with the arm at home; more than a `Then` asks for."""
@@ -180,8 +189,11 @@ class Home:
         return pictures
 
 
+# --- demonstrations ---
+
+
 @dataclass(frozen=True)
-class Moment:
+class Frame:
     """A decision of the expert.
 
     Attributes:
@@ -202,7 +214,7 @@ class Moment:
 class Demonstration:
     """An episode of the expert: its decisions, whether the goal came true in time, and after how many steps."""
 
-    moments: tuple[Moment, ...]
+    frames: tuple[Frame, ...]
     success: bool
     steps: int
 
@@ -259,7 +271,7 @@ def follow(task: Task, sim: Simulation, seed: int, horizon: int = HORIZON) -> De
         sim.step(action)
         progress.step(sim.holds)
         watcher.look_for_rest(progress.steps)
-    return Demonstration(watcher.moments(progress.success), progress.success, progress.steps)
+    return Demonstration(watcher.frames(progress.success), progress.success, progress.steps)
 
 
 class _Watcher:
@@ -269,8 +281,8 @@ class _Watcher:
         self._sim, self._home = sim, Home(sim)
         self._rests = rest_steps(task.goal) > 0
         self._was_home, self._before = True, sim.proprio()
-        self._noted: list[tuple[Atom, Moment]] = []
-        self._rest: Moment | None = None
+        self._noted: list[tuple[Atom, Frame]] = []
+        self._rest: Frame | None = None
 
     def note(self, answer: Atom, step: int) -> None:
         """Take down what the expert turns to now."""
@@ -288,13 +300,13 @@ class _Watcher:
         self._was_home = self._sim.holds(HOME) and (still or self._was_home)
         self._before = now
 
-    def moments(self, success: bool) -> tuple[Moment, ...]:
+    def frames(self, success: bool) -> tuple[Frame, ...]:
         """Return the decisions of an episode that has ended."""
         # While a `Then` still counts how long its last part holds, the expert may turn to what is not asked for.
         while success and self._noted and not self._sim.holds(self._noted[-1][0]):
             self._noted.pop()
         rest = () if self._rest is None else (self._rest,)
-        return (*(moment for _, moment in self._noted), *rest)
+        return (*(frame for _, frame in self._noted), *rest)
 
-    def _photograph(self, answer: str, step: int) -> Moment:
-        return Moment(answer, step, photograph(self._sim), self._home.look(), self._sim.proprio())
+    def _photograph(self, answer: str, step: int) -> Frame:
+        return Frame(answer, step, photograph(self._sim), self._home.look(), self._sim.proprio())

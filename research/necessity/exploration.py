@@ -1,4 +1,7 @@
-"""One scene in which answers are tried out: from any state, with the arm at home before and after."""
+"""Is there a way to the goal that pictures alone can guide? Every answer is tried at every state that can be reached.
+
+The best policies without memory on the resulting graph are then walked in the simulator.
+"""
 
 from __future__ import annotations
 
@@ -44,6 +47,8 @@ from research.necessity.settings import Settings
 if TYPE_CHECKING:
     from lerobot_memobench.sim.simulation import Simulation, Snapshot
 
+
+# --- one scene in which answers are tried out ---
 
 SAME_PLACE = 0.02
 """Distance up to which an object is where it was when states of the exploration are told apart, m."""
@@ -162,6 +167,9 @@ class Laboratory:
             np.array([q for _, q in articulations]),
             np.array([SAME_JOINT["slide" if a.kind == "drawer" else "hinge"] for a, _ in articulations]),
         )
+
+
+# --- exploration ---
 
 
 @dataclass
@@ -308,6 +316,9 @@ def walk(
             break
         laboratory.do(answer, listen, horizon - steps)
     return reached
+
+
+# --- the search for a policy without memory ---
 
 
 def search(laboratory: Laboratory, settings: Settings) -> dict[str, Any]:

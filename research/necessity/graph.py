@@ -1,4 +1,10 @@
-"""An explored scene as a graph of states and answers, and what a goal remembers along its moves. Pure: no simulator."""
+"""An explored scene as a graph of states and answers, and the best policies without memory on it. Pure: no simulator.
+
+`memoryless` asks whether the demonstrated decisions can be repeated from pictures alone. A goal often accepts other
+ways: three drawers may be opened together and closed one by one, and then each picture says what is left to do. Here
+the answers are moves of a graph that was explored in the simulator; a policy walks it from the start, sees only
+pictures, and succeeds when the goal comes true within the horizon.
+"""
 
 from __future__ import annotations
 
@@ -109,6 +115,8 @@ def is_decided(memories: Memories) -> bool:
     """Whether every goal is reached or lost."""
     return all(memory is None or memory == LOST for memory in memories)
 
+
+# --- the best fixed map from pictures to answers ---
 
 VISITS = 300_000
 """Moves after which the search for the best map stops with the best it has found."""
@@ -222,6 +230,8 @@ class _Search:
         if share > self.best[0]:
             self.best = (share, policy)
 
+
+# --- the best probabilities of answers given the picture, where a wrong answer may be mended ---
 
 STRIDE = 25
 """Steps are counted in multiples of this when probabilities are optimised, rounded up: a move never gets cheaper."""

@@ -1,10 +1,10 @@
-"""How far a policy without memory can come: aliased moments, chance and ceilings. Pure: no simulator.
+"""How far a policy without memory can come: aliased frames, chance and ceilings. Pure: no simulator.
 
 A *history* is one demonstrated episode seen as a row of decisions; a decision is the picture that is seen before it
 (as the number of a class of pictures that cannot be told apart) and the answer that is right in this history. A policy
 without memory is a map from pictures to answers, or to probabilities of answers. It passes a history when it gives the
 right answer at each of its decisions; one wrong answer fails (what a policy may gain by trying again is the subject of
-`best_map` and `best_probabilities`).
+`graph`).
 
 Histories of one scene are weighed together: they are what may lie behind the same pictures.
 """
@@ -25,7 +25,7 @@ ITERATIONS = 2000
 
 @dataclass(frozen=True)
 class Decision:
-    """A moment at which the demonstrator turned to something new.
+    """A frame at which the demonstrator turned to something new.
 
     Attributes:
         picture: class of what is seen; equal numbers cannot be told apart.

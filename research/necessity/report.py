@@ -1,4 +1,4 @@
-"""Is a memory needed? What the figures of a task come to."""
+"""Memory necessity: verdicts, a table for the terminal, Markdown for people, JSON for programs, a figure of pairs."""
 
 from __future__ import annotations
 
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from PIL.Image import Image as Strip
 
 
+# --- verdicts ---
+
 VERDICTS = {
     "no": "pictures decide every step of the demonstrated routine: no memory is needed",
     "order": "with the arm at home, pictures tell not the demonstrated order but another that the goal accepts",
@@ -43,14 +45,16 @@ def verdict(result: Result) -> str:
     return "order" if any_order["confirmed"] == any_order["of"] else "yes"
 
 
+# --- published tasks beside their strict tasks ---
+
 HEADINGS = (
     *("published task", "best map", "memory needed"),
-    *("its twin", "goals", "best map", "best prob.", "as it happens", "expert", "memory needed"),
+    *("its strict task", "goals", "best map", "best prob.", "as it happens", "expert", "memory needed"),
 )
 
 
 def side_by_side(published: Sequence[Result], strict: Sequence[Result]) -> str:
-    """Return a Markdown table with a row per twin, and what it says in all; the published goals are the fixed ones."""
+    """Return a Markdown table with a row per strict task, and a summary; published goals are the fixed ones."""
     fixed = {result["task"]: result for result in published if result["referent"] == REFERENTS[0]}
     lines = ["| " + " | ".join(HEADINGS) + " |", "|---" * len(HEADINGS) + "|"]
     for result in strict:
@@ -70,7 +74,7 @@ def _published(result: Result | None) -> list[str]:
 
 
 def _strict(result: Result) -> list[str]:
-    """Return the cells of a twin."""
+    """Return the cells of a strict task."""
     in_order, any_order, expert = result["in_order"], result["any_order"], result["expert"]
     found = [NOT_APPLICABLE] * 2
     if any_order is not None:
@@ -100,6 +104,8 @@ def bounds(results: Sequence[Result]) -> str:
     return f"From pictures alone {needed} of {len(drawn)} tasks were not solved: {'; '.join(told)}."
 
 
+# --- aliased pairs: frames that look the same and ask for different answers ---
+
 LARGEST_FIGURE = 300_000
 """Bytes: the figure of the documentation is kept in the repository."""
 
@@ -107,7 +113,7 @@ CAMERAS = ("third person", "wrist")
 
 
 def pairs_figure(out: Path, results: Sequence[Result]) -> bytes | None:
-    """Return a PNG of a few aliased pairs: both moments side by side, and what is right at each; None without any.
+    """Return a PNG of a few aliased pairs: both frames side by side, and what is right at each; None without any.
 
     One pair within an episode and one between goals, the two ways in which memory is needed; of drawn tasks one of each
     family.
@@ -154,8 +160,8 @@ def _drawn(shown: Sequence[tuple[Result, Strip]]) -> Figure:
             axis.set_xticks([])
             axis.set_yticks([])
             axis.set_xlabel(CAMERAS[k % 2], fontsize=8)
-        for axis, moment in ((axes[0], pair["a"]), (axes[2], pair["b"])):
-            axis.set_title(f"step {moment['step']}: {_short(moment['answer'])}", fontsize=9, loc="left")
+        for axis, frame in ((axes[0], pair["a"]), (axes[2], pair["b"])):
+            axis.set_title(f"step {frame['step']}: {_short(frame['answer'])}", fontsize=9, loc="left")
         axes[0].set_ylabel(_wrapped(result["task"]), fontsize=8)
     return plot
 
@@ -180,6 +186,9 @@ def _wrapped(name: str, width: int = 26) -> str:
 
 
 JSON_FILE, MARKDOWN_FILE, FIGURE_FILE = "necessity.json", "necessity.md", "aliased_pairs.png"
+
+
+# --- tables ---
 
 
 @dataclass(frozen=True)
@@ -272,7 +281,7 @@ def markdown(results: Sequence[Result]) -> str:
     other = min((result["smallest_different"] for result in results), default=1.0)
     lines += [
         "",
-        f"Moments that count as looking the same differ in at most {100 * same:.2f} % of the pixels of a camera, those "
+        f"Frames that count as looking the same differ in at most {100 * same:.2f} % of the pixels of a camera, those "
         f"that count as different in at least {100 * other:.2f} %.",
         "",
         *([bounds(results), ""] if bounds(results) else []),
@@ -338,7 +347,7 @@ def put_into_page(page: Path, results: Sequence[Result], beside: Sequence[Result
     """Put the table into a Markdown page, between its two marks; return the page.
 
     Args:
-        beside: results of the published tasks; then the table shows those and their twins, which ``results`` are of.
+        beside: results of the published tasks; then the table shows those beside the strict tasks of ``results``.
 
     Raises:
         MemobenchError: see `around_table`.
@@ -349,7 +358,7 @@ def put_into_page(page: Path, results: Sequence[Result], beside: Sequence[Result
 
 
 def write(out: Path, results: Sequence[Result]) -> list[Path]:
-    """Write JSON, Markdown and, where a pair of moments looks the same, the figure; return their paths."""
+    """Write JSON, Markdown and, where a pair of frames looks the same, the figure; return their paths."""
     out.mkdir(parents=True, exist_ok=True)
     content = [{**result, "memory_needed": verdict(result)} for result in results]
     written = [

@@ -1,4 +1,4 @@
-"""The demonstrations of all variants from one start: which of their moments look the same, and what follows."""
+"""The demonstrations of all variants from one start: which of their frames look the same, and what follows."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lerobot_memobench.tasks.task import Task
 from research.necessity.demonstrations import (
     Demonstration,
-    Moment,
+    Frame,
     difference,
     differences,
     largest_pixel_difference,
@@ -37,7 +37,7 @@ EXAMPLES = 3
 
 
 class Scene:
-    """Moments of successful demonstrations: what a failed one did is no answer to learn.
+    """Frames of successful demonstrations: what a failed one did is no answer to learn.
 
     Args:
         variants, shown: goals that may lie behind the start, and how each was demonstrated.
@@ -46,22 +46,22 @@ class Scene:
 
     def __init__(self, variants: Sequence[Task], shown: Sequence[Demonstration], tolerance: float) -> None:
         self._owners: list[int] = []
-        self._moments: list[Moment] = []
+        self._frames: list[Frame] = []
         self._asked: list[str] = []
         for variant, demonstration in zip(variants, shown, strict=True):
             if demonstration.success:
-                self._moments += demonstration.moments
-                self._owners += [variant.variant_index] * len(demonstration.moments)
-                self._asked += [variant.language] * len(demonstration.moments)
+                self._frames += demonstration.frames
+                self._owners += [variant.variant_index] * len(demonstration.frames)
+                self._asked += [variant.language] * len(demonstration.frames)
         self._tolerance = tolerance
-        self._differences = differences([moment.at_home for moment in self._moments])
+        self._differences = differences([frame.at_home for frame in self._frames])
         self._pictures = classes(self._differences, tolerance)
 
     def result(self, seed: int) -> dict[str, Any]:
         """Return what is kept of a scene; ``aliased`` and ``in_order`` are empty where no demonstration succeeded."""
         histories = self._histories(self._pictures)
-        as_exact = self._histories(classes(pairwise_table(self._moments, _exactly), PIXEL_EXACT))
-        as_it_happens = self._histories(classes(pairwise_table(self._moments, _as_it_happens), self._tolerance))
+        as_exact = self._histories(classes(pairwise_table(self._frames, _exactly), PIXEL_EXACT))
+        as_it_happens = self._histories(classes(pairwise_table(self._frames, _as_it_happens), self._tolerance))
         apart = ~np.equal.outer(self._pictures, self._pictures)
         counts = {"at_home": histories, "pixel_exact": as_exact, "as_it_happens": as_it_happens}
         return {
@@ -80,30 +80,30 @@ class Scene:
         if not self._pairs:
             return None
         i, j = self._pairs[0]
-        return np.concatenate([*self._moments[i].at_home, *self._moments[j].at_home], axis=1)
+        return np.concatenate([*self._frames[i].at_home, *self._frames[j].at_home], axis=1)
 
     def _histories(self, pictures: Sequence[int]) -> list[History]:
         """Return a history per demonstration; what is seen under different instructions can be told apart."""
         rows: dict[int, list[Decision]] = {}
         instructions = list(dict.fromkeys(self._asked))
-        for owner, asked, moment, picture in zip(self._owners, self._asked, self._moments, pictures, strict=True):
-            seen = picture + instructions.index(asked) * len(self._moments)
-            rows.setdefault(owner, []).append(Decision(seen, moment.answer))
+        for owner, asked, frame, picture in zip(self._owners, self._asked, self._frames, pictures, strict=True):
+            seen = picture + instructions.index(asked) * len(self._frames)
+            rows.setdefault(owner, []).append(Decision(seen, frame.answer))
         return [tuple(row) for row in rows.values()]
 
     @cached_property
     def _pairs(self) -> list[tuple[int, int]]:
-        """Moments that look the same and ask for different answers."""
+        """Frames that look the same and ask for different answers."""
         return [
             (i, j)
-            for i, j in combinations(range(len(self._moments)), 2)
+            for i, j in combinations(range(len(self._frames)), 2)
             if self._pictures[i] == self._pictures[j]
             and self._asked[i] == self._asked[j]
-            and self._moments[i].answer != self._moments[j].answer
+            and self._frames[i].answer != self._frames[j].answer
         ]
 
     def _example(self, seed: int, i: int, j: int) -> dict[str, Any]:
-        a, b = self._moments[i], self._moments[j]
+        a, b = self._frames[i], self._frames[j]
         return {
             "seed": seed,
             "a": self._said(i),
@@ -114,17 +114,17 @@ class Scene:
         }
 
     def _said(self, index: int) -> dict[str, Any]:
-        moment = self._moments[index]
-        return {"variant": self._owners[index], "step": moment.step, "answer": moment.answer}
+        frame = self._frames[index]
+        return {"variant": self._owners[index], "step": frame.step, "answer": frame.answer}
 
 
-def _exactly(a: Moment, b: Moment) -> float:
-    """Return how much two moments differ with the arm at home if every pixel could be used."""
+def _exactly(a: Frame, b: Frame) -> float:
+    """Return how much two frames differ with the arm at home if every pixel could be used."""
     return largest_pixel_difference(a.at_home, b.at_home)
 
 
-def _as_it_happens(a: Moment, b: Moment) -> float:
-    """Return how much two moments differ with the arm where it was; 1 where the hand was elsewhere."""
+def _as_it_happens(a: Frame, b: Frame) -> float:
+    """Return how much two frames differ with the arm where it was; 1 where the hand was elsewhere."""
     return difference(a.seen, b.seen) if np.abs(a.proprio - b.proprio).max() <= SAME_HAND else 1.0
 
 

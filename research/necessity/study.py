@@ -1,4 +1,8 @@
-"""What a necessity study keeps, and of which types it is. Anything else in its files is made again."""
+"""Memory necessity of one task, from simulated episodes to a JSON object; of many tasks, in several processes.
+
+One file is kept per scene and one per search, so that a killed run goes on, and a run of more scenes uses those there
+are. Anything else in such a file is made again.
+"""
 
 from __future__ import annotations
 
@@ -22,6 +26,9 @@ from research.necessity.settings import Settings, fingerprint, variants_of
 
 if TYPE_CHECKING:
     from lerobot_memobench.sim.simulation import Simulation
+
+
+# --- what is kept, and of which types it is ---
 
 
 @dataclass(frozen=True)
@@ -64,7 +71,7 @@ class Kept:
 
 
 class Said(TypedDict):
-    """A moment of an aliased pair."""
+    """A frame of an aliased pair."""
 
     variant: Count
     step: Count
@@ -132,13 +139,15 @@ class Found(TypedDict):
 
 
 class KeptResult(TypedDict):
-    """What of `study.Result` stands beside a twin's."""
+    """What of `study.Result` stands beside a strict task's."""
 
     task: str
     referent: str
     in_order: InOrder | None
     any_order: Found | None
 
+
+# --- the study of one task ---
 
 Piece = Literal["scene", "search"]
 """What is made and kept one at a time, for each seed."""
@@ -248,7 +257,7 @@ def _mean_of(tables: Sequence[dict[str, float]]) -> dict[str, float] | None:
 
 
 def pictures_path(out: Path, task: str, referent: str, seed: int) -> Path:
-    """Return where a scene's first aliased pair lies: a strip of both moments, two cameras each.
+    """Return where a scene's first aliased pair lies: a strip of both frames, two cameras each.
 
     Raises:
         MemobenchError: the names, which may come from a file of results, lead elsewhere.
@@ -267,6 +276,8 @@ def _write_pair(scene: Scene, path: Path) -> None:
     with draft_of(path) as draft:
         Image.fromarray(strip).save(draft, optimize=True)
 
+
+# --- pieces of work for several processes ---
 
 PIECES: dict[Piece, str] = {"scene": "scenes", "search": "searches"}
 """In the order in which they are made, and what several are called."""

@@ -12,7 +12,7 @@ import pytest
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import get_task
 from research.necessity.__main__ import main
-from research.necessity.demonstrations import Demonstration, Moment, Picture
+from research.necessity.demonstrations import Demonstration, Frame, Picture
 from research.necessity.drawn import scene
 from research.necessity.report import markdown, rows, verdict, write
 from research.necessity.scene import PIXEL_EXACT
@@ -24,12 +24,12 @@ STACK = "stack_the_bowls_one_by_one_in_the_exact_sequence_shown_in_the_video"
 MILK = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
 
 
-def demonstration(*moments: tuple[str, Picture, float], success: bool = True) -> Demonstration:
+def demonstration(*frames: tuple[str, Picture, float], success: bool = True) -> Demonstration:
     """Decisions with the picture at home, and where the hand was."""
     return Demonstration(
         tuple(
-            Moment(answer, 10 * k, (picture,), (picture,), np.full(8, hand, dtype=np.float32))
-            for k, (answer, picture, hand) in enumerate(moments)
+            Frame(answer, 10 * k, (picture,), (picture,), np.full(8, hand, dtype=np.float32))
+            for k, (answer, picture, hand) in enumerate(frames)
         ),
         success,
         100,

@@ -1,4 +1,12 @@
-"""What a control step costs, whatever takes it: noted where vector environments step and LeRobot's evaluation ends."""
+"""``lerobot eval`` itself, per control step: beside the bare vector environment, and stock robosuite in LeRobot's loop.
+
+What is timed lasts from the first step of an episode to LeRobot's figures of it, videos written: start-up and reset are
+apart. The policies act at random and cost nothing; how often they look at pictures is what differs.
+
+`rollouts_total`: two evaluations of one rollout of each task, cut after a few and after more steps, tell what a step
+costs and what a rollout costs before its first step; all processes run at once, so what they take from one another is
+in it. What a real policy computes is to be added.
+"""
 
 from __future__ import annotations
 

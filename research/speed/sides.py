@@ -1,4 +1,4 @@
-"""What a measurement was made on."""
+"""The two sides of a comparison: this simulator, and stock robosuite 1.4.1 with the same arm, cameras and sizes."""
 
 from __future__ import annotations
 
@@ -62,6 +62,8 @@ def _gl_device() -> str:
     close_renderers()
     return f"{gl_backend()} on {device}"
 
+
+# --- the sides ---
 
 STOCK_CAMERAS = ["agentview", "robot0_eye_in_hand"]
 IMAGE_SIZE = 256
@@ -291,6 +293,9 @@ def alternate(
     return [(median_of(ours, ours_per_round), median_of(theirs, theirs_per_round)) for _ in range(rounds)]
 
 
+# --- stock robosuite as an environment of LeRobot ---
+
+
 class StockEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     """Stock robosuite as LeRobot's loop wants it, with our observation's names."""
 
@@ -328,6 +333,9 @@ class StockEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     def render(self) -> NDArray[np.uint8]:
         """Return both cameras side by side."""
         return np.hstack(list(self._pictures.values()))
+
+
+# --- what is reported ---
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from lerobot_memobench.evaluation.figures.style import (
     looks_of,
     new_figure,
     paper_style,
-    remark_on,
+    remarks_on,
     with_remarks,
 )
 from lerobot_memobench.evaluation.metrics import METRICS, PROCESS_METRICS, Rate
@@ -254,7 +254,7 @@ def _correlations_legend(figure: Figure, entries: Sequence[Entry], memory_types:
 
 def _remarks(entries: Sequence[Entry]) -> list[str]:
     """Return the remarks on ours."""
-    told = dict.fromkeys(f"{entry.method}: {entry.remark}" for entry in entries if entry.remark)
+    told = dict.fromkeys(f"{entry.method}: {'; '.join(entry.remarks)}" for entry in entries if entry.remarks)
     alone = len({entry.method for entry in entries if not entry.published}) == 1
     return [literal(one.partition(": ")[2] if alone else one) for one in told]
 
@@ -352,7 +352,7 @@ def draw_replan(runs: Sequence[Run], paper: bool = False, by_type: bool = False)
             if not below:
                 place.set_xlabel("replan interval, steps")
                 place.tick_params(labelbottom=True)
-        _replan_legend(figure, looks, sweeps(runs) if paper or len(set(map(remark_on, runs))) > 1 else {})
+        _replan_legend(figure, looks, sweeps(runs) if paper or len(set(map(remarks_on, runs))) > 1 else {})
         return figure
 
 
@@ -372,7 +372,7 @@ def _replan_legend(figure: Figure, looks: Mapping[Identity, Line], ours: Mapping
     handles = [Line2D([], [], **look.drawn, ms=4, lw=_width(not theirs)) for (_, theirs), look in looks.items()]
     alone = all(published for _, published in looks)
     marks = [
-        f"paper: {name}" if published and not alone else with_remarks(name, map(remark_on, ours.get(name, ())))
+        f"paper: {name}" if published and not alone else with_remarks(name, map(remarks_on, ours.get(name, ())))
         for name, published in looks
     ]
     longest = max(len(line) for mark in marks for line in mark.splitlines())

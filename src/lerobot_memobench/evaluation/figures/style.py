@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -203,7 +204,7 @@ class Entry:
 
     Attributes:
         memory_types, tasks: name -> figures; the paper publishes none per task. published: whether it is the paper's.
-        remark: what a legend says of it beside others (`remark_on`).
+        remarks: what a legend says of it beside others (`remarks_on`).
     """
 
     method: str
@@ -213,7 +214,7 @@ class Entry:
     tasks: Mapping[str, Figures]
     memory_type_of: Mapping[str, str]
     published: bool = False
-    remark: str = ""
+    remarks: tuple[str, ...] = ()
 
     @property
     def identity(self) -> Identity:
@@ -236,21 +237,21 @@ def entries_of(runs: Sequence[Run]) -> list[Entry]:
                 _figures(summary.average),
                 tasks,
                 summary.memory_type_of,
-                remark=remark_on(run),
+                remarks=remarks_on(run),
             )
         )
     return found
 
 
-def remark_on(run: Run) -> str:
-    """Return how much was run and the policy's inputs, each where it is not the paper's; "" for neither."""
+def remarks_on(run: Run) -> tuple[str, ...]:
+    """Return how much was run and the policy's inputs, each where it is not the paper's."""
     inputs = "" if run.summary.inputs == PAPER_INPUTS else f"inputs: {run.summary.inputs}"
-    return ";\n".join(filter(None, (extent(run), inputs)))
+    return tuple(filter(None, (extent(run), inputs)))
 
 
-def with_remarks(name: str, remarks: Iterable[str]) -> str:
-    """Return a name for a legend, and on further lines what is to be said of it."""
-    told = ";\n".join(dict.fromkeys(filter(None, remarks)))
+def with_remarks(name: str, remarks: Iterable[tuple[str, ...]]) -> str:
+    """Return a name for a legend, and on further lines the remarks on its rows."""
+    told = ";\n".join(dict.fromkeys(chain.from_iterable(remarks)))
     return f"{name}\n({told})" if told else name
 
 
@@ -300,10 +301,10 @@ def labels_of(entries: Sequence[Entry]) -> dict[Identity, str]:
     evaluations were run unlike.
     """
     beside = len({entry.published for entry in entries}) > 1
-    remarks: dict[Identity, list[str]] = {}
+    remarks: dict[Identity, list[tuple[str, ...]]] = {}
     for entry in entries:
-        remarks.setdefault(entry.identity, []).append(entry.remark)
-    differ = len({remark for told in remarks.values() for remark in told}) > 1
+        remarks.setdefault(entry.identity, []).append(entry.remarks)
+    differ = len({row for told in remarks.values() for row in told}) > 1
     return {
         (method, published): f"paper: {method}"
         if published and beside

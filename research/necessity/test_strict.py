@@ -1,4 +1,4 @@
-"""Published tasks and their twins in one table, and the drawn tasks' settings."""
+"""Published tasks and their strict tasks in one table, and the drawn tasks' settings."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lerobot_memobench.tasks.catalogue import get_task
 from research.necessity.report import PAGE_BEGIN, PAGE_END, bounds, put_into_page, read_results, side_by_side
 from research.necessity.settings import settings_of, variants_of
 
-STOVE, TWIN = "turn_on_the_stove_and_turn_it_off", "turn_the_stove_on_and_off_a_given_number_of_times"
+STOVE, STRICT_TASK = "turn_on_the_stove_and_turn_it_off", "turn_the_stove_on_and_off_a_given_number_of_times"
 MILK = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
 
 
@@ -34,18 +34,18 @@ def result(task: str, referent: str, found: float | None, confirmed: int = 0) ->
     }
 
 
-def test_a_published_task_stands_beside_its_twin() -> None:
-    table = side_by_side([result(STOVE, "fixed", None)], [result(TWIN, "drawn", 1 / 3, 3)])
-    row = next(line for line in table.splitlines() if TWIN in line)
-    assert row == f"| `{STOVE}` | 100.0 | no | `{TWIN}` | 3 | 33.3 (3/9) | 21.0 | 0.0 | 9/9 | yes |"
+def test_a_published_task_stands_beside_its_strict_task() -> None:
+    table = side_by_side([result(STOVE, "fixed", None)], [result(STRICT_TASK, "drawn", 1 / 3, 3)])
+    row = next(line for line in table.splitlines() if STRICT_TASK in line)
+    assert row == f"| `{STOVE}` | 100.0 | no | `{STRICT_TASK}` | 3 | 33.3 (3/9) | 21.0 | 0.0 | 9/9 | yes |"
     assert "From pictures alone 1 of 1 tasks were not solved:" in table
     assert "best fixed map in any order at most 33.3 %, on average 33.3 %" in table
-    assert "| – | – | `" in side_by_side([], [result(TWIN, "drawn", 0.0)]), "published tasks may not be measured"
+    assert "| – | – | `" in side_by_side([], [result(STRICT_TASK, "drawn", 0.0)]), "published tasks may not be measured"
 
 
 def test_bounds_are_told_of_drawn_tasks_that_were_searched() -> None:
     assert bounds([result(STOVE, "fixed", 0.5, 9)]) == ""
-    assert bounds([result(TWIN, "drawn", None)]) == ""
+    assert bounds([result(STRICT_TASK, "drawn", None)]) == ""
 
 
 def test_a_page_shows_both_when_it_is_told_of_the_published_results(tmp_path: Path) -> None:
@@ -53,7 +53,7 @@ def test_a_page_shows_both_when_it_is_told_of_the_published_results(tmp_path: Pa
     kept.write_text(json.dumps([result(STOVE, "fixed", None)]))
     page = tmp_path / "page.md"
     page.write_text(f"{PAGE_BEGIN}{PAGE_END}")
-    text = put_into_page(page, [result(TWIN, "drawn", 0.0)], read_results(kept)).read_text()
+    text = put_into_page(page, [result(STRICT_TASK, "drawn", 0.0)], read_results(kept)).read_text()
     assert f"| `{STOVE}` | 100.0 | no |" in text
     with pytest.raises(MemobenchError, match="there is no"):
         read_results(tmp_path / "missing.json")
@@ -63,9 +63,9 @@ def test_a_page_shows_both_when_it_is_told_of_the_published_results(tmp_path: Pa
 
 
 def test_a_drawn_task_has_one_setting_and_all_its_goals() -> None:
-    assert settings_of(get_task(TWIN), ("fixed", "random")) == ("drawn",)
-    assert [variant.language for variant in variants_of(get_task(TWIN), "drawn")] == [
-        variant.language for variant in map(get_task(TWIN).variant, range(3))
+    assert settings_of(get_task(STRICT_TASK), ("fixed", "random")) == ("drawn",)
+    assert [variant.language for variant in variants_of(get_task(STRICT_TASK), "drawn")] == [
+        variant.language for variant in map(get_task(STRICT_TASK).variant, range(3))
     ]
     assert settings_of(get_task(MILK), ("fixed", "random")) == ("fixed", "random")
     assert settings_of(get_task(STOVE), ("random",)) == ("fixed",)
