@@ -113,18 +113,18 @@ HELP: dict[str, tuple[HelpRow, ...]] = {
         HelpRow(
             "detector=",
             "with a policy that reads objects: package or a file, the detector that finds them in pictures",
-            "none: the environment tells them",
+            "none: the environment gives them",
         ),
         HelpRow(
             "referent=",
-            "fixed: the published goals; random: the seed decides what the prompt video shows; strict tasks are always "
-            "drawn",
+            "fixed: the published goals; random: the seed decides what the demonstration prompt shows; strict tasks "
+            "are always drawn",
             "fixed",
         ),
         HelpRow("demonstration_prompt=", "false leaves the prompt out", "true"),
         HelpRow(
             "prompt_in=",
-            "steps: the policy sees the prompt; reset: it plays before the first observation",
+            "steps: the policy observes the prompt; reset: it plays before the first observation",
             "by the policy",
         ),
         HelpRow("horizon=", "execution steps per episode", "1200"),
@@ -172,8 +172,8 @@ HELP: dict[str, tuple[HelpRow, ...]] = {
         HelpRow("replan=", "actions executed per prediction at evaluation"),
         HelpRow(
             "obs_type=",
-            "what a policy of LeRobot's learns to see: pixels_agent_pos, environment_state_agent_pos or both; left "
-            "out: pictures where the dataset has them, else objects",
+            "inputs of a policy of LeRobot's: pixels_agent_pos, environment_state_agent_pos or both; left out: "
+            "pictures where the dataset has them, else objects",
         ),
         HelpRow("prompt_frames=", "false: no frame of a prompt is trained on; true: all are; left out: by the policy"),
         HelpRow("episodes=", "of the dataset, those of these numbers: [0, 1, 2]"),
