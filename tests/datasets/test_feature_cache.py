@@ -212,7 +212,7 @@ def test_refusals_name_reason_and_fix(root: Path) -> None:
         _open(root)
     build_feature_cache(root, "test", _Frames(), _Texts())
     for changes, reason in (
-        ({"frames_key": "other"}, "another vision tower"),
+        ({"frames_key": "other"}, "another visual encoder"),
         ({"stride": 2}, "stride 1, and stride 2"),
         ({"texts_key": "other"}, "another text encoder"),
     ):

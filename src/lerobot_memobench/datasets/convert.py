@@ -1,6 +1,6 @@
-"""Files in the published HDF5 layout, this package's or others', to a LeRobotDataset.
+"""Convert files in the published HDF5 layout, this package's or others', to a LeRobotDataset.
 
-What can be used is used; what cannot is named with file, group and reason. Episodes go through the same staging as
+Groups that cannot be used are named with file, group and reason. Episodes go through the same staging as
 generated ones, so a killed conversion is continued by the same command, and a folder without ``meta/info.json`` is no
 dataset to anybody.
 """

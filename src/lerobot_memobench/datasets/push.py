@@ -1,4 +1,4 @@
-"""A dataset to the Hugging Face hub, so that ``LeRobotDataset("<user>/memobench")`` loads it anywhere.
+"""Push a dataset to the Hugging Face hub, so that ``LeRobotDataset("<user>/memobench")`` loads it anywhere.
 
 huggingface_hub's ``upload_folder`` does the work (its ``upload_large_folder`` is deprecated in favour of it): it
 commits a large folder in parts, and the same call continues an upload that was broken off, since what the hub has

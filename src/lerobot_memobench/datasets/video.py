@@ -1,4 +1,4 @@
-"""Camera frames to MP4, as LeRobot stores them.
+"""Camera frames as MP4, as LeRobot stores them, and statistics of their pixels.
 
 Encoding: H.264, preset ultrafast, one key frame in ten, CRF 23, no B-frames. Measured on an episode of the
 benchmark (396 frames of 256×256, one encoder thread, on busy cores; third person / wrist):

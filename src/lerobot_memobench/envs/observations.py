@@ -33,7 +33,7 @@ METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": CONTROL
 
 # --- which of them a policy reads ---
 
-SEEN_PIXELS, DETECTIONS, PRIVILEGED, SIMULATOR, MEMORY_TEXT = (
+PIXEL_INPUT, DETECTIONS, PRIVILEGED, SIMULATOR, MEMORY_TEXT = (
     *("pixels", "detections", "privileged object state", "privileged simulator state", "oracle memory text"),
 )
 """What a policy may read, as reports say it. Detections: objects that a detector finds in pixels."""
@@ -93,7 +93,7 @@ def policy_inputs(policy: Any, obs_type: str, oracle_memory: bool = False) -> st
         ignores = type(policy).__module__.startswith("lerobot.") and policy.type not in READ_OBJECTS
         pixels = obs_type != OBJECTS and (everything or "VISUAL" in types)
         objects = obs_type != PIXELS and not ignores and (everything or "ENV" in types)
-        found = (SEEN_PIXELS,) * pixels + (PRIVILEGED,) * objects
+        found = (PIXEL_INPUT,) * pixels + (PRIVILEGED,) * objects
     return ", ".join(found + (MEMORY_TEXT,) * oracle_memory) or NOTHING
 
 

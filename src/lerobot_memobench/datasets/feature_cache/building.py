@@ -56,14 +56,14 @@ Progress = Callable[[int, int], None]
 
 
 class FrameEncoder(Protocol):
-    """The frozen vision tower: images (N, 3, H, W) in [0, 1], or what else is read -> tokens (N, P, D) bfloat16."""
+    """The frozen visual encoder: images (N, 3, H, W) in [0, 1], or what else is read -> tokens (N, P, D) bfloat16."""
 
     tokens_per_frame: int
     dim: int
 
     @property
     def key(self) -> str:
-        """Identity of the tower: weights and input size."""
+        """Identity of the encoder: weights and input size."""
 
     def __call__(self, images: Any, /) -> Tensor:
         """Encode."""
@@ -97,10 +97,10 @@ def build_feature_cache(
 
     Args:
         root: folder of a LeRobotDataset v3.0.
-        frames: the frozen vision tower. texts: the frozen text encoder.
+        frames: the frozen visual encoder. texts: the frozen text encoder.
         camera: image column that memory shows. stride: every how many frames one is stored.
-        batch_size: frames per pass of the tower.
-        workers: threads that decode videos ahead of the tower; as many as there are cores, up to 8, by default.
+        batch_size: frames per pass of the encoder.
+        workers: threads that decode videos ahead of the encoder; as many as there are cores, up to 8, by default.
         progress: called with (episodes done, episodes in all), first with what is done already.
         place: folder in which the cache's is made, where it is not to lie beside the dataset.
         read: from where frames come; from the camera's videos by default.
@@ -242,7 +242,7 @@ class Encoding:
 
     Attributes:
         folder: of the cache; its file of tokens has its full size.
-        batch_size: frames per pass of the tower. workers: threads that decode videos ahead of it.
+        batch_size: frames per pass of the encoder. workers: threads that decode videos ahead of it.
     """
 
     folder: Path
@@ -254,7 +254,7 @@ class Encoding:
     def run(self, frames: FrameEncoder, read: FrameReader, progress: Progress) -> None:
         """Encode every episode that is not marked done; its mark is written after its tokens are on the disk.
 
-        Videos are decoded in threads, a few parts ahead; the tower takes the parts in their order, so that the file is
+        Videos are decoded in threads, a few parts ahead; the encoder takes the parts in their order, so that the file is
         the same whatever the number of threads, and a killed build has finished the first so many episodes. Tokens
         are written, not mapped: a disk that refuses a mapped page kills the process (SIGBUS).
         """
@@ -288,7 +288,7 @@ class Encoding:
 
 @dataclass(frozen=True)
 class _Part:
-    """Frames of one episode that the tower takes at once."""
+    """Frames of one episode that the encoder takes at once."""
 
     episode: int
     frames: list[int]

@@ -1,6 +1,6 @@
 """Where a feature cache lies, what is in it, and whether it fits.
 
-Caches made with another tower (weights, input size, pooling), camera or stride have other names and lie side by side.
+Caches made with another encoder (weights, input size, pooling), camera or stride have other names and lie side by side.
 
 Layout of ``<dataset>/feature_cache/<name>/``, or of ``<name>/`` in a folder that was chosen for caches::
 
@@ -40,7 +40,7 @@ class CacheMeta:
 
     format: int
     dataset: str  # fingerprint of the dataset's content
-    frames_key: str  # identity of the vision tower
+    frames_key: str  # identity of the visual encoder
     texts_key: str  # identity of the text encoder that it was begun with
     camera: str
     stride: int
@@ -72,7 +72,7 @@ class CacheMeta:
         reasons = {
             "format": "has an older format",
             "dataset": "is stale: the dataset's frames changed after it was made",
-            "frames_key": "is foreign: another vision tower (other weights or input size) made it",
+            "frames_key": "is foreign: another visual encoder (other weights or input size) made it",
             "camera": f"is foreign: it shows camera {theirs}, and {ours} is asked for",
             "stride": f"is foreign: it was made with stride {self.stride}, and stride {wanted.get('stride')} is asked "
             "for",

@@ -165,12 +165,12 @@ class FeatureCache(FrameLookup):
 
         Args:
             root: folder of the LeRobotDataset.
-            frames_key: identity of the vision tower that will read the cache.
+            frames_key: identity of the visual encoder that will read the cache.
             texts_key: identity of the text encoder; None when no text is needed.
             place: folder that holds caches, where it is not the one beside the dataset.
 
         Raises:
-            MemobenchError: no cache, an unfinished one, one of another dataset (stale), or one made by another tower,
+            MemobenchError: no cache, an unfinished one, one of another dataset (stale), or one made by another encoder,
                 camera, stride or text encoder (foreign). The message names the reason and the fix.
         """
         root = Path(root)

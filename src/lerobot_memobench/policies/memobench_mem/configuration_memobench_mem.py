@@ -18,7 +18,7 @@ from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
-from lerobot_memobench.envs.observations import DETECTIONS, SEEN_PIXELS
+from lerobot_memobench.envs.observations import DETECTIONS, PIXEL_INPUT
 from lerobot_memobench.envs.observations import PRIVILEGED as PRIVILEGED_INPUT
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.perception.visual_encoder import SIDE
@@ -488,7 +488,7 @@ class MemobenchMemConfig(PI05Config):
     def inputs(self) -> tuple[str, ...]:
         """Policy inputs beside the robot's state, in the words of `envs.observations`."""
         if not self.uses_objects:
-            return (SEEN_PIXELS,)
+            return (PIXEL_INPUT,)
         return (DETECTIONS,) if self.uses_detector else (PRIVILEGED_INPUT,)
 
     @property

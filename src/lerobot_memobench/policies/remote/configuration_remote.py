@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from lerobot.configs import PreTrainedConfig
 
-from lerobot_memobench.envs.observations import PRIVILEGED, SEEN_PIXELS, SIMULATOR
+from lerobot_memobench.envs.observations import PIXEL_INPUT, PRIVILEGED, SIMULATOR
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.baselines.configuration_baselines import UntrainedConfig
 
@@ -146,7 +146,7 @@ class RemoteConfig(UntrainedConfig):
         """What its server is sent, in the words of `envs.observations`."""
         sent = set(self.sent().values())
         told = {"environment_state": PRIVILEGED, "expert_action": SIMULATOR, "blind_action": SIMULATOR}
-        pixels = (SEEN_PIXELS,) * bool(sent & {IMAGE, WRIST_IMAGE})
+        pixels = (PIXEL_INPUT,) * bool(sent & {IMAGE, WRIST_IMAGE})
         return pixels + tuple(dict.fromkeys(words for name, words in told.items() if name in sent))
 
     @property
