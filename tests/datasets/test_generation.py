@@ -236,7 +236,7 @@ def test_tasks_with_a_prompt_have_a_number_of_their_own(tasks, recorded, tmp_pat
 
 
 @pytest.mark.parametrize("where", ["mine", "mine/checkpoints/000100/pretrained_model", "mine/pretrained_model"])
-def test_a_driving_policy_is_told_by_the_name_of_its_run(tmp_path, where):
+def test_a_learner_is_named_by_its_run(tmp_path, where):
     (tmp_path / where).mkdir(parents=True)
     (tmp_path / where / "model.safetensors").write_bytes(b"weights")
     name, _, digest = generation.policy_told(str(tmp_path / where)).partition(" ")
@@ -290,14 +290,14 @@ def test_hdf5_killed_at_every_change_to_the_disk(tasks, recorded, tmp_path):
     run(tasks, tmp_path / "undisturbed", formats=formats)
     reference = tree_hash(tmp_path / "undisturbed")
     killed = 0
-    for call in range(1, 400, 13):
+    for call in range(1, 400, 29):
         shutil.rmtree(out, ignore_errors=True)
         if not kill_at(call, lambda: run(tasks, out, formats=formats)):
             break
         killed += 1
         run(tasks, out, formats=formats)
         assert {k: v for k, v in tree_hash(out).items() if not k.startswith(".staging")} == reference, call
-    assert killed > 4
+    assert killed > 2
 
 
 @pytest.mark.parametrize(
@@ -345,15 +345,14 @@ IN_C = RuntimeError("Can't write data (file write failed: errno = 28, error mess
 """As HDF5 tells of it, in an error of its own."""
 
 
-@pytest.mark.parametrize("error", [FULL, IN_C], ids=["OSError", "in C"])
 @pytest.mark.parametrize(
-    "place",
+    ("place", "error"),
     [
-        "lerobot_memobench.datasets.staging.np.savez_compressed",
-        "lerobot_memobench.datasets.video.VideoWriter.close",
-        "lerobot_memobench.datasets.staging.flush_to_disk",
-        "lerobot_memobench.datasets.lerobot_format.assembling.ParquetFiles.write",
-        "lerobot_memobench.datasets.lerobot_format.assembling.write_card",
+        ("lerobot_memobench.datasets.staging.np.savez_compressed", FULL),
+        ("lerobot_memobench.datasets.video.VideoWriter.close", IN_C),
+        ("lerobot_memobench.datasets.staging.flush_to_disk", FULL),
+        ("lerobot_memobench.datasets.lerobot_format.assembling.ParquetFiles.write", IN_C),
+        ("lerobot_memobench.datasets.lerobot_format.assembling.write_card", FULL),
     ],
 )
 def test_a_full_disk_is_one_sentence_and_loses_nothing(tasks, recorded, tmp_path, monkeypatch, place, error):
@@ -582,7 +581,7 @@ def kill_at(call: int, work) -> bool:
         os._exit(1)
 
 
-@pytest.mark.parametrize("every", [9, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("every", [19, pytest.param(2, marks=pytest.mark.slow)])
 def test_killed_at_every_change_to_the_disk(tasks, recorded, tmp_path, every):
     """Kill at every n-th change, resume, compare with an undisturbed run, byte for byte."""
     out = tmp_path / "ds"
@@ -600,5 +599,5 @@ def test_killed_at_every_change_to_the_disk(tasks, recorded, tmp_path, every):
             assert {k: v for k, v in tree_hash(out).items() if not k.startswith(".staging")} == reference
         run(tasks, out)
         assert tree_hash(out) == reference, f"killed at change {call}"
-    assert killed > 8
-    assert unfinished > 8
+    assert killed > 3
+    assert unfinished > 3

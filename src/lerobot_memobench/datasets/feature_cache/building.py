@@ -254,7 +254,7 @@ class Encoding:
     def run(self, frames: FrameEncoder, read: FrameReader, progress: Progress) -> None:
         """Encode every episode that is not marked done; its mark is written after its tokens are on the disk.
 
-        Videos are decoded in threads, a few parts ahead; the encoder takes the parts in their order, so that the file is
+        Videos are decoded in threads, a few parts ahead; the encoder takes them in their order, so that the file is
         the same whatever the number of threads, and a killed build has finished the first so many episodes. Tokens
         are written, not mapped: a disk that refuses a mapped page kills the process (SIGBUS).
         """
