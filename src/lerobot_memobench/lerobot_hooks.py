@@ -62,8 +62,8 @@ ROLLOUT = Hook(
     "lerobot.scripts.lerobot_eval",
     "rollout",
     ("env", "policy", "seeds"),
-    "seed each batch of episodes by itself, and draw only what a policy looks at",
-    "LeRobot seeds once per run, so a resumed run would draw other numbers, and draws pictures that nobody sees",
+    "seed each batch of episodes by itself, and draw only the observations that a policy needs",
+    "LeRobot seeds once per run, so a resumed run would draw other numbers, and it draws every picture",
 )
 INSIDE_SLURM = Hook(
     "lerobot.scripts.lerobot_eval",
@@ -76,8 +76,8 @@ OPEN_DATASETS = Hook(
     "lerobot.datasets.factory",
     "make_train_eval_datasets",
     ("cfg",),
-    "leave prompt frames out, choose what a policy sees, tell of which training a held-out part is",
-    "LeRobot trains on prompts, whose actions have no effect, and gives a policy pictures and object state alike",
+    "leave frames of demonstration prompts out, choose a policy's inputs, tell a held-out part its training",
+    "LeRobot trains on prompts, whose actions have no effect, and takes pictures and object state alike for inputs",
     everywhere=True,
 )
 MAKE_PROCESSORS = Hook(
@@ -223,6 +223,12 @@ def installed() -> list[Hook]:
     return [hook for hook in HOOKS if any(there.layers for there in _made.values() if there.hook is hook)]
 
 
+def table() -> str:
+    """Return all hooks as Markdown, as docs/develop.md lists them."""
+    rows = [f"| `{hook.module}.{hook.name}` | {hook.does} | {hook.why} | {hook.version} |" for hook in HOOKS]
+    return "\n".join(["| function | is made to | because | read in |", "|---|---|---|---|", *rows])
+
+
 def check_version(part: str = "evaluation loop") -> None:
     """Refuse another LeRobot than the one whose loops are known: another one may run other episodes, or unseeded ones.
 
@@ -252,3 +258,7 @@ def _check_parameters(hook: Hook, function: Function) -> None:
         f"{hook.version}, where it is made to {hook.does}: {package} {metadata.version(package)} is installed, or "
         f"something has replaced it; install {package}=={version} (make setup), or leave out what replaces it"
     )
+
+
+if __name__ == "__main__":
+    print(table())

@@ -47,7 +47,7 @@ from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.jobs.threads import ACTING, limit_torch, use_threads
 from lerobot_memobench.lerobot_hooks import ROLLOUT, installed
 from lerobot_memobench.protocol import CONTROL_HZ, EVALUATION_SEED, HORIZON
-from lerobot_memobench.tasks.task import DRAWN, PUBLISHED, REFERENTS, STRICT, SUITES, referent_told
+from lerobot_memobench.tasks.task import DRAWN, PUBLISHED, REFERENTS, STRICT, SUITES
 
 PolicyCheck = Callable[[str, PreTrainedConfig, dict[str, PolicyFeature], dict[str, str]], None]
 """Called with a checkpoint's path and configuration, what is shown by its names at the policy, and LeRobot's
@@ -143,7 +143,8 @@ class MemobenchEnvConfig(EnvConfig):
                 f"env.task_dir={self.task_dir} runs every task in that folder, and tasks={chosen} chooses among the "
                 "catalogue's; leave tasks= out, or name the folder of one task by env.task_dir="
             )
-        self.referent = referent_told(self.referent, drawn=self.suite == STRICT)
+        if self.suite == STRICT:
+            self.referent = DRAWN  # each of its tasks draws its own
         if self.obs_type != PIXELS:
             self.features, self.features_map = policy_features(self.obs_type), policy_names(self.obs_type)
 
