@@ -400,10 +400,10 @@ def test_a_file_that_may_grow_no_further(tasks, recorded, tmp_path):
 
 @pytest.fixture
 def disk(tmp_path):
-    """A disk of its own, of a quarter of a MiB."""
+    """A disk of its own, of half a MiB."""
     folder = tmp_path / "disk"
     folder.mkdir()
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", folder], capture_output=True)
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=512k", "tmpfs", folder], capture_output=True)
     if mounted.returncode:
         pytest.skip("nothing may be mounted here")
     yield folder
@@ -414,15 +414,15 @@ def test_a_real_disk_that_fills_up_and_one_that_is_closed(tasks, recorded, disk,
     monkeypatch.setattr(generation, "FRAMES", {"published": {}})
     monkeypatch.setattr(generation, "check_room", lambda *_: None)  # it would be refused before
     with pytest.raises(MemobenchError, match=r"ds cannot be written \(No space left on device; .* are free there"):
-        run(tasks, disk / "ds", episodes=20, image_size=64)
+        run(tasks, disk / "ds", episodes=40, image_size=64)
     assert not is_dataset(disk / "ds")
     subprocess.run(["mount", "-o", "remount,ro", disk], check=True)
     with pytest.raises(MemobenchError, match=r"ds cannot be written \(Read-only file system"):
-        run(tasks, disk / "ds", episodes=20, image_size=64)
+        run(tasks, disk / "ds", episodes=40, image_size=64)
     subprocess.run(["mount", "-o", "remount,rw,size=64m", disk], check=True)
     made = len(recorded)
-    run(tasks, disk / "ds", episodes=20, image_size=64)
-    assert 0 < len(recorded) - made < 40, "what was finished is not made again"
+    run(tasks, disk / "ds", episodes=40, image_size=64)
+    assert 0 < len(recorded) - made < 80, "what was finished is not made again"
 
 
 def test_a_folder_that_cannot_be(tasks, recorded, tmp_path):
