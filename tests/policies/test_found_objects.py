@@ -102,7 +102,7 @@ def test_what_is_found_is_kept_for_every_frame(
         policy, before, _, dataset = made_for_training(root, **finding)
         assert set(policy.config.input_features) == {OBS_STATE, *VIEWS}
         batch = before(batch_of(dataset, [45, 50]))
-    seen = [policy.perception.look(pictures_of(root, index), batch["observation.raw_state"][row : row + 1])
+    seen = [policy.perception.detect(pictures_of(root, index), batch["observation.raw_state"][row : row + 1])
             for row, index in enumerate((45, 50))]  # fmt: skip
     truth = torch.cat(seen)
     assert truth.any()
@@ -168,11 +168,11 @@ def test_they_act_from_pictures_as_from_what_is_found_in_them(
     assert set(finds.config.image_features) == {*VIEWS}
     for frame in range(8):
         batch = observed(root, dataset, frame)
-        slots = finds.perception.look(batch, batch[OBS_STATE])
+        slots = finds.perception.detect(batch, batch[OBS_STATE])
         objects = {key: value for key, value in batch.items() if key not in VIEWS} | {OBS_ENV_STATE: slots}
         assert torch.equal(given.select_action(told(objects)), finds.select_action(seeing(batch)))
     with pytest.raises(MemobenchError, match=r"no 'observation\.images\.wrist_image', which the detector reads"):
-        finds.perception.look({next(iter(VIEWS)): torch.zeros(1, 3, 48, 48)}, torch.zeros(1, 8))
+        finds.perception.detect({next(iter(VIEWS)): torch.zeros(1, 3, 48, 48)}, torch.zeros(1, 8))
 
 
 def test_what_the_environment_tells_is_not_looked_at(blind: Path, detector: Path, root: Path) -> None:

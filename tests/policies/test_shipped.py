@@ -168,5 +168,5 @@ def test_the_card_tells_of_the_errors_of_eyes(
     (source / "train_config.json").write_text(json.dumps({**told, "output_dir": str(tmp_path / "run")}))
     monkeypatch.setattr(script, "SHIPPED", tmp_path / "shipped")
     text = (script.ship(tmp_path / "run", "seeing", None, {}, []) / "README.md").read_text()
-    assert "sees objects." in text
+    assert "reads objects." in text
     assert "policy.detection_noise=1.0" in text.partition("lerobot train")[2]

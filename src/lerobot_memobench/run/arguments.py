@@ -46,7 +46,6 @@ COMMON: dict[str, tuple[str, ...]] = {
     "size": ("policy.size",),
     "perception": ("policy.perception",),
     "detector": ("policy.detector",),
-    "visual_encoder": ("policy.visual_encoder",),
     "device": ("policy.device",),
     "replan": ("policy.n_action_steps", "env.replan_steps"),
     "tasks": ("env.tasks",),

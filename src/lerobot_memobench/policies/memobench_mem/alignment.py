@@ -1,4 +1,4 @@
-"""Objectives that tie memory tokens to the text of the checkpoint being worked on (paper, appendix on alignment).
+"""Objectives that align memory tokens with the text of the current subgoal (paper, appendix on alignment).
 
 All are used in training only. H (B, L, d_m) are memory tokens, the mask (B, L) marks the real ones, T are text
 embeddings of width d_t. Vectors with a hat in the paper are L2-normalised; so are they here.
@@ -26,6 +26,8 @@ from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import TEXT, TEXT_MASK
 from lerobot_memobench.policies.memobench_mem.training import joint, mean_over_ranks, world_size
+
+logger = logging.getLogger(__name__)
 
 POSITIVE_SIMILARITY = 0.99  # texts more similar than this are the same subgoal
 INITIAL_TEMPERATURE = 0.07
@@ -194,8 +196,7 @@ def make_alignment(name: str, memory_dim: int, text_dim: int, frames: int, token
     raise MemobenchError(f"There is no alignment '{name}': {nearest(name, known)}")
 
 
-# ==== loss.py
-# The alignment's part of a training step: its weighted loss, and numbers to log.
+# -- loss of a training step ------------------------------------------------------------------------------------------
 
 
 def alignment_loss(
@@ -237,10 +238,8 @@ def alignment_loss(
     return weighted, logged | alignment.numbers()
 
 
-# ==== subgoals.py
-# The subgoal texts that training samples are aligned with: one per sample, or one per remembered frame.
+# -- subgoal texts of samples -----------------------------------------------------------------------------------------
 
-logger = logging.getLogger(__name__)
 
 SEVERAL = 3
 """Subgoals of an episode that can change places in more than one way."""

@@ -1,4 +1,7 @@
-"""Checkpoints of the policy: what may be loaded into it, and its averaged weights beside the trained ones."""
+"""Model checkpoints of the policy: its configuration, weights, statistics and saved processor steps, each checked.
+
+The model file holds the averaged weights; the trained ones lie beside it for going on.
+"""
 
 from __future__ import annotations
 
@@ -90,8 +93,8 @@ def restore_average(average: WeightAverage, source: str | Path, revision: str | 
     return average
 
 
-# ==== weights.py
-# Files of a checkpoint: finding them, what they must hold, and starting from pi0.5's.
+# -- files ------------------------------------------------------------------------------------------------------------
+
 
 MODEL_FILE = "model.safetensors"
 TRAINING_FILE = "training_weights.safetensors"
@@ -192,17 +195,17 @@ def load_exactly(module: nn.Module, weights: dict[str, Tensor], source: str | Pa
     module.load_state_dict({name: weights[name] for name in own if name in weights}, strict=False)
 
 
-# ==== saved_steps.py
-# What the preprocessor of a checkpoint must agree on with the policy that goes on from it.
-#
-# LeRobot loads the saved steps. Ours follow the policy (`processing.training_run`) and LeRobot hands some of its own
-# their new settings; the rest would keep the checkpoint's, whatever the configuration says.
+# -- saved processor steps --------------------------------------------------------------------------------------------
+
 
 _ORACLE = "memobench_oracle_memory"
 
 
 def require_agreement(source: str | Path, revision: str | None, config: MemobenchMemConfig, *, training: bool) -> None:
     """Check that the saved steps of a checkpoint do, or will do, what ``config`` says.
+
+    LeRobot loads them. Ours follow the policy (`sampler.TrainingRun`), and LeRobot hands some of its own their new
+    settings; the rest would keep the checkpoint's.
 
     A checkpoint without a preprocessor passes: LeRobot says what it lacks.
 

@@ -169,12 +169,12 @@ mean something else, mostly without a word. Those that decide others stand befor
 OF_ACTING = _names(
     """
     n_action_steps full_chunk_when_stalled detector visual_encoder num_inference_steps rtc_config device dtype use_amp
-    compile_model compile_mode pretrained_path pretrained_revision use_peft output_features
+    compile_model compile_mode freeze_vision_encoder pretrained_path pretrained_revision use_peft output_features
     """
 )
 """Fields that are free where a checkpoint acts. A ``detector`` is no part of it, and its own ``visual_encoder`` has a
 rule of its own (`checkpoints.read_config`); LeRobot makes ``output_features`` of the environment's, which
-`policies.shown` compares with the checkpoint's."""
+`policies.shown` compares with the checkpoint's, and ``freeze_vision_encoder`` is always true here."""
 OF_TRAINING = _names(
     """
     detection_noise base_weights align align_weight subgoal_level shuffle_subgoals
@@ -277,9 +277,9 @@ class MemobenchMemConfig(PI05Config):
     """Frames of an episode that stand side by side in a batch, and share memory; none: 6 where training decodes no
     video, else 1, LeRobot's order. ``batch_size`` counts frames all the same."""
     task_weights: dict[str, float] | None = None
-    """Tasks are drawn in proportion to these weights, however long their episodes are. Keys are task names, memory types
-    or ``prompted`` (tasks that begin with a demonstration prompt), of which the first that a task has counts; other
-    tasks weigh 1, and ``{}`` draws all alike. None: ``{}`` where training decodes no video, else frames alike."""
+    """Tasks are drawn in proportion to these weights, however long their episodes are. Keys are task names, memory
+    types or ``prompted`` (tasks that begin with a demonstration prompt), of which the first that a task has counts;
+    other tasks weigh 1, and ``{}`` draws all alike. None: ``{}`` where training decodes no video, else frames alike."""
     warmup_fraction: float = 0.05
     min_lr_ratio: float = FROM_SIZE
     """Learning rate at the end, as a fraction of the highest, to which it falls as a cosine; 1: it stays constant.
@@ -419,8 +419,8 @@ class MemobenchMemConfig(PI05Config):
         if self.uses_visual_encoder:
             if self.image_size != (SIDE, SIDE):
                 raise MemobenchError(
-                    f"--policy.image_resolution={self.image_resolution} cannot be used: the visual encoder takes {SIDE} "
-                    f"x {SIDE} pixels; leave it out, or use --policy.visual_encoder={RANDOM}."
+                    f"--policy.image_resolution={self.image_resolution} cannot be used: the visual encoder takes "
+                    f"{SIDE} x {SIDE} pixels; leave it out, or use --policy.visual_encoder={RANDOM}."
                 )
             return
         multiple = MEMORY_GRID * self.dimensions.vision.patch

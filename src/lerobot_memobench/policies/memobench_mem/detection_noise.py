@@ -1,8 +1,8 @@
-"""Slots as eyes would find them: what the environment tells, with errors like theirs, drawn anew for every batch.
+"""Detection noise: privileged object state with errors like the detector's, drawn anew for every batch.
 
-So a policy learns from told objects, of any number of demonstrations without a picture, what it will be shown of found
-ones. Sizes are those of the package's eyes at 720 moments of the thirty tasks and the strict ones (tuning seeds, arms
-moved at random): 1.6 mm off in the median, 8 at the 90th percentile and 18 at the 97th.
+So a policy learns from demonstrations without a picture to act by detections. Sizes are those of the package's detector
+at 720 frames of the thirty tasks and the strict ones (tuning seeds, arms moved at random): 1.6 mm off in the median, 8
+at the 90th percentile and 18 at the 97th.
 """
 
 from __future__ import annotations
@@ -39,10 +39,11 @@ that thing once more and elsewhere; and how far from it both are, m."""
 
 
 def with_detection_noise(slots: Tensor, hand: Tensor, size: float) -> Tensor:
-    """Return slots (N, SLOTS, WIDTH) as eyes would find them.
+    """Return slots (N, SLOTS, WIDTH) with the errors of a detector.
 
     Args:
-        hand: its place in the world, m, and its turn, (N, >= 3). size: of the errors; 1 is as those eyes err.
+        hand: (N, >= 3), its place in the world, m, and its turn.
+        size: of the errors; 1 is as the package's detector errs.
     """
     seen = upright(slots)
     there = field(seen, "present").squeeze(-1) > 0

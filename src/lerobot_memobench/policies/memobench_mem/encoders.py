@@ -31,18 +31,18 @@ if TYPE_CHECKING:
 LOUD = 8.0
 """How much larger than a layer's output tokens are made; at 1 they learned slower."""
 PrefixParts = tuple[list[Tensor], list[Tensor]]
-"""What is seen now, in the place of LeRobot's images: parts (B, ...), and which of each one's tokens are real: (B,)
-for all of them, or (B, n)."""
+"""Present observations in the place of LeRobot's images: parts (B, ...), and masks of their real tokens: (B,) for all
+of a part, or (B, n)."""
 
 
 class ObservationEncoder(ABC):
-    """A way to see a moment. Training and a rollout use the same, so that what they remember agrees.
+    """Encoder of present and remembered observations; training and rollouts use the same.
 
     Attributes:
-        memory_input: the observation of which a frame's tokens are made, without which nothing is seen.
+        memory_input: name of the observation of which a remembered frame is made.
         dim: D, width of the tokens that the memory's encoder is given.
         grid: side of the square of a picture's tokens; 0 where tokens have no place in a picture.
-        pictures: whether it looks at pictures, which an environment may repeat.
+        pictures: whether it reads pictures, which an environment may repeat.
     """
 
     memory_input: str
@@ -53,27 +53,24 @@ class ObservationEncoder(ABC):
     @property
     @abstractmethod
     def key(self) -> str:
-        """Identity of what is remembered of frames: with equal keys, equal frames are remembered alike."""
+        """Identity of the remembered tokens: with equal keys, equal frames have equal tokens."""
 
     @abstractmethod
     def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
-        """Return what is remembered of some rows of an observation, (n, P, D'); nothing in it learns."""
+        """Return the stored tokens (n, P, D') of some rows of an observation; nothing in them learns."""
 
     def present(self, batch: Mapping[str, Tensor]) -> PrefixParts | None:
-        """Return what is seen now of a batch of observations; None where it is LeRobot's images."""
+        """Return the parts of a batch of present observations; None where they are LeRobot's images."""
         return None
 
     @abstractmethod
     def prefix(self, observed: Tensor) -> Tensor:
-        """Return the prefix tokens (B, n, d_vlm) of one part of the present (B, ...)."""
+        """Return the prefix tokens (B, n, d_vlm) of one part (B, ...)."""
 
     def memory(self, encoder: nn.Module) -> nn.Module:
-        """Return what makes memory tokens of remembered frames, given the mechanism's encoder of (B, F, P, D)."""
+        """Return the memory encoder of stored frames, given the mechanism's encoder of (B, F, P, D)."""
         return encoder
 
-
-# ==== frozen.py
-# Frozen weights: drawn from a fixed seed where none are given, and told apart by a hash.
 
 VISION_SEED = 20_250_705  # weights of an image tower for which none were given
 
@@ -98,7 +95,7 @@ def seed_parameters(module: nn.Module, seed: int) -> None:
 
 
 def fingerprint(modules: dict[str, nn.Module]) -> str:
-    """Short hash of names, shapes and values of the modules' parameters."""
+    """Return a short hash of names, shapes and values of the modules' parameters."""
     digest = hashlib.blake2b(digest_size=12)
     for prefix, module in sorted(modules.items()):
         for name, parameter in sorted(module.named_parameters()):
@@ -107,8 +104,7 @@ def fingerprint(modules: dict[str, nn.Module]) -> str:
     return digest.hexdigest()
 
 
-# ==== pixels.py
-# Pixels: pictures through pi0.5's frozen image tower; a remembered one is pooled to 4 x 4 tokens.
+# -- pi0.5's image tower ----------------------------------------------------------------------------------------------
 
 
 def pool_tokens(tokens: Tensor) -> Tensor:
@@ -126,8 +122,8 @@ class ImageTowerEncoder(ObservationEncoder):
     """The image tower, and the projection of its tokens to the language model's width.
 
     Args:
-        resolution: height and width of the pictures that the tower sees, pixels.
-        camera: whose pictures are remembered.
+        resolution: height and width of the tower's pictures, pixels.
+        camera: its pictures are remembered.
     """
 
     tokens_per_frame = MEMORY_GRID**2
@@ -170,14 +166,11 @@ class ImageTowerEncoder(ObservationEncoder):
         return self.projector(self.tower(observed.to(torch.float32)).last_hidden_state).to(observed.dtype)
 
 
-# ==== eyes.py
-# Detector: pictures through the tower of `lerobot_memobench.perception`, which learns no more; its tokens do.
-#
-# All tokens of a present picture enter the prefix; of a remembered one the pooled ones are kept. In a training sample the
-# tokens stand in the pictures' place, see `seen_pictures`.
+# -- visual encoder ---------------------------------------------------------------------------------------------------
+
 
 ENCODED = "observation.encoded."
-"""What the names of pictures' tokens in training samples begin with."""
+"""Prefix of the names of encoded pictures in training samples."""
 
 
 def encoded_key(camera: str) -> str:
@@ -199,11 +192,11 @@ class PixelPool(nn.Module):
 
 
 class VisualTokenEncoder(nn.Module, ObservationEncoder):
-    """The tokens of all cameras' present pictures; pooled ones of one camera's are remembered.
+    """Tokens of all cameras' present pictures by the frozen visual encoder; pooled ones of one camera are remembered.
 
     Args:
-        tower: without batch normalisation. It is the model's own part, as image towers are, and not registered here.
-        cameras: whose pictures are seen now. camera: whose are remembered. width: of the policy's tokens.
+        tower: folded. It is the model's own part, as image towers are, and not registered here.
+        cameras: of the present. camera: of the memory. width: of the policy's tokens.
     """
 
     tokens_per_frame = POOLED**2
@@ -218,7 +211,7 @@ class VisualTokenEncoder(nn.Module, ObservationEncoder):
 
     @property
     def tower(self) -> VisualEncoder:
-        """What pictures are seen through."""
+        """The frozen visual encoder."""
         return self._tower[0]
 
     @cached_property
@@ -239,31 +232,31 @@ class VisualTokenEncoder(nn.Module, ObservationEncoder):
     def encode(self, pictures: Tensor) -> Tensor:
         """Return the tokens (N, 64, WIDTH) bfloat16 of pictures (N, 3, H, W) in [0, 1]."""
         device = self.tower.grid_position.device
-        with torch.autocast(device.type, enabled=False):  # mixed precision would see otherwise than the cache did
-            seen: Tensor = self.tower(resized(pictures.to(device)))
-        return seen.to(torch.bfloat16)
+        with torch.autocast(device.type, enabled=False):  # mixed precision would differ from the cache
+            tokens: Tensor = self.tower(resized(pictures.to(device)))
+        return tokens.to(torch.bfloat16)
 
     @torch.no_grad()
     def pooled(self, tokens: Tensor) -> Tensor:
-        """Return what is remembered, (N, 16, WIDTH) bfloat16, of what `encode` returns."""
+        """Return pooled tokens (N, 16, WIDTH) bfloat16 of those that `encode` returns."""
         tower = self.tower
         with torch.autocast(tower.grid_position.device.type, enabled=False):
             return tower.pooled(tokens.to(tower.grid_position.device, torch.float32)).to(torch.bfloat16)
 
     def present(self, batch: Mapping[str, Tensor]) -> PrefixParts:
-        """Return each camera's tokens (B, 64, WIDTH), all of them real: those that the batch has, or of its pictures.
+        """Return each camera's tokens (B, 64, WIDTH), all of them real: encoded in the batch, or of its pictures.
 
         Raises:
             MemobenchError: it has neither of a camera.
         """
-        parts = [self._seen(batch, camera) for camera in self.cameras]
+        parts = [self._tokens(batch, camera) for camera in self.cameras]
         return parts, [torch.ones(len(part), dtype=torch.bool) for part in parts]
 
-    def _seen(self, batch: Mapping[str, Tensor], camera: str) -> Tensor:
+    def _tokens(self, batch: Mapping[str, Tensor], camera: str) -> Tensor:
         if encoded_key(camera) in batch:
             return batch[encoded_key(camera)]
         if camera not in batch:
-            raise MemobenchError(f"The observation has no '{camera}', which this policy sees; {cure(camera, batch)}")
+            raise MemobenchError(f"The observation has no '{camera}', which this policy reads; {cure(camera, batch)}")
         return self.encode(batch[camera])
 
     def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:

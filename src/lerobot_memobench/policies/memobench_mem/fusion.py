@@ -1,4 +1,8 @@
-"""How actions read memory: the interface `MemoryFusion`, and its two kinds, modulation and context."""
+"""How actions read memory tokens: the interface `MemoryFusion`, and its two kinds.
+
+`Modulation` scales and shifts what every layer of the action expert feeds forward (RoboMME's modulator); `Context` puts
+memory into the prefix. Shapes: B rows, L memory tokens, W width of the action expert, T action tokens.
+"""
 
 from __future__ import annotations
 
@@ -45,10 +49,8 @@ class MemoryFusion(ABC):
         return name
 
 
-# ==== modulation.py
-# Modulation: memory scales and shifts what every layer of the action expert feeds forward (RoboMME's modulator).
-#
-# Shapes: B rows, L memory tokens, W width of the action expert, T action tokens.
+# -- modulation -------------------------------------------------------------------------------------------------------
+
 
 _ROPE_BASE = 10_000.0
 
@@ -208,8 +210,7 @@ class Modulation(MemoryFusion):
         return re.sub(r"post_attention_layernorm\.(dense|weight)", r"post_attention_layernorm.norm.\1", name)
 
 
-# ==== context.py
-# Context: memory tokens join the prefix, behind images and language.
+# -- context ----------------------------------------------------------------------------------------------------------
 
 
 class Context(MemoryFusion):

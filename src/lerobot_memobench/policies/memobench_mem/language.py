@@ -1,6 +1,6 @@
-"""The tokenizers of prompts: a pretrained one, or words from a list built out of the dataset's tasks.
+"""Tokenizers of text prompts (pretrained, or of words from the dataset's tasks), and frozen text encoders of subgoals.
 
-What either of them loses is told: words that it does not know, and what its length cuts off.
+A tokenizer warns of what it loses: words that it does not know, and what its length cuts off.
 """
 
 from __future__ import annotations
@@ -164,8 +164,7 @@ class WordTokenizerProcessorStep(PromptTokenizerProcessorStep):
         return super().get_config() | {"vocabulary": self.vocabulary}
 
 
-# ==== text_encoders.py
-# The frozen encoders that turn subgoals into training targets.
+# -- frozen text encoders of subgoals ---------------------------------------------------------------------------------
 
 
 class WordTextEncoder:

@@ -1,7 +1,7 @@
 """``memobench_mem``: LeRobot's pi0.5 with a visual memory, trained with or without aligning it to subgoal texts.
 
-The policy from its construction to an update (``forward``) and to an action (``select_action``). The network that it
-trains and asks for actions is `network`; what training adds to it is `training`; what a checkpoint holds, `checkpoints`.
+The policy from its construction to an update (``forward``) and to an action (``select_action``). Its network is in
+`network`, parts of training in `training`, model checkpoints in `checkpoints`.
 """
 
 from __future__ import annotations
@@ -279,9 +279,9 @@ class MemobenchMemPolicy(PI05Policy):
         if self.config.encodes_ahead and self.training and any(key in batch for key in self.config.image_features):
             raise MemobenchError(
                 "The training batch has pictures, which this policy does not read (they were encoded before training), "
-                "because a stream or loader processes made it, or because another policy is trained on the same dataset "
-                "object: pass --num_workers=0, which is quicker too, leave dataset.streaming out, and open the dataset "
-                "once for each policy."
+                "because a stream or loader processes made it, or because another policy is trained on the same "
+                "dataset object: pass --num_workers=0, which is quicker too, leave dataset.streaming out, and open the "
+                "dataset once for each policy."
             )
 
     def _read_memory(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor] | None:
@@ -319,9 +319,9 @@ class MemobenchMemPolicy(PI05Policy):
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Return the next action of every row (B, A), normalised.
 
-        Every row uses up its own chunk: ``n_action_steps`` of it, or all (``full_chunk_when_stalled``). A chunk is planned
-        from that row alone, so rows of a batch are independent, when the row's execution begins or its last chunk is
-        used up. In the prompt phase, where actions have no effect, and for frozen rows nothing is planned.
+        Every row uses up its own chunk: ``n_action_steps`` of it, or all (``full_chunk_when_stalled``). A chunk is
+        planned from that row alone, so rows of a batch are independent, when the row's execution begins or its last
+        chunk is used up. In the prompt phase, where actions have no effect, and for frozen rows nothing is planned.
         """
         self.thread.check()
         if self.training:  # a millisecond, if it were said at every step

@@ -46,7 +46,7 @@ OWN = ("memory.", "state_token.", "instruction.", "paligemma_with_expert.percept
 
 
 class MemoryPI05(PI05Pytorch):
-    """LeRobot's pi0.5 model at a policy's dimensions, with a memory: `set_memory`, then ``forward`` or ``sample_actions``.
+    """LeRobot's pi0.5 at a policy's dimensions, with a memory: `set_memory`, then ``forward`` or ``sample_actions``.
 
     Attributes:
         memory: encoder of remembered frames to memory tokens. fusion: how actions read these; None: plain pi0.5.
@@ -174,7 +174,7 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
         self.perception = self._perception(config)
 
     def _perception(self, config: MemobenchMemConfig) -> ObservationEncoder:
-        """Build the configuration's encoder of observations, in the place of pi0.5's image tower where it is another."""
+        """Build the encoder of observations, in the place of pi0.5's image tower where it is another."""
         vlm = self.paligemma.model
         if config.uses_visual_encoder:
             # The policy loads its weights.
@@ -191,7 +191,7 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
         config.object_classes = config.object_classes or list(classes())
         slots = config.object_classes, config.tokens_per_frame, config.dimensions.vlm.width
         if config.detector is not None:
-            # Noise is for privileged object state alone: a policy that was trained by it goes on by detections as they are.
+            # Noise is for privileged object state alone: a policy that was trained by it goes on without.
             return DetectionEncoder(ObjectsFromPictures(load_detector(config.detector)), *slots)
         return ObjectEncoder(*slots, config.detection_noise)
 

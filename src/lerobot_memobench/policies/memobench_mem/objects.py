@@ -1,6 +1,8 @@
-"""Slots of objects as tokens: where each thing is, in the world and from the hand, through a small network.
+"""Encoders of objects: the slots of `sim.object_slots`, each a token, from privileged object state or from detections.
 
-A slot is a row of `sim.object_slots`; the hand's pose is the robot's state before it is normalised. All places are m.
+An object's pose is told in the world and from the hand, whose pose is the robot's state before it is normalised. A
+remembered frame is stored as numbers (slots, robot state, phase), and pooled to tokens by learned attention. All places
+are m.
 """
 
 from __future__ import annotations
@@ -69,7 +71,7 @@ def slot_features(slots: Tensor, hand: Tensor) -> Tensor:
 
 
 class SlotEncoder(nn.Module):
-    """A vector for each thing in slots, through a network of two layers; what is absent costs nothing.
+    """A vector for each object in slots, through a network of two layers; empty slots cost nothing.
 
     Args:
         order: for each class index of today's slots, that of the classes it was trained with, or the number of these.
@@ -96,16 +98,14 @@ class SlotEncoder(nn.Module):
         return made, there
 
 
-# ==== objects.py
-# Objects: the slots of `sim.object_slots` instead of pictures; a remembered frame keeps them as numbers.
-#
-# What is stored of a frame is what was seen, and what becomes of it is learned: slots, robot state and phase, one row.
+# -- object state -----------------------------------------------------------------------------------------------------
+
 
 OBS_RAW_STATE, OBS_PHASE = "observation.raw_state", "observation.phase"
 
 
 def frame_row(slots: Tensor, state: Tensor, phase: Tensor) -> Tensor:
-    """Return what is stored of N frames, (N, 1, SIZE + 6 + 1): slots (N, SIZE), state (N, >= 6) and phase (N,)."""
+    """Return N stored frames (N, 1, SIZE + 6 + 1) of slots (N, SIZE), state (N, >= 6) and phase (N,)."""
     row = torch.cat([slots, state[:, :HAND_DIM], phase.reshape(-1, 1).to(slots.dtype)], dim=1)
     return rearrange(row, "n d -> n 1 d")
 
@@ -118,10 +118,10 @@ def in_slots(made: Tensor, there: Tensor, empty: float = 0.0) -> Tensor:
 
 
 class ObjectPool(nn.Module):
-    """A stored frame to a few tokens of unit size: its things, pooled by learned attention.
+    """A stored frame to a few tokens of unit size: its objects, pooled by learned attention.
 
-    As these layers begin, what was seen comes out several times smaller than when it was seen, which the encoder adds
-    to it. At unit size, 400 updates chose the right one of three bowls at 85 % of moments, instead of at 58 %.
+    As these layers begin, their output is several times smaller than the encoding of time that is added to it. At unit
+    size, 400 updates chose the right one of three bowls at 85 % of frames, instead of at 58 %.
     """
 
     def __init__(self, order: Sequence[int], kinds: int, tokens: int, width: int, noise: float = 0.0) -> None:
@@ -140,7 +140,7 @@ class ObjectPool(nn.Module):
             slots = with_detection_noise(slots, hand, self.noise)
         made, there = self.slot(slots, hand)
         score = self.score(made)
-        # A finite score keeps a frame in which nothing is seen finite: it becomes zeros.
+        # A finite score keeps a frame without objects finite: it becomes zeros.
         scores, values = in_slots(score, there, -1e4), in_slots(made, there)
         pooled = torch.einsum("nsk,nsd->nkd", scores.softmax(dim=1), values)
         kept: Tensor = self.out(pooled + self.phase(phase).unsqueeze(1))
@@ -148,10 +148,10 @@ class ObjectPool(nn.Module):
 
 
 class ObjectEncoder(nn.Module, ObservationEncoder):
-    """A token per thing that is seen now; what is remembered are the numbers themselves, for `ObjectPool`.
+    """A token per present object; a remembered frame is its numbers, for `ObjectPool`.
 
     Args:
-        trained: names of the classes that it knows, in order of their indices.
+        trained: names of the classes that it was trained with, in order of their indices.
         tokens_per_frame: memory tokens of a frame. width: of all tokens.
         noise: size of the detection noise that is added to slots while it learns; 0: none.
     """
@@ -169,10 +169,10 @@ class ObjectEncoder(nn.Module, ObservationEncoder):
         self.slot = SlotEncoder(self.order, self.kinds, 2 * width, width)
 
     def present(self, batch: Mapping[str, Tensor]) -> PrefixParts:
-        """Return what is seen now: slots and hand (B, n WIDTH + 6), and which of the n slots hold something (B, n).
+        """Return slots and hand (B, n WIDTH + 6), and which of the n slots hold an object (B, n).
 
         A batch to learn from has as many slots as the fullest of its samples; elsewhere there are all of them, so that
-        what is done does not depend on what else is in the batch.
+        a row does not depend on the others.
         """
         slots = batch[OBS_ENV_STATE].to(torch.float32).unflatten(1, (SLOTS, WIDTH))
         hand = batch[OBS_RAW_STATE][:, :HAND_DIM].to(slots)
@@ -196,7 +196,7 @@ class ObjectEncoder(nn.Module, ObservationEncoder):
         return in_slots(made * LOUD, there)
 
     def pool(self) -> ObjectPool:
-        """Return what makes a stored frame's tokens."""
+        """Return the pool of stored frames."""
         return ObjectPool(self.order, self.kinds, self.tokens_per_frame, self.dim, self.noise)
 
     def memory(self, encoder: nn.Module) -> nn.Module:
@@ -204,27 +204,24 @@ class ObjectEncoder(nn.Module, ObservationEncoder):
         return PooledMemoryEncoder(self.pool(), encoder)
 
 
-# ==== found.py
-# Objects that eyes find in the present pictures, in the place of those that the environment tells.
-#
-# All that learns is as in `objects`, so a policy that was trained on the environment's objects acts from pictures too.
-# Detector are no part of the policy: a checkpoint names them, and others may be given to it.
+# -- detections -------------------------------------------------------------------------------------------------------
+
 
 DETECTED = f"{ENCODED}objects"
-"""Name in a training sample of what was found in its pictures, (B, SIZE)."""
+"""Name of the detections (B, SIZE) in a training sample."""
 VIEWS = {f"{OBS_IMAGES}.{name}": camera for name, camera in CAMERAS.items()}
-"""Picture at the policy -> camera."""
+"""Name of a picture at the policy -> camera."""
 
 
 class ObjectsFromPictures:
-    """Find objects in pictures by the policy's names of these."""
+    """Detections in pictures by their names at the policy, as slots."""
 
     def __init__(self, detector: Detector) -> None:
         self._detector, self._locate = detector, ObjectLocalizer(detector)
 
     @cached_property
     def key(self) -> str:
-        """Identity of what is found: weights, and size of the pictures."""
+        """Identity of the detections: weights, and size of the pictures."""
         return f"{fingerprint({'detector': self._detector})}-{SIDE}x{SIDE}-objects-{SIZE}"
 
     def __call__(self, pictures: Mapping[str, Tensor], states: Tensor) -> Tensor:
@@ -240,28 +237,31 @@ class ObjectsFromPictures:
                 )
         device = next(self._detector.parameters()).device
         views = {camera: pictures[name].to(device) for name, camera in VIEWS.items()}
-        with torch.autocast(device.type, enabled=False):  # mixed precision would see otherwise than training did
+        with torch.autocast(device.type, enabled=False):  # mixed precision would differ from training
             return self._locate(views, states).to(states.device)
 
 
 class DetectionEncoder(ObjectEncoder):
-    """A token per thing that is found now; what is remembered are its numbers.
+    """A token per object that is detected in the present pictures, in the place of privileged object state.
+
+    All that learns is as in `ObjectEncoder`, so a policy that was trained on privileged object state acts from pictures
+    too. The detector is no part of the policy: a checkpoint names it, and another may be given to it.
 
     Args:
-        look: no module, so that a checkpoint has no part of it.
+        detect: no module, so that a checkpoint has no part of it.
         trained, tokens_per_frame, width: as of `ObjectEncoder`.
     """
 
     memory_input = next(iter(VIEWS))
     pictures = True
 
-    def __init__(self, look: ObjectsFromPictures, trained: Sequence[str], tokens_per_frame: int, width: int) -> None:
+    def __init__(self, detect: ObjectsFromPictures, trained: Sequence[str], tokens_per_frame: int, width: int) -> None:
         super().__init__(trained, tokens_per_frame, width)
-        self.look = look
-        self.key = look.key
+        self.detect = detect
+        self.key = detect.key
 
     def present(self, batch: Mapping[str, Tensor]) -> PrefixParts:
-        """Return what `ObjectEncoder.present` does, of what was found in the batch's pictures, or is now."""
+        """Return what `ObjectEncoder.present` does, of detections in the batch or in its pictures."""
         return super().present(self._with_objects(batch))
 
     def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
@@ -271,5 +271,5 @@ class DetectionEncoder(ObjectEncoder):
         return super().remember(self._with_objects(chosen), range(len(rows)))
 
     def _with_objects(self, batch: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
-        found = batch[DETECTED] if DETECTED in batch else self.look(batch, batch[OBS_RAW_STATE])
+        found = batch[DETECTED] if DETECTED in batch else self.detect(batch, batch[OBS_RAW_STATE])
         return {**batch, OBS_ENV_STATE: found}

@@ -126,14 +126,6 @@ def _tokenizer(config: MemobenchMemConfig, meta: Any | None) -> TokenizerProcess
     return WordTokenizerProcessorStep(vocabulary=make_vocabulary(texts, config.dimensions.vocabulary), **options)
 
 
-# ==== gather_memory.py
-# Memory, phase and subgoals of training samples, looked up in the feature cache.
-#
-# LeRobot keeps of a training batch only what its transition knows, and that is the frame's global ``index``; phase,
-# subgoals and history are therefore all looked up by it. Rollouts carry no ``index``; there the policy itself keeps the
-# history.
-
-
 def gathering(config: MemobenchMemConfig) -> dict[str, Any]:
     """Return the fields of a policy's `GatherMemoryProcessorStep`."""
     same = ("align", "subgoal_level", "shuffle_subgoals", "shuffle_seed", "memory")
@@ -146,8 +138,11 @@ def gathering(config: MemobenchMemConfig) -> dict[str, Any]:
 class GatherMemoryProcessorStep(ProcessorStep):
     """Add history, phase and subgoal embeddings to training samples; leave observations of a rollout alone.
 
+    LeRobot keeps of a training batch only what its transition knows, which is the frame's global ``index``; all is
+    looked up by it in the feature cache. Rollouts carry no ``index``; there the policy itself keeps the history.
+
     Adds ``memory.tokens`` (B, F, P, D), ``memory.steps`` (B, F) int64, ``memory.mask`` (B, F) bool, ``phase`` (B,),
-    what eyes saw in the frames (``observation.seen.*``), and with an alignment ``memory.text`` and
+    features of the frames (``observation.encoded.*``), and with an alignment ``memory.text`` and
     ``memory.text_mask``: (B, d_t) and (B,) for the frame itself, or with ``framewise`` (B, F, d_t) and (B, F) for the
     frames of the history. With ``frames`` 0 (``memory_fusion=none``) there is no history.
 
@@ -243,10 +238,6 @@ class GatherMemoryProcessorStep(ProcessorStep):
         return features
 
 
-# ==== oracle_memory.py
-# Ground-truth memory text in the prompt, one of the paper's controls.
-
-
 @dataclass
 @ProcessorStepRegistry.register(name="memobench_oracle_memory")
 class OracleMemoryProcessorStep(ProcessorStep):
@@ -302,14 +293,12 @@ class OracleMemoryProcessorStep(ProcessorStep):
         return features
 
 
-# ==== raw_state.py
-# The robot's state in metres and radians, beside the normalised one: places of objects are told from the hand.
-
-
 @dataclass
 @ProcessorStepRegistry.register(name="memobench_raw_state")
 class RawStateProcessorStep(ObservationProcessorStep):
-    """Keep the state (B, n) as it is, as ``observation.raw_state``; before it is normalised."""
+    """Copy the state (B, n), m and rad, to ``observation.raw_state``, before it is normalised: objects' places are told
+    from the hand.
+    """
 
     def observation(self, observation: dict) -> dict:
         """Return the observation with its state twice."""

@@ -194,7 +194,8 @@ def task_weights(
     is the episode's instruction.
 
     Args:
-        meta: the dataset's metadata. episodes: (E + 1,) first frame of each episode, and N. phase: (N,) 0 in the prompt.
+        meta: the dataset's metadata. episodes: (E + 1,) first frame of each episode, and N.
+        phase: (N,) 0 in the prompt.
         weights: by task name, memory type or ``prompted``; the first of them that a task has counts, and else 1.
 
     Raises:
@@ -342,8 +343,8 @@ def check_transforms(policy: Any, transformed: bool) -> None:
     """
     if transformed and getattr(policy, "encodes_ahead", False):
         raise MemobenchError(
-            "dataset.image_transforms.enable=true would change nothing: this policy's pictures are encoded once, before "
-            "training; leave it out (detectors and visual encoders are trained on changed pictures), or use "
+            "dataset.image_transforms.enable=true would change nothing: this policy's pictures are encoded once, "
+            "before training; leave it out (detectors and visual encoders are trained on changed pictures), or use "
             "policy.visual_encoder=random, which encodes the pictures of each sample."
         )
 

@@ -1,8 +1,12 @@
-"""How actions are learned: by flow matching, as in pi0.5, or by regression, through the same passes of the same model.
+"""Parts of training: the loss of actions, sums over the ranks of a distributed run, the weights' average, the curve.
 
-Flow matching learns the velocity ``noise - actions`` at every time between the two, and a plan follows it from drawn
-noise. Regression asks at one place only, zero noise at time 1: the velocity there is minus the actions, and one Euler
-step ends at them.
+Actions are learned by flow matching, as in pi0.5, or by regression, through the same passes of the same model. Flow
+matching learns the velocity ``noise - actions`` at every time between the two, and a chunk follows it from drawn noise.
+Regression asks at one place only, zero noise at time 1: the velocity there is minus the actions, and one Euler step
+ends at them.
+
+LeRobot trains several processes with DDP, which averages gradients over them. All that ranks count together here is
+made for that average: it is then the gradient of the joint batch. Every rank must come by at the same time.
 """
 
 from __future__ import annotations
@@ -48,9 +52,6 @@ def losses_of(objective: str, squared: Tensor) -> Tensor:
     return squared + (squared + _SMOOTH).sqrt() if objective == REGRESSION else squared
 
 
-# ==== action_loss.py
-# Which actions of a batch count in the loss, and its mean over them.
-
 ACTION_IS_PAD = "action_is_pad"
 
 
@@ -89,12 +90,7 @@ def mean_losses(losses: Tensor, counted: Tensor) -> ActionLoss:
     return ActionLoss(per_sample, per_sample.sum() / samples, per_dim)
 
 
-# ==== ranks.py
-# What the ranks of a distributed run count together, so that a batch shared among them is one batch.
-#
-# LeRobot trains several processes with DDP, which averages gradients over them. All here is made for that average: it
-# is then the gradient of the joint batch, and no factor is left to anybody else. Every rank must come by at the same
-# time; with one process nothing is done.
+# -- ranks ------------------------------------------------------------------------------------------------------------
 
 
 def world_size() -> int:
@@ -160,8 +156,7 @@ class _Gather(torch.autograd.Function):
         return gradient[ctx.own], None
 
 
-# ==== averaging.py
-# Exponential moving average of the trained weights, which evaluation uses (paper: decay 0.999).
+# -- average of the weights -------------------------------------------------------------------------------------------
 
 
 class WeightAverage:
@@ -250,8 +245,8 @@ class WeightAverage:
         return [name for name in self.parameters if f"weights.{name}" not in tensors]
 
 
-# ==== training_curve.py
-# How the losses of a training run fell: kept beside each checkpoint as numbers and as a picture.
+# -- curve of the losses ----------------------------------------------------------------------------------------------
+
 
 PICTURE, NUMBERS = "training_curve.png", "training_curve.json"
 WINDOW = 10
@@ -313,7 +308,3 @@ class TrainingCurve:
             told = read_json(folder / NUMBERS, dict[str, Any], "remove it; the curve then begins anew")
             found.points, found.held_out = told["points"], told.get("held_out", [])
         return found
-
-
-# ==== schedule.py
-# The learning rate of the paper's recipe, as a schedule of LeRobot's.

@@ -1,13 +1,10 @@
-"""What stays of the frames that were seen? One file per mechanism, the same in training and in a rollout."""
+"""Memory mechanisms, one file each, by their names. `mechanism` is their interface, `encoder` makes memory tokens."""
 
 from __future__ import annotations
 
 from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import FrameSampling
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryMechanism
 from lerobot_memobench.policies.memobench_mem.memory.none import NoMemory
-
-# ==== registry.py
-# Which memory mechanisms are there?
 
 MECHANISMS: dict[str, type[MemoryMechanism]] = {NoMemory.name: NoMemory, FrameSampling.name: FrameSampling}
 

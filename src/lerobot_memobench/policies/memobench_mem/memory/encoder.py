@@ -1,6 +1,6 @@
-"""From frames to memory tokens: the tokens of a frame, joined with where and when they were seen.
+"""Encoders of remembered frames to memory tokens: a frame's tokens, joined with their time and place in the picture.
 
-Source: spec policy.md, which follows RoboMME's pi0.5 memory module. Shapes: B rows, F frames, P = 16 tokens per frame,
+As RoboMME's pi0.5 memory module. Shapes: B rows, F frames, P = 16 tokens per frame,
 D width of the vision tokens, d_m width of memory tokens.
 """
 
@@ -69,7 +69,7 @@ class MemoryEncoder(nn.Module):
         """
         of_image, of_position = self.project.weight.split([tokens.shape[-1], self.position.out_features], dim=1)
         image = F.linear(tokens.to(of_image.dtype), of_image, self.project.bias)
-        # A training batch gives all its frames one by one (`PooledMemoryEncoder.shared`), seen at a tenth as many steps.
+        # A training batch gives its frames one by one (`PooledMemoryEncoder.shared`), of a tenth as many steps.
         at, places = steps.unique(return_inverse=True) if steps.shape[1] == 1 else (steps, None)
         positions = F.linear(F.silu(self._positions(at)), of_position)
         if places is not None:
@@ -89,10 +89,6 @@ class MemoryEncoder(nn.Module):
         rows = rearrange(F.linear(grid, of_row), "y d -> y 1 d")
         columns = rearrange(F.linear(grid, of_column), "x d -> 1 x d")
         return rearrange(time, "... d -> ... 1 d") + rearrange(rows + columns, "y x d -> (y x) d")
-
-
-# ==== tokens.py
-# Memory tokens as they are read: by each row its own, or made once of what many rows remember.
 
 
 class MemoryTokens(NamedTuple):
@@ -117,10 +113,6 @@ class MemoryTokens(NamedTuple):
         if self.places is None:
             return self.each
         return self.each.index_select(0, self.places.flatten()).unflatten(0, self.places.shape).flatten(1, 2)
-
-
-# ==== pooled_memory.py
-# A memory of frames that are stored as they were seen, and of which it is learned what becomes of each.
 
 
 class PooledMemoryEncoder(nn.Module):

@@ -1,7 +1,7 @@
-"""What a memory mechanism is: what it writes per frame, what it reads per plan, and how large both become.
+"""Interface of memory mechanisms, and the histories that they are asked for: in training and in a rollout.
 
-A mechanism is a rule without weights: it says which frames of an episode stay, and which of them a plan sees. What is
-learned, how those frames become memory tokens, is its encoder, through which gradients flow to every frame read.
+A mechanism is a rule without weights: which frames of an episode are kept, and which of them are read for an action
+chunk. Its encoder, which makes memory tokens of the frames read, is learned.
 """
 
 from __future__ import annotations
@@ -19,10 +19,12 @@ from lerobot_memobench.datasets.feature_cache.reading import FrameLookup
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MEMORY_GRID
 from lerobot_memobench.policies.memobench_mem.memory.encoder import MemoryEncoder
 
+logger = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class Frame:
-    """One moment: its control step since the episode began, and its tokens (P, D) on the CPU."""
+    """A frame: its control step since the episode began, and its tokens (P, D) on the CPU."""
 
     step: int
     tokens: Tensor
@@ -83,8 +85,8 @@ class MemoryMechanism(ABC):
         return MemoryEncoder(image_dim, memory_dim, grid)
 
 
-# ==== batch.py
-# How memory lies in a batch: right-padded rows of frames, and the names by which training samples carry them.
+# -- frames in a batch ------------------------------------------------------------------------------------------------
+
 
 TOKENS, STEPS, MASK = "memory.tokens", "memory.steps", "memory.mask"
 FRAMES = "memory.frames"
@@ -121,8 +123,7 @@ def collate_frames(rows: Sequence[Sequence[Frame]], frames: int) -> MemoryBatch:
     return batch
 
 
-# ==== training.py
-# The memory of training samples: a mechanism recalls it from the dataset's feature cache.
+# -- training: frames of a feature cache ------------------------------------------------------------------------------
 
 
 class CachedEpisode:
@@ -142,10 +143,7 @@ def recall_at(cache: FrameLookup, mechanism: MemoryMechanism, episode: int, fram
     return mechanism.recall(CachedEpisode(cache, episode), frame // cache.meta.stride)
 
 
-# ==== rollout.py
-# The memory of a rollout: a mechanism writes what the rows of a vector environment see, each by its own clock.
-
-logger = logging.getLogger(__name__)
+# -- rollouts: frames of the rows of a vector environment -------------------------------------------------------------
 
 
 @dataclass
