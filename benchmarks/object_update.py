@@ -24,12 +24,12 @@ from lerobot.utils.constants import OBS_ENV_STATE
 from policies import config, remembered, training_batch, updates
 from turns import medians
 
-from lerobot_memobench.computing.freed_memory import keep_freed_memory
 from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, MASK, STEPS, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE, frame_row
+from lerobot_memobench.policies.memobench_mem.training import keep_freed_memory
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH
 
 REMEMBERED, THINGS = 50, 10

@@ -21,13 +21,13 @@ import torch
 from policies import config, remembered, training_batch, updates
 from turns import medians
 
-from lerobot_memobench.computing.freed_memory import keep_freed_memory
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, WIDTH
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import encoded_key
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, MASK, STEPS, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.network import attend_fused
+from lerobot_memobench.policies.memobench_mem.training import keep_freed_memory
 
 SLOTS = 50
 """Remembered frames of an episode: its prompt, and an execution of 250 steps."""

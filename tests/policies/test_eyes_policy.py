@@ -1,4 +1,4 @@
-"""Pictures through a visual encoder, by LeRobot's own doors: settings, caches, samples, training, rollouts, checkpoints."""
+"""Pictures through a visual encoder, by LeRobot's own doors: settings, caches, samples, training, rollouts."""
 
 from __future__ import annotations
 

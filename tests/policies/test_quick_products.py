@@ -1,17 +1,62 @@
-"""Products in bfloat16 while a policy learns: when they are on, and that the same is learned."""
+"""Products in bfloat16 while a policy learns: where a CPU is quicker by them, when they are on, what is learned."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
 
-from lerobot_memobench.computing import bfloat16
+from lerobot_memobench.policies.memobench_mem import training
 from tests.support.object_dataset import make_object_dataset
 from tests.support.small_policy import batch_of, made_for_training
 
 OBJECTS = {"perception": "objects", "size": "small", "n_action_steps": 3, "memory_stride": 1}
+
+
+@pytest.fixture(autouse=True)
+def asked_anew() -> Iterator[None]:
+    training.quicker_in_bfloat16.cache_clear()
+    yield
+    training.quicker_in_bfloat16.cache_clear()
+
+
+@pytest.mark.parametrize("instructions", ["avx512_bf16", "amx_bf16"])
+@pytest.mark.parametrize("slower", [0.5, 0.7, 0.9, 1.0, 2.0])
+def test_they_are_taken_where_they_are_clearly_quicker(
+    slower: float, instructions: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    products = torch.backends.mkldnn.matmul
+    usual = products.fp32_precision
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {instructions: True})
+    monkeypatch.setattr(training, "_seconds", lambda: slower if products.fp32_precision == "bf16" else 1.0)
+    assert training.quicker_in_bfloat16() == (slower < 0.8)
+    assert products.fp32_precision == usual
+
+
+@pytest.mark.parametrize("known", [{}, {"avx512_bf16": False, "avx512_f": True}])
+def test_a_cpu_without_instructions_for_them_is_not_tried(
+    known: dict[str, bool], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: known)
+    monkeypatch.setattr(training, "_seconds", lambda: pytest.fail("it was tried"))
+    assert not training.quicker_in_bfloat16()
+
+
+def test_the_trial_multiplies_in_both_and_puts_everything_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    products, multiply = torch.backends.mkldnn.matmul, training._seconds
+    usual, tried = products.fp32_precision, set()
+
+    def seconds() -> float:
+        tried.add(products.fp32_precision)
+        return multiply()
+
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True})
+    monkeypatch.setattr(training, "_seconds", seconds)
+    training.quicker_in_bfloat16()
+    assert tried == {"ieee", "bf16"}
+    assert products.fp32_precision == usual
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +71,7 @@ def settings() -> tuple[str, bool]:
 @pytest.mark.parametrize("quick", [True, False])
 def test_they_are_on_within_a_pass(root: Path, quick: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """What another policy computes between a forward pass, its backward pass and its update, is computed as ever."""
-    monkeypatch.setattr(bfloat16, "quicker_in_bfloat16", lambda: quick)
+    monkeypatch.setattr(training, "quicker_in_bfloat16", lambda: quick)
     policy, before, _, dataset = made_for_training(root, **OBJECTS)
     batch = before(batch_of(dataset, [10, 30, 50]))
     usual, during = settings(), ("bf16", False) if quick else settings()
@@ -41,7 +86,7 @@ def test_they_are_on_within_a_pass(root: Path, quick: bool, monkeypatch: pytest.
         assert (seen, settings()) == ([during], usual)
         loss.sum().backward()
         assert (seen, settings()) == ([during, during], usual)
-    with pytest.raises(RuntimeError), bfloat16.quick_products():
+    with pytest.raises(RuntimeError), training.quick_products():
         raise RuntimeError
     assert settings() == usual
 
@@ -52,7 +97,7 @@ def test_the_same_is_learned(root: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     batch = before(batch_of(dataset, list(range(8, 38)) * 8))
     found = []
     for on in (True, False):
-        monkeypatch.setattr(bfloat16, "quicker_in_bfloat16", lambda on=on: on)
+        monkeypatch.setattr(training, "quicker_in_bfloat16", lambda on=on: on)
         policy.zero_grad()
         loss, _ = policy.train().forward(batch)
         loss.backward()

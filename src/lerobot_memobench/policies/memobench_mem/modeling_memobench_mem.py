@@ -25,8 +25,6 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from transformers.initialization import no_init_weights
 
-from lerobot_memobench.computing.bfloat16 import quick_gradients, quick_products
-from lerobot_memobench.computing.freed_memory import keep_freed_memory
 from lerobot_memobench.datasets.feature_cache.reading import RecordedFrames
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.weights import load_visual_encoder
@@ -69,10 +67,13 @@ from lerobot_memobench.policies.memobench_mem.training import (
     TrainingCurve,
     WeightAverage,
     counted_actions,
+    keep_freed_memory,
     losses_of,
     mean_losses,
     means_over_ranks,
     noise_and_time,
+    quick_gradients,
+    quick_products,
 )
 from lerobot_memobench.protocol import EXECUTION, PROMPT
 

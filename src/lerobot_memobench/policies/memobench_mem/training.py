@@ -1,4 +1,4 @@
-"""Parts of training: the loss of actions, sums over the ranks of a distributed run, the weights' average, the curve.
+"""Parts of training: the actions' loss, ranks of a distributed run, the weights' average, the curve, speed on a CPU.
 
 Actions are learned by flow matching, as in pi0.5, or by regression, through the same passes of the same model. Flow
 matching learns the velocity ``noise - actions`` at every time between the two, and a chunk follows it from drawn noise.
@@ -11,9 +11,13 @@ made for that average: it is then the gradient of the joint batch. Every rank mu
 
 from __future__ import annotations
 
+import ctypes
 import json
+import platform
+import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -308,3 +312,92 @@ class TrainingCurve:
             told = read_json(folder / NUMBERS, dict[str, Any], "remove it; the curve then begins anew")
             found.points, found.held_out = told["points"], told.get("held_out", [])
         return found
+
+
+# -- speed on a CPU --------------------------------------------------------------------------------------------------
+
+INSTRUCTIONS = ("avx512_bf16", "amx_bf16")
+CLEARLY = 0.8
+"""Share of float32's time that products in bfloat16 may take at most: the same machine decides the same each time."""
+
+
+@cache
+def quicker_in_bfloat16() -> bool:
+    """Return whether this CPU is clearly quicker by instructions for products in bfloat16; not where torch cannot tell.
+
+    It is tried once, in some 70 ms: of two CPUs with ``avx512_bf16`` an AMD EPYC made twice as many a second as in
+    float32, an Intel Xeon without AMX no more.
+    """
+    # LeRobot takes torch from 2.7 on, which could not be asked yet.
+    known: dict[str, bool] = getattr(torch.cpu, "get_capabilities", dict)()
+    if not any(known.get(name, False) for name in INSTRUCTIONS):
+        return False
+    products = torch.backends.mkldnn.matmul
+    before, seconds = products.fp32_precision, dict.fromkeys(("ieee", "bf16"), float("inf"))
+    try:
+        for precision in [*seconds] * 6:
+            products.fp32_precision = precision
+            seconds[precision] = min(seconds[precision], _seconds())
+    finally:
+        products.fp32_precision = before
+    return seconds["bf16"] < CLEARLY * seconds["ieee"]
+
+
+def _seconds() -> float:
+    """Return how long a product takes."""
+    left, right = torch.ones(1024, 512), torch.ones(512, 512)
+    start = time.perf_counter()
+    left @ right
+    return time.perf_counter() - start
+
+
+@contextmanager
+def quick_products() -> Iterator[None]:
+    """While this lasts, round the factors of products to bfloat16, if that is quicker on this CPU.
+
+    Weights, gradients, sums and all that is no product stay float32. Attention in one kernel, whose small products
+    suffer, is left out, and a policy that learns by it (`network.attend_fused`) does without. The setting is torch's and
+    the process's, so it is on within a pass only, forward or backward.
+    """
+    if not quicker_in_bfloat16():
+        yield
+        return
+    products = torch.backends.mkldnn.matmul
+    before = products.fp32_precision, torch.backends.cuda.flash_sdp_enabled()  # of the CPU's kernel, too
+    products.fp32_precision = "bf16"
+    torch.backends.cuda.enable_flash_sdp(False)
+    try:
+        yield
+    finally:
+        products.fp32_precision, fused = before
+        torch.backends.cuda.enable_flash_sdp(fused)
+
+
+def quick_gradients(loss: Tensor) -> None:
+    """Let a loss's backward pass be computed with `quick_products`."""
+
+    def begin(_: Tensor) -> None:
+        passing = ExitStack()
+        passing.enter_context(quick_products())
+        torch.autograd.Variable._execution_engine.queue_callback(passing.close)  # when the pass has ended
+
+    if loss.requires_grad:
+        loss.register_hook(begin)
+
+
+_TRIM_THRESHOLD, _TOP_PAD, _MMAP_THRESHOLD = -1, -2, -3  # of glibc's malloc.h
+_LARGEST = 32 << 20
+"""What glibc allows at most of what it does not map one by one, bytes."""
+
+
+def keep_freed_memory() -> None:
+    """Let this process's malloc hold on to what is freed; nothing where the C library is not glibc.
+
+    Else it goes back to the system and comes anew, page by page. A small policy's update frees and takes some hundred
+    MB; without the pages' faults it took 16 % less.
+    """
+    if platform.libc_ver()[0] != "glibc":
+        return
+    libc = ctypes.CDLL(None)
+    for parameter, value in ((_MMAP_THRESHOLD, _LARGEST), (_TRIM_THRESHOLD, 2**31 - 1), (_TOP_PAD, 8 * _LARGEST)):
+        libc.mallopt(parameter, value)
