@@ -103,7 +103,7 @@ def test_a_prompt_within_reset_ends_with_the_objects_of_the_execution() -> None:
     np.testing.assert_array_equal(*shown)
 
 
-@pytest.mark.parametrize("obs_type", [OBJECTS, BOTH])
+@pytest.mark.parametrize("obs_type", [pytest.param(OBJECTS, marks=pytest.mark.slow), BOTH])
 def test_batches_of_one_and_three_sync_and_async(obs_type: str, gl: str, tmp_path: Path) -> None:
     def roll(env: gym.vector.VectorEnv, seeds: list[int]) -> dict[str, Any]:
         env.reset(seed=seeds)

@@ -55,7 +55,7 @@ def roll(env: gym.vector.VectorEnv) -> list[dict[str, Any]]:
     return steps
 
 
-@pytest.mark.parametrize("use_async", [False, True])
+@pytest.mark.parametrize("use_async", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_logged_row_ends_at_once_and_the_others_are_what_they_were(tmp_path: Path, use_async: bool) -> None:
     whole = vector(tmp_path / "whole", resume=False)
     reference = roll(whole)
