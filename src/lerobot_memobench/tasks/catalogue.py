@@ -281,7 +281,7 @@ def load_task(folder: str | Path, require_metadata: bool = True) -> Task:
         suite=metadata.suite(),
         derived_from=metadata.text("derived_from") or None,
         drawn=metadata.flag("drawn"),
-        spoilt_as=metadata.failure_class("spoilt_as"),
+        spoilt_as=metadata.spoilt_as(),
     )
 
 

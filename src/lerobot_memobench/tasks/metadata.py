@@ -13,7 +13,7 @@ untouched.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast, get_args
 
@@ -85,19 +85,23 @@ class Metadata:
         """Return an optional text, "" where it is not given."""
         return _text(self.data, key, str(self.path))
 
+    def _choice(self, key: str, allowed: Sequence[str], default: str | None = None) -> Any:
+        value = self.data.get(key, default)
+        if value != default and value not in allowed:
+            raise self._error(key, value, f"one of {', '.join(allowed)}")
+        return value
+
     def memory_type(self) -> MemoryType | None:
         """Return the memory type, None where the file does not say it."""
-        value = self.data.get("memory_type")
-        if value is not None and value not in MEMORY_TYPES:
-            raise self._error("memory_type", value, f"one of {', '.join(MEMORY_TYPES)}")
-        return cast(MemoryType | None, value)
+        return cast(MemoryType | None, self._choice("memory_type", MEMORY_TYPES))
 
     def suite(self) -> Suite:
         """Return the suite that the task belongs to: the published one unless the file says another."""
-        value = self.data.get("suite", PUBLISHED)
-        if value not in SUITES:
-            raise self._error("suite", value, f"one of {', '.join(SUITES)}")
-        return cast(Suite, value)
+        return cast(Suite, self._choice("suite", SUITES, PUBLISHED))
+
+    def spoilt_as(self) -> str | None:
+        """Return the class of failure of a strict task that can no longer be solved, None where it is not given."""
+        return cast(str | None, self._choice("spoilt_as", STRICT_FAILURES))
 
     def flag(self, key: str) -> bool:
         """Return an optional truth value, False where it is not given."""
@@ -105,13 +109,6 @@ class Metadata:
         if not isinstance(value, bool):
             raise self._error(key, value, "true or false")
         return value
-
-    def failure_class(self, key: str) -> str | None:
-        """Return an optional class of failure that only strict tasks have, None where it is not given."""
-        value = self.data.get(key)
-        if value is not None and value not in STRICT_FAILURES:
-            raise self._error(key, value, f"one of {', '.join(STRICT_FAILURES)}")
-        return cast(str | None, value)
 
     # --- checkpoints ---
 
