@@ -1,4 +1,4 @@
-"""Pictures through a visual encoder, by LeRobot's own doors: settings, caches, samples, training, rollouts."""
+"""Images through the visual encoder: settings, caches, samples, training, checkpoints; the rest is any perception's."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import threading
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
@@ -30,12 +29,9 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, MA
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from tests.support.picture_rollouts import (
     CAMERAS,
-    acts_as_its_checkpoint,
     observed,
-    refuses_pictures_in_a_batch,
-    trained_and_acted,
 )
-from tests.support.small_policy import batch_of, losses_in_training, made_for_training, small_config
+from tests.support.small_policy import batch_of, made_for_training, small_config
 from tests.support.synthetic_dataset import LENGTHS
 
 FRAME_BYTES = 2 * GRID**2 * WIDTH
@@ -55,7 +51,7 @@ def detector(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def seeing(detector: Path) -> dict[str, Any]:
+def encoder_fields(detector: Path) -> dict[str, Any]:
     return {"size": "small", "visual_encoder": str(detector), "n_action_steps": 3, "memory_stride": 2}
 
 
@@ -70,7 +66,7 @@ def copy(dataset_root: Path, to: Path) -> Path:
 
 
 @pytest.fixture
-def looked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def encoded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """How many pictures each pass of a tower saw."""
     seen: list[int] = []
     original = VisualEncoder.forward
@@ -91,7 +87,7 @@ def apart(one: torch.Tensor, other: torch.Tensor) -> float:
 # -- settings ------------------------------------------------------------------------------------------------------
 
 
-def test_the_packages_eyes_are_the_default_of_small_pixels(tmp_path: Path) -> None:
+def test_the_package_encoder_is_the_default_of_small_pixels(tmp_path: Path) -> None:
     random = MemobenchMemConfig(device="cpu", size="small", visual_encoder="random")
     assert (random.memory_stride, random.frames_per_episode, random.task_weights) == (1, 1, None)
     config = MemobenchMemConfig(device="cpu", size="small")
@@ -121,7 +117,7 @@ def test_bad_settings_are_refused(fields: dict[str, Any], message: str) -> None:
         MemobenchMemConfig(device="cpu", **fields)
 
 
-def test_eyes_that_are_none_are_refused(root: Path, tmp_path: Path) -> None:
+def test_a_file_that_holds_no_encoder_is_refused(root: Path, tmp_path: Path) -> None:
     with pytest.raises(MemobenchError, match=r"there is no file.*python -m research.detector train"):
         cache_dataset(root, small_config(size="small", visual_encoder=str(tmp_path / "absent")))
     save_detector(
@@ -135,10 +131,14 @@ def test_eyes_that_are_none_are_refused(root: Path, tmp_path: Path) -> None:
 
 
 def test_both_are_made_once_and_their_size_is_told_before(
-    dataset_root: Path, tmp_path: Path, seeing: dict[str, Any], looked: list[int], monkeypatch: pytest.MonkeyPatch
+    dataset_root: Path,
+    tmp_path: Path,
+    encoder_fields: dict[str, Any],
+    encoded: list[int],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     root, told = copy(dataset_root, tmp_path / "data"), []
-    folder = cache_dataset(root, small_config(**seeing), tell=lambda said: told.append((said, len(looked))))
+    folder = cache_dataset(root, small_config(**encoder_fields), tell=lambda said: told.append((said, len(encoded))))
     made = {path.name.rsplit("-", 1)[0]: (path / "tokens.bin").stat().st_size for path in (root / FOLDER).glob("*/")}
     assert folder.name.rsplit("-", 1)[0] == "small-stride2"
     slots = sum(-(-length // 2) for length in LENGTHS)
@@ -147,21 +147,21 @@ def test_both_are_made_once_and_their_size_is_told_before(
     assert told[0][1] == 0
     assert "94 frames" in told[0][0]
     assert "24.0 KiB of each of 2 pictures of a frame, and 6.0 KiB of every frame that is remembered" in told[0][0]
-    assert sum(looked) == sum(LENGTHS) * len(CAMERAS), "the memory is made of what was seen, and not looked at again"
+    assert sum(encoded) == sum(LENGTHS) * len(CAMERAS), "the memory is made of what was seen, and not encoded again"
 
     def refuse(*_: Any, **__: Any) -> None:
         raise AssertionError("a video was opened")
 
     monkeypatch.setattr("lerobot.datasets.dataset_reader.decode_video_frames", refuse)
     monkeypatch.setattr("lerobot_memobench.datasets.feature_cache.building.frame_reader", refuse)
-    looked.clear()
-    policy, before, _, dataset = made_for_training(root, **seeing)
+    encoded.clear()
+    policy, before, _, dataset = made_for_training(root, **encoder_fields)
     assert policy.forward(before(batch_of(dataset, [10, 30])))[0].isfinite()
-    assert looked == []
+    assert encoded == []
 
 
 def test_a_cache_that_was_killed_is_finished(
-    dataset_root: Path, tmp_path: Path, seeing: dict[str, Any], root: Path, monkeypatch: pytest.MonkeyPatch
+    dataset_root: Path, tmp_path: Path, encoder_fields: dict[str, Any], root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     killed = copy(dataset_root, tmp_path / "data")
     passes = iter(range(4))
@@ -175,23 +175,23 @@ def test_a_cache_that_was_killed_is_finished(
     with monkeypatch.context() as patched:
         patched.setattr(VisualEncoder, "forward", kill)
         with pytest.raises(KeyboardInterrupt):
-            cache_dataset(killed, small_config(**seeing), batch_size=40)
+            cache_dataset(killed, small_config(**encoder_fields), batch_size=40)
     for where in (killed, root):
-        cache_dataset(where, small_config(**seeing), batch_size=40)
+        cache_dataset(where, small_config(**encoder_fields), batch_size=40)
     made = [path.relative_to(killed) for path in killed.glob(f"{FOLDER}/*/tokens.bin")]
     assert len(made) == 3
     assert all((killed / path).read_bytes() == (root / path).read_bytes() for path in made)
 
 
 def test_of_two_trainings_each_looks_at_one_camera(
-    dataset_root: Path, tmp_path: Path, seeing: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+    dataset_root: Path, tmp_path: Path, encoder_fields: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root, original = copy(dataset_root, tmp_path / "data"), VisualEncoder.forward
     begun, waits, go = threading.Event(), threading.Event(), threading.Event()
-    looked = {"first": 0, "second": 0}
+    encoded = {"first": 0, "second": 0}
 
     def held(tower: VisualEncoder, images: torch.Tensor) -> torch.Tensor:
-        looked[threading.current_thread().name] += len(images)
+        encoded[threading.current_thread().name] += len(images)
         if threading.current_thread().name == "first":
             begun.set()
             assert go.wait(60)
@@ -200,40 +200,44 @@ def test_of_two_trainings_each_looks_at_one_camera(
     monkeypatch.setattr(VisualEncoder, "forward", held)
     monkeypatch.setattr(building.logger, "warning", lambda *_: waits.set())
     first, second = (
-        threading.Thread(target=cache_dataset, args=(root, small_config(**seeing)), name=name, daemon=True)
-        for name in looked
+        threading.Thread(target=cache_dataset, args=(root, small_config(**encoder_fields)), name=name, daemon=True)
+        for name in encoded
     )
     first.start()
     assert begun.wait(60)
     second.start()
     assert waits.wait(60)
-    assert looked["second"] == sum(LENGTHS)
+    assert encoded["second"] == sum(LENGTHS)
     go.set()
     first.join(60)
     second.join(60)
-    assert looked == {"first": sum(LENGTHS), "second": sum(LENGTHS)}
+    assert encoded == {"first": sum(LENGTHS), "second": sum(LENGTHS)}
     assert len(list((root / FOLDER).glob("*/tokens.bin"))) == len(CAMERAS) + 1
 
 
 def test_a_disk_without_room_for_all_is_told_before_any_is_made(
-    dataset_root: Path, tmp_path: Path, seeing: dict[str, Any], looked: list[int], monkeypatch: pytest.MonkeyPatch
+    dataset_root: Path,
+    tmp_path: Path,
+    encoder_fields: dict[str, Any],
+    encoded: list[int],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     root, usage = copy(dataset_root, tmp_path / "data"), shutil.disk_usage(tmp_path)
     room = 2 * sum(LENGTHS) * FRAME_BYTES  # for the present pictures, and not for the memory
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=room))
     with pytest.raises(MemobenchError, match=r"4\.7 MiB are needed there and 4\.4 MiB are free.*feature_cache_dir"):
-        cache_dataset(root, small_config(**seeing))
-    assert looked == []
+        cache_dataset(root, small_config(**encoder_fields))
+    assert encoded == []
     assert not (root / FOLDER).exists()
 
 
-def test_caches_of_other_eyes_lie_beside_and_elsewhere(
-    dataset_root: Path, tmp_path: Path, seeing: dict[str, Any]
+def test_caches_of_other_encoders_lie_beside_and_elsewhere(
+    dataset_root: Path, tmp_path: Path, encoder_fields: dict[str, Any]
 ) -> None:
     root, place = copy(dataset_root, tmp_path / "data"), tmp_path / "caches"
     others = made_detector(tmp_path / "others.safetensors", 2)
-    for file in (seeing["visual_encoder"], str(others)):
-        cache_dataset(root, small_config(**seeing | {"visual_encoder": file, "feature_cache_dir": str(place)}))
+    for file in (encoder_fields["visual_encoder"], str(others)):
+        cache_dataset(root, small_config(**encoder_fields | {"visual_encoder": file, "feature_cache_dir": str(place)}))
     assert len([path for path in place.iterdir() if path.is_dir()]) == 6
     assert not (root / FOLDER).exists()
 
@@ -241,8 +245,8 @@ def test_caches_of_other_eyes_lie_beside_and_elsewhere(
 # -- samples -------------------------------------------------------------------------------------------------------
 
 
-def test_a_sample_has_tokens_in_the_place_of_pictures(root: Path, seeing: dict[str, Any]) -> None:
-    policy, before, _, dataset = made_for_training(root, **seeing)
+def test_a_sample_has_tokens_in_the_place_of_pictures(root: Path, encoder_fields: dict[str, Any]) -> None:
+    policy, before, _, dataset = made_for_training(root, **encoder_fields)
     sample, lerobots = dataset[45], DatasetReader.get_item.__wrapped__(dataset.reader, 45)
     assert not set(CAMERAS) & sample.keys()
     assert set(policy.config.image_features) == set(CAMERAS)
@@ -254,10 +258,10 @@ def test_a_sample_has_tokens_in_the_place_of_pictures(root: Path, seeing: dict[s
     assert len(batch[FRAMES].unique()) < batch[MASK].sum(), "moments of an episode share frames"
 
 
-def test_pictures_that_are_changed_are_refused(root: Path, seeing: dict[str, Any]) -> None:
+def test_pictures_that_are_changed_are_refused(root: Path, encoder_fields: dict[str, Any]) -> None:
     from lerobot_memobench.run.training import trained_on
 
-    policy, _, _, dataset = made_for_training(root, **seeing)
+    policy, _, _, dataset = made_for_training(root, **encoder_fields)
     dataset.set_image_transforms(lambda picture: 1 - picture)
     with pytest.raises(MemobenchError, match=r"image_transforms.*leave it out.*policy\.visual_encoder=random"):
         dataset[0]
@@ -271,36 +275,16 @@ def test_pictures_that_are_changed_are_refused(root: Path, seeing: dict[str, Any
         lerobot_train.make_train_eval_datasets(TrainPipelineConfig(dataset=data, policy=policy.config))
 
 
-def test_pictures_in_a_batch_are_refused(root: Path, seeing: dict[str, Any]) -> None:
-    refuses_pictures_in_a_batch(root, seeing)
-
-
 # -- training and rollouts see alike -------------------------------------------------------------------------------
-
-
-def test_a_rollout_sees_and_remembers_what_training_reads(root: Path, seeing: dict[str, Any]) -> None:
-    made = made_for_training(root, **seeing)
-    trained, acted, tokens = trained_and_acted(root, made)
-    policy = made[0]
-    (of_cache, _), (of_pictures, _) = (policy.perception.present(batch) for batch in (trained, acted))
-    for one, other in ((trained[TOKENS], tokens), *zip(of_cache, of_pictures, strict=True)):
-        assert apart(one, other) <= ROUNDED
-    assert apart(of_cache[0], of_cache[1]) > 4 * ROUNDED, "cameras see differently"
-    assert apart(tokens[0, 0], tokens[0, 7]) > 4 * ROUNDED, "so do moments"
-    words = ("observation.language.tokens", "observation.language.attention_mask")
-    prefixes = [
-        policy.model.embed_prefix(*policy._preprocess_images(batch), *(batch[key] for key in words))
-        for batch in (trained, acted)
-    ]
-    assert prefixes[0][0].shape[1] == 2 * GRID**2 + 1 + trained[words[1]].sum(), "both pictures, the state, the words"
-    assert apart(prefixes[0][0], prefixes[1][0]) <= ROUNDED
 
 
 @pytest.mark.parametrize(
     "fields", [{"align": "framewise"}, {"memory_fusion": "context"}, {"memory_fusion": "none"}], ids=str
 )
-def test_every_kind_trains_and_the_tower_does_not(root: Path, seeing: dict[str, Any], fields: dict[str, Any]) -> None:
-    policy, before, _, dataset = made_for_training(root, **seeing | fields)
+def test_every_kind_trains_and_the_tower_does_not(
+    root: Path, encoder_fields: dict[str, Any], fields: dict[str, Any]
+) -> None:
+    policy, before, _, dataset = made_for_training(root, **encoder_fields | fields)
     policy.train().forward(before(batch_of(dataset, [10, 30, 50, 80])))[0].backward()
     learning = {id(parameter) for parameter in policy.get_optim_params()}
     assert not any(id(parameter) in learning for parameter in policy.perception.tower.parameters())
@@ -310,7 +294,7 @@ def test_every_kind_trains_and_the_tower_does_not(root: Path, seeing: dict[str, 
 
 
 def test_attention_in_one_kernel_learns_the_same_and_acts_by_lerobots(
-    root: Path, seeing: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+    root: Path, encoder_fields: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fused: list[bool] = []
 
@@ -319,7 +303,7 @@ def test_attention_in_one_kernel_learns_the_same_and_acts_by_lerobots(
         return scaled_dot_product_attention(*tensors, **named)
 
     monkeypatch.setattr(network, "scaled_dot_product_attention", counting)
-    policy, before, _, dataset = made_for_training(root, **seeing)
+    policy, before, _, dataset = made_for_training(root, **encoder_fields)
     batch = before(batch_of(dataset, [10, 30, 50]))
     layers = [module for module in policy.modules() if isinstance(module, modeling_gemma.GemmaAttention)]
     found = []
@@ -342,42 +326,17 @@ def test_attention_in_one_kernel_learns_the_same_and_acts_by_lerobots(
     assert not fused
 
 
-def test_loss_falls(root: Path, seeing: dict[str, Any]) -> None:
-    policy, before, _, dataset = made_for_training(root, **seeing | {"chunk_size": 4, "memory_frames": 4})
-    losses = losses_in_training(policy, before(batch_of(dataset, [*range(8, 38, 4)])), updates=30)
-    assert np.mean(losses[-5:]) < 0.5 * np.mean(losses[:5])
-
-
-def test_pictures_are_looked_at_where_they_are_remembered_or_acted_upon(
-    root: Path, seeing: dict[str, Any], looked: list[int]
-) -> None:
-    policy, before, _, dataset = made_for_training(root, **seeing | {"memory_stride": 4})
-    looked.clear()
-    counts = []
-    for index in range(8):
-        policy.select_action(before(observed(root, dataset, index)))
-        counts.append(sum(looked))
-        looked.clear()
-    assert counts == [3, 0, 0, 2, 1, 0, 2, 0], "two for each plan of three actions, one for every fourth frame"
-
-
-def test_an_observation_without_a_camera_is_told(root: Path, seeing: dict[str, Any]) -> None:
-    policy, before, _, dataset = made_for_training(root, **seeing)
-    seen = observed(root, dataset, 0)
-    del seen[CAMERAS[1]]
-    with pytest.raises(MemobenchError, match=r"no 'observation\.images\.wrist_image'.*rename_map"):
-        policy.select_action(before(seen))
-
-
 # -- checkpoints ---------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
-def saved(root: Path, seeing: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Any, Any, Path]:
+def saved(
+    root: Path, encoder_fields: dict[str, Any], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Any, Any, Any, Path]:
     """A policy whose encoder's file is gone since, as they are where a checkpoint is taken to."""
     folder = tmp_path_factory.mktemp("checkpoint")
-    file = shutil.copy(seeing["visual_encoder"], folder / "detector.safetensors")
-    policy, before, after, dataset = made_for_training(root, **seeing | {"visual_encoder": str(file)})
+    file = shutil.copy(encoder_fields["visual_encoder"], folder / "detector.safetensors")
+    policy, before, after, dataset = made_for_training(root, **encoder_fields | {"visual_encoder": str(file)})
     policy.train().forward(before(batch_of(dataset, [10, 30])))
     policy.update()
     for part in (policy, before, after):
@@ -386,12 +345,8 @@ def saved(root: Path, seeing: dict[str, Any], tmp_path_factory: pytest.TempPathF
     return policy, before, dataset, folder / "pretrained_model"
 
 
-def test_a_checkpoint_holds_its_tower_and_acts_as_the_policy_did(saved: tuple[Any, ...], root: Path) -> None:
-    acts_as_its_checkpoint(root, *saved)
-
-
-def test_training_goes_on_through_the_tower_of_the_checkpoint(
-    saved: tuple[Any, ...], root: Path, looked: list[int]
+def test_training_resumes_with_the_encoder_of_the_checkpoint(
+    saved: tuple[Any, ...], root: Path, encoded: list[int]
 ) -> None:
     _, _, dataset, folder = saved
     config = PreTrainedConfig.from_pretrained(folder)
@@ -399,10 +354,10 @@ def test_training_goes_on_through_the_tower_of_the_checkpoint(
     again = make_policy(config, ds_meta=dataset.meta)
     pre, _ = make_pre_post_processors(config, pretrained_path=str(folder))
     again.train().forward(pre(batch_of(dataset, [10, 60])))[0].backward()
-    assert looked == [], "its caches are found by its tower"
+    assert encoded == [], "its caches are found by its tower"
 
 
-def test_other_eyes_than_a_checkpoint_was_trained_through_are_refused(saved: tuple[Any, ...], detector: Path) -> None:
+def test_another_encoder_than_a_checkpoint_was_trained_with_is_refused(saved: tuple[Any, ...], detector: Path) -> None:
     folder = saved[3]
     for other in (str(detector), "package"):
         config = PreTrainedConfig.from_pretrained(folder, cli_overrides=[f"--visual_encoder={other}"])
