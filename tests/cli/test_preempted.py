@@ -10,11 +10,12 @@ import subprocess
 import sys
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
+from lerobot_memobench.errors import MemobenchError
 from tests.support.object_dataset import make_object_dataset
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are looked up in /proc")
@@ -112,6 +113,25 @@ def test_the_handler_goes_with_the_command() -> None:
     assert signal.getsignal(signal.SIGTERM) is before
 
 
+@pytest.mark.parametrize(("words", "begins"), [(["cache", "nowhere"], "go on"), (["tasks", "--json"], "begin anew")])
+def test_what_a_command_says(words: list[str], begins: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    from lerobot_memobench.cli import memobench
+
+    said: list[str] = []
+
+    @contextlib.contextmanager
+    def saying(how: Callable[[], str]) -> Iterator[None]:
+        said.append(how())
+        raise MemobenchError("not now")
+        yield
+
+    monkeypatch.setattr(memobench, "saying_how_to_go_on", saying)
+    monkeypatch.setattr(memobench, "use_threads", lambda role: None)
+    assert memobench.main(words) == 2
+    assert said == [f"memobench: ended by SIGTERM; {begins} with: {shlex.join(['memobench', *words])}"]
+
+
+@pytest.mark.slow
 def test_demonstrations(tmp_path: Path) -> None:
     words = ["generate", "--out", "my data", "--tasks", STOVE, "--no-images", "--episodes", "200", "--workers", "2"]
     job = Job(["-m", COMMANDS["memobench"], *words], tmp_path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import builtins
 import ctypes.util
+import json
 import platform
 import shutil
 import sys
@@ -14,7 +15,10 @@ import numpy as np
 import pytest
 from packaging.specifiers import SpecifierSet
 
+from lerobot_memobench.cli.console import console
+from lerobot_memobench.cli.demo import finding_table
 from lerobot_memobench.doctor import examination
+from lerobot_memobench.doctor.examination import Finding, exit_status
 from lerobot_memobench.doctor.probe import SIDE, TOLERANCE, difference, read_golden, render_golden, run_probe, shrink
 from lerobot_memobench.sim.rendering import BACKENDS
 
@@ -189,3 +193,15 @@ def test_shrinking_averages_blocks() -> None:
     image = np.zeros((2 * SIDE, 2 * SIDE, 3), dtype=np.uint8)
     image[::2] = 100
     assert (shrink(image) == 50).all()
+
+
+def test_the_exit_status_and_the_table() -> None:
+    findings = [Finding("a", "ok", "x"), Finding("b", "warning", "[y]", "do z")]
+    assert exit_status(findings) == 0
+    assert exit_status([*findings, Finding("c", "failed", "w", "v")]) == 1
+    screen = console()
+    with screen.capture() as capture:
+        screen.print(finding_table(findings))
+    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in capture.get().splitlines() if "│" in line]
+    assert rows == [["a", "ok", "x"], ["b", "warning", "[y]"], ["", "", "fix: do z"]]
+    assert json.dumps([finding.as_dict() for finding in findings])

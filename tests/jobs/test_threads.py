@@ -179,7 +179,7 @@ print(torch.get_num_threads(), os.environ.get("OPENBLAS_NUM_THREADS"), os.enviro
 @pytest.mark.parametrize(
     ("module", "begin", "call", "found"),
     [
-        ("run.lerobot_commands", "load_command", 'load_command("eval")', "1 1 1"),
+        pytest.param("run.lerobot_commands", "load_command", 'load_command("eval")', "1 1 1", marks=pytest.mark.slow),
         ("cli.memobench", "main", 'main(["tasks", "--help"])', "1 1 1"),
         ("jobs.processes", "process_pool", "", None),
     ],

@@ -211,7 +211,9 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return found
 
 
-@pytest.mark.parametrize(("words", "prompts"), [([], False), (["prompt_frames=true"], True)])
+@pytest.mark.parametrize(
+    ("words", "prompts"), [([], False), pytest.param(["prompt_frames=true"], True, marks=pytest.mark.slow)]
+)
 def test_lerobot_train(words: list[str], prompts: bool, root: Path, tmp_path: Path, trained: list[int]) -> None:
     assert main(["train", *WORDS, *words, f"dataset={root}", f"output_dir={tmp_path / 'run'}"]) == 0
     assert len(trained) >= sum(LENGTHS) - PROMPTS[1]  # an epoch

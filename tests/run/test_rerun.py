@@ -242,7 +242,7 @@ def command_lines(draw: st.DrawFn) -> list[str]:
     return ["env=memobench", f"policy={policy}", *(f"{key}={draw(known[key])}" for key in keys)]
 
 
-@settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=20, suppress_health_check=[HealthCheck.too_slow])
 @given(command_lines())
 def test_a_card_that_we_write_is_repeated(line: list[str]) -> None:
     plan = plan_line([*line, "output_dir=out"])

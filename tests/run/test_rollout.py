@@ -121,7 +121,7 @@ CASES: dict[str, tuple[str, dict[str, Any], list[int]]] = {
 }
 
 
-@pytest.mark.parametrize("rows", [1, 3])
+@pytest.mark.parametrize("rows", [pytest.param(1, marks=pytest.mark.slow), 2])
 @pytest.mark.parametrize("case", [*CASES, "act"])
 def test_a_rollout_is_lerobots(case: str, rows: int, drawn: list[int], tmp_path: Path) -> None:
     name, fields, looked = CASES.get(case, ("act", ACT, []))
@@ -159,14 +159,13 @@ DIFFUSION = {"down_dims": (16, 32), "num_inference_steps": 2, "horizon": 8, "n_g
 DIFFUSION |= {"diffusion_step_embed_dim": 16, "crop_shape": (84, 84), "pretrained_backbone_weights": None}
 
 
-@pytest.mark.parametrize("obs_type", [OBJECTS, BOTH])
 @pytest.mark.parametrize(
-    ("name", "fields", "spares"),
+    ("name", "fields", "spares", "obs_type"),
     [
-        ("act", ACT, True),
-        ("diffusion", DIFFUSION, False),
-        ("memobench_expert", {}, True),
-        ("memobench_random", {}, True),
+        ("act", ACT, True, BOTH),
+        ("diffusion", DIFFUSION, False, OBJECTS),
+        ("memobench_expert", {}, True, OBJECTS),
+        ("memobench_random", {}, True, BOTH),
     ],
 )
 def test_a_rollout_on_objects_is_lerobots(
@@ -189,7 +188,7 @@ def test_a_memory_of_pictures_refuses_to_be_shown_objects_alone(tmp_path: Path) 
         rolled(lerobot_eval.rollout, 1, tmp_path, "memobench_mem", obs_type=OBJECTS, **MEMORY)
 
 
-@pytest.mark.parametrize("use_async", [False, True])
+@pytest.mark.parametrize("use_async", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_what_nobody_watches_is_not_drawn(use_async: bool, tmp_path: Path) -> None:
     """By the word of a vector environment, in this process or in workers, until the next reset."""
     config = MemobenchEnvConfig(tasks=HIGHLIGHT, demonstration_prompt=False, render="fast", log_dir=str(tmp_path))

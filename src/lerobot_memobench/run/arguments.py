@@ -149,7 +149,7 @@ HELP: dict[str, tuple[HelpRow, ...]] = {
             "all at once, processes",
         ),
         HelpRow(
-            "align=, size=, perception=",
+            "align=, size=, perception=, visual_encoder=",
             "of a policy named by its type, as in lerobot train; a checkpoint keeps its own, and others are refused",
             "the type's",
         ),
@@ -168,6 +168,7 @@ HELP: dict[str, tuple[HelpRow, ...]] = {
             "detector=",
             "with perception=objects: package or a file, the detector that finds them in pictures",
         ),
+        HelpRow("visual_encoder=", "with perception=pixels at size=small: package, a file, or random"),
         HelpRow("replan=", "actions executed per prediction at evaluation"),
         HelpRow(
             "obs_type=",
