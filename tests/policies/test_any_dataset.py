@@ -201,7 +201,7 @@ def test_a_memory_camera_is_one_that_is_seen(tmp_path: Path) -> None:
 # --- what is not there ---
 
 
-@pytest.mark.parametrize("size", ["tiny", "small"])
+@pytest.mark.parametrize("size", ["tiny", pytest.param("small", marks=pytest.mark.slow)])
 def test_no_memory_makes_no_feature_cache(size: str, tmp_path: Path) -> None:
     robot = Foreign()
     root = robot.write(tmp_path / "data")

@@ -1,7 +1,8 @@
-"""Plans asked for chunk by chunk: LeRobot's real-time chunking, and callers that act several steps on one plan."""
+"""The rows of a rollout: their action queues, one thread, and LeRobot's real-time chunking."""
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,88 @@ from lerobot.rollout.inference.rtc import supports_rtc_inference
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MASK, STEPS
+from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import ActionQueues
 from tests.support.object_dataset import make_object_dataset
 from tests.support.small_policy import made_for_training
+
+STATE = torch.tensor([0.1, 0.2, 1.0, 3.13, 0.1, 0.0, 0.04, -0.04])
+AXIS = torch.tensor([0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0])
+
+
+def carried_out(*states: torch.Tensor | None) -> list[int]:
+    """Return how much is carried out of plans of 16 actions, made one after another where the robot is so."""
+    plans, counts = ActionQueues(7), []
+    plans.resize(1)
+    for state in states:
+        plans.begin(0, torch.zeros(16, 7), 6, state)
+        counts.append(len(plans.queues[0]))
+        plans.queues[0].clear()
+    return counts
+
+
+def moved(index: int, by: float) -> torch.Tensor:
+    return STATE + by * torch.eye(8)[index]
+
+
+@pytest.mark.parametrize(
+    "where", [STATE, moved(2, 0.005), moved(6, 0.005), moved(4, 0.05), STATE - 2 * STATE * AXIS * 1.0035]
+)
+def test_a_hand_that_stands_still_carries_out_all(where: torch.Tensor) -> None:
+    """The last one is turned by nearly the same angle, past half a turn: its axis points the other way."""
+    assert carried_out(STATE, where) == [6, 16]
+
+
+@pytest.mark.parametrize("where", [moved(2, 0.01), moved(7, 0.01), moved(4, 0.2)])
+def test_a_hand_or_a_finger_that_moves_carries_out_some(where: torch.Tensor) -> None:
+    assert carried_out(STATE, where) == [6, 6]
+
+
+def test_without_a_state_and_after_a_plan_was_dropped_it_is_some() -> None:
+    assert carried_out(None, None) == [6, 6]
+    plans = ActionQueues(7)
+    plans.resize(1)
+    plans.begin(0, torch.zeros(16, 7), 6, STATE)
+    plans.drop(0)
+    plans.begin(0, torch.zeros(16, 7), 6, STATE)
+    assert len(plans.queues[0]) == 6
+
+
+# -- one thread -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def acting(dataset_root: Path) -> Any:
+    policy, before, _, dataset = made_for_training(dataset_root, memory_frames=2)
+    item = dataset[0]
+    observed = {k: v[None] for k, v in item.items() if k.startswith("observation.") and isinstance(v, torch.Tensor)}
+    batch = before(observed | {"task": [item["task"]]})
+    return policy, lambda: policy.select_action(batch)
+
+
+def test_a_rollout_in_another_thread_is_refused_and_not_mixed(acting: Any) -> None:
+    """What LeRobot does with env.max_parallel_tasks=2."""
+    policy, act = acting
+    policy.reset()
+    act()
+    with ThreadPoolExecutor(1) as other:
+        other.submit(policy.reset).result()
+        other.submit(act).result()
+        with pytest.raises(MemobenchError, match="max_parallel_tasks=1"):
+            act()
+
+
+def test_rollouts_one_after_the_other_may_come_from_any_thread(acting: Any) -> None:
+    policy, act = acting
+    for _ in range(2):
+        with ThreadPoolExecutor(1) as other:
+            other.submit(policy.reset).result()
+            assert other.submit(act).result().shape == (1, 7)
+    policy.reset()
+    act()
+    act()
+
+
+# -- real-time chunking -----------------------------------------------------------------------------------------------
 
 OBJECTS: dict[str, Any] = {"perception": "objects", "size": "small", "n_action_steps": 3, "memory_stride": 2}
 
