@@ -58,8 +58,13 @@ Progress = Callable[[int, int], None]
 class FrameEncoder(Protocol):
     """The frozen visual encoder: images (N, 3, H, W) in [0, 1], or what else is read -> tokens (N, P, D) bfloat16."""
 
-    tokens_per_frame: int
-    dim: int
+    @property
+    def tokens_per_frame(self) -> int:
+        """P."""
+
+    @property
+    def dim(self) -> int:
+        """D."""
 
     @property
     def key(self) -> str:

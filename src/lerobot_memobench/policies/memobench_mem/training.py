@@ -332,7 +332,7 @@ def quicker_in_bfloat16() -> bool:
     known: dict[str, bool] = getattr(torch.cpu, "get_capabilities", dict)()
     if not any(known.get(name, False) for name in INSTRUCTIONS):
         return False
-    products = torch.backends.mkldnn.matmul
+    products = torch.backends.mkldnn.matmul  # type: ignore[attr-defined]  # torch sets it late
     before, seconds = products.fp32_precision, dict.fromkeys(("ieee", "bf16"), float("inf"))
     try:
         for precision in [*seconds] * 6:
@@ -362,7 +362,7 @@ def quick_products() -> Iterator[None]:
     if not quicker_in_bfloat16():
         yield
         return
-    products = torch.backends.mkldnn.matmul
+    products = torch.backends.mkldnn.matmul  # type: ignore[attr-defined]  # torch sets it late
     before = products.fp32_precision, torch.backends.cuda.flash_sdp_enabled()  # of the CPU's kernel, too
     products.fp32_precision = "bf16"
     torch.backends.cuda.enable_flash_sdp(False)
