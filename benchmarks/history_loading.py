@@ -32,8 +32,8 @@ from turns import medians, peak, reset_peak, resident
 from lerobot_memobench.datasets.feature_cache.building import build_feature_cache
 from lerobot_memobench.datasets.feature_cache.layout import FOLDER
 from lerobot_memobench.datasets.feature_cache.reading import FeatureCache
+from lerobot_memobench.policies.memobench_mem.alignment import WordTextEncoder
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import SIZES
-from lerobot_memobench.policies.memobench_mem.language import WordTextEncoder
 from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import sample_frames
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import GatherMemoryProcessorStep
 

@@ -18,9 +18,8 @@ from lerobot.policies import make_pre_post_processors
 from lerobot_memobench.datasets.feature_cache.layout import FOLDER
 from lerobot_memobench.datasets.feature_cache.reading import FeatureCache
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem.alignment import SEVERAL, shuffled_subgoals, text_rows
+from lerobot_memobench.policies.memobench_mem.alignment import SEVERAL, WordTextEncoder, shuffled_subgoals, text_rows
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
-from lerobot_memobench.policies.memobench_mem.language import WordTextEncoder
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.memory_text import with_memory
@@ -78,7 +77,7 @@ def test_plain_policies_read_no_memory_text(dataset_root: Path) -> None:
 
 def test_six_checkpoints_fit_into_the_prompt() -> None:
     """The longest memory of the catalogue is not cut off by the word tokenizer's length."""
-    from lerobot_memobench.policies.memobench_mem.language import words
+    from lerobot_memobench.policies.memobench_mem.alignment import words
     from lerobot_memobench.tasks.catalogue import get_task, task_names
     from lerobot_memobench.tasks.memory_text import memory_text
 

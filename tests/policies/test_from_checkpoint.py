@@ -20,9 +20,8 @@ from lerobot.scripts.lerobot_train import train
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.language import WordTokenizerProcessorStep
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import gathering
+from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import WordTokenizerProcessorStep, gathering
 from tests.support.small_policy import batch_of
 
 

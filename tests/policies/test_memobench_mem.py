@@ -21,18 +21,17 @@ from safetensors.torch import load_file, save_file
 from lerobot_memobench.datasets.feature_cache.layout import find_cache
 from lerobot_memobench.datasets.feature_cache.reading import FeatureCache
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem import language, modeling_memobench_mem
-from lerobot_memobench.policies.memobench_mem.alignment import make_alignment
-from lerobot_memobench.policies.memobench_mem.language import (
+from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem, processor_memobench_mem
+from lerobot_memobench.policies.memobench_mem.alignment import WordTextEncoder, make_alignment
+from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import sample_frames
+from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import (
+    GatherMemoryProcessorStep,
     PromptTokenizerProcessorStep,
-    WordTextEncoder,
     WordTokenizerProcessorStep,
     make_vocabulary,
     make_word_tokenizer,
 )
-from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import sample_frames
-from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import GatherMemoryProcessorStep
 from tests.support.small_policy import CHUNK, batch_of, made_for_training, small_config
 
 
@@ -510,7 +509,7 @@ def step_of(texts: list[str], length: int = 24) -> WordTokenizerProcessorStep:
 
 
 def test_unknown_words_are_told_once_by_name(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    monkeypatch.setattr(language, "_told", set())
+    monkeypatch.setattr(processor_memobench_mem, "_told", set())
     step = step_of(["Switch the stove on."])
     for _ in range(3):
         step._tokenize_text(["Switch the stove on.", "Switch the stove on twice, then once."])
@@ -518,7 +517,7 @@ def test_unknown_words_are_told_once_by_name(monkeypatch: pytest.MonkeyPatch, ca
     told = caplog.text
     assert "does not know 'twice', 'then', 'once' in 'Switch the stove on twice, then once.'" in told
     monkeypatch.setattr(step, "input_tokenizer", None)  # what has been looked at is not tokenized again
-    language.warn_of_losses(None, "Switch the stove on twice, then once.", 24, full=False)
+    processor_memobench_mem.warn_of_losses(None, "Switch the stove on twice, then once.", 24, full=False)
     step = step_of(["Switch the stove on."])
     step._tokenize_text("Task: Turn the stove on once, State: 1 2;")
     assert "does not know 'turn' in 'Turn the stove on once'" in caplog.messages[1]
@@ -527,7 +526,7 @@ def test_unknown_words_are_told_once_by_name(monkeypatch: pytest.MonkeyPatch, ca
 def test_what_the_token_limit_cuts_off_is_told_once_per_instruction(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(language, "_told", set())
+    monkeypatch.setattr(processor_memobench_mem, "_told", set())
     prompt = "Task: Switch the stove on. Memory: the stove was on, State: {} 12 200;\nAction: "
     step = step_of([prompt], length=14)
     for state in (7, 8, 9):
@@ -548,7 +547,7 @@ def test_what_the_token_limit_cuts_off_is_told_once_per_instruction(
 def test_the_pretrained_tokenizer_tells_what_it_cuts_off(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(language, "_told", set())
+    monkeypatch.setattr(processor_memobench_mem, "_told", set())
     words = make_word_tokenizer(make_vocabulary(["put the bowl"], 1024))
     step = PromptTokenizerProcessorStep(tokenizer=words, max_length=3)
     step._tokenize_text(["put the bowl"])

@@ -21,7 +21,7 @@ from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.envs.episode_log import read_episodes, read_protocol_file
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.policies.memobench_mem.language import make_vocabulary, make_word_tokenizer
+from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import make_vocabulary, make_word_tokenizer
 from lerobot_memobench.protocol import EXECUTION, PROMPT
 from lerobot_memobench.run.lerobot_commands import call_lerobot
 from lerobot_memobench.sim.object_layout import SIZE

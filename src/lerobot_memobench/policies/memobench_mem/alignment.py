@@ -1,17 +1,20 @@
-"""Objectives that align memory tokens with the text of the current subgoal (paper, appendix on alignment).
+"""Alignment of memory tokens with the text of the current subgoal: objectives, loss, texts and their encoders.
 
-All are used in training only. H (B, L, d_m) are memory tokens, the mask (B, L) marks the real ones, T are text
-embeddings of width d_t. Vectors with a hat in the paper are L2-normalised; so are they here.
+From the paper's appendix on alignment; all in training only. H (B, L, d_m) are memory tokens, the mask (B, L) marks the
+real ones, T are text embeddings of width d_t. Vectors with a hat in the paper are L2-normalised; so are they here.
 """
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import logging
 import math
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -357,3 +360,93 @@ def shuffled_subgoals(rows: np.ndarray, episodes: np.ndarray, seed: int = 7) -> 
         replace = dict(zip(replaced.tolist(), by.tolist(), strict=True))
         shuffled[start:end] = [replace.get(row, -1) for row in rows[start:end].tolist()]
     return shuffled, elsewhere
+
+
+# -- frozen text encoders of subgoals ---------------------------------------------------------------------------------
+
+
+_WORD = re.compile(r"\w+|[^\w\s]")
+
+
+def words(text: str) -> list[str]:
+    """Lower-case words and punctuation marks of a text."""
+    return _WORD.findall(text.lower())
+
+
+class WordTextEncoder:
+    """Fixed embeddings of texts as sums of one random vector per word and per pair of neighbouring words.
+
+    Equal texts get equal vectors, different ones (nearly always) cosines well below 0.99. Needs no weights.
+    """
+
+    def __init__(self, dim: int) -> None:
+        self.dim = dim
+
+    @property
+    def key(self) -> str:
+        """Identity of the embeddings."""
+        return f"words-1-{self.dim}"
+
+    def _vector(self, token: str) -> Tensor:
+        seed = int.from_bytes(hashlib.blake2b(token.encode(), digest_size=7).digest(), "big")
+        return torch.randn(self.dim, generator=torch.Generator().manual_seed(seed))
+
+    def __call__(self, texts: Sequence[str]) -> Tensor:
+        """(N, dim) float32, normalised."""
+        rows = []
+        for text in texts:
+            tokens = words(text)
+            pairs = [f"{first} {second}" for first, second in itertools.pairwise(tokens)]
+            rows.append(torch.stack([self._vector(token) for token in [*tokens, *pairs]]).sum(dim=0))
+        return F.normalize(torch.stack(rows), dim=-1)
+
+
+class SiglipTextEncoder:
+    """SigLIP's text tower from a folder or the hub; (N, 1152) for So400m, as in the paper."""
+
+    def __init__(self, name: str, dim: int, device: str = "cpu") -> None:
+        self.name, self.dim, self.device = name, dim, device
+
+    @property
+    def key(self) -> str:
+        """Identity of the embeddings: the model's name, wherever it lies."""
+        return f"siglip-{self.name.rstrip('/').rsplit('/', 1)[-1]}-{self.dim}"
+
+    @torch.no_grad()
+    def __call__(self, texts: Sequence[str]) -> Tensor:
+        """Pooled text features (N, dim) float32.
+
+        Raises:
+            MemobenchError: the weights cannot be loaded, or have another width.
+        """
+        tokenizer, model = self._load()
+        rows = []
+        for part in itertools.batched(texts, 64):
+            # SigLIP was trained with every text padded to 64 tokens.
+            inputs = tokenizer(list(part), padding="max_length", max_length=64, truncation=True, return_tensors="pt")
+            rows.append(model(inputs["input_ids"].to(self.device)).pooler_output.float().cpu())
+        return torch.cat(rows)
+
+    def _load(self) -> tuple[Any, Any]:
+        """Tokenizer and model."""
+        from transformers import AutoTokenizer, SiglipTextModel
+
+        try:
+            tokenizer = AutoTokenizer.from_pretrained(self.name)
+            model = SiglipTextModel.from_pretrained(self.name, dtype=torch.float32).to(self.device).eval()
+        except (OSError, ValueError) as error:
+            raise MemobenchError(
+                f"The text encoder '{self.name}' could not be loaded ({type(error).__name__}): give a folder with a "
+                "SigLIP model by --policy.text_encoder, or make the hub reachable."
+            ) from error
+        if model.config.hidden_size != self.dim:
+            raise MemobenchError(
+                f"The text encoder '{self.name}' gives {model.config.hidden_size} numbers per text and this size "
+                f"needs {self.dim}; choose another with --policy.text_encoder."
+            )
+        return tokenizer, model
+
+
+def make_text_encoder(name: str, dim: int, device: str = "cpu") -> WordTextEncoder | SiglipTextEncoder:
+    """``words`` gives the built-in encoder, anything else is a SigLIP model's folder or repository."""
+    return WordTextEncoder(dim) if name == "words" else SiglipTextEncoder(name, dim, device)

@@ -40,6 +40,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import in_words
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, WIDTH, VisualEncoder
 from lerobot_memobench.perception.weights import load_detector, load_visual_encoder
+from lerobot_memobench.policies.memobench_mem.alignment import SiglipTextEncoder, WordTextEncoder, make_text_encoder
 from lerobot_memobench.policies.memobench_mem.checkpoints import load_exactly, read_weights
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import (
@@ -49,11 +50,6 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
     VisualTokenEncoder,
     encoded_key,
     seed_parameters,
-)
-from lerobot_memobench.policies.memobench_mem.language import (
-    SiglipTextEncoder,
-    WordTextEncoder,
-    make_text_encoder,
 )
 from lerobot_memobench.policies.memobench_mem.network import SizedPaliGemmaWithExpert
 from lerobot_memobench.policies.memobench_mem.objects import (

@@ -1,8 +1,14 @@
-"""Pre- and post-processing of ``memobench_mem``: pi0.5's steps, plus the memory of training samples."""
+"""Pre- and post-processing of ``memobench_mem``: pi0.5's steps, memory of training samples, tokenizers of text prompts.
+
+A tokenizer is a pretrained one, or of words from the dataset's tasks. It warns of what it loses: words that it does not
+know, and what its length cuts off.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,6 +30,11 @@ from lerobot.processor import (
     make_policy_processor_pipelines,
 )
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
+from tokenizers import Regex, Tokenizer
+from tokenizers.models import WordLevel
+from tokenizers.normalizers import Lowercase
+from tokenizers.pre_tokenizers import Split
+from tokenizers.processors import TemplateProcessing
 from torch import Tensor
 
 from lerobot_memobench.datasets.feature_cache.reading import FrameLookup, RecordedFrames
@@ -32,14 +43,10 @@ from lerobot_memobench.policies.memobench_mem.alignment import (
     text_rows,
     texts_of_frames,
     texts_of_histories,
+    words,
 )
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import ENCODED
-from lerobot_memobench.policies.memobench_mem.language import (
-    PromptTokenizerProcessorStep,
-    WordTokenizerProcessorStep,
-    make_vocabulary,
-)
 from lerobot_memobench.policies.memobench_mem.memory import make_mechanism
 from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import FrameSampling
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
@@ -56,6 +63,8 @@ from lerobot_memobench.policies.memobench_mem.memory.none import NoMemory
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE
 from lerobot_memobench.policies.memobench_mem.sampler import TrainingRun, prompt_texts, require_cache, training_run
 from lerobot_memobench.tasks.memory_text import MARK, with_memory
+
+logger = logging.getLogger(__name__)
 
 
 def make_memobench_mem_pre_post_processors(
@@ -311,3 +320,133 @@ class RawStateProcessorStep(ObservationProcessorStep):
     ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
         """Leave the features as they are."""
         return features
+
+
+# -- tokenizers of text prompts ---------------------------------------------------------------------------------------
+
+_SPECIAL = ("<pad>", "<unk>", "<bos>", "<eos>")
+
+
+def make_vocabulary(texts: Iterable[str], size: int) -> list[str]:
+    """Words for :class:`WordTokenizerProcessorStep`: special tokens, the prompt's frame, states 0-255, then ``texts``.
+
+    The commonest words stay when there are more than ``size`` in all.
+    """
+    return extend([*_SPECIAL, *"-:;,.", "task", "state", "action", *map(str, range(256))], texts, size)
+
+
+def extend(vocabulary: Sequence[str], texts: Iterable[str], size: int) -> list[str]:
+    """Return a vocabulary and behind it, sorted, the words of ``texts`` that it lacks: the commonest up to ``size``."""
+    counts = Counter(word for text in texts for word in words(text))
+    for word in vocabulary:
+        counts.pop(word, None)
+    ranked = sorted(counts, key=lambda word: (-counts[word], word))
+    return [*vocabulary, *sorted(ranked[: max(0, size - len(vocabulary))])]
+
+
+def make_word_tokenizer(vocabulary: Sequence[str]) -> Any:
+    """A word-level tokenizer from its list of words; unknown words become ``<unk>``. No file and no hub."""
+    from transformers import PreTrainedTokenizerFast  # slow to import, and the other size needs none of it
+
+    number = {word: row for row, word in enumerate(vocabulary)}
+    tokenizer = Tokenizer(WordLevel(number, unk_token="<unk>"))
+    tokenizer.normalizer = Lowercase()
+    tokenizer.pre_tokenizer = Split(Regex(r"\w+|[^\w\s]"), behavior="removed", invert=True)
+    tokenizer.post_processor = TemplateProcessing(single="<bos> $A", special_tokens=[("<bos>", number["<bos>"])])
+    return PreTrainedTokenizerFast(
+        tokenizer_object=tokenizer, pad_token="<pad>", unk_token="<unk>", bos_token="<bos>", eos_token="<eos>"
+    )
+
+
+_told: set[str] = set()
+"""Texts, instructions and words about which this process has been warned."""
+
+
+def warn_of_losses(tokenizer: Any, text: str, max_length: int, full: bool) -> None:
+    """Warn of what a policy does not read of a prompt: unknown words, each once per process; and what is cut off, once
+    per instruction: numbers of the state and memory texts differ from step to step.
+
+    Args:
+        full: the prompt takes all of ``max_length`` tokens, and may have had more.
+    """
+    prompt = text.partition(", State: ")[0]
+    instruction = prompt.partition(MARK)[0].removeprefix("Task: ")
+    if f"read {prompt}" in _told and (not full or f"cut {instruction}" in _told):
+        return
+    coded = tokenizer(text, return_offsets_mapping=True)
+    spans = list(zip(coded["input_ids"], coded["offset_mapping"], strict=True))
+    unknown = dict.fromkeys(text[a:b].lower() for token, (a, b) in spans if token == tokenizer.unk_token_id)
+    new = [repr(word) for word in unknown if f"word {word}" not in _told]
+    if new:
+        logger.warning(
+            "the policy does not know %s in %r, and reads unknown words all alike; it can act on these only after "
+            "training on instructions that hold them",
+            ", ".join(new),
+            instruction,
+        )
+    if len(spans) > max_length and f"cut {instruction}" not in _told:
+        logger.warning(
+            "the prompt of %r has %d tokens and the policy reads %d (policy.tokenizer_max_length when it is trained); "
+            "cut off: %r",
+            instruction,
+            len(spans),
+            max_length,
+            text[spans[max_length][1][0] :],
+        )
+        _told.add(f"cut {instruction}")
+    _told.update(f"word {word}" for word in unknown)
+    _told.add(f"read {prompt}")
+
+
+@dataclass
+@ProcessorStepRegistry.register(name="memobench_tokenizer")
+class PromptTokenizerProcessorStep(TokenizerProcessorStep):
+    """LeRobot's tokenizer step, which warns of what it loses of a prompt."""
+
+    def _tokenize_text(self, text: str | list[str]) -> dict[str, Tensor]:
+        found: dict[str, Tensor] = super()._tokenize_text(text)
+        # A full row may have been cut off. Both are looked at in numbers first: this runs at every step.
+        tokenizer, full = self.input_tokenizer, found["attention_mask"].bool().all(dim=-1)
+        unknown = (found["input_ids"] == (-1 if tokenizer.unk_token_id is None else tokenizer.unk_token_id)).any(dim=-1)
+        for row in (unknown | full).nonzero().flatten().tolist():
+            warn_of_losses(tokenizer, text if isinstance(text, str) else text[row], self.max_length, bool(full[row]))
+        return found
+
+
+@dataclass
+@ProcessorStepRegistry.register(name="memobench_word_tokenizer")
+class WordTokenizerProcessorStep(PromptTokenizerProcessorStep):
+    """LeRobot's tokenizer step with the word tokenizer; its words are saved in the checkpoint's processor file.
+
+    A step that is told to ``follow`` a training takes the length of its prompts, and learns the words of its dataset
+    that it does not have, behind its own, which keep their numbers.
+    """
+
+    vocabulary: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        if not self.vocabulary:
+            raise MemobenchError(
+                "The checkpoint's preprocessor has no 'vocabulary' for its word tokenizer; save the policy again with "
+                "its preprocessor."
+            )
+        self.tokenizer = make_word_tokenizer(self.vocabulary)
+        super().__post_init__()
+
+    def follow(self, run: TrainingRun) -> None:
+        """Learn the words of a run's prompts, and take their length."""
+        assert run.config.tokenizer_max_length is not None  # set by the configuration
+        self.max_length = run.config.tokenizer_max_length
+        self.vocabulary = extend(self.vocabulary, run.prompt_texts(), run.config.dimensions.vocabulary)
+        self.__post_init__()
+
+    def _tokenize_text(self, text: str | list[str]) -> dict[str, Tensor]:
+        """Do as LeRobot does, with each of the texts once: the samples of a batch share a few instructions."""
+        texts = [text] if isinstance(text, str) else text
+        row = {different: number for number, different in enumerate(dict.fromkeys(texts))}
+        rows = torch.tensor([row[text] for text in texts])
+        return {name: of_different[rows] for name, of_different in super()._tokenize_text([*row]).items()}
+
+    def get_config(self) -> dict[str, Any]:
+        """Return what the processor file holds, the words included."""
+        return super().get_config() | {"vocabulary": self.vocabulary}

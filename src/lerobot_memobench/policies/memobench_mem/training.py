@@ -355,9 +355,9 @@ def _seconds() -> float:
 def quick_products() -> Iterator[None]:
     """While this lasts, round the factors of products to bfloat16, if that is quicker on this CPU.
 
-    Weights, gradients, sums and all that is no product stay float32. Attention in one kernel, whose small products
-    suffer, is left out, and a policy that learns by it (`network.attend_fused`) does without. The setting is torch's and
-    the process's, so it is on within a pass only, forward or backward.
+    Weights, gradients, sums and all that is no product stay float32. Attention in one kernel, whose many small
+    products suffer, is left out, and a policy that learns by it (`network.attend_fused`) does without. The setting is
+    torch's and the process's, so it is on within a pass only, forward or backward.
     """
     if not quicker_in_bfloat16():
         yield
