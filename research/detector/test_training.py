@@ -67,10 +67,10 @@ def pictures(tmp_path: Path) -> Pictures:
         pytest.param(
             8,
             6 + 1 + 12,
-            id="from update 6, then one read whitens and what is learned last takes twelve",
+            id="from update 6, then one read whitens and what is trained last takes twelve",
             marks=pytest.mark.slow,
         ),
-        pytest.param(19, 1 + 8, id="from update 4 of what is learned last"),
+        pytest.param(19, 1 + 8, id="from update 4 of what is trained last"),
     ],
 )
 def test_a_stopped_run_ends_as_another(
@@ -99,7 +99,7 @@ def test_a_stopped_run_ends_as_another(
     assert (tmp_path / "stopped" / CURVE).is_file()
 
 
-def test_what_other_eyes_learned_last_is_not_gone_on_with(pictures: Pictures, tmp_path: Path) -> None:
+def test_the_last_part_of_another_training_is_not_resumed(pictures: Pictures, tmp_path: Path) -> None:
     settings = Training(updates=4, batch=4)
     alone = train(pictures, KINDS, tmp_path / "alone", settings, encoder=small_encoder, save_every=2)
     train(pictures, KINDS, tmp_path / "again", replace(settings, seed=1), encoder=small_encoder, save_every=2)
@@ -125,11 +125,11 @@ def test_every_weight_learns(pictures: Pictures, tmp_path: Path) -> None:
     torch.manual_seed(settings.seed)
     first = dict(Detector(small_encoder(), KINDS).named_parameters())
     same = {name for name, value in first.items() if torch.equal(value, learned[name])}
-    assert {name.rpartition(".")[0] for name in same} == TRAINED_LAST, "only what is learned last"
+    assert {name.rpartition(".")[0] for name in same} == TRAINED_LAST, "only what is trained last"
 
 
 @pytest.mark.slow
-def test_what_is_learned_last_fits_and_changes_nothing_else(
+def test_what_is_trained_last_fits_and_changes_nothing_else(
     pictures: Pictures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(training, "UNCERTAINTY_RATE", 0.1)
@@ -162,7 +162,7 @@ def test_what_is_learned_last_fits_and_changes_nothing_else(
         for same in np.linspace(-6, 0, 13):
             other = replace(learned, score=lambda *cells, same=same: torch.full_like(score(*cells), same))
             assert 5 * score_loss(learned, wanted) < score_loss(other, wanted), (
-                "right detected are told from wrong ones"
+                "right detections are told from wrong ones"
             )
 
 
@@ -182,7 +182,7 @@ def test_changed_pictures_stay_pictures() -> None:
 
 
 @torch.no_grad()
-def test_white_tokens_say_what_the_others_said(tmp_path: Path) -> None:
+def test_heads_of_whitened_tokens_predict_the_same(tmp_path: Path) -> None:
     detector, images = (
         Detector(trained_a_little(small_encoder()), ("cork", "cap")).eval(),
         torch.rand(24, 3, SIDE, SIDE),
@@ -202,7 +202,7 @@ def test_white_tokens_say_what_the_others_said(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("cells", CELLS.values(), ids=CELLS)
-def test_what_was_there_is_found(cells: tuple[int, int, int]) -> None:
+def test_detections_undo_targets(cells: tuple[int, int, int]) -> None:
     rows, (grid, _, coarse) = synthetic(6), cells
     for row, things in zip(rows, detections(perfect(targets(rows, SQUARES, *cells), grid * coarse)), strict=True):
         assert sorted(things["kind"]) == list(range(SQUARES))
@@ -218,7 +218,7 @@ def test_what_was_there_is_found(cells: tuple[int, int, int]) -> None:
         assert ((things["lit"] > 0.5) == true["lit"]).all()
 
 
-def test_saying_so_costs_nothing_and_anything_else_does() -> None:
+def test_losses_are_of_what_is_wrong() -> None:
     wanted = targets(synthetic(3), SQUARES, GRID)
     right = perfect(wanted, FINE_SIDE)
     assert all(float(value) < 1e-3 for value in loss(right, wanted).values())
@@ -233,7 +233,7 @@ def test_saying_so_costs_nothing_and_anything_else_does() -> None:
         assert [other for other, value in costs.items() if float(value) > 0.5] == [name]
 
 
-def test_what_hardly_shows_is_not_taught() -> None:
+def test_what_hardly_shows_is_no_target() -> None:
     rows = synthetic(1)
     rows["things"]["pixels"][:, 1] = 3
     wanted = targets(rows, SQUARES, GRID)
@@ -241,7 +241,7 @@ def test_what_hardly_shows_is_not_taught() -> None:
     assert set(wanted.cells[:, 1].tolist()) == {0, 2}
 
 
-def test_of_two_of_a_kind_in_a_cell_the_nearer_is_asked_for() -> None:
+def test_of_two_of_a_kind_in_a_cell_the_nearer_is_the_target() -> None:
     rows = synthetic(1)
     rows["things"][0, 1] = rows["things"][0, 0]
     rows["things"]["anchor"][0, :2] = [(0.5, 0.53), (0.5, 0.58)]
@@ -249,7 +249,7 @@ def test_of_two_of_a_kind_in_a_cell_the_nearer_is_asked_for() -> None:
     assert len(cells) == len({tuple(cell) for cell in cells})
 
 
-def test_an_origin_outside_the_picture_is_told() -> None:
+def test_an_origin_outside_the_image_is_predicted() -> None:
     """Of a stove or a pan the wrist's camera shows a corner; what was asked for then had once ended at a quarter."""
     rows = synthetic(4)
     rows["things"]["position"][:, :, 0] += 0.8 * 2 * HEIGHT * SLOPE

@@ -57,7 +57,7 @@ def test_folding_leaves_tokens_as_they_were() -> None:
 
 
 @torch.no_grad()
-def test_eyes_come_back_from_their_file(tmp_path: Path) -> None:
+def test_a_detector_comes_back_from_its_file(tmp_path: Path) -> None:
     detector, images = Detector(trained_a_little(small_encoder()), ("cork", "cap")), torch.rand(2, 3, SIDE, SIDE)
     before = all_outputs(detector.eval()(images))
     save_detector(detector, tmp_path / "detector.safetensors")
@@ -71,14 +71,14 @@ def test_eyes_come_back_from_their_file(tmp_path: Path) -> None:
         assert ((kept - value).abs() <= rounding + 1e-9).all(), name
 
 
-def test_the_packages_eyes_have_a_name() -> None:
+def test_the_package_detector_has_a_name() -> None:
     assert detector_file(PACKAGE) == detector_file(Path(PACKAGE)) == SHIPPED  # the command line makes paths of names
 
 
-def test_other_files_are_no_eyes(tmp_path: Path) -> None:
+def test_other_files_are_no_detectors(tmp_path: Path) -> None:
     with pytest.raises(MemobenchError, match="there is no file"):
         load_detector(tmp_path / "none.safetensors")
-    (tmp_path / "text.safetensors").write_text("eyes")
+    (tmp_path / "text.safetensors").write_text("text")
     with pytest.raises(MemobenchError, match="holds no detector"):
         load_detector(tmp_path / "text.safetensors")
     save_file({"weight": torch.zeros(2)}, tmp_path / "other.safetensors")
@@ -104,7 +104,7 @@ def test_a_pooled_token_is_of_its_own_four() -> None:
     assert not torch.allclose(parts[:, 0], parts[:, 1])  # what is where in it is kept
 
 
-def test_the_neck_knows_which_token_a_cell_lies_in() -> None:
+def test_a_cell_of_the_pyramid_reads_its_own_token() -> None:
     encoder = small_encoder()
     pyramid = FeaturePyramid(encoder).eval()
     for block in (module for module in pyramid.modules() if isinstance(module, ResidualBlock)):
@@ -123,7 +123,7 @@ def test_the_neck_knows_which_token_a_cell_lies_in() -> None:
     assert not torch.allclose(cells[0, 4, 8], cells[0, 4, 9]), "what is where in a token's square is told apart"
 
 
-def test_doubts_are_of_the_picture_and_of_metres() -> None:
+def test_uncertainties_are_of_the_image_and_of_metres() -> None:
     output = perfect(targets(synthetic(2), KINDS, GRID), CELLS)
     uncertainty = torch.tensor([0.16, 0.01, 0.02]).log()[:, None, None].expand(2, KINDS, 3, CELLS, CELLS)
     assert not detections(output)[0]["uncertainty"].any()
@@ -131,7 +131,7 @@ def test_doubts_are_of_the_picture_and_of_metres() -> None:
         assert things["uncertainty"] == pytest.approx(np.tile([0.01, 0.01, 0.02], (KINDS, 1)), rel=1e-4)
 
 
-def test_a_second_look_says_which_finds_are_right() -> None:
+def test_the_refinement_head_scores_peaks() -> None:
     output = perfect(targets(synthetic(2), KINDS, GRID), CELLS)
     logits = torch.tensor([-4.0, 0.0, 2.0])
 
@@ -143,7 +143,7 @@ def test_a_second_look_says_which_finds_are_right() -> None:
         assert things["score"] == pytest.approx(torch.sigmoid(logits[[2, 1]]).numpy())
 
 
-def test_a_second_look_is_at_what_is_around_a_find() -> None:
+def test_the_refinement_head_sees_what_is_around_a_peak() -> None:
     """Elsewhere it says of a place what it output of it, nothing far from it matters, and its square's edge does."""
     torch.manual_seed(0)
     look, side = RefinementHead(6, 5, KINDS), 16

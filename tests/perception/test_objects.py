@@ -50,7 +50,7 @@ def bent(sim: Simulation) -> Simulation:
     return sim
 
 
-def told(slots: NDArray[np.float32] | torch.Tensor) -> NDArray[np.float32]:
+def objects_of(slots: NDArray[np.float32] | torch.Tensor) -> NDArray[np.float32]:
     """Return the things (n, WIDTH) of an observation."""
     rows = np.asarray(slots).reshape(SLOTS, WIDTH)
     return rows[rows[:, 0] > 0]
@@ -66,14 +66,14 @@ def test_views_are_the_cameras(camera: str) -> None:
 
 
 @pytest.mark.parametrize("task", [BOWLS, DRAWERS, STOVE])
-def test_perfect_finds_are_what_the_simulator_tells(gl: str, localizer: ObjectLocalizer, task: str) -> None:
+def test_perfect_detections_are_the_simulators_slots(gl: str, localizer: ObjectLocalizer, task: str) -> None:
     sim = bent(simulation(task))
     sim.highlights = (highlight_of(sim, next(name for name, asset in sim.assets.items() if asset.kind == "object")),)
     labeller = Labeller(sim)
     detected = {
         camera: perfect(labeller.take(camera), score) for camera, score in zip(MJCF_CAMERAS, (1.0, 0.9), strict=True)
     }
-    found, true = told(localizer.slots(detected, views_of(sim.proprio()))), told(ObjectSlots(sim).observe())
+    found, true = objects_of(localizer.slots(detected, views_of(sim.proprio()))), objects_of(ObjectSlots(sim).observe())
     assert len(true) > 3
     assert true[:, -1].any()
     assert not true[:, -1].all()
@@ -111,7 +111,7 @@ def count(
         at, depth = projected(np.array([place]), view_of(camera, state))
         find["kind"], find["score"], find["turn"] = kinds().index(kind), score, (1.0, 0.0)
         find["place"], find["depth"], find["height"] = at, depth, place[2] - TABLE_TOP
-    return len(told(localizer.slots(detected, views_of(state))))
+    return len(objects_of(localizer.slots(detected, views_of(state))))
 
 
 def test_one_thing_is_seen_by_both_cameras(localizer: ObjectLocalizer) -> None:
@@ -139,17 +139,17 @@ def test_a_place_is_where_both_lines_of_sight_meet(localizer: ObjectLocalizer) -
         one["uncertainty"] = (0.001, 0.01, 0.01)
     views = views_of(state)
     alone = {
-        camera: told(localizer.slots({**detected, other: detected[other][:0]}, views))[0, PLACE]
+        camera: objects_of(localizer.slots({**detected, other: detected[other][:0]}, views))[0, PLACE]
         for camera, other in zip(MJCF_CAMERAS, reversed(MJCF_CAMERAS), strict=True)
     }
     assert min(np.linalg.norm(place - true) for place in alone.values()) > 0.01
-    assert np.linalg.norm(told(localizer.slots(detected, views))[0, PLACE] - true) < 0.004
+    assert np.linalg.norm(objects_of(localizer.slots(detected, views))[0, PLACE] - true) < 0.004
     detected["wrist"]["uncertainty"] = (0.1, 0.1, 0.1)
-    assert told(localizer.slots(detected, views))[0, PLACE] == pytest.approx(alone["agentview"], abs=1e-3)
+    assert objects_of(localizer.slots(detected, views))[0, PLACE] == pytest.approx(alone["agentview"], abs=1e-3)
 
 
 @pytest.mark.parametrize("camera", MJCF_CAMERAS)
-def test_what_one_camera_finds_alone_must_be_surer(localizer: ObjectLocalizer, camera: str) -> None:
+def test_a_detection_of_one_camera_needs_a_higher_score(localizer: ObjectLocalizer, camera: str) -> None:
     state = simulation(BOWLS).proprio().astype(float)
     here = (float(state[0]), float(state[1]), 0.91)
     doubtful = [(name, "butter", (MIN_SCORE + MIN_SCORE_ALONE) / 2, here) for name in MJCF_CAMERAS]
@@ -165,16 +165,16 @@ def test_a_kind_that_this_version_does_not_know_is_passed_over() -> None:
     state = simulation(BOWLS).proprio().astype(float)
     for kind, count in ((0, 0), (1, 1)):
         detected["kind"] = kind
-        assert len(told(foreign.slots({"agentview": detected, "wrist": detected[:0]}, views_of(state)))) == count
+        assert len(objects_of(foreign.slots({"agentview": detected, "wrist": detected[:0]}, views_of(state)))) == count
 
 
-def test_the_packages_eyes_find_what_stands_on_a_table(gl: str) -> None:
+def test_the_package_detector_detects_what_stands_on_a_table(gl: str) -> None:
     sim = simulation(BOWLS)
     pictures = {name: torch.from_numpy(sim.render(name)).permute(2, 0, 1)[None] / 255 for name in MJCF_CAMERAS}
     found = ObjectLocalizer(load_detector(PACKAGE))(pictures, torch.from_numpy(sim.proprio())[None])
     assert found.shape == (1, SIZE)
     assert found.dtype == torch.float32
-    for thing in told(ObjectSlots(sim).observe()):
-        alike = told(found)
+    for thing in objects_of(ObjectSlots(sim).observe()):
+        alike = objects_of(found)
         alike = alike[alike[:, 1] == thing[1]]
         assert np.linalg.norm(alike[:, PLACE] - thing[PLACE], axis=1).min() < 0.02, classes()[int(thing[1])]

@@ -127,12 +127,12 @@ DIFFUSION = (
 )
 
 
-@pytest.mark.parametrize("policy", [ACT, DIFFUSION], ids=["act", "diffusion"])
+@pytest.mark.parametrize("policy", [pytest.param(ACT, marks=pytest.mark.slow), DIFFUSION], ids=["act", "diffusion"])
 def test_on_pictures(policy: tuple[str, ...], dataset: Path, tmp_path: Path) -> None:
     assert train_and_roll_out(dataset, tmp_path, *policy)["obs_type"] == "pixels_agent_pos"
 
 
-@pytest.mark.parametrize("policy", [ACT, DIFFUSION], ids=["act", "diffusion"])
+@pytest.mark.parametrize("policy", [ACT, pytest.param(DIFFUSION, marks=pytest.mark.slow)], ids=["act", "diffusion"])
 @pytest.mark.parametrize(
     ("pictures", "said", "seen"),
     [
@@ -355,7 +355,7 @@ def test_the_first_plan_is_made_from_the_first_execution_frame(
     assert read_protocol_file(tmp_path)["prompt_in"] == "reset"
 
 
-def test_a_policy_that_knows_phases_sees_the_prompt(
+def test_a_policy_that_reads_prompts_is_shown_them(
     lerobot_eval: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from lerobot_memobench.policies.baselines.modeling_baselines import MemobenchExpertPolicy

@@ -94,7 +94,7 @@ def trained_a_little(encoder: VisualEncoder) -> VisualEncoder:
 
 
 def all_outputs(readings: dict[str, DetectorOutput]) -> list[Tensor]:
-    """Return all that is output but doubts, as it is now: geometry is only worked out when it is asked for."""
+    """Return all output but uncertainty, as it is now: geometry is only computed when it is queried."""
     assert set(readings) == set(READINGS)
     return [
         values
