@@ -121,7 +121,7 @@ def cache_dataset(
         weights: model checkpoint whose image tower or visual encoder is used, see `load_image_tower`.
         workers: threads that decode videos ahead of the encoder; by the cores of the machine when None.
         progress: called with (episodes done, episodes in all).
-        tell: told where it lies and how large it will be, before it is made.
+        tell: called with the cache's place and size before it is made.
 
     Returns:
         The cache's folder, ``<root>/feature_cache/<size>-stride<n>-<hash>``, or below ``config.feature_cache_dir``;
@@ -275,7 +275,7 @@ def make_caches(
     tell: Callable[[str], None] = logger.info,
     **how: Any,
 ) -> tuple[FeatureCache | None, dict[str, FeatureCache]]:
-    """Make or finish the tokens of the dataset at ``root``; how large they will be is told before.
+    """Make or finish the tokens of the dataset at ``root``; their size is logged before.
 
     Args:
         how: of `build_feature_cache`.

@@ -174,7 +174,7 @@ OF_ACTING = _names(
 )
 """Fields that are free where a checkpoint acts. A ``detector`` is no part of it, and its own ``visual_encoder`` has a
 rule of its own (`checkpoints.read_config`); LeRobot makes ``output_features`` of the environment's, which
-`policies.shown` compares with the checkpoint's, and ``freeze_vision_encoder`` is always true here."""
+`policies.compatibility` compares with the checkpoint's, and ``freeze_vision_encoder`` is always true here."""
 OF_TRAINING = _names(
     """
     detection_noise base_weights align align_weight subgoal_level shuffle_subgoals
@@ -545,9 +545,10 @@ class MemobenchMemConfig(PI05Config):
             self.input_features.setdefault(OBS_ENV_STATE, PolicyFeature(FeatureType.ENV, shape))
 
     def validate_features(self) -> None:
-        """Keep of the features what this perception looks at, besides the state.
+        """Keep the features that this perception reads, besides the state.
 
-        A checkpoint that was trained on the environment's objects has no pictures among them; eyes look at all cameras.
+        A checkpoint that was trained on privileged object state has no pictures among them; a detector reads all
+        cameras.
 
         Raises:
             MemobenchError: they lack the slots of objects or the camera that is remembered, or have more numbers than
@@ -563,7 +564,7 @@ class MemobenchMemConfig(PI05Config):
             }
         if not self.uses_pictures and OBS_ENV_STATE not in self.input_features:
             raise MemobenchError(
-                f"perception=objects sees by '{OBS_ENV_STATE}', which is not there; train on a dataset of this "
+                f"perception=objects reads '{OBS_ENV_STATE}', which is not there; train on a dataset of this "
                 "version's `memobench generate`, and evaluate with --env.obs_type=environment_state_agent_pos."
             )
         self._choose_memory_camera()
@@ -576,7 +577,7 @@ class MemobenchMemConfig(PI05Config):
             self.memory_camera = cameras[0]
         if self.uses_pictures and not self.uses_objects and cameras and self.memory_camera not in cameras:
             raise MemobenchError(
-                f"--policy.memory_camera={self.memory_camera} is none of the cameras that this policy sees "
+                f"--policy.memory_camera={self.memory_camera} is none of this policy's cameras "
                 f"({', '.join(cameras)}); name one of them, or leave it out for the first."
             )
 

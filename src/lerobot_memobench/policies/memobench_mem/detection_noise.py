@@ -32,9 +32,9 @@ found 3 cm off."""
 TURN, JOINT = (0.002, 2.0), {"drawer": (0.0025, 0.7), "door": (0.013, 0.6), "knob": (0.034, 0.6)}
 """Errors of a turn, rad, and of moving parts, m or rad."""
 MISSED, KIND_MISSED = 0.01, 0.003
-"""How often a thing is not found at a moment, and a kind at no moment."""
+"""How often an object is missed in a frame, and a class in all of a batch."""
 FALSE, SECOND_NAME, MISNAMED, ASTRAY = 0.6, 0.8, 0.015, 0.06
-"""Things found at a moment that are none: which share of them is a second name for one that is, where the others are
+"""False objects of a frame: which share of them is a second name for one that is, where the others are
 that thing once more and elsewhere; and how far from it both are, m."""
 
 
@@ -45,10 +45,10 @@ def with_detection_noise(slots: Tensor, hand: Tensor, size: float) -> Tensor:
         hand: (N, >= 3), its place in the world, m, and its turn.
         size: of the errors; 1 is as the package's detector errs.
     """
-    seen = upright(slots)
-    there = field(seen, "present").squeeze(-1) > 0
-    kind = field(seen, "class").squeeze(-1).long()
-    place, joint = field(seen, "position"), field(seen, "joint")
+    noisy = upright(slots)
+    there = field(noisy, "present").squeeze(-1) > 0
+    kind = field(noisy, "class").squeeze(-1).long()
+    place, joint = field(noisy, "position"), field(noisy, "joint")
     at_hand = _error(place, *AT_HAND_PLACE) * place.new_tensor([1.0, 1.0, HIGHER])
     at_hand *= (place - hand[:, None, :3]).norm(dim=-1, keepdim=True) < AT_HAND
     of_kinds = _error(place.new_empty(len(classes()), 3), *KIND_PLACE)[kind]
@@ -56,11 +56,11 @@ def with_detection_noise(slots: Tensor, hand: Tensor, size: float) -> Tensor:
     place += size * (_error(place, *PLACE) + of_kinds + at_hand + down)
     for name, how in JOINT.items():
         joint += size * _error(joint, *how) * (kind == classes().index(name))[..., None]
-    _turn(seen, size * _error(joint, *TURN).squeeze(-1))
+    _turn(noisy, size * _error(joint, *TURN).squeeze(-1))
     missed = torch.rand_like(joint).squeeze(-1) < size * MISSED
     missed |= (torch.rand(len(classes()), device=kind.device) < size * KIND_MISSED)[kind]
-    _add_false(seen, there & ~missed, size)
-    return in_order(seen)
+    _add_false(noisy, there & ~missed, size)
+    return in_order(noisy)
 
 
 def _error(like: Tensor, size: float, spread: float) -> Tensor:
@@ -87,26 +87,26 @@ def _standing() -> Tensor:
     return heights
 
 
-def _turn(seen: Tensor, angle: Tensor) -> None:
+def _turn(noisy: Tensor, angle: Tensor) -> None:
     """Turn the level x axes of things by angles (N, SLOTS), rad."""
-    x, y, z = field(seen, "rotation")[..., :3].unbind(-1)
+    x, y, z = field(noisy, "rotation")[..., :3].unbind(-1)
     sine, cosine = angle.sin(), angle.cos()
-    set_axis(seen, torch.stack([cosine * x - sine * y, sine * x + cosine * y, z], dim=-1))
+    set_axis(noisy, torch.stack([cosine * x - sine * y, sine * x + cosine * y, z], dim=-1))
 
 
-def _add_false(seen: Tensor, there: Tensor, size: float) -> None:
+def _add_false(noisy: Tensor, there: Tensor, size: float) -> None:
     """Take away what is not ``there`` (N, SLOTS), and put what is none into some of the slots that are empty then."""
     empty = (~there).sum(dim=1, keepdim=True).clamp(min=1)
     chance = size * FALSE / empty * there.any(dim=1, keepdim=True)
-    false = ~there & (torch.rand(there.shape, device=seen.device) < chance)
+    false = ~there & (torch.rand(there.shape, device=noisy.device) < chance)
     row = false.nonzero()[:, 0]
-    made = seen[row, torch.multinomial(there[row].float(), 1)[:, 0]] if len(row) else seen[false]
-    misnamed = torch.rand(len(made), 1, device=seen.device) < SECOND_NAME
+    made = noisy[row, torch.multinomial(there[row].float(), 1)[:, 0]] if len(row) else noisy[false]
+    misnamed = torch.rand(len(made), 1, device=noisy.device) < SECOND_NAME
     kind, place = field(made, "class"), field(made, "position")
     kind[:] = torch.where(misnamed, torch.randint_like(kind, len(classes())), kind)
     place += torch.randn_like(place) * torch.where(misnamed, MISNAMED, ASTRAY)
-    seen[~there] = 0.0
-    seen[false] = made
+    noisy[~there] = 0.0
+    noisy[false] = made
 
 
 def in_order(slots: Tensor) -> Tensor:

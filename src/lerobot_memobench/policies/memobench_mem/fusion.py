@@ -37,7 +37,7 @@ class MemoryFusion(ABC):
         """Take the memory, of width d_m, that the next passes read."""
 
     def prefix(self, prefix: Prefix) -> Prefix:
-        """Return the prefix that the model sees, given LeRobot's."""
+        """Return the model's prefix, given LeRobot's."""
         return prefix
 
     def owns(self, name: str) -> bool:
@@ -214,7 +214,7 @@ class Modulation(MemoryFusion):
 
 
 class Context(MemoryFusion):
-    """Memory tokens are seen by the whole prefix and by the actions; nothing is added to the model."""
+    """The whole prefix and the actions attend to memory tokens; nothing is added to the model."""
 
     def __init__(self, model: nn.Module, memory_dim: int, expert_dim: int) -> None:
         self.memory: MemoryTokens | None = None

@@ -349,11 +349,11 @@ class MemobenchMemPolicy(PI05Policy):
         Returns:
             Per row its control step since the episode began, whether a new episode began, and whether it is frozen.
         """
-        seen = self.perception.memory_input
-        if seen not in batch:
-            what = f"'{seen}'" if seen else "picture"
-            raise MemobenchError(f"The observation has no {what}, which this policy remembers; {cure(seen, batch)}")
-        count = len(batch[seen])
+        name = self.perception.memory_input
+        if name not in batch:
+            what = f"'{name}'" if name else "picture"
+            raise MemobenchError(f"The observation has no {what}, which this policy remembers; {cure(name, batch)}")
+        count = len(batch[name])
         steps = _column(batch, OBS_STEP) or [self._calls] * count  # without a clock one call is one step
         phases = _column(batch, OBS_PHASE) if OBS_STEP in batch else None
         clocks = list(zip(phases or [EXECUTION] * count, steps, strict=True))
@@ -362,8 +362,8 @@ class MemobenchMemPolicy(PI05Policy):
         self.noise.resize(count)
         for row in range(count):
             if started[row]:
-                told = (key for key in (seen, OBS_STATE, OBS_LANGUAGE_TOKENS) if key in batch)
-                self.noise.begin(row, (batch[key][row] for key in told))
+                observed = (key for key in (name, OBS_STATE, OBS_LANGUAGE_TOKENS) if key in batch)
+                self.noise.begin(row, (batch[key][row] for key in observed))
         return steps, started, frozen
 
     def _encode(self, batch: dict[str, Tensor], clocks: list[tuple[int, int]], rows: list[int]) -> Tensor:
@@ -412,7 +412,7 @@ class MemobenchMemPolicy(PI05Policy):
         """Return whether the next observation's pictures or objects are read: it is remembered, or planned from.
 
         Asked after an action. Whether the next frame is the first of an execution, where chunks begin, only the
-        environment knows: that one is to be shown in any case, as the first of an episode.
+        environment knows: that one is observed in any case, as the first of an episode.
         """
         return self.history.writes_next() or bool(self.queues.wanting(self._acting_rows))
 
@@ -430,7 +430,7 @@ class MemobenchMemPolicy(PI05Policy):
         """Take in one observation per row and plan for all rows: (B, chunk, A), normalised.
 
         A policy that remembers must be offered the observation of every control step by `observe`, this one included,
-        unless it tells its step (``observation.step``); or let `select_action` see to it. ``noise``
+        unless it holds its step (``observation.step``); or let `select_action` do so. ``noise``
         (B, chunk, max_action_dim) replaces the episodes' own; other keywords are LeRobot's real-time chunking ones.
 
         Raises:
@@ -456,8 +456,8 @@ class MemobenchMemPolicy(PI05Policy):
             steps = [row.position for row in self.history.rows]
         else:
             raise MemobenchError(
-                "This policy remembers what it saw at every control step, and was asked for two plans with no "
-                "observation between them: its memory would be another one than in training; let select_action see "
+                "This policy remembers observations of every control step, and was asked for two plans with no "
+                "observation between them: its memory would be another one than in training; let select_action take "
                 "every observation (--inference.type=sync), offer each to observe before planning, or train with "
                 "--policy.memory_fusion=none."
             )

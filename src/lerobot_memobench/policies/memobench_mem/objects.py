@@ -1,6 +1,6 @@
 """Encoders of objects: the slots of `sim.object_slots`, each a token, from privileged object state or from detections.
 
-An object's pose is told in the world and from the hand, whose pose is the robot's state before it is normalised. A
+An object's pose is given in the world and from the hand, whose pose is the robot's state before it is normalised. A
 remembered frame is stored as numbers (slots, robot state, phase), and pooled to tokens by learned attention. All places
 are m.
 """
@@ -63,7 +63,7 @@ def slot_features(slots: Tensor, hand: Tensor) -> Tensor:
     offset = place - hand[:, :3]
     # A row vector times the hand's matrix is that vector in the hand's frame.
     from_hand = (offset.unsqueeze(1) @ turned).squeeze(1)
-    near = [torch.tanh(seen / scale) for seen in (offset, from_hand) for scale in NEAR]
+    near = [torch.tanh(vector / scale) for vector in (offset, from_hand) for scale in NEAR]
     middle = torch.tensor(MIDDLE, device=place.device)
     places = [(place - middle) * PER_METRE, offset * PER_METRE, *near]
     rest = [field(slots, "joint") * PER_METRE, field(slots, "highlighted")]

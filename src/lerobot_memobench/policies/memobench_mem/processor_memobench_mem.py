@@ -186,10 +186,13 @@ class GatherMemoryProcessorStep(ProcessorStep):
         indices = extra["index"].reshape(-1).tolist()
         transition = transition.copy()
         transition[TransitionKey.COMPLEMENTARY_DATA] = {**extra, **self.gather(cache, indices)}
-        told = transition.get(TransitionKey.OBSERVATION) or {}
+        observation = transition.get(TransitionKey.OBSERVATION) or {}
         # LeRobot passes on observations alone, and in a dataset with pictures objects are none by name.
-        if isinstance(cache, RecordedFrames) and OBS_ENV_STATE in cache.columns and OBS_ENV_STATE not in told:
-            transition[TransitionKey.OBSERVATION] = {**told, OBS_ENV_STATE: cache.columns[OBS_ENV_STATE][indices]}
+        if isinstance(cache, RecordedFrames) and OBS_ENV_STATE in cache.columns and OBS_ENV_STATE not in observation:
+            transition[TransitionKey.OBSERVATION] = {
+                **observation,
+                OBS_ENV_STATE: cache.columns[OBS_ENV_STATE][indices],
+            }
         return transition
 
     @property
@@ -202,8 +205,8 @@ class GatherMemoryProcessorStep(ProcessorStep):
         places = [cache.locate(index) for index in indices]  # refuses frames that the cache does not know
         phase = {PHASE: torch.from_numpy(cache.phase[np.asarray(indices)].astype(np.int64))}
         if isinstance(cache, RecordedFrames):
-            seen = [name for name in cache.columns if name.startswith(ENCODED)]
-            phase |= {name: cache.columns[name][torch.tensor(indices)] for name in seen}
+            encoded = [name for name in cache.columns if name.startswith(ENCODED)]
+            phase |= {name: cache.columns[name][torch.tensor(indices)] for name in encoded}
         mechanism = self.mechanism
         if mechanism.frames == 0:
             return phase
@@ -305,8 +308,9 @@ class OracleMemoryProcessorStep(ProcessorStep):
 @dataclass
 @ProcessorStepRegistry.register(name="memobench_raw_state")
 class RawStateProcessorStep(ObservationProcessorStep):
-    """Copy the state (B, n), m and rad, to ``observation.raw_state``, before it is normalised: objects' places are told
-    from the hand.
+    """Copy the state (B, n), m and rad, to ``observation.raw_state`` before it is normalised.
+
+    Objects' places are given from the hand.
     """
 
     def observation(self, observation: dict) -> dict:
@@ -405,7 +409,7 @@ class PromptTokenizerProcessorStep(TokenizerProcessorStep):
 
     def _tokenize_text(self, text: str | list[str]) -> dict[str, Tensor]:
         found: dict[str, Tensor] = super()._tokenize_text(text)
-        # A full row may have been cut off. Both are looked at in numbers first: this runs at every step.
+        # A full row may have been cut off. Both are checked in numbers first: this runs at every step.
         tokenizer, full = self.input_tokenizer, found["attention_mask"].bool().all(dim=-1)
         unknown = (found["input_ids"] == (-1 if tokenizer.unk_token_id is None else tokenizer.unk_token_id)).any(dim=-1)
         for row in (unknown | full).nonzero().flatten().tolist():

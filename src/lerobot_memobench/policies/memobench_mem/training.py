@@ -50,7 +50,7 @@ def losses_of(objective: str, squared: Tensor) -> Tensor:
     them.
 
     Absolute errors make actions exact, and squared ones are what a memory is learned by: to have chosen another of
-    three bowls is a large error at few moments. After 800 updates 20 of 20 bowls were right by both, 15 by squared
+    three bowls is a large error in few frames. After 800 updates 20 of 20 bowls were right by both, 15 by squared
     ones, one by absolute ones.
     """
     return squared + (squared + _SMOOTH).sqrt() if objective == REGRESSION else squared
@@ -301,8 +301,8 @@ class TrainingCurve:
             return
         numbers = {"updates_per_point": WINDOW, "points": self.points, "held_out": self.held_out}
         write_file(folder / NUMBERS, json.dumps(numbers))
-        looks = {f"{LOSS}, held out": [(look["updates"], look[LOSS]) for look in self.held_out]}
-        draw_curve(self.points, WINDOW, folder / PICTURE, marked=looks, hidden=HIDDEN, shares=SHARES, columns=3)
+        measured = {f"{LOSS}, held out": [(look["updates"], look[LOSS]) for look in self.held_out]}
+        draw_curve(self.points, WINDOW, folder / PICTURE, marked=measured, hidden=HIDDEN, shares=SHARES, columns=3)
 
     @classmethod
     def read(cls, folder: Path) -> TrainingCurve:

@@ -50,7 +50,7 @@ class MemoryEncoder(nn.Module):
 
     A Linear of a concatenation is the sum of its parts' Linears. The 16 tokens of a frame share their time and all
     frames share their grid, so the first Linear is applied to F times and 4 + 4 places instead of F * 16 tokens.
-    Tokens without a ``grid`` are told their time alone.
+    Tokens without a ``grid`` are joined with their time alone.
     """
 
     framewise = True
@@ -62,7 +62,7 @@ class MemoryEncoder(nn.Module):
         self.project = nn.Linear(image_dim + self.position.out_features, memory_dim)
 
     def forward(self, tokens: Tensor, steps: Tensor, frame_mask: Tensor) -> tuple[Tensor, Tensor]:
-        """Encode tokens (B, F, P, D) seen at control steps (B, F).
+        """Encode tokens (B, F, P, D) of control steps (B, F).
 
         Returns:
             H (B, F*P, d_m) float32 and its mask (B, F*P) bool, from ``frame_mask`` (B, F).
@@ -127,7 +127,7 @@ class PooledMemoryEncoder(nn.Module):
         self.pool, self.encoder = pool, encoder
 
     def forward(self, frames: Tensor, steps: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-        """Encode frames (B, F, P, D') seen at steps (B, F), of which mask (B, F) are real.
+        """Encode frames (B, F, P, D') of steps (B, F), of which mask (B, F) are real.
 
         Returns:
             H (B, L, d_m) and its mask (B, L).

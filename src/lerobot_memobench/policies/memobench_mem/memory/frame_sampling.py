@@ -1,4 +1,4 @@
-"""Frame sampling: a plan sees frames spread evenly over the episode so far (RoboMME; the paper's memory module)."""
+"""Frame sampling: an action chunk reads frames spread evenly over the episode so far (RoboMME; the paper's memory)."""
 
 from __future__ import annotations
 

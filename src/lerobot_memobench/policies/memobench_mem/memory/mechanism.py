@@ -43,7 +43,7 @@ class MemoryMechanism(ABC):
 
     Attributes:
         name: by which it is chosen.
-        frames: how many frames a plan reads at most; with 0 no frame is looked at, and training loads none.
+        frames: how many frames a chunk reads at most; with 0 none is encoded, and training loads none.
         capacity: how many frames are kept of an episode at most; None where all are, however many come.
     """
 
@@ -59,7 +59,7 @@ class MemoryMechanism(ABC):
 
     @abstractmethod
     def read(self, kept: Sequence[Frame]) -> list[Frame]:
-        """Return what a plan sees of what is kept: at most `frames` frames, the oldest first."""
+        """Return the frames that a chunk reads of those kept: at most `frames`, the oldest first."""
 
     def recall(self, episode: EpisodeFrames, slot: int) -> list[Frame]:
         """Return what training reads at an episode's frame ``slot``: what a rollout reads there.
@@ -135,7 +135,7 @@ class CachedEpisode:
     def load(self, slots: Sequence[int]) -> list[Frame]:
         """Read these frames, and no others, from the cache's file."""
         tokens = self.cache.tokens(self.episode, slots)
-        return [Frame(slot * self.cache.meta.stride, seen) for slot, seen in zip(slots, tokens.unbind(), strict=True)]
+        return [Frame(slot * self.cache.meta.stride, one) for slot, one in zip(slots, tokens.unbind(), strict=True)]
 
 
 def recall_at(cache: FrameLookup, mechanism: MemoryMechanism, episode: int, frame: int) -> list[Frame]:
@@ -158,7 +158,7 @@ class Row:
     clock: tuple[int, int] | None = None
     position: int = 0
     frozen: bool = False
-    told: bool = False  # that it is longer than what is kept
+    warned: bool = False  # that it is longer than what is kept
     kept: list[Frame] = field(default_factory=list)
     missed: int | None = None
 
@@ -211,8 +211,8 @@ class RolloutMemory:
         if wanted and self.mechanism.frames:
             for number, tokens in zip(wanted, encode(wanted).to("cpu"), strict=True):
                 writing, capacity = self.rows[number], self.mechanism.capacity
-                if capacity is not None and len(writing.kept) == capacity and not writing.told:
-                    writing.told = True
+                if capacity is not None and len(writing.kept) == capacity and not writing.warned:
+                    writing.warned = True
                     logger.warning(
                         "An episode has more than %d remembered frames, of which the latest are kept; call "
                         "policy.reset() when an episode begins.",

@@ -8,7 +8,7 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import Frame, Mem
 
 
 class NoMemory(MemoryMechanism):
-    """The baseline that never sees the past."""
+    """The baseline without a memory."""
 
     name = "none"
     capacity = 0
