@@ -166,8 +166,12 @@ class GatherMemoryProcessorStep(ProcessorStep):
     shuffle_seed: int = 7
     memory: str = FrameSampling.name
     cache: FrameLookup | None = field(default=None, repr=False)
+    mechanism: MemoryMechanism = field(init=False, repr=False)
     _run: TrainingRun | None = field(default=None, init=False, repr=False)
     _texts: np.ndarray | None = field(default=None, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        self.mechanism = make_mechanism(self.memory if self.frames else NoMemory.name, self.frames)
 
     def follow(self, run: TrainingRun) -> None:
         """Look up in a run's cache from now on, by its settings, unless there is a cache of its own."""
@@ -176,6 +180,7 @@ class GatherMemoryProcessorStep(ProcessorStep):
         self._run, self._texts = run, None
         for name, value in gathering(run.config).items():
             setattr(self, name, value)
+        self.__post_init__()
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         """Return the transition with what was looked up."""
@@ -194,11 +199,6 @@ class GatherMemoryProcessorStep(ProcessorStep):
                 OBS_ENV_STATE: cache.columns[OBS_ENV_STATE][indices],
             }
         return transition
-
-    @property
-    def mechanism(self) -> MemoryMechanism:
-        """How samples remember; with no frames, not at all."""
-        return make_mechanism(self.memory if self.frames else NoMemory.name, self.frames)
 
     def gather(self, cache: FrameLookup, indices: Sequence[int]) -> dict[str, Tensor]:
         """Look up frames of the dataset by their global indices."""
