@@ -339,6 +339,7 @@ def training_run(folder: Path, steps: int = 100, done: tuple[int, ...] = (40, 80
         (place / "training_state").mkdir()
         (place / "training_state" / "training_step.json").write_text(json.dumps({"step": step}))
         config.save_pretrained(place / "pretrained_model")
+        policy.save_pretrained(place / "pretrained_model")
         (place.parent / "last").unlink(missing_ok=True)
         (place.parent / "last").symlink_to(place.name)
     return place / "pretrained_model"

@@ -229,13 +229,12 @@ def check_as_begun(arguments: LerobotArguments) -> None:
     given = [flag for flag in given if flag.partition("=")[0] not in chosen]
     if not given:
         return
-    from lerobot.configs.train import TrainPipelineConfig
+    from lerobot.configs import parser
+    from lerobot.configs.policies import PreTrainedConfig
 
     with quiet():
-        begun = TrainPipelineConfig.from_pretrained(checkpoint).policy
-        asked = TrainPipelineConfig.from_pretrained(checkpoint, cli_args=given).policy
-    if begun is None or asked is None:
-        return
+        begun = PreTrainedConfig.from_pretrained(checkpoint)
+        asked = PreTrainedConfig.from_pretrained(checkpoint, cli_overrides=parser.get_cli_overrides("policy", given))
     for name, value, held in differing(asked, begun, getattr(begun, "kept_since_begun", ())):
         raise MemobenchError(
             f"this training was begun with {name}={held}, and goes on with nothing else than that: found {value}; "
