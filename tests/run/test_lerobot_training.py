@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from lerobot.scripts import lerobot_train
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.datasets import execution_frames
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.checkpoint import check_resumed
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.run.training import trained_on
 
@@ -223,6 +225,21 @@ def test_lerobot_train(words: list[str], prompts: bool, root: Path, tmp_path: Pa
 def test_an_unclear_choice_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["train", *WORDS, "prompt_frames=some"]) == 2
     assert "prompt_frames=some: expected true or false" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("resume", [["--resume=true"], ["--resume"], ["--resume=false"], []])
+def test_plain_lerobot_train_goes_on_as_it_was_begun(
+    resume: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    MemobenchMemConfig(device="cpu", push_to_hub=False).save_pretrained(tmp_path)
+    file = tmp_path / "train_config.json"
+    monkeypatch.setattr(sys, "argv", ["lerobot-train", f"--config_path={file}", "--policy.align=semantic", *resume])
+    check_resumed(tmp_path, MemobenchMemConfig(device="cpu", push_to_hub=False, n_action_steps=1))
+    changed = MemobenchMemConfig(device="cpu", push_to_hub=False, align="semantic")
+    check_resumed(tmp_path / "another", changed)
+    refuses = resume in (["--resume=true"], ["--resume"])
+    with pytest.raises(MemobenchError, match="begun with align=none") if refuses else nullcontext():
+        check_resumed(tmp_path, changed)
 
 
 @pytest.mark.slow

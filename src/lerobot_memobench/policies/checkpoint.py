@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import sys
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
@@ -223,6 +224,37 @@ def check_as_trained(source: str | Path, policy: PreTrainedConfig, revision: str
         raise MemobenchError(
             f"--policy.{name}={asked} cannot be followed: '{source}' was trained with {held}, and {why}; "
             f"leave {name} out, or train with it"
+        )
+
+
+def check_resumed(source: str | Path, policy: PreTrainedConfig) -> None:
+    """Refuse that LeRobot's own ``--resume`` goes on with a training under settings that it was not begun with.
+
+    Args:
+        source: the checkpoint that is loaded; nothing is checked where the command line resumes none, or another.
+        policy: configuration under which it would go on; errors as of `check_as_begun`.
+    """
+    from lerobot.configs import parser
+
+    file, resume = parser.parse_arg("config_path"), parser.parse_arg("resume")
+    resumes = "--resume" in sys.argv if resume is None else resume.lower() == "true"
+    if resumes and file is not None and Path(source).resolve() in (Path(file).resolve(), Path(file).resolve().parent):
+        check_as_begun(source, policy, as_trained(source, policy))
+
+
+def check_as_begun(checkpoint: str | Path, asked: PreTrainedConfig, begun: PreTrainedConfig) -> None:
+    """Refuse to go on with a training under settings that it was not begun with.
+
+    Which settings these are the policy's configuration says, by ``kept_since_begun: ClassVar[tuple[str, ...]]``.
+
+    Raises:
+        MemobenchError: one of them is another.
+    """
+    for name, value, held in differing(asked, begun, getattr(begun, "kept_since_begun", ())):
+        raise MemobenchError(
+            f"this training was begun with {name}={held}, and goes on with nothing else than that: found {value}; "
+            f"leave {name} out, or train a new run from the checkpoint: policy={checkpoint} policy.{name}={value} "
+            "output_dir=<new folder>"
         )
 
 

@@ -29,6 +29,7 @@ from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.lerobot_hooks import OPEN_DATASETS, check_version, install
 from lerobot_memobench.policies.checkpoint import (
     as_trained,
+    check_as_begun,
     checkpoint_folder,
     checkpoint_type,
     differing,
@@ -95,7 +96,7 @@ def complete_training(arguments: LerobotArguments) -> LerobotArguments:
         if named and not arguments.has("policy.repo_id"):  # LeRobot would ask for one
             arguments = arguments.default("policy.push_to_hub", False)
     check_dataset(arguments)
-    check_as_begun(arguments)
+    check_same_training(arguments)
     policy = policy_config(arguments)
     check_observations(policy, env_config(arguments))
     steps = whole_number(arguments.get("steps"))
@@ -212,10 +213,8 @@ def _check_same_policy(given: Arguments, checkpoint: Path, folder: str) -> None:
         raise MemobenchError(f"the training in {folder} is of policy={begun}, and policy={named} was asked for")
 
 
-def check_as_begun(arguments: LerobotArguments) -> None:
+def check_same_training(arguments: LerobotArguments) -> None:
     """Refuse to go on with a training under settings, or on a dataset, that it was not begun with.
-
-    Which settings these are the policy's configuration says, by ``kept_since_begun: ClassVar[tuple[str, ...]]``.
 
     Raises:
         MemobenchError: one of them is another.
@@ -235,12 +234,7 @@ def check_as_begun(arguments: LerobotArguments) -> None:
     with quiet():
         begun = PreTrainedConfig.from_pretrained(checkpoint)
         asked = PreTrainedConfig.from_pretrained(checkpoint, cli_overrides=parser.get_cli_overrides("policy", given))
-    for name, value, held in differing(asked, begun, getattr(begun, "kept_since_begun", ())):
-        raise MemobenchError(
-            f"this training was begun with {name}={held}, and goes on with nothing else than that: found {value}; "
-            f"leave {name} out, or train a new run from the checkpoint: policy={checkpoint} policy.{name}={value} "
-            "output_dir=<new folder>"
-        )
+    check_as_begun(checkpoint, asked, begun)
 
 
 def _check_same_dataset(arguments: LerobotArguments, checkpoint: Path) -> None:

@@ -28,7 +28,7 @@ from transformers.initialization import no_init_weights
 from lerobot_memobench.datasets.feature_cache.reading import RecordedFrames
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.weights import load_visual_encoder
-from lerobot_memobench.policies.checkpoint import check_as_trained
+from lerobot_memobench.policies.checkpoint import check_as_trained, check_resumed
 from lerobot_memobench.policies.compatibility import PICTURE_STEP, cure, require_fresh
 from lerobot_memobench.policies.memobench_mem.alignment import alignment_loss, make_alignment, require_texts
 from lerobot_memobench.policies.memobench_mem.caching import open_frames
@@ -494,6 +494,8 @@ class MemobenchMemPolicy(PI05Policy):
             require_agreement(saved, of, config, training=dataset_meta is not None)
             if dataset_meta is None:
                 check_as_trained(saved, config, of)
+            else:
+                check_resumed(saved, config)
         policy = cls(config, dataset_meta=dataset_meta, load_base=False)
         load_weights(policy, path, source, remembers=config.memory != "none")
         policy.to(config.device)
