@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +16,17 @@ MakeTask = Callable[..., Task]
 MakeDemo = Callable[..., Demonstration]
 
 
-@pytest.fixture(autouse=True)
-def _own_datasets_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True, scope="module")
+def _own_datasets_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Keep Arrow copies of test datasets out of the user's cache."""
     import datasets
 
-    monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path / "hf_datasets_cache")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path_factory.mktemp("hf_datasets_cache"))
+        yield
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_task() -> MakeTask:
     def make(operations: str = "SUC", name: str = "synthetic_task", memory_type: str = "temporal") -> Task:
         checkpoints = tuple(
@@ -58,7 +60,7 @@ def make_task() -> MakeTask:
     return make
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_demo(make_task: MakeTask) -> MakeDemo:
     """Return a function of a truth table: ``rows[k]`` is a string of 0 and 1, one character per frame."""
 

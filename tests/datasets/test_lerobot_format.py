@@ -22,7 +22,7 @@ SIZE = 64
 REPO = "local/test"
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def demos(make_demo, make_task):
     """Three episodes of two tasks; the last two begin with a demonstration prompt of 5 frames."""
     second = make_task("SU", name="other_task", memory_type="object")
@@ -35,11 +35,12 @@ def demos(make_demo, make_task):
     ]
 
 
-@pytest.fixture
-def dataset(demos, tmp_path: Path):
+@pytest.fixture(scope="module")
+def dataset(demos, tmp_path_factory: pytest.TempPathFactory):
+    """Their dataset, which no test changes."""
     from lerobot.datasets import LeRobotDataset
 
-    root = write_dataset(demos, tmp_path / "ds", repo_id=REPO)
+    root = write_dataset(demos, tmp_path_factory.mktemp("whole") / "ds", repo_id=REPO)
     return LeRobotDataset(REPO, root=root)
 
 
