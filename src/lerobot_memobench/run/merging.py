@@ -45,7 +45,7 @@ def merge_and_report(out: Path, folders: Sequence[Path]) -> EvaluationReport:
 def merge(out: Path, folders: Sequence[Path]) -> list[tuple[str, int]]:
     """Join the logs, cards and videos of evaluations of one protocol into the folder ``out``.
 
-    What ``out`` holds already is joined as well. Films are hard links where the disk allows it, else copies; LeRobot's
+    What ``out`` holds already is joined as well. Videos are hard links where the disk allows it, else copies; LeRobot's
     own files stay where they are. Every check comes before anything is written.
 
     Returns:
@@ -71,7 +71,7 @@ def merge(out: Path, folders: Sequence[Path]) -> list[tuple[str, int]]:
         write_protocol(out, _joined_settings([*map(read_protocol_file, sources), *protocols.values()]))
     for source in folders:
         if source != out:
-            _share_films(source / VIDEOS, out / VIDEOS)
+            _share_videos(source / VIDEOS, out / VIDEOS)
     write_episodes(out, joined)
     if card is None:
         remove_card(out)
@@ -168,18 +168,18 @@ def _check_task_files(card: Mapping[str, Any], folder: Path) -> None:
             raise MemobenchError(f"the episodes of {name} in {folder} were run with other task files than the others")
 
 
-def _share_films(source: Path, target: Path) -> None:
+def _share_videos(source: Path, target: Path) -> None:
     """Give videos of episodes a second name, or copy them; ones that are there stay."""
-    for film in sorted(source.glob("*.mp4")):
-        place = target / film.name
+    for video in sorted(source.glob("*.mp4")):
+        place = target / video.name
         if place.exists():
             continue
         target.mkdir(parents=True, exist_ok=True)
         with draft_of(place) as draft:
             try:
-                os.link(film, draft)
+                os.link(video, draft)
             except OSError:  # another disk, or one without links
-                shutil.copyfile(film, draft)
+                shutil.copyfile(video, draft)
 
 
 def part_folders(out: Path) -> list[Path]:
