@@ -79,7 +79,10 @@ def _count(count: Callable[..., None], at: Advance) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return the exit status."""
-    name, *rest = (sys.argv[1:] if argv is None else argv) or [""]
+    name, *rest = (sys.argv[1:] if argv is None else argv) or ["--help"]
+    if name == "--help":
+        print(__doc__, "Each has --help.", sep="\n")
+        return 0
     commands: dict[str, Callable[..., None]] = {"train": train, "test": measure}
     command = commands.get(name)
     if command is None:

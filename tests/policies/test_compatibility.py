@@ -300,8 +300,7 @@ def test_a_configuration_without_a_type_is_an_earlier_form(tmp_path: Path) -> No
 
 # --- fixed by training ---
 
-FROZEN = "freeze_vision_encoder"  # LeRobot's; always true here
-NAMES = [field.name for field in dataclasses.fields(MemobenchMemConfig) if field.name != FROZEN]
+NAMES = [field.name for field in dataclasses.fields(MemobenchMemConfig)]
 
 
 def test_every_field_is_classified() -> None:

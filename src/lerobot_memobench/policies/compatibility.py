@@ -1,4 +1,4 @@
-"""What a policy sees, and what an environment shows: whether they agree, and what to do about it."""
+"""Check that a policy's inputs and an environment's observations agree, and say what to do where they do not."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ REFUSAL = "leave env.render_every at 1 for a policy that remembers the frames be
 
 
 def cure(missing: str, observed: Collection[str]) -> str:
-    """Return how to be shown an observation, to end a sentence with.
+    """Return how an observation is had, to end a sentence with.
 
     Args:
         missing: its name at the policy.
@@ -55,7 +55,7 @@ def cure(missing: str, observed: Collection[str]) -> str:
 def check_policy(
     path: str, policy: PreTrainedConfig, shown: Mapping[str, PolicyFeature], renamed: Mapping[str, str]
 ) -> None:
-    """Refuse a checkpoint that is not whole, or that was trained on something else than it will be shown.
+    """Refuse a checkpoint that is not whole, or that was trained on other inputs than it will get.
 
     Args:
         path: its folder, or a repository. policy: its configuration, of the checkpoint's own features.

@@ -1,4 +1,4 @@
-"""One environment's talk with its server: episodes begin anew, and survive a server that goes away and comes back."""
+"""One environment's session with its server; episodes survive a server that goes away and comes back."""
 
 from __future__ import annotations
 
