@@ -16,7 +16,7 @@ EXPERIMENTS = "bowl: one task, in minutes; prompted: ten tasks; joint: all thirt
 
 
 class Name(StrEnum):
-    """The experiments (`studies.learning.experiments`)."""
+    """The experiments (`experiments`)."""
 
     BOWL = "bowl"
     PROMPTED = "prompted"
