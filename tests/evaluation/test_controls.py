@@ -12,8 +12,7 @@ import pytest
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.comparison import by_replan, paired
-from lerobot_memobench.evaluation.controls import relabelled
+from lerobot_memobench.evaluation.controls import by_replan, paired, relabelled
 from lerobot_memobench.evaluation.memory_controls import contrasts, gap_closed, prefix_curves, published_contrasts
 from lerobot_memobench.evaluation.metrics import summarise
 from lerobot_memobench.paper import raw_tables

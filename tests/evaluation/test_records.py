@@ -13,6 +13,7 @@ from lerobot_memobench.envs.episode_log import (
     PROTOCOL_FILE,
     EpisodeLog,
     check_protocol,
+    differences,
     has_log,
     write_episodes,
     write_protocol,
@@ -21,15 +22,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.comparison import compare
 from lerobot_memobench.evaluation.html.write import write_html
 from lerobot_memobench.evaluation.metrics import failure_counts, summarise
-from lerobot_memobench.evaluation.records import (
-    CARD_FILE,
-    by_method,
-    differences,
-    read_protocol,
-    read_rollouts,
-    read_runs,
-    sweeps,
-)
+from lerobot_memobench.evaluation.records import CARD_FILE, by_method, read_protocol, read_rollouts, read_runs, sweeps
 from lerobot_memobench.evaluation.report import build, render, write_report
 from lerobot_memobench.evaluation.report_tables import failures_table
 from lerobot_memobench.run.merging import merge

@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_memobench.envs.episode_log import OF_THE_POLICY, SETTINGS, differences
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.evaluation.metrics import METRICS, Record, operations, percent, policy_inputs, value_of
-from lerobot_memobench.evaluation.records import OF_THE_POLICY, SETTINGS, Run, differences
+from lerobot_memobench.evaluation.records import Run
 from lerobot_memobench.evaluation.report_tables import AVERAGE, inputs_phrase
 from lerobot_memobench.evaluation.statistics import PERMUTATIONS, detectable, holm, mcnemar, sign_flip
 from lerobot_memobench.evaluation.tables import Cell, Count, Name, Numbers, Report, Section, Table
@@ -74,45 +75,6 @@ def unlike_pairs(pairs: Sequence[Pair], allow: Collection[str]) -> dict[str, str
                 f"episode {x['episode']} ({field} {x[field]} and {y[field]})"
             }
     return {}
-
-
-# --- rollouts of one replan interval ---
-
-
-def by_replan(records: Sequence[Record]) -> dict[int | None, list[Record]]:
-    """Group rollouts by replan interval, ascending; unknown intervals last."""
-    groups: dict[int | None, list[Record]] = {}
-    for record in records:
-        groups.setdefault(record.get("replan_steps"), []).append(record)
-    return dict(sorted(groups.items(), key=lambda item: (item[0] is None, item[0] or 0)))
-
-
-def paired(a: Sequence[Record], b: Sequence[Record]) -> tuple[list[Record], list[Record], int]:
-    """Return the rollouts of episodes that both have, in one order, and how many of either had no partner.
-
-    Raises:
-        MemobenchError: no episode is in both, or one is in either of them twice.
-    """
-    tables = []
-    for records in (a, b):
-        table: dict[tuple[Any, ...], Record] = {}
-        for record in records:
-            key = (record["task"], record.get("referent", "fixed"), record["episode"], record.get("seed"))
-            if key in table:
-                raise MemobenchError(
-                    f"episode {record['episode']} of {record['task']!r} was given twice under one replan interval; "
-                    "name each evaluation once"
-                )
-            table[key] = record
-        tables.append(table)
-    common = [key for key in tables[0] if key in tables[1]]
-    if not common:
-        raise MemobenchError(
-            f"the evaluations have no episode in common ({len(a)} and {count_of(len(b), 'rollout')}); compare "
-            "evaluations of the same tasks, seeds and referent"
-        )
-    alone = len(tables[0]) + len(tables[1]) - 2 * len(common)
-    return [tables[0][key] for key in common], [tables[1][key] for key in common], alone
 
 
 # --- differences ---
@@ -190,11 +152,11 @@ def compare(
         for metric in METRICS
         if (row := _difference(scope, metric, members, rng, permutations)) is not None
     ]
-    notes, seen = (
+    notes, inputs = (
         tuple(_notes(a, b, len(pairs))),
         (policy_inputs([mine for mine, _ in pairs]), policy_inputs([other for _, other in pairs])),
     )
-    return Comparison(a.name, b.name, len(pairs), tuple(_adjusted(rows)), notes, seen)
+    return Comparison(a.name, b.name, len(pairs), tuple(_adjusted(rows)), notes, inputs)
 
 
 def _like_pairs(a: Run, b: Run, allow: Collection[str]) -> list[Pair]:
@@ -329,10 +291,10 @@ def _table(key: str, title: str, found: Comparison, rows: Sequence[Difference], 
     header += ["p (Holm)"] * tasks + ["detectable"]
     starts = [k for k, row in enumerate(rows) if k == 0 or rows[k - 1].scope != row.scope]
     cells = tuple(_row(row, tasks, k in starts) for k, row in enumerate(rows))
-    seen = "; ".join(
+    inputs = "; ".join(
         f"{name}: {inputs_phrase(words)}" for name, words in zip((found.a, found.b), found.inputs, strict=True)
     )
-    return Table(key, title, tuple(header), cells, note=f"{seen}.", rules=frozenset(starts) - {0})
+    return Table(key, title, tuple(header), cells, note=f"{inputs}.", rules=frozenset(starts) - {0})
 
 
 def _row(row: Difference, tasks: bool, first: bool) -> tuple[Cell, ...]:

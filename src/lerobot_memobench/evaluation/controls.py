@@ -10,9 +10,8 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.envs.episode_log import POLICY, differences, read_episodes
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.comparison import by_replan, paired
 from lerobot_memobench.evaluation.metrics import (
     METRICS,
     PROCESS_METRICS,
@@ -23,7 +22,7 @@ from lerobot_memobench.evaluation.metrics import (
     policy_inputs,
     summarise,
 )
-from lerobot_memobench.evaluation.records import POLICY, asked_for, differences, read_protocol
+from lerobot_memobench.evaluation.records import asked_for, read_protocol
 from lerobot_memobench.evaluation.report_tables import inputs_phrase
 from lerobot_memobench.evaluation.statistics import as_percent
 from lerobot_memobench.evaluation.tables import Cell, Name, Report, Section, Table
@@ -45,9 +44,9 @@ def pairs_by_replan(
     """
     check_alike(first, second, ignore)
     notes: list[str] = []
-    seen: list[str] = []
+    inputs: list[str] = []
     a, b = (
-        by_replan([record for folder in folders for record in _rollouts(folder, notes, seen)])
+        by_replan([record for folder in folders for record in _rollouts(folder, notes, inputs)])
         for folders in (first, second)
     )
     common = [replan for replan in a if replan in b]
@@ -68,7 +67,7 @@ def pairs_by_replan(
         if partnerless:
             alone = count_of(partnerless, "rollout")
             notes.append(f"replan interval {replan}: {alone} without a partner left out")
-    return found, notes + seen
+    return found, notes + inputs
 
 
 def check_alike(first: Sequence[Path], second: Sequence[Path], ignore: Sequence[str] = ()) -> None:
@@ -106,11 +105,47 @@ def check_one_policy(folders: Sequence[Path]) -> None:
             )
 
 
-def _rollouts(folder: Path, notes: list[str], seen: list[str]) -> list[Record]:
-    """Return the rollouts of an evaluation that were asked for; its policy's inputs are told in ``seen``."""
+def _rollouts(folder: Path, notes: list[str], inputs: list[str]) -> list[Record]:
+    """Return the rollouts of an evaluation that were asked for; its policy's inputs are told in ``inputs``."""
     found: list[Record] = [*asked_for(folder, read_episodes(folder, notes), notes)]
-    seen.append(f"{folder}: {inputs_phrase(policy_inputs(found))}")
+    inputs.append(f"{folder}: {inputs_phrase(policy_inputs(found))}")
     return found
+
+
+def by_replan(records: Sequence[Record]) -> dict[int | None, list[Record]]:
+    """Group rollouts by replan interval, ascending; unknown intervals last."""
+    groups: dict[int | None, list[Record]] = {}
+    for record in records:
+        groups.setdefault(record.get("replan_steps"), []).append(record)
+    return dict(sorted(groups.items(), key=lambda item: (item[0] is None, item[0] or 0)))
+
+
+def paired(a: Sequence[Record], b: Sequence[Record]) -> tuple[list[Record], list[Record], int]:
+    """Return the rollouts of episodes that both have, in one order, and how many of either had no partner.
+
+    Raises:
+        MemobenchError: no episode is in both, or one is in either of them twice.
+    """
+    tables = []
+    for records in (a, b):
+        table: dict[tuple[Any, ...], Record] = {}
+        for record in records:
+            key = (record["task"], record.get("referent", "fixed"), record["episode"], record.get("seed"))
+            if key in table:
+                raise MemobenchError(
+                    f"episode {record['episode']} of {record['task']!r} was given twice under one replan interval; "
+                    "name each evaluation once"
+                )
+            table[key] = record
+        tables.append(table)
+    common = [key for key in tables[0] if key in tables[1]]
+    if not common:
+        raise MemobenchError(
+            f"the evaluations have no episode in common ({len(a)} and {count_of(len(b), 'rollout')}); compare "
+            "evaluations of the same tasks, seeds and referent"
+        )
+    alone = len(tables[0]) + len(tables[1]) - 2 * len(common)
+    return [tables[0][key] for key in common], [tables[1][key] for key in common], alone
 
 
 def rollouts_by_level(*folders: Path) -> tuple[dict[str, list[Record]], list[str]]:
@@ -125,9 +160,9 @@ def rollouts_by_level(*folders: Path) -> tuple[dict[str, list[Record]], list[str
     for folder in folders[1:]:
         check_alike(folders[:1], [folder])
     notes: list[str] = []
-    seen: list[str] = []
+    inputs: list[str] = []
     levels: dict[str, list[Record]] = {
-        level: _rollouts(folder, notes, seen) for level, folder in zip(LEVELS, folders, strict=True)
+        level: _rollouts(folder, notes, inputs) for level, folder in zip(LEVELS, folders, strict=True)
     }
     intervals = {level: list(by_replan(records)) for level, records in levels.items()}
     if len({tuple(found) for found in intervals.values()}) > 1:
@@ -135,7 +170,7 @@ def rollouts_by_level(*folders: Path) -> tuple[dict[str, list[Record]], list[str
         raise MemobenchError(f"the levels were evaluated at different replan intervals ({told}); use the same replan=")
     if len(intervals[LEVELS[0]]) > 1:
         notes.append("the evaluations mix replan intervals; the figures are over all of them")
-    return levels, notes + seen
+    return levels, notes + inputs
 
 
 def with_labels_of_level(levels: Mapping[str, Sequence[Record]]) -> dict[str, list[Record]]:

@@ -18,7 +18,6 @@ from annotated_types import Ge, Le, MinLen
 from lerobot_memobench.envs.episode_log import (
     EXTENT,
     MOST_EPISODES,
-    OF_THE_POLICY,
     POLICY,
     SETTINGS,
     CheckpointRecord,
@@ -78,7 +77,7 @@ class Start(TypedDict):
     times: NotRequired[Count]
 
 
-class Found(Outcome):
+class CardEpisode(Outcome):
     """What an episode came to."""
 
     task: Name
@@ -88,7 +87,7 @@ class Found(Outcome):
     checkpoints: NotRequired[list[CheckpointRecord]]
 
 
-class Told(TypedDict, total=False):
+class StartFacts(TypedDict, total=False):
     """What is taken from a start where the rest of it does not matter."""
 
     command: list[str]
@@ -100,7 +99,7 @@ class Card(TypedDict):
 
     protocol: Protocol
     policy: NotRequired[Policy]
-    runs: NotRequired[list[Told]]
+    runs: NotRequired[list[StartFacts]]
 
 
 class WholeCard(TypedDict):
@@ -116,23 +115,10 @@ class WholeCard(TypedDict):
     flags: list[str]
     shard: str | None
     runs: Annotated[list[Start], MinLen(1)]
-    episodes: list[Found]
+    episodes: list[CardEpisode]
 
 
 # --- the protocol ---
-
-__all__ = [
-    "CARD_FILE",
-    "EXTENT",
-    "OF_THE_POLICY",
-    "POLICY",
-    "SETTINGS",
-    "differences",
-    "one_suite",
-    "protocol_of_log",
-    "read_card",
-    "read_protocol",
-]
 
 CARD_FILE = "card.json"
 

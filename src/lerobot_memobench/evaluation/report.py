@@ -14,7 +14,7 @@ from typing import Any
 
 from rich.console import RenderableType
 
-from lerobot_memobench.envs.episode_log import not_run, notes_on_not_run, read_log, write_episodes
+from lerobot_memobench.envs.episode_log import POLICY, not_run, notes_on_not_run, read_log, write_episodes
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.evaluation.metrics import (
     METRICS,
@@ -28,7 +28,7 @@ from lerobot_memobench.evaluation.metrics import (
     report_values,
     summarise,
 )
-from lerobot_memobench.evaluation.records import POLICY, Run, asked_for, sweeps, unlike
+from lerobot_memobench.evaluation.records import Run, asked_for, sweeps, unlike
 from lerobot_memobench.evaluation.report_tables import (
     PAPER_INPUTS,
     beside_paper,
@@ -139,11 +139,11 @@ def build(runs: Sequence[Run], paper: bool = False) -> Report:
 
 def _section(summary: Summary, records: Sequence[Record], notes: Sequence[str]) -> Section:
     """Return the section of one evaluation, without a title."""
-    seen = inputs_sentence(summary.inputs)
+    inputs = inputs_sentence(summary.inputs)
     made = (memory_types_table(summary), tasks_table(summary), prefix_table(summary), failures_table(summary))
     return Section(
         "",
-        tuple(replace(each, note=f"{each.note} {seen}".strip()) for each in made),
+        tuple(replace(each, note=f"{each.note} {inputs}".strip()) for each in made),
         (protocol_sentence(records), pooled_sentence(summary)),
         tuple(notes),
     )

@@ -268,7 +268,7 @@ def _averages(method: str, runs: Sequence[Run]) -> Table:
         f"Average by replan interval: {method}",
         ("replan interval", "n", *METRICS),
         rows,
-        note=f"{HOW_TO_READ} {_seen(runs)}",
+        note=f"{HOW_TO_READ} {_inputs(runs)}",
         best=best_in_columns(rows),
     )
 
@@ -280,12 +280,12 @@ def _memory_types(method: str, runs: Sequence[Run]) -> Table:
         f"Memory types by replan interval: {method}",
         rows,
         leading=("replan interval",),
-        note=_seen(runs),
+        note=_inputs(runs),
         best=best_in_columns(rows),
     )
 
 
-def _seen(runs: Sequence[Run]) -> str:
+def _inputs(runs: Sequence[Run]) -> str:
     return inputs_sentence(policy_inputs([record for run in runs for record in run.records]))
 
 

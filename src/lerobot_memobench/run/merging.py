@@ -12,6 +12,7 @@ from typing import Any
 from lerobot_memobench.envs.episode_log import (
     EXTENT,
     POLICY,
+    differences,
     has_log,
     read_log,
     read_protocol_file,
@@ -19,12 +20,7 @@ from lerobot_memobench.envs.episode_log import (
     write_protocol,
 )
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.records import (
-    CARD_FILE,
-    differences,
-    read_card,
-    read_protocol,
-)
+from lerobot_memobench.evaluation.records import CARD_FILE, read_card, read_protocol
 from lerobot_memobench.io import draft_of
 from lerobot_memobench.run.card import disagreement, extended, key_of, remove_card, with_episodes, write_card
 from lerobot_memobench.run.run import VIDEOS, EvaluationReport, report_on

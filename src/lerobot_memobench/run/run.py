@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.envs.episode_log import has_log, read_episodes, read_log, read_protocol_file
+from lerobot_memobench.envs.episode_log import POLICY, differences, has_log, read_episodes, read_log, read_protocol_file
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import Summary
-from lerobot_memobench.evaluation.records import CARD_FILE, POLICY, differences, read_card, read_protocol
+from lerobot_memobench.evaluation.records import CARD_FILE, read_card, read_protocol
 from lerobot_memobench.evaluation.report import REPORT_MARKDOWN, write_report
 from lerobot_memobench.io import count_of, remove_drafts
 from lerobot_memobench.jobs.processes import locked

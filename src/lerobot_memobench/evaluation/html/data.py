@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench import __version__
+from lerobot_memobench.envs.episode_log import POLICY
 from lerobot_memobench.envs.video import OPERATION_COLOURS
 from lerobot_memobench.evaluation.metrics import (
     Rate,
@@ -22,13 +23,7 @@ from lerobot_memobench.evaluation.metrics import (
     operations,
     percent,
 )
-from lerobot_memobench.evaluation.records import (
-    CARD_FILE,
-    POLICY,
-    Run,
-    read_card,
-    unlike,
-)
+from lerobot_memobench.evaluation.records import CARD_FILE, Run, read_card, unlike
 from lerobot_memobench.evaluation.report_tables import outcomes, settings_phrases
 from lerobot_memobench.evaluation.tables import OPERATION_NAMES
 from lerobot_memobench.io import count_of

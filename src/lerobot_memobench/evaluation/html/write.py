@@ -142,16 +142,16 @@ def find_videos(folder: Path, records: Sequence[Record]) -> tuple[dict[int, Path
     for k, record in enumerate(records):
         if not _names_a_file(episode_id(record)):
             continue
-        film = folder / VIDEOS / f"{record['task']}.{record['episode']}.mp4"
-        if film.is_file():
-            if _fits(frame_count(film), record, held=LAST_FRAMES + 1):
-                found[k] = film
+        video = folder / VIDEOS / f"{record['task']}.{record['episode']}.mp4"
+        if video.is_file():
+            if _fits(frame_count(video), record, held=LAST_FRAMES + 1):
+                found[k] = video
                 continue
-            misfits.append(film.name)
+            misfits.append(video.name)
         other = others.get(k)
         if other is not None and _fits(frame_count(other), record, held=0):
             found[k] = other
-    # A film's name does not tell the referent: where both settings are in one log, it could be of either.
+    # A video's name does not tell the referent: where both settings are in one log, it could be of either.
     claims = Counter(found.values())
     misfits += [video.name for video, count in claims.items() if count > 1]
     found = {k: video for k, video in found.items() if claims[video] == 1}
