@@ -275,7 +275,7 @@ def text_attribute(group: h5py.Group, key: str, required: bool = False) -> Any:
             raise Unusable(f"the attribute {key!r} is missing")
         return None
     if not isinstance(value, str):
-        raise Unusable(f"the attribute {key!r} is of type {type(value).__name__}, expected text")
+        raise Unusable(f"the attribute {key!r} is of type {type(group.attrs[key]).__name__}, expected text")
     return value
 
 
