@@ -199,13 +199,13 @@ class Frame:
     Attributes:
         answer: what it begins to do.
         step: control steps of the execution so far.
-        seen: pictures as it happens. at_home: pictures with the arm at home.
+        observations: pictures as it happens. at_home: pictures with the arm at home.
         proprio: (8,) as it happens; at home it is the same at every decision of an episode.
     """
 
     answer: str
     step: int
-    seen: tuple[Picture, ...]
+    observations: tuple[Picture, ...]
     at_home: tuple[Picture, ...]
     proprio: NDArray[np.float32]
 

@@ -146,7 +146,7 @@ class _Way:
     Attributes:
         party: which start it began at. reached: goals reached from the starts before that one.
         node, memories, used: where it is, what the goals of this start remember, steps used.
-        seen: states on the way, to which a map returns for ever.
+        visited: states on the way, to which a map returns for ever.
     """
 
     party: int
@@ -154,7 +154,7 @@ class _Way:
     node: int
     memories: Memories
     used: int = 0
-    seen: frozenset[object] = frozenset()
+    visited: frozenset[object] = frozenset()
 
     @property
     def total(self) -> int:
@@ -202,7 +202,7 @@ class _Search:
         picture = self._graph.pictures[way.node]
         answers = [policy[picture]] if picture in policy else self._answers
         known = [answer for answer in answers if answer in moves]
-        if is_decided(way.memories) or state in way.seen or self._visits > VISITS or not known:
+        if is_decided(way.memories) or state in way.visited or self._visits > VISITS or not known:
             self.set_out(way.party + 1, way.total, policy)
             return
         for answer in known:
@@ -213,8 +213,8 @@ class _Search:
         """Take a move, the last one if there is time for no other."""
         watches = self._parties[way.party][1]
         memories = advance_all(watches, way.memories, move, self._horizon - way.used)
-        seen = way.seen | {(way.node, way.memories)}
-        after = _Way(way.party, way.reached, move.to, memories, way.used + move.steps, seen)
+        visited = way.visited | {(way.node, way.memories)}
+        after = _Way(way.party, way.reached, move.to, memories, way.used + move.steps, visited)
         if after.used < self._horizon:
             self._walk(after, policy)
         else:

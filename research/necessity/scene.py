@@ -125,7 +125,7 @@ def _exactly(a: Frame, b: Frame) -> float:
 
 def _as_it_happens(a: Frame, b: Frame) -> float:
     """Return how much two frames differ with the arm where it was; 1 where the hand was elsewhere."""
-    return difference(a.seen, b.seen) if np.abs(a.proprio - b.proprio).max() <= SAME_HAND else 1.0
+    return difference(a.observations, b.observations) if np.abs(a.proprio - b.proprio).max() <= SAME_HAND else 1.0
 
 
 def _ceilings(

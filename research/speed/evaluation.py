@@ -104,7 +104,7 @@ LINES = {
 
 
 @contextmanager
-def looking_every(steps: int) -> Iterator[None]:
+def observing_every(steps: int) -> Iterator[None]:
     """While this lasts, the random policy looks at every ``steps``-th observation, at none with 0."""
     calls = itertools.count(1)
     with patch.object(
@@ -123,7 +123,7 @@ def evaluate_once(every: int, films: int, steps: int, task: str = TASK) -> Cost:
         f"videos={films}",
     ]
     words += ["episodes=1", "batch_size=1", f"horizon={steps}"]
-    with tempfile.TemporaryDirectory() as out, looking_every(every), stopwatch() as watch:
+    with tempfile.TemporaryDirectory() as out, observing_every(every), stopwatch() as watch:
         run_evaluation(plan_line([*words, f"output_dir={Path(out) / 'run'}"]), lambda text: None)
     return watch.cost
 
@@ -307,7 +307,7 @@ def _evaluate(tasks: str, steps: int, shard: str, every: int, out: str) -> None:
     import lerobot_memobench.registration  # noqa: F401 - makes the policy known
 
     words = ["env=memobench", f"tasks={tasks}", "policy=memobench_random", "episodes=1", "videos=0", f"horizon={steps}"]
-    with looking_every(every):
+    with observing_every(every):
         run_evaluation(plan_line([*words, f"shard={shard}", f"output_dir={out}"]), lambda text: None)
 
 

@@ -12,7 +12,7 @@ from lerobot_memobench.policies.baselines.configuration_baselines import Memoben
 from lerobot_memobench.policies.baselines.modeling_baselines import MemobenchRandomPolicy
 from research.speed import evaluation
 from research.speed.claims import BENCHMARKS
-from research.speed.evaluation import Cost, Stopwatch, evaluate_once, looking_every, step_bare
+from research.speed.evaluation import Cost, Stopwatch, evaluate_once, observing_every, step_bare
 
 
 def test_a_step_costs_what_passes_from_the_first_to_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -28,7 +28,7 @@ def test_a_step_costs_what_passes_from_the_first_to_the_end(monkeypatch: pytest.
 def test_the_policy_looks_as_often_as_it_is_told() -> None:
     policy = MemobenchRandomPolicy(MemobenchRandomConfig())
     for every, looks in ((0, []), (1, [1, 2, 3, 4, 5, 6]), (3, [3, 6])):
-        with looking_every(every):
+        with observing_every(every):
             assert [number for number in range(1, 7) if policy.needs_observation()] == looks
 
 

@@ -239,7 +239,7 @@ def test_tasks_with_a_prompt_have_a_number_of_their_own(tasks, recorded, tmp_pat
 def test_a_learner_is_named_by_its_run(tmp_path, where):
     (tmp_path / where).mkdir(parents=True)
     (tmp_path / where / "model.safetensors").write_bytes(b"weights")
-    name, _, digest = generation.policy_told(str(tmp_path / where)).partition(" ")
+    name, _, digest = generation.policy_text(str(tmp_path / where)).partition(" ")
     assert name == "mine"
     assert digest == hashlib.sha256(b"weights").hexdigest()[:16]
 

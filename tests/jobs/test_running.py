@@ -12,7 +12,7 @@ import pytest
 from filelock import lock_descriptor
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.jobs.executors import Datatrove, Needs, asked_for, check_executor, options_told, run_jobs
+from lerobot_memobench.jobs.executors import Datatrove, Needs, asked_for, check_executor, options_text, run_jobs
 from lerobot_memobench.jobs.processes import Advance, locked, taking_turns
 from lerobot_memobench.run.arguments import read_executor_options
 from tests.support.note_job import Note
@@ -67,7 +67,7 @@ def test_words_for_sbatch_are_handed_on_and_false_is_false() -> None:
     words += ["sbatch_args.exclusive=true", "sbatch_args.mail-type=END", "requeue_signals=SIGUSR1,SIGTERM", "nice=0"]
     options = read_executor_options(words)
     check_executor("slurm", options)
-    told = options_told("slurm", options, Needs(cores=2, memory_gb=9, gpus=1))
+    told = options_text("slurm", options, Needs(cores=2, memory_gb=9, gpus=1))
     making = Datatrove("slurm", 1, Path("logs"), 1, told).arguments
     assert making["sbatch_args"] == {
         "account": "lab",
@@ -88,11 +88,11 @@ def test_words_for_sbatch_are_handed_on_and_false_is_false() -> None:
 
 def test_a_job_on_slurm_asks_for_what_it_needs_unless_told_otherwise() -> None:
     needs = Needs(cores=2, memory_gb=8, gpus=1)
-    assert options_told("slurm", {}, needs) == {"cpus_per_task": 2, "mem_per_cpu_gb": 4, "gpus_per_task": 1}
+    assert options_text("slurm", {}, needs) == {"cpus_per_task": 2, "mem_per_cpu_gb": 4, "gpus_per_task": 1}
     own = {"cpus_per_task": 8, "mem_per_cpu_gb": 3, "gpus_per_task": 0}
-    assert options_told("slurm", own, needs) == own
+    assert options_text("slurm", own, needs) == own
     assert "8 cores, 24 GB, no GPU" in asked_for(own)
-    assert options_told("local", {}, needs) == {}
+    assert options_text("local", {}, needs) == {}
 
 
 @needs_datatrove

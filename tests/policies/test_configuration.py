@@ -58,6 +58,7 @@ def test_defaults_are_the_papers() -> None:
         ({"subgoal_level": "middle"}, "intermediate"),
         ({"memory_stride": 0}, "memory_stride"),
         ({"tokens_per_frame": 8}, "16"),
+        ({"freeze_vision_encoder": False}, "leave it out"),
         ({"ema_decay": 1.0}, "ema_decay"),
         ({"image_resolution": (100, 100)}, "multiple of 48"),
     ],

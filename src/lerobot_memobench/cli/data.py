@@ -13,7 +13,7 @@ from lerobot_memobench.cli.console import OfSuite, Suite, WhichSuite, console, c
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.tables import Unbroken
 from lerobot_memobench.io import count_of
-from lerobot_memobench.jobs.executors import asked_for, options_told
+from lerobot_memobench.jobs.executors import asked_for, options_text
 from lerobot_memobench.run.arguments import read_executor_options
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 
@@ -122,7 +122,7 @@ def generate(
         )
     _print_summary(summary, out)
     if summary.submitted:
-        screen.print(asked_for(options_told(executor.value, options, NEEDS)), soft_wrap=True, highlight=False)
+        screen.print(asked_for(options_text(executor.value, options, NEEDS)), soft_wrap=True, highlight=False)
     return summary.exit_status
 
 

@@ -79,11 +79,11 @@ for group, commands in COMMANDS.items():
 def _elsewhere(name: str, example: str) -> None:
     """Point from ``memobench <name>`` to LeRobot's command."""
 
-    def told(words: Annotated[list[str] | None, typer.Argument()] = None) -> None:
+    def refuse(words: Annotated[list[str] | None, typer.Argument()] = None) -> None:
         asked = f"here: lerobot {name} {' '.join(words)}" if words else f"such as: {example}"
         raise MemobenchError(f"`memobench` has no command {name!r}, it is LeRobot's; {asked} (`lerobot {name} --help`)")
 
-    app.command(name, hidden=True, add_help_option=False, context_settings={"ignore_unknown_options": True})(told)
+    app.command(name, hidden=True, add_help_option=False, context_settings={"ignore_unknown_options": True})(refuse)
 
 
 _elsewhere("eval", "lerobot eval env=memobench policy=<checkpoint> tasks=object")

@@ -43,11 +43,11 @@ from lerobot_memobench.datasets.staging import (
 )
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import file_hash, file_name, free_bytes, in_words, telling_of_the_disk
-from lerobot_memobench.jobs.executors import Needs, check_executor, options_told, run_jobs
+from lerobot_memobench.jobs.executors import Needs, check_executor, options_text, run_jobs
 from lerobot_memobench.jobs.processes import ProgressCallback
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import DEMONSTRATION_SEED, IMAGE_SIZE
-from lerobot_memobench.tasks.task import Task, referent_told
+from lerobot_memobench.tasks.task import Task, referent_text
 
 WEIGHTS = "model.safetensors"
 NEEDS = Needs(cores=1, memory_gb=4)
@@ -117,7 +117,7 @@ def generate(
         )
     check_executor(executor, executor_options)
     _check_prompts(tasks, demonstration_prompt)
-    referent = referent_told(referent, drawn=all(task.drawn for task in tasks))
+    referent = referent_text(referent, drawn=all(task.drawn for task in tasks))
     if perturb and policy is not None:
         raise MemobenchError("the arm is to be moved both at random and by a policy; leave out --perturb or --policy")
     settings = RecordingSettings(referent, images, image_size, demonstration_prompt, hold_frames, perturb, policy)
@@ -137,7 +137,7 @@ def generate(
             workers=workers,
             progress=progress,
             executor=executor,
-            options=options_told(executor, executor_options or {}, NEEDS),
+            options=options_text(executor, executor_options or {}, NEEDS),
             logs=_logs(out, executor),
             finish=partial(_finish_on_slurm, plan, out.absolute(), repo_id),
         )
@@ -172,7 +172,7 @@ class _Plan:
             "prompted_episodes": self.prompted_episodes,
             "seed_base": self.seed_base,
             **asdict(self.settings),
-            "policy": self.settings.policy and policy_told(self.settings.policy),
+            "policy": self.settings.policy and policy_text(self.settings.policy),
             "task_files": [task_hash(task) for task in self.tasks],
             "versions": _versions(),
         }
@@ -188,7 +188,7 @@ class _Plan:
         seeds = f"{self.episodes} seeds per task{more} from {self.seed_base} on"
         moved = ", the arm moved off its way at random in two thirds of them" if self.settings.perturb else ""
         if self.settings.policy is not None:
-            moved = f", the arm moved by the policy {policy_told(self.settings.policy)} for some steps at a time"
+            moved = f", the arm moved by the policy {policy_text(self.settings.policy)} for some steps at a time"
         return f"`memobench generate`, {seeds}, referent {referent}{prompts}{moved}. {SCRIPTED}"
 
     def jobs(self, folder: Path) -> list[RecordingJob]:
@@ -318,7 +318,7 @@ def _check_finished(out: Path, plan: _Plan, manifest: dict[str, Any]) -> None:
                 )
 
 
-def policy_told(checkpoint: str) -> str:
+def policy_text(checkpoint: str) -> str:
     """Return a checkpoint's name, or its training run's, and the hash of its weights: another one is another run."""
     weights = Path(checkpoint) / WEIGHTS
     if not weights.is_file():

@@ -25,7 +25,7 @@ from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.failures import INVALID_ACTION, UNSTABLE_PHYSICS
 from lerobot_memobench.tasks.formula import Atom, atoms
 from lerobot_memobench.tasks.progress import Progress
-from lerobot_memobench.tasks.task import DRAWN, REFERENTS, STRICT, Task, referent_told
+from lerobot_memobench.tasks.task import DRAWN, REFERENTS, STRICT, Task, referent_text
 
 
 class Fault(NamedTuple):
@@ -69,7 +69,7 @@ class Episode:
         if referent not in known:
             raise MemobenchError(f"referent is {referent!r}; {nearest(referent, known)}")
         self.published = task
-        self.referent, self.horizon = referent_told(referent, task.drawn), horizon
+        self.referent, self.horizon = referent_text(referent, task.drawn), horizon
         self.demonstration_prompt = demonstration_prompt and task.prompt is not None
         self.sim = Simulation(task, render)
         self._slots: ObjectSlots | None = None

@@ -43,7 +43,7 @@ from lerobot_memobench.protocol import (
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.tasks.catalogue import get_task, load_task, suite_of
 from lerobot_memobench.tasks.memory_text import memory_text, with_memory
-from lerobot_memobench.tasks.task import referent_told
+from lerobot_memobench.tasks.task import referent_text
 
 logger = logging.getLogger(__name__)
 
@@ -110,7 +110,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             "suite": self._task.suite,
             "seed_base": seed_base,
             "obs_type": obs_type,
-            "referent": referent_told(referent, self._task.drawn),
+            "referent": referent_text(referent, self._task.drawn),
             "demonstration_prompt": demonstration_prompt,
             "prompt_in": prompt_in,
             "horizon": horizon,

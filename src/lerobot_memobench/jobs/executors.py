@@ -120,7 +120,7 @@ class Needs:
     gpus: int = 0
 
 
-def options_told(executor: str, options: Mapping[str, Any], needs: Needs) -> dict[str, Any]:
+def options_text(executor: str, options: Mapping[str, Any], needs: Needs) -> dict[str, Any]:
     """Return the options of an executor, with what a job needs where they say nothing of it; on Slurm alone.
 
     Datatrove would ask for one core, 2 GB and no GPU.

@@ -17,7 +17,7 @@ from typing import Any
 from lerobot_memobench.envs.episode_log import has_log
 from lerobot_memobench.envs.prompting import parameters_of
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.jobs.executors import ELSEWHERE, Needs, check_executor, options_told, run_jobs
+from lerobot_memobench.jobs.executors import ELSEWHERE, Needs, check_executor, options_text, run_jobs
 from lerobot_memobench.jobs.processes import ProgressCallback
 from lerobot_memobench.jobs.threads import LARGE, sharing
 from lerobot_memobench.run.card import card_of
@@ -172,7 +172,7 @@ def executor_options(plan: EvaluationPlan) -> dict[str, Any]:
     parameters = parameters_of(plan.policy_path) or 0 if plan.policy_path is not None else 0
     on_gpu = device.startswith("cuda") if device else parameters >= LARGE
     needs = Needs(cores=2, memory_gb=8 + 2 * 4 * parameters // 10**9, gpus=int(on_gpu))
-    return options_told(options.executor, options.executor_options, needs)
+    return options_text(options.executor, options.executor_options, needs)
 
 
 def run_shards(

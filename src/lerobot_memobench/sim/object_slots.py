@@ -30,7 +30,7 @@ POINTS = 24
 QUANTUM = 1e-4
 """Poses are told to 0.1 mm (rotations and angles to 1e-4): a drawer that holds something rests a nanometre from an
 empty one, and a difference like that would say what is inside, or change the order of slots."""
-SEEN_POINTS = 2
+VISIBLE_POINTS = 2
 """Rays that must arrive: one may slip through a gap between drawer and frame."""
 
 Array = NDArray[np.float64]
@@ -161,7 +161,7 @@ class ObjectSlots:
             owners = self.owners(geoms)
             mine = self._of_point[inside]
             hits += np.bincount(mine[owners == mine], minlength=len(hits))
-        return hits >= SEEN_POINTS
+        return hits >= VISIBLE_POINTS
 
     def _row(self, thing: Thing) -> Array:
         data = self._sim.data

@@ -39,7 +39,7 @@ BDDL_FILE = "task_config.bddl"
 METADATA_FILE = "task_config.meta.json"
 
 
-def referent_told(asked: str, drawn: bool) -> str:
+def referent_text(asked: str, drawn: bool) -> str:
     """Return the referent of episodes for which one was asked: none can be chosen where each draws its own."""
     return DRAWN if drawn else asked
 

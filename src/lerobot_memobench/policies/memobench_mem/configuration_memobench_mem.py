@@ -174,7 +174,7 @@ OF_ACTING = _names(
 )
 """Fields that are free where a checkpoint acts. A ``detector`` is no part of it, and its own ``visual_encoder`` has a
 rule of its own (`checkpoints.read_config`); LeRobot makes ``output_features`` of the environment's, which
-`policies.compatibility` compares with the checkpoint's, and ``freeze_vision_encoder`` is always true here."""
+`policies.compatibility` compares with the checkpoint's, and ``freeze_vision_encoder`` has one value here."""
 OF_TRAINING = _names(
     """
     detection_noise base_weights align align_weight subgoal_level shuffle_subgoals
@@ -286,6 +286,8 @@ class MemobenchMemConfig(PI05Config):
     None: the size's, 0.02 at ``small`` and the paper's 1 elsewhere."""
 
     # -- pi0.5's fields with this recipe's values, or the size's where they are None or empty
+    freeze_vision_encoder: bool = True
+    """Always: memory tokens are cached from the image tower."""
     chunk_size: int = FROM_SIZE
     n_action_steps: int = FROM_SIZE
     full_chunk_when_stalled: bool = False
@@ -351,7 +353,11 @@ class MemobenchMemConfig(PI05Config):
             self.align_weight = ALIGN_WEIGHTS[self.align]
         if self.objective == REGRESSION:
             self.num_inference_steps = 1
-        self.freeze_vision_encoder = True  # memory tokens are cached from the tower, and must stay what they are
+        if not self.freeze_vision_encoder:
+            raise MemobenchError(
+                "--policy.freeze_vision_encoder=false would train the image tower, whose tokens of remembered frames "
+                "are computed once, before training; leave it out."
+            )
         super().__post_init__()
         self._check_numbers()
         self._check_perception()
