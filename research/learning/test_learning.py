@@ -1,4 +1,4 @@
-"""From commands to tables: what is run once, gone on with and counted. What is learned, `python -m research.learning` shows."""
+"""From commands to tables: what is run once, gone on with and counted (`python -m research.learning`)."""
 
 from __future__ import annotations
 

@@ -78,7 +78,7 @@ def task_table(found: Sequence[Task]) -> Table:
     suites = {task.suite for task in found}
     title = count_of(len(found), "task") + (f" of the {suites.pop()} suite" if len(suites) == 1 else "")
     table = Table(title=title, title_justify="left", header_style="bold", pad_edge=False)
-    for name in ("no.", "task", "memory type", "checkpoints", "prompt video", "instruction"):
+    for name in ("no.", "task", "memory type", "checkpoints", "demonstration prompt", "instruction"):
         table.add_column(name, justify="right" if name == "no." else "left")
     for k, task in enumerate(found):
         if k and task.memory_type != found[k - 1].memory_type:
