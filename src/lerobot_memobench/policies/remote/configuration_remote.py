@@ -95,7 +95,7 @@ class RemoteConfig(UntrainedConfig):
         mirror: send images mirrored left to right, for checkpoints trained on LIBERO's images as openpi turns them.
         gripper: meaning of the last number of an action, one of `GRIPPERS`; the dialect's when left out.
         memory: whether the server remembers what it was sent; the dialect's when left out.
-        send_prompt: whether it sees the demonstration prompt. Switch it off for a policy without memory, to save the time.
+        send_prompt: whether it sees the demonstration prompt. Switch it off for a policy without memory, to save time.
         history_every: steps between the frames of the prompt that it sees; ``n_action_steps`` when left out. A server
             that buffers frames (robomme) gets all of them.
         connect_timeout: how long the first connection is waited for, s.
