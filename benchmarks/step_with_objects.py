@@ -18,9 +18,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 from turns import medians
 
 from lerobot_memobench.envs.episode import Episode
+from lerobot_memobench.protocol import VALIDATION_SEED
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-
-SEED = 20_000
 
 
 def main() -> None:
@@ -57,12 +56,12 @@ def main() -> None:
 
 def stepper(episode: Episode, see: Callable[[Episode], object], steps: int) -> Callable[[], None]:
     """Return a function that takes some steps of an episode, looking at each; a new one begins where it ended."""
-    episode.reset(SEED)
+    episode.reset(VALIDATION_SEED)
 
     def take() -> None:
         for _ in range(steps):
             if episode.done:
-                episode.reset(SEED)
+                episode.reset(VALIDATION_SEED)
             see(episode)
             episode.step(episode.expert_action())
 

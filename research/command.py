@@ -8,11 +8,8 @@ from collections.abc import Callable
 
 import typer
 
-from lerobot_memobench.cli.console import one_sentence
-from lerobot_memobench.jobs.processes import saying_how_to_go_on
+from lerobot_memobench.cli.console import run_app
 from lerobot_memobench.jobs.threads import ACTING, LEARNING, use_threads
-
-USAGE_ERROR = 2
 
 
 def run(name: str, command: Callable[..., None], argv: list[str] | None = None, *, learns: bool = False) -> int:
@@ -32,18 +29,4 @@ def run(name: str, command: Callable[..., None], argv: list[str] | None = None, 
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
     app.command()(command)
     again = f"{program}: ended by SIGTERM; go on with: {program} {shlex.join(arguments)}"
-    try:
-        with saying_how_to_go_on(lambda: again):
-            app(args=arguments, standalone_mode=False, prog_name=program)
-    except (typer.Abort, KeyboardInterrupt, EOFError):
-        return 130
-    except typer.Exit as stop:
-        return stop.exit_code
-    except Exception as error:
-        message: Callable[[], str] | None = getattr(error, "format_message", None)  # click's usage errors
-        sentence = one_sentence(error) if message is None else f"{message()} (see `{program} --help`)"
-        if sentence is None:
-            raise
-        print(f"{program}: {sentence}", file=sys.stderr)
-        return USAGE_ERROR
-    return 0
+    return run_app(app, arguments, program, again)

@@ -27,10 +27,10 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import Count, Number, read_json, write_file
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.sampler import training_run
-from lerobot_memobench.protocol import CAMERAS
+from lerobot_memobench.protocol import CAMERAS, EVALUATION_SEED
 from research.alignment.measures import Measures, Split, guesses, make_questions, split_episodes
 from research.alignment.report import draw, measures_table, summarise
-from research.learning.experiments import EVALUATION_SEEDS, MEMORY, MEMORYLESS, Experiment
+from research.learning.experiments import MEMORY, MEMORYLESS, Experiment
 from research.learning.results import as_json, contrasts, contrasts_table, costs_table, outcomes_table
 from research.learning.stages import Cost, Stages, name_of
 from research.learning.study import Rolled, Say, train_and_roll_out
@@ -61,7 +61,7 @@ class StudySettings:
     seeds: int = 3
     held_out: int = 4
     rollouts: int = 20
-    first_seed: int = EVALUATION_SEEDS
+    first_seed: int = EVALUATION_SEED
     level: str = "intermediate"
     frames_per_episode: int = 24
 

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, logsigmoid
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import draft_of, draw_curve, mean_of
+from lerobot_memobench.io import draft_of
 from lerobot_memobench.perception.detector import (
     COARSE,
     FINE,
@@ -34,7 +34,12 @@ from lerobot_memobench.perception.detector import (
 from lerobot_memobench.perception.geometry import projected
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, VisualEncoder
 from lerobot_memobench.perception.weights import save_detector
-from lerobot_memobench.policies.memobench_mem.training import keep_freed_memory, quicker_in_bfloat16
+from lerobot_memobench.policies.memobench_mem.training import (
+    draw_curve,
+    keep_freed_memory,
+    mean_of,
+    quicker_in_bfloat16,
+)
 from lerobot_memobench.sim.scene import TABLE_TOP
 from research.detector.data import Pictures
 from research.detector.labels import MASK, Rows, images_of

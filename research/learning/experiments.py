@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
+from lerobot_memobench.protocol import EVALUATION_SEED
 from lerobot_memobench.tasks.catalogue import BOWL, get_task, task_names
 from lerobot_memobench.tasks.task import PUBLISHED
 
@@ -33,10 +34,6 @@ PERCEPTIONS = {
 }
 """A policy that is to act by detections learns by privileged object state with their noise."""
 
-EVALUATION_SEEDS = 7
-TUNING_SEEDS = 20_000
-"""First seeds: of the evaluation that is reported, and of one that settings may be chosen by."""
-
 
 @dataclass(frozen=True)
 class Experiment:
@@ -62,7 +59,7 @@ class Experiment:
     pixel_steps: int | None = None
     seeds: int = 1
     rollouts: int = 50
-    first_seed: int = EVALUATION_SEEDS
+    first_seed: int = EVALUATION_SEED
     referent: str = "random"
     prompted_episodes: int | None = None
 

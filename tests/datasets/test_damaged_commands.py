@@ -32,13 +32,13 @@ from lerobot_memobench.datasets.lerobot_format.reading import read_episode
 from lerobot_memobench.datasets.replay import replay, resimulate
 from lerobot_memobench.datasets.staging import stage_demonstration
 from lerobot_memobench.datasets.validate import validate as validation
-from lerobot_memobench.datasets.video import encode_video
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import CAMERAS
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks import get_task
 from tests.support import mutations
+from tests.support.videos import encode_video
 
 TASK = "put_the_butter_into_the_bowl_from_the_prompt_video"
 FRAMES, EXEC_START, SIZE = 6, 2, 32

@@ -15,8 +15,9 @@ from lerobot_memobench.datasets.lerobot_format.assembling import numeric_stats, 
 from lerobot_memobench.datasets.lerobot_format.layout import dataset_features, is_dataset
 from lerobot_memobench.datasets.lerobot_format.reading import read_episode
 from lerobot_memobench.datasets.staging import stage_demonstration
-from lerobot_memobench.datasets.video import ImageHistograms, encode_video
+from lerobot_memobench.datasets.video import ImageHistograms
 from lerobot_memobench.errors import MemobenchError
+from tests.support.videos import encode_video
 
 SIZE = 64
 REPO = "local/test"

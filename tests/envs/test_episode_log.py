@@ -13,25 +13,18 @@ import pytest
 
 from lerobot_memobench.envs.episode_log import EpisodeLog, has_log, read_episodes, write_episodes
 from lerobot_memobench.errors import MemobenchError
+from tests.support import logs
 
 
 def record(task: str = "a_task", episode: int = 0, **changes: Any) -> dict[str, Any]:
-    return {
-        "task": task,
-        "memory_type": "temporal",
-        "episode": episode,
-        "seed": 7 + episode,
-        "referent": "fixed",
+    own = {
         "replan_steps": None,
         "prompt_steps": 0,
         "steps": 100,
-        "success": True,
-        "checkpoints": [{"operation": "S", "first_step": 3, "ordered_step": 3}],
-        "failure": None,
         "scene_hash": "0123456789abcdef",
         "wall_s": 1.5,
-        **changes,
     }
+    return logs.record(task, episode, **own | changes)
 
 
 def test_written_records_are_read_back_as_they_were(tmp_path: Path) -> None:

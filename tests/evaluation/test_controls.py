@@ -16,6 +16,7 @@ from lerobot_memobench.evaluation.controls import by_replan, paired, relabelled
 from lerobot_memobench.evaluation.memory_controls import contrasts, gap_closed, prefix_curves, published_contrasts
 from lerobot_memobench.evaluation.metrics import summarise
 from lerobot_memobench.paper import raw_tables
+from tests.support.logs import record
 
 STOVE = "turn_on_the_stove_and_turn_it_off_then_put_the_frying_pan_on_it"
 DRAWERS = "check_all_three_drawers_of_the_cabinet"
@@ -31,20 +32,9 @@ def rollout(
     **changes: Any,
 ) -> dict[str, Any]:
     steps = [10 * (k + 1) if it else None for k, it in enumerate(done)]
-    return {
-        "task": task,
-        "memory_type": memory_type,
-        "episode": episode,
-        "seed": 7 + episode,
-        "referent": "fixed",
-        "replan_steps": 5,
-        "success": all(done) if success is None else success,
-        "checkpoints": [
-            {"operation": o, "first_step": s, "ordered_step": s} for o, s in zip(operations, steps, strict=True)
-        ],
-        "failure": None,
-        **changes,
-    }
+    succeeded = all(done) if success is None else success
+    marks = zip(operations, steps, steps, strict=True)
+    return record(task, episode, marks, memory_type=memory_type, success=succeeded, **changes)
 
 
 def rollouts(reached: list[int], **changes: Any) -> list[dict[str, Any]]:

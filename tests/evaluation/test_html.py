@@ -24,6 +24,7 @@ from lerobot_memobench.evaluation.html.data import page_data, task_source
 from lerobot_memobench.evaluation.html.write import find_videos, frame_count, inline_json, page, write_html
 from lerobot_memobench.evaluation.records import folder_names, read_runs
 from lerobot_memobench.tasks.catalogue import get_task, task_index
+from tests.support import logs
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
 BUTTER = "put_the_butter_picked_up_in_the_prompt_video_on_the_plate"
@@ -31,26 +32,17 @@ BUTTER = "put_the_butter_picked_up_in_the_prompt_video_on_the_plate"
 
 def record(task: str = STOVE, episode: int = 0, *, success: bool = True, **changes: Any) -> dict[str, Any]:
     """A rollout of the stove's task (S, U): both checkpoints in order, or only the second one, too early."""
-    steps = [(6, 6), (12, 12)] if success else [(None, None), (9, None)]
-    return {
-        "task": task,
-        "memory_type": "temporal",
-        "episode": episode,
-        "seed": 7 + episode,
-        "referent": "fixed",
+    marks = [("S", 6, 6), ("U", 12, 12)] if success else [("S", None, None), ("U", 9, None)]
+    own = {
         "variant": 0,
         "replan_steps": None,
         "prompt_steps": 0,
         "steps": 12 if success else 20,
         "success": success,
-        "checkpoints": [
-            {"operation": operation, "first_step": first, "ordered_step": ordered}
-            for operation, (first, ordered) in zip("SU", steps, strict=True)
-        ],
         "failure": None if success else "storage_failure",
         "scene_hash": "0123456789abcdef",
-        **changes,
     }
+    return logs.record(task, episode, marks, **own | changes)
 
 
 def evaluation(folder: Path, records: list[dict[str, Any]]) -> Path:

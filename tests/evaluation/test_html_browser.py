@@ -19,6 +19,7 @@ from lerobot_memobench.envs.video import OPERATION_COLOURS, VideoRecorder
 from lerobot_memobench.evaluation.html.write import write_html
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support import browser as chromium
+from tests.support.logs import record
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
 DRAWER = "check_the_top_drawer_of_the_cabinet"
@@ -34,21 +35,9 @@ pytestmark = pytest.mark.skipif(
 
 
 def rollout(task: str, episode: int, marks: list[tuple[str, int | None, int | None]], **changes: Any) -> dict[str, Any]:
-    return {
-        "task": task,
-        "memory_type": "temporal",
-        "episode": episode,
-        "seed": 7 + episode,
-        "referent": "fixed",
-        "variant": 0,
-        "prompt_steps": 0,
-        "steps": 40,
-        "success": changes.get("failure") is None,
-        "checkpoints": [{"operation": o, "first_step": first, "ordered_step": ordered} for o, first, ordered in marks],
-        "failure": None,
-        "scene_hash": "0123456789abcdef",
-        **changes,
-    }
+    success = changes.get("failure") is None
+    own = {"variant": 0, "prompt_steps": 0, "steps": 40, "success": success, "scene_hash": "0123456789abcdef"}
+    return record(task, episode, marks, **own | changes)
 
 
 RECORDS = [

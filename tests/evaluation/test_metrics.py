@@ -32,6 +32,7 @@ from lerobot_memobench.evaluation.report_tables import inputs_sentence, pooled_s
 from lerobot_memobench.paper import published_rows
 from lerobot_memobench.tasks.catalogue import BOWL, get_task, task_names
 from lerobot_memobench.tasks.failures import FAILURES, asks_order, classify, classify_failure
+from tests.support.logs import record
 
 
 def rollout(
@@ -44,22 +45,8 @@ def rollout(
     ordered: list[int | None] | None = None,
     **changes: Any,
 ) -> dict[str, Any]:
-    ordered = first if ordered is None else ordered
-    return {
-        "task": task,
-        "memory_type": memory_type,
-        "episode": episode,
-        "seed": 7 + episode,
-        "referent": "fixed",
-        "replan_steps": 5,
-        "success": success,
-        "checkpoints": [
-            {"operation": o, "first_step": f, "ordered_step": s}
-            for o, f, s in zip(operations, first, ordered, strict=True)
-        ],
-        "failure": None,
-        **changes,
-    }
+    marks = zip(operations, first, first if ordered is None else ordered, strict=True)
+    return record(task, episode, marks, memory_type=memory_type, success=success, **changes)
 
 
 #: 4 rollouts of a temporal task, 2 of another, 2 of a spatial one and 2 of an object one.
@@ -287,26 +274,15 @@ def log() -> list[dict[str, Any]]:
         episode = 0
         for count, first, ordered, success, failure in groups:
             for _ in range(count):
-                checkpoints = [
-                    {"operation": operations[k], "first_step": first[k], "ordered_step": ordered[k]}
-                    for k in range(len(operations))
-                ]
+                known = {
+                    "prompt_steps": 0,
+                    "steps": 1200,
+                    "failure": failure,
+                    "scene_hash": f"{task}{episode}",
+                    "wall_s": 1.0,
+                }
                 records.append(
-                    {
-                        "task": task,
-                        "memory_type": memory_type,
-                        "episode": episode,
-                        "seed": 7 + episode,
-                        "referent": "fixed",
-                        "replan_steps": 5,
-                        "prompt_steps": 0,
-                        "steps": 1200,
-                        "success": success,
-                        "checkpoints": checkpoints,
-                        "failure": failure,
-                        "scene_hash": f"{task}{episode}",
-                        "wall_s": 1.0,
-                    }
+                    rollout(task, memory_type, operations, list(first), success, episode, list(ordered), **known)
                 )
                 episode += 1
     return records

@@ -28,32 +28,11 @@ from lerobot_memobench.evaluation.report_tables import failures_table
 from lerobot_memobench.run.merging import merge
 from lerobot_memobench.tasks.failures import FAILURES
 from tests.support import logs
-from tests.support.logs import evaluation, rollout
-
-SETTINGS: dict[str, Any] = {
-    "seed_base": 7,
-    "referent": "fixed",
-    "demonstration_prompt": True,
-    "horizon": 1200,
-    "replan_steps": None,
-    "render": "default",
-    "render_every": 1,
-    "oracle_memory": False,
-}
+from tests.support.logs import SETTINGS, evaluation, rollout
 
 
 def record(task: str = "a_task", episode: int = 0, **changes: Any) -> dict[str, Any]:
-    return {
-        "task": task,
-        "memory_type": "temporal",
-        "episode": episode,
-        "seed": 7 + episode,
-        "referent": "fixed",
-        "replan_steps": 20,
-        "success": True,
-        "checkpoints": [{"operation": "S", "first_step": 3, "ordered_step": 3}],
-        **changes,
-    }
+    return logs.record(task, episode, **{"replan_steps": 20} | changes)
 
 
 def test_the_environments_settings_stand_beside_the_log(tmp_path: Path) -> None:

@@ -11,24 +11,13 @@ from rich.console import Console
 from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.evaluation.report import evaluation_markdown, table, write_report
 from lerobot_memobench.evaluation.report_tables import failure_line
+from tests.support import logs
 
 
 def record(task: str, memory_type: str, episode: int, success: bool, **changes: Any) -> dict[str, Any]:
-    return {
-        "task": task,
-        "memory_type": memory_type,
-        "episode": episode,
-        "seed": 7 + episode,
-        "referent": "fixed",
-        "replan_steps": 5,
-        "success": success,
-        "checkpoints": [
-            {"operation": "S", "first_step": 3, "ordered_step": 3},
-            {"operation": "U", "first_step": 5 if success else None, "ordered_step": 5 if success else None},
-        ],
-        "failure": None if success else "stale_memory",
-        **changes,
-    }
+    marks = [("S", 3, 3), ("U", 5 if success else None, 5 if success else None)]
+    own = {"memory_type": memory_type, "success": success, "failure": None if success else "stale_memory"}
+    return logs.record(task, episode, marks, **own | changes)
 
 
 def logged(folder: Path, episodes: int = 4) -> Path:

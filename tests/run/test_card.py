@@ -32,29 +32,19 @@ from lerobot_memobench.run.card import (
 from lerobot_memobench.run.machine import run_facts
 from lerobot_memobench.run.merging import merge
 from lerobot_memobench.run.run import resumed_card
+from tests.support import logs
 
 
 def record(task: str = "a_task", episode: int = 0, **changes: Any) -> dict[str, Any]:
-    return {
-        "task": task,
-        "memory_type": "temporal",
-        "episode": episode,
-        "seed": 7 + episode,
-        "referent": "fixed",
+    own = {
         "variant": 0,
         "replan_steps": None,
         "prompt_steps": 0,
         "steps": 100,
-        "success": True,
-        "checkpoints": [
-            {"operation": "S", "first_step": 3, "ordered_step": 3},
-            {"operation": "U", "first_step": 9, "ordered_step": 9},
-        ],
-        "failure": None,
         "scene_hash": "0123456789abcdef",
         "wall_s": 1.5,
-        **changes,
     }
+    return logs.record(task, episode, [("S", 3, 3), ("U", 9, 9)], **own | changes)
 
 
 def card(**changes: Any) -> dict[str, Any]:

@@ -15,17 +15,7 @@ from lerobot_memobench.evaluation.records import read_card, read_protocol
 from lerobot_memobench.run.card import new_card, policy_facts, write_card
 from lerobot_memobench.run.machine import run_facts
 from lerobot_memobench.run.merging import merge, merge_and_report, part_folders
-
-SETTINGS = {
-    "seed_base": 7,
-    "referent": "fixed",
-    "demonstration_prompt": True,
-    "horizon": 1200,
-    "replan_steps": None,
-    "render": "default",
-    "render_every": 1,
-    "oracle_memory": False,
-}
+from tests.support.logs import SETTINGS
 
 
 def part(folder: Path, episodes: list[int], task: str = "a", settings: Any = SETTINGS, **changes: Any) -> Path:

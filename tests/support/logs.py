@@ -8,6 +8,41 @@ from typing import Any
 
 from lerobot_memobench.envs.episode_log import write_episodes
 
+Mark = tuple[str, int | None, int | None]
+"""A checkpoint of a rollout: operation, first step, ordered step."""
+SETTINGS: dict[str, Any] = {
+    "seed_base": 7,
+    "referent": "fixed",
+    "demonstration_prompt": True,
+    "horizon": 1200,
+    "replan_steps": None,
+    "render": "default",
+    "render_every": 1,
+    "oracle_memory": False,
+}
+"""A protocol, as an environment writes it beside a log."""
+
+
+def record(
+    task: str = "a_task", episode: int = 0, marks: Iterable[Mark] = (("S", 3, 3),), **changes: Any
+) -> dict[str, Any]:
+    """A successful rollout; ``marks`` are its checkpoints."""
+    return {
+        "task": task,
+        "memory_type": "temporal",
+        "episode": episode,
+        "seed": 7 + episode,
+        "referent": "fixed",
+        "replan_steps": 5,
+        "success": True,
+        "checkpoints": [
+            {"operation": operation, "first_step": first, "ordered_step": ordered}
+            for operation, first, ordered in marks
+        ],
+        "failure": None,
+        **changes,
+    }
+
 
 def rollout(
     task: str, memory_type: str, operations: str, done: Iterable[bool], success: bool, episode: int, **changes: Any
@@ -15,22 +50,9 @@ def rollout(
     """A record; ``done`` says which checkpoints were satisfied, one step after another."""
     steps = [10 * (k + 1) if satisfied else None for k, satisfied in enumerate(done)]
     so_far = [all(step is not None for step in steps[: k + 1]) for k in range(len(steps))]
-    return {
-        "task": task,
-        "memory_type": memory_type,
-        "episode": episode,
-        "seed": 7 + episode,
-        "referent": "fixed",
-        "replan_steps": 5,
-        "success": success,
-        "checkpoints": [
-            {"operation": operation, "first_step": step, "ordered_step": step if before else None}
-            for operation, step, before in zip(operations, steps, so_far, strict=True)
-        ],
-        "failure": None,
-        "scene_hash": f"{task}-{episode}",
-        **changes,
-    }
+    ordered = [step if before else None for step, before in zip(steps, so_far, strict=True)]
+    own = {"memory_type": memory_type, "success": success, "scene_hash": f"{task}-{episode}"}
+    return record(task, episode, zip(operations, steps, ordered, strict=True), **own | changes)
 
 
 def evaluation(folder: Path, successes: int = 2, episodes: int = 4, **changes: Any) -> Path:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 from enum import StrEnum
@@ -19,7 +19,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import disk_refusal
+from lerobot_memobench.jobs.processes import saying_how_to_go_on
 from lerobot_memobench.tasks.task import PUBLISHED, STRICT
+
+USAGE_ERROR = 2
 
 WITH_PARENT = "--with-parent"
 """First argument of a process of `lerobot` that is to end when its standard input closes: whoever wanted it is gone."""
@@ -116,6 +119,35 @@ def chain(error: BaseException) -> Iterator[BaseException]:
         seen.add(id(current))
         yield current
         current = current.__cause__ or (None if current.__suppress_context__ else current.__context__)
+
+
+def run_app(app: typer.Typer, arguments: Sequence[str], program: str, again: str) -> int:
+    """Run a command line; return the exit status. Errors a user can mend are one sentence on stderr, status 2.
+
+    Args:
+        app: its commands.
+        arguments: what was typed behind ``program``.
+        program: as it is typed, such as ``memobench``.
+        again: what is told when SIGTERM ends it.
+    """
+    try:
+        with saying_how_to_go_on(lambda: again):
+            result = app(args=list(arguments), standalone_mode=False, prog_name=program)
+    except (typer.Abort, KeyboardInterrupt, EOFError):
+        return 130
+    except typer.Exit as stop:
+        return stop.exit_code
+    except Exception as error:
+        message: Callable[[], str] | None = getattr(error, "format_message", None)  # click's usage errors
+        if message is not None and type(error).__name__ == "NoArgsIsHelpError":  # a group without a command: its help
+            print(message())
+            return 0
+        sentence = one_sentence(error) if message is None else f"{message()} (see `{program} --help`)"
+        if sentence is None:
+            raise
+        print(f"{program}: {sentence}", file=sys.stderr)
+        return int(getattr(error, "exit_code", USAGE_ERROR))
+    return result if isinstance(result, int) else 0
 
 
 def one_sentence(error: BaseException) -> str | None:

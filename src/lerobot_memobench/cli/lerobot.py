@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from lerobot_memobench.cli.console import WITH_PARENT, one_sentence
+from lerobot_memobench.cli.console import USAGE_ERROR, WITH_PARENT, one_sentence
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.jobs.processes import saying_how_to_go_on
 from lerobot_memobench.run.arguments import (
@@ -28,8 +28,6 @@ from lerobot_memobench.run.arguments import (
     split_arguments,
 )
 from lerobot_memobench.run.lerobot_commands import call_lerobot, lerobot_commands, without_configuration
-
-USAGE_ERROR = 2
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -16,18 +16,15 @@ import typer
 from typer.core import TyperGroup
 
 from lerobot_memobench.cli import data, figures
-from lerobot_memobench.cli.console import one_sentence
+from lerobot_memobench.cli.console import run_app
 from lerobot_memobench.cli.data import cache, generate
 from lerobot_memobench.cli.demo import demo, doctor
 from lerobot_memobench.cli.report import compare, controls, html, merge, report, rerun
 from lerobot_memobench.cli.tasks import gallery, objects, recipe, tasks
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.jobs.processes import saying_how_to_go_on
 from lerobot_memobench.jobs.threads import ACTING, LEARNING, use_threads
 
 __all__ = ["app", "main"]
-
-USAGE_ERROR = 2
 
 
 class Grouped(TyperGroup):
@@ -106,37 +103,12 @@ def options(
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit status. Errors a user can mend are one sentence on stderr, status
-    2.
-    """
+    """Run the command line; return the exit status."""
     words = list(sys.argv[1:] if argv is None else argv)
     use_threads(LEARNING if words and words[0] in LEARN else ACTING)
     begins = "go on" if words and words[0] in GO_ON else "begin anew"
     again = f"memobench: ended by SIGTERM; {begins} with: {shlex.join(['memobench', *words])}"
-    try:
-        with saying_how_to_go_on(lambda: again):
-            result = app(args=words, standalone_mode=False, prog_name="memobench")
-    except MemobenchError as error:
-        print(f"memobench: {' '.join(str(error).split())}", file=sys.stderr)
-        return USAGE_ERROR
-    except (typer.Abort, KeyboardInterrupt, EOFError):
-        return 130
-    except typer.Exit as stop:
-        return stop.exit_code
-    except Exception as error:
-        message: Callable[[], str] | None = getattr(error, "format_message", None)  # click's usage errors
-        if message is None:
-            sentence = one_sentence(error)
-            if sentence is None:
-                raise
-            print(f"memobench: {sentence}", file=sys.stderr)
-            return USAGE_ERROR
-        if type(error).__name__ == "NoArgsIsHelpError":  # a group without a command: its help
-            print(message())
-            return 0
-        print(f"memobench: {message()} (see `memobench --help`)", file=sys.stderr)
-        return int(getattr(error, "exit_code", USAGE_ERROR))
-    return result if isinstance(result, int) else 0
+    return run_app(app, words, "memobench", again)
 
 
 if __name__ == "__main__":

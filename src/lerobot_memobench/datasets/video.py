@@ -79,16 +79,6 @@ class VideoWriter:
             self._container = None
 
 
-def encode_video(
-    frames: NDArray[np.uint8], path: Path, encoder: RGBEncoderConfig | None = None, fps: int = CONTROL_HZ
-) -> None:
-    """Encode (T, H, W, 3) uint8 frames to ``path``."""
-    writer = VideoWriter(path, encoder, fps)
-    for frame in frames:
-        writer.add(frame)
-    writer.close()
-
-
 def join_videos(videos: Sequence[tuple[Path, int]], path: Path, fps: int = CONTROL_HZ) -> None:
     """Join videos of one encoder, given with their number of frames, without encoding them again.
 
