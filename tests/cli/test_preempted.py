@@ -115,7 +115,7 @@ def test_the_handler_goes_with_the_command() -> None:
 
 @pytest.mark.parametrize(("words", "begins"), [(["cache", "nowhere"], "go on"), (["tasks", "--json"], "begin anew")])
 def test_what_a_command_says(words: list[str], begins: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    from lerobot_memobench.cli import memobench
+    from lerobot_memobench.cli import console, memobench
 
     said: list[str] = []
 
@@ -125,7 +125,7 @@ def test_what_a_command_says(words: list[str], begins: str, monkeypatch: pytest.
         raise MemobenchError("not now")
         yield
 
-    monkeypatch.setattr(memobench, "saying_how_to_go_on", saying)
+    monkeypatch.setattr(console, "saying_how_to_go_on", saying)
     monkeypatch.setattr(memobench, "use_threads", lambda role: None)
     assert memobench.main(words) == 2
     assert said == [f"memobench: ended by SIGTERM; {begins} with: {shlex.join(['memobench', *words])}"]
