@@ -21,11 +21,11 @@ from typing import Any
 
 import torch
 from policies import config, observation, training_batch
+from random_weights import random_policy
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.memobench_mem.random_weights import random_policy
 
 ARMS: dict[str, dict[str, Any]] = {
     "paper": {"gradient_checkpointing": True},

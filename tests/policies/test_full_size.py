@@ -15,11 +15,11 @@ from lerobot.policies.pi05.modeling_pi05 import PaliGemmaWithExpertModel, PI05Py
 from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 from torch import Tensor
 
+from benchmarks.random_weights import fill_buffers, random_policy
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import Frame, Row
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
-from lerobot_memobench.policies.memobench_mem.random_weights import fill_buffers, random_policy
 
 CAMERA = "observation.images.image"
 FRAMES, PROMPT, CHUNK = 32, 60, 50

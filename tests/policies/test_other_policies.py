@@ -390,7 +390,7 @@ def test_auto_is_by_the_policy_that_lerobot_runs(
     line: list[str], found: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import lerobot_policy_memobench  # noqa: F401
-    from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+    from lerobot_memobench.envs.prompting import policy_being_run, prompt_in
 
     monkeypatch.chdir(tmp_path)
     for folder in ("checkpoint", "run"):
@@ -399,5 +399,4 @@ def test_auto_is_by_the_policy_that_lerobot_runs(
     Path("train.yaml").write_text("policy:\n  type: diffusion\n")
     Path("run/train_config.json").write_text('{"policy": {"type": "memobench_mem"}}')
     monkeypatch.setattr(sys, "argv", ["lerobot-eval", *line])
-    assert MemobenchEnvConfig().resolved_prompt_in() == found
-    assert MemobenchEnvConfig(prompt_in="steps").resolved_prompt_in() == "steps"
+    assert prompt_in(policy_being_run()) == found

@@ -19,7 +19,7 @@ import yaml
 
 from lerobot_memobench.envs.episode_log import INPUTS, POLICY
 from lerobot_memobench.envs.observations import policy_inputs
-from lerobot_memobench.envs.prompting import checkpoint_being_run, in_file, policy_being_run, quiet, training_runs
+from lerobot_memobench.envs.prompting import in_file, quiet, training_runs
 from lerobot_memobench.io import file_hash
 
 NOT_THE_CHECKPOINT = (
@@ -78,9 +78,12 @@ def _known(facts: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in facts.items() if value is not None}
 
 
-def acting(obs_type: str, oracle_memory: bool) -> Acting:
-    """Return who acts in environments that observe this, by the command line of the process."""
-    policy = _policy()
+def acting(policy: Any | None, obs_type: str, oracle_memory: bool) -> Acting:
+    """Return who acts in environments that observe this, by the command line of the process.
+
+    Args:
+        policy: as `prompting.policy_being_run` returns it.
+    """
     if policy is None:
         return NOBODY
     run = f"{dt.datetime.now():%Y%m%dT%H%M%S}-{secrets.token_hex(3)}"
@@ -88,21 +91,6 @@ def acting(obs_type: str, oracle_memory: bool) -> Acting:
 
 
 # --- the command line ---
-
-
-def _policy() -> Any | None:
-    """Return the configuration of the policy that is run; where only its type is told, in a file, the class of it."""
-    import draccus
-    from lerobot.configs import parser
-
-    with quiet():
-        checkpoint = checkpoint_being_run()
-        if checkpoint is not None:
-            return checkpoint[1]
-        kind = policy_being_run()
-        if kind is None or parser.get_type_arg("policy") is None:
-            return kind
-        return draccus.parse(kind, args=parser.get_cli_overrides("policy") or [])
 
 
 def _seeds() -> range | None:

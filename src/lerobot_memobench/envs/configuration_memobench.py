@@ -36,8 +36,7 @@ from lerobot_memobench.envs.observations import (
 from lerobot_memobench.envs.prompting import (
     AUTO,
     PLACES,
-    checkpoint_being_run,
-    parameters_being_run,
+    parameters_of,
     policy_being_run,
     prompt_in,
     rename_map,
@@ -155,12 +154,11 @@ class MemobenchEnvConfig(EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """What every sub-environment is made with."""
+        """What every sub-environment is made with, but for what follows from the policy."""
         return {
             "obs_type": self.obs_type,
             "referent": self.referent,
             "demonstration_prompt": self.demonstration_prompt,
-            "prompt_in": self.resolved_prompt_in(),
             "horizon": self.horizon,
             "render": self.render,
             "render_every": self.render_every,
@@ -198,17 +196,20 @@ class MemobenchEnvConfig(EnvConfig):
         """Return `{memory type: {task id: vector env}}`; nothing is simulated before an env's first reset."""
         from lerobot_memobench.envs.memobench_env import MemobenchEnv, skip_logged
 
-        self.check_checkpoint()
+        policy = policy_being_run()
+        self._check_checkpoint(policy)
         chosen = self.selected()  # before anything is written: a wrong name leaves nothing behind
         _check_recording(n_envs, self.obs_type)
-        _use_threads()
+        _use_threads(policy)
         use_async_envs = use_async_envs and n_envs > 1
         if use_async_envs:
             # LeRobot's workers are forked from a server: it imports torch and the simulator once for all of them.
             get_context("forkserver").set_forkserver_preload([MemobenchEnv.__module__])
         log_dir = self.resolved_log_dir()
-        settings = {**self.gym_kwargs, "acting": acting(self.obs_type, self.oracle_memory)}
-        protocol = {**self.protocol, "prompt_in": settings["prompt_in"], **settings["acting"].protocol}
+        prompt = prompt_in(policy) if self.prompt_in == AUTO else self.prompt_in
+        by = acting(policy, self.obs_type, self.oracle_memory)
+        settings = {**self.gym_kwargs, "prompt_in": prompt, "acting": by}
+        protocol = {**self.protocol, "prompt_in": prompt, **by.protocol}
         check_protocol(log_dir, protocol)  # now, not when the first episode has been simulated
         suites: dict[str, dict[int, gym.vector.VectorEnv]] = {}
         for memory_type, task_id, folder in chosen:
@@ -218,15 +219,16 @@ class MemobenchEnvConfig(EnvConfig):
             suites.setdefault(memory_type, {})[task_id] = self._vector([make] * n_envs, use_async_envs)
         return suites
 
-    def check_checkpoint(self) -> None:
+    def _check_checkpoint(self, policy: Any) -> None:
         """Refuse the checkpoint on LeRobot's command line where it was made for something else than is shown here."""
+        from lerobot.configs import parser
         from lerobot.envs.utils import env_to_policy_features
 
-        running = None if training_runs() else checkpoint_being_run()
-        if running is not None:
-            check_obs_type(running[1], self.obs_type)
+        path = None if training_runs() else parser.get_path_arg("policy")
+        if path is not None:
+            check_obs_type(policy, self.obs_type)
             for check in POLICY_CHECKS:
-                check(*running, env_to_policy_features(self), rename_map())
+                check(path, policy, env_to_policy_features(self), rename_map())
 
     def _vector(self, make: list[Callable[[], gym.Env[Any, Any]]], use_async_envs: bool) -> gym.vector.VectorEnv:
         from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
@@ -239,10 +241,6 @@ class MemobenchEnvConfig(EnvConfig):
         return gym.vector.SyncVectorEnv(
             [freeze_after_episode_end(one) for one in make], autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP
         )
-
-    def resolved_prompt_in(self) -> str:
-        """Return where the prompt plays: as given, else as suits the policy on LeRobot's command line."""
-        return prompt_in(policy_being_run()) if self.prompt_in == AUTO else self.prompt_in
 
     def resolved_log_dir(self) -> Path:
         """Return the folder of the episode log: given, else the run's output folder, else a dated one.
@@ -288,14 +286,18 @@ def _check_recording(rows: int, obs_type: str) -> None:
         )
 
 
-def _use_threads() -> None:
+def _use_threads(policy: Any) -> None:
     """Give plain ``lerobot-eval`` the threads that `lerobot eval` has, as far as its libraries have not begun theirs.
 
     Any other program of LeRobot's, such as a training that evaluates in between, keeps what it has.
     """
     if Path(sys.argv[0]).stem.replace("_", "-") != "lerobot-eval":
         return
+    from lerobot.configs import parser
+
     use_threads(ACTING)
-    parameters = parameters_being_run()
+    path = parser.get_path_arg("policy")
+    weightless = 0 if getattr(policy, "weightless", False) else None
+    parameters = weightless if path is None else parameters_of(path)
     if parameters is not None:
         limit_torch(parameters)

@@ -35,29 +35,24 @@ def prompt_in(policy: object | None) -> str:
     return STEPS if policy is None or reads_prompt(policy) else RESET
 
 
-def policy_being_run() -> type | None:
-    """Return the class of the configuration of the policy on LeRobot's command line, None where none is told.
+def policy_being_run() -> PreTrainedConfig | type | None:
+    """Return the configuration of the policy on LeRobot's command line; where only its type is told, in a file, the
+    class of it; None where none is told.
 
     An environment's configuration does not hold the policy; LeRobot's parser tells it.
     """
+    import draccus
     from lerobot.configs import PreTrainedConfig, parser
 
-    checkpoint = checkpoint_being_run()
-    if checkpoint is not None:
-        return type(checkpoint[1])
-    name = parser.get_type_arg("policy") or in_file("policy", "type")
-    known: dict[str, type] = PreTrainedConfig.get_known_choices()
-    return known.get(name) if isinstance(name, str) else None
-
-
-def parameters_being_run() -> int | None:
-    """Return about how many parameters the policy on LeRobot's command line has, None where that is not known yet."""
-    from lerobot.configs import parser
-
-    path = parser.get_path_arg("policy")
-    if path is None:
-        return 0 if getattr(policy_being_run(), "weightless", False) else None
-    return parameters_of(path)
+    path, name = parser.get_path_arg("policy"), parser.get_type_arg("policy")
+    told = parser.get_cli_overrides("policy") or []
+    with quiet():
+        if path is not None:
+            overrides = [*parser.get_yaml_overrides("policy"), *told]
+            return PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+        known: dict[str, type] = PreTrainedConfig.get_known_choices()
+        kind = known.get(str(name or in_file("policy", "type")))
+        return kind if kind is None or name is None else draccus.parse(kind, args=told)
 
 
 def parameters_of(path: str) -> int | None:
@@ -76,17 +71,6 @@ def parameters_of(path: str) -> int | None:
         folder = Path(cached).parent
     sizes = [file.stat().st_size for file in folder.glob("*model*.safetensors")]
     return sum(sizes) // 4 if sizes else None
-
-
-def checkpoint_being_run() -> tuple[str, PreTrainedConfig] | None:
-    """Return path and configuration of the checkpoint on LeRobot's command line; None where none is told."""
-    from lerobot.configs import PreTrainedConfig, parser
-
-    path = parser.get_path_arg("policy")
-    if path is None:
-        return None
-    overrides = [*parser.get_yaml_overrides("policy"), *(parser.get_cli_overrides("policy") or [])]
-    return path, PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
 
 
 @contextmanager
