@@ -22,7 +22,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.comparison import compare
 from lerobot_memobench.evaluation.html.write import write_html
 from lerobot_memobench.evaluation.metrics import failure_counts, summarise
-from lerobot_memobench.evaluation.records import CARD_FILE, by_method, read_protocol, read_rollouts, read_runs, sweeps
+from lerobot_memobench.evaluation.records import CARD_FILE, read_protocol, read_rollouts, read_runs, sweeps
 from lerobot_memobench.evaluation.report import build, render, write_report
 from lerobot_memobench.evaluation.report_tables import failures_table
 from lerobot_memobench.run.merging import merge
@@ -149,10 +149,12 @@ def test_unnamed_evaluations_are_grouped_by_policy(tmp_path: Path) -> None:
     for name, k, digest in (("a", 5, "aaaaaaaaaaaa"), ("b", 20, "aaaaaaaaaaaa"), ("c", 5, "cccccccccccc")):
         card(logs.evaluation(tmp_path / name, replan_steps=k), type="act", sha256=digest)
     runs = read_runs([tmp_path / "a", tmp_path / "b", tmp_path / "c"])
-    assert {method: [run.name for run in group] for method, group in by_method(runs).items()} == {
-        "act aaaaaaaa": ["a", "b"],
-        "act cccccccc": ["c"],
-    }
+    assert [(run.name, run.method) for run in runs] == [
+        ("a", "act aaaaaaaa"),
+        ("b", "act aaaaaaaa"),
+        ("c", "act cccccccc"),
+    ]
+    assert [run.name for run in sweeps(runs)["act aaaaaaaa"]] == ["a", "b"]
 
 
 def test_the_policys_own_interval_is_known_from_its_card(tmp_path: Path) -> None:

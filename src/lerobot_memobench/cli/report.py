@@ -315,7 +315,7 @@ def given_runs(folders: list[str] | None, with_: Beside | None) -> tuple[list[Ru
         raise MemobenchError("there is nothing to draw; name folders of evaluations, or --with paper, or both")
     runs = read_runs(folders) if folders else []
     check_beside(runs, paper)
-    for note in unlike({run.name: run.protocol for run in runs}) if runs else ():
+    for note in unlike(runs):
         print(f"memobench: note: {note}", file=sys.stderr)
     return runs, paper
 

@@ -13,11 +13,11 @@ import numpy as np
 
 from lerobot_memobench.envs.episode_log import OF_THE_POLICY, SETTINGS, differences
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.evaluation.metrics import METRICS, Record, operations, percent, policy_inputs, value_of
+from lerobot_memobench.evaluation.metrics import METRICS, Record, by_task, operations, policy_inputs, value_of
 from lerobot_memobench.evaluation.records import Run
 from lerobot_memobench.evaluation.report_tables import AVERAGE, inputs_phrase
 from lerobot_memobench.evaluation.statistics import PERMUTATIONS, detectable, holm, mcnemar, sign_flip
-from lerobot_memobench.evaluation.tables import Cell, Count, Name, Numbers, Report, Section, Table
+from lerobot_memobench.evaluation.tables import Cell, Count, Name, Numbers, Report, Section, Table, figure
 from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 
@@ -152,11 +152,8 @@ def compare(
         for metric in METRICS
         if (row := _difference(scope, metric, members, rng, permutations)) is not None
     ]
-    notes, inputs = (
-        tuple(_notes(a, b, len(pairs))),
-        (policy_inputs([mine for mine, _ in pairs]), policy_inputs([other for _, other in pairs])),
-    )
-    return Comparison(a.name, b.name, len(pairs), tuple(_adjusted(rows)), notes, inputs)
+    inputs = (policy_inputs([mine for mine, _ in pairs]), policy_inputs([other for _, other in pairs]))
+    return Comparison(a.name, b.name, len(pairs), tuple(_adjusted(rows)), tuple(_notes(a, b, len(pairs))), inputs)
 
 
 def _like_pairs(a: Run, b: Run, allow: Collection[str]) -> list[Pair]:
@@ -192,19 +189,14 @@ def _notes(a: Run, b: Run, pairs: int) -> list[str]:
 def _scopes(pairs: Sequence[Pair]) -> dict[str, dict[str, list[Pair]]]:
     """Return scope -> task -> pairs: the average, each memory type, each task, in the report's order."""
     tasks: dict[str, list[Pair]] = {}
-    types: dict[str, str] = {}
     for pair in pairs:
         tasks.setdefault(pair[0]["task"], []).append(pair)
-        types[pair[0]["task"]] = pair[0]["memory_type"]
     scopes = {AVERAGE: tasks}
     for memory_type in MEMORY_TYPES:
-        members = {name: group for name, group in tasks.items() if types[name] == memory_type}
+        members = {name: group for name, group in tasks.items() if group[0][0]["memory_type"] == memory_type}
         if members:
             scopes[memory_type] = members
-    order: dict[str, int] = {name: k for k, name in enumerate(MEMORY_TYPES)}
-    for name in sorted(tasks, key=lambda task: (order.get(types[task], len(order)), task)):
-        scopes[name] = {name: tasks[name]}
-    return scopes
+    return scopes | {name: {name: tasks[name]} for name in by_task(mine for mine, _ in pairs)}
 
 
 # --- one metric in one scope ---
@@ -282,8 +274,15 @@ def comparison_report(found: Comparison) -> Report:
         _table("difference-tasks", "Tasks", found, by_task, tasks=True),
     )
     sentence = f"{count_of(found.pairs, 'episode')} in both, paired by task, episode and referent."
-    title = f"{found.b} against {found.a}"
-    return Report(title, (Section("", tables, (sentence, NOTE), found.notes),), data(found))
+    data = {
+        "a": found.a,
+        "b": found.b,
+        "inputs": {found.a: found.inputs[0], found.b: found.inputs[1]},
+        "pairs": found.pairs,
+        "differences": [_entry(row) for row in found.differences],
+        "notes": list(found.notes),
+    }
+    return Report(f"{found.b} against {found.a}", (Section("", tables, (sentence, NOTE), found.notes),), data)
 
 
 def _table(key: str, title: str, found: Comparison, rows: Sequence[Difference], tasks: bool) -> Table:
@@ -315,8 +314,7 @@ def _row(row: Difference, tasks: bool, first: bool) -> tuple[Cell, ...]:
 
 
 def _points(value: float, signed: bool = False) -> Numbers:
-    text = f"{percent(value):{'+' if signed else ''}.1f}"
-    return Numbers(text.replace("-", "−"))
+    return Numbers(figure(value, signed).replace("-", "−"))
 
 
 def _p(value: float | None) -> Numbers:
@@ -325,19 +323,8 @@ def _p(value: float | None) -> Numbers:
     return Numbers("< 0.001" if value < 0.001 else f"{value:.3f}")
 
 
-def data(found: Comparison) -> dict[str, Any]:
-    """Return a comparison as JSON values; rates in per cent, p as they are."""
-    return {
-        "a": found.a,
-        "b": found.b,
-        "inputs": {found.a: found.inputs[0], found.b: found.inputs[1]},
-        "pairs": found.pairs,
-        "differences": [_entry(row) for row in found.differences],
-        "notes": list(found.notes),
-    }
-
-
 def _entry(row: Difference) -> dict[str, Any]:
+    """Return a difference as JSON values; rates in per cent, p as they are."""
     return {
         "scope": row.scope,
         "metric": row.metric,

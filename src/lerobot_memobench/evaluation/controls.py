@@ -17,14 +17,13 @@ from lerobot_memobench.evaluation.metrics import (
     PROCESS_METRICS,
     Rate,
     Record,
-    Row,
     Summary,
+    percent,
     policy_inputs,
     summarise,
 )
 from lerobot_memobench.evaluation.records import asked_for, read_protocol
 from lerobot_memobench.evaluation.report_tables import inputs_phrase
-from lerobot_memobench.evaluation.statistics import as_percent
 from lerobot_memobench.evaluation.tables import Cell, Name, Report, Section, Table
 from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.catalogue import get_task, task_names
@@ -221,8 +220,6 @@ GRANULARITY_SENTENCE = (
 Levels = Mapping[str, Sequence[Record]]
 """Level -> rollouts of the policy that was taught at it."""
 
-Summaries = Mapping[str, Summary]
-
 
 def relabelled(records: Sequence[Record], labels: Mapping[str, Sequence[str]]) -> list[Record]:
     """Return rollouts with the operation labels of another language level; tasks without labels keep theirs.
@@ -259,11 +256,25 @@ def granularity_report(levels: Levels, own_labels: Levels, paper: bool = False) 
     summaries = {level: summarise(records) for level, records in levels.items()}
     own = {level: summarise(records) for level, records in own_labels.items()}
     tables = (_rates(summaries, own), _prefixes(summaries, paper))
-    data = {level: _data(summary, own[level]) for level, summary in summaries.items()}
+    data = {
+        level: {
+            "n": summary.rollouts,
+            "average": {metric: percent(rate.value) for metric, rate in summary.average.items()},
+            "own_labels": {metric: percent(rate.value) for metric, rate in own[level].average.items()},
+            "tasks": {
+                task: {
+                    "SR": percent(row["SR"].value),
+                    "prefix": [percent(rate.value) for rate in summary.prefix[task]],
+                }
+                for task, row in summary.tasks.items()
+            },
+        }
+        for level, summary in summaries.items()
+    }
     return Report("Annotation granularity", (Section("", tables, sentences=(GRANULARITY_SENTENCE,)),), data)
 
 
-def _rates(summaries: Summaries, own: Summaries) -> Table:
+def _rates(summaries: Mapping[str, Summary], own: Mapping[str, Summary]) -> Table:
     rows: tuple[tuple[Cell, ...], ...] = tuple(
         (
             level,
@@ -276,7 +287,7 @@ def _rates(summaries: Summaries, own: Summaries) -> Table:
     return Table("granularity", "metrics by level", header, rows)
 
 
-def _prefixes(summaries: Summaries, paper: bool) -> Table:
+def _prefixes(summaries: Mapping[str, Summary], paper: bool) -> Table:
     width = max(len(rates) for summary in summaries.values() for rates in summary.prefix.values())
     names = dict.fromkeys(task for summary in summaries.values() for task in summary.tasks)
     rows: list[tuple[Cell, ...]] = [
@@ -289,22 +300,3 @@ def _prefixes(summaries: Summaries, paper: bool) -> Table:
         for level, (good, n) in PAPER_GRANULARITY.items():
             rows.append(prefix_row(PAPER_TASK, level, [*([None] * width), Rate(good / n, n)], width))
     return Table("granularity_prefix", "prefix completion by level", prefix_header("level", width), tuple(rows))
-
-
-def _data(summary: Summary, own: Summary) -> dict[str, Any]:
-    return {
-        "n": summary.rollouts,
-        "average": _plain(summary.average),
-        "own_labels": _plain(own.average),
-        "tasks": {
-            task: {
-                "SR": as_percent(row["SR"].value),
-                "prefix": as_percent([rate.value for rate in summary.prefix[task]]),
-            }
-            for task, row in summary.tasks.items()
-        },
-    }
-
-
-def _plain(row: Row) -> dict[str, float | None]:
-    return {metric: as_percent(rate.value) for metric, rate in row.items()}

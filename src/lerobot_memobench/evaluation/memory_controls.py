@@ -7,32 +7,24 @@ applicable memory types, as in every table of the benchmark. Rates are fractions
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, is_dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from lerobot_memobench.evaluation.controls import (
-    PAPER,
-    PAPER_TASK,
-    prefix_header,
-    prefix_row,
-    replan_title,
-)
-from lerobot_memobench.evaluation.metrics import METRICS, Rate, Record, by_task, prefix, satisfied, value_of
+from lerobot_memobench.evaluation.controls import PAPER, PAPER_TASK, prefix_header, prefix_row, replan_title
+from lerobot_memobench.evaluation.metrics import METRICS, Rate, Record, by_task, percent, prefix, satisfied, value_of
 from lerobot_memobench.evaluation.statistics import (
     DRAWS,
     Array,
     Estimate,
-    as_percent,
     difference_interval,
-    estimate,
     newcombe,
-    number,
     percentiles,
 )
-from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, Cell, Name, Report, Section, Table
+from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, Cell, Name, Report, Section, Table, figure
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 
 AVERAGE = "average"
@@ -70,94 +62,65 @@ def gap_closed(standard: float | None, other: float | None) -> float | None:
     return (other - standard) / (1.0 - standard)
 
 
+@dataclass(frozen=True)
+class _Outcomes:
+    """One metric of one task's paired rollouts: (n,) of either evaluation, and the episodes that are drawn, (D, n)."""
+
+    a: Array
+    b: Array
+    drawn: NDArray[np.intp]
+
+
 def contrasts(standard: Sequence[Record], other: Sequence[Record], draws: int = DRAWS, seed: int = 0) -> Contrasts:
     """Return, per memory type and on average, each metric under both evaluations; rollouts are paired already."""
-    points = [_rates(records, np.random.default_rng(seed), 0) for records in (standard, other)]
-    # The same seed draws the same episodes of both.
-    clouds = [_rates(records, np.random.default_rng(seed), draws) for records in (standard, other)]
+    rng = np.random.default_rng(seed)
+    others = by_task(other)
+    kinds: dict[str, list[dict[str, _Outcomes]]] = {}
+    for task, group in by_task(standard).items():
+        drawn = rng.integers(len(group), size=(draws, len(group)))
+        outcomes = {}
+        for metric in METRICS:
+            a, b = ([value_of(record, metric) for record in records] for records in (group, others[task]))
+            if None not in (*a, *b):
+                outcomes[metric] = _Outcomes(np.array(a, dtype=float), np.array(b, dtype=float), drawn)
+        kinds.setdefault(str(group[0]["memory_type"]), []).append(outcomes)
+    scopes = {**{name: [tasks] for name, tasks in kinds.items()}, AVERAGE: list(kinds.values())}
     return {
         name: {
-            metric: _contrast(
-                _pairs(standard, other, name, metric),
-                *(point[name][metric] for point in points),
-                *(cloud[name][metric] for cloud in clouds),
-            )
-            for metric in metrics
+            metric: _contrast([[task[metric] for task in tasks if metric in task] for tasks in groups])
+            for metric in METRICS
         }
-        for name, metrics in points[0].items()
+        for name, groups in scopes.items()
     }
 
 
-def _pairs(standard: Sequence[Record], other: Sequence[Record], scope: str, metric: str) -> tuple[Array, Array, Array]:
-    """Return each pair's two values and its weight in the mean of a scope, (n,) each, where the metric applies."""
-    groups: dict[str, list[tuple[Array, Array]]] = {}
-    others = by_task(other)
-    for task, group in by_task(standard).items():
-        kind = str(group[0]["memory_type"])
-        a, b = _values(group)[metric], _values(others[task])[metric]
-        if scope in (kind, AVERAGE) and a is not None and b is not None:
-            groups.setdefault(kind, []).append((a, b))
-    parts = [
-        (a, b, np.full(len(a), 1 / (len(groups) * len(tasks) * len(a)))) for tasks in groups.values() for a, b in tasks
-    ]
-    if not parts:
-        return np.empty(0), np.empty(0), np.empty(0)
-    a, b, weights = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return a, b, weights
-
-
-def _contrast(
-    pairs: tuple[Array, Array, Array],
-    a: Array | None,
-    b: Array | None,
-    many_a: Array | None,
-    many_b: Array | None,
-) -> Contrast:
-    """Return what pairs, their rates, (1,), and bootstrap draws of these, (draws,), say of two evaluations."""
-    if a is None or b is None or many_a is None or many_b is None:
+def _contrast(groups: Sequence[Sequence[_Outcomes]]) -> Contrast:
+    """Return what memory types of tasks of paired outcomes say of two evaluations: a mean of means, with bootstrap."""
+    known = [tasks for tasks in groups if tasks]
+    if not known:
         return Contrast(None, None, Estimate(None), Estimate(None))
+
+    def mean(value: Callable[[_Outcomes], Any]) -> Any:
+        return np.mean([np.mean([value(task) for task in tasks], axis=0) for tasks in known], axis=0)
+
+    a, b = float(mean(lambda task: task.a.mean())), float(mean(lambda task: task.b.mean()))
+    many_a = mean(lambda task: task.a[task.drawn].mean(axis=1))
+    many_b = mean(lambda task: task.b[task.drawn].mean(axis=1))
+    parts = [(task.a, task.b, 1 / (len(known) * len(tasks) * len(task.a))) for tasks in known for task in tasks]
+    pairs = (
+        np.concatenate([a for a, _, _ in parts]),
+        np.concatenate([b for _, b, _ in parts]),
+        np.concatenate([np.full(len(a), weight) for a, _, weight in parts]),
+    )
     gap = 1.0 - many_a
     shares = (many_b - many_a)[gap >= LEAST_GAP] / gap[gap >= LEAST_GAP]
-    closed = Estimate(gap_closed(float(a[0]), float(b[0])))
+    closed = Estimate(gap_closed(a, b))
     # Where the gap vanishes in many draws, the share has no interval worth the name.
     if closed.value is not None and len(shares) > 0.9 * len(gap):
-        least, most = (bound / (1.0 - float(a[0])) for bound in newcombe(*pairs))
+        least, most = (bound / (1.0 - a) for bound in newcombe(*pairs))
         low, high = percentiles(shares)
         closed = Estimate(closed.value, min(low, least), min(max(high, most), 1.0))
-    difference = Estimate(float(b[0]) - float(a[0]), *difference_interval(many_b - many_a, *pairs))
-    return Contrast(float(a[0]), float(b[0]), difference, closed)
-
-
-def _rates(records: Sequence[Record], rng: np.random.Generator, draws: int) -> dict[str, dict[str, Array | None]]:
-    """Return rates per memory type and average, each (draws,), or (1,) as they are when ``draws`` is 0."""
-    tasks: dict[str, list[dict[str, Array | None]]] = {}
-    for group in by_task(records).values():
-        chosen = rng.integers(len(group), size=(draws, len(group))) if draws else np.arange(len(group))[None]
-        tasks.setdefault(str(group[0]["memory_type"]), []).append(
-            {
-                metric: None if values is None else values[chosen].mean(axis=1)
-                for metric, values in _values(group).items()
-            }
-        )
-    rates: dict[str, dict[str, Array | None]] = {name: _mean(tasks[name]) for name in MEMORY_TYPES if name in tasks}
-    return {**rates, AVERAGE: _mean(list(rates.values()))}
-
-
-def _values(group: Sequence[Record]) -> dict[str, Array | None]:
-    """Return each metric of each rollout of one task, (n,); None for an operation that the task has not."""
-    values: dict[str, Array | None] = {}
-    for metric in METRICS:
-        found = [value_of(record, metric) for record in group]
-        values[metric] = None if None in found else np.array(found, dtype=float)
-    return values
-
-
-def _mean(rows: Sequence[Mapping[str, Array | None]]) -> dict[str, Array | None]:
-    result: dict[str, Array | None] = {}
-    for metric in METRICS:
-        known = [values for row in rows if (values := row[metric]) is not None]
-        result[metric] = np.mean(known, axis=0) if known else None
-    return result
+    return Contrast(a, b, Estimate(b - a, *difference_interval(many_b - many_a, *pairs)), closed)
 
 
 def published_contrasts(table: Mapping[str, Any]) -> Contrasts:
@@ -201,9 +164,9 @@ def oracle_report(found: Mapping[int | None, Contrasts], paper: tuple[int, Contr
     for replan, contrasts in found.items():
         beside = paper[1] if paper is not None and replan == paper[0] else None
         tables.append(_oracle_table(replan, contrasts, beside))
-        data[str(replan)] = as_percent(contrasts)
+        data[str(replan)] = _as_percent(contrasts)
     if paper is not None:
-        data[PAPER] = as_percent(paper[1])
+        data[PAPER] = _as_percent(paper[1])
         if paper[0] not in found:
             tables.append(_oracle_table(paper[0], paper[1], None, f", {PAPER}"))
     return Report("Oracle memory decomposition", (Section("", tuple(tables), sentences=(ORACLE_SENTENCE,)),), data)
@@ -224,10 +187,27 @@ def _oracle_table(replan: int | None, found: Contrasts, beside: Contrasts | None
 
 def _cells(metrics: Mapping[str, Contrast]) -> list[Cell]:
     pairs = [
-        NOT_APPLICABLE if metrics[m].standard is None else f"{number(metrics[m].standard)}/{number(metrics[m].other)}"
+        NOT_APPLICABLE if metrics[m].standard is None else f"{figure(metrics[m].standard)}/{figure(metrics[m].other)}"
         for m in METRICS
     ]
-    return [*pairs, *(estimate(metrics[m].closed) for m in METRICS)]
+    return [*pairs, *(_estimate(metrics[m].closed) for m in METRICS)]
+
+
+def _estimate(found: Estimate, sign: bool = False) -> str:
+    if found.low is None or found.high is None:
+        return figure(found.value, sign)
+    return f"{figure(found.value, sign)} [{figure(found.low, sign)}, {figure(found.high, sign)}]"
+
+
+def _as_percent(value: Any) -> Any:
+    """Return a dataclass, mapping, sequence or rate with every rate in per cent, for JSON."""
+    if is_dataclass(value):
+        value = vars(value)
+    if isinstance(value, Mapping):
+        return {key: _as_percent(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_as_percent(item) for item in value]
+    return percent(value) if isinstance(value, float) else value
 
 
 # --- shuffled memory: prefix completion ---
@@ -309,15 +289,14 @@ def shuffled_report(
         published: the paper's, per cent, ``normal`` and ``shuffled``.
     """
     tables = [_shuffled_table(replan, curves) for replan, curves in found.items()]
-    short = {curve.task for curves in found.values() for curve in curves if len(curve.normal) <= SEVERAL}
-    said = f"{ELSEWHERE} So it was with {', '.join(sorted(short))}." if short else ""
+    data: dict[str, Any] = {str(replan): _as_percent(curves) for replan, curves in found.items()}
     if published is not None:
         tables.append(_published_table(published))
-    data: dict[str, Any] = {str(replan): as_percent(list(curves)) for replan, curves in found.items()}
-    if published is not None:
         data[PAPER] = dict(published)
-    sentences = (SHUFFLED_SENTENCE, said) if said else (SHUFFLED_SENTENCE,)
-    return Report("Shuffled memory", (Section("", tuple(tables), sentences=sentences),), data)
+    sentences = [SHUFFLED_SENTENCE]
+    if short := {curve.task for curves in found.values() for curve in curves if len(curve.normal) <= SEVERAL}:
+        sentences.append(f"{ELSEWHERE} So it was with {', '.join(sorted(short))}.")
+    return Report("Shuffled memory", (Section("", tuple(tables), sentences=tuple(sentences)),), data)
 
 
 def _shuffled_table(replan: int | None, curves: Sequence[PrefixCurve]) -> Table:
@@ -326,7 +305,7 @@ def _shuffled_table(replan: int | None, curves: Sequence[PrefixCurve]) -> Table:
     for curve in curves:
         for memory, rates in (("normal", curve.normal), ("shuffled", curve.other)):
             rows.append(prefix_row(Name(curve.task), memory, [Rate(rate, curve.n) for rate in rates], width))
-        change = [estimate(difference, sign=True) for difference in curve.differences]
+        change = [_estimate(difference, sign=True) for difference in curve.differences]
         rows.append(prefix_row(Name(curve.task), "difference", change, width))
     return Table(f"shuffled_{replan}", replan_title(replan), prefix_header("memory", width), tuple(rows))
 
@@ -338,9 +317,9 @@ def _published_table(published: Mapping[str, Sequence[float]]) -> Table:
     rows = [
         prefix_row(PAPER_TASK, memory, [*cells, cells[-1]], len(cells))
         for memory, cells in (
-            ("normal", [number(rate) for rate in normal]),
-            ("shuffled", [number(rate) for rate in shuffled]),
-            ("difference", [number(rate, sign=True) for rate in change]),
+            ("normal", [figure(rate) for rate in normal]),
+            ("shuffled", [figure(rate) for rate in shuffled]),
+            ("difference", [figure(rate, sign=True) for rate in change]),
         )
     ]
     return Table("shuffled_paper", PAPER, prefix_header("memory", len(normal)), tuple(rows))

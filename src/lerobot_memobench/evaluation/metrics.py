@@ -165,8 +165,8 @@ class Rate:
 
     @property
     def interval(self) -> tuple[float, float] | None:
-        """Wilson's 95 % interval."""
-        return None if self.value is None else wilson(self.value, self.trials)
+        """Wilson's 95 % interval; None where the rate does not apply, or rests on no rollouts, such as the paper's."""
+        return None if self.value is None or not self.trials else wilson(self.value, self.trials)
 
 
 Row = dict[str, Rate]

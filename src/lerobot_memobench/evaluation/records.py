@@ -135,7 +135,7 @@ def read_protocol(folder: str | Path) -> dict[str, Any]:
         MemobenchError: there is no evaluation in the folder.
     """
     folder = Path(folder)
-    card = read_card(folder / CARD_FILE) if (folder / CARD_FILE).is_file() else {}
+    card = card_of(folder)
     told: dict[str, Any] = {**card.get("protocol", {}), **read_protocol_file(folder)}
     if not {*EXTENT, *SETTINGS} - {"suite"} <= set(told):  # without a suite it is of the time when there was one
         told = {**protocol_of_log(read_episodes(folder)), **told}
@@ -149,12 +149,15 @@ def protocol_of_log(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "tasks": sorted({record["task"] for record in records}),
         "episodes": max((number for number in numbers if number <= MOST_EPISODES), default=0),  # others have no number
     }
-    if all(record.get("seed") is not None for record in records):
-        _note(found, "seed_base", [record["seed"] - record["episode"] for record in records])
-    if (suite := one_suite(records)) != PUBLISHED:
-        found["suite"] = suite
-    for key in ("referent", "replan_steps"):
-        _note(found, key, [record[key] for record in records if key in record])
+    seeded = all(record.get("seed") is not None for record in records)
+    values: dict[str, set[Any]] = {
+        "seed_base": {record["seed"] - record["episode"] for record in records if seeded},
+        "suite": {one_suite(records)} - {PUBLISHED},
+        **{key: {record[key] for record in records if key in record} for key in ("referent", "replan_steps")},
+    }
+    for key, distinct in values.items():
+        if distinct:
+            found[key] = distinct.pop() if len(distinct) == 1 else sorted(distinct, key=str)
     return found
 
 
@@ -171,12 +174,6 @@ def one_suite(records: Iterable[Mapping[str, Any]]) -> str:
         )
     (suite,) = there
     return str(suite)
-
-
-def _note(found: dict[str, Any], key: str, values: list[Any]) -> None:
-    distinct = list(dict.fromkeys(values))
-    if distinct:
-        found[key] = distinct[0] if len(distinct) == 1 else sorted(distinct, key=str)
 
 
 def read_card(path: Path, *, whole: bool = False) -> dict[str, Any]:
@@ -197,6 +194,11 @@ def read_card(path: Path, *, whole: bool = False) -> dict[str, Any]:
             f"the card {path} cannot be read (it is missing); name a {CARD_FILE} that `lerobot eval` wrote"
         ) from None
     return found
+
+
+def card_of(folder: Path) -> dict[str, Any]:
+    """Return what reports take from the card of an evaluation, {} where it has none."""
+    return read_card(folder / CARD_FILE) if (folder / CARD_FILE).is_file() else {}
 
 
 # --- evaluations ---
@@ -233,7 +235,7 @@ class Run:
             return None
         (steps,) = found
         if steps is None:
-            steps = (self.protocol.get(POLICY) or {}).get("settings", {}).get("n_action_steps")
+            steps = self.protocol[POLICY].get("settings", {}).get("n_action_steps")
         return steps if isinstance(steps, int) else None
 
 
@@ -252,39 +254,30 @@ def read_runs(words: Sequence[str | Path]) -> list[Run]:
     for (label, folder), name in zip(given, names, strict=True):
         records, notes = read_rollouts(folder)
         runs.append(Run(name, label or "", folder, records, read_protocol(folder), notes))
-    check_one_suite({run.folder: run.records for run in runs})
+    suites = [one_suite(run.records) for run in runs]
+    for run, suite in zip(runs, suites, strict=True):
+        if suite != suites[0]:
+            raise MemobenchError(
+                f"{runs[0].folder} is an evaluation of the {suites[0]} suite and {run.folder} one of the {suite} "
+                "suite; report each suite by itself"
+            )
     return _with_methods(runs)
 
 
-def check_one_suite(records: Mapping[Path, Sequence[Record]]) -> None:
-    """Refuse evaluations (folder -> rollouts) of several suites: their figures are of other tasks.
-
-    Raises:
-        MemobenchError: naming two of them.
-    """
-    suites = {folder: one_suite(rollouts) for folder, rollouts in records.items()}
-    (first, reference), *others = suites.items()
-    for folder, suite in others:
-        if suite != reference:
-            raise MemobenchError(
-                f"{first} is an evaluation of the {reference} suite and {folder} one of the {suite} suite; report each "
-                "suite by itself"
-            )
-
-
-def unlike(protocols: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return a sentence for each of several evaluations (name -> protocol) that was not run as the first one was.
+def unlike(runs: Sequence[Run]) -> list[str]:
+    """Return a sentence for each of several evaluations that was not run as the first one was.
 
     Replan intervals may differ: they are compared on purpose.
     """
-    (first, reference), *others = protocols.items()
-    found = {name: differences(reference, protocol, extent=True, ignore=("replan_steps",)) for name, protocol in others}
-    return [
-        f"{name} was not run as {first} was ({'; '.join(settings)}, the first value being that of {first}): their "
-        "figures do not compare; `memobench compare` does so over the episodes in common, where it can"
-        for name, settings in found.items()
-        if settings
-    ]
+    notes = []
+    for run in runs[1:]:
+        first = runs[0].name
+        if found := differences(runs[0].protocol, run.protocol, extent=True, ignore=("replan_steps",)):
+            notes.append(
+                f"{run.name} was not run as {first} was ({'; '.join(found)}, the first value being that of {first}): "
+                "their figures do not compare; `memobench compare` does so over the episodes in common, where it can"
+            )
+    return notes
 
 
 def read_rollouts(folder: str | Path) -> tuple[list[dict[str, Any]], list[str]]:
@@ -307,7 +300,7 @@ def asked_for(folder: Path, records: list[dict[str, Any]], notes: list[str]) -> 
 
     Logs of today hold none. Of others that are left out, ``notes`` gets a sentence.
     """
-    card = read_card(folder / CARD_FILE) if (folder / CARD_FILE).is_file() else {}
+    card = card_of(folder)
     count, base = (card.get("protocol", {}).get(key) for key in ("episodes", "seed_base"))
     if count is None:
         return records
@@ -358,9 +351,12 @@ def _with_methods(runs: Sequence[Run]) -> list[Run]:
 
 def _methods(runs: Sequence[Run]) -> list[str]:
     """Return whose result each run is: the name that it was given, else its policy's, else its folder's."""
-    policies = dict.fromkeys(_policy(run) for run in runs if not run.method and run.protocol.get(POLICY))
-    kinds = Counter(kind for kind, _ in policies)
-    chosen = [run.method or (_policy_name(run, kinds) if run.protocol.get(POLICY) else run.name) for run in runs]
+    kinds = Counter(kind for kind, _ in {_policy(run) for run in runs if not run.method and run.protocol[POLICY]})
+    chosen = []
+    for run in runs:
+        kind, digest = _policy(run)
+        policy = kind if kinds[kind] == 1 else f"{kind} {digest[:HASH_DIGITS]}".strip()
+        chosen.append(run.method or (policy if run.protocol[POLICY] else run.name))
     # Where policies are not told, or several results of one stand at the same interval, folders are what is known.
     places = Counter((method, run.replan_steps) for run, method in zip(runs, chosen, strict=True))
     repeated = {method for (method, _), count in places.items() if count > 1}
@@ -372,29 +368,20 @@ def _methods(runs: Sequence[Run]) -> list[str]:
     return [run.name if method in repeated else method for run, method in zip(runs, chosen, strict=True)]
 
 
-def _policy_name(run: Run, kinds: Mapping[str, int]) -> str:
-    kind, digest = _policy(run)
-    return kind if kinds[kind] == 1 else f"{kind} {digest[:HASH_DIGITS]}".strip()
-
-
 def _policy(run: Run) -> tuple[str, str]:
     """Return type and hash of a run's policy, "" as far as they are unknown."""
-    policy = run.protocol.get(POLICY) or {}
+    policy = run.protocol[POLICY]
     return str(policy.get("type") or "policy"), str(policy.get("sha256") or "")
 
 
-def by_method(runs: Sequence[Run]) -> dict[str, list[Run]]:
-    """Return method -> its runs, by replan interval; runs without one come last."""
-    grouped: dict[str, list[Run]] = {}
-    for run in runs:
-        grouped.setdefault(run.method, []).append(run)
-    return {
-        method: sorted(group, key=lambda run: (run.replan_steps is None, run.replan_steps or 0))
-        for method, group in grouped.items()
-    }
-
-
 def sweeps(runs: Sequence[Run]) -> dict[str, list[Run]]:
-    """Return the methods that were evaluated at several replan intervals."""
-    known = {name: [run for run in group if run.replan_steps is not None] for name, group in by_method(runs).items()}
-    return {name: group for name, group in known.items() if len({run.replan_steps for run in group}) > 1}
+    """Return method -> its runs, by replan interval, of the methods that were evaluated at several intervals."""
+    methods: dict[str, list[Run]] = {run.method: [] for run in runs}
+    for run in runs:
+        if run.replan_steps is not None:
+            methods[run.method].append(run)
+    return {
+        method: sorted(group, key=lambda run: run.replan_steps or 0)
+        for method, group in methods.items()
+        if len({run.replan_steps for run in group}) > 1
+    }

@@ -123,8 +123,7 @@ def build(runs: Sequence[Run], paper: bool = False) -> Report:
     check_beside(runs, paper)
     found = []
     if len(runs) > 1:
-        notes = unlike({run.name: run.protocol for run in runs})
-        found.append(Section("Evaluations", (overview(runs),), notes=tuple(notes)))
+        found.append(Section("Evaluations", (overview(runs),), notes=tuple(unlike(runs))))
     found += [sweep(method, group) for method, group in sweeps(runs).items()]
     for run in runs:
         section = _section(run.summary, run.records, run.notes)
@@ -175,15 +174,14 @@ def _unique_keys(found: Report) -> Report:
     """Number the labels of tables that stand in several sections."""
     if len(found.sections) < 2:
         return found
-    return replace(found, sections=tuple(_numbered(section, k) for k, section in enumerate(found.sections, start=1)))
-
-
-def _numbered(section: Section, number: int) -> Section:
-    numbered = []
-    for each in section.tables:
-        title = f"{each.title}: {section.title}" if section.title and each.key in OF_EACH_EVALUATION else each.title
-        numbered.append(replace(each, key=f"{each.key}-{number}", title=title))
-    return replace(section, tables=tuple(numbered))
+    sections = []
+    for number, section in enumerate(found.sections, start=1):
+        tables = []
+        for each in section.tables:
+            title = f"{each.title}: {section.title}" if section.title and each.key in OF_EACH_EVALUATION else each.title
+            tables.append(replace(each, key=f"{each.key}-{number}", title=title))
+        sections.append(replace(section, tables=tuple(tables)))
+    return replace(found, sections=tuple(sections))
 
 
 # --- JSON ---
@@ -195,10 +193,7 @@ def report_data(runs: Sequence[Run], paper: bool) -> dict[str, Any]:
     if len(runs) == 1:
         found = run_data(runs[0])
     else:
-        found = {
-            "evaluations": {run.name: run_data(run) for run in runs},
-            "notes": unlike({run.name: run.protocol for run in runs}),
-        }
+        found = {"evaluations": {run.name: run_data(run) for run in runs}, "notes": unlike(runs)}
     if swept := sweeps(runs):
         found["replan_sweep"] = {method: _sweep_data(group) for method, group in swept.items()}
     if paper:
@@ -210,7 +205,7 @@ def report_data(runs: Sequence[Run], paper: bool) -> dict[str, Any]:
 def run_data(run: Run) -> dict[str, Any]:
     """Return the figures of one evaluation: the keys of ``report.json``, and more beside them."""
     summary = run.summary
-    policy = run.protocol.get(POLICY) or {}
+    policy = run.protocol[POLICY]
     return {
         **report_values(summary),
         "name": run.name,
@@ -236,13 +231,11 @@ def run_data(run: Run) -> dict[str, Any]:
 
 
 def _intervals(row: Row) -> dict[str, list[float | None] | None]:
-    return {metric: interval_of(row[metric]) for metric in METRICS}
+    return {metric: _interval(row[metric]) for metric in METRICS}
 
 
-def interval_of(rate: Rate) -> list[float | None] | None:
-    """Return the interval of a rate in per cent, None where it has none."""
-    interval = rate.interval if rate.trials else None
-    return None if interval is None else [percent(bound) for bound in interval]
+def _interval(rate: Rate) -> list[float | None] | None:
+    return None if rate.interval is None else [percent(bound) for bound in rate.interval]
 
 
 def _pooled(rate: Rate) -> dict[str, Any]:
@@ -289,20 +282,9 @@ def csv_rows(runs: Sequence[Run], paper: bool) -> list[CsvRow]:
 def _run_rows(run: Run) -> Iterator[CsvRow]:
     for place, name, figure, rate in _figures(run.summary):
         # Records of one rollout are not independent: an interval over them would be too narrow.
-        interval = None if place == "pooled" and figure != "SR" else interval_of(rate)
-        low, high = interval or (None, None)
-        yield (
-            run.name,
-            run.replan_steps,
-            place,
-            name,
-            figure,
-            percent(rate.value),
-            low,
-            high,
-            rate.n or None,
-            run.summary.inputs,
-        )
+        interval = None if place == "pooled" and figure != "SR" else _interval(rate)
+        figures = (percent(rate.value), *(interval or (None, None)), rate.n or None)
+        yield (run.name, run.replan_steps, place, name, figure, *figures, run.summary.inputs)
 
 
 def _extent(run: Run) -> Iterator[CsvRow]:

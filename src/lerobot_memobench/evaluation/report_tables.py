@@ -204,8 +204,7 @@ NOTE = "inputs: of the policy; k: the replan interval."
 def overview(runs: Sequence[Run]) -> Table:
     """Return one row per evaluation, and under the table in what they were not run alike."""
     rows = tuple(run_row(run) for run in runs)
-    notes = unlike({run.name: run.protocol for run in runs})
-    return wide_table("overview", "Evaluations", rows, note=" ".join([NOTE, *notes]), best=best_in_columns(rows))
+    return wide_table("overview", "Evaluations", rows, note=" ".join([NOTE, *unlike(runs)]), best=best_in_columns(rows))
 
 
 def run_row(run: Run) -> tuple[Cell, ...]:
@@ -250,53 +249,39 @@ def wide_table(
 
 def sweep(method: str, runs: Sequence[Run]) -> Section:
     """Return the tables of one method at several replan intervals, and which interval is best for what."""
-    notes = []
-    if len({frozenset(run.summary.tasks) for run in runs}) > 1:
-        notes.append("the intervals were not evaluated on the same tasks; their averages do not compare")
-    return Section(
-        f"Replan sweep: {method}",
-        (_averages(method, runs), _memory_types(method, runs)),
-        (f"Best replan interval by average: {', '.join(_best(runs))}.",),
-        tuple(notes),
+    averages = tuple((run.replan_steps, *rate_row(None, run.summary.average)[1:]) for run in runs)
+    types = tuple((run.replan_steps, *all_rates(run.summary)) for run in runs)
+    inputs = inputs_sentence(policy_inputs([record for run in runs for record in run.records]))
+    slug = "-".join("".join(c if c.isalnum() and c.isascii() else " " for c in method).split()) or "policy"
+    tables = (
+        Table(
+            f"replan-{slug}",
+            f"Average by replan interval: {method}",
+            ("replan interval", "n", *METRICS),
+            averages,
+            note=f"{HOW_TO_READ} {inputs}",
+            best=best_in_columns(averages),
+        ),
+        wide_table(
+            f"replan-types-{slug}",
+            f"Memory types by replan interval: {method}",
+            types,
+            leading=("replan interval",),
+            note=inputs,
+            best=best_in_columns(types),
+        ),
     )
-
-
-def _averages(method: str, runs: Sequence[Run]) -> Table:
-    rows = tuple((run.replan_steps, *rate_row(None, run.summary.average)[1:]) for run in runs)
-    return Table(
-        f"replan-{_slug(method)}",
-        f"Average by replan interval: {method}",
-        ("replan interval", "n", *METRICS),
-        rows,
-        note=f"{HOW_TO_READ} {_inputs(runs)}",
-        best=best_in_columns(rows),
-    )
-
-
-def _memory_types(method: str, runs: Sequence[Run]) -> Table:
-    rows = tuple((run.replan_steps, *all_rates(run.summary)) for run in runs)
-    return wide_table(
-        f"replan-types-{_slug(method)}",
-        f"Memory types by replan interval: {method}",
-        rows,
-        leading=("replan interval",),
-        note=_inputs(runs),
-        best=best_in_columns(rows),
-    )
-
-
-def _inputs(runs: Sequence[Run]) -> str:
-    return inputs_sentence(policy_inputs([record for run in runs for record in run.records]))
-
-
-def _best(runs: Sequence[Run]) -> list[str]:
-    """Return the best average of each metric and where it is reached, each as a phrase."""
-    return [
+    best = [
         f"{metric} {figure(rate.value)} at {' and '.join(map(str, steps))}"
         for metric in METRICS
         for steps, rate in [best_interval(runs, metric)]
         if rate is not None
     ]
+    notes = []
+    if len({frozenset(run.summary.tasks) for run in runs}) > 1:
+        notes.append("the intervals were not evaluated on the same tasks; their averages do not compare")
+    title, sentence = f"Replan sweep: {method}", f"Best replan interval by average: {', '.join(best)}."
+    return Section(title, tables, (sentence,), tuple(notes))
 
 
 def best_interval(runs: Sequence[Run], metric: str) -> tuple[list[int], Rate | None]:
@@ -307,10 +292,6 @@ def best_interval(runs: Sequence[Run], metric: str) -> tuple[list[int], Rate | N
         return [], None
     best = [run for value, run in found if value == max(known)]
     return [run.replan_steps for run in best if run.replan_steps is not None], best[0].summary.average[metric]
-
-
-def _slug(name: str) -> str:
-    return "-".join("".join(c if c.isalnum() and c.isascii() else " " for c in name).split()) or "policy"
 
 
 # --- beside the paper's tables ---
@@ -344,18 +325,8 @@ def check_beside(runs: Sequence[Run], paper: bool) -> None:
 def beside_paper(runs: Sequence[Run]) -> Section:
     """Return the paper's tables of rates with these evaluations on top of each, and in what they depart from it."""
     tables = [_beside(runs, *each) for each in TABLES]
-    return Section("Beside the paper", (*tables, paper_failures()), notes=tuple(departure_notes(runs)))
-
-
-def departure_notes(runs: Sequence[Run]) -> list[str]:
-    """Return a sentence for each evaluation that was not run as the paper's were."""
-    return [f"{run.name} departs from the paper's protocol: {', '.join(d)}" for run in runs if (d := departures(run))]
-
-
-def beside_name(run: Run) -> str:
-    """Return what an evaluation is called beside the paper's rows of 30 tasks and 1,500 rollouts."""
-    told = extent(run)
-    return f"{run.name} ({told})" if told else run.name
+    notes = [f"{run.name} departs from the paper's protocol: {', '.join(d)}" for run in runs if (d := departures(run))]
+    return Section("Beside the paper", (*tables, paper_failures()), notes=tuple(notes))
 
 
 def extent(run: Run) -> str:
@@ -367,8 +338,13 @@ def extent(run: Run) -> str:
 
 
 def _beside(runs: Sequence[Run], key: str, title: str, sources: Sequence[str]) -> Table:
+    """Return a table of the paper's; ours are named with their extent, beside rows of 30 tasks and 1,500 rollouts."""
     published = published_rows(*sources)
-    rows = (*((beside_name(run), *run_row(run)[1:]) for run in runs), *(_published_row(row) for row in published))
+    names = [f"{run.name} ({told})" if (told := extent(run)) else run.name for run in runs]
+    rows = (
+        *((name, *run_row(run)[1:]) for name, run in zip(names, runs, strict=True)),
+        *(_published_row(row) for row in published),
+    )
     steps = [row.replan_steps for row in published]
     changes = {len(runs) + k for k in range(1, len(steps)) if steps[k] != steps[k - 1]}
     return wide_table(key, title, rows, strong=range(len(runs)), rules={len(runs), *changes})

@@ -12,17 +12,14 @@ Newcombe's of so many pairs.
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.evaluation.metrics import Z95, percent, wilson
-from lerobot_memobench.evaluation.tables import NOT_APPLICABLE
+from lerobot_memobench.evaluation.metrics import Z95, wilson
 
 EXACT_UP_TO = 16
 """Pairs that differ up to which all assignments of signs are enumerated: 2^16 = 65,536."""
@@ -176,28 +173,3 @@ def newcombe(a: Array, b: Array, weights: Array) -> tuple[float, float]:
         return math.sqrt(max(x * x - 2 * phi * x * y + y * y, 0.0))
 
     return q - p - reach(q - low_q, high_p - p), q - p + reach(high_q - q, p - low_p)
-
-
-def number(value: float | None, sign: bool = False) -> str:
-    """Return a fraction as per cent with one decimal."""
-    if value is None:
-        return NOT_APPLICABLE
-    return f"{100.0 * value:+.1f}" if sign else f"{100.0 * value:.1f}"
-
-
-def estimate(found: Estimate, sign: bool = False) -> str:
-    """Return an estimate with its interval."""
-    if found.low is None or found.high is None:
-        return number(found.value, sign)
-    return f"{number(found.value, sign)} [{number(found.low, sign)}, {number(found.high, sign)}]"
-
-
-def as_percent(value: Any) -> Any:
-    """Return a dataclass, mapping, sequence or rate with every rate in per cent with one decimal, for JSON."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return as_percent(dataclasses.asdict(value))
-    if isinstance(value, Mapping):
-        return {key: as_percent(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [as_percent(item) for item in value]
-    return percent(value) if isinstance(value, float) else value

@@ -8,6 +8,7 @@ import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import groupby
 
 from rich import box
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
@@ -101,29 +102,27 @@ class Report:
         return [table for section in self.sections for table in section.tables]
 
 
-def figure(value: float | None) -> str:
+def figure(value: float | None, sign: bool = False) -> str:
     """Return a fraction as a percentage with one decimal."""
     found = percent(value)
-    return NOT_APPLICABLE if found is None else f"{found:.1f}"
+    return NOT_APPLICABLE if found is None else f"{found:{'+' if sign else ''}.1f}"
 
 
-def plain(cell: Cell) -> str:
-    """Return a cell that is no rate as text."""
-    return NOT_APPLICABLE if cell is None else str(cell)
-
-
-def bounds(rate: Rate) -> tuple[str, str] | None:
-    """Return the interval of a rate in per cent, None where it has none."""
-    interval = rate.interval if rate.trials else None
-    return None if interval is None else (figure(interval[0]), figure(interval[1]))
+def _words(cell: Cell, interval: str | None, escape: Callable[[str], str] = str) -> str:
+    """Return a cell as text; ``interval`` is how an interval is written, None for not at all."""
+    if not isinstance(cell, Rate):
+        return escape(NOT_APPLICABLE if cell is None else str(cell))
+    value = escape(figure(cell.value))
+    if interval is None or cell.interval is None:
+        return value
+    return value + interval.format(*map(figure, cell.interval))
 
 
 def best_in_columns(rows: tuple[tuple[Cell, ...], ...]) -> frozenset[tuple[int, int]]:
     """Return the cells that hold the highest rate of their column, all of them where they tie as printed."""
     found = set()
     for column in range(len(rows[0]) if rows else 0):
-        rates = {k: row[column] for k, row in enumerate(rows) if isinstance(row[column], Rate)}
-        printed = {k: percent(rate.value) for k, rate in rates.items() if isinstance(rate, Rate)}
+        printed = {k: percent(cell.value) for k, row in enumerate(rows) if isinstance(cell := row[column], Rate)}
         known = [value for value in printed.values() if value is not None]
         if len(printed) > 1 and known:
             found |= {(k, column) for k, value in printed.items() if value == max(known)}
@@ -137,58 +136,36 @@ def markdown(report: Report) -> str:
     """Return a report as GitHub's Markdown."""
     lines = [f"# {report.title}", ""]
     for section in report.sections:
-        lines += markdown_section(section)
+        lines += [f"## {_escaped(section.title)}", ""] if section.title else []
+        for note in section.notes:
+            lines += [f"> {note}", ""]
+        for sentence in section.sentences:
+            lines += [_escaped(sentence), ""]
+        for table in section.tables:
+            lines += [f"### {_escaped(table.title)}", ""] if table.title else []
+            lines += [*markdown_table(table), ""]
+            lines += [table.note, ""] if table.note else []
     return "\n".join(lines).rstrip("\n") + "\n"
-
-
-def markdown_section(section: Section) -> list[str]:
-    """Return the lines of a section: heading, notes, sentences, tables."""
-    lines = [f"## {_escaped(section.title)}", ""] if section.title else []
-    for note in section.notes:
-        lines += [f"> {note}", ""]
-    for sentence in section.sentences:
-        lines += [_escaped(sentence), ""]
-    for table in section.tables:
-        lines += [f"### {_escaped(table.title)}", ""] if table.title else []
-        lines += [*markdown_table(table), ""]
-        lines += [table.note, ""] if table.note else []
-    return lines
 
 
 def markdown_table(table: Table) -> list[str]:
     """Return the lines of a table in GitHub's Markdown."""
-    rule = "|".join("---" if table.is_text(column) else "---:" for column in range(len(table.header)))
-    lines = [_markdown_row(_header(table)), f"|{rule}|"]
+    header = [f"{title} {name}".lstrip() for title, name in zip(table.titles, table.header, strict=True)]
+    rule = "|".join("---" if table.is_text(column) else "---:" for column in range(len(header)))
+    lines = [f"| {' | '.join(header)} |", f"|{rule}|"]
     for index, row in enumerate(table.rows):
         cells = []
         for column, cell in enumerate(row):
-            words = _markdown_cell(cell, table.intervals)
+            interval = " [{}, {}]" if table.intervals else None
+            words = f"`{cell}`" if isinstance(cell, Name) else _words(cell, interval, _escaped)
             emphasised = (index in table.strong and isinstance(cell, str)) or (index, column) in table.best
             cells.append(f"**{words}**" if emphasised and words else words)
-        lines.append(_markdown_row(cells))
+        lines.append(f"| {' | '.join(cells)} |")
     return lines
-
-
-def _markdown_row(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
-
-
-def _markdown_cell(cell: Cell, intervals: bool) -> str:
-    if isinstance(cell, Rate):
-        interval = bounds(cell) if intervals else None
-        return figure(cell.value) + ("" if interval is None else f" [{interval[0]}, {interval[1]}]")
-    if isinstance(cell, Name):
-        return f"`{cell}`"
-    return _escaped(plain(cell))
 
 
 def _escaped(words: str) -> str:
     return re.sub(r"([|*_`<>\\])", r"\\\1", words)
-
-
-def _header(table: Table) -> list[str]:
-    """Return the header with the groups' titles before the names."""
-    return [f"{title} {name}" if title else name for title, name in zip(table.titles, table.header, strict=True)]
 
 
 # --- LaTeX in the style of booktabs ---
@@ -283,21 +260,12 @@ def _latex_row(table: Table, index: int) -> list[str]:
     """Return the line of a row, after a rule where one is drawn."""
     cells = []
     for column, cell in enumerate(table.rows[index]):
-        words = _latex_cell(cell, table.intervals)
+        words = _words(cell, r" {{\scriptsize [{}, {}]}}" if table.intervals else None, latex_text)
+        words = rf"\texttt{{{words}}}" if isinstance(cell, Name) else words
         strong = index in table.strong or (index, column) in table.best
         cells.append(rf"\textbf{{{words}}}" if strong and words else words)
     rule = [r"\midrule"] if index in table.rules else []
     return [*rule, " & ".join(cells) + r" \\"]
-
-
-def _latex_cell(cell: Cell, intervals: bool) -> str:
-    if isinstance(cell, Rate):
-        interval = bounds(cell) if intervals else None
-        value = latex_text(figure(cell.value))
-        return value + ("" if interval is None else rf" {{\scriptsize [{interval[0]}, {interval[1]}]}}")
-    if isinstance(cell, Name):
-        return rf"\texttt{{{latex_text(cell)}}}"
-    return latex_text(plain(cell))
 
 
 # --- the terminal ---
@@ -416,43 +384,34 @@ def _terminal_row(table: Table, index: int) -> list[Text]:
     for column, cell in enumerate(table.rows[index]):
         best = (index, column) in table.best
         style = "bold" if best or index in table.strong else ""
-        text = _terminal_cell(cell, table.intervals) + "*" * best
+        text = _words(cell, " [{}–{}]" if table.intervals else None) + "*" * best
         whole = isinstance(cell, Name)
         cells.append(Text(text, style=style, no_wrap=whole or None, overflow="ignore" if whole else None))
     return cells
 
 
-def _terminal_cell(cell: Cell, intervals: bool) -> str:
-    if isinstance(cell, Rate):
-        interval = bounds(cell) if intervals else None
-        return figure(cell.value) + ("" if interval is None else f" [{interval[0]}–{interval[1]}]")
-    return plain(cell)
-
-
 def _in_parts(table: Table) -> list[Table]:
     """Cut a table with groups of columns into several that fit; each keeps the columns before the first group."""
-    leading = 0
-    for title, span in table.groups:
-        if title:
-            break
-        leading += span
+    titles = table.titles
+    leading = [column for column, title in enumerate(titles) if not title]
     parts: list[list[int]] = [[]]
-    column = leading
-    for _, span in [group for group in table.groups if group[0]]:
-        if parts[-1] and leading + len(parts[-1]) + span > MOST_COLUMNS:
+    for _, group in groupby([column for column, title in enumerate(titles) if title], titles.__getitem__):
+        columns = list(group)
+        if parts[-1] and len(leading) + len(parts[-1]) + len(columns) > MOST_COLUMNS:
             parts.append([])
-        parts[-1] += range(column, column + span)
-        column += span
+        parts[-1] += columns
     if len(parts) == 1:
         return [table]
-    return [_columns(table, [*range(leading), *part], first=k == 0) for k, part in enumerate(parts)]
+    return [
+        _columns(table, [*leading, *part], table.title if k == 0 else f"{table.title}, continued")
+        for k, part in enumerate(parts)
+    ]
 
 
-def _columns(table: Table, chosen: Sequence[int], first: bool) -> Table:
-    """Return some columns of a table; the title is kept on the first part."""
+def _columns(table: Table, chosen: Sequence[int], title: str) -> Table:
     return replace(
         table,
-        title=table.title if first else f"{table.title}, continued",
+        title=title,
         header=tuple(table.header[column] for column in chosen),
         rows=tuple(tuple(row[column] for column in chosen) for row in table.rows),
         groups=tuple((table.titles[column], 1) for column in chosen),
@@ -461,8 +420,6 @@ def _columns(table: Table, chosen: Sequence[int], first: bool) -> Table:
 
 
 # --- JSON, CSV, and all formats ---
-
-__all__ = ["WRITERS", "csv_text", "json_text", "latex", "markdown", "terminal", "text"]
 
 
 def json_text(report: Report) -> str:

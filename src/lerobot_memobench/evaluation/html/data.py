@@ -23,7 +23,7 @@ from lerobot_memobench.evaluation.metrics import (
     operations,
     percent,
 )
-from lerobot_memobench.evaluation.records import CARD_FILE, Run, read_card, unlike
+from lerobot_memobench.evaluation.records import Run, card_of, unlike
 from lerobot_memobench.evaluation.report_tables import outcomes, settings_phrases
 from lerobot_memobench.evaluation.tables import OPERATION_NAMES
 from lerobot_memobench.io import count_of
@@ -51,7 +51,7 @@ def page_data(runs: Sequence[Run], videos: Sequence[Mapping[int, str]], known: M
     """
     return {
         "version": __version__,
-        "notices": unlike({run.name: run.protocol for run in runs}),
+        "notices": unlike(runs),
         "fps": CONTROL_HZ,
         "levels": list(LEVELS),
         "memory_types": list(MEMORY_TYPES),
@@ -108,9 +108,7 @@ def _variant(record: Record) -> int:
 
 def run_data(run: Run, videos: Mapping[int, str]) -> dict[str, Any]:
     """Return one evaluation: protocol, rates, failures and rollouts."""
-    summary = run.summary
-    card = run.folder / CARD_FILE
-    starts = read_card(card).get("runs", []) if card.is_file() else []
+    summary, starts = run.summary, card_of(run.folder).get("runs", [])
     return {
         "name": run.name,
         "folder": str(run.folder),
