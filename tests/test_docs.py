@@ -5,8 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_memobench.run.arguments import HELP
-
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("src/**/*.md")])
 BLOCK = re.compile(r"```.*?```", re.DOTALL)
@@ -57,5 +55,14 @@ def test_the_table_of_short_forms_is_the_help(command: str) -> None:
     text = (ROOT / "docs" / {"eval": "evaluate.md", "train": "train.md"}[command]).read_text()
     lines = text[text.index("| short form |") :].split("\n\n")[0].splitlines()[2:]
     plain = [re.sub(r"\[([^][]*)\]\([^)]*\)", r"\1", line).replace("`", "") for line in lines]
-    rows = [tuple(cell.strip() for cell in line.strip("| ").split(" | ")) for line in plain]
-    assert rows == [tuple(meaning)[: len(rows[0])] for meaning in HELP[command]]
+    rows = [[cell.strip() for cell in line.strip("| ").split(" | ")] for line in plain]
+    assert rows == [row[: len(rows[0])] for row in helped(command)]
+
+
+def helped(command: str) -> list[list[str]]:
+    """Return the rows of the help: what is typed, what it sets, what holds without it ("" where nothing is said)."""
+    text = (ROOT / "src/lerobot_memobench/cli" / f"lerobot_{command}.txt").read_text()
+    blocks = re.findall(r"^  (\S.*)\n((?: {8}.*\n)+)", text, re.MULTILINE)
+    told = [(typed, " ".join(explained.split())) for typed, explained in blocks]
+    splits = [(typed, *re.fullmatch(r"(.*?)(?: \(default: (.*)\))?", words).groups("")) for typed, words in told]
+    return [list(row) for row in splits]

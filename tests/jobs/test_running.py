@@ -12,9 +12,16 @@ import pytest
 from filelock import lock_descriptor
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.jobs.executors import Datatrove, Needs, asked_for, check_executor, options_text, run_jobs
+from lerobot_memobench.jobs.executors import (
+    Datatrove,
+    Needs,
+    asked_for,
+    check_executor,
+    options_text,
+    read_options,
+    run_jobs,
+)
 from lerobot_memobench.jobs.processes import Advance, locked, taking_turns
-from lerobot_memobench.run.arguments import read_executor_options
 from tests.support.note_job import Note
 
 needs_datatrove = pytest.mark.skipif(find_spec("datatrove") is None, reason="datatrove is not installed")
@@ -65,7 +72,7 @@ def test_words_for_sbatch_are_handed_on_and_false_is_false() -> None:
 
     words = ["partition=gpu", "time=08:00:00", "account=lab", "gres=gpu:a100:1", "requeue=false", "srun_args.mpi=none"]
     words += ["sbatch_args.exclusive=true", "sbatch_args.mail-type=END", "requeue_signals=SIGUSR1,SIGTERM", "nice=0"]
-    options = read_executor_options(words)
+    options = read_options(words)
     check_executor("slurm", options)
     told = options_text("slurm", options, Needs(cores=2, memory_gb=9, gpus=1))
     making = Datatrove("slurm", 1, Path("logs"), 1, told).arguments
@@ -109,7 +116,7 @@ def test_a_job_on_slurm_asks_for_what_it_needs_unless_told_otherwise() -> None:
 )
 def test_options_that_slurm_does_not_take(option: str, message: str) -> None:
     with pytest.raises(MemobenchError, match=message):
-        check_executor("slurm", read_executor_options(["partition=gpu", "time=1:00", option]))
+        check_executor("slurm", read_options(["partition=gpu", "time=1:00", option]))
 
 
 def test_one_run_at_a_time_in_a_folder(tmp_path: Path) -> None:
@@ -155,3 +162,15 @@ with {hold}:
         holder.wait()
     with taking_turns(path), locked(tmp_path, tmp_path):
         pass
+
+
+def test_executor_options() -> None:
+    assert read_options(["partition=cpu", "mem_per_cpu_gb=4", "env_command=a=b"]) == {
+        "partition": "cpu",
+        "mem_per_cpu_gb": 4,
+        "env_command": "a=b",
+    }
+    told = read_options(["requeue=false", "with_srun=True", "condaenv=none", "qos="])
+    assert told == {"requeue": False, "with_srun": True, "condaenv": None, "qos": ""}
+    with pytest.raises(MemobenchError, match="expected key=value"):
+        read_options(["partition"])

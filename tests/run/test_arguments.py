@@ -18,7 +18,6 @@ from lerobot_memobench.run.arguments import (
     LerobotArguments,
     check_task_names,
     flag_value,
-    read_executor_options,
     recipe_file,
     recipes,
     split_arguments,
@@ -40,18 +39,6 @@ def test_a_line_is_taken_apart() -> None:
 def test_a_word_that_is_neither_is_refused(word: str) -> None:
     with pytest.raises(MemobenchError, match="expected key=value"):
         split_arguments(["env=memobench", word])
-
-
-def test_executor_options() -> None:
-    assert read_executor_options(["partition=cpu", "mem_per_cpu_gb=4", "env_command=a=b"]) == {
-        "partition": "cpu",
-        "mem_per_cpu_gb": 4,
-        "env_command": "a=b",
-    }
-    told = read_executor_options(["requeue=false", "with_srun=True", "condaenv=none", "qos="])
-    assert told == {"requeue": False, "with_srun": True, "condaenv": None, "qos": ""}
-    with pytest.raises(MemobenchError, match="expected key=value"):
-        read_executor_options(["partition"])
 
 
 def test_flags_are_found() -> None:
@@ -130,6 +117,18 @@ def test_dotted_keys_and_untouched_flags() -> None:
         "--eval.use_async_envs=false",
         "--policy.chunk_size=10",
     ]
+
+
+def test_an_optimizer_is_chosen_like_a_policy() -> None:
+    flags = ["--optimizer.type=adam", "--optimizer.lr=1e-3"]
+    assert trained("policy=act", "optimizer=adam", "optimizer.lr=1e-3")[1:] == flags
+    assert trained("policy=act", "optimizer.type=adam", "optimizer.lr=1e-3")[1:] == flags
+    with pytest.raises(MemobenchError, match=r"needs optimizer="):
+        trained("policy=act", "optimizer.lr=1e-3")
+
+
+def test_a_visual_encoder_has_a_short_form() -> None:
+    assert trained("policy=memobench_mem", "visual_encoder=package")[1:] == ["--policy.visual_encoder=package"]
 
 
 def test_the_order_of_words_does_not_matter() -> None:

@@ -226,6 +226,14 @@ def test_the_command_that_goes_on(words: list[str], found: list[str]) -> None:
     assert (again.log, again.options.resume) == (plan.log, True)
 
 
+def test_a_policy_of_a_configuration_file_is_the_policy() -> None:
+    Path("eval.yaml").write_text("policy: {type: memobench_blind}\n")
+    for words, offered in ((["config_path=eval.yaml"], "env.blind_action"), ([], "env.expert_action")):
+        plan = plan_line([LINE[0], *words])
+        assert [flag for flag in plan.portable_flags if "action=" in flag] == [f"--{offered}=true"]
+        assert plan.arguments.has("policy.type") is (not words)
+
+
 # --- the plan itself ---
 
 

@@ -13,8 +13,7 @@ from lerobot_memobench.cli.console import OfSuite, Suite, WhichSuite, console, c
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.tables import Unbroken
 from lerobot_memobench.io import count_of
-from lerobot_memobench.jobs.executors import asked_for, options_text
-from lerobot_memobench.run.arguments import read_executor_options
+from lerobot_memobench.jobs.executors import asked_for, options_text, read_options
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 
 if TYPE_CHECKING:
@@ -86,7 +85,7 @@ def generate(
     """Make a LeRobotDataset of the scripted experts' demonstrations. The same command continues a killed
     run.
     """
-    options = read_executor_options(executor_option or [])
+    options = read_options(executor_option or [])
     named: dict[str, Any] = {} if repo_id is None else {"repo_id": repo_id}
     chosen = [get_task(name) for name in resolve_tasks(tasks, suite)]
     from lerobot_memobench.datasets.generation import NEEDS, episodes_of

@@ -11,23 +11,14 @@ import os
 import shlex
 import sys
 import threading
-import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from lerobot_memobench.cli.console import USAGE_ERROR, WITH_PARENT, one_sentence
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.jobs.processes import saying_how_to_go_on
-from lerobot_memobench.run.arguments import (
-    HELP,
-    Arguments,
-    check_task_names,
-    help_text,
-    read_arguments,
-    resolve_recipe,
-    split_arguments,
-)
-from lerobot_memobench.run.lerobot_commands import call_lerobot, lerobot_commands, without_configuration
+from lerobot_memobench.run.arguments import SHORT_FORMS, check_task_names, read_arguments, split_arguments
+from lerobot_memobench.run.lerobot_commands import call_lerobot, lerobot_commands
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -58,49 +49,19 @@ def run(line: Sequence[str]) -> int:
     name, given = line[0], split_arguments(line[1:])
     if name not in commands:
         raise MemobenchError(f"there is no command {name!r}, {nearest(name, commands)}")
-    if given.wants_help and name in HELP:
-        print(help_text(name), flush=True)
+    if given.wants_help and name in SHORT_FORMS:
+        print(Path(__file__).with_name(f"lerobot_{name}.txt").read_text(), flush=True)
     if name == "train":
-        return train(given, line[1:])
+        from lerobot_memobench.cli.evaluate import tell
+        from lerobot_memobench.run.training import train
+
+        return train(given, line[1:], tell)
     check_task_names(given)
     if name == "eval":
         from lerobot_memobench.cli.evaluate import evaluate
 
         return evaluate(given, ("lerobot", *line))
     return call_lerobot(name, read_arguments(name, given).flags)
-
-
-def train(given: Arguments, line: Sequence[str]) -> int:
-    """Run ``lerobot train`` with the benchmark's defaults, checked.
-
-    Args:
-        line: the arguments as they were typed, for who is to go on with it.
-    """
-    from lerobot_memobench.run import training
-
-    begun = time.time()
-    prompt_frames, obs_type, given = training.take_training_options(resolve_recipe(training.resumed(given)))
-    check_task_names(given)
-    arguments = read_arguments("train", given)
-    if given.wants_help:
-        return call_lerobot("train", arguments.flags)
-    from lerobot_memobench.datasets.lerobot_format.layout import naming_damage
-
-    arguments = training.complete_training(arguments)
-    root = arguments.get("dataset.root")
-    note, left = training.note_on_resume(arguments)
-    for noted in (note, training.note_on_start(arguments)):
-        if noted is not None:
-            print(noted, file=sys.stderr)
-    if not left:
-        return 0
-    with (
-        saying_how_to_go_on(lambda: f"lerobot: {training.how_to_go_on(arguments, line, begun)}"),
-        training.trained_on(prompt_frames, obs_type),
-        naming_damage(Path(root) if root else None),
-        without_configuration(),
-    ):
-        return call_lerobot("train", arguments.flags)
 
 
 def overview(commands: Iterable[str]) -> str:

@@ -134,6 +134,25 @@ def options_text(executor: str, options: Mapping[str, Any], needs: Needs) -> dic
     return {"mem_per_cpu_gb": memory, **asked}
 
 
+def read_options(given: Sequence[str]) -> dict[str, Any]:
+    """Return typed options, such as ``partition=cpu``: numbers, truth values and ``none`` as such.
+
+    In the arguments of another program (``srun_args.mpi=none``) ``none`` is a name.
+
+    Raises:
+        MemobenchError: one is not ``key=value``.
+    """
+    plain: dict[str, bool | None] = {"true": True, "false": False}
+    options: dict[str, Any] = {}
+    for option in given:
+        key, equals, value = option.partition("=")
+        if not key or not equals:
+            raise MemobenchError(f"found executor option {option!r}, expected key=value, such as partition=cpu")
+        known = plain if "." in key else {**plain, "none": None, "null": None}
+        options[key] = int(value) if value.isdecimal() else known.get(value.lower(), value)
+    return options
+
+
 def asked_for(options: Mapping[str, Any]) -> str:
     """Return in a sentence what each job on Slurm asks for."""
     cores, gpus = int(options["cpus_per_task"]), options["gpus_per_task"]

@@ -8,19 +8,17 @@ sentence before anything runs. Short forms stand for LeRobot's names, ``policy=`
 from __future__ import annotations
 
 import dataclasses
-import enum
 import logging
-import textwrap
-import types
 import typing
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Union
+from typing import Any
 
 import draccus
 import yaml
+from draccus.utils import DecodingError, is_choice_type, is_enum, is_literal, is_union
 
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.checkpoint import (
@@ -36,22 +34,14 @@ from lerobot_memobench.tasks.task import PUBLISHED
 
 logger = logging.getLogger(__name__)
 
-CHOOSING = ("policy", "env", "dataset")
-"""Keys that choose something rather than set a field."""
 RECIPE, CONFIG_FILE = "config", "config_path"
 """Our key and LeRobot's for a configuration file."""
+DATASET = "dataset"
 
 COMMON: dict[str, tuple[str, ...]] = {
-    "align": ("policy.align",),
-    "size": ("policy.size",),
-    "perception": ("policy.perception",),
-    "detector": ("policy.detector",),
-    "device": ("policy.device",),
+    **{key: (f"policy.{key}",) for key in ("align", "size", "perception", "detector", "visual_encoder", "device")},
+    **{key: (f"env.{key}",) for key in ("tasks", "obs_type", "suite", "referent")},
     "replan": ("policy.n_action_steps", "env.replan_steps"),
-    "tasks": ("env.tasks",),
-    "obs_type": ("env.obs_type",),
-    "suite": ("env.suite",),
-    "referent": ("env.referent",),
 }
 SHORT_FORMS: dict[str, dict[str, tuple[str, ...]]] = {
     "eval": {
@@ -63,154 +53,13 @@ SHORT_FORMS: dict[str, dict[str, tuple[str, ...]]] = {
     },
     "train": {**COMMON, "episodes": ("dataset.episodes",)},
 }
-"""Command -> short form -> the fields it sets, of which those that exist are set."""
+"""Command -> short form -> the fields it sets, of which those that exist are set. `cli/lerobot_<command>.txt` explains
+them."""
 RUN_OPTIONS = ("verbose", "resume", "shard", "shards", "workers", "executor", "executor_option")
 """Keys of `lerobot eval env=memobench` that say how it is run, not what (`plan.RunOptions`)."""
 TRAINING_OPTIONS = ("prompt_frames", "obs_type")
 """Keys of `lerobot train` that are none of LeRobot's (`training.take_training_options`)."""
-
-
-class HelpRow(NamedTuple):
-    """A row of the help: what is typed, what it sets, and what holds without it ("" where nothing is said)."""
-
-    typed: str
-    sets: str
-    default: str = ""
-
-
-HELP: dict[str, tuple[HelpRow, ...]] = {
-    "eval": (
-        HelpRow(
-            "policy=",
-            "a checkpoint folder (or a training run's), a repository user/name, a policy of the package, or a policy "
-            "type; a folder that is named like one of these is named by a path, ./act",
-            "the scripted expert",
-        ),
-        HelpRow(
-            "host=, port=, dialect=",
-            "with policy=remote: the policy server that acts",
-            "127.0.0.1, by dialect, openpi",
-        ),
-        HelpRow("suite=", "published, or strict: thirty tasks made to need a memory", "published"),
-        HelpRow(
-            "tasks=",
-            "of that suite all, memory types (temporal, spatial, object, procedural), task names, or numbers and "
-            "ranges of memobench tasks (12, 3-7), separated by commas",
-            "all",
-        ),
-        HelpRow("episodes=", "episodes per task; episode i uses the seed 7 + i, or that of seed= + i", "50"),
-        HelpRow(
-            "replan=",
-            "the policy executes so many actions of each prediction; also noted in the log",
-            "the policy's own",
-        ),
-        HelpRow(
-            "obs_type=",
-            "what is observed: pixels_agent_pos, environment_state_agent_pos or both",
-            "what the policy was trained on, else pictures",
-        ),
-        HelpRow(
-            "detector=",
-            "with a policy that reads objects: package or a file, the detector that finds them in pictures",
-            "none: the environment gives them",
-        ),
-        HelpRow(
-            "referent=",
-            "fixed: the published goals; random: the seed decides what the demonstration prompt shows; strict tasks "
-            "are always drawn",
-            "fixed",
-        ),
-        HelpRow("demonstration_prompt=", "false leaves the prompt out", "true"),
-        HelpRow(
-            "prompt_in=",
-            "steps: the policy observes the prompt; reset: it plays before the first observation",
-            "by the policy",
-        ),
-        HelpRow("horizon=", "execution steps per episode", "1200"),
-        HelpRow(
-            "videos=",
-            "episodes of each task that are recorded as videos, from the first; −1 all",
-            "10, without pictures in the observations 0",
-        ),
-        HelpRow(
-            "batch_size=",
-            "environments at once, each in a process of its own",
-            "by cores, dividing the episodes",
-        ),
-        HelpRow("device=", "where the policy runs: cpu, cuda, …", "the checkpoint's, else by machine"),
-        HelpRow("output_dir=", "where everything goes", "outputs/eval/<date>/<time>_…"),
-        HelpRow("verbose=", "true: LeRobot's own messages too, its configuration and progress", "false"),
-        HelpRow("resume=", "true: go on with the evaluation in output_dir=", "false"),
-        HelpRow("shard=", "run this part alone, such as 1/8; memobench merge joins the parts", "all of it"),
-        HelpRow("shards=", "run so many parts as jobs and merge them", "no parts"),
-        HelpRow(
-            "workers=, executor=, executor_option=",
-            "with shards=: how many jobs at once; processes, local, slurm or ray; what that one takes, key=value",
-            "all at once, processes",
-        ),
-        HelpRow(
-            "align=, size=, perception=, visual_encoder=",
-            "of a policy named by its type, as in lerobot train; a checkpoint keeps its own, and others are refused",
-            "the type's",
-        ),
-    ),
-    "train": (
-        HelpRow("policy=", "a policy type, or a checkpoint to start from"),
-        HelpRow("config=", "a recipe of memobench recipe, or a YAML file of your own"),
-        HelpRow("align=", "how memory is aligned with checkpoint language: none, semantic, contrastive, framewise"),
-        HelpRow("dataset=", "a folder that memobench generate wrote, or a repository user/name"),
-        HelpRow("size=", "small and tiny: a few million parameters, from scratch, on a CPU; pi05: 3.2 billion"),
-        HelpRow(
-            "perception=",
-            "pixels: pictures, through a frozen tower, at size=small a visual encoder; objects: their poses as numbers",
-        ),
-        HelpRow(
-            "detector=",
-            "with perception=objects: package or a file, the detector that finds them in pictures",
-        ),
-        HelpRow("visual_encoder=", "with perception=pixels at size=small: package, a file, or random"),
-        HelpRow("replan=", "actions executed per prediction at evaluation"),
-        HelpRow(
-            "obs_type=",
-            "inputs of a policy of LeRobot's: pixels_agent_pos, environment_state_agent_pos or both; left out: "
-            "pictures where the dataset has them, else objects",
-        ),
-        HelpRow("prompt_frames=", "false: no frame of a prompt is trained on; true: all are; left out: by the policy"),
-        HelpRow("episodes=", "of the dataset, those of these numbers: [0, 1, 2]"),
-        HelpRow("device=", "where it is trained: cpu, cuda, …"),
-        HelpRow("output_dir=", "where everything goes; with resume=true, the training that is gone on with"),
-        HelpRow("resume=", "true: go on with the last checkpoint in output_dir="),
-        HelpRow("steps=", "updates of the weights, with resume=true those before included", "100000"),
-        HelpRow("batch_size=", "frames per update", "8, of objects or through a visual encoder 72"),
-        HelpRow("save_freq=", "updates from one checkpoint to the next; the last update always makes one", "20000"),
-        HelpRow("env=", "memobench: evaluate within the training, every env_eval_freq= updates", "no evaluation"),
-        HelpRow("tasks=", "with env=: those evaluated on, as in lerobot eval", "all"),
-        HelpRow("suite=", "with env=: theirs, published or strict", "published"),
-        HelpRow("referent=", "with env=: fixed, the published goals; random, the seed decides", "fixed"),
-    ),
-}
-"""Command -> what `lerobot <command> --help` says of its arguments; docs/evaluate.md and docs/train.md have the same
-rows."""
-
-EXAMPLES = {
-    "eval": "lerobot eval env=memobench policy=<checkpoint> tasks=object episodes=10",
-    "train": "lerobot train policy=memobench_mem align=contrastive dataset=<folder>",
-}
-
-
-def help_text(command: str, width: int = 100) -> str:
-    """Return what `lerobot eval --help` or `lerobot train --help` says before LeRobot's own flags."""
-    lines = [f"usage: {EXAMPLES[command]}", "", "short forms:"]
-    for typed, sets, default in HELP[command]:
-        text = sets + (f" (default: {default})" if default else "")
-        lines += [f"  {typed}", *textwrap.wrap(text, width, initial_indent=" " * 8, subsequent_indent=" " * 8)]
-    lines += [
-        "",
-        "Any other setting goes by LeRobot's full name, as key=value or --key=value; those of what env= and policy=",
-        "name are among them:",
-        "",
-    ]
-    return "\n".join(lines)
+OPTIONS = {"eval": RUN_OPTIONS, "train": TRAINING_OPTIONS}
 
 
 # --- what is typed ---
@@ -295,22 +144,6 @@ def whole_number(text: str | None) -> int | None:
         return None
 
 
-def read_executor_options(given: Sequence[str]) -> dict[str, Any]:
-    """Return values of ``executor_option=``, such as ``partition=cpu``: numbers, truth values and ``none`` as such.
-
-    In the arguments of another program (``srun_args.mpi=none``) ``none`` is a name.
-    """
-    plain: dict[str, bool | None] = {"true": True, "false": False}
-    options: dict[str, Any] = {}
-    for option in given:
-        key, equals, value = option.partition("=")
-        if not key or not equals:
-            raise MemobenchError(f"found executor option {option!r}, expected key=value, such as partition=cpu")
-        known = plain if "." in key else {**plain, "none": None, "null": None}
-        options[key] = int(value) if value.isdecimal() else known.get(value.lower(), value)
-    return options
-
-
 def check_task_names(given: Arguments) -> None:
     """Refuse unknown task names before LeRobot's import, which takes many seconds.
 
@@ -338,7 +171,7 @@ class LerobotArguments:
     Attributes:
         flags: LeRobot's, as its parser reads them: ``--key=value``, or ``--key`` alone.
         config: the command's configuration class; None for a command that has none (plain argparse).
-        chosen: ``policy`` and ``env`` -> the class chosen for them.
+        chosen: fields such as ``policy`` and ``env`` -> the class chosen for them, on the line or in a file.
     """
 
     flags: tuple[str, ...]
@@ -369,10 +202,10 @@ class LerobotArguments:
         return replace(self, flags=tuple(without_flags(self.flags, *keys)))
 
     def choosing(self, key: str, name: str) -> LerobotArguments:
-        """Return arguments whose ``policy`` or ``env`` is of the registered type ``name``, where none is chosen yet."""
-        if key in self.chosen or self.config is None:
-            return self
-        return replace(self, chosen={**self.chosen, key: registry(self.config, key)[name]})
+        """Return arguments that choose the registered type ``name`` for a field such as ``policy``."""
+        assert self.config is not None
+        chosen = {**self.chosen, key: registries(self.config)[key][name]}
+        return replace(self.changed(f"{key}.type", name), chosen=chosen)
 
 
 def read_arguments(command: str, given: Arguments) -> LerobotArguments:
@@ -399,64 +232,50 @@ def translate(command: str, given: Arguments, config: type | None, file: Mapping
     """
     if config is None:
         return LerobotArguments((*given.flags, *(f"--{key}={value}" for key, value in given.pairs)))
-    known = field_types(config)
-    choosing = [(key, value) for key, value in given.pairs if key in CHOOSING and key in known]
-    others = [pair for pair in given.pairs if pair not in choosing]
-    flags = [*given.flags, *(flag for key, value in choosing for flag in choice_flags(config, key, value))]
+    choices = registries(config)
+    choosing = {*choices, *({DATASET} & field_types(config).keys())}
+    flags = [
+        *given.flags,
+        *(flag for key, value in given.pairs if key in choosing for flag in choice_flags(config, key, value)),
+    ]
+    others = [(key, value) for key, value in given.pairs if key not in choosing]
     # Fields of the policy and the environment are known once these are, wherever they stand in the line.
     explicit = [*flags, *(f"--{key}={value}" for key, value in others)]
-    found = {key: chosen_class(config, key, explicit, file) for key in ("policy", "env") if key in known}
-    chosen: dict[str, type] = {key: choice for key, choice in found.items() if choice is not None}
-    short = SHORT_FORMS.get(command, {})
+    found = {key: chosen_class(config, key, explicit, file) for key in choices}
+    chosen = {key: choice for key, choice in found.items() if choice is not None}
+    known, short = dict(settings(config, chosen)), SHORT_FORMS.get(command, {})
     for key, value in others:
-        if key in short:
-            flags += _short_form_flags(config, chosen, key, value, short[key])
-            continue
+        # replan= sets the policy's interval and tells the environment, which writes it down; either may be missing.
+        fields = [each for each in short.get(key, ()) if each in known]
+        if key in short and not fields:
+            owner, _, name = short[key][0].partition(".")
+            raise MemobenchError(
+                f"{key}= sets {owner}.{name}, which this {owner} ({chosen[owner].__name__}) does not have"
+                if owner in chosen
+                else f"{key}= sets {name} of the {owner}: name one with {owner}="
+            )
         try:
-            annotation = annotation_of(config, key, chosen)
+            flags += [f"--{each}={checked_value(key, setting_type(known, each), value)}" for each in fields or [key]]
         except KeyError:
-            options = {"eval": RUN_OPTIONS, "train": TRAINING_OPTIONS}.get(command, ())
-            keys = [*CHOOSING, *short, *all_keys(config, chosen), *options]
+            keys = [*known, *short, *OPTIONS.get(command, ())]
             raise MemobenchError(f"lerobot {command} has no setting {key!r}, {nearest(key, keys)}") from None
-        flags.append(f"--{key}={checked_value(key, annotation, value)}")
     return LerobotArguments(tuple(flags), config, chosen)
 
 
-def _short_form_flags(
-    config: type, chosen: Mapping[str, type], key: str, value: str, targets: tuple[str, ...]
-) -> list[str]:
-    """Return the flags of those of a short form's fields that exist; at least one must."""
-    found = []
-    for target in targets:
-        # replan= sets the policy's interval and tells the environment, which writes it down; either may be missing.
-        try:
-            annotation = annotation_of(config, target, chosen)
-        except (KeyError, MemobenchError):
-            continue
-        found.append(f"--{target}={checked_value(key, annotation, value)}")
-    if found:
-        return found
-    owner, _, name = targets[0].partition(".")
-    if owner in chosen:
-        kind = chosen[owner].__name__
-        raise MemobenchError(f"{key}= sets {targets[0]}, which this {owner} ({kind}) does not have")
-    raise MemobenchError(f"{key}= sets {name} of the {owner}: name one with {owner}=")
-
-
-# --- what policy=, env= and dataset= choose: a registered type, a checkpoint, a repository, a folder ---
+# --- what policy=, env=, dataset= … choose: a registered type, a checkpoint, a repository, a folder ---
 
 
 def choice_flags(config: type, key: str, value: str) -> list[str]:
-    """Return the flags for ``policy=``, ``env=`` or ``dataset=`` of a command with this configuration.
+    """Return the flags for what chooses, such as ``policy=``, of a command with this configuration.
 
     Raises:
         MemobenchError: there is no such thing, with what is near.
     """
     if not value:
         raise MemobenchError(f"{key}= is empty; name a {key}")
-    if key == "dataset":
+    if key == DATASET:
         return dataset_flags(value)
-    known = registry(config, key)
+    known = registries(config)[key]
     path = checkpoint_of(value, known) if key == "policy" else None
     if path is not None:
         return [f"--policy.path={path}"]
@@ -500,11 +319,11 @@ def dataset_flags(value: str) -> list[str]:
 
 
 def chosen_class(config: type, key: str, flags: Sequence[str], file: Mapping[str, Any]) -> type | None:
-    """Return the class that flags or a configuration file choose for ``policy`` or ``env``.
+    """Return the class that flags or a configuration file choose for a field such as ``policy``.
 
     None when nothing is chosen, or when it is not known here.
     """
-    known = registry(config, key)
+    known = registries(config)[key]
     path = flag_value(flags, f"{key}.path")
     name = flag_value(flags, f"{key}.type")
     section = file.get(key)
@@ -591,79 +410,70 @@ def read_config_file(given: str | None) -> dict[str, Any]:
     return content
 
 
-# --- the settings of a command and the values that they take: read from its dataclasses ---
+# --- the settings of a command and the values that they take: read from its dataclasses, as draccus does ---
 
 CHOICE_KEYS = ("type", "path", "discover_packages_path")
-"""What LeRobot's parser understands beside the fields of a registry: ``--policy.type``."""
-
-Chosen = Mapping[str, type]
-"""Dotted key of a registry field (``policy``) -> the class chosen for it."""
+"""What LeRobot's parser understands beside the fields of a choice: ``--policy.type``."""
+PLAIN = {bool: "true or false", int: "a whole number", float: "a number"}
 
 
 def field_types(cls: type) -> dict[str, Any]:
-    """Return field name -> annotation without its None, for the fields that can be set."""
+    """Return field name -> annotation without its None (``int`` for ``int | None``), for the fields that can be set."""
     hints = typing.get_type_hints(cls)
     return {each.name: _without_none(hints[each.name]) for each in dataclasses.fields(cls) if each.init}
 
 
 def _without_none(annotation: Any) -> Any:
-    """Return the annotation without its None: ``int`` for ``int | None``."""
-    if typing.get_origin(annotation) in (Union, types.UnionType):
-        parts = [part for part in typing.get_args(annotation) if part is not type(None)]
-        return parts[0] if len(parts) == 1 else Union[tuple(parts)]  # noqa: UP007 - built at run time
-    return annotation
+    parts = [part for part in typing.get_args(annotation) if part is not type(None)]
+    return parts[0] if is_union(annotation) and len(parts) == 1 else annotation
 
 
-def registry(config: type, key: str) -> dict[str, type]:
-    """Return name -> class of what may be chosen for a registry field such as ``policy``."""
-    choices = field_types(config)[key].get_known_choices()
-    return {str(name): choice for name, choice in choices.items()}
+def registries(config: type) -> dict[str, dict[str, type]]:
+    """Return field -> name -> class of what may be chosen for it, such as for ``policy``."""
+    return {
+        key: {str(name): choice for name, choice in annotation.get_known_choices().items()}
+        for key, annotation in field_types(config).items()
+        if is_choice_type(annotation)
+    }
 
 
-def _is_registry(annotation: Any) -> bool:
-    """Return whether a field is chosen by ``.type`` among registered classes."""
-    return isinstance(annotation, type) and issubclass(annotation, draccus.ChoiceRegistry)
+def settings(config: type, chosen: Mapping[str, type], before: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the dotted key and the type of each setting, sections and choices among them.
 
-
-def all_keys(config: type, chosen: Chosen, before: str = "") -> Iterator[str]:
-    """Yield every dotted key that may be set."""
+    Args:
+        chosen: dotted key of a choice (``policy``) -> the class chosen for it.
+    """
     for name, annotation in field_types(config).items():
         key = before + name
-        if _is_registry(annotation):
-            choice = chosen.get(key)
-            yield from (f"{key}.{word}" for word in CHOICE_KEYS[:2])
-            if choice is not None:
-                yield from all_keys(choice, chosen, key + ".")
-        elif dataclasses.is_dataclass(annotation):
-            yield from all_keys(typing.cast(type, annotation), chosen, key + ".")
-        else:
-            yield key
+        if is_choice_type(annotation):
+            yield from ((f"{key}.{word}", str) for word in CHOICE_KEYS)
+            annotation = chosen.get(key, annotation)
+        yield key, annotation
+        if dataclasses.is_dataclass(annotation) and not is_choice_type(annotation):
+            yield from settings(typing.cast(type, annotation), chosen, key + ".")
 
 
-def annotation_of(config: type, key: str, chosen: Chosen) -> Any:
-    """Return the annotation of the field at a dotted key; ``Any`` where it cannot be known.
+def setting_type(known: Mapping[str, Any], key: str) -> Any:
+    """Return the type of one of the `settings`; ``Any`` where LeRobot's parser alone decides, as within a dict.
 
     Raises:
-        KeyError: there is no such field. MemobenchError: the key belongs to a choice that has not been made
+        KeyError: there is no such setting. MemobenchError: it belongs to a choice that has not been made
             (``env.horizon`` without an environment).
     """
     if key == CONFIG_FILE:
         return str
-    cls = config
-    parts = key.split(".")
-    for k, part in enumerate(parts[:-1]):
-        annotation = field_types(cls)[part]
-        if _is_registry(annotation):
-            if k == len(parts) - 2 and parts[-1] in CHOICE_KEYS:
-                return str
-            choice = chosen.get(".".join(parts[: k + 1]))
-            if choice is None and k == 0:
-                raise MemobenchError(f"{key!r} needs {part}=: name one before setting something of it")
-            annotation = choice
-        if not dataclasses.is_dataclass(annotation):
-            return Any  # a dict, a union, a choice made elsewhere: LeRobot's parser decides
-        cls = typing.cast(type, annotation)
-    return field_types(cls)[parts[-1]]
+    owner = key
+    while owner not in known:
+        owner = owner.rpartition(".")[0]
+        if not owner:
+            raise KeyError(key)
+    if owner == key:
+        return known[key]
+    if is_choice_type(known[owner]) and "." not in owner:
+        raise MemobenchError(f"{key!r} needs {owner}=: name one before setting something of it")
+    if dataclasses.is_dataclass(known[owner]) and not is_choice_type(known[owner]):
+        raise KeyError(key)
+    return Any
 
 
 def checked_value(key: str, annotation: Any, text: str) -> str:
@@ -674,12 +484,18 @@ def checked_value(key: str, annotation: Any, text: str) -> str:
     """
     if text in ("null", "~"):
         return text
-    if annotation in (bool, int, float):
-        # For text, a word such as `align=none` is a value.
-        return "null" if text.lower() == "none" else _checked_plain(key, annotation, text)
-    if typing.get_origin(annotation) is Literal:
+    if annotation in PLAIN:
+        plain = text.lower()
+        if plain == "none":  # for text, a word such as `align=none` is a value
+            return "null"
+        try:
+            draccus.decode(annotation, plain)
+        except DecodingError:
+            raise MemobenchError(f"{key}={text}: expected {PLAIN[annotation]}") from None
+        return plain
+    if is_literal(annotation):
         known = named = [str(value) for value in typing.get_args(annotation)]
-    elif isinstance(annotation, type) and issubclass(annotation, enum.Enum):
+    elif is_enum(annotation):
         named = list(annotation.__members__)
         known = [*(str(member.value) for member in annotation), *named]
     else:
@@ -689,16 +505,6 @@ def checked_value(key: str, annotation: Any, text: str) -> str:
     return text
 
 
-def _checked_plain(key: str, annotation: type, text: str) -> str:
-    """Return the text of a truth value or number."""
-    if annotation is bool:
-        if text.lower() not in ("true", "false"):
-            raise MemobenchError(f"{key}={text}: expected true or false")
-        return text.lower()
-    plain = text.replace("_", "") if annotation is int else text
-    try:
-        annotation(plain)
-    except ValueError:
-        word = "a whole number" if annotation is int else "a number"
-        raise MemobenchError(f"{key}={text}: expected {word}") from None
-    return plain
+def is_true(key: str, text: str | None) -> bool:
+    """Return the truth value that an option of ours is given; not given, it is false."""
+    return text is not None and checked_value(key, bool, text) == "true"

@@ -17,7 +17,7 @@ from lerobot_memobench.envs.observations import OBJECTS, PIXELS, check_obs_type,
 from lerobot_memobench.envs.prompting import prompt_in, quiet, read_rename_map
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import CARD_FILE, read_card
-from lerobot_memobench.jobs.executors import ELSEWHERE
+from lerobot_memobench.jobs.executors import ELSEWHERE, read_options
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint
 from lerobot_memobench.policies.compatibility import REFUSAL, check_features
@@ -27,9 +27,9 @@ from lerobot_memobench.run.arguments import (
     RUN_OPTIONS,
     Arguments,
     LerobotArguments,
+    is_true,
     joined,
     read_arguments,
-    read_executor_options,
     split_arguments,
     whole_number,
     without_flags,
@@ -223,12 +223,11 @@ def make_grid(arguments: LerobotArguments, environment: MemobenchEnvConfig) -> G
 
 def with_policy(arguments: LerobotArguments) -> LerobotArguments:
     """Return arguments with the scripted expert where no policy is named; a scripted policy is offered its action."""
-    if not arguments.has("policy.path"):
-        arguments = arguments.default("policy.type", EXPERT)
-    name = arguments.get("policy.type")
-    if name in SCRIPTED:
-        arguments = arguments.default(SCRIPTED[name], True)
-    return arguments if name is None else arguments.choosing("policy", name)
+    if "policy" not in arguments.chosen and not arguments.has("policy.path"):
+        arguments = arguments.choosing("policy", EXPERT)
+    chosen: Any = arguments.chosen.get("policy")
+    offered = None if chosen is None else SCRIPTED.get(chosen.get_choice_name(chosen))
+    return arguments if offered is None else arguments.default(offered, True)
 
 
 def with_batch_size(arguments: LerobotArguments, options: RunOptions, log: Path, most: int | None) -> LerobotArguments:
@@ -428,13 +427,13 @@ def take_run_options(given: Arguments) -> tuple[RunOptions, Arguments]:
             found.setdefault(key, []).append(value)
     last = {key: values[-1] for key, values in found.items()}
     options = RunOptions(
-        verbose=_boolean("verbose", last.get("verbose", "false")),
-        resume=_boolean("resume", last.get("resume", "false")),
+        verbose=is_true("verbose", last.get("verbose")),
+        resume=is_true("resume", last.get("resume")),
         shard=Shard.parse(last["shard"]) if "shard" in last else None,
         shards=_count("shards", last.get("shards")),
         workers=_count("workers", last.get("workers")),
         executor=last.get("executor", PROCESSES),
-        executor_options=read_executor_options(found.get("executor_option", [])),
+        executor_options=read_options(found.get("executor_option", [])),
     )
     if options.shards and options.shard is not None:
         raise MemobenchError(
@@ -455,12 +454,6 @@ def _count(key: str, text: str | None) -> int:
     if not text.isdecimal() or int(text) < 1:
         raise MemobenchError(f"found {key}={text}; expected a whole number from 1 on")
     return int(text)
-
-
-def _boolean(key: str, text: str) -> bool:
-    if text.lower() not in ("true", "false"):
-        raise MemobenchError(f"found {key}={text}; expected true or false")
-    return text.lower() == "true"
 
 
 # --- all episodes, in the batches in which they are run, and which of them a part or a run has left ---

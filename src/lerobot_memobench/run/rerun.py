@@ -8,8 +8,8 @@ refused by name.
 
 from __future__ import annotations
 
+import dataclasses
 import datetime as dt
-import enum
 import json
 import re
 import typing
@@ -17,10 +17,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from draccus.utils import is_enum, is_literal, is_union
+
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import CARD_FILE, read_card
 from lerobot_memobench.policies.checkpoint import local_folder
-from lerobot_memobench.run.arguments import annotation_of, checked_value, chosen_class, flag_value
+from lerobot_memobench.run.arguments import PLAIN, checked_value, chosen_class, flag_value, setting_type
+from lerobot_memobench.run.arguments import settings as settings_of
 from lerobot_memobench.run.card import checkpoint_files, detector_hash, tree_hash
 from lerobot_memobench.run.lerobot_commands import config_class, load_command, register_plugins
 from lerobot_memobench.run.machine import gl_facts, versions
@@ -28,22 +31,22 @@ from lerobot_memobench.run.plan import ENVIRONMENT, EvaluationPlan, plan_line
 
 ENV, POLICY_TYPE, POLICY_PATH, TASK_DIR = "env.type", "policy.type", "policy.path", "env.task_dir"
 
-NUMBERS = (
-    *("seed", "eval.n_episodes", "eval.batch_size", "eval.use_async_envs", "eval.recording"),
-    *("env.fps", "env.demonstration_prompt", "env.horizon", "env.render_every", "env.replan_steps", "env.seed_base"),
-    *("env.expert_action", "env.blind_action", "env.oracle_memory", "env.videos", "env.resume"),
-    *("env.max_parallel_tasks", "env.disable_env_checker"),
+REACHING_OUT = (
+    "push_to_hub",
+    "private",
+    "recording_private",
+    "use_peft",
+    "trust_remote_code",
+    "discover_packages_path",
 )
-"""Numbers and truth values of the run and the environment. Of a policy's, all are taken but `REACHING_OUT`."""
-REACHING_OUT = ("push_to_hub", "private", "use_peft", "trust_remote_code", "discover_packages_path")
-"""Truth values of a policy by which more than its numbers changes."""
+"""Settings by which more than numbers changes. All other numbers and truth values are taken."""
 WORDS = (
     *("job_name", "env.task", "env.tasks", "env.suite", "env.obs_type", "env.referent", "env.prompt_in", "env.render"),
     *("policy.size", "policy.perception", "policy.align", "policy.subgoal_level", "policy.memory_fusion"),
     *("policy.memory_camera", "policy.detector"),
     *("policy.dtype", "policy.dialect", "policy.gripper"),
 )
-"""Words, which name one of several known things."""
+"""Texts that name one of several known things."""
 NOTES = ("policy.label", "policy.keys")
 """Text that stands on a card, or in a message to the policy's server."""
 SERVERS = ("policy.host", "policy.servers")
@@ -145,8 +148,8 @@ def allowed_flags(flags: Any, server: str | None = None) -> list[str]:
             raise MemobenchError(f"--server {server} is for a policy that runs in a server, and the card's does not")
         settings = {key: value for key, value in settings.items() if key not in (*SERVERS, "policy.port")}
         named = [f"--policy.servers={server}"]
-    check = _checker([f"--{key}={settings[key]}" for key in (ENV, POLICY_TYPE, POLICY_PATH) if key in settings])
-    return [f"--{key}={check(key, value)}" for key, value in settings.items()] + named
+    known = _known([f"--{key}={settings[key]}" for key in (ENV, POLICY_TYPE, POLICY_PATH) if key in settings])
+    return [f"--{key}={_checked(known, key, value)}" for key, value in settings.items()] + named
 
 
 def _taken_apart(flag: str) -> tuple[str, str]:
@@ -180,58 +183,39 @@ def _folder(key: str, value: str) -> str:
     return value
 
 
-def _checker(choosing: list[str]) -> Callable[[str, str], str]:
-    """Return what checks a setting.
-
-    Args:
-        choosing: the flags that choose environment and policy.
-    """
+def _known(choosing: list[str]) -> dict[str, Any]:
+    """Return the settings of an evaluation with these flags that choose environment and policy."""
     config = config_class(load_command("eval"))
     assert config is not None
     register_plugins()
     found = {key: chosen_class(config, key, choosing, {}) for key in ("env", "policy")}
-    chosen = {key: choice for key, choice in found.items() if choice is not None}
-
-    def check(key: str, value: str) -> str:
-        if key in (ENV, POLICY_TYPE, POLICY_PATH, TASK_DIR):
-            return value  # known by now
-        for keys, (holds, expected) in EXPECTED.items():
-            if key in keys:
-                if not holds(value):
-                    raise _refused(key, value, f"expected {expected}")
-                return value
-        return _number(config, chosen, key, value)
-
-    return check
+    return dict(settings_of(config, {key: choice for key, choice in found.items() if choice is not None}))
 
 
-def _number(config: type, chosen: Mapping[str, type], key: str, value: str) -> str:
-    """Return a number, a truth value, one of a field's known values or a list of numbers, as LeRobot reads it."""
-    of_policy = key.startswith("policy.") and key.rpartition(".")[2] not in REACHING_OUT
-    if key not in NUMBERS and not of_policy:
-        raise _refused(key, value, "which no card sets that is repeated")
+def _checked(known: Mapping[str, Any], key: str, value: str) -> str:
+    """Return a value as LeRobot reads it, if it is one that names nothing but what is here."""
+    if key in (ENV, POLICY_TYPE, POLICY_PATH, TASK_DIR):
+        return value  # known by now
+    for keys, (holds, expected) in EXPECTED.items():
+        if key in keys:
+            if not holds(value):
+                raise _refused(key, value, f"expected {expected}")
+            return value
     try:
-        annotation = annotation_of(config, key, chosen)
+        kind = setting_type(known, key)
     except KeyError:
-        raise _refused(key, value, "which is no setting of this policy's") from None
-    if value in NOTHING:
+        raise _refused(key, value, "which is no setting of this evaluation") from None
+    if key.rpartition(".")[2] in REACHING_OUT or dataclasses.is_dataclass(kind):
+        raise _refused(key, value, "which no card sets that is repeated")
+    parts = typing.get_args(kind) if is_union(kind) else (kind,)
+    may_be_text = any(part in (str, Path, Any, object) for part in parts)
+    if value in NOTHING and (key.startswith("policy.") or not may_be_text):
         return value
-    if _may_be_text(annotation):
+    if may_be_text:
         raise _refused(key, value, "which may name a file or a repository")
-    if not _is_closed(annotation) and not _holds_numbers(value):
+    if not (kind in PLAIN or is_enum(kind) or is_literal(kind) or _holds_numbers(value)):
         raise _refused(key, value, "expected numbers")
-    return checked_value(key, annotation, value)
-
-
-def _may_be_text(annotation: Any) -> bool:
-    parts = typing.get_args(annotation) if typing.get_origin(annotation) is typing.Union else (annotation,)
-    return any(part in (str, Path, Any, object) for part in parts)
-
-
-def _is_closed(annotation: Any) -> bool:
-    """Whether `checked_value` takes known values only."""
-    is_enum = isinstance(annotation, type) and issubclass(annotation, enum.Enum)
-    return annotation in (bool, int, float) or is_enum or typing.get_origin(annotation) is typing.Literal
+    return checked_value(key, kind, value)
 
 
 def _parsed(text: str) -> Any:

@@ -12,6 +12,7 @@ import copy
 import functools
 import logging
 import shlex
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -20,11 +21,12 @@ from typing import Any
 
 import yaml
 
-from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, PRIVILEGED
+from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, PRIVILEGED, naming_damage
 from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS as INPUT
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, OBS_TYPES, PIXELS
 from lerobot_memobench.envs.prompting import quiet, reads_prompt
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.jobs.processes import saying_how_to_go_on
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.lerobot_hooks import OPEN_DATASETS, check_version, install
 from lerobot_memobench.policies.checkpoint import (
@@ -41,9 +43,15 @@ from lerobot_memobench.run.arguments import (
     TRAINING_OPTIONS,
     Arguments,
     LerobotArguments,
+    check_task_names,
     checked_value,
+    is_true,
+    read_arguments,
+    resolve_recipe,
     whole_number,
 )
+from lerobot_memobench.run.lerobot_commands import call_lerobot, without_configuration
+from lerobot_memobench.run.plan import check_observations, env_config, policy_config
 
 logger = logging.getLogger(__name__)
 
@@ -58,6 +66,36 @@ TRAINED = ("policy.type", "policy.path", "reward_model.type", "reward_model.path
 """What may say what is trained."""
 
 
+def train(given: Arguments, line: Sequence[str], tell: Callable[[str], None]) -> int:
+    """Run ``lerobot train`` with the benchmark's defaults, checked; return the exit status.
+
+    Args:
+        line: the arguments as they were typed, for who is to go on with it.
+        tell: told what may matter and stops nothing.
+    """
+    begun = time.time()
+    prompt_frames, obs_type, given = take_training_options(resolve_recipe(resumed(given)))
+    check_task_names(given)
+    arguments = read_arguments("train", given)
+    if given.wants_help:
+        return call_lerobot("train", arguments.flags)
+    arguments = complete_training(arguments)
+    note, left = note_on_resume(arguments)
+    for noted in (note, note_on_start(arguments)):
+        if noted is not None:
+            tell(noted)
+    if not left:
+        return 0
+    root = arguments.get("dataset.root")
+    with (
+        saying_how_to_go_on(lambda: f"lerobot: {how_to_go_on(arguments, line, begun)}"),
+        trained_on(prompt_frames, obs_type),
+        naming_damage(Path(root) if root else None),
+        without_configuration(),
+    ):
+        return call_lerobot("train", arguments.flags)
+
+
 def take_training_options(given: Arguments) -> tuple[bool | None, str | None, Arguments]:
     """Return the options of a command line that LeRobot does not have, and the arguments without them.
 
@@ -68,15 +106,14 @@ def take_training_options(given: Arguments) -> tuple[bool | None, str | None, Ar
     Raises:
         MemobenchError: the first is neither true nor false, or the second no kind of observation.
     """
-    found = {key: value for key, value in given.pairs if key in TRAINING_OPTIONS}
-    of_env = {"obs_type"} if any(key == "env" for key, _ in given.pairs) else set()  # it is a setting of it, too
+    found = dict(given.pairs)
+    of_env = {"obs_type"} if "env" in found else set()  # it is a setting of it, too
     rest = [pair for pair in given.pairs if pair[0] in of_env or pair[0] not in TRAINING_OPTIONS]
-    prompt_frames, obs_type = found.get("prompt_frames"), found.get("obs_type")
+    obs_type = found.get("obs_type")
     if obs_type is not None and obs_type not in OBS_TYPES:
         raise MemobenchError(f"found obs_type={obs_type}, {nearest(obs_type, OBS_TYPES)}")
-    if prompt_frames is not None:
-        prompt_frames = checked_value("prompt_frames", bool, prompt_frames)
-    return {"true": True, "false": False}.get(str(prompt_frames)), obs_type, replace(given, pairs=rest)
+    wanted = checked_value("prompt_frames", bool, found.get("prompt_frames", "null"))
+    return {"true": True, "false": False}.get(wanted), obs_type, replace(given, pairs=rest)
 
 
 def complete_training(arguments: LerobotArguments) -> LerobotArguments:
@@ -85,8 +122,6 @@ def complete_training(arguments: LerobotArguments) -> LerobotArguments:
     Raises:
         MemobenchError: no policy is named, or the dataset or the model checkpoint is none.
     """
-    from lerobot_memobench.run.plan import check_observations, env_config, policy_config
-
     from_file = arguments.has(CONFIG_FILE)
     if not from_file:
         if not any(arguments.has(key) for key in TRAINED):
@@ -134,8 +169,6 @@ def note_on_start(arguments: LerobotArguments) -> str | None:
     """Return a note on a training that begins from a model checkpoint under other settings than its weights were
     trained for, which fine-tuning may mean; None: there is nothing to note.
     """
-    from lerobot_memobench.run.plan import policy_config
-
     path = arguments.get("policy.path")
     policy = None if path is None else policy_config(arguments)
     if path is None or policy is None:
@@ -162,7 +195,7 @@ def resumed(given: Arguments) -> Arguments:
         MemobenchError: there is nothing to go on with, a recipe is named, or another policy than that of the run.
     """
     wanted = "true" if "--resume" in given.flags and given.value("resume") is None else given.value("resume")
-    if wanted is None or checked_value("resume", bool, wanted) != "true":
+    if not is_true("resume", wanted):
         return given
     recipe, stated = given.value(RECIPE), given.value(CONFIG_FILE)
     if recipe is None and stated is not None and not (Path(stated).is_file() and Path(stated).name != TRAIN_CONFIG):
