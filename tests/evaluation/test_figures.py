@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lerobot_memobench.envs.video import OPERATION_COLOURS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.figures import rates, rollouts, style
 from lerobot_memobench.evaluation.records import Run, read_runs
@@ -33,7 +32,7 @@ def runs(tmp_path: Path) -> list[Run]:
 
 def best(table: str) -> dict[str, str]:
     """Metric -> the method with the highest average over its best replan interval."""
-    axes = style.average_axes()
+    axes = style.AVERAGE_AXES
     found = style.best_over_replan(style.published_entries(table), axes)
     return {metric: max(found, key=lambda whose: found[whose][k] or 0.0)[0] for k, (_, metric) in enumerate(axes)}
 
@@ -46,7 +45,7 @@ def test_the_papers_radar_says_what_its_text_says() -> None:
 
 
 def test_axes_are_normalised_by_their_highest() -> None:
-    kept, tops, shares = rates.normalised(style.published_entries("main"), style.average_axes())
+    kept, tops, shares = rates.normalised(style.published_entries("main"), style.AVERAGE_AXES)
     assert tops == [31.9, 58.1, 49.9, 32.1]
     assert len(kept) == 4
     assert shares["MemoryVLA", True] == pytest.approx([29.2 / 31.9, 55.1 / 58.1, 1.0, 14.1 / 32.1])
@@ -56,28 +55,26 @@ def test_axes_are_normalised_by_their_highest() -> None:
 def test_what_does_not_apply_is_a_gap_and_no_zero(runs: list[Run]) -> None:
     """Our two tasks are of two memory types: the paper's other axes do not apply to them."""
     rows = [*style.entries_of(runs), *style.published_entries("main")]
-    kept, _, shares = rates.normalised(rows, style.type_axes())
+    kept, _, shares = rates.normalised(rows, style.TYPE_AXES)
     ours = dict(zip(kept, shares["mine_$", False], strict=True))
     assert {memory_type for (memory_type, _), share in ours.items() if share is not None} == {"temporal", "spatial"}
     assert ours["object", "SR"] is None
-    figure = rates.draw_radar([("both", rows)], style.type_axes())
+    figure = rates.draw_radar([("both", rows)], style.TYPE_AXES)
     (line,) = [line for line in figure.axes[0].lines if line.get_label().startswith("mine")]
     drawn = np.asarray(line.get_ydata(), dtype=float)
     assert np.isnan(drawn).sum() == sum(share is None for share in [*ours.values(), next(iter(ours.values()))])
     texts = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
     assert texts[-1] == "a gap: not applicable, or not evaluated"
-    zeros = rates.normalised([replace(rows[0], average=dict.fromkeys(("SR", "MSR", "MUR"), 0.0))], radar_axes())[2]
+    zeros = rates.normalised(
+        [replace(rows[0], average=dict.fromkeys(("SR", "MSR", "MUR"), 0.0))], style.AVERAGE_AXES[:3]
+    )[2]
     assert list(zeros.values()) == [[0.0, 0.0, 0.0]], "a rate of nought is one"
-
-
-def radar_axes() -> list[style.Axis]:
-    return style.average_axes()[:3]
 
 
 def test_an_evaluation_called_like_a_method_of_the_papers_is_none_of_it(tmp_path: Path) -> None:
     logs.evaluation(tmp_path / "a", 2)
     ours = style.entries_of(read_runs([f"π0.5={tmp_path / 'a'}"]))
-    found = style.best_over_replan([*ours, *style.published_entries("main")], style.average_axes())
+    found = style.best_over_replan([*ours, *style.published_entries("main")], style.AVERAGE_AXES)
     assert found["π0.5", False][0] == 50.0
     assert found["π0.5", True][0] == pytest.approx(31.0, abs=3)
 
@@ -117,7 +114,7 @@ def test_inputs_are_told_where_evaluations_differ_in_them(tmp_path: Path) -> Non
 
 
 def test_axes_that_apply_to_nobody_are_left_out() -> None:
-    kept, _, _ = rates.normalised(style.published_entries("main"), style.type_axes())
+    kept, _, _ = rates.normalised(style.published_entries("main"), style.TYPE_AXES)
     assert len(kept) == 13  # object has no U, C; procedural no C
     assert ("object", "MUR") not in kept
 
@@ -128,7 +125,7 @@ def test_a_radar_of_two_axes_is_refused(tmp_path: Path) -> None:
     write_episodes(tmp_path, [logs.rollout("o", "object", "S", [True], True, 0)])
     ours = style.entries_of(read_runs([tmp_path]))
     with pytest.raises(MemobenchError, match="only 2 apply"):
-        rates.draw_radar([("", ours)], style.average_axes())
+        rates.draw_radar([("", ours)], style.AVERAGE_AXES)
 
 
 # --- correlations ---
@@ -207,17 +204,16 @@ def test_replan_curves(runs: list[Run]) -> None:
 # --- drawing ---
 
 
-def test_operations_have_the_colours_of_the_videos() -> None:
-    assert {key: "#" + bytes(colour).hex() for key, colour in OPERATION_COLOURS.items()} == style.OPERATION_COLOURS
+def test_every_outcome_has_a_look_of_its_own() -> None:
     assert list(style.OUTCOMES) == ["success", *FAILURES, *REFINED_FAILURES, *STRICT_FAILURES, *FAULTS]
     assert len({look.hatch for look in style.OUTCOMES.values()}) == len(style.OUTCOMES)
 
 
 def test_methods_look_different_in_colour_and_in_grey() -> None:
-    looks = list(style.lines_of([f"method {k}" for k in range(11)]).values())
+    looks = list(style.looks_of((f"method {k}", False) for k in range(11)).values())
     for values in ([x.colour for x in looks], [x.marker for x in looks], [str(x.dashes) for x in looks]):
         assert len(set(values)) == 11
-    many = style.lines_of([str(k) for k in range(30)]).values()
+    many = style.looks_of((str(k), False) for k in range(30)).values()
     assert len({(x.colour, x.marker, str(x.dashes)) for x in many}) == 30
     assert not {x.colour for x in looks} & set(style.OPERATION_COLOURS.values())
 
@@ -230,7 +226,7 @@ def test_names_are_set_literally_but_for_the_models() -> None:
 def test_every_figure_of_ours_beside_the_papers(name: str, runs: list[Run], tmp_path: Path) -> None:
     ours, theirs = style.entries_of(runs), style.published_entries("main")
     drawn = {
-        "radar": lambda: rates.draw_radar([("both", [*ours, *theirs])], style.average_axes()),
+        "radar": lambda: rates.draw_radar([("both", [*ours, *theirs])], style.AVERAGE_AXES),
         "correlations": lambda: rates.draw_correlations([*ours, *theirs]),
         "failures": lambda: rollouts.draw_failures([*rollouts.bars(runs), rollouts.paper_bar()]),
         "prefix": lambda: rollouts.draw_prefix([*rollouts.panels(runs), rollouts.paper_panel()]),

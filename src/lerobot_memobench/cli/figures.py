@@ -55,11 +55,11 @@ def radar(
 ) -> None:
     """Per method the best value over replan intervals, each axis normalised by its highest."""
     from lerobot_memobench.evaluation.figures.rates import draw_radar
-    from lerobot_memobench.evaluation.figures.style import average_axes, entries_of, published_entries, type_axes
+    from lerobot_memobench.evaluation.figures.style import AVERAGE_AXES, TYPE_AXES, entries_of, published_entries
 
     runs, paper = given_runs(folders, with_)
     ours = entries_of(runs)
-    chosen = average_axes() if axes is Axes.AVERAGE else type_axes()
+    chosen = AVERAGE_AXES if axes is Axes.AVERAGE else TYPE_AXES
     webs = [("", ours)]
     if paper:
         webs = [

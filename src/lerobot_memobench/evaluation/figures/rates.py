@@ -51,9 +51,9 @@ def normalised(
     An axis that does not apply to a method, such as one whose tasks it was not evaluated on, has no share of it: None.
     """
     best = best_over_replan(entries, axes)
-    highest = [max((row[k] for row in best.values() if row[k] is not None), default=None) for k in range(len(axes))]  # type: ignore[type-var]
-    kept = [k for k, value in enumerate(highest) if value is not None]
-    tops = [float(highest[k] or 0.0) for k in kept]
+    columns = [[value for row in best.values() if (value := row[k]) is not None] for k in range(len(axes))]
+    kept = [k for k, values in enumerate(columns) if values]
+    tops = [max(columns[k]) for k in kept]
     shares = {whose: [_share(row[k], top) for k, top in zip(kept, tops, strict=True)] for whose, row in best.items()}
     return [axes[k] for k in kept], tops, shares
 
@@ -215,13 +215,17 @@ def _both(entries: Sequence[Entry]) -> bool:
 
 
 def _draw_correlations_panel(place: Any, entries: Sequence[Entry], metric: str, by_task: bool) -> None:
+    from matplotlib.patches import Rectangle
+
     texts = []
     for published in (True, False):
         found = points([entry for entry in entries if entry.published is published], metric, by_task)
         if found:
             _scatter(place, found, published)
-            whose = "paper: " if published else "here: "
-            texts.append(_correlations_text(found, whose if _both(entries) else ""))
+            r = pearson(found)
+            value = "r not defined" if r is None else f"r = {r:.2f}".replace("-", "−")
+            whose = ("paper: " if published else "here: ") if _both(entries) else ""
+            texts.append(f"{whose}{value} ({len(found)} points)")
     place.set_title("\n".join(texts), fontsize=8, fontweight="normal")
     place.set_xlabel(f"{metric}, % ({METRIC_NAMES[metric]})")
     place.set_xlim(-4, 104)
@@ -231,7 +235,8 @@ def _draw_correlations_panel(place: Any, entries: Sequence[Entry], metric: str, 
     place.set_aspect("equal")
     place.plot([0, 100], [0, 100], color=GRID, lw=0.7, zorder=0)
     if metric == "MSR":
-        _shade(place)
+        shaded = {"facecolor": SHADE, "edgecolor": "none", "zorder": -1}
+        place.add_patch(Rectangle((HIGH_STORAGE, -4), 104 - HIGH_STORAGE, LOW_SUCCESS + 4, **shaded))
 
 
 def _correlations_legend(figure: Figure, entries: Sequence[Entry], memory_types: Sequence[str], shaded: bool) -> None:
@@ -276,21 +281,6 @@ def _scatter(place: Any, found: Sequence[Point], published: bool) -> None:
             zorder=3,
             clip_on=False,
         )
-
-
-def _shade(place: Any) -> None:
-    from matplotlib.patches import Rectangle
-
-    corner = (HIGH_STORAGE, -4)
-    place.add_patch(
-        Rectangle(corner, 104 - HIGH_STORAGE, LOW_SUCCESS + 4, facecolor=SHADE, edgecolor="none", zorder=-1)
-    )
-
-
-def _correlations_text(found: Sequence[Point], before: str) -> str:
-    r = pearson(found)
-    value = "r not defined" if r is None else f"r = {r:.2f}".replace("-", "−")
-    return f"{before}{value} ({len(found)} points)"
 
 
 # --- rates by replan interval: a line per method, with Wilson's intervals where n is known (paper, main results) ---
@@ -360,9 +350,21 @@ def _draw_replan_panel(place: Any, found: Sequence[Curve], looks: Mapping[Identi
     if not found:
         place.set_visible(False)
         return
-    for curve in found:
-        _draw_curve(place, curve, looks[curve[0], curve[3]])
-    _replan_frame(place, found)
+    for name, steps, rates, published in found:
+        look = looks[name, published]
+        values = [math.nan if rate.value is None else 100 * rate.value for rate in rates]
+        if not published:
+            intervals = [rate.interval or (0.0, 1.0) for rate in rates]
+            low, high = ([100 * bounds[k] for bounds in intervals] for k in (0, 1))
+            place.fill_between(steps, low, high, color=look.colour, alpha=0.15, lw=0, zorder=1)
+        order = 2 if published else 3
+        place.plot(steps, values, **look.drawn, ms=4, lw=_width(not published), zorder=order, clip_on=False)
+    place.set_xticks(sorted({step for _, steps, _, _ in found for step in steps}))
+    place.set_ylim(bottom=0)
+    # Room for markers at the top, and at least ten points of scale: noise is not to look like a trend.
+    place.set_ylim(top=min(102.0, max(10.0, place.get_ylim()[1])))
+    place.grid(axis="y", color=GRID, lw=0.5)
+    place.locator_params(axis="y", nbins=5)
 
 
 def _replan_legend(figure: Figure, looks: Mapping[Identity, Line], ours: Mapping[str, Sequence[Run]]) -> None:
@@ -381,24 +383,3 @@ def _replan_legend(figure: Figure, looks: Mapping[Identity, Line], ours: Mapping
 
 def _width(ours: bool) -> float:
     return 1.9 if ours else 1.1
-
-
-def _draw_curve(place: Any, curve: Curve, look: Line) -> None:
-    _, steps, rates, published = curve
-    values = [math.nan if rate.value is None else 100 * rate.value for rate in rates]
-    if not published:
-        intervals = [rate.interval or (0.0, 1.0) for rate in rates]
-        low, high = ([100 * bounds[k] for bounds in intervals] for k in (0, 1))
-        place.fill_between(steps, low, high, color=look.colour, alpha=0.15, lw=0, zorder=1)
-    order = 2 if published else 3
-    place.plot(steps, values, **look.drawn, ms=4, lw=_width(not published), zorder=order, clip_on=False)
-
-
-def _replan_frame(place: Any, found: Sequence[Curve]) -> None:
-    steps = sorted({step for _, its_steps, _, _ in found for step in its_steps})
-    place.set_xticks(steps)
-    place.set_ylim(bottom=0)
-    # Room for markers at the top, and at least ten points of scale: noise is not to look like a trend.
-    place.set_ylim(top=min(102.0, max(10.0, place.get_ylim()[1])))
-    place.grid(axis="y", color=GRID, lw=0.5)
-    place.locator_params(axis="y", nbins=5)

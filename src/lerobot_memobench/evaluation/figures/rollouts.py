@@ -73,16 +73,13 @@ def bars(runs: Sequence[Run], by_task: bool = False) -> list[Bar]:
         for task, memory_type in summary.memory_type_of.items():
             groups.setdefault("all rollouts", {}).setdefault(run.name, []).append(task)
             groups.setdefault(task if by_task else memory_type, {}).setdefault(run.name, []).append(task)
-    named = {run.name: run for run in runs}
-    return [
-        Bar(heading, name if len(runs) > 1 else "", _failures_parts(named[name], tasks))
-        for heading, members in groups.items()
-        for name, tasks in members.items()
-    ]
-
-
-def _failures_parts(run: Run, tasks: Sequence[str]) -> tuple[Part, ...]:
-    return tuple((name, count, "") for name, count in outcomes(run.summary, tasks).items())
+    summaries = {run.name: run.summary for run in runs}
+    found = []
+    for heading, members in groups.items():
+        for name, tasks in members.items():
+            parts = tuple((outcome, count, "") for outcome, count in outcomes(summaries[name], tasks).items())
+            found.append(Bar(heading, name if len(runs) > 1 else "", parts))
+    return found
 
 
 def paper_bar() -> Bar:
@@ -94,7 +91,8 @@ def paper_bar() -> Bar:
 
 def draw_failures(found: Sequence[Bar]) -> Figure:
     """Draw bars, those of one heading together."""
-    places = _places(found)
+    steps = [1.0 if a.heading == b.heading else 1.45 for a, b in pairwise(found)]
+    places = list(accumulate(steps, initial=0.0))  # from the top
     with paper_style():
         figure = new_figure(7.0, 1.35 + 0.27 * (places[-1] + 1))
         axis = figure.subplots()
@@ -108,12 +106,6 @@ def draw_failures(found: Sequence[Bar]) -> Figure:
         axis.spines["left"].set_visible(False)
         _failures_legend(figure, found)
         return figure
-
-
-def _places(found: Sequence[Bar]) -> list[float]:
-    """Return where each bar lies, from the top."""
-    steps = [1.0 if a.heading == b.heading else 1.45 for a, b in pairwise(found)]
-    return list(accumulate(steps, initial=0.0))
 
 
 def _failures_legend(figure: Figure, found: Sequence[Bar]) -> None:

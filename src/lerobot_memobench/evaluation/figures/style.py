@@ -10,10 +10,11 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lerobot_memobench.envs.video import OPERATION_COLOURS as VIDEO_COLOURS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import METRICS, Row
 from lerobot_memobench.evaluation.records import Run
@@ -26,13 +27,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-OPERATION_COLOURS = {"S": "#56b4e9", "U": "#e69f00", "C": "#009e73"}
-METRIC_NAMES = {
-    "SR": "success",
-    "MSR": "storage",
-    "MUR": "update",
-    "MCR": "compression",
-}
+OPERATION_COLOURS = {key: "#" + bytes(colour).hex() for key, colour in VIDEO_COLOURS.items()}
+METRIC_NAMES = {"SR": "success", "MSR": "storage", "MUR": "update", "MCR": "compression"}
 
 INK, FAINT, GRID = "#222222", "#777777", "#d9d9d9"
 
@@ -91,25 +87,23 @@ _DASHES: tuple[Any, ...] = (
 )  # fmt: skip
 
 
-def lines_of(names: Sequence[str]) -> dict[str, Line]:
-    """Return a look for each method: no two of eleven share colour, marker or dashes, no two of a hundred all three."""
-    return {name: _line(k) for k, name in enumerate(dict.fromkeys(names))}
-
-
 def looks_of(identities: Iterable[tuple[str, bool]]) -> dict[tuple[str, bool], Line]:
     """Return a look for each (method, whether it is the paper's).
 
+    No two of eleven evaluations share colour, marker or dashes, no two of a hundred all three.
     A method of the paper's has the same one in every figure, from the palette's end; evaluations take theirs from its
     beginning, as they are named. The paper's markers are open, so that they are told apart also where colours repeat.
     """
-    distinct = list(dict.fromkeys(identities))
-    ours = lines_of([name for name, published in distinct if not published])
-    return {(name, published): _papers_line(name) if published else ours[name] for name, published in distinct}
+    number = count()
+    return {
+        (name, published): _papers_line(name) if published else _line(next(number))
+        for name, published in dict.fromkeys(identities)
+    }
 
 
 def _line(k: int) -> Line:
-    count = len(_COLOURS)
-    return Line(_COLOURS[k % count], _MARKERS[(k + k // count) % count], _DASHES[(k + k // count) % count])
+    size = len(_COLOURS)
+    return Line(_COLOURS[k % size], _MARKERS[(k + k // size) % size], _DASHES[(k + k // size) % size])
 
 
 def _papers_line(name: str) -> Line:
@@ -269,6 +263,8 @@ def _figures(row: Row) -> dict[str, float | None]:
 
 Axis = tuple[str | None, str]
 """(memory type, metric); None for the average."""
+AVERAGE_AXES: list[Axis] = [(None, metric) for metric in METRICS]
+TYPE_AXES: list[Axis] = [(memory_type, metric) for memory_type in MEMORY_TYPES for metric in METRICS]
 
 
 def best_over_replan(entries: Iterable[Entry], axes: Sequence[Axis]) -> dict[Identity, list[float | None]]:
@@ -282,16 +278,6 @@ def best_over_replan(entries: Iterable[Entry], axes: Sequence[Axis]) -> dict[Ide
             if value is not None and (so_far is None or value > so_far):
                 row[k] = value
     return found
-
-
-def average_axes() -> list[Axis]:
-    """Return the metrics of the average."""
-    return [(None, metric) for metric in METRICS]
-
-
-def type_axes() -> list[Axis]:
-    """Return the metrics of each memory type."""
-    return [(memory_type, metric) for memory_type in MEMORY_TYPES for metric in METRICS]
 
 
 def labels_of(entries: Sequence[Entry]) -> dict[Identity, str]:
