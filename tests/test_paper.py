@@ -10,7 +10,8 @@ import pytest
 
 from lerobot_memobench.datasets.lerobot_format.card import FAMILIES, LENGTH_BUCKETS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.paper import METRICS, PublishedRow, failure_taxonomy, published_rows, raw_tables
+from lerobot_memobench.evaluation.metrics import METRICS
+from lerobot_memobench.paper import PublishedRow, failure_taxonomy, published_rows, raw_tables
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 
 HANDED_OVER = Path(__file__).parents[2] / "shared" / "spec" / "paper_tables.json"

@@ -12,8 +12,7 @@ from lerobot_memobench.cli.console import console
 from lerobot_memobench.cli.report import Formats, show_report
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import write_file
-from lerobot_memobench.paper import annotator_agreement
-from research.agreement.published import published_report
+from research.agreement.published import annotator_agreement, published_report
 from research.agreement.study import blank_sheet, read_labels, report, study
 from research.command import run
 

@@ -8,11 +8,11 @@ Cohen's kappa, which must use up those differences.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from lerobot_memobench.evaluation.tables import Numbers, Report, Section, Table
-from lerobot_memobench.paper import AgreementFigures
+from lerobot_memobench.paper import raw_tables
 from lerobot_memobench.tasks.task import OPERATIONS
 from research.agreement.study import confusion_kappa, confusion_table, kappa
 
@@ -21,6 +21,45 @@ RATERS = 3
 
 TEMPLATES = {"S": 35, "U": 32, "C": 17}
 """Released label -> templates, as the paper's confusion table says."""
+
+
+@dataclass(frozen=True)
+class AgreementFigures:
+    """The paper's annotation study: three raters, 84 templates.
+
+    Attributes:
+        confusion: released label -> pooled decisions of the raters for S, U, C.
+        exact, majority, pooled: (agreeing, of) templates, templates, decisions.
+        per_rater: shares, in the paper's order.
+    """
+
+    confusion: Mapping[str, tuple[int, int, int]]
+    fleiss_kappa: float
+    cohen_kappa: tuple[float, ...]
+    exact: tuple[int, int]
+    majority: tuple[int, int]
+    pooled: tuple[int, int]
+    per_rater: tuple[float, ...]
+
+
+def annotator_agreement() -> AgreementFigures:
+    """Return what the paper says of its annotation study."""
+    raw = raw_tables()["annotator_agreement"]
+
+    def count(key: str) -> tuple[int, int]:
+        """Take ``part/whole`` apart."""
+        part, whole = raw[key].split("/")
+        return int(part), int(whole)
+
+    return AgreementFigures(
+        confusion={label: (row[0], row[1], row[2]) for label, row in raw["confusion"].items()},
+        fleiss_kappa=raw["fleiss_kappa"],
+        cohen_kappa=tuple(raw["cohen_kappa"]),
+        exact=count("exact_agreement"),
+        majority=count("majority_vs_released"),
+        pooled=count("pooled_vs_released"),
+        per_rater=tuple(raw["per_rater_vs_released"]),
+    )
 
 
 @dataclass(frozen=True)

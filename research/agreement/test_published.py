@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from lerobot_memobench.paper import annotator_agreement
-from research.agreement.published import disagreements, from_published, odd_ones_out
+from research.agreement.published import annotator_agreement, disagreements, from_published, odd_ones_out
 from research.agreement.study import Labels, study
 
 

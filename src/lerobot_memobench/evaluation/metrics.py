@@ -46,32 +46,31 @@ def prefix(values: Sequence[bool]) -> list[bool]:
 
 
 def by_task(records: Iterable[Record]) -> dict[str, list[Record]]:
-    """Group records by task, in the order of memory types and then of names."""
+    """Group records by task, in the order of memory types and then of names.
+
+    Raises:
+        MemobenchError: rollouts of one task do not agree on what the task is.
+    """
     grouped: dict[str, list[Record]] = {}
     for record in records:
         grouped.setdefault(record["task"], []).append(record)
     for name, group in grouped.items():
-        _check_one_version(name, group)
+        for what, found in (
+            ("memory_type", {record["memory_type"] for record in group}),
+            ("operations", {operations(record) for record in group}),
+        ):
+            if len(found) > 1:
+                raise MemobenchError(
+                    f"rollouts of {name!r} disagree on their {what} ({', '.join(sorted(found))}); "
+                    "report logs of different versions of a task separately"
+                )
+        if group[0]["memory_type"] not in MEMORY_TYPES:
+            raise MemobenchError(
+                f"rollouts of {name!r} have the memory type {group[0]['memory_type']!r}; expected one of "
+                + ", ".join(MEMORY_TYPES)
+            )
     order = {memory_type: k for k, memory_type in enumerate(MEMORY_TYPES)}
     return dict(sorted(grouped.items(), key=lambda item: (order[item[1][0]["memory_type"]], item[0])))
-
-
-def _check_one_version(name: str, group: Sequence[Record]) -> None:
-    """Refuse rollouts of one task that do not agree on what the task is."""
-    for what, found in (
-        ("memory_type", {record["memory_type"] for record in group}),
-        ("operations", {operations(record) for record in group}),
-    ):
-        if len(found) > 1:
-            raise MemobenchError(
-                f"rollouts of {name!r} disagree on their {what} ({', '.join(sorted(found))}); "
-                "report logs of different versions of a task separately"
-            )
-    if group[0]["memory_type"] not in MEMORY_TYPES:
-        raise MemobenchError(
-            f"rollouts of {name!r} have the memory type {group[0]['memory_type']!r}; expected one of "
-            + ", ".join(MEMORY_TYPES)
-        )
 
 
 # --- under which protocol ---
@@ -211,9 +210,9 @@ def task_row(records: Sequence[Record]) -> Row:
 
 def value_of(record: Record, metric: str) -> float | None:
     """Return what a rollout gives to a metric: success, or the share of its operation's checkpoints satisfied."""
-    return (
-        float(bool(record["success"])) if metric == "SR" else checkpoint_rate([record], PROCESS_METRICS[metric]).value
-    )
+    if metric == "SR":
+        return float(bool(record["success"]))
+    return checkpoint_rate([record], PROCESS_METRICS[metric]).value
 
 
 def pooled_row(records: Sequence[Record]) -> Row:

@@ -12,39 +12,25 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from lerobot_memobench.errors import MemobenchError, nearest
 
-TABLES_FILE = Path(__file__).with_name("tables.json")
+TABLES = ("main", "alignment", "oracle", "memer")
+"""The paper's tables of rates: main results, memory alignment, oracle memory, MemER with privileged supervision."""
 
-METRICS = ("SR", "MSR", "MUR", "MCR")
-
-TABLES: Mapping[str, str] = MappingProxyType(
-    {
-        "main": "main results",
-        "alignment": "memory alignment results",
-        "oracle": "oracle memory decomposition",
-        "memer": "MemER with privileged supervision",
-    }
-)
-"""Name -> the paper's table of rates that it stands for."""
-
-LABELS: Mapping[str, str] = MappingProxyType(
-    {
-        "pi0": "π0",
-        "pi05": "π0.5",
-        "pi05 + RoboMME Memory Module": "π0.5 + memory module",
-        "Contrastive Memory Alignment": "contrastive alignment",
-        "Semantic Memory Alignment": "semantic alignment",
-        "Framewise Memory Alignment": "framewise alignment",
-        "Memory module": "π0.5 + memory module",
-        "standard_pi05": "π0.5",
-        "oracle_pi05": "π0.5 + oracle memory",
-        "memer": "MemER",
-    }
-)
+LABELS = {
+    "pi0": "π0",
+    "pi05": "π0.5",
+    "pi05 + RoboMME Memory Module": "π0.5 + memory module",
+    "Contrastive Memory Alignment": "contrastive alignment",
+    "Semantic Memory Alignment": "semantic alignment",
+    "Framewise Memory Alignment": "framewise alignment",
+    "Memory module": "π0.5 + memory module",
+    "standard_pi05": "π0.5",
+    "oracle_pi05": "π0.5 + oracle memory",
+    "memer": "MemER",
+}
 
 Figures = Mapping[str, float | None]
 """Metric -> per cent, None where the paper prints a dash."""
@@ -74,7 +60,7 @@ class PublishedRow:
 @cache
 def raw_tables() -> dict[str, Any]:
     """Return the content of ``tables.json``; do not change it."""
-    content: dict[str, Any] = json.loads(TABLES_FILE.read_text(encoding="utf-8"))
+    content: dict[str, Any] = json.loads(Path(__file__).with_name("tables.json").read_text(encoding="utf-8"))
     return content
 
 
@@ -110,42 +96,3 @@ def shuffled_control() -> dict[str, list[float]]:
     """Return the prefix completion per checkpoint of that task, per cent: with normal and with shuffled subgoals."""
     found = raw_tables()["shuffled_control"]
     return {"normal": list(found["normal_prefix"]), "shuffled": list(found["shuffled_prefix"])}
-
-
-@dataclass(frozen=True)
-class AgreementFigures:
-    """The paper's annotation study: three raters, 84 templates.
-
-    Attributes:
-        confusion: released label -> pooled decisions of the raters for S, U, C.
-        exact, majority, pooled: (agreeing, of) templates, templates, decisions.
-        per_rater: shares, in the paper's order.
-    """
-
-    confusion: Mapping[str, tuple[int, int, int]]
-    fleiss_kappa: float
-    cohen_kappa: tuple[float, ...]
-    exact: tuple[int, int]
-    majority: tuple[int, int]
-    pooled: tuple[int, int]
-    per_rater: tuple[float, ...]
-
-
-def annotator_agreement() -> AgreementFigures:
-    """Return what the paper says of its annotation study."""
-    raw = raw_tables()["annotator_agreement"]
-
-    def count(key: str) -> tuple[int, int]:
-        """Take ``part/whole`` apart."""
-        part, whole = raw[key].split("/")
-        return int(part), int(whole)
-
-    return AgreementFigures(
-        confusion={label: (row[0], row[1], row[2]) for label, row in raw["confusion"].items()},
-        fleiss_kappa=raw["fleiss_kappa"],
-        cohen_kappa=tuple(raw["cohen_kappa"]),
-        exact=count("exact_agreement"),
-        majority=count("majority_vs_released"),
-        pooled=count("pooled_vs_released"),
-        per_rater=tuple(raw["per_rater_vs_released"]),
-    )

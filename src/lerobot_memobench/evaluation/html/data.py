@@ -153,7 +153,7 @@ def row_data(row: Row) -> dict[str, Any]:
 
 def rate_data(rate: Rate) -> list[float | int | None] | None:
     """Return [per cent, lower, upper bound of Wilson's 95 % interval, n]; None where not applicable."""
-    if rate.value is None or rate.interval is None:
+    if rate.interval is None:
         return None
     low, high = rate.interval
     return [percent(rate.value), percent(low), percent(high), rate.n]

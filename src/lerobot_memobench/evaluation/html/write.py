@@ -27,6 +27,7 @@ from lerobot_memobench.evaluation.html.data import episode_id, page_data, task_s
 from lerobot_memobench.evaluation.metrics import Record
 from lerobot_memobench.evaluation.records import Run, read_runs
 from lerobot_memobench.io import draft_of, file_name, parsed, write_file
+from lerobot_memobench.tasks.catalogue import task_names
 
 PAGE = "index.html"
 VIDEOS = "videos"
@@ -200,39 +201,25 @@ def _lerobot_videos(folder: Path, records: Sequence[Record]) -> dict[int, Path]:
         entries = [(e["task_group"], e["task_id"], e["metrics"]["successes"]) for e in info["per_task"]]
     except (OSError, ValueError, KeyError, TypeError):
         return {}
-    by_task = _positions(records)
+    by_task: dict[str, list[int]] = {}
+    for k in sorted(range(len(records)), key=lambda k: int(records[k]["episode"])):
+        by_task.setdefault(records[k]["task"], []).append(k)
+    names = task_names(suite=None)  # LeRobot runs a task of the catalogue under its number
     found: dict[int, Path] = {}
     for group, task_id, successes in entries:
         if not _names_a_file(f"{group}_{task_id}"):
             continue
-        for positions in by_task.values():
+        for task, positions in by_task.items():
             rollouts = [records[k] for k in positions]
             if rollouts[0]["memory_type"] != group or [r["success"] for r in rollouts] != successes:
                 continue
-            if _task_number(str(rollouts[0]["task"])) != task_id:
+            if task not in names or names.index(task) != task_id:
                 continue
             for number, k in enumerate(positions):
                 video = folder / VIDEOS / f"{group}_{task_id}" / f"eval_episode_{number}.mp4"
                 if video.is_file():
                     found[k] = video
     return found
-
-
-def _positions(records: Sequence[Record]) -> dict[str, list[int]]:
-    positions: dict[str, list[int]] = {}
-    for k, record in enumerate(records):
-        positions.setdefault(record["task"], []).append(k)
-    for name, ks in positions.items():
-        positions[name] = sorted(ks, key=lambda k: int(records[k]["episode"]))
-    return positions
-
-
-def _task_number(name: str) -> int | None:
-    """The number under which LeRobot runs a task of the catalogue."""
-    from lerobot_memobench.tasks.catalogue import task_names
-
-    names = task_names(suite=None)
-    return names.index(name) if name in names else None
 
 
 def place_videos(chosen: Mapping[Path, Path], link: bool) -> None:
