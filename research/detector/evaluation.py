@@ -28,7 +28,7 @@ from lerobot_memobench.perception.geometry import depth_at_height, projected, ra
 from lerobot_memobench.perception.objects import DRAWERS, LIT, PARTS, ObjectLocalizer
 from lerobot_memobench.perception.visual_encoder import SIDE, VisualEncoder, resized
 from lerobot_memobench.perception.weights import load_detector
-from lerobot_memobench.sim.scene import TABLE_TOP
+from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS
 from research.detector.data import SCENES, Pictures
 from research.detector.labels import Rows, images_of, kinds

@@ -15,7 +15,7 @@ from lerobot_memobench.perception.detector import DETECTION, Detections, Detecto
 from lerobot_memobench.perception.geometry import projected
 from lerobot_memobench.perception.visual_encoder import SIDE
 from lerobot_memobench.perception.weights import SHIPPED, load_detector, save_detector
-from lerobot_memobench.sim.scene import TABLE_TOP
+from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS
 from research.detector import evaluation
 from research.detector.__main__ import main

@@ -40,7 +40,7 @@ from lerobot_memobench.policies.memobench_mem.training import (
     mean_of,
     quicker_in_bfloat16,
 )
-from lerobot_memobench.sim.scene import TABLE_TOP
+from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
 from research.detector.data import Pictures
 from research.detector.labels import MASK, Rows, images_of
 

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.scene import state_size
 from lerobot_memobench.sim.simulation import NO_OP, Simulation, axis_angle
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 
@@ -191,5 +190,5 @@ def test_state_sizes_are_the_published_ones() -> None:
 
 def test_state_size_is_time_positions_velocities(simulate: Simulate) -> None:
     sim = simulate()
-    assert sim.state().shape == (sim.state_dim,) == (state_size(sim.model),)
+    assert sim.state().shape == (sim.state_dim,) == (1 + sim.model.nq + sim.model.nv,)
     assert sim.state().dtype == np.float64

@@ -8,7 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lerobot_memobench.sim import robot
-from lerobot_memobench.sim.scene import TABLE_TOP, scene_spec
+from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
+from lerobot_memobench.sim.scene import scene_spec
 from lerobot_memobench.sim.simulation import NO_OP, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.scene import TABLE_TOP
+from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
 from lerobot_memobench.sim.simulation import NO_OP, Simulation
 from lerobot_memobench.sim.world import DETENT_DISTANCE, PLACE_DISTANCE
 from lerobot_memobench.tasks.catalogue import get_task

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.experts.grasping import pick, put_at
-from lerobot_memobench.experts.hand import CLOSED, OPEN, UP, Array, Hand
-from lerobot_memobench.experts.travel import HOME, Steps, go_home, pointing
+from lerobot_memobench.experts.hand import CLOSED, OPEN, UP, Array, Hand, Steps
+from lerobot_memobench.experts.travel import HOME, go_home, pointing
 from lerobot_memobench.sim.rendering import Highlight
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.formula import Atom
@@ -51,7 +51,7 @@ class PromptDemonstrator:
         yield from hand.wait(PAUSE, OPEN)
         match self._prompt.kind:
             case "routine":
-                yield from self._routine((position, rotation))
+                yield from self._routine(position, rotation)
             case "pick":
                 yield from self._pick(hand)
             case "point":
@@ -68,12 +68,12 @@ class PromptDemonstrator:
         assert self._prompt.target is not None
         return self._prompt.target
 
-    def _routine(self, home: tuple[Array, Array]) -> Steps:
+    def _routine(self, position: Array, rotation: Array) -> Steps:
         expert = Expert(self._task, self._sim, self._rng)
         while not expert.done:
             yield expert.act()
         self.shown = expert.succeeded
-        yield from go_home(expert.hand, *home)
+        yield from go_home(expert.hand, position, rotation)
 
     def _hide(self) -> Steps:
         """Put each thing into its drawer and shut that, then come home; shown if all are out of sight."""

@@ -22,9 +22,9 @@ from lerobot_memobench.experts.fixtures import (
     turn_knob,
 )
 from lerobot_memobench.experts.grasping import pick, put_in_drawer, put_on, put_on_region
-from lerobot_memobench.experts.hand import OPEN, UP, Hand
-from lerobot_memobench.experts.travel import Steps, come_home, drawer_around, outward_of, stands_out
-from lerobot_memobench.sim.scene import TABLE, TABLE_TOP
+from lerobot_memobench.experts.hand import OPEN, UP, Hand, Steps
+from lerobot_memobench.experts.travel import come_home, drawer_around, outward_of, stands_out
+from lerobot_memobench.sim.assets.kitchen import TABLE, TABLE_TOP
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.formula import (
     LATCHES,
@@ -66,28 +66,18 @@ def steps_of(formula: Formula) -> list[Atom]:
     match formula:
         case Atom():
             return [formula]
-        case And(children) | Then(children) | Round(children):
-            return [atom for child in children for atom in steps_of(child)]
-        case When((moment, then)):
-            return [*steps_of(then), *steps_of(moment)]
-        case Exactly(child=child) | Hold(child=child):
-            return steps_of(child)
-        case Or(children):
-            return steps_of(children[0]) if children else []
         case Not() | Never():
             return []
-    raise TypeError(f"not a formula: {formula!r}")
+        case Or(parts):
+            return steps_of(parts[0])
+        case When((moment, then)):
+            return [*steps_of(then), *steps_of(moment)]
+    return [atom for part in children(formula) for atom in steps_of(part)]
 
 
 def rest_of(formula: Formula) -> int:
     """Return for how many steps at most a goal's atoms have to hold until it does: each operator waits for its own."""
-    match formula:
-        case Hold(number=own):
-            pass
-        case Then():
-            own = HOLD_STEPS
-        case _:
-            own = 0
+    own = formula.number if isinstance(formula, Hold) else HOLD_STEPS if isinstance(formula, Then) else 0
     return own + max((rest_of(child) for child in children(formula)), default=0)
 
 
@@ -206,12 +196,11 @@ class Expert:
 
     def _take(self, step: Step) -> Steps:
         """Bring an atom about, or rest at home."""
-        if isinstance(step, Atom):
-            came = step.predicate == "handhome" and not self._holds(step)
-            yield from self.achieve(step)
-            rest = LINGER if came else 0
-        else:
+        if isinstance(step, Hold):
             rest = step.number
+        else:
+            rest = LINGER if step.predicate == "handhome" and not self._holds(step) else 0
+            yield from self.achieve(step)
         for _ in range(rest):
             yield self.hand.toward(*self.sim.home, OPEN)
 
@@ -256,17 +245,15 @@ class Expert:
 
     def _put_on(self, name: str, support: str) -> Steps:
         on_object = support in self.sim.assets
-        place = self.sim.body_pose(support)[0] if on_object else self._middle_of(support)
-        place = place - self.sim.assets[name].bottom * UP
+        middle = self.sim.body_pose(support)[0] if on_object else self._middle_of(support)
+        place = middle - self.sim.assets[name].bottom * UP
         drawer = drawer_around(self.hand, name)
         if drawer is not None:
             yield from self.achieve(Atom("open", (drawer,)))
         held = yield from pick(self.hand, name, place=place)
-        if held is None:
-            return
-        if support in self.sim.assets:
+        if held is not None and on_object:
             yield from put_on(self.hand, held, support)
-        else:
+        elif held is not None:
             yield from put_on_region(self.hand, held, self._middle_of(support))
 
     def _middle_of(self, region: str) -> NDArray[np.float64]:
@@ -279,20 +266,15 @@ class Expert:
         return centre + rotation @ np.array([0.0, 0.0, self.sim.site_half_size(region)[2]])
 
     def _open(self, name: str) -> Steps:
-        if self.sim.world.articulation(name)[0].kind != "door":
-            yield from open_drawer(self.hand, name)
-        elif self.task.suite == STRICT:
-            yield from pull_open(self.hand, name)
-        else:
-            yield from open_door(self.hand, name)
+        door = pull_open if self.task.suite == STRICT else open_door
+        return (door if self._is_door(name) else open_drawer)(self.hand, name)
 
     def _close(self, name: str) -> Steps:
-        if self.sim.world.articulation(name)[0].kind != "door":
-            yield from close_drawer(self.hand, name)
-        elif self.task.suite == STRICT:
-            yield from push_shut(self.hand, name)
-        else:
-            yield from close_door(self.hand, name)
+        door = push_shut if self.task.suite == STRICT else close_door
+        return (door if self._is_door(name) else close_drawer)(self.hand, name)
+
+    def _is_door(self, name: str) -> bool:
+        return self.sim.world.articulation(name)[0].kind == "door"
 
     def _put_in(self, name: str, region: str) -> Steps:
         drawers = [
@@ -305,7 +287,7 @@ class Expert:
             known = nearest(region, drawers) if drawers else "the scene has no drawer, let a policy of your own do it"
             raise MemobenchError(f"the expert puts things into drawers only, and {region!r} is none; {known}")
         articulation, q = self.sim.world.articulation(region)
-        if articulation.open_below is not None and q > articulation.open_below:
+        if q > articulation.open_below:
             yield from self._open(region)
         out = outward_of(self.hand, articulation)
         held = yield from pick(self.hand, name, avoid=out)

@@ -19,6 +19,7 @@ from lerobot_memobench.experts.hand import (
     UP,
     Array,
     Hand,
+    Steps,
     cross,
     downward,
     frame,
@@ -27,8 +28,6 @@ from lerobot_memobench.experts.hand import (
 )
 from lerobot_memobench.experts.travel import (
     LOST,
-    Doing,
-    Steps,
     far,
     leaning,
     let_go,
@@ -92,10 +91,9 @@ def _off_handle(hand: Hand, articulation: Articulation, tilt: float, back: float
     return target
 
 
-def open_drawer(hand: Hand, region: str) -> Doing:
+def open_drawer(hand: Hand, region: str) -> Steps:
     """Take a drawer's handle and pull until the drawer counts as open."""
     articulation, _ = hand.sim.world.articulation(region)
-    assert articulation.open_below is not None
     tilt = TILT + float(hand.rng.uniform(-0.06, 0.06))
     for _ in range(ATTEMPTS):
         out = outward_of(hand, articulation)
@@ -105,18 +103,15 @@ def open_drawer(hand: Hand, region: str) -> Doing:
         yield from hand.open(6)
         back = _off_handle(hand, articulation, tilt, 0.09)
         yield from hand.move(back, rotation, OPEN, tolerance=0.02, turn_tolerance=1.0, timeout=50)
-        _, q = hand.sim.world.articulation(region)
-        if q < articulation.open_below:
-            return True
-    return False
+        if hand.sim.world.articulation(region)[1] < articulation.open_below:
+            return
 
 
 def _take_handle(hand: Hand, articulation: Articulation, tilt: float) -> Steps:
+    at = partial(_off_handle, hand, articulation, tilt)
+
     def turned() -> Array:
         return _at_handle(hand, articulation, tilt)[2]
-
-    def at(back: float) -> Callable[[], Array]:
-        return _off_handle(hand, articulation, tilt, back)
 
     yield from rise(hand, OPEN, 0.16)
     yield from hand.move(at(0.14), turned, OPEN, tolerance=0.03, turn_tolerance=0.15)
@@ -129,7 +124,6 @@ def _pull_drawer(hand: Hand, region: str, rotation: Array, out: Array) -> Steps:
     """Pull a drawer by its handle until it is open, or the handle is lost."""
     for _ in range(90):
         articulation, q = hand.sim.world.articulation(region)
-        assert articulation.open_below is not None
         if q < articulation.open_below - 0.006:
             break
         handle, _ = hand.sim.site_pose(articulation.handle_site)
@@ -138,10 +132,9 @@ def _pull_drawer(hand: Hand, region: str, rotation: Array, out: Array) -> Steps:
         yield hand.toward(handle + 0.035 * out, rotation, CLOSED, speed=0.8)
 
 
-def close_drawer(hand: Hand, region: str) -> Doing:
+def close_drawer(hand: Hand, region: str) -> Steps:
     """Push an open drawer shut with closed fingers on its handle."""
     articulation, _ = hand.sim.world.articulation(region)
-    assert articulation.closed_above is not None
     tilt = TILT + float(hand.rng.uniform(-0.06, 0.06))
     for _ in range(ATTEMPTS):
         out = outward_of(hand, articulation)
@@ -150,10 +143,8 @@ def close_drawer(hand: Hand, region: str) -> Doing:
         yield from _push_drawer(hand, region, rotation, out)
         back = hand.position + 0.08 * out
         yield from hand.move(back, rotation, CLOSED, tolerance=0.02, turn_tolerance=1.0, timeout=50)
-        _, q = hand.sim.world.articulation(region)
-        if q > articulation.closed_above:
-            return True
-    return False
+        if hand.sim.world.articulation(region)[1] > articulation.closed_above:
+            return
 
 
 def _come_before(hand: Hand, articulation: Articulation, rotation: Array, out: Array) -> Steps:
@@ -171,9 +162,7 @@ def _come_before(hand: Hand, articulation: Articulation, rotation: Array, out: A
 def _push_drawer(hand: Hand, region: str, rotation: Array, out: Array) -> Steps:
     """Push a drawer by its handle until it is shut, or the fingers slip off sideways."""
     articulation, _ = hand.sim.world.articulation(region)
-    closed_above = articulation.closed_above
-    assert closed_above is not None
-    shut = pressed(lambda: hand.sim.world.articulation(region)[1] > closed_above + 0.003)
+    shut = pressed(lambda: hand.sim.world.articulation(region)[1] > articulation.closed_above + 0.003)
     for _ in range(110):
         if shut():
             break
@@ -184,12 +173,10 @@ def _push_drawer(hand: Hand, region: str, rotation: Array, out: Array) -> Steps:
         yield hand.toward(handle - 0.03 * out, rotation, CLOSED, speed=0.7)
 
 
-def turn_knob(hand: Hand, name: str, on: bool) -> Doing:
+def turn_knob(hand: Hand, name: str, on: bool) -> Steps:
     """Take a knob's ridge from above and turn it until it counts as on, or as off."""
     articulation, _ = hand.sim.world.articulation(name)
     on_from, off_to = articulation.on_at_least, articulation.off_below
-    assert on_from is not None
-    assert off_to is not None
     aim = on_from + float(hand.rng.uniform(0.12, 0.25)) if on else off_to - 0.15
 
     def reached(spare: float) -> bool:
@@ -202,8 +189,7 @@ def turn_knob(hand: Hand, name: str, on: bool) -> Doing:
         yield from _twist(hand, name, aim, turned if on else pressed(turned))
         yield from let_go(hand, 0.10)
         if reached(0.0):
-            return True
-    return False
+            return
 
 
 def _ridge(hand: Hand, articulation: Articulation) -> tuple[Array, Array]:
@@ -298,37 +284,31 @@ def _owner(hand: Hand, name: str) -> str:
 
 def wanted(q: float, articulation: Articulation, opening: bool) -> bool:
     """Return whether a door is open, or closed, with a little to spare."""
-    assert articulation.open_below is not None
-    assert articulation.closed_above is not None
     return q < articulation.open_below - 0.015 if opening else q > articulation.closed_above + 0.002
 
 
-def open_door(hand: Hand, name: str) -> Doing:
+def open_door(hand: Hand, name: str) -> Steps:
     """Pull a door by its handle as far as the arm comfortably reaches, then swing it on by its upper edge."""
     articulation, _ = hand.sim.world.articulation(name)
-    assert articulation.open_below is not None
     for _ in range(ATTEMPTS):
         if far(door_now(hand, name).handle) < REACH:
             yield from _pull_door(hand, name)
         if hand.sim.world.articulation(name)[1] >= articulation.open_below:
             yield from _swing_door(hand, name, opening=True)
         if hand.sim.world.articulation(name)[1] < articulation.open_below:
-            return True
-    return False
+            return
 
 
-def close_door(hand: Hand, name: str) -> Doing:
+def close_door(hand: Hand, name: str) -> Steps:
     """Swing a door by its upper edge until its handle is in reach, then push it shut there."""
     articulation, _ = hand.sim.world.articulation(name)
-    assert articulation.closed_above is not None
     for _ in range(ATTEMPTS):
         door = door_now(hand, name)
         if far(door.handle + PUSH_GAP * door.outward) > REACH:
             yield from _swing_door(hand, name, opening=False)
         yield from _push_door(hand, name)
         if hand.sim.world.articulation(name)[1] > articulation.closed_above:
-            return True
-    return False
+            return
 
 
 def _pull_door(hand: Hand, name: str) -> Steps:
@@ -362,7 +342,6 @@ def _swing_door(hand: Hand, name: str, opening: bool) -> Steps:
     """Take a door that stands ajar by its upper edge and follow its arc."""
     articulation, start = hand.sim.world.articulation(name)
     goal = articulation.open_below if opening else articulation.closed_q
-    assert goal is not None
     way = float(np.sign(goal - start))
     flip = np.sign(door_now(hand, name, (goal - start) / 2).outward @ EASY_CLOSING) or 1.0
 
@@ -429,23 +408,21 @@ def _push_door(hand: Hand, name: str) -> Steps:
 # leans out as far as the door goes, where that of the published demonstrations lets go and takes it anew ---
 
 
-def pull_open(hand: Hand, name: str) -> Doing:
+def pull_open(hand: Hand, name: str) -> Steps:
     """Take a door's handle and follow the arc until the door counts as open; a second way where that fails."""
     articulation, _ = hand.sim.world.articulation(name)
     yield from _sweep_open(hand, name)
     yield from let_go(hand, 0.08)
-    if wanted(hand.sim.world.articulation(name)[1], articulation, True):
-        return True
-    return (yield from open_door(hand, name))
+    if not wanted(hand.sim.world.articulation(name)[1], articulation, True):
+        yield from open_door(hand, name)
 
 
-def push_shut(hand: Hand, name: str) -> Doing:
+def push_shut(hand: Hand, name: str) -> Steps:
     """Push a door's panel from outside until it is shut; a second way where that fails."""
     articulation, _ = hand.sim.world.articulation(name)
     yield from _sweep_shut(hand, name)
-    if wanted(hand.sim.world.articulation(name)[1], articulation, False):
-        return True
-    return (yield from close_door(hand, name))
+    if not wanted(hand.sim.world.articulation(name)[1], articulation, False):
+        yield from close_door(hand, name)
 
 
 def _turned(hand: Hand, door: Door, place: Array, flip: float) -> Array:

@@ -22,6 +22,7 @@ from lerobot_memobench.experts.hand import (
     UP,
     Array,
     Hand,
+    Steps,
     Target,
     cross,
     downward,
@@ -32,7 +33,6 @@ from lerobot_memobench.experts.hand import (
 from lerobot_memobench.experts.travel import (
     FINGER_REACH,
     FULLY_OPEN,
-    Doing,
     Held,
     clear_of_objects,
     corners,
@@ -48,7 +48,7 @@ from lerobot_memobench.experts.travel import (
     travel,
 )
 from lerobot_memobench.sim.assets.asset import Asset, Grasp
-from lerobot_memobench.sim.scene import TABLE_TOP
+from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
 
 ATTEMPTS = 4
 """How often a thing is reached for, a handle, door or knob moved, before it is given up."""
@@ -353,7 +353,7 @@ def carry(
     clearance: float,
     tolerance: float = 0.006,
     support: str = "",
-) -> Doing:
+) -> Steps:
     """Bring the held thing's origin over a destination (3,) and down to it; stop early when it was lost.
 
     Args:
@@ -384,10 +384,8 @@ def carry(
 
     yield from hand.move(over, turn, CLOSED, tolerance=0.012, turn_tolerance=0.08, give_up=lost)
     yield from hand.move(at(clearance), turn, CLOSED, tolerance=0.012, timeout=60, give_up=lost)
-    if lost():
-        return False
-    yield from hand.lower(at(0.0), turn, CLOSED, tolerance=tolerance)
-    return holding(hand, held)
+    if not lost():
+        yield from hand.lower(at(0.0), turn, CLOSED, tolerance=tolerance)
 
 
 def _hand_over(hand: Hand, held: Held, destination: Target, turn: Array) -> Callable[[float], Target]:
@@ -416,7 +414,7 @@ def _upright(hand: Hand, held: Held) -> Array:
     return Rotation.from_rotvec(unit(tilt) * angle).as_matrix() @ hand.rotation
 
 
-def put_on(hand: Hand, held: Held, support: str) -> Doing:
+def put_on(hand: Hand, held: Held, support: str) -> Steps:
     """Set the held thing down on the middle of another object."""
     asset, below = hand.sim.assets[held.name], hand.sim.assets[support]
     # What is too long for a bowl's floor comes to rest on its wall, near the rim.
@@ -430,31 +428,25 @@ def put_on(hand: Hand, held: Held, support: str) -> Doing:
         return position + rotation @ np.array([0.0, 0.0, height]) + (drop + 0.008) * UP
 
     clearance = max(0.08, below.top - height + 0.06)
-    arrived = yield from carry(hand, held, destination, turn, clearance, support=support)
+    yield from carry(hand, held, destination, turn, clearance, support=support)
     yield from release(hand)
-    return arrived
 
 
-def put_on_region(hand: Hand, held: Held, position: Array) -> Doing:
+def put_on_region(hand: Hand, held: Held, position: Array) -> Steps:
     """Set the held thing down with its origin over a place (3,) of a level surface."""
     asset = hand.sim.assets[held.name]
     turn = _upright(hand, held)
-    arrived = yield from carry(
-        hand, held, lambda: position + (0.006 - asset.bottom) * UP, turn, clearance=0.10, tolerance=0.008
-    )
+    yield from carry(hand, held, lambda: position + (0.006 - asset.bottom) * UP, turn, clearance=0.10, tolerance=0.008)
     yield from release(hand)
-    return arrived
 
 
-def put_at(hand: Hand, held: Held, position: Array, rotation: Array | None = None) -> Doing:
-    """Set the held thing down with its origin at a place, turned as it was."""
-    turn = hand.rotation if rotation is None else rotation @ held.turn.T
-    arrived = yield from carry(hand, held, lambda: position + 0.004 * UP, turn, clearance=0.08)
+def put_at(hand: Hand, held: Held, position: Array, rotation: Array) -> Steps:
+    """Set the held thing down with its origin at a place, turned by a rotation (3, 3)."""
+    yield from carry(hand, held, lambda: position + 0.004 * UP, rotation @ held.turn.T, clearance=0.08)
     yield from release(hand)
-    return arrived
 
 
-def put_in_drawer(hand: Hand, held: Held, region: str, outward: Array) -> Doing:
+def put_in_drawer(hand: Hand, held: Held, region: str, outward: Array) -> Steps:
     """Drop the held thing into an open drawer."""
     half = hand.sim.site_half_size(region)
     asset = hand.sim.assets[held.name]
@@ -465,6 +457,5 @@ def put_in_drawer(hand: Hand, held: Held, region: str, outward: Array) -> Doing:
         centre, _ = hand.sim.site_pose(region)
         return centre + 0.015 * outward + (half[2] - asset.bottom - 0.005) * UP - 0.02 * UP
 
-    arrived = yield from carry(hand, held, destination, turn, clearance=0.12, tolerance=0.012)
+    yield from carry(hand, held, destination, turn, clearance=0.12, tolerance=0.012)
     yield from release(hand)
-    return arrived

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from lerobot_memobench.sim.controller import POSITION_SCALE, ROTATION_SCALE
 from lerobot_memobench.sim.robot import ARM_JOINTS
 from lerobot_memobench.sim.simulation import Simulation
 
 Array = NDArray[np.float64]
-Motion = Iterator[NDArray[np.float32]]
-"""Actions, one per control step; each is computed from the state at the time it is asked for."""
+Steps = Generator[NDArray[np.float32], None, None]
+"""A motion, or a part of one: yields actions (7,), each computed from the state at the time it is asked for."""
 Target = Callable[[], Array]
 """A position (3,) or rotation (3, 3) that may move while it is being reached."""
 
@@ -22,11 +23,10 @@ OPEN, CLOSED = -1.0, 1.0
 DOWN = np.array([0.0, 0.0, -1.0])
 UP = np.array([0.0, 0.0, 1.0])
 
-POSITION_SCALE, ROTATION_SCALE = 0.05, 0.5
-"""Metres and radians per unit of action (OSC_POSE)."""
-
 COARSE = 0.02
 """Tolerance from which a place only has to be passed, m."""
+ROTATION_SPEED = 0.35
+"""Largest angular action."""
 SLOW = 0.4
 """Linear action under which a hand that arrives does not shoot past."""
 PATIENCE = 25
@@ -102,7 +102,6 @@ class Hand:
         """Largest linear action of this episode; 1 is about 0.25 m/s."""
         self.slew = float(rng.uniform(0.16, 0.22))
         """Largest change of an action's component per step."""
-        self.rotation_speed = 0.35
         self._last: Array = np.zeros(6)
 
     @property
@@ -123,14 +122,14 @@ class Hand:
     def toward(self, position: Array, rotation: Array, gripper: float, speed: float = 1.0) -> NDArray[np.float32]:
         """Return the action (7,) that brings the hand nearer to a pose."""
         here, turned = self.sim.eef_pose()
-        if self._elbow() > ELBOW_STRAIGHT:
+        if self.sim.data.joint(ARM_JOINTS[3]).qpos[0] > ELBOW_STRAIGHT:
             # Through the straight pose: only from stretched the elbow bends back the right way.
             position = here + 0.04 * self.radial(here)
         linear = (position - here) / POSITION_SCALE
         limit = self.speed * speed
         linear *= min(1.0, limit / max(length(linear), 1e-9))
         angular = self._turn(rotation, turned) / ROTATION_SCALE
-        angular *= min(1.0, self.rotation_speed / max(length(angular), 1e-9))
+        angular *= min(1.0, ROTATION_SPEED / max(length(angular), 1e-9))
         wanted = np.concatenate([linear, angular])
         self._last = self._last + np.clip(wanted - self._last, -self.slew, self.slew)
         return np.append(self._last, gripper).astype(np.float32)
@@ -140,19 +139,14 @@ class Hand:
         self._last = self._last - np.clip(self._last, -self.slew, self.slew)
         return np.append(self._last, gripper).astype(np.float32)
 
-    def _elbow(self) -> float:
-        return float(self.sim.data.joint(ARM_JOINTS[3]).qpos[0])
-
     def radial(self, place: Array) -> Array:
         """Return the level direction (3,) from the arm's foot to a place."""
-        out = (place - self.sim.data.body(SHOULDER).xpos) * np.array([1.0, 1.0, 0.0])
-        return unit(out)
+        return unit((place - self.sim.data.body(SHOULDER).xpos) * np.array([1.0, 1.0, 0.0]))
 
     def stretch(self, position: Array, rotation: Array) -> float:
         """Return the distance from shoulder to wrist when the hand is at a pose, m."""
         inward = -self.radial(position)
-        inward = inward - rotation[:, 2] * (inward @ rotation[:, 2])
-        inward = unit(inward)
+        inward = unit(inward - rotation[:, 2] * (inward @ rotation[:, 2]))
         wrist = position - FLANGE * rotation[:, 2] + ELL * inward
         return length(wrist - self.sim.data.body(SHOULDER).xpos)
 
@@ -180,7 +174,7 @@ class Hand:
         speed: float = 1.0,
         timeout: int = 160,
         give_up: Callable[[], bool] | None = None,
-    ) -> Motion:
+    ) -> Steps:
         """Go to a pose, following it where it moves.
 
         Stop after ``timeout`` steps, when ``give_up`` says so, or when for `PATIENCE` steps it got no nearer.
@@ -204,7 +198,7 @@ class Hand:
                 return
             yield self.toward(goal, turn, gripper, speed)
 
-    def lower(self, position: Target, rotation: Array, gripper: float, *, tolerance: float) -> Motion:
+    def lower(self, position: Target, rotation: Array, gripper: float, *, tolerance: float) -> Steps:
         """Go down to a pose, slowly; stop where something carries the load: when the hand gets no lower."""
         heights: list[float] = []
         for _ in range(60):
@@ -216,13 +210,13 @@ class Hand:
                 return
             yield self.toward(goal, rotation, gripper, 0.45)
 
-    def wait(self, steps: int, gripper: float) -> Motion:
+    def wait(self, steps: int, gripper: float) -> Steps:
         """Hold still for some steps, for the fingers to move or a thing to settle."""
         position, rotation = self.sim.eef_pose()
         for _ in range(steps):
             yield self.toward(position, rotation, gripper)
 
-    def open(self, steps: int) -> Motion:
+    def open(self, steps: int) -> Steps:
         """Open the fingers at rest for some steps; such in which they were kept shut all the same do not count."""
         position, rotation = self.sim.eef_pose()
         for _ in range(LATE):
@@ -233,16 +227,14 @@ class Hand:
             if steps == 0:
                 return
 
-    def close(
-        self, position: Target | None = None, rotation: Array | None = None, least: int = 8, most: int = 24
-    ) -> Motion:
+    def close(self, position: Target | None = None, rotation: Array | None = None) -> Steps:
         """Close the fingers, at rest or following a target, until they stop on something or on each other."""
         here, turned = self.sim.eef_pose()
         before = self.sim.gripper_opening()
-        for step in range(most):
+        for step in range(24):
             goal = here if position is None else position()
             yield self.toward(goal, turned if rotation is None else rotation, CLOSED)
             now = self.sim.gripper_opening()
-            if step >= least and before - now < 2e-4:
+            if step >= 8 and before - now < 2e-4:
                 return
             before = now

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lerobot_memobench.experts.hand import (
     COMFORTABLE,
@@ -16,20 +15,17 @@ from lerobot_memobench.experts.hand import (
     UP,
     Array,
     Hand,
+    Steps,
     cross,
     frame,
     length,
     unit,
 )
 from lerobot_memobench.sim.assets.asset import Articulation, Asset
+from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
 from lerobot_memobench.sim.robot import BASE_POSITION
-from lerobot_memobench.sim.scene import TABLE_TOP
 from lerobot_memobench.tasks.formula import Atom
 
-Steps = Generator[NDArray[np.float32], None, None]
-"""A part of a motion: yields actions (7,)."""
-Doing = Generator[NDArray[np.float32], None, bool]
-"""A motion: yields actions (7,), returns whether it did what it is for."""
 LOST = 0.05
 """Distance between hand and thing, beyond that at the grasp, at which it counts as dropped, m."""
 HOME = Atom("handhome", ())

@@ -19,9 +19,9 @@ from torch.nn.functional import normalize
 from lerobot_memobench.perception.detector import Detections, Detector, detections
 from lerobot_memobench.perception.geometry import View, depth_at_height, rays, views_of
 from lerobot_memobench.perception.visual_encoder import resized
+from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
 from lerobot_memobench.sim.object_layout import SLOTS, WIDTH, field
 from lerobot_memobench.sim.object_slots import classes, in_slots
-from lerobot_memobench.sim.scene import TABLE_TOP
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS
 
 Array = NDArray[np.float64]

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import copy
 import logging
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -34,19 +33,13 @@ CLOSING = np.array([-1.0, 1.0])
 """Sign of the fingers' commands that closes them."""
 
 
-@dataclass(frozen=True)
-class OSCConfig:
-    """Gains and scales of the published controller."""
-
-    kp: float = 150.0
-    damping_ratio: float = 1.0
-    position_scale: float = 0.05
-    """Metres per unit of action."""
-    rotation_scale: float = 0.5
-    """Radians per unit of action."""
-    nullspace_kp: float = 10.0
-    gripper_speed: float = 0.01
-    """Change of the gripper's command (−1 open … 1 closed, ideal range) per physics step."""
+KP, NULLSPACE_KP = 150.0, 10.0
+"""Gains of the published controller, which is critically damped."""
+KD, NULLSPACE_KD = 2 * np.sqrt(KP), 2 * np.sqrt(NULLSPACE_KP)
+POSITION_SCALE, ROTATION_SCALE = 0.05, 0.5
+"""Metres and radians per unit of action."""
+GRIPPER_SPEED = 0.01
+"""Change of the gripper's command (−1 open … 1 closed, ideal range) per physics step."""
 
 
 class OSCController:
@@ -54,11 +47,9 @@ class OSCController:
 
     Args:
         model: a compiled scene that holds the arm of `sim.robot`.
-        config: gains; the published ones by default.
     """
 
-    def __init__(self, model: mujoco.MjModel, config: OSCConfig | None = None) -> None:
-        self.config = config or OSCConfig()
+    def __init__(self, model: mujoco.MjModel) -> None:
         self._model = model
         joints = [model.joint(name).id for name in robot.ARM_JOINTS]
         self._qpos = model.jnt_qposadr[joints]
@@ -74,9 +65,6 @@ class OSCController:
         low, high = model.actuator_ctrlrange[self._fingers].T
         self._finger_bias, self._finger_scale = (high + low) / 2, (high - low) / 2
         self._home = np.array(robot.ARM_START)
-        self._kp = self.config.kp
-        self._kd = 2 * np.sqrt(self.config.kp) * self.config.damping_ratio
-        self._null_kd = 2 * np.sqrt(self.config.nullspace_kp)
         nv = model.nv
         self._jac = np.zeros((6, nv))
         self._mass = np.zeros((nv, nv))
@@ -96,8 +84,8 @@ class OSCController:
         A zero rotation keeps the former goal's orientation, as the published controller does.
         """
         delta = np.clip(action[:6], -1.0, 1.0)
-        self.goal_position = data.site_xpos[self._site] + delta[:3] * self.config.position_scale
-        rotation = delta[3:] * self.config.rotation_scale
+        self.goal_position = data.site_xpos[self._site] + delta[:3] * POSITION_SCALE
+        rotation = delta[3:] * ROTATION_SCALE
         if np.any(np.abs(rotation) > 0.0):
             present = data.site_xmat[self._site].reshape(3, 3)
             self.goal_rotation = rotation_matrix(rotation) @ present
@@ -115,15 +103,15 @@ class OSCController:
         velocity = data.qvel[dofs]
         present = data.site_xmat[self._site].reshape(3, 3)
         twist = jacobian @ velocity
-        force = self._kp * (self.goal_position - data.site_xpos[self._site]) - self._kd * twist[:3]
-        torque = self._kp * orientation_error(self.goal_rotation, present) - self._kd * twist[3:]
+        force = KP * (self.goal_position - data.site_xpos[self._site]) - KD * twist[:3]
+        torque = KP * orientation_error(self.goal_rotation, present) - KD * twist[3:]
 
         # All three systems are symmetric and positive definite. LAPACK is called directly: at these sizes numpy's
         # checks around it cost five times the solution.
         mass_inverse_jt = dposv(mass, jacobian.T)[1]
         inertia_inverse = jacobian @ mass_inverse_jt
         wrench = np.concatenate([dposv(inertia_inverse[:3, :3], force)[1], dposv(inertia_inverse[3:, 3:], torque)[1]])
-        posture = mass @ (self.config.nullspace_kp * (self._home - data.qpos[self._qposs]) - self._null_kd * velocity)
+        posture = mass @ (NULLSPACE_KP * (self._home - data.qpos[self._qposs]) - NULLSPACE_KD * velocity)
         # Nullspace: (I − Jᵀ Λ J M⁻¹) posture, with Λ the full task-space inertia.
         wrench -= dposv(inertia_inverse, mass_inverse_jt.T @ posture)[1]
         return jacobian.T @ wrench + data.qfrc_bias[dofs] + posture
@@ -138,7 +126,7 @@ class OSCController:
 
     def gripper_change(self, gripper_action: float) -> Array:
         """Return by how much the fingers' command moves in one physics step, (2,)."""
-        change: Array = CLOSING * (self.config.gripper_speed * np.sign(gripper_action))
+        change: Array = CLOSING * (GRIPPER_SPEED * np.sign(gripper_action))
         return change
 
     def advance(self, data: mujoco.MjData, gripper_action: float, substeps: int) -> None:
@@ -213,10 +201,10 @@ class CompiledController(OSCController):
             has another BLAS.
     """
 
-    def __init__(self, model: mujoco.MjModel, config: OSCConfig | None = None) -> None:
+    def __init__(self, model: mujoco.MjModel) -> None:
         from lerobot_memobench.sim import osc_kernel
 
-        super().__init__(model, config)
+        super().__init__(model)
         self._functions = osc_kernel.functions()
         self._scratch = osc_kernel.scratch(model.nv)
         low, high = self._torque_limits
@@ -224,10 +212,10 @@ class CompiledController(OSCController):
             site=self._site,
             dof=self._dofs.start,
             qpos=self._qposs.start,
-            kp=float(self._kp),
-            kd=float(self._kd),
-            null_kp=float(self.config.nullspace_kp),
-            null_kd=float(self._null_kd),
+            kp=KP,
+            kd=float(KD),
+            null_kp=NULLSPACE_KP,
+            null_kd=float(NULLSPACE_KD),
             home=self._home,
             low=low.copy(),
             high=high.copy(),

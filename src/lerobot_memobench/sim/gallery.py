@@ -93,7 +93,7 @@ def catalogue_classes(kind: Literal["objects", "fixtures"]) -> list[str]:
 def _cells(class_name: str, views: Sequence[View], size: int) -> list[tuple[str, Pixels]]:
     """Return labels and pictures of an instance on plain ground: closed or off, and open or on where it moves."""
     spec = _plain_ground()
-    asset = build_asset(spec, spec.worldbody, "thing", class_name)
+    asset = build_asset(spec, "thing", class_name)
     spec.body("thing").pos = [0.0, 0.0, TABLE_TOP - asset.bottom]
     low, high = np.array(asset.low), np.array(asset.high)
     middle = (low + high) / 2 + [0.0, 0.0, TABLE_TOP - asset.bottom]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.assets.asset import Asset
-from lerobot_memobench.sim.scene import TABLE, TABLE_TOP
+from lerobot_memobench.sim.assets.kitchen import TABLE, TABLE_TOP
 from lerobot_memobench.tasks.bddl import Region
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task
@@ -34,24 +34,6 @@ class Placement:
     """World pose of each fixture and object."""
     joints: dict[str, float]
     """Position of each articulated joint, m or rad."""
-
-
-def _yaw_pose(x: float, y: float, z: float, yaw: float) -> Pose:
-    return np.array([x, y, z, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
-
-
-def _draw_region(region: Region, rng: np.random.Generator) -> tuple[float, float, float]:
-    """Return x, y and yaw drawn evenly from one of the region's ranges."""
-    x1, y1, x2, y2 = region.ranges[int(rng.integers(len(region.ranges)))]
-    return float(rng.uniform(x1, x2)), float(rng.uniform(y1, y2)), float(rng.uniform(*region.yaw))
-
-
-def _compose(parent: Pose, offset: NDArray[np.float64], yaw: float = 0.0) -> Pose:
-    """Return the pose at an offset in a parent's frame, turned about its z axis."""
-    position, quaternion, turn = np.empty(3), np.empty(4), np.array([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
-    mujoco.mju_rotVecQuat(position, offset, parent[3:])
-    mujoco.mju_mulQuat(quaternion, parent[3:], turn)
-    return np.concatenate([parent[:3] + position, quaternion])
 
 
 class Placer:
@@ -102,7 +84,7 @@ class Placer:
             raise MemobenchError(f"task {self._task.name}: {name!r} starts at {place!r}, which is no region or object")
         return max(owners, key=len)
 
-    def _joints(self, rng: np.random.Generator) -> dict[str, float]:
+    def _joints(self) -> dict[str, float]:
         """Closed and off, unless an `init` atom says otherwise."""
         wanted = {atom.args[0]: atom.predicate for atom in self._task.init if len(atom.args) == 1}
         joints = {}
@@ -114,7 +96,7 @@ class Placer:
         return joints
 
     def draw(self, rng: np.random.Generator) -> Placement:
-        """Draw until nothing overlaps, and leave the last draw written in model and data.
+        """Draw until nothing overlaps; return the last draw, and leave it written in model and data.
 
         Raises:
             MemobenchError: when no draw of `ATTEMPTS` is free of overlap.
@@ -133,20 +115,27 @@ class Placer:
         )
 
     def _draw_once(self, rng: np.random.Generator) -> Placement:
-        joints = self._joints(rng)
+        joints = self._joints()
         poses: dict[str, Pose] = {}
         for name in self._order:
             asset, atom = self._assets[name], self._places[name]
             support = self._support(name)
             if support is None:
-                x, y, yaw = _draw_region(self._task.regions[atom.args[1]], rng)
-                poses[name] = _yaw_pose(x, y, TABLE_TOP - asset.bottom + GAP, yaw)
+                poses[name] = self._on_table(self._task.regions[atom.args[1]], TABLE_TOP - asset.bottom + GAP, rng)
             elif atom.args[1] == support:
+                below, above = poses[support], np.empty(3)
                 height = self._assets[support].supports - asset.bottom + GAP
-                poses[name] = _compose(poses[support], np.array([0.0, 0.0, height]))
+                mujoco.mju_rotVecQuat(above, [0.0, 0.0, height], below[3:])
+                poses[name] = np.concatenate([below[:3] + above, below[3:]])
             else:
                 poses[name] = self._on_site(name, atom, poses, joints, rng)
         return Placement(poses, joints)
+
+    def _on_table(self, region: Region, height: float, rng: np.random.Generator) -> Pose:
+        """Draw a pose evenly from one of a region's ranges."""
+        x1, y1, x2, y2 = region.ranges[int(rng.integers(len(region.ranges)))]
+        x, y, yaw = rng.uniform(x1, x2), rng.uniform(y1, y2), rng.uniform(*region.yaw)
+        return np.array([x, y, height, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
 
     def _on_site(
         self, name: str, atom: Atom, poses: dict[str, Pose], joints: dict[str, float], rng: np.random.Generator

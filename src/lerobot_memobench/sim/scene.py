@@ -15,15 +15,12 @@ from lerobot_memobench.protocol import CONTROL_HZ
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.assets.asset import Articulation, Asset
 from lerobot_memobench.sim.assets.builder import SITE_GROUP
-from lerobot_memobench.sim.assets.kitchen import build_kitchen
+from lerobot_memobench.sim.assets.kitchen import TABLE, build_kitchen
 from lerobot_memobench.sim.assets.registry import build_asset
 from lerobot_memobench.tasks.task import STRICT, Task
 
 Array = NDArray[np.float64]
 
-TABLE = "kitchen_table"
-TABLE_TOP = 0.90
-"""Height of the table's top, m."""
 AGENTVIEW = "agentview"
 
 AGENTVIEW_POSITION = (0.6586131746834771, 0.0, 1.6103500240372423)
@@ -80,22 +77,14 @@ def scene_spec(task: Task) -> tuple[mujoco.MjSpec, dict[str, Asset]]:
     build_kitchen(spec)
     place, turn = list(AGENTVIEW_POSITION), list(AGENTVIEW_QUATERNION)
     spec.worldbody.add_camera(name=AGENTVIEW, pos=place, quat=turn, fovy=AGENTVIEW_ANGLE)
-    assets: dict[str, Asset] = {}
-    for name, class_name in task.fixtures.items():
-        if name != TABLE:
-            assets[name] = build_asset(spec, spec.worldbody, name, class_name)
-    for name, class_name in task.objects.items():
-        assets[name] = build_asset(spec, spec.worldbody, name, class_name)
+    classes = {**task.fixtures, **task.objects}
+    assets = {name: build_asset(spec, name, classes[name]) for name in classes if name != TABLE}
+    for name in task.objects:
         spec.body(name).add_freejoint(name=f"{name}_joint0")
     if task.suite == STRICT:
         add_detents(spec, assets)
         stop_rolling(spec, task.objects)
     return spec, assets
-
-
-def state_size(model: mujoco.MjModel) -> int:
-    """Length of the flattened state: time, positions, velocities."""
-    return int(1 + model.nq + model.nv)
 
 
 # --- strict scenes: detents and rolling friction ---
@@ -120,20 +109,9 @@ ROLLING = 0.002
 """Rolling friction, m: how far from under the middle a surface holds a thing that rolls."""
 
 
-@dataclass(frozen=True)
-class _Detent:
-    """How far from the closed end the dead centre is, m or rad, and how hard the spring presses there, N or Nm."""
-
-    travel: float
-    press: float
-
-
-_DETENTS: dict[str, _Detent] = {
-    "drawer": _Detent(0.009, 5.0),
-    "door": _Detent(0.035, 0.45),
-    "knob": _Detent(0.09, 0.15),
-}
-"""Each presses harder than the joint's friction, from wherever the joint counts as closed or off."""
+_DETENTS = {"drawer": (0.009, 5.0), "door": (0.035, 0.45), "knob": (0.09, 0.15)}
+"""How far from the closed end the dead centre is, m or rad, and how hard the spring presses there, N or Nm: harder than
+the joint's friction, from wherever the joint counts as closed or off."""
 
 
 def add_detents(spec: mujoco.MjSpec, assets: Mapping[str, Asset]) -> None:
@@ -151,10 +129,10 @@ def _add_spring(
     spec: mujoco.MjSpec, fixture: mujoco.MjsBody, joint: mujoco.MjsJoint, articulation: Articulation
 ) -> None:
     """Add the spring: it runs from beside the way of a point of the moving part to that point."""
-    detent = _DETENTS[articulation.kind]
+    travel, press = _DETENTS[articulation.kind]
     lever = 1.0 if articulation.kind == "drawer" else LEVER
-    reach = detent.travel * lever
-    dead_centre = articulation.closed_q + np.sign(articulation.open_q - articulation.closed_q) * detent.travel
+    reach = travel * lever
+    dead_centre = articulation.closed_q + np.sign(articulation.open_q - articulation.closed_q) * travel
     point, place = _way(joint, lever, dead_centre)
     fixed = joint.parent.pos + place + OFFSET * reach * np.array([0.0, 0.0, 1.0])
     ends = {"fixed": (fixture, fixed), "moving": (joint.parent, point)}
@@ -165,7 +143,7 @@ def _add_spring(
         tendon.wrap_site(name)
     closed = float(np.hypot(1.0, OFFSET))
     pushes = (SLACK - closed) / closed * reach * lever
-    stiffness = detent.press / pushes
+    stiffness = press / pushes
     # Newer MuJoCo takes the coefficients of a polynomial.
     tendon.stiffness = stiffness if np.ndim(tendon.stiffness) == 0 else [stiffness, 0.0, 0.0]
     tendon.springlength = [SLACK * reach, 1.0]

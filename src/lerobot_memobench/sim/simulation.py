@@ -17,9 +17,9 @@ from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.protocol import ACTION_DIM
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.controller import CLOSING, make_controller
-from lerobot_memobench.sim.placement import Placement, Placer
+from lerobot_memobench.sim.placement import Placer
 from lerobot_memobench.sim.rendering import Highlight, Image, Renderer, RenderSettings, get_renderer
-from lerobot_memobench.sim.scene import AGENTVIEW, SUBSTEPS, get_scene, state_size
+from lerobot_memobench.sim.scene import AGENTVIEW, SUBSTEPS, get_scene
 from lerobot_memobench.sim.world import Start, World
 from lerobot_memobench.tasks.formula import SINCE_START, Atom
 from lerobot_memobench.tasks.task import STRICT, Task
@@ -113,26 +113,11 @@ class Simulation:
 
         Equal seeds of equal tasks give bit-equal states, whatever was simulated before.
         """
-        rng = np.random.default_rng([seed, zlib.crc32(self.task.scene_name.encode())])
-        self._rewind()
-        self._placement = self._placer.draw(rng)
-        self._settle()
-
-    def reset_to(self, placement: Placement) -> None:
-        """Like `reset`, from a placement that was recorded."""
-        self._rewind()
-        self._placement = placement
-        self._placer.write(placement)
-        self._settle()
-
-    def _rewind(self) -> None:
-        """Put the arm at its start; things are placed next."""
         self._at_home = None
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[self._arm_qpos] = robot.ARM_START
         self.data.qpos[self._finger_qpos] = robot.GRIPPER_OPEN if self._strict else robot.GRIPPER_START
-
-    def _settle(self) -> None:
+        self._placer.draw(np.random.default_rng([seed, zlib.crc32(self.task.scene_name.encode())]))
         self.highlights = ()
         mujoco.mj_step1(self.model, self.data)
         self._controller.reset(self.data)
@@ -165,7 +150,7 @@ class Simulation:
         self._controller.advance(self.data, float(action[6]), SUBSTEPS)
         self._check_physics(time)
         if self._at_home is not None and action[6] <= 0.0 and self._start.in_detent():
-            self._stand_at_home(self._at_home)  # unless it is told to close: it must be able to
+            self._stand_as(self._at_home)  # unless it is told to close: it must be able to
 
     def _check_physics(self, time: float) -> None:
         """Raise what MuJoCo has warned of since ``time``: it goes on from the model's initial state without a word."""
@@ -176,10 +161,17 @@ class Simulation:
             counts[:] = 0
             raise UnstablePhysicsError(f"the physics broke down {time:.2f} s after the scene was set up: {said}")
 
-    def _stand_at_home(self, home: Snapshot) -> None:
-        """Let a strict scene's arm stand as when the scene had settled: where it has been is not in it any more."""
-        time = self.data.time
-        self.restore_arm(home)
+    def _stand_as(self, home: Snapshot) -> None:
+        """Put arm, fingers and controller back as they were, to the bit; time and all other things stay as they are.
+
+        Joint angles too, not only the hand's pose: seven joints can hold one pose in many ways, and which one it is
+        would tell where the arm has come from.
+        """
+        time, qpos, qvel = self.data.time, self.data.qpos.copy(), self.data.qvel.copy()
+        self.restore(home)
+        others = max(self._finger_qpos) + 1  # the arm comes first in the model, its fingers last of it
+        self.data.qpos[others:], self.data.qvel[others:] = qpos[others:], qvel[others:]
+        mujoco.mj_step1(self.model, self.data)
         self.data.time = time
 
     # --- state ----------------------------------------------------------------------------------------------
@@ -187,7 +179,7 @@ class Simulation:
     @property
     def state_dim(self) -> int:
         """Length of `state()`: 1 + nq + nv of the compiled model."""
-        return state_size(self.model)
+        return int(1 + self.model.nq + self.model.nv)
 
     def state(self) -> Array:
         """Return time, qpos and qvel as one vector (state_dim,), as the published files store it."""
@@ -268,18 +260,6 @@ class Simulation:
         """Return where a drawer's region (3,) is now; the origin for a region of the table, which does not move."""
         site = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_SITE, place)
         return self.data.site_xpos[site].copy() if site >= 0 else np.zeros(3)
-
-    def restore_arm(self, snapshot: Snapshot) -> None:
-        """Put arm, fingers and controller back as in a snapshot, to the bit; all other things stay as they are.
-
-        Joint angles too, not only the hand's pose: seven joints can hold one pose in many ways, and which one it is
-        would tell where the arm has come from.
-        """
-        qpos, qvel = self.data.qpos.copy(), self.data.qvel.copy()
-        self.restore(snapshot)
-        others = max(self._finger_qpos) + 1  # the arm comes first in the model, its fingers last of it
-        self.data.qpos[others:], self.data.qvel[others:] = qpos[others:], qvel[others:]
-        mujoco.mj_step1(self.model, self.data)
 
     def scene_hash(self) -> str:
         """Return a short hash of the present state and of where the fixtures stand."""

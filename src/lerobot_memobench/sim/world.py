@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import isnan
 
 import mujoco
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.assets.asset import Articulation, Asset
-from lerobot_memobench.sim.scene import TABLE_TOP
+from lerobot_memobench.sim.assets.kitchen import TABLE, TABLE_TOP
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task
 
@@ -59,7 +60,7 @@ class World:
             while body > 0 and body not in roots:
                 body = model.body_parentid[body]
             self._owner[geom] = roots.get(body, -1)
-            if model.geom(geom).name.startswith("kitchen_table"):
+            if model.geom(geom).name.startswith(TABLE):
                 self._owner[geom] = self._table
         self._joints: dict[str, tuple[Articulation, int]] = {}
         for name, asset in assets.items():
@@ -104,7 +105,7 @@ class World:
         return articulation, float(self._data.qpos[address])
 
     def _index(self, name: str) -> int:
-        if name == "kitchen_table":
+        if name == TABLE:
             return self._table
         if name not in self._instances:
             raise MemobenchError(
@@ -114,16 +115,15 @@ class World:
 
     def _articulated(self, predicate: str, name: str) -> bool:
         articulation, q = self.articulation(name)
-        limits = {
-            "open": (articulation.open_below, lambda bound: q < bound),
-            "close": (articulation.closed_above, lambda bound: q > bound),
-            "turnon": (articulation.on_at_least, lambda bound: q >= bound),
-            "turnoff": (articulation.off_below, lambda bound: q < bound),
-        }
-        bound, test = limits[predicate]
-        if bound is None:
+        limit, holds = {
+            "open": (articulation.open_below, q < articulation.open_below),
+            "close": (articulation.closed_above, q > articulation.closed_above),
+            "turnon": (articulation.on_at_least, q >= articulation.on_at_least),
+            "turnoff": (articulation.off_below, q < articulation.off_below),
+        }[predicate]
+        if isnan(limit):
             raise MemobenchError(f"{name!r} is a {articulation.kind}: {predicate!r} has no meaning for it")
-        return bool(test(bound))
+        return holds
 
     def _in(self, a: str, region: str) -> bool:
         self._index(a)
@@ -143,17 +143,16 @@ class World:
         self._index(a)
         position = self._data.body(a).xpos
         declared = self._task.regions.get(region)
-        if declared is not None and declared.target == "kitchen_table":
+        if declared is not None and declared.target == TABLE:
             inside = any(x1 <= position[0] <= x2 and y1 <= position[1] <= y2 for x1, y1, x2, y2 in declared.ranges)
             height = position[2] - TABLE_TOP
-            return inside and -ON_SITE_BELOW < height < ON_SITE_ABOVE and self.touching(a, "kitchen_table")
+            return inside and -ON_SITE_BELOW < height < ON_SITE_ABOVE and self.touching(a, TABLE)
         site = self._site(region)
         local = self._data.site_xmat[site].reshape(3, 3).T @ (position - self._data.site_xpos[site])
         half = self._model.site_size[site]
         height = local[2] - half[2]
-        return bool(np.all(np.abs(local[:2]) < half[:2]) and -ON_SITE_BELOW < height < ON_SITE_ABOVE) and self.touching(
-            a, self._parent(region)
-        )
+        inside = bool(np.all(np.abs(local[:2]) < half[:2]) and -ON_SITE_BELOW < height < ON_SITE_ABOVE)
+        return inside and self.touching(a, self._owner_of(region))
 
     def _site(self, region: str) -> int:
         site = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_SITE, region)
@@ -162,7 +161,7 @@ class World:
             raise MemobenchError(f"task {self._task.name} has no region {region!r}; {nearest(region, known)}")
         return site
 
-    def _parent(self, region: str) -> str:
+    def _owner_of(self, region: str) -> str:
         return max((name for name in self._instances if region.startswith(f"{name}_")), key=len)
 
 

@@ -26,7 +26,7 @@ def kitchen() -> mujoco.MjSpec:
 def test_unknown_class_names_the_nearest() -> None:
     spec = mujoco.MjSpec()
     with pytest.raises(MemobenchError, match="microwave"):
-        build_asset(spec, spec.worldbody, "oven_1", "microwav")
+        build_asset(spec, "oven_1", "microwav")
 
 
 def test_registered_builder_goes_first(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -38,5 +38,5 @@ def test_registered_builder_goes_first(monkeypatch: pytest.MonkeyPatch) -> None:
 
     register("cork__3", cube)
     spec = mujoco.MjSpec()
-    assert build_asset(spec, spec.worldbody, "a", "cork__3").high[0] == pytest.approx(0.03)
-    assert build_asset(spec, spec.worldbody, "b", "cork__1").high[0] != pytest.approx(0.01)
+    assert build_asset(spec, "a", "cork__3").high[0] == pytest.approx(0.03)
+    assert build_asset(spec, "b", "cork__1").high[0] != pytest.approx(0.01)

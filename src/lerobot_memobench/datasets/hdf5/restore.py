@@ -26,9 +26,9 @@ from lerobot_memobench.datasets.labels import digest
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.demonstration_prompt import highlights_at
 from lerobot_memobench.io import file_name
+from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.placement import GAP
-from lerobot_memobench.sim.scene import TABLE_TOP
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, load_task, task_names
 from lerobot_memobench.tasks.progress import Progress

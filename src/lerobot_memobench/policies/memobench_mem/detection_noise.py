@@ -14,10 +14,11 @@ import torch
 from torch import Tensor
 
 from lerobot_memobench.perception.objects import set_axis, upright
+from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
 from lerobot_memobench.sim.assets.registry import build_asset, known_classes
 from lerobot_memobench.sim.object_layout import WIDTH, field
 from lerobot_memobench.sim.object_slots import classes
-from lerobot_memobench.sim.scene import AGENTVIEW_POSITION, TABLE_TOP
+from lerobot_memobench.sim.scene import AGENTVIEW_POSITION
 
 PLACE, KIND_PLACE = (0.0006, 1.45), (0.00065, 1.0)
 """Error of a place in each direction, m, and by how much its size varies (spread of its logarithm): of each sight of a
@@ -82,7 +83,7 @@ def _standing() -> Tensor:
     spec, heights = mujoco.MjSpec(), torch.full((len(classes()),), torch.inf)
     for index, name in enumerate(classes()):
         if name in known_classes():
-            asset = build_asset(spec, spec.worldbody, name, name)
+            asset = build_asset(spec, name, name)
             heights[index] = TABLE_TOP - asset.bottom if asset.kind == "object" else torch.inf
     return heights
 

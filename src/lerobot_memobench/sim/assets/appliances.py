@@ -72,7 +72,6 @@ def _door_mesh() -> MeshData:
     """Return the door in the frame of its hinge, closed: the door runs to +x, its front is at -y."""
     wide, thick, high = 2 * _HALF_X, _DOOR_THICK, _DOOR_HIGH
     lo, hi = -high, high
-
     quads: list[Quad] = [
         [(0, -thick, lo), (wide, -thick, lo), (wide, -thick, hi), (0, -thick, hi)],
         [(wide, 0, lo), (0, 0, lo), (0, 0, hi), (wide, 0, hi)],
@@ -147,7 +146,7 @@ def _microwave(b: Builder) -> Asset:
 def _door(b: Builder, front: str, metal: str) -> Articulation:
     """Add the door with its joint and handle."""
     door = b.child("door", (-_HALF_X, _FRONT - _DOOR_GAP, _DOOR_Z))
-    b.exclude(b.body, door)
+    b.spec.add_exclude(bodyname1=b.body.name, bodyname2=door.name)
     joint = b.joint(door, "microjoint", "hinge", (0, 0, 1), DOOR_RANGE, damping=0.5, frictionloss=0.15)
     b.visual_mesh(b.mesh("microwave_door", _door_mesh), front, body=door)
     b.visual_mesh(b.mesh("microwave_bar", lambda: blocks(_handle())), metal, body=door)
@@ -201,7 +200,6 @@ def _plate_mesh() -> MeshData:
     x0, x1 = _PLATE
     y, z, bevel = _HALF_WIDTH, _TOP, 0.028
     front_z = 0.014
-
     quads: list[Quad] = [
         [(x0, -y, z), (x1 - bevel, -y, z), (x1 - bevel, y, z), (x0, y, z)],
         [(x1 - bevel, -y, z), (x1, -y, front_z), (x1, y, front_z), (x1 - bevel, y, z)],
@@ -247,14 +245,9 @@ def _ridge_mesh() -> MeshData:
     return box((*_RIDGE, half)).warped(taper).moved((0, 0, _RIDGE_TOP - half))
 
 
-def _mark(canvas: Canvas) -> None:
-    canvas.rect(0, 0, 1, 1, (24, 24, 26))
-    # The top face (row 0, column 2) has a white line towards +x, the pointer.
-    canvas.rect(2 / 3 + 0.13, 0.25, 2 / 3 + 0.2, 0.5, (235, 235, 235))
-
-
 def _ridge_texture() -> Pixels:
-    return drawn(96, 64, (24, 24, 26), _mark)
+    # The top face (row 0, column 2) has a white line towards +x, the pointer.
+    return drawn(96, 64, (24, 24, 26), lambda c: c.rect(2 / 3 + 0.13, 0.25, 2 / 3 + 0.2, 0.5, (235, 235, 235)))
 
 
 def _stove(b: Builder) -> Asset:
@@ -307,7 +300,4 @@ def _knob(b: Builder, black: str, ridge: str) -> Articulation:
     )
 
 
-BUILDERS: dict[str, Callable[[Builder], Asset]] = {
-    "microwave": _microwave,
-    "flat_stove": _stove,
-}
+BUILDERS: dict[str, Callable[[Builder], Asset]] = {"microwave": _microwave, "flat_stove": _stove}

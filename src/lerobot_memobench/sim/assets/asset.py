@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from math import nan
 from types import MappingProxyType
 from typing import Literal
 
@@ -26,14 +27,12 @@ class Grasp:
     ``yaw``: angle of the closing axis about the body's z [rad]; 0 closes along the body's x.
     ``width``: what is between the fingers [m].
     ``symmetric``: the grasp may be turned about the body's z axis by any angle, position and axis together.
-    ``depth``: how far below ``position`` there is still something to hold [m]; fingers may reach that deep.
     """
 
     position: tuple[float, float, float]
     yaw: float
     width: float
     symmetric: bool = False
-    depth: float = 0.01
 
 
 @dataclass(frozen=True)
@@ -54,8 +53,9 @@ class Articulation:
     """A joint that predicates read and experts move.
 
     Drawers and doors are open when q < ``open_below`` and closed when q > ``closed_above``; knobs are on when
-    q >= ``on_at_least`` and off when q < ``off_below``. ``closed_q`` and ``open_q`` are good targets for q
-    (off and on for a knob). ``handle_site``: full name of the site at the handle's middle, which moves along.
+    q >= ``on_at_least`` and off when q < ``off_below``; the others' limits are nan. ``closed_q`` and ``open_q`` are
+    good targets for q (off and on for a knob). ``handle_site``: full name of the site at the handle's middle, which
+    moves along.
     """
 
     joint: str
@@ -64,10 +64,10 @@ class Articulation:
     open_q: float
     handle_site: str
     handle: Handle
-    open_below: float | None = None
-    closed_above: float | None = None
-    on_at_least: float | None = None
-    off_below: float | None = None
+    open_below: float = nan
+    closed_above: float = nan
+    on_at_least: float = nan
+    off_below: float = nan
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,7 @@ class Bottle:
     def build(self, b: Builder) -> Asset:
         """Add the bottle to the scene."""
         high = self.profile[-1][1]
-        mesh = b.mesh(self.key, self._mesh)
-        b.visual_mesh(mesh, b.material(self.key, self.texture, specular=self.gloss, shininess=0.6))
+        b.textured_mesh(self.key, self._mesh, self.texture, self.gloss, 0.6)
         radius = max(r for r, _ in self.profile)
         x, y = radius * self.scale[0], radius * self.scale[1]
         self._contacts(b, x, y, high)
@@ -73,13 +72,13 @@ class Bottle:
         at = min(reach, self.shoulder - 0.010)
         if high - at > 0.042:
             # The body begins below the fingers' reach.
-            b.grasp((0, 0, high - 0.022 - middle), ALONG_X, 2 * self.neck, symmetric=True, depth=0.01)
+            b.grasp((0, 0, high - 0.022 - middle), ALONG_X, 2 * self.neck, symmetric=True)
         elif self._is_round and 2 * x <= 0.068:
-            b.grasp((0, 0, at - middle), ALONG_X, 2 * x, symmetric=True, depth=0.02)
+            b.grasp((0, 0, at - middle), ALONG_X, 2 * x, symmetric=True)
         else:
             for yaw, width in ((ALONG_X, 2 * x), (ALONG_Y, 2 * y)):
                 if width <= 0.068:
-                    b.grasp((0, 0, at - middle), yaw, width, depth=0.02)
+                    b.grasp((0, 0, at - middle), yaw, width)
 
     def texture(self) -> Pixels:
         """Return the front's picture wrapped around, so that from +x (and -x) it looks as it was painted."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -27,19 +27,18 @@ SITE_GROUP = 4
 SOLREF = (0.01, 1.0)
 SOLIMP = (0.95, 0.99, 0.001, 0.5, 2.0)
 FRICTION = (1.0, 0.02, 0.0005)
-ROLLING_FRICTION = 0.004
 GRIP_FRICTION = (1.8, 0.03, 0.0005)
 
 Vector = Sequence[float] | NDArray[np.float64]
 
-Primitive = Literal["box", "cylinder", "capsule", "ellipsoid", "sphere"]
+Primitive = Literal["box", "cylinder"]
 _TYPES: dict[Primitive, mujoco.mjtGeom] = {
     "box": mujoco.mjtGeom.mjGEOM_BOX,
     "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
-    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
-    "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
-    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
 }
+ORIGIN = (0.0, 0.0, 0.0)
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+"""No turn, as a quaternion wxyz."""
 
 
 class Builder:
@@ -48,15 +47,10 @@ class Builder:
     Bodies, geoms, joints and sites are named ``f"{name}_{suffix}"``.
     """
 
-    def __init__(
-        self, spec: mujoco.MjSpec, parent: mujoco.MjsBody, name: str, class_name: str, variant: int = 0
-    ) -> None:
-        """Add the root body ``name`` below ``parent``; the scene places it and frees objects with a joint."""
-        self.spec = spec
-        self.name = name
-        self.class_name = class_name
-        self.variant = variant
-        self.body: mujoco.MjsBody = parent.add_body(name=name)
+    def __init__(self, spec: mujoco.MjSpec, name: str, class_name: str, variant: int = 0) -> None:
+        """Add the root body ``name`` to the world; the scene places it and frees objects with a joint."""
+        self.spec, self.name, self.class_name, self.variant = spec, name, class_name, variant
+        self.body: mujoco.MjsBody = spec.worldbody.add_body(name=name)
         self._counts: dict[str, int] = {}
         self._grasps: list[Grasp] = []
 
@@ -79,7 +73,6 @@ class Builder:
         rgba: Vector = (1.0, 1.0, 1.0, 1.0),
         specular: float = 0.2,
         shininess: float = 0.3,
-        reflectance: float = 0.0,
         emission: float = 0.0,
     ) -> str:
         """Return the name of the material ``key``, made on first use; ``image`` draws its texture."""
@@ -87,22 +80,16 @@ class Builder:
         if self.spec.material(name) is not None:
             return name
         made = self.spec.add_material(name=name, rgba=list(rgba), specular=specular, shininess=shininess)
-        made.reflectance = reflectance
         made.emission = emission
         if image is not None:
-            self._texture(name, np.ascontiguousarray(image(), dtype=np.uint8))
+            pixels = np.ascontiguousarray(image(), dtype=np.uint8)
+            height, width, _ = pixels.shape
+            texture = self.spec.add_texture(
+                name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, height=height, width=width, nchannel=3
+            )
+            texture.data = pixels.tobytes()
             made.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
         return name
-
-    def _texture(self, name: str, pixels: Pixels) -> None:
-        texture = self.spec.add_texture(
-            name=name,
-            type=mujoco.mjtTexture.mjTEXTURE_2D,
-            height=pixels.shape[0],
-            width=pixels.shape[1],
-            nchannel=3,
-        )
-        texture.data = pixels.tobytes()
 
     def mesh(self, key: str, make: Callable[[], MeshData], smooth: bool = False) -> str:
         """Return the name of the mesh ``key``, made on first use; ``smooth`` shades sharp edges as round."""
@@ -125,12 +112,9 @@ class Builder:
 
     # --- bodies and joints
 
-    def child(self, suffix: str, pos: Vector = (0.0, 0.0, 0.0), quat: Vector | None = None) -> mujoco.MjsBody:
+    def child(self, suffix: str, pos: Vector = ORIGIN) -> mujoco.MjsBody:
         """Add a body below the root."""
-        made = self.body.add_body(name=self.full(suffix), pos=list(pos))
-        if quat is not None:
-            made.quat = list(quat)
-        return made
+        return self.body.add_body(name=self.full(suffix), pos=list(pos))
 
     def joint(
         self,
@@ -141,7 +125,6 @@ class Builder:
         limits: tuple[float, float],
         damping: float,
         frictionloss: float,
-        pos: Vector = (0.0, 0.0, 0.0),
     ) -> str:
         """Add a joint limited to ``limits`` [m or rad] to ``body`` and return its full name."""
         name = self.full(suffix)
@@ -152,7 +135,6 @@ class Builder:
             name=name,
             type=kinds[kind],
             axis=list(axis),
-            pos=list(pos),
             range=list(np.degrees(limits) if in_degrees else limits),
             limited=mujoco.mjtLimited.mjLIMITED_TRUE,
             damping=damping,
@@ -162,71 +144,52 @@ class Builder:
         )
         return name
 
-    def exclude(self, first: mujoco.MjsBody, second: mujoco.MjsBody) -> None:
-        """Keep two bodies from touching each other."""
-        self.spec.add_exclude(bodyname1=first.name, bodyname2=second.name)
-
     # --- geoms and sites
 
-    def visual_mesh(
-        self,
-        mesh: str,
-        material: str,
-        pos: Vector = (0.0, 0.0, 0.0),
-        quat: Vector | None = None,
-        body: mujoco.MjsBody | None = None,
-        rgba: Vector | None = None,
-    ) -> mujoco.MjsGeom:
+    def visual_mesh(self, mesh: str, material: str, body: mujoco.MjsBody | None = None) -> mujoco.MjsGeom:
         """Add a mesh that is seen and never touched."""
-        geom = (body or self.body).add_geom(
-            name=self._fresh("visual"),
-            type=mujoco.mjtGeom.mjGEOM_MESH,
-            meshname=mesh,
-            material=material,
-            pos=list(pos),
-        )
-        return self._seen(geom, quat, rgba)
+        return self._seen(body, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh, material=material)
+
+    def textured_mesh(
+        self,
+        key: str,
+        make: Callable[[], MeshData],
+        image: Callable[[], Pixels],
+        specular: float,
+        shininess: float,
+        smooth: bool = False,
+    ) -> None:
+        """Add a visual mesh with a texture of its own; both are named ``key``."""
+        mesh = self.mesh(key, make, smooth)
+        self.visual_mesh(mesh, self.material(key, image, specular=specular, shininess=shininess))
 
     def visual(
-        self,
-        kind: Primitive,
-        size: Vector,
-        material: str,
-        pos: Vector = (0.0, 0.0, 0.0),
-        quat: Vector | None = None,
-        body: mujoco.MjsBody | None = None,
-        rgba: Vector | None = None,
-    ) -> mujoco.MjsGeom:
+        self, kind: Primitive, size: Vector, material: str, pos: Vector = ORIGIN, quat: Vector = UPRIGHT
+    ) -> None:
         """Add a primitive that is seen and never touched; for round things meshes have fewer faces."""
-        geom = (body or self.body).add_geom(
-            name=self._fresh("visual"), type=_TYPES[kind], size=_size(size), material=material, pos=list(pos)
-        )
-        return self._seen(geom, quat, rgba)
+        self._seen(None, type=_TYPES[kind], size=_size(size), material=material, pos=list(pos), quat=list(quat))
 
-    def _seen(self, geom: mujoco.MjsGeom, quat: Vector | None, rgba: Vector | None) -> mujoco.MjsGeom:
-        geom.contype, geom.conaffinity, geom.group, geom.mass = 0, 0, VISUAL_GROUP, 0.0
-        if quat is not None:
-            geom.quat = list(quat)
-        if rgba is not None:
-            geom.rgba = list(rgba)
-        return geom
+    def _seen(self, body: mujoco.MjsBody | None, **given: Any) -> mujoco.MjsGeom:
+        seen = {"contype": 0, "conaffinity": 0, "group": VISUAL_GROUP, "mass": 0.0}
+        return (body or self.body).add_geom(name=self._fresh("visual"), **seen, **given)
 
     def collision(
         self,
         kind: Primitive,
         size: Vector,
         mass: float,
-        pos: Vector = (0.0, 0.0, 0.0),
-        quat: Vector | None = None,
+        pos: Vector = ORIGIN,
+        quat: Vector = UPRIGHT,
         body: mujoco.MjsBody | None = None,
         friction: Vector = FRICTION,
     ) -> mujoco.MjsGeom:
         """Add a primitive that is touched, weighs ``mass`` and is never seen."""
-        geom = (body or self.body).add_geom(
+        return (body or self.body).add_geom(
             name=self._fresh("collision"),
             type=_TYPES[kind],
             size=_size(size),
             pos=list(pos),
+            quat=list(quat),
             mass=mass,
             group=COLLISION_GROUP,
             rgba=[0.2, 0.8, 0.2, 0.4],
@@ -235,13 +198,6 @@ class Builder:
             solref=list(SOLREF),
             solimp=list(SOLIMP),
         )
-        if quat is not None:
-            geom.quat = list(quat)
-        if kind in ("sphere", "ellipsoid"):
-            # Fruit comes to rest: without rolling friction a ball would wander over the table for ever.
-            geom.condim = 6
-            geom.friction = [friction[0], friction[1], ROLLING_FRICTION]
-        return geom
 
     def ring(
         self,
@@ -261,41 +217,42 @@ class Builder:
         half_width = max(r0, r1) * np.tan(np.pi / count)
         upright = np.stack([out, [0.0, 1.0, 0.0], along], axis=1)
         for k in range(count):
-            turn = _about_z(2 * np.pi * k / count)
-            self.collision(
-                "box",
-                (thickness / 2, half_width, slant / 2),
-                mass / count,
-                pos=turn @ middle,
-                quat=_quat(turn @ upright),
-                friction=friction,
-            )
+            angle = 2 * np.pi * k / count
+            c, s = np.cos(angle), np.sin(angle)
+            turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+            quat = np.zeros(4)
+            mujoco.mju_mat2Quat(quat, (turn @ upright).ravel())
+            half = (thickness / 2, half_width, slant / 2)
+            self.collision("box", half, mass / count, turn @ middle, quat, friction=friction)
 
     def site(
         self,
         suffix: str,
         pos: Vector,
         size: Vector = (0.005, 0.005, 0.005),
-        quat: Vector | None = None,
+        quat: Vector = UPRIGHT,
         body: mujoco.MjsBody | None = None,
         box: bool = False,
     ) -> str:
         """Add a site and return its full name; ``size`` holds half sizes when ``box``."""
         name = self.full(suffix)
         kind = mujoco.mjtGeom.mjGEOM_BOX if box else mujoco.mjtGeom.mjGEOM_SPHERE
-        made = (body or self.body).add_site(
-            name=name, pos=list(pos), size=_size(size), type=kind, group=SITE_GROUP, rgba=[0.2, 0.5, 1.0, 0.3]
+        (body or self.body).add_site(
+            name=name,
+            pos=list(pos),
+            quat=list(quat),
+            size=_size(size),
+            type=kind,
+            group=SITE_GROUP,
+            rgba=[0.2, 0.5, 1.0, 0.3],
         )
-        if quat is not None:
-            made.quat = list(quat)
         return name
 
     # --- facts
 
-    def grasp(self, position: Vector, yaw: float, width: float, symmetric: bool = False, depth: float = 0.01) -> None:
+    def grasp(self, position: Vector, yaw: float, width: float, symmetric: bool = False) -> None:
         """Note a way to hold the object from above."""
-        x, y, z = (float(v) for v in position)
-        self._grasps.append(Grasp((x, y, z), float(yaw), float(width), symmetric, float(depth)))
+        self._grasps.append(Grasp(_triple(position), yaw, float(width), symmetric))
 
     def object(
         self,
@@ -352,17 +309,6 @@ def _size(size: Vector) -> list[float]:
 def _triple(values: Vector) -> tuple[float, float, float]:
     x, y, z = (float(v) for v in values)
     return (x, y, z)
-
-
-def _about_z(angle: float) -> NDArray[np.float64]:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _quat(matrix: NDArray[np.float64]) -> list[float]:
-    quat = np.zeros(4)
-    mujoco.mju_mat2Quat(quat, np.ascontiguousarray(matrix).ravel())
-    return [float(v) for v in quat]
 
 
 def turned(axis: Vector, angle: float) -> list[float]:

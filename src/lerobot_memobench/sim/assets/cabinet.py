@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from functools import partial
 
 import mujoco
 
 from lerobot_memobench.sim.assets.asset import Articulation, Asset, Handle
 from lerobot_memobench.sim.assets.builder import GRIP_FRICTION, Builder
-from lerobot_memobench.sim.assets.meshes import Block, MeshData, blocks
-from lerobot_memobench.sim.assets.paint import Colour, wood
+from lerobot_memobench.sim.assets.meshes import Block, blocks
+from lerobot_memobench.sim.assets.paint import wood
 
 DRAWER_RANGE = (-0.16, 0.01)
 CLOSED = 0.005
@@ -88,34 +88,14 @@ def _handle() -> list[Block]:
     ]
 
 
-def _mesh(parts: Callable[[], list[Block]]) -> Callable[[], MeshData]:
-    return lambda: blocks(parts(), tile=0.25)
-
-
-class _Materials(NamedTuple):
-    dark: str
-    front: str
-    inside: str
-    metal: str
-
-
-def _materials(b: Builder) -> _Materials:
-    def boards(key: str, dark: Colour, light: Colour, seed: int, waves: float, shine: tuple[float, float]) -> str:
-        return b.material(
-            f"cabinet_{key}", lambda: wood(dark, light, seed=seed, waves=waves), specular=shine[0], shininess=shine[1]
-        )
-
-    return _Materials(
-        dark=boards("wood", (46, 34, 28), (92, 70, 58), 5, 7, (0.15, 0.2)),
-        front=boards("front", (66, 48, 38), (118, 90, 72), 6, 7, (0.15, 0.2)),
-        inside=boards("inside", (150, 118, 84), (196, 164, 124), 7, 4, (0.1, 0.1)),
-        metal=b.material("cabinet_metal", rgba=(0.62, 0.62, 0.63, 1), specular=0.8, shininess=0.6),
-    )
+def _add(b: Builder, key: str, parts: list[Block], material: str, body: mujoco.MjsBody) -> None:
+    """Add what is seen of some boards."""
+    b.visual_mesh(b.mesh(f"cabinet_{key}", lambda: blocks(parts, tile=0.25)), material, body)
 
 
 def _cabinet(b: Builder) -> Asset:
-    materials = _materials(b)
-    b.visual_mesh(b.mesh("cabinet_carcass", _mesh(_carcass)), materials.dark)
+    grain = partial(wood, (46, 34, 28), (92, 70, 58), seed=5, waves=7)
+    _add(b, "carcass", _carcass(), b.material("cabinet_wood", grain, specular=0.15, shininess=0.2), b.body)
     for part in _carcass():
         b.collision("box", part.half, 0.8, part.centre)
     middle, depth = (_FRONT + _BACK) / 2, (_BACK - _FRONT) / 2
@@ -125,10 +105,10 @@ def _cabinet(b: Builder) -> Asset:
     for k, level in enumerate(LEVELS):
         drawer = b.child(f"{level}_drawer", (0, 0, _BOARD + k * _PITCH + 0.0015))
         for other in bodies:
-            b.exclude(other, drawer)
+            b.spec.add_exclude(bodyname1=other.name, bodyname2=drawer.name)
         bodies.append(drawer)
         joint = b.joint(drawer, f"{level}_level", "slide", (0, 1, 0), DRAWER_RANGE, damping=50, frictionloss=2.0)
-        _fill_drawer(b, drawer, materials)
+        _fill_drawer(b, drawer)
         regions[f"{level}_region"] = _inside(b, drawer, level)
         articulations[f"{level}_region"] = _articulation(b, drawer, level, joint)
     return b.fixture(
@@ -140,11 +120,16 @@ def _cabinet(b: Builder) -> Asset:
     )
 
 
-def _fill_drawer(b: Builder, drawer: mujoco.MjsBody, materials: _Materials) -> None:
+def _fill_drawer(b: Builder, drawer: mujoco.MjsBody) -> None:
     """Add what is seen and felt of a drawer to its body."""
-    b.visual_mesh(b.mesh("cabinet_drawer", _mesh(_box)), materials.inside, body=drawer)
-    b.visual_mesh(b.mesh("cabinet_panel", _mesh(_panel)), materials.front, body=drawer)
-    b.visual_mesh(b.mesh("cabinet_handle", _mesh(_handle)), materials.metal, body=drawer)
+    dark = partial(wood, (66, 48, 38), (118, 90, 72), seed=6, waves=7)
+    light = partial(wood, (150, 118, 84), (196, 164, 124), seed=7, waves=4)
+    front = b.material("cabinet_front", dark, specular=0.15, shininess=0.2)
+    inside = b.material("cabinet_inside", light, specular=0.1, shininess=0.1)
+    metal = b.material("cabinet_metal", rgba=(0.62, 0.62, 0.63, 1), specular=0.8, shininess=0.6)
+    _add(b, "drawer", _box(), inside, drawer)
+    _add(b, "panel", _panel(), front, drawer)
+    _add(b, "handle", _handle(), metal, drawer)
     for part in (*_box(), *_panel()):
         b.collision("box", part.half, 0.12, part.centre, body=drawer)
     for part in _handle():

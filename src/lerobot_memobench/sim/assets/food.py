@@ -12,13 +12,8 @@ import numpy as np
 
 from lerobot_memobench.sim.assets.asset import ALONG_X, ALONG_Y, Asset
 from lerobot_memobench.sim.assets.builder import GRIP_FRICTION, Builder
-from lerobot_memobench.sim.assets.meshes import Floats, Half, MeshData, ball, grid_faces, lathe, merged, tube
+from lerobot_memobench.sim.assets.meshes import Floats, MeshData, ball, grid_faces, lathe, merged, tube
 from lerobot_memobench.sim.assets.paint import WHITE, Canvas, Colour, Pixels, drawn
-
-
-def _plain(mesh: MeshData) -> MeshData:
-    """Return the mesh without texture coordinates."""
-    return MeshData(mesh.vertices, mesh.faces)
 
 
 def _round_contacts(b: Builder, radius: float, half: float, mass: float, foot: float = 0.62) -> None:
@@ -44,7 +39,7 @@ def _tomato_mesh() -> MeshData:
         points[:, :2] *= (share / 1.045)[:, None]
         return points
 
-    return _plain(body.warped(lobes))
+    return body.warped(lobes).without_uv()
 
 
 def _calyx_mesh() -> MeshData:
@@ -66,7 +61,7 @@ def _tomato(b: Builder) -> Asset:
     b.visual_mesh(b.mesh("tomato_calyx", _calyx_mesh), green)
     radius, half = _TOMATO
     _round_contacts(b, radius, half, 0.10)
-    b.grasp((0, 0, 0), ALONG_X, 2 * radius, symmetric=True, depth=0.008)
+    b.grasp((0, 0, 0), ALONG_X, 2 * radius, symmetric=True)
     return b.object((-radius, -radius, -half), (radius, radius, half + 0.002), round=True)
 
 
@@ -125,12 +120,9 @@ def _artichoke_texture() -> Pixels:
 
 def _artichoke(b: Builder) -> Asset:
     radius, half = _ARTICHOKE
-    b.visual_mesh(
-        b.mesh("artichoke", _artichoke_mesh),
-        b.material("artichoke", _artichoke_texture, specular=0.15, shininess=0.3),
-    )
+    b.textured_mesh("artichoke", _artichoke_mesh, _artichoke_texture, specular=0.15, shininess=0.3)
     _round_contacts(b, 0.94 * radius, half, 0.10)
-    b.grasp((0, 0, 0), ALONG_X, 1.88 * radius, symmetric=True, depth=0.010)
+    b.grasp((0, 0, 0), ALONG_X, 1.88 * radius, symmetric=True)
     return b.object((-radius, -radius, -half), (radius, radius, half), round=True)
 
 
@@ -157,10 +149,8 @@ def _broccoli_crown() -> MeshData:
 
 def _broccoli_stalk() -> MeshData:
     _, half = _BROCCOLI
-    stalk = lathe(
-        [(0.0, -half), (0.0125, -half), (0.0115, -0.55 * half), (0.0150, -0.05 * half), (0.02, 0.1 * half)], 9
-    )
-    return _plain(stalk)
+    profile = [(0.0, -half), (0.0125, -half), (0.0115, -0.55 * half), (0.0150, -0.05 * half), (0.02, 0.1 * half)]
+    return lathe(profile, 9).without_uv()
 
 
 def _broccoli_texture() -> Pixels:
@@ -180,7 +170,7 @@ def _broccoli(b: Builder) -> Asset:
     b.collision("cylinder", (0.0140, 0.5 * half), 0.06, (0, 0, -0.5 * half))
     b.collision("cylinder", (0.94 * radius, 0.010), 0.03, (0, 0, 0.1 * half), friction=GRIP_FRICTION)
     b.collision("cylinder", (0.6 * radius, 0.4 * half), 0.01, (0, 0, 0.6 * half))
-    b.grasp((0, 0, 0.1 * half), ALONG_X, 1.88 * radius, symmetric=True, depth=0.012)
+    b.grasp((0, 0, 0.1 * half), ALONG_X, 1.88 * radius, symmetric=True)
     return b.object((-radius, -radius, -half), (radius, radius, half), round=True)
 
 
@@ -241,12 +231,9 @@ def _sprout_texture() -> Pixels:
 
 def _sprout(b: Builder) -> Asset:
     radius, half = _SPROUT
-    b.visual_mesh(
-        b.mesh("brussels_sprout", _sprout_mesh),
-        b.material("brussels_sprout", _sprout_texture, specular=0.25, shininess=0.4),
-    )
+    b.textured_mesh("brussels_sprout", _sprout_mesh, _sprout_texture, specular=0.25, shininess=0.4)
     _round_contacts(b, radius, half, 0.05, foot=0.55)
-    b.grasp((0, 0, 0), ALONG_X, 2 * radius, symmetric=True, depth=0.008)
+    b.grasp((0, 0, 0), ALONG_X, 2 * radius, symmetric=True)
     return b.object((-radius, -radius, -half), (radius, radius, half), round=True)
 
 
@@ -254,7 +241,7 @@ def _sprout(b: Builder) -> Asset:
 _BAG = (0.0230, 0.0480, 0.0600)
 
 
-def _bag_mesh(half: Half) -> MeshData:
+def _bag_mesh() -> MeshData:
     """Return a bag on a gusset, pressed flat at the top; the image's halves are front and back."""
     columns, rows = 8, 9
     vertices: list[tuple[float, float, float]] = []
@@ -264,7 +251,7 @@ def _bag_mesh(half: Half) -> MeshData:
         faces += grid_faces(columns, rows, len(vertices))
         for i in range(rows + 1):
             for j in range(columns + 1):
-                vertices.append(_bag_point(half, sign, 2 * j / columns - 1, i / rows))
+                vertices.append(_bag_point(sign, 2 * j / columns - 1, i / rows))
                 uv.append((0.01 + 0.48 * j / columns + (0.0 if sign > 0 else 0.5), 0.99 - 0.98 * (i / rows)))
     back = (rows + 1) * (columns + 1)
     for j in range(columns):
@@ -274,9 +261,9 @@ def _bag_mesh(half: Half) -> MeshData:
     return MeshData(np.array(vertices), np.array(faces), np.array(uv))
 
 
-def _bag_point(half: Half, sign: float, across: float, up: float) -> tuple[float, float, float]:
+def _bag_point(sign: float, across: float, up: float) -> tuple[float, float, float]:
     """Return a point of the bag's front (or back, ``sign`` -1): ``across`` from -1 to 1, ``up`` from 0 to 1."""
-    x, y, z = half
+    x, y, z = _BAG
     # Thick below, flat at the seam on top; the bag narrows a little where it is full.
     thick = np.sqrt(max(0.0, 1 - (max(0.0, up - 0.25) / 0.66) ** 2)) if up < 0.9 else 0.0
     thick = max(0.06, thick * (0.72 + 0.28 * min(1.0, up / 0.2)))
@@ -305,17 +292,13 @@ def _bag_texture() -> Pixels:
 
 
 def _bag_of_snacks(b: Builder) -> Asset:
-    half = _BAG
-    b.visual_mesh(
-        b.mesh("bag_of_snacks", lambda: _bag_mesh(half)),
-        b.material("bag_of_snacks", _bag_texture, specular=0.7, shininess=0.6),
-    )
-    x, y, z = half
+    b.textured_mesh("bag_of_snacks", _bag_mesh, _bag_texture, specular=0.7, shininess=0.6)
+    x, y, z = _BAG
     b.collision("box", (0.72 * x, 0.94 * y, z - 0.008), 0.05, (0, 0, -0.008), friction=GRIP_FRICTION)
     b.collision("box", (x, 0.6 * y, 0.5 * z), 0.03, (0, 0, -0.25 * z), friction=GRIP_FRICTION)
     b.collision("box", (0.10 * x, 0.94 * y, 0.008), 0.002, (0, 0, z - 0.008), friction=GRIP_FRICTION)
-    b.grasp((0, 0, z - 0.030), ALONG_X, 1.44 * x, depth=0.02)
-    return b.object((-x, -y, -z), half)
+    b.grasp((0, 0, z - 0.030), ALONG_X, 1.44 * x)
+    return b.object((-x, -y, -z), _BAG)
 
 
 # Chestnut --------------------------------------------------------------------------------------
@@ -344,15 +327,12 @@ def _chestnut_texture() -> Pixels:
 
 def _chestnut(b: Builder) -> Asset:
     x, y, half = _CHESTNUT
-    b.visual_mesh(
-        b.mesh("chestnut", _chestnut_mesh, smooth=True),
-        b.material("chestnut", _chestnut_texture, specular=0.9, shininess=0.8),
-    )
+    b.textured_mesh("chestnut", _chestnut_mesh, _chestnut_texture, specular=0.9, shininess=0.8, smooth=True)
     b.collision("box", (x, 0.70 * y, 0.45 * half), 0.02, (0, 0, -0.15 * half), friction=GRIP_FRICTION)
     b.collision("box", (0.70 * x, y, 0.45 * half), 0.01, (0, 0, -0.15 * half), friction=GRIP_FRICTION)
     b.collision("cylinder", (0.60 * x, 0.90 * half), 0.01, (0, 0, -0.10 * half))
-    b.grasp((0, 0, -0.002), ALONG_X, 2 * x, depth=0.008)
-    b.grasp((0, 0, -0.002), ALONG_Y, 2 * y, depth=0.008)
+    b.grasp((0, 0, -0.002), ALONG_X, 2 * x)
+    b.grasp((0, 0, -0.002), ALONG_Y, 2 * y)
     return b.object((-x, -y, -half), (x, y, half))
 
 
@@ -363,14 +343,15 @@ _BISCUIT = (0.0290, 0.0115)
 def _biscuit_mesh() -> MeshData:
     """Return two scalloped biscuits with cream between them."""
     radius, half = _BISCUIT
-    profile = [
-        (0.0, -half),
-        (radius - 0.002, -half),
-        (radius, -half + 0.002),
+    profile = [(0.0, -half), (radius - 0.002, -half), (radius, -half + 0.002)]
+    profile += [
         (radius, -0.0030),
         (radius - 0.003, -0.0025),
+        (radius - 0.003, 0.0025),
+        (radius, 0.0030),
+        (radius, half - 0.002),
+        (radius - 0.002, half),
     ]
-    profile += [(radius - 0.003, 0.0025), (radius, 0.0030), (radius, half - 0.002), (radius - 0.002, half)]
     profile += [(0.55 * radius, half - 0.0008), (0.0, half - 0.0005)]
 
     def scallop(points: Floats) -> Floats:
@@ -398,11 +379,9 @@ def _biscuit_texture() -> Pixels:
 
 def _biscuit(b: Builder) -> Asset:
     radius, half = _BISCUIT
-    b.visual_mesh(
-        b.mesh("biscuit", _biscuit_mesh), b.material("biscuit", _biscuit_texture, specular=0.1, shininess=0.2)
-    )
+    b.textured_mesh("biscuit", _biscuit_mesh, _biscuit_texture, specular=0.1, shininess=0.2)
     b.collision("cylinder", (radius, half), 0.04, friction=GRIP_FRICTION)
-    b.grasp((0, 0, 0), ALONG_X, 2 * radius, symmetric=True, depth=0.006)
+    b.grasp((0, 0, 0), ALONG_X, 2 * radius, symmetric=True)
     return b.object((-radius, -radius, -half), (radius, radius, half), round=True)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import mujoco
 import numpy as np
@@ -10,26 +11,23 @@ import numpy as np
 from lerobot_memobench.sim.assets.asset import Asset
 from lerobot_memobench.sim.assets.builder import Builder
 from lerobot_memobench.sim.assets.meshes import Block, blocks
-from lerobot_memobench.sim.assets.paint import Pixels, speckle, wood
+from lerobot_memobench.sim.assets.paint import speckle, wood
 
+TABLE = "kitchen_table"
 TABLE_SIZE = (1.0, 1.2, 0.05)
 TABLE_TOP = 0.90
+"""Height of the table's top, m."""
 WALL_X = -1.25
 
 
-def build_kitchen(spec: mujoco.MjSpec, table: str = "kitchen_table") -> Asset:
+def build_kitchen(spec: mujoco.MjSpec) -> Asset:
     """Add table, floor, walls and lights to the world body of ``spec`` and return the table."""
     _light(spec)
-    _room(Builder(spec, spec.worldbody, "room", "room"))
-    spec.worldbody.add_geom(
-        name="room_ground",
-        type=mujoco.mjtGeom.mjGEOM_PLANE,
-        size=[3, 3, 0.1],
-        group=0,
-        rgba=[0.5, 0.5, 0.5, 0],
-    )
-    asset = _table(Builder(spec, spec.worldbody, table, "kitchen_table"))
-    spec.body(table).pos = [0, 0, TABLE_TOP]
+    _room(Builder(spec, "room", "room"))
+    ground = mujoco.mjtGeom.mjGEOM_PLANE
+    spec.worldbody.add_geom(name="room_ground", type=ground, size=[3, 3, 0.1], group=0, rgba=[0.5, 0.5, 0.5, 0])
+    asset = _table(Builder(spec, TABLE, TABLE))
+    spec.body(TABLE).pos = [0, 0, TABLE_TOP]
     return asset
 
 
@@ -79,14 +77,11 @@ def _room(room: Builder) -> None:
     room.visual_mesh(room.mesh("room_walls", lambda: blocks(walls, 0.6)), wall)
 
 
-def _table_texture() -> Pixels:
-    return wood((190, 172, 152), (222, 207, 189), seed=21, size=512, waves=3)
-
-
 def _table(b: Builder) -> Asset:
     """Build the table; its origin is the middle of its top."""
     x, y, thick = TABLE_SIZE[0] / 2, TABLE_SIZE[1] / 2, TABLE_SIZE[2]
-    light = b.material("table", _table_texture, specular=0.05, shininess=0.1)
+    grain = partial(wood, (190, 172, 152), (222, 207, 189), seed=21, size=512, waves=3)
+    light = b.material("table", grain, specular=0.05, shininess=0.1)
     leg = b.material("table_leg", rgba=(0.62, 0.52, 0.42, 1), specular=0.05)
     top = Block((0, 0, -thick / 2), (x, y, thick / 2), 0)
     b.visual_mesh(b.mesh("table_top", lambda: blocks([top], tile=1.2)), light)
@@ -113,15 +108,10 @@ _SHELF_MIDDLE = 0.105  # top of the board between the layers
 def _boards() -> list[Block]:
     y, depth = (_SHELF_FRONT + _SHELF_BACK) / 2, (_SHELF_BACK - _SHELF_FRONT) / 2
     inner = _SHELF_HALF_X - _SHELF_BOARD
+    high = (_SHELF_HIGH - _SHELF_BOARD) / 2
+    beside = _SHELF_HALF_X - _SHELF_BOARD / 2
     return [
-        *(
-            Block(
-                (s * (_SHELF_HALF_X - _SHELF_BOARD / 2), y, (_SHELF_HIGH - _SHELF_BOARD) / 2),
-                (_SHELF_BOARD / 2, depth, (_SHELF_HIGH - _SHELF_BOARD) / 2),
-                2,
-            )
-            for s in (-1.0, 1.0)
-        ),
+        *(Block((s * beside, y, high), (_SHELF_BOARD / 2, depth, high), 2) for s in (-1.0, 1.0)),
         Block((0, y, _SHELF_HIGH - _SHELF_BOARD / 2), (_SHELF_HALF_X, depth, _SHELF_BOARD / 2), 0),
         Block((0, y, _SHELF_MIDDLE - _SHELF_BOARD / 2), (inner, depth, _SHELF_BOARD / 2), 0),
         Block((0, y, _SHELF_BOARD / 2), (inner, depth, _SHELF_BOARD / 2), 0),
@@ -152,7 +142,4 @@ def _shelf(b: Builder) -> Asset:
     )
 
 
-BUILDERS: dict[str, Callable[[Builder], Asset]] = {
-    "kitchen_table": _table,
-    "wooden_two_layer_shelf": _shelf,
-}
+BUILDERS: dict[str, Callable[[Builder], Asset]] = {TABLE: _table, "wooden_two_layer_shelf": _shelf}

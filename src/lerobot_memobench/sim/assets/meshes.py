@@ -51,6 +51,10 @@ class MeshData:
         """Return the mesh with one texture coordinate everywhere (a palette entry)."""
         return MeshData(self.vertices, self.faces, np.array([[u, v]]), np.zeros_like(self.faces))
 
+    def without_uv(self) -> MeshData:
+        """Return the mesh without texture coordinates."""
+        return MeshData(self.vertices, self.faces)
+
 
 def merged(*meshes: MeshData) -> MeshData:
     """Return one mesh of all; either all of them have texture coordinates or none."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -13,26 +14,27 @@ from lerobot_memobench.sim.assets.meshes import Floats, Half, MeshData, Quad, bo
 from lerobot_memobench.sim.assets.paint import BLACK, WHITE, Canvas, Colour, Pixels, atlas, drawn, wrapped
 
 
-def _package(
-    b: Builder,
-    key: str,
-    half: Half,
-    texture: Callable[[], Pixels],
-    mass: float,
-    shape: Callable[[Half], MeshData] = box,
-    gloss: float = 0.25,
-    widest: float = 0.066,
-) -> Asset:
-    """Build a box with a texture; it is held across every horizontal side of up to ``widest``, m."""
-    b.visual_mesh(b.mesh(key, lambda: shape(half)), b.material(key, texture, specular=gloss, shininess=0.4))
-    b.collision("box", half, mass, friction=GRIP_FRICTION)
-    x, y, z = half
-    # A finger reaches about 4 cm below the palm, and should not touch the table.
-    at = max(0.0, z - 0.032)
-    for yaw, width in sorted(((ALONG_X, 2 * x), (ALONG_Y, 2 * y)), key=lambda pair: pair[1]):
-        if width <= widest:
-            b.grasp((0, 0, at), yaw, width, depth=min(0.03, at + z - 0.004))
-    return b.object((-x, -y, -z), half)
+@dataclass(frozen=True)
+class Package:
+    """A box with a texture; it is held across every horizontal side of up to ``widest``, m."""
+
+    key: str
+    half: Half
+    texture: Callable[[], Pixels]
+    mass: float
+    widest: float = 0.066
+
+    def build(self, b: Builder) -> Asset:
+        """Add the package to the scene."""
+        b.textured_mesh(self.key, lambda: box(self.half), self.texture, specular=0.25, shininess=0.4)
+        b.collision("box", self.half, self.mass, friction=GRIP_FRICTION)
+        x, y, z = self.half
+        # A finger reaches about 4 cm below the palm, and should not touch the table.
+        at = max(0.0, z - 0.032)
+        for yaw, width in sorted(((ALONG_X, 2 * x), (ALONG_Y, 2 * y)), key=lambda pair: pair[1]):
+            if width <= self.widest:
+                b.grasp((0, 0, at), yaw, width)
+        return b.object((-x, -y, -z), self.half)
 
 
 # Butter ----------------------------------------------------------------------------------------
@@ -56,9 +58,8 @@ def _butter_texture() -> Pixels:
     return atlas({"+z": drawn(96, 180, yellow, top), "+x": end, "-x": end, "+y": long, "-y": long}, yellow)
 
 
-def _butter(b: Builder) -> Asset:
-    # A little shorter than the published one, so that it can be taken by its ends where others lie close beside it.
-    return _package(b, "butter", (0.0358, 0.0195, 0.0090), _butter_texture, 0.06, widest=0.073)
+# A little shorter than the published one, so that it can be taken by its ends where others lie close beside it.
+BUTTER = Package("butter", (0.0358, 0.0195, 0.0090), _butter_texture, 0.06, widest=0.073)
 
 
 # Boxes -----------------------------------------------------------------------------------------
@@ -90,22 +91,13 @@ def _oatmeal_texture() -> Pixels:
     return wrapped(drawn(160, 224, tan, front), drawn(96, 224, tan, side), top, red)
 
 
-def _oatmeal(b: Builder) -> Asset:
-    return _package(b, "box_of_oatmeal", (0.0240, 0.0480, 0.0690), _oatmeal_texture, 0.18)
+OATMEAL = Package("box_of_oatmeal", (0.0240, 0.0480, 0.0690), _oatmeal_texture, 0.18)
 
 
 def _cereal_loops(canvas: Canvas) -> None:
     canvas.oval(0.08, 0.60, 0.92, 0.96, (240, 246, 250))
     colours = ((220, 52, 48), (62, 160, 72), (240, 130, 30), (70, 110, 200))
-    spots = (
-        (0.18, 0.68),
-        (0.38, 0.63),
-        (0.58, 0.66),
-        (0.72, 0.74),
-        (0.28, 0.80),
-        (0.48, 0.76),
-        (0.56, 0.85),
-    )
+    spots = ((0.18, 0.68), (0.38, 0.63), (0.58, 0.66), (0.72, 0.74), (0.28, 0.80), (0.48, 0.76), (0.56, 0.85))
     for k, (x, y) in enumerate(spots):
         canvas.oval(x, y, x + 0.13, y + 0.095, colours[k % 4])
         canvas.oval(x + 0.045, y + 0.032, x + 0.085, y + 0.063, (240, 246, 250))
@@ -128,8 +120,7 @@ def _cereal_texture() -> Pixels:
     return wrapped(drawn(160, 240, yellow, front), drawn(80, 240, yellow, side), top, yellow)
 
 
-def _cereal(b: Builder) -> Asset:
-    return _package(b, "box_of_cereal", (0.0210, 0.0500, 0.0720), _cereal_texture, 0.16)
+CEREAL = Package("box_of_cereal", (0.0210, 0.0500, 0.0720), _cereal_texture, 0.16)
 
 
 def _ear_of_wheat(canvas: Canvas) -> None:
@@ -159,8 +150,7 @@ def _flour_texture() -> Pixels:
     return wrapped(drawn(160, 224, paper, front), drawn(112, 224, paper, side), top, paper)
 
 
-def _flour(b: Builder) -> Asset:
-    return _package(b, "box_of_flour", (0.0280, 0.0430, 0.0660), _flour_texture, 0.22)
+FLOUR = Package("box_of_flour", (0.0280, 0.0430, 0.0660), _flour_texture, 0.22)
 
 
 # Bean curd -------------------------------------------------------------------------------------
@@ -187,17 +177,42 @@ def _bean_curd_texture() -> Pixels:
     return atlas(faces, cream)
 
 
-def _bean_curd(b: Builder) -> Asset:
-    return _package(b, "bean_curd", (0.0250, 0.0300, 0.0175), _bean_curd_texture, 0.12)
+BEAN_CURD = Package("bean_curd", (0.0250, 0.0300, 0.0175), _bean_curd_texture, 0.12)
 
 
 # Cartons of milk with a gable top ---------------------------------------------------------------
 
 
-def _carton_mesh(half: Half, shoulder: float, fin: float = 0.009) -> MeshData:
-    """Return a gable-top carton: atlas cells as for a box, the slopes take the tops of front and back."""
+@dataclass(frozen=True)
+class Carton:
+    """A gable-top carton, whose slopes begin ``shoulder`` below its top [m]."""
+
+    key: str
+    half: Half
+    texture: Callable[[], Pixels]
+    mass: float
+    shoulder: float
+
+    def build(self, b: Builder) -> Asset:
+        """Add the carton to the scene."""
+        b.textured_mesh(
+            self.key, lambda: _carton_mesh(self.half, self.shoulder), self.texture, specular=0.25, shininess=0.4
+        )
+        x, y, z = self.half
+        shoulder, base = self.shoulder, z - self.shoulder
+        b.collision("box", (x, y, (base + z) / 2), 0.9 * self.mass, (0, 0, (base - z) / 2), friction=GRIP_FRICTION)
+        gable = (0.35 * x, y, shoulder / 2)
+        b.collision("box", gable, 0.1 * self.mass, (0, 0, z - shoulder / 2), friction=GRIP_FRICTION)
+        at = z - 0.0325  # the palm all but touches the fin
+        b.grasp((0, 0, at), ALONG_X, 2 * x)
+        b.grasp((0, 0, at), ALONG_Y, 2 * y)
+        return b.object((-x, -y, -z), self.half)
+
+
+def _carton_mesh(half: Half, shoulder: float) -> MeshData:
+    """Return the carton's mesh: atlas cells as for a box, the slopes take the tops of front and back."""
     x, y, z = half
-    base, ridge, thin = z - shoulder, z - fin, 0.0022
+    base, ridge, thin = z - shoulder, z - 0.009, 0.0022
     # Half depth at each height, and which part of the front's image lies below it.
     outline = [(x, -z, 0.0), (x, base, (base + z) / (2 * z)), (thin, ridge, (ridge + z) / (2 * z)), (thin, z, 1.0)]
     quads: list[Quad] = []
@@ -223,22 +238,6 @@ def _part_of_cell(column: int, row: int, low: float, high: float) -> Floats:
     bottom, top = uv[0, 1], uv[2, 1]
     uv[:2, 1], uv[2:, 1] = bottom + low * (top - bottom), bottom + high * (top - bottom)
     return uv
-
-
-def _carton(
-    b: Builder, key: str, half: Half, texture: Callable[[], Pixels], mass: float, shoulder: float = 0.032
-) -> Asset:
-    b.visual_mesh(
-        b.mesh(key, lambda: _carton_mesh(half, shoulder)), b.material(key, texture, specular=0.25, shininess=0.4)
-    )
-    x, y, z = half
-    base = z - shoulder
-    b.collision("box", (x, y, (base + z) / 2), 0.9 * mass, (0, 0, (base - z) / 2), friction=GRIP_FRICTION)
-    b.collision("box", (0.35 * x, y, shoulder / 2), 0.1 * mass, (0, 0, z - shoulder / 2), friction=GRIP_FRICTION)
-    at = z - 0.0325  # the palm all but touches the fin
-    b.grasp((0, 0, at), ALONG_X, 2 * x, depth=0.03)
-    b.grasp((0, 0, at), ALONG_Y, 2 * y, depth=0.03)
-    return b.object((-x, -y, -z), half)
 
 
 def _splash(canvas: Canvas, colour: Colour, level: float) -> None:
@@ -269,8 +268,7 @@ def _milk_texture() -> Pixels:
     return wrapped(drawn(128, 256, red, front), drawn(128, 256, red, side), drawn(16, 16, red), red)
 
 
-def _milk(b: Builder) -> Asset:
-    return _carton(b, "milk", (0.0265, 0.0270, 0.0655), _milk_texture, 0.15)
+MILK = Carton("milk", (0.0265, 0.0270, 0.0655), _milk_texture, 0.15, 0.032)
 
 
 def _cow(canvas: Canvas) -> None:
@@ -301,16 +299,7 @@ def _carton_of_milk_texture() -> Pixels:
     return wrapped(drawn(128, 256, (226, 240, 250), front), drawn(128, 256, sky, side), drawn(16, 16, navy), navy)
 
 
-def _carton_of_milk(b: Builder) -> Asset:
-    return _carton(b, "carton_of_milk", (0.0310, 0.0310, 0.0790), _carton_of_milk_texture, 0.20, 0.036)
+CARTON_OF_MILK = Carton("carton_of_milk", (0.0310, 0.0310, 0.0790), _carton_of_milk_texture, 0.20, 0.036)
 
-
-BUILDERS: dict[str, Callable[[Builder], Asset]] = {
-    "butter": _butter,
-    "box_of_oatmeal": _oatmeal,
-    "box_of_cereal": _cereal,
-    "box_of_flour": _flour,
-    "bean_curd": _bean_curd,
-    "milk": _milk,
-    "carton_of_milk": _carton_of_milk,
-}
+_ALL: tuple[Package | Carton, ...] = (BUTTER, OATMEAL, CEREAL, FLOUR, BEAN_CURD, MILK, CARTON_OF_MILK)
+BUILDERS: dict[str, Callable[[Builder], Asset]] = {thing.key: thing.build for thing in _ALL}

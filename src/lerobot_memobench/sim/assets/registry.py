@@ -43,8 +43,8 @@ def known_classes() -> list[str]:
     return sorted(_builders)
 
 
-def build_asset(spec: mujoco.MjSpec, parent: mujoco.MjsBody, name: str, class_name: str) -> Asset:
-    """Build an instance ``name`` of ``class_name`` below ``parent`` and return the facts about it.
+def build_asset(spec: mujoco.MjSpec, name: str, class_name: str) -> Asset:
+    """Build an instance ``name`` of ``class_name`` into a scene and return the facts about it.
 
     Raises:
         MemobenchError: no builder is registered for the class.
@@ -56,7 +56,7 @@ def build_asset(spec: mujoco.MjSpec, parent: mujoco.MjsBody, name: str, class_na
             f"there is no asset of class {class_name!r} for {name!r}: {nearest(family, _builders)} "
             "Register one with lerobot_memobench.sim.assets.registry.register."
         )
-    return build(Builder(spec, parent, name, class_name, variant))
+    return build(Builder(spec, name, class_name, variant))
 
 
 def split_class(class_name: str) -> tuple[str, int]:

@@ -80,7 +80,7 @@ class Bowl:
         low = (self._wall(self.base) - middle, 0.5 * self.base)
         b.ring(16, low, (self.rim - middle, top), self.wall, 0.5 * self.mass, GRIP_FRICTION)
         held = self.height - 0.008
-        b.grasp((self._wall(held) - middle, 0.0, held), ALONG_X, self.wall + 0.003, symmetric=True, depth=0.015)
+        b.grasp((self._wall(held) - middle, 0.0, held), ALONG_X, self.wall + 0.003, symmetric=True)
         r, h = self.rim, self.height
         return b.object((-r, -r, 0), (r, r, h), round=True, floor=self.base, clear=self.foot - self.wall)
 
@@ -161,7 +161,7 @@ def _plate(b: Builder) -> Asset:
         0.4 * mass,
         GRIP_FRICTION,
     )
-    b.grasp((_PLATE - 0.006, 0.0, _PLATE_HIGH - 0.004), ALONG_X, 0.012, symmetric=True, depth=0.004)
+    b.grasp((_PLATE - 0.006, 0.0, _PLATE_HIGH - 0.004), ALONG_X, 0.012, symmetric=True)
     r = _PLATE
     return b.object((-r, -r, 0), (r, r, _PLATE_HIGH), round=True, floor=0.005, clear=_PLATE_FLOOR)
 
@@ -246,7 +246,7 @@ def _frypan(b: Builder) -> Asset:
             friction=GRIP_FRICTION,
         )
     for y in (0.135, 0.165, 0.195):
-        b.grasp((0.0, y, 0.0445 + 0.1 * (y - 0.15)), ALONG_X, 0.021, depth=0.03)
+        b.grasp((0.0, y, 0.0445 + 0.1 * (y - 0.15)), ALONG_X, 0.021)
     high = (_PAN, _PAN_END, _PAN_HIGH)
     return b.object((-_PAN, -_PAN, 0), high, floor=0.005, clear=_PAN_BASE - 0.006)
 
@@ -306,7 +306,7 @@ def _moka_black() -> MeshData:
         up=(0, 0.6, 0.8),
     )
     knob = ball((0.009, 0.009, 0.008), 8, 5).moved((0, 0, z + 0.144))
-    return merged(MeshData(handle.vertices, handle.faces), MeshData(knob.vertices, knob.faces))
+    return merged(handle, knob.without_uv())
 
 
 def _moka_pot(b: Builder) -> Asset:
@@ -322,8 +322,8 @@ def _moka_pot(b: Builder) -> Asset:
     b.collision("box", (0.009, 0.006, 0.030), 0.01, (0, -0.080, z + 0.091), friction=GRIP_FRICTION)
     b.collision("box", (0.009, 0.022, 0.006), 0.005, (0, -0.055, z + 0.123), friction=GRIP_FRICTION)
     b.collision("cylinder", (0.009, 0.008), 0.005, (0, 0, z + 0.144), friction=GRIP_FRICTION)
-    b.grasp((0.0, -0.080, z + 0.110), ALONG_X, 0.018, depth=0.03)
-    b.grasp((0.0, 0.0, z + 0.144), ALONG_X, 0.018, depth=0.004)
+    b.grasp((0.0, -0.080, z + 0.110), ALONG_X, 0.018)
+    b.grasp((0.0, 0.0, z + 0.144), ALONG_X, 0.018)
     return b.object((-0.0405, -0.087, z), (0.0405, 0.061, z + 0.152))
 
 

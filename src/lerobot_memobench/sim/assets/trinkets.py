@@ -31,8 +31,7 @@ def _charger_texture() -> Pixels:
 
 def _prongs() -> MeshData:
     x = _CHARGER[0]
-    pieces = [Block((-x - 0.0085, s * 0.0075, 0), (0.0085, 0.0012, 0.0035), 0) for s in (-1.0, 1.0)]
-    return blocks(pieces)
+    return blocks([Block((-x - 0.0085, s * 0.0075, 0), (0.0085, 0.0012, 0.0035), 0) for s in (-1.0, 1.0)])
 
 
 def _cable() -> MeshData:
@@ -61,9 +60,9 @@ def _charger(b: Builder) -> Asset:
     b.visual_mesh(b.mesh("charger_cable", _cable, smooth=True), dark)
     b.collision("box", _CHARGER, 0.06, friction=GRIP_FRICTION)
     b.collision("box", (0.0085, 0.0087, 0.0035), 0.004, (-x - 0.0085, 0, 0))
-    b.grasp((0, 0, 0), ALONG_Y, 2 * y, depth=0.012)
+    b.grasp((0, 0, 0), ALONG_Y, 2 * y)
     # Lengthwise, by the prongs' ends and the port's side: for a hand that must not close towards a drawer.
-    b.grasp((-0.0085, 0, 0), ALONG_X, 2 * x + 0.017, depth=0.012)
+    b.grasp((-0.0085, 0, 0), ALONG_X, 2 * x + 0.017)
     return b.object((-x - 0.017, -y, -z), (x + 0.0235, y + 0.0125, z))
 
 
@@ -100,9 +99,9 @@ def _cap_texture() -> Pixels:
 
 def _cap(b: Builder) -> Asset:
     radius, half = _CAP
-    b.visual_mesh(b.mesh("cap", _cap_mesh), b.material("cap", _cap_texture, specular=0.5, shininess=0.5))
+    b.textured_mesh("cap", _cap_mesh, _cap_texture, specular=0.5, shininess=0.5)
     b.collision("cylinder", (radius, half), 0.03, friction=GRIP_FRICTION)
-    b.grasp((0, 0, 0), ALONG_X, 2 * radius, symmetric=True, depth=0.008)
+    b.grasp((0, 0, 0), ALONG_X, 2 * radius, symmetric=True)
     return b.object((-radius, -radius, -half), (radius, radius, half), round=True)
 
 
@@ -137,9 +136,9 @@ def _cork_mesh() -> MeshData:
 
 def _cork(b: Builder) -> Asset:
     top, bottom, half = _CORK
-    b.visual_mesh(b.mesh("cork", _cork_mesh), b.material("cork", _cork_texture, specular=0.05, shininess=0.1))
+    b.textured_mesh("cork", _cork_mesh, _cork_texture, specular=0.05, shininess=0.1)
     b.collision("cylinder", (bottom, half), 0.015, friction=GRIP_FRICTION)
-    b.grasp((0, 0, 0.004), ALONG_X, 2 * bottom, symmetric=True, depth=0.015)
+    b.grasp((0, 0, 0.004), ALONG_X, 2 * bottom, symmetric=True)
     return b.object((-top, -top, -half), (top, top, half), round=True)
 
 
