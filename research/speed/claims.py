@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.jobs.threads import by_the_libraries, by_the_rule
 from research.speed.sides import (
     TASK,
     Apart,
@@ -41,6 +40,7 @@ from research.speed.sides import (
     stock_robosuite,
     timed,
 )
+from research.speed.threads import by_the_libraries, by_the_rule
 
 # --- several processes at once: steps per second together, and the memory of each ---
 

@@ -30,13 +30,14 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode_log import read_episodes
-from lerobot_memobench.jobs.threads import by_the_libraries, by_the_rule, cores
+from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.policies.baselines.modeling_baselines import MemobenchRandomPolicy
 from lerobot_memobench.protocol import EVALUATION_EPISODES, EVALUATION_SEED, HORIZON
 from lerobot_memobench.run.plan import plan_line
 from lerobot_memobench.run.run import run_evaluation
 from lerobot_memobench.tasks.catalogue import task_names
 from research.speed.sides import TASK, Apart, Line, StockEnv, machine, stock_open
+from research.speed.threads import by_the_libraries, by_the_rule
 
 
 class Cost(NamedTuple):

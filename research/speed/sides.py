@@ -26,12 +26,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.envs.observations import METADATA, action_space, observation_space
-from lerobot_memobench.jobs.threads import by_the_libraries, cores
+from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ
 from lerobot_memobench.sim.rendering import RenderSettings, close_renderers, gl_backend
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.progress import Progress
+from research.speed.threads import by_the_libraries
 
 TASK = "put_the_butter_into_the_bowl_from_the_prompt_video"
 """What is measured unless another task is named: its bowls have the most contacts of the catalogue's usual scenes."""

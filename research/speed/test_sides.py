@@ -8,9 +8,9 @@ import time
 import numpy as np
 import pytest
 
-from lerobot_memobench.jobs.threads import by_the_libraries, by_the_rule
 from research.speed import apart_case
 from research.speed.sides import Apart, Ours, Times, Vectored, alternate, timed
+from research.speed.threads import by_the_libraries, by_the_rule
 
 
 def test_sides_take_turns_and_medians_count() -> None:

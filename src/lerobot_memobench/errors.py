@@ -1,10 +1,10 @@
-"""The one error that users see, and the help it gives."""
+"""The one error that users see, what led to an error, and the help a message gives."""
 
 from __future__ import annotations
 
 import difflib
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 
 class MemobenchError(ValueError):
@@ -12,6 +12,16 @@ class MemobenchError(ValueError):
 
     The command line prints the message without a traceback and exits with status 2.
     """
+
+
+def chain(error: BaseException) -> Iterator[BaseException]:
+    """Yield an error and the errors that led to it, outermost first."""
+    seen: set[int] = set()  # an error may be its own cause's cause
+    current: BaseException | None = error
+    while current is not None and id(current) not in seen:
+        seen.add(id(current))
+        yield current
+        current = current.__cause__ or (None if current.__suppress_context__ else current.__context__)
 
 
 SYSTEMS = {"darwin": "macOS", "win32": "Windows", "cygwin": "Windows"}

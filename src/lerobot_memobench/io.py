@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from annotated_types import Ge, Le, MaxLen, MinLen
 
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.errors import MemobenchError, chain
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
@@ -112,17 +112,13 @@ def _hash_of(path: str, *version: int) -> str:
 
 def disk_refusal(error: BaseException) -> str | None:
     """Return what a disk answered to writing, as the system puts it, where that led to an error; None where not."""
-    current: BaseException | None = error
-    for _ in range(20):  # an error may be its own cause's cause
-        if current is None:
-            return None
+    for current in chain(error):
         number = getattr(current, "errno", None)
         if number in (*FULL, *CLOSED):
             return os.strerror(number)
-        found = _IN_WORDS.search(str(current)) if not isinstance(current, MemobenchError) else None
-        if found:
+        found = _IN_WORDS.search(str(current))
+        if found and not isinstance(current, MemobenchError):
             return found[0]
-        current = current.__cause__ or (None if current.__suppress_context__ else current.__context__)
     return None
 
 

@@ -8,6 +8,7 @@ import json
 import platform
 import shutil
 import sys
+from dataclasses import asdict
 from importlib import metadata
 from typing import Any
 
@@ -204,4 +205,4 @@ def test_the_exit_status_and_the_table() -> None:
         screen.print(finding_table(findings))
     rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in capture.get().splitlines() if "│" in line]
     assert rows == [["a", "ok", "x"], ["b", "warning", "[y]"], ["", "", "fix: do z"]]
-    assert json.dumps([finding.as_dict() for finding in findings])
+    assert json.dumps([asdict(finding) for finding in findings])

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 from enum import StrEnum
+from functools import partial
 from http.client import HTTPException
 from typing import Annotated
 from urllib.error import URLError
@@ -17,7 +18,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.errors import MemobenchError, chain
 from lerobot_memobench.io import disk_refusal
 from lerobot_memobench.jobs.processes import saying_how_to_go_on
 from lerobot_memobench.tasks.task import PUBLISHED, STRICT
@@ -59,6 +60,16 @@ def console() -> Console:
     What stands in brackets is printed as it is: most of it comes out of files.
     """
     return Console(width=None if sys.stdout.isatty() else WIDTH_OF_A_FILE, highlight=False, markup=False)
+
+
+def say(text: object) -> None:
+    """Print a line, however long."""
+    console().print(str(text), soft_wrap=True)
+
+
+def tell(text: str) -> None:
+    """Tell the user on stderr what may matter and stops nothing."""
+    print(text, file=sys.stderr)
 
 
 class Count:
@@ -111,28 +122,22 @@ FETCHING = (URLError, HTTPException, ConnectionError, TimeoutError)
 """What torch raises where it cannot fetch weights."""
 
 
-def chain(error: BaseException) -> Iterator[BaseException]:
-    """Yield an error and the errors that led to it, outermost first."""
-    seen: set[int] = set()
-    current: BaseException | None = error
-    while current is not None and id(current) not in seen:
-        seen.add(id(current))
-        yield current
-        current = current.__cause__ or (None if current.__suppress_context__ else current.__context__)
-
-
 def run_app(app: typer.Typer, arguments: Sequence[str], program: str, again: str) -> int:
-    """Run a command line; return the exit status. Errors a user can mend are one sentence on stderr, status 2.
+    """Run the commands of an app as `run_command` does."""
+    call = partial(app, args=list(arguments), standalone_mode=False, prog_name=program)
+    return run_command(call, program, again)
+
+
+def run_command(call: Callable[[], object], program: str, again: str) -> int:
+    """Run a command; return the exit status. Errors a user can mend are one sentence on stderr, status 2.
 
     Args:
-        app: its commands.
-        arguments: what was typed behind ``program``.
         program: as it is typed, such as ``memobench``.
         again: what is told when SIGTERM ends it.
     """
     try:
         with saying_how_to_go_on(lambda: again):
-            result = app(args=list(arguments), standalone_mode=False, prog_name=program)
+            result = call()
     except (typer.Abort, KeyboardInterrupt, EOFError):
         return 130
     except typer.Exit as stop:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.table import Table
 
-from lerobot_memobench.cli.console import OfSuite, Suite, WhichSuite, console, counting
+from lerobot_memobench.cli.console import OfSuite, Suite, WhichSuite, console, counting, say
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.tables import Unbroken
 from lerobot_memobench.io import count_of
@@ -116,12 +117,12 @@ def generate(
             executor=executor.value,
             executor_options=options,
             progress=advance,
-            tell=lambda said: screen.print(said, soft_wrap=True, markup=False),
+            tell=partial(screen.print, soft_wrap=True),
             **named,
         )
     _print_summary(summary, out)
     if summary.submitted:
-        screen.print(asked_for(options_text(executor.value, options, NEEDS)), soft_wrap=True, highlight=False)
+        say(asked_for(options_text(executor.value, options, NEEDS)))
     return summary.exit_status
 
 
@@ -140,16 +141,15 @@ def _folder_of(policy: str | None) -> str | None:
 
 def _print_summary(summary: GenerationSummary, out: Path) -> None:
     """Print what became of every seed, and where the dataset is."""
-    screen = console()
-    screen.print(Unbroken(_summary_table(summary)), crop=False)
+    console().print(Unbroken(_summary_table(summary)), crop=False)
     for failure in summary.failures:
-        screen.print(f"no demonstration of {failure.task_name}, seed {failure.seed}: {failure.reason}")
+        say(f"no demonstration of {failure.task_name}, seed {failure.seed}: {failure.reason}")
     if summary.submitted:
-        screen.print(f"jobs are submitted; the last of them assembles the dataset in {out}", soft_wrap=True)
+        say(f"jobs are submitted; the last of them assembles the dataset in {out}")
     elif summary.folder is None:
-        screen.print("no dataset was written: no seed was solved")
+        say("no dataset was written: no seed was solved")
     else:
-        screen.print(f"dataset: {summary.folder}", soft_wrap=True)
+        say(f"dataset: {summary.folder}")
 
 
 def _summary_table(summary: GenerationSummary) -> Table:
@@ -189,17 +189,17 @@ def convert(
             upside_down=upside_down,
             workers=workers,
             progress=advance,
-            tell=lambda said: screen.print(said, soft_wrap=True, markup=False),
+            tell=partial(screen.print, soft_wrap=True),
             **({} if repo_id is None else {"repo_id": repo_id}),
         )
     for problem in summary.problems:
-        screen.print(f"left out: {problem}", soft_wrap=True)
+        say(f"left out: {problem}")
     for note in summary.notes:
-        screen.print(f"note: {note}", soft_wrap=True, markup=False)
+        say(f"note: {note}")
     if summary.folder is None:
-        screen.print("no dataset was written: nothing could be used")
+        say("no dataset was written: nothing could be used")
     else:
-        screen.print(f"dataset of {count_of(summary.episodes, 'episode')}: {summary.folder}", soft_wrap=True)
+        say(f"dataset of {count_of(summary.episodes, 'episode')}: {summary.folder}")
     return summary.exit_status
 
 
@@ -260,9 +260,9 @@ def cache(
             batch_size=batch_size,
             workers=workers,
             progress=count,
-            tell=lambda said: screen.print(said, soft_wrap=True),
+            tell=partial(screen.print, soft_wrap=True),
         )
-    screen.print(f"feature cache: {folder}", soft_wrap=True)
+    say(f"feature cache: {folder}")
 
 
 def validate(
@@ -277,15 +277,14 @@ def validate(
 
     if suite is not None:
         check_suite_of(folder, suite)
-    screen = console()
-    with counting(screen, "episodes") as count:
+    with counting(console(), "episodes") as count:
 
         def advance(done: int, total: int, verdict: Verdict) -> None:
             count(done, total, verdict.episode, trouble=verdict.disagreement)
 
         verdicts = run(folder, workers=workers, progress=advance)
     wrong = sum(verdict.disagreement is not None for verdict in verdicts)
-    screen.print(f"{len(verdicts) - wrong} of {len(verdicts)} episodes agree")
+    say(f"{len(verdicts) - wrong} of {len(verdicts)} episodes agree")
     return exit_status(verdicts)
 
 
@@ -300,11 +299,7 @@ def push(
     """
     from lerobot_memobench.datasets.push import push as run
 
-    screen = console()
-    address = run(
-        folder, repo_id, private=private, hdf5=hdf5, tell=lambda said: screen.print(said, soft_wrap=True, markup=False)
-    )
-    screen.print(f"dataset: {address}", soft_wrap=True)
+    say(f"dataset: {run(folder, repo_id, private=private, hdf5=hdf5, tell=say)}")
     return 0
 
 
@@ -319,7 +314,6 @@ def describe(
 
     if suite is not None:
         check_suite_of(folder, suite)
-    screen = console()
-    for file in run(folder, out or folder / "description", say=screen.print):
-        screen.print(str(file), soft_wrap=True)
+    for file in run(folder, out or folder / "description", say=say):
+        say(file)
     return 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,7 +12,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from lerobot_memobench.cli.console import console
+from lerobot_memobench.cli.console import console, say, tell
 
 if TYPE_CHECKING:
     from lerobot_memobench.doctor.examination import Finding, Status
@@ -29,7 +30,7 @@ def demo(
     """
     from rich.markdown import Markdown
 
-    from lerobot_memobench.cli.evaluate import evaluate_here, tell, tell_beginning
+    from lerobot_memobench.cli.evaluate import evaluate_here
     from lerobot_memobench.evaluation.report import REPORT_MARKDOWN
     from lerobot_memobench.run.demo import (
         CONTACT_SHEET,
@@ -44,7 +45,7 @@ def demo(
     from lerobot_memobench.run.run import VIDEOS, run_evaluation
 
     def one_of_three(name: str, folder: Path) -> int:
-        return run_evaluation(memory_plan(name, folder), tell, tell_beginning).status
+        return run_evaluation(memory_plan(name, folder), tell, say).status
 
     status = make_demo(
         out,
@@ -53,14 +54,13 @@ def demo(
     )
     if status:
         return status
-    screen = console()
     if (out / MEMORY_TABLE).is_file():
-        screen.print(Markdown((out / MEMORY_TABLE).read_text()))
-    screen.print(f"report:  {out / REPORT_MARKDOWN}", soft_wrap=True)
-    screen.print(f"videos:  {out / VIDEOS}", soft_wrap=True)
-    screen.print(f"picture: {out / CONTACT_SHEET}", soft_wrap=True)
+        console().print(Markdown((out / MEMORY_TABLE).read_text()))
+    say(f"report:  {out / REPORT_MARKDOWN}")
+    say(f"videos:  {out / VIDEOS}")
+    say(f"picture: {out / CONTACT_SHEET}")
     if (out / MEMORY_VIDEO).is_file():
-        screen.print(f"memory:  {out / MEMORY_VIDEO}", soft_wrap=True)
+        say(f"memory:  {out / MEMORY_VIDEO}")
     return 0
 
 
@@ -72,7 +72,7 @@ def doctor(
 
     findings = examine()
     if as_json:
-        print(json.dumps([finding.as_dict() for finding in findings], indent=1))
+        print(json.dumps([asdict(finding) for finding in findings], indent=1))
     else:
         console().print(finding_table(findings))
     return exit_status(findings)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lerobot_memobench.cli.console import WITH_PARENT, console, counting
+from lerobot_memobench.cli.console import WITH_PARENT, console, counting, say, tell
 from lerobot_memobench.evaluation.report import table
 from lerobot_memobench.evaluation.report_tables import failure_line, inputs_phrase
 from lerobot_memobench.io import count_of
@@ -49,7 +48,7 @@ def evaluate_here(plan: EvaluationPlan, say_where: bool = True) -> int:
     Args:
         say_where: whether the report's file is named.
     """
-    ended = run_evaluation(plan, tell, tell_beginning)
+    ended = run_evaluation(plan, tell, say)
     if ended.report is not None:
         print_figures(ended.report)
         if say_where:
@@ -61,9 +60,8 @@ def evaluate_here(plan: EvaluationPlan, say_where: bool = True) -> int:
 
 def evaluate_in_parts(plan: EvaluationPlan) -> int:
     """Run all parts of an evaluation as jobs, merge them and print the report; 1 when episodes are missing."""
-    screen = console()
     jobs = plan_shards(plan, SHARD_PROGRAM, tell)
-    with counting(screen, "parts", len(jobs)) as count:
+    with counting(console(), "parts", len(jobs)) as count:
 
         def advance(news: Advance) -> None:
             count(news.done, news.total, news.task_name, found=news.found)
@@ -71,8 +69,8 @@ def evaluate_in_parts(plan: EvaluationPlan) -> int:
         report = run_shards(plan, jobs, advance, finish=merge_and_print)
     if report is not None:
         return print_merged(report)
-    screen.print(f"jobs are submitted; the last of them merges the parts in {plan.output.absolute()}", soft_wrap=True)
-    screen.print(asked_for(executor_options(plan)), soft_wrap=True, highlight=False)
+    say(f"jobs are submitted; the last of them merges the parts in {plan.output.absolute()}")
+    say(asked_for(executor_options(plan)))
     return 0
 
 
@@ -84,16 +82,14 @@ def merge_and_print(out: Path, folders: Sequence[Path]) -> int:
 def print_merged(report: EvaluationReport) -> int:
     """Print the report of a merged evaluation; return 1 when episodes that were asked for are missing."""
     print_figures(report)
-    screen = console()
-    screen.print(f"report: {report.page}", soft_wrap=True)
+    say(f"report: {report.page}")
     if not report.absent:
         return 0
     task, episode = report.absent[0]
     was, is_ = ("was", "is") if len(report.absent) == 1 else ("were", "are")
-    screen.print(
+    say(
         f"note: {count_of(len(report.absent), 'episode')} that {was} asked for {is_} missing, the first is {task}, "
-        f"episode {episode}; run their parts with resume=true and merge again",
-        soft_wrap=True,
+        f"episode {episode}; run their parts with resume=true and merge again"
     )
     return 1
 
@@ -107,13 +103,3 @@ def print_figures(report: EvaluationReport) -> None:
     screen.print(inputs_phrase(report.summary.inputs))
     for note in report.notes:
         screen.print(f"note: {note}")
-
-
-def tell_beginning(text: str) -> None:
-    """Say what is about to be run."""
-    console().print(text, soft_wrap=True)
-
-
-def tell(text: str) -> None:
-    """Tell the user what may matter and stops nothing."""
-    print(text, file=sys.stderr)

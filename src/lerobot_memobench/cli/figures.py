@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lerobot_memobench.cli.console import console
+from lerobot_memobench.cli.console import say
 from lerobot_memobench.cli.report import Folders, With, given_runs
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.task import PUBLISHED
@@ -157,4 +157,4 @@ def _save(figure: Figure, out: Path, name: str) -> None:
 
     with paper_style():
         for path in save(figure, out, name):
-            console().print(str(path), soft_wrap=True)
+            say(path)

@@ -12,32 +12,20 @@ import shlex
 import sys
 import threading
 from collections.abc import Iterable, Sequence
+from functools import partial
 from pathlib import Path
 
-from lerobot_memobench.cli.console import USAGE_ERROR, WITH_PARENT, one_sentence
+from lerobot_memobench.cli.console import WITH_PARENT, run_command, tell
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.jobs.processes import saying_how_to_go_on
 from lerobot_memobench.run.arguments import SHORT_FORMS, check_task_names, read_arguments, split_arguments
 from lerobot_memobench.run.lerobot_commands import call_lerobot, lerobot_commands
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit status. Errors a user can mend are one sentence on stderr, status
-    2.
-    """
+    """Run the command line; return the exit status."""
     line = list(sys.argv[1:] if argv is None else argv)
     again = f"lerobot: ended by SIGTERM; begin anew with: {shlex.join(['lerobot', *line])}"
-    try:
-        with saying_how_to_go_on(lambda: again):
-            return run(line)
-    except KeyboardInterrupt:
-        return 130
-    except Exception as error:
-        sentence = one_sentence(error)
-        if sentence is None:
-            raise
-        print(f"lerobot: {sentence}", file=sys.stderr)
-        return USAGE_ERROR
+    return run_command(partial(run, line), "lerobot", again)
 
 
 def run(line: Sequence[str]) -> int:
@@ -52,7 +40,6 @@ def run(line: Sequence[str]) -> int:
     if given.wants_help and name in SHORT_FORMS:
         print(Path(__file__).with_name(f"lerobot_{name}.txt").read_text(), flush=True)
     if name == "train":
-        from lerobot_memobench.cli.evaluate import tell
         from lerobot_memobench.run.training import train
 
         return train(given, line[1:], tell)

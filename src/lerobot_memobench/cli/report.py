@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lerobot_memobench.cli.console import console
+from lerobot_memobench.cli.console import console, say, tell
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import count_of, write_file
 
@@ -85,37 +84,23 @@ def report(
     report.json and report.md of each evaluation are written beside its log as well.
     """
     from lerobot_memobench.evaluation.records import read_runs
-    from lerobot_memobench.evaluation.report import write_documents
+    from lerobot_memobench.evaluation.report import build, render, write_documents, write_report
+    from lerobot_memobench.evaluation.tables import terminal
 
     runs = read_runs(folders)
     wanted = list(dict.fromkeys(each.value for each in format_ or [ReportFormat.TABLE]))
     paper = with_ is Beside.PAPER
-    _write_beside(runs)
-    if out is None:
-        _print_report(runs, wanted, paper)
-        return
-    for path in write_documents(runs, out, wanted, paper):
-        console().print(str(path), soft_wrap=True)
-
-
-def _write_beside(runs: Sequence[Run]) -> None:
-    """Write each evaluation's own report beside its log, where that can be written."""
-    from lerobot_memobench.evaluation.report import write_report
-
     for run in runs:
         try:
             write_report(run.folder)
         except OSError as error:  # an archive that is only read
-            reason = error.strerror or error
-            print(f"memobench: {run.folder} cannot be written ({reason}); no report there", file=sys.stderr)
-
-
-def _print_report(runs: Sequence[Run], formats: Sequence[str], paper: bool) -> None:
-    from lerobot_memobench.evaluation.report import build, render
-    from lerobot_memobench.evaluation.tables import terminal
-
+            tell(f"memobench: {run.folder} cannot be written ({error.strerror or error}); no report there")
+    if out is not None:
+        for path in write_documents(runs, out, wanted, paper):
+            say(path)
+        return
     found = build(runs, paper)
-    for name in formats:
+    for name in wanted:
         if name == ReportFormat.TABLE:
             console().print(terminal(found), crop=False)
         else:
@@ -164,11 +149,10 @@ def html(
     from lerobot_memobench.evaluation.html.write import write_html
 
     written = write_html(folders, out, link=link, task_dir=task_dir)
-    screen = console()
     for note in written.notes:
-        screen.print(f"note: {note}", soft_wrap=True)
-    screen.print(f"{count_of(written.rollouts, 'episode')}, {written.videos} with a video")
-    screen.print(f"open {written.page}", soft_wrap=True)
+        say(f"note: {note}")
+    say(f"{count_of(written.rollouts, 'episode')}, {written.videos} with a video")
+    say(f"open {written.page}")
 
 
 def merge(
@@ -193,25 +177,9 @@ def rerun(
 ) -> int:
     """Repeat the evaluation of a card and compare every episode. Status 1: one ended differently."""
     from lerobot_memobench.cli.evaluate import evaluate_here
-    from lerobot_memobench.envs.episode_log import read_episodes
-    from lerobot_memobench.run import rerun as again
-    from lerobot_memobench.run.card import first_disagreement
+    from lerobot_memobench.run.rerun import repeat
 
-    told = again.repeatable_card(card, server)
-    again.check_policy(told)
-    screen = console()
-    for note in again.differences_here(told):
-        screen.print(f"note: {note}", soft_wrap=True)
-    plan = again.plan_of_card(told, out)
-    status = evaluate_here(plan)
-    if status:
-        return status
-    problem = first_disagreement(told["episodes"], read_episodes(plan.log))
-    if problem is not None:
-        screen.print(f"not repeated: {problem}", soft_wrap=True)
-        return 1
-    screen.print(f"repeated: all {len(told['episodes'])} episodes agree with the card", soft_wrap=True)
-    return 0
+    return repeat(card, out, server, evaluate_here, say)
 
 
 controls = typer.Typer(
@@ -290,8 +258,7 @@ def _show(report: Report, notes: Sequence[str], name: str, out: Path | None) -> 
         replace(each, tables=tuple(replace(t, note=f"{t.note} {told}") for t in each.tables))
         for each in report.sections
     ]
-    screen = console()
-    screen.print(terminal(noted), crop=False)
+    console().print(terminal(noted), crop=False)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         data = {"title": report.title, "notes": list(notes), **report.data}
@@ -301,7 +268,7 @@ def _show(report: Report, notes: Sequence[str], name: str, out: Path | None) -> 
             "json": json.dumps(data, indent=1) + "\n",
         }
         for ending, content in contents.items():
-            screen.print(str(write_file(out / f"{name}.{ending}", content)), soft_wrap=True)
+            say(write_file(out / f"{name}.{ending}", content))
     return 0
 
 
@@ -316,7 +283,7 @@ def given_runs(folders: list[str] | None, with_: Beside | None) -> tuple[list[Ru
     runs = read_runs(folders) if folders else []
     check_beside(runs, paper)
     for note in unlike(runs):
-        print(f"memobench: note: {note}", file=sys.stderr)
+        tell(f"memobench: note: {note}")
     return runs, paper
 
 
@@ -326,33 +293,17 @@ def show_report(report: Report, name: str, formats: Sequence[ReportFormat] | Non
     Raises:
         MemobenchError: CSV is wanted.
     """
+    from lerobot_memobench.evaluation.tables import WRITERS, terminal
+
     wanted = list(dict.fromkeys(formats or [ReportFormat.TABLE]))
     if ReportFormat.CSV in wanted:
         raise MemobenchError(f"found --format csv; expected {', '.join(ENDINGS)}: what is told here is no one table")
     for each in wanted:
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)
-            path = write_file(out / f"{name}.{ENDINGS[each]}", _writer(each)(report))
-            console().print(str(path), soft_wrap=True)
+            say(write_file(out / f"{name}.{ENDINGS[each]}", WRITERS[each](report)))
         elif each is ReportFormat.TABLE:
-            _print_table(report)
+            console().print(report.title, style="bold")
+            console().print(terminal(report), crop=False)
         else:
-            print(_writer(each)(report), end="")
-
-
-def _print_table(report: Report) -> None:
-    from lerobot_memobench.evaluation.tables import terminal
-
-    console().print(report.title, style="bold")
-    console().print(terminal(report), crop=False)
-
-
-def _writer(format_: ReportFormat) -> Callable[[Report], str]:
-    from lerobot_memobench.evaluation.tables import json_text, latex, markdown, text
-
-    return {
-        ReportFormat.TABLE: text,
-        ReportFormat.MARKDOWN: markdown,
-        ReportFormat.LATEX: latex,
-        ReportFormat.JSON: json_text,
-    }[format_]
+            print(WRITERS[each](report), end="")

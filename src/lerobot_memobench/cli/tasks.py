@@ -6,12 +6,12 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.table import Table
 
-from lerobot_memobench.cli.console import Suite, WhichSuite, console
+from lerobot_memobench.cli.console import Suite, WhichSuite, console, say
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.tables import Unbroken
 from lerobot_memobench.io import count_of
@@ -39,7 +39,10 @@ def tasks(
     """List the benchmark's tasks, or those of a folder."""
     found, problems = load_tasks(folder, suite)
     if as_json:
-        print(json.dumps(records(found), indent=1))
+        from lerobot_memobench.sim.simulation import Simulation
+
+        # State sizes come from the compiled models.
+        print(json.dumps([task_record(task, Simulation(task).state_dim) for task in found], indent=1))
     else:
         console().print(Unbroken(task_table(found), column=1), crop=False)
     for problem in problems:
@@ -64,13 +67,6 @@ def load_tasks(folder: Path | None, suite: str = PUBLISHED) -> tuple[list[Task],
     if not found:
         raise MemobenchError(problems[0])
     return found, problems
-
-
-def records(found: Sequence[Task]) -> list[dict[str, Any]]:
-    """Return what ``memobench tasks --json`` prints; state sizes come from the compiled models."""
-    from lerobot_memobench.sim.simulation import Simulation
-
-    return [task_record(task, Simulation(task).state_dim) for task in found]
 
 
 def task_table(found: Sequence[Task]) -> Table:
@@ -100,11 +96,10 @@ def objects(
     if as_json:
         print(json.dumps(told, indent=1))
         return
-    screen = console()
-    screen.print(f"{SLOTS} slots, one after another; of each:")
+    say(f"{SLOTS} slots, one after another; of each:")
     for field in told["fields"]:
-        screen.print(f"  {field['start']:>2}  {field['name']} ({field['size']})")
-    screen.print("classes: " + ", ".join(f"{k} {name}" for k, name in enumerate(told["classes"])), soft_wrap=True)
+        say(f"  {field['start']:>2}  {field['name']} ({field['size']})")
+    say("classes: " + ", ".join(f"{k} {name}" for k, name in enumerate(told["classes"])))
 
 
 def gallery(
@@ -117,7 +112,7 @@ def gallery(
     from lerobot_memobench.sim.gallery import write_gallery
 
     for picture in write_gallery(out, suite):
-        console().print(str(picture), soft_wrap=True)
+        say(picture)
 
 
 def recipe(

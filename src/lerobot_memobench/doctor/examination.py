@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Literal
@@ -52,10 +52,6 @@ class Finding:
     status: Status
     detail: str
     fix: str = ""
-
-    def as_dict(self) -> dict[str, str]:
-        """Return the finding for JSON."""
-        return asdict(self)
 
 
 def examine() -> list[Finding]:
@@ -168,9 +164,9 @@ def not_registered() -> list[str]:
     from lerobot.envs.configs import EnvConfig
     from lerobot.policies import factory as _factory  # noqa: F401 - importing it registers policies
 
-    policies, environments = PreTrainedConfig.get_known_choices(), EnvConfig.get_known_choices()
-    missing = [f"policy {name}" for name in ("memobench_mem", "memobench_expert") if name not in policies]
-    return missing + [f"env {name}" for name in ("memobench",) if name not in environments]
+    needed = {"policy memobench_mem", "policy memobench_expert", "env memobench"}
+    known = {f"policy {name}" for name in PreTrainedConfig.get_known_choices()}
+    return sorted(needed - known - {f"env {name}" for name in EnvConfig.get_known_choices()})
 
 
 def _installed(name: str) -> str | None:

@@ -69,7 +69,7 @@ ProgressCallback = Callable[[Advance], None]
 def run_in_processes(jobs: Sequence[Job], workers: int, tell: Callable[[Job], None]) -> None:
     """Run the jobs, ``workers`` at a time; ``tell`` of each in the order in which they end."""
     with process_pool(min(workers, len(jobs))) as pool:
-        futures: dict[Future[None], Job] = {pool.submit(_run, job): job for job in jobs}
+        futures: dict[Future[None], Job] = {pool.submit(job.run): job for job in jobs}
         for future in as_completed(futures):
             future.result()
             tell(futures[future])
@@ -89,10 +89,6 @@ def process_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
         ) from None
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _run(job: Job) -> None:
-    job.run()
 
 
 def _begin_worker() -> None:

@@ -51,7 +51,7 @@ def torch_threads(role: str, processes: int = 1, *, large: bool = False) -> int 
         return 1
     if role == LEARNING and processes == 1 and cores() == len(_affinity()):
         return None  # by affinity torch counts, too, and it leaves hyperthreads out
-    return max(1, min(cores(), _without_hyperthreads()) // processes)
+    return max(1, min(cores(), physical_cores()) // processes)
 
 
 def use_threads(role: str) -> None:
@@ -69,21 +69,6 @@ def use_threads(role: str) -> None:
         given.pop(key, None)
     given.update(chosen)
     given[CHOSEN_HERE] = ",".join(sorted(chosen))
-
-
-def by_the_libraries() -> dict[str, str]:
-    """Return this process's environment with the threads that the libraries take where nobody tells them: one on every
-    core. To measure what the rule does.
-    """
-    threads = dict.fromkeys(ONE_EACH, str(cores())) | {TORCH: str(_without_hyperthreads())}
-    return {key: value for key, value in os.environ.items() if key != CHOSEN_HERE} | SPINNING | threads
-
-
-def by_the_rule() -> dict[str, str]:
-    """Return this process's environment as the rule has it for one that acts, whatever a user says. To measure it."""
-    chosen = {**ONE_EACH, **SPINNING, TORCH: "1"}
-    kept = {key: value for key, value in os.environ.items() if key not in (BESIDE, "OMP_WAIT_POLICY")}
-    return {**kept, **chosen, CHOSEN_HERE: ",".join(chosen)}
 
 
 def limit_torch(parameters: int) -> None:
@@ -120,7 +105,7 @@ def _affinity() -> set[int]:
     return set(range(os.cpu_count() or 1))
 
 
-def _without_hyperthreads() -> int:
+def physical_cores() -> int:
     """Return how many cores the processors of this process belong to."""
     found = set()
     for number in _affinity():

@@ -29,6 +29,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import CARD_FILE
 from lerobot_memobench.io import Count, file_hash, read_json, write_file
 from lerobot_memobench.policies.checkpoint import ADAPTER_FILE, WEIGHTS_FILE, local_folder, portable_path
+from lerobot_memobench.run.arguments import without_flags
 from lerobot_memobench.run.machine import gl_facts, run_facts
 from lerobot_memobench.run.plan import EvaluationPlan
 
@@ -232,11 +233,9 @@ def _widened_flags(card: Mapping[str, Any], extent: Mapping[str, Any]) -> list[s
     """Return a card's flags, changed to a wider extent where it is wider."""
     flags = list(card["flags"])
     if extent["episodes"] != card["protocol"]["episodes"]:
-        flags = [flag for flag in flags if not flag.startswith("--eval.n_episodes=")]
-        flags.append(f"--eval.n_episodes={extent['episodes']}")
+        flags = [*without_flags(flags, "eval.n_episodes"), f"--eval.n_episodes={extent['episodes']}"]
     if extent["tasks"] != sorted(card["protocol"]["tasks"]):
-        flags = [flag for flag in flags if not flag.startswith(("--env.task=", "--env.tasks="))]
-        flags.append(f"--env.tasks={','.join(extent['tasks'])}")
+        flags = [*without_flags(flags, "env.task", "env.tasks"), f"--env.tasks={','.join(extent['tasks'])}"]
     return flags
 
 

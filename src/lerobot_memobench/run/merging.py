@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import shutil
 from collections.abc import Mapping, Sequence
@@ -21,9 +22,10 @@ from lerobot_memobench.envs.episode_log import (
 )
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import CARD_FILE, read_card, read_protocol
+from lerobot_memobench.evaluation.report import write_report
 from lerobot_memobench.io import draft_of
 from lerobot_memobench.run.card import disagreement, extended, key_of, remove_card, with_episodes, write_card
-from lerobot_memobench.run.run import VIDEOS, EvaluationReport, report_on
+from lerobot_memobench.run.run import VIDEOS, EvaluationReport
 
 SHARDS = "shard-*-of-*"
 """Folders of the parts of an evaluation, in its own."""
@@ -32,7 +34,7 @@ SHARDS = "shard-*-of-*"
 def merge_and_report(out: Path, folders: Sequence[Path]) -> EvaluationReport:
     """Merge parts into the folder ``out`` and report the whole; see `merge`."""
     absent = merge(out, folders)
-    report = report_on(out, absent=absent)
+    report = EvaluationReport(out, *write_report(out), absent)
     if _tells_whose(read_protocol(out), read_log(out)):
         return report
     return replace(report, notes=[*report.notes, f"{out} does not say whose episodes it holds: no part of it did"])
@@ -146,22 +148,17 @@ def join(parts: Mapping[Path, Sequence[Mapping[str, Any]]]) -> list[dict[str, An
 
 def _joined_card(folders: Sequence[Path]) -> dict[str, Any] | None:
     """Return one card for all, None where one of them has none: it would say more than is known."""
-    card: dict[str, Any] | None = None
-    for folder in folders:
-        if not (folder / CARD_FILE).is_file():
-            return None
-        mine = read_card(folder / CARD_FILE, whole=True)
-        card = mine if card is None else extended(card, mine, again=False)
-    if card is not None:
-        for folder in folders:
-            _check_task_files(card, folder)
-    return card
-
-
-def _check_task_files(card: Mapping[str, Any], folder: Path) -> None:
-    for name, value in read_card(folder / CARD_FILE, whole=True)["task_files"].items():
-        if card["task_files"][name] != value:
-            raise MemobenchError(f"the episodes of {name} in {folder} were run with other task files than the others")
+    if not all((folder / CARD_FILE).is_file() for folder in folders):
+        return None
+    cards = {folder: read_card(folder / CARD_FILE, whole=True) for folder in folders}
+    joined = functools.reduce(lambda card, mine: extended(card, mine, again=False), cards.values())
+    for folder, card in cards.items():
+        for name, value in card["task_files"].items():
+            if joined["task_files"][name] != value:
+                raise MemobenchError(
+                    f"the episodes of {name} in {folder} were run with other task files than the others"
+                )
+    return joined
 
 
 def _share_videos(source: Path, target: Path) -> None:

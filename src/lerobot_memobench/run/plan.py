@@ -7,6 +7,7 @@ costs a sentence and not a run. What a user sets stays; what is left open gets t
 from __future__ import annotations
 
 import datetime as dt
+import itertools
 import shlex
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -155,10 +156,9 @@ def make_plan(arguments: LerobotArguments, options: RunOptions, command: Sequenc
     output = _output(arguments, options)
     log = Path(arguments.get(LOG) or output)
     arguments = arguments.changed(OUTPUT, output).changed(LOG, log)
-    arguments = with_batch_size(arguments, options, log, getattr(policy, "max_environments", None))
     if obs_type_of(policy) not in (None, PIXELS):
         arguments = arguments.default("env.obs_type", obs_type_of(policy))
-    arguments = with_protocol(arguments, getattr(policy, "n_action_steps", None), in_parts=options.shards > 0)
+    arguments = with_protocol(arguments, options, log, policy)
     if policy is not None:  # else LeRobot's process finds out
         arguments = arguments.default("env.prompt_in", prompt_in(policy))
     environment = cast("MemobenchEnvConfig | None", env_config(arguments))
@@ -194,11 +194,8 @@ def _output(arguments: LerobotArguments, options: RunOptions) -> Path:
     name = arguments.get("policy.type") or (chosen.get_choice_name(chosen) if chosen else "policy")  # type: ignore[attr-defined]
     now = dt.datetime.now()
     base = Path("outputs/eval") / f"{now:%Y-%m-%d}" / f"{now:%H-%M-%S}_{ENVIRONMENT}_{name}"
-    folder, k = base, 1
-    while folder.exists():
-        k += 1
-        folder = base.with_name(f"{base.name}_{k}")
-    return folder
+    others = (base.with_name(f"{base.name}_{k}") for k in itertools.count(2))
+    return next(folder for folder in itertools.chain([base], others) if not folder.exists())
 
 
 def make_grid(arguments: LerobotArguments, environment: MemobenchEnvConfig) -> Grid:
@@ -230,21 +227,42 @@ def with_policy(arguments: LerobotArguments) -> LerobotArguments:
     return arguments if offered is None else arguments.default(offered, True)
 
 
-def with_batch_size(arguments: LerobotArguments, options: RunOptions, log: Path, most: int | None) -> LerobotArguments:
-    """Return arguments with as many environments at once as the way it is run, or the policy, allows.
+def with_protocol(
+    arguments: LerobotArguments, options: RunOptions, log: Path, policy: PreTrainedConfig | None
+) -> LerobotArguments:
+    """Return arguments with the protocol's seed and episodes, a batch, a device, the replan interval, videos."""
+    import torch
 
-    Going on keeps the number of the earlier run: what a policy samples may depend on it. Parts run one at a time: by
-    cores, each machine would cut the evaluation differently.
+    arguments = arguments.default("seed", EVALUATION_SEED).default("eval.n_episodes", EVALUATION_EPISODES)
+    if whole_number(arguments.get("seed")) is not None:
+        arguments = arguments.default("env.seed_base", arguments.get("seed"))  # episodes are counted from the first
+    # A policy may serve few environments at once, such as one for each of its servers.
+    arguments = with_batch_size(arguments, options, log, getattr(policy, "max_environments", None) or LARGEST_BATCH)
+    # Where parts run elsewhere, that machine decides: this one may be a login node without a GPU, or with the only one.
+    if not options.shards and not torch.cuda.is_available() and not torch.backends.mps.is_available():
+        arguments = arguments.default("policy.device", "cpu")
+    if (n_action_steps := getattr(policy, "n_action_steps", None)) is not None:
+        arguments = arguments.default("env.replan_steps", n_action_steps)
+    return arguments.default("env.videos", 0 if arguments.get("env.obs_type") == OBJECTS else VIDEO_EPISODES)
 
-    Args:
-        most: environments that the policy can serve, such as one for each of its servers.
+
+def with_batch_size(arguments: LerobotArguments, options: RunOptions, log: Path, most: int) -> LerobotArguments:
+    """Return arguments with the largest batch that LeRobot would choose and that divides the episodes.
+
+    LeRobot runs whole batches and throws the surplus of the last one away, after simulating it. Going on keeps the
+    number of the earlier run: what a policy samples may depend on it. Parts run one at a time: by cores, each machine
+    would cut the evaluation differently.
     """
+    if (arguments.get("eval.batch_size") or "0") != "0":
+        return arguments
     earlier = earlier_batch_size(log) if options.resume else None
-    if earlier is not None and _batch_is_open(arguments):
-        arguments = arguments.changed("eval.batch_size", earlier)
-    if options.in_parts:
-        arguments = arguments.default("eval.batch_size", 1)
-    return arguments if most is None else with_largest_batch(arguments, most)
+    if earlier is not None:
+        return arguments.changed("eval.batch_size", earlier)
+    if options.in_parts and not arguments.has("eval.batch_size"):
+        return arguments.default("eval.batch_size", 1)
+    episodes = whole_number(arguments.get("eval.n_episodes")) or 1
+    limit = max(1, min(int(cores() * 0.7), episodes, most))
+    return arguments.changed("eval.batch_size", max(size for size in range(1, limit + 1) if episodes % size == 0))
 
 
 def earlier_batch_size(log: Path) -> int | None:
@@ -255,43 +273,6 @@ def earlier_batch_size(log: Path) -> int | None:
     starts = read_card(path).get("runs") or [{}]
     size = starts[-1].get("batch_size")
     return None if size is None else int(size)
-
-
-def with_largest_batch(arguments: LerobotArguments, most: int) -> LerobotArguments:
-    """Return arguments with the largest batch that LeRobot would choose and that divides the episodes; at most
-    ``most``.
-
-    LeRobot runs whole batches and throws the surplus of the last one away, after simulating it.
-    """
-    if not _batch_is_open(arguments):
-        return arguments
-    episodes = int(arguments.get("eval.n_episodes") or EVALUATION_EPISODES)
-    limit = max(1, min(int(cores() * 0.7), episodes, most))
-    return arguments.changed("eval.batch_size", max(size for size in range(1, limit + 1) if episodes % size == 0))
-
-
-def _batch_is_open(arguments: LerobotArguments) -> bool:
-    return (arguments.get("eval.batch_size") or "0") == "0"
-
-
-def with_protocol(arguments: LerobotArguments, n_action_steps: int | None, in_parts: bool = False) -> LerobotArguments:
-    """Return arguments with the protocol's seed and episodes, a batch, a device, the policy's replan interval, videos.
-
-    Args:
-        in_parts: all of them are run as jobs, each of which decides on its own machine which device there is.
-    """
-    import torch
-
-    arguments = arguments.default("seed", EVALUATION_SEED).default("eval.n_episodes", EVALUATION_EPISODES)
-    if whole_number(arguments.get("seed")) is not None:
-        arguments = arguments.default("env.seed_base", arguments.get("seed"))  # episodes are counted from the first
-    arguments = with_largest_batch(arguments, LARGEST_BATCH)
-    # Where parts run elsewhere, that machine decides: this one may be a login node without a GPU, or with the only one.
-    if not in_parts and not torch.cuda.is_available() and not torch.backends.mps.is_available():
-        arguments = arguments.default("policy.device", "cpu")
-    if n_action_steps is not None:
-        arguments = arguments.default("env.replan_steps", n_action_steps)
-    return arguments.default("env.videos", 0 if arguments.get("env.obs_type") == OBJECTS else VIDEO_EPISODES)
 
 
 # --- the configurations of the policy and the environment, as LeRobot will build them ---

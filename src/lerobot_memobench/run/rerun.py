@@ -19,12 +19,13 @@ from typing import Any
 
 from draccus.utils import is_enum, is_literal, is_union
 
+from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import CARD_FILE, read_card
 from lerobot_memobench.policies.checkpoint import local_folder
 from lerobot_memobench.run.arguments import PLAIN, checked_value, chosen_class, flag_value, setting_type
 from lerobot_memobench.run.arguments import settings as settings_of
-from lerobot_memobench.run.card import checkpoint_files, detector_hash, tree_hash
+from lerobot_memobench.run.card import checkpoint_files, detector_hash, first_disagreement, tree_hash
 from lerobot_memobench.run.lerobot_commands import config_class, load_command, register_plugins
 from lerobot_memobench.run.machine import gl_facts, versions
 from lerobot_memobench.run.plan import ENVIRONMENT, EvaluationPlan, plan_line
@@ -57,6 +58,40 @@ DEVICE = re.compile(r"cpu|mps|(cuda|xpu)(:\d+)?")
 SERVER = re.compile(r"(?:\w+://)?(?:127\.0\.0\.1|localhost)(?::\d+)?")
 OBSERVATION = re.compile(r"[\w./-]+")
 NOTHING = ("null", "none", "None", "~")
+
+
+def repeat(
+    path: Path,
+    out: Path | None,
+    server: str | None,
+    evaluate: Callable[[EvaluationPlan], int],
+    say: Callable[[str], None],
+) -> int:
+    """Repeat the evaluation of a card and compare every episode; return 1 where one ended differently.
+
+    Args:
+        path: the card, or its folder.
+        out: folder of the repetition, a dated one when None.
+        server: see `repeatable_card`.
+        evaluate: runs the plan and returns its exit status.
+        say: told what differs here, and what was found.
+
+    Raises:
+        MemobenchError: the card cannot be repeated here.
+    """
+    card = repeatable_card(path, server)
+    check_policy(card)
+    for note in differences_here(card):
+        say(f"note: {note}")
+    plan = plan_of_card(card, out)
+    if status := evaluate(plan):
+        return status
+    problem = first_disagreement(card["episodes"], read_episodes(plan.log))
+    if problem is None:
+        say(f"repeated: all {len(card['episodes'])} episodes agree with the card")
+        return 0
+    say(f"not repeated: {problem}")
+    return 1
 
 
 def repeatable_card(path: Path, server: str | None = None) -> dict[str, Any]:

@@ -20,7 +20,7 @@ import hashlib
 import logging
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -60,10 +60,8 @@ KNOWN: dict[tuple[str, str], Callable[[Any], bool]] = {
 def calm_output() -> Iterator[None]:
     """Keep progress bars out of log files, and a library's farewell out of the end of a run."""
     logging.getLogger("OpenGL").setLevel(logging.WARNING)
-    with ExitStack() as stack:
-        if not sys.stderr.isatty():
-            # The bar is redrawn at every step. LeRobot leaves it out where it takes itself to be in a batch job.
-            stack.enter_context(hooked(INSIDE_SLURM, lambda _: lambda: True))
+    # The bar is redrawn at every step. LeRobot leaves it out where it takes itself to be in a batch job.
+    with nullcontext() if sys.stderr.isatty() else hooked(INSIDE_SLURM, lambda _: lambda: True):
         yield
 
 
@@ -209,19 +207,13 @@ def _roll(env: Any, policy: Any, settings: dict[str, Any], quiet: bool) -> dict[
     return dict(zip((ACTION, "reward", "success", "done"), stacked, strict=True))
 
 
-@contextmanager
-def _recorder(env: Any, settings: Mapping[str, Any]) -> Iterator[Recorder | None]:
-    """Yield what records the batch, None where nothing does; what it has recorded is whole when this ends."""
+def _recorder(env: Any, settings: Mapping[str, Any]) -> AbstractContextManager[Recorder | None]:
+    """Return what records the batch, None where nothing does; what it has recorded is whole when it is left."""
     folder, features, repository, private = (settings.get(name) for name in RECORDS)
     if folder is None or features is None:
-        yield None
-        return
+        return nullcontext()
     fps = env.unwrapped.metadata["render_fps"]
-    recorder = Recorder(Path(folder), features, env.num_envs, fps, repository, bool(private))
-    try:
-        yield recorder
-    finally:
-        recorder.close()
+    return closing(Recorder(Path(folder), features, env.num_envs, fps, repository, bool(private)))
 
 
 def _act(env: Any, policy: Any, through: Mapping[str, Any], batch: dict[str, Any]) -> NDArray[np.float32]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
@@ -129,21 +130,11 @@ def _finish(plan: EvaluationPlan, card: dict[str, Any]) -> EvaluationReport:
     protocol.pop(POLICY, None)  # a card says more of it; the file has what `auto` came to in LeRobot's process
     # LeRobot runs whole batches: episodes beyond those asked for are no part of the report.
     limit = None if plan.grid is None else plan.grid.first + max(plan.grid.runs, protocol["episodes"])
-    report = report_on(plan.log, limit)
+    report = EvaluationReport(plan.log, *write_report(plan.log, limit))
     records = [record for record in read_episodes(plan.log) if limit is None or record["episode"] < limit]
     card = with_checkpoint({**card, "protocol": protocol}, plan.policy_path)
     write_card(plan.log, with_episodes(card, records))
     return report
-
-
-def report_on(folder: Path, episodes: int | None = None, absent: Sequence[tuple[str, int]] = ()) -> EvaluationReport:
-    """Write the report of the log in ``folder`` beside it and return it.
-
-    Args:
-        episodes: report those below this number; None for all.
-    """
-    summary, notes = write_report(folder, episodes)
-    return EvaluationReport(folder, summary, notes, absent)
 
 
 # --- going on: whether it is the same evaluation, which episodes are left, what is then run ---
@@ -210,16 +201,10 @@ def remainder(plan: EvaluationPlan, ranges: Ranges | None) -> EvaluationPlan:
         arguments = arguments.changed("env.task" if arguments.has("env.task") else "env.tasks", ",".join(names))
     if has_log(plan.log):
         arguments = arguments.changed("env.resume", True)
-        output = unused_subfolder(plan.output)
+        # LeRobot would write over the first run's own files.
+        others = (plan.output / f"continued-{k}" for k in itertools.count(1))
+        output = next(folder for folder in others if not folder.exists())
     return replace(plan, arguments=arguments, output=output)
-
-
-def unused_subfolder(output: Path) -> Path:
-    """Return the first folder ``continued-k`` that is not there: LeRobot would write over the first run's own files."""
-    k = 1
-    while (output / f"continued-{k}").exists():
-        k += 1
-    return output / f"continued-{k}"
 
 
 # --- the folder: whether it may be written to, held while a run lasts, left clean behind it ---
@@ -259,7 +244,8 @@ def held(plan: EvaluationPlan) -> Iterator[None]:
     plan.log.mkdir(parents=True, exist_ok=True)
     try:
         with locked(plan.log, plan.log):
-            _clean(plan.log)
+            for folder in (plan.log, plan.log / VIDEOS):  # what a killed run was writing
+                remove_drafts(folder)
             yield
     finally:
         if not has_log(plan.log):
@@ -278,12 +264,6 @@ def made(folder: Path) -> Iterator[None]:
     finally:
         if new:
             _remove_empty(folder)
-
-
-def _clean(folder: Path) -> None:
-    """Remove what a killed run was writing: whole files have names of their own."""
-    for place in (folder, folder / VIDEOS):
-        remove_drafts(place)
 
 
 def _remove_empty(folder: Path) -> None:

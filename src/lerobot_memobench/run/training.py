@@ -257,8 +257,7 @@ def check_same_training(arguments: LerobotArguments) -> None:
         return
     _check_same_dataset(arguments, checkpoint)
     chosen = ("--policy.path", "--policy.type", "--policy.discover_packages_path")
-    given = [flag for flag in arguments.flags if flag.startswith("--policy.")]
-    given = [flag for flag in given if flag.partition("=")[0] not in chosen]
+    given = [f for f in arguments.flags if f.startswith("--policy.") and f.partition("=")[0] not in chosen]
     if not given:
         return
     from lerobot.configs import parser
@@ -276,7 +275,11 @@ def _check_same_dataset(arguments: LerobotArguments, checkpoint: Path) -> None:
     root, repository = arguments.get("dataset.root"), arguments.get("dataset.repo_id")
     held = str(begun.get("root") or begun.get("repo_id"))
     advice = f"leave that out, or train a new run from the checkpoint: policy={checkpoint} output_dir=<new folder>"
-    same = root is not None and begun.get("root") is not None and _same_place(root, begun["root"])
+    same = (
+        root is not None
+        and begun.get("root") is not None
+        and (Path(root).expanduser().resolve() == Path(begun["root"]).expanduser().resolve())
+    )
     if not same and (root is not None or repository not in (None, begun.get("repo_id"))):
         moved = begun.get("root") is not None and not Path(held).expanduser().exists()
         raise MemobenchError(
@@ -290,10 +293,6 @@ def _check_same_dataset(arguments: LerobotArguments, checkpoint: Path) -> None:
             raise MemobenchError(
                 f"this training was begun with dataset.{name}={begun.get(name)}, and {asked} was asked for; {advice}"
             )
-
-
-def _same_place(a: str, b: str) -> bool:
-    return Path(a).expanduser().resolve() == Path(b).expanduser().resolve()
 
 
 def _gone_on_with(arguments: LerobotArguments) -> Path | None:

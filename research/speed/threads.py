@@ -1,0 +1,22 @@
+"""The environments in which libraries take threads by our rule, and by themselves: to measure what the rule does."""
+
+from __future__ import annotations
+
+import os
+
+from lerobot_memobench.jobs.threads import BESIDE, CHOSEN_HERE, ONE_EACH, SPINNING, TORCH, cores, physical_cores
+
+
+def by_the_libraries() -> dict[str, str]:
+    """Return this process's environment with the threads that the libraries take where nobody tells them: one on every
+    core.
+    """
+    threads = dict.fromkeys(ONE_EACH, str(cores())) | {TORCH: str(physical_cores())}
+    return {key: value for key, value in os.environ.items() if key != CHOSEN_HERE} | SPINNING | threads
+
+
+def by_the_rule() -> dict[str, str]:
+    """Return this process's environment as the rule has it for one that acts, whatever a user says."""
+    chosen = {**ONE_EACH, **SPINNING, TORCH: "1"}
+    kept = {key: value for key, value in os.environ.items() if key not in (BESIDE, "OMP_WAIT_POLICY")}
+    return {**kept, **chosen, CHOSEN_HERE: ",".join(chosen)}
