@@ -34,11 +34,10 @@ import av
 import numpy as np
 
 from lerobot_memobench.datasets.convert import convert
-from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.demonstration import Demonstration, labels
 from lerobot_memobench.datasets.generation import generate
 from lerobot_memobench.datasets.hdf5.reading import PublishedFile
 from lerobot_memobench.datasets.hdf5.writing import write_task_file
-from lerobot_memobench.datasets.labels import labels
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.datasets.lerobot_format.layout import dataset_features, image_key
 from lerobot_memobench.datasets.recording import record_demonstration

@@ -20,11 +20,10 @@ import pytest
 from lerobot_memobench.cli.data import convert as command
 from lerobot_memobench.datasets import convert as convert_module
 from lerobot_memobench.datasets.convert import convert
-from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels
 from lerobot_memobench.datasets.hdf5.reading import PublishedFile
 from lerobot_memobench.datasets.hdf5.restore import read_fixture_poses, restore, task_of
 from lerobot_memobench.datasets.hdf5.writing import model_file, write_task_file
-from lerobot_memobench.datasets.labels import digest, labels
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
 from lerobot_memobench.datasets.lerobot_format.reading import read_episode

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lerobot_memobench.datasets.labels import Labels, digest, labels
+from lerobot_memobench.datasets.demonstration import digest, labels
 from lerobot_memobench.errors import MemobenchError
 
 
@@ -154,13 +154,13 @@ def test_labels_match_a_plain_simulation_of_the_definition(make_demo):
                 index += 1
 
 
-def test_prefix_keeps_labels(make_demo):
-    demo = make_demo(["000010", "011111"], exec_start=1, size=16)
-    whole, part = labels(demo), labels(demo.prefix(5))
+def test_labels_of_a_frame_are_those_of_the_frames_up_to_it(make_demo):
+    whole, part = (
+        labels(make_demo(["000010", "011111"], exec_start=1)),
+        labels(make_demo(["00001", "01111"], exec_start=1)),
+    )
     for name, column in part.columns().items():
         assert np.array_equal(np.asarray(column), np.asarray(whole.columns()[name])[:5]), name
-    with pytest.raises(MemobenchError, match="prefix of 1 frames"):
-        demo.prefix(1)
 
 
 def test_digest_sees_every_part(make_demo, make_task):
@@ -187,7 +187,8 @@ def test_digest_sees_every_part(make_demo, make_task):
     assert len({digest(demo), *(digest(other) for other in others)}) == len(others) + 1
     # Images and memory layout are no part of it.
     assert digest(replace(demo, states=np.asfortranarray(demo.states))) == digest(demo)
-    assert digest(make_demo(["0010", "0001"], exec_start=1, size=16).prefix(4)) != ""
+    shown = make_demo(["0010", "0001"], exec_start=1, size=16)
+    assert digest(replace(shown, images=None)) == digest(shown)
 
 
 @pytest.mark.parametrize(
@@ -207,7 +208,3 @@ def test_digest_sees_every_part(make_demo, make_task):
 def test_inconsistent_arrays_are_named(make_demo, change, message):
     with pytest.raises(MemobenchError, match=message):
         replace(make_demo(["0010", "0001"]), **change)
-
-
-def test_labels_type(make_demo):
-    assert isinstance(labels(make_demo(["01"])), Labels)

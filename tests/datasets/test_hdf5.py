@@ -9,9 +9,9 @@ import h5py
 import numpy as np
 import pytest
 
+from lerobot_memobench.datasets.demonstration import digest, labels
 from lerobot_memobench.datasets.hdf5.reading import PublishedFile, Unusable, find_files, truth_from_intervals
 from lerobot_memobench.datasets.hdf5.writing import data_attributes, write_task_file
-from lerobot_memobench.datasets.labels import digest, labels
 from lerobot_memobench.datasets.staging import EpisodeStage, stage_demonstration
 from lerobot_memobench.errors import MemobenchError
 

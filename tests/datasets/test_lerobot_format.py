@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_memobench.datasets.labels import digest, labels
+from lerobot_memobench.datasets.demonstration import digest, labels
 from lerobot_memobench.datasets.lerobot_format.assembling import numeric_stats, write_dataset
 from lerobot_memobench.datasets.lerobot_format.layout import dataset_features, is_dataset
 from lerobot_memobench.datasets.lerobot_format.reading import read_episode

@@ -18,9 +18,8 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.scripts import lerobot_edit_dataset as tool
 from lerobot.scripts.lerobot_train import train
 
-from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.demonstration import Demonstration, digest
 from lerobot_memobench.datasets.describe import describe
-from lerobot_memobench.datasets.labels import digest
 from lerobot_memobench.datasets.lerobot_format.assembling import assemble, write_dataset
 from lerobot_memobench.datasets.lerobot_format.layout import EPISODE_INFO, MANIFEST_FILE
 from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, episodes_where, list_episodes, read_episode

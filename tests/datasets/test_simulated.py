@@ -22,9 +22,8 @@ import pytest
 
 from lerobot_memobench.datasets import dagger
 from lerobot_memobench.datasets.dagger import TURN_STEPS, load_learner
-from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels
 from lerobot_memobench.datasets.generation import generate
-from lerobot_memobench.datasets.labels import digest, labels
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
 from lerobot_memobench.datasets.lerobot_format.reading import read_episode

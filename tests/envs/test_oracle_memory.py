@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lerobot_memobench.datasets.labels import labels
+from lerobot_memobench.datasets.demonstration import labels
 from lerobot_memobench.datasets.recording import record_demonstration
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.memobench_env import MemobenchEnv

@@ -1,20 +1,31 @@
-"""The one in-memory form of a demonstration.
+"""The one in-memory form of a demonstration, its labels and its hash.
 
 An episode is recorded by the scripted expert, read from HDF5 or taken from a rollout; whatever its origin it becomes a
-:class:`Demonstration`.
+:class:`Demonstration`. Every checkpoint column of a dataset is a function of it, `labels`, so that writers, validators
+and policies cannot disagree about its meaning.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+import hashlib
+import json
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, PROPRIO_DIM
-from lerobot_memobench.tasks.task import Task
+from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, CONTROL_HZ, EXECUTION, PROMPT, PROPRIO_DIM
+from lerobot_memobench.tasks.memory_text import memory_text, subtask_texts
+from lerobot_memobench.tasks.task import LEVELS, OPERATIONS, Task
+
+MAX_CHECKPOINTS = 6
+"""Width of ``checkpoint.completed``: no task of the benchmark has more checkpoints."""
+MIN_FRAMES_BETWEEN_ROWS = 5
+"""LeRobot's ``emitted_at`` looks 0.1 s to either side and raises when it finds two rows of a style, so rows
+of one style must be more than 0.2 s apart: at 20 frames/s, at least 5 frames."""
+LanguageRow = dict[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,28 +73,23 @@ class Demonstration:
     executed: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
-        length, count = len(self.states), len(self.task.checkpoints)
+        length = len(self.states)
         self._check("states", self.states, np.float64, (length, None))
         self._check("actions", self.actions, np.float32, (length, ACTION_DIM))
         self._check("proprio", self.proprio, np.float32, (length, PROPRIO_DIM))
-        self._check("satisfied", self.satisfied, np.bool_, (length, count))
+        self._check("satisfied", self.satisfied, np.bool_, (length, len(self.task.checkpoints)))
         if self.objects is not None:
             self._check("objects", self.objects, np.float32, (length, None))
         if self.executed is not None:
             self._check("executed", self.executed, np.float32, (length, ACTION_DIM))
-        self._check_images(length)
-        self._check_start(length)
-
-    def _check_images(self, length: int) -> None:
-        for camera, frames in (self.images or {}).items():
-            self._check(f"images[{camera!r}]", frames, np.uint8, (length, None, None, 3))
-        if self.images is not None and set(self.images) != set(CAMERAS):
-            raise MemobenchError(
-                f"{self._where()}: images of {sorted(self.images)} given, expected {sorted(CAMERAS)} or none"
-            )
-
-    def _check_start(self, length: int) -> None:
-        if not 0 <= self.exec_start < max(length, 1) or length == 0:
+        if self.images is not None:
+            for camera, frames in self.images.items():
+                self._check(f"images[{camera!r}]", frames, np.uint8, (length, None, None, 3))
+            if set(self.images) != set(CAMERAS):
+                raise MemobenchError(
+                    f"{self._where()}: images of {sorted(self.images)} given, expected {sorted(CAMERAS)} or none"
+                )
+        if not 0 <= self.exec_start < length:
             raise MemobenchError(
                 f"{self._where()}: execution starts at frame {self.exec_start} of {length}; "
                 "it must be one of the episode's frames"
@@ -117,21 +123,193 @@ class Demonstration:
         """The actions (T, 7) that moved the arm: played again, they give the states."""
         return self.actions if self.executed is None else self.executed
 
-    @property
-    def steps(self) -> int:
-        """Number of execution frames, those held after success included."""
-        return len(self) - self.exec_start
 
-    def prefix(self, length: int) -> Demonstration:
-        """Return the first ``length`` frames; their labels are the first ``length`` labels of the whole."""
-        if not self.exec_start < length <= len(self):
-            raise MemobenchError(
-                f"{self._where()}: a prefix of {length} frames was asked for; "
-                f"it must reach into the execution, frames {self.exec_start + 1} to {len(self)}"
-            )
-        images = None if self.images is None else {k: v[:length] for k, v in self.images.items()}
-        columns = ("states", "actions", "proprio", "satisfied", "objects", "executed")
-        cut: dict[str, Any] = {
-            name: None if (whole := getattr(self, name)) is None else whole[:length] for name in columns
+# --- labels ---
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """Per-frame columns of one episode of T frames (attribute to column name: :meth:`columns`).
+
+    Attributes:
+        phase: (T,) int64, 0 prompt, 1 execution.
+        index: (T,) int64, checkpoints completed in order at frames before t: the number of the one worked on.
+        operation: (T,) int64, 0 S, 1 U, 2 C of that checkpoint, -1 when none is left.
+        completed: (T, 6) bool, checkpoint k has been satisfied at some frame up to and including t.
+        event: (T,) bool, some checkpoint is satisfied for the first time at frame t.
+        simple_subgoal: T strings, intermediate-level text of the checkpoint worked on. Once all are done the
+            last one's text stays (``operation`` is -1 there), so the column is never empty.
+        grounded_subgoal, coarse_subgoal: the same at the fine and at the coarse level.
+        memory: T strings, intermediate-level texts of the checkpoints completed in order before t, joined by
+            "; "; empty at the start. The oracle memory of the paper (:mod:`lerobot_memobench.tasks.memory_text`).
+        subtask: T strings, the checkpoint worked on as an instruction: in LeRobot's language rows, and no column.
+        key_frames: (K,) int64, the frame at which checkpoint k was completed in order, -1 if it never was.
+    """
+
+    phase: NDArray[np.int64]
+    index: NDArray[np.int64]
+    operation: NDArray[np.int64]
+    completed: NDArray[np.bool_]
+    event: NDArray[np.bool_]
+    simple_subgoal: list[str]
+    grounded_subgoal: list[str]
+    coarse_subgoal: list[str]
+    memory: list[str]
+    subtask: list[str]
+    key_frames: NDArray[np.int64]
+
+    def columns(self) -> dict[str, NDArray | list[str]]:
+        """Return the dataset's column names and their T values each."""
+        return {
+            "phase": self.phase,
+            "checkpoint.index": self.index,
+            "checkpoint.operation": self.operation,
+            "checkpoint.completed": self.completed,
+            "checkpoint.event": self.event,
+            "simple_subgoal": self.simple_subgoal,
+            "grounded_subgoal": self.grounded_subgoal,
+            "coarse_subgoal": self.coarse_subgoal,
+            "memory": self.memory,
         }
-        return replace(self, images=images, **cut)
+
+
+def labels(demo: Demonstration) -> Labels:
+    """Compute every checkpoint column of a demonstration.
+
+    A checkpoint is completed in order at the first frame at which its predicate holds while all earlier ones
+    have been completed (at that frame or before it). Several may be completed at one frame. A predicate that
+    held too early and no longer holds when its turn comes is not completed, though ``completed`` and
+    ``event``, which ignore the order, show it.
+    """
+    task, length = demo.task, len(demo)
+    if len(task.checkpoints) > MAX_CHECKPOINTS:
+        raise MemobenchError(
+            f"task {task.name} has {len(task.checkpoints)} checkpoints; the column checkpoint.completed has room for "
+            f"{MAX_CHECKPOINTS}, so merge some of them"
+        )
+    key_frames = _ordered_completion(demo.satisfied)
+    index = np.searchsorted(key_frames[key_frames >= 0], np.arange(length), side="left").astype(np.int64)
+    ever = np.logical_or.accumulate(demo.satisfied, axis=0)
+    # One entry per value of index, 0 ... K; the last stands for "none left". A code is a position in "SUC".
+    codes = [OPERATIONS.index(checkpoint.operation) for checkpoint in task.checkpoints] + [-1]
+    texts = {level: _subgoals(task, number) for number, level in enumerate(LEVELS)}
+    subtasks = subtask_texts(task)
+    subtasks.append(subtasks[-1])
+    memories = [memory_text(task, k) for k in range(len(task.checkpoints) + 1)]
+    return Labels(
+        phase=np.where(np.arange(length) < demo.exec_start, PROMPT, EXECUTION).astype(np.int64),
+        index=index,
+        operation=np.array(codes, dtype=np.int64)[index],
+        completed=np.pad(ever, [(0, 0), (0, MAX_CHECKPOINTS - ever.shape[1])]),
+        event=np.asarray(np.diff(ever, axis=0, prepend=False).any(axis=1)),
+        simple_subgoal=[texts["intermediate"][k] for k in index],
+        grounded_subgoal=[texts["fine"][k] for k in index],
+        coarse_subgoal=[texts["coarse"][k] for k in index],
+        memory=[memories[k] for k in index],
+        subtask=[subtasks[k] for k in index],
+        key_frames=key_frames,
+    )
+
+
+def _ordered_completion(satisfied: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return (K,) frames of ordered completion in a (T, K) truth table, -1 for never."""
+    key_frames = np.full(satisfied.shape[1], -1, dtype=np.int64)
+    frame = 0
+    for k in range(satisfied.shape[1]):
+        holds = np.flatnonzero(satisfied[frame:, k])
+        if holds.size == 0:
+            break
+        frame += int(holds[0])  # the next checkpoint may hold at this same frame
+        key_frames[k] = frame
+    return key_frames
+
+
+def _subgoals(task: Task, level: int) -> list[str]:
+    """K + 1 texts; once all checkpoints are done the last one's stays. A task without any has its instruction."""
+    texts = [checkpoint.language[level] for checkpoint in task.checkpoints] or [task.language]
+    return [*texts, texts[-1]]
+
+
+# --- language rows ---
+
+
+def persistent_rows(found: Labels) -> list[LanguageRow]:
+    """Return an episode's language rows for LeRobot's training recipes, sorted by timestamp, style, role.
+
+    LeRobot keeps them in the column ``language_persistent``: one list per episode, repeated on every frame, each row
+    active from its timestamp until the next of its style (``lerobot.datasets.language``). The styles are those of its
+    annotation pipeline: ``subtask`` (the next thing to do, as an instruction) and ``memory`` (the things done, in the
+    past tense; none before the first completion).
+
+    A text that is replaced again within 0.2 s (checkpoints completed at nearly the same time) gets no row;
+    the text before it stays active until the one after it begins, so a row never claims something too early.
+    The per-frame string columns keep every change.
+    """
+    rows = [_row("subtask", text, frame) for frame, text in _changes(found.subtask)]
+    rows += [_row("memory", text, frame) for frame, text in _changes(found.memory) if text]
+    return sorted(rows, key=lambda row: (row["timestamp"], row["style"], row["role"]))
+
+
+def _changes(texts: list[str]) -> list[tuple[int, str]]:
+    """Return (frame, text) wherever a text begins, without empty and short-lived ones."""
+    kept: list[tuple[int, str]] = []
+    for frame, text in enumerate(texts):
+        if not text or (frame > 0 and text == texts[frame - 1]):
+            continue
+        if kept and frame - kept[-1][0] < MIN_FRAMES_BETWEEN_ROWS:
+            replaced, _ = kept.pop()
+            frame = 0 if replaced == 0 else frame  # something must be active from the episode's first frame on
+        kept.append((frame, text))
+    return kept
+
+
+def _row(style: str, text: str, frame: int) -> LanguageRow:
+    # LeRobot's frame timestamps are float32; a row must equal its frame's to the bit.
+    timestamp = float(np.float32(frame / CONTROL_HZ))
+    return {
+        "role": "assistant",
+        "content": text,
+        "style": style,
+        "timestamp": timestamp,
+        # LeRobot's annotation writer puts None here, and then its own `lerobot-dataset-viz` cannot open the dataset:
+        # it batches frames with torch's collate function, which knows no None. Empty means the same to LeRobot's
+        # recipes: they look at a camera only when asked for one, and at tool calls if there are any.
+        "camera": "",
+        "tool_calls": [],
+    }
+
+
+# --- the hash ---
+
+
+def digest(demo: Demonstration) -> str:
+    """Return the sha256 (hex) of an episode: identity, states, actions and the label columns.
+
+    Images are left out: they follow from the states, and a renderer may differ in a pixel where physics does
+    not. So are the visible objects, and ``coarse_subgoal`` and ``subtask``, which the other columns and the
+    task decide: they came later than the first datasets, and their hashes stay what they are.
+    """
+    found = labels(demo)
+    identity = {
+        "task": demo.task.name,
+        "seed": demo.seed,
+        "referent": demo.referent,
+        "variant": demo.variant,
+        "exec_start": demo.exec_start,
+        "success": bool(demo.success),
+    }
+    columns: dict[str, NDArray | list[str]] = {"states": demo.states, "actions": demo.actions}
+    if demo.executed is not None:
+        columns["executed"] = demo.executed
+    columns |= {f.name: getattr(found, f.name) for f in fields(found) if f.name not in ("coarse_subgoal", "subtask")}
+    # Independent of byte order, memory layout and dictionary order.
+    sha = hashlib.sha256(json.dumps(identity, sort_keys=True).encode())
+    for name in sorted(columns):
+        column = columns[name]
+        if isinstance(column, list):
+            sha.update(json.dumps([name, column]).encode())
+            continue
+        flat = np.ascontiguousarray(column).astype(column.dtype.newbyteorder("<"), copy=False)
+        sha.update(json.dumps([name, flat.dtype.str, list(flat.shape)]).encode())
+        sha.update(flat.tobytes())
+    return sha.hexdigest()

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.datasets.demonstration import Demonstration
-from lerobot_memobench.datasets.labels import digest, labels, persistent_rows
+from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels, persistent_rows
 from lerobot_memobench.datasets.lerobot_format.layout import EXECUTED_ACTION, OBJECTS, image_key, objects_column
 from lerobot_memobench.datasets.lerobot_format.reading import Columns, RecordedEpisode
 from lerobot_memobench.errors import MemobenchError

@@ -32,9 +32,8 @@ import numpy as np
 from annotated_types import Len
 from numpy.typing import NDArray
 
-from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.demonstration import Demonstration, LanguageRow, digest, labels, persistent_rows
 from lerobot_memobench.datasets.hdf5.writing import EpisodeFile, data_attributes
-from lerobot_memobench.datasets.labels import LanguageRow, digest, labels, persistent_rows
 from lerobot_memobench.datasets.video import ImageHistograms, Stats, VideoWriter
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import (
@@ -97,7 +96,7 @@ class Identity(TypedDict):
 
 
 class Row(TypedDict, total=False):
-    """One of LeRobot's persistent language rows; `labels.persistent_rows` writes them."""
+    """One of LeRobot's persistent language rows; `persistent_rows` writes them."""
 
     role: str
     content: str | None

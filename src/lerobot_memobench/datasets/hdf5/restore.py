@@ -19,10 +19,9 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.demonstration import Demonstration, digest
 from lerobot_memobench.datasets.hdf5.reading import SUFFIX, PublishedDemo, PublishedFile, Unusable, truth_from_intervals
 from lerobot_memobench.datasets.hdf5.writing import Pose
-from lerobot_memobench.datasets.labels import digest
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.demonstration_prompt import highlights_at
 from lerobot_memobench.io import file_name

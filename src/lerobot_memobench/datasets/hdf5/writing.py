@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels
 from lerobot_memobench.datasets.hdf5.reading import IMAGE_NAMES, Image, truth_to_intervals
-from lerobot_memobench.datasets.labels import digest, labels
 from lerobot_memobench.protocol import CONTROL_HZ
 from lerobot_memobench.tasks.formula import to_lists
 from lerobot_memobench.tasks.task import BDDL_FILE, Task

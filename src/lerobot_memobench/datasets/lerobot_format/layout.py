@@ -14,7 +14,7 @@ import numpy as np
 from annotated_types import Ge, Le
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from lerobot_memobench.datasets.labels import MAX_CHECKPOINTS
+from lerobot_memobench.datasets.demonstration import MAX_CHECKPOINTS
 from lerobot_memobench.datasets.staging import STAGING
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import Count, Malformed, Whole, count_of, first_fault, parsed, read_json, refusing
