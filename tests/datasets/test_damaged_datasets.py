@@ -107,7 +107,7 @@ def requests(folder: Path) -> None:
 
 
 def use_request(folder: Path) -> None:
-    with episodes_folder(folder, MANIFEST["request"], "name another folder"):
+    with episodes_folder(folder, MANIFEST["request"]):
         pass
 
 

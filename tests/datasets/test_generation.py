@@ -190,22 +190,12 @@ def test_an_unfinished_run_of_another_request_is_not_mixed_in(tasks, recorded, t
     with pytest.raises(KeyboardInterrupt):
         run(tasks, tmp_path / "ds")
     monkeypatch.undo()
-    with pytest.raises(MemobenchError, match="unfinished run with images=True, now False"):
+    with pytest.raises(MemobenchError, match="unfinished run with images=True, now False") as told:
         run(tasks, tmp_path / "ds", images=False)
+    assert f"delete {tmp_path / 'ds' / '.staging'} to start anew or name another folder" in str(told.value)
     edited = [replace(tasks[0], bddl_text="another goal"), tasks[1]]
     with pytest.raises(MemobenchError, match="unfinished run with task_files"):
         run(edited, tmp_path / "ds")
-
-
-def test_start_anew(tasks, recorded, tmp_path, monkeypatch):
-    with monkeypatch.context() as patch:
-        patch.setattr(generation, "assemble", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt))
-        with pytest.raises(KeyboardInterrupt):
-            run(tasks, tmp_path / "ds")
-    recorded.clear()
-    run(tasks, tmp_path / "ds", resume=False, episodes=1)
-    assert recorded == [("task_a", 10_000), ("task_b", 10_000)]
-    assert is_dataset(tmp_path / "ds")
 
 
 def test_two_runs_at_once(tasks, recorded, tmp_path):

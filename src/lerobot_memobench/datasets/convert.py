@@ -163,7 +163,7 @@ def convert(
     staging = out / STAGING
     with (
         telling_of_the_disk(out, "what is finished stays, and the same command goes on from there"),
-        episodes_folder(out, request, f"delete {staging} to start anew or name another folder") as folder,
+        episodes_folder(out, request) as folder,
     ):
         jobs, problems, notes = _plan(files, folder, upside_down)
         _tell_of_the_run(jobs, out, tell)

@@ -74,41 +74,36 @@ def generate(
     images: bool = True,
     image_size: int = IMAGE_SIZE,
     demonstration_prompt: bool = True,
-    hold_frames: int = HOLD_FRAMES,
     perturb: bool = False,
     policy: str | None = None,
     formats: Collection[str] = (LEROBOT,),
     workers: int = 1,
     executor: str = "processes",
     executor_options: Mapping[str, Any] | None = None,
-    resume: bool = True,
     repo_id: str = DEFAULT_REPO_ID,
     progress: ProgressCallback | None = None,
     tell: Callable[[str], None] = lambda _: None,
 ) -> GenerationSummary:
     """Make ``episodes`` demonstrations of each task (with a prompt: ``prompted_episodes``) into the folder ``out``.
 
-    Failed episodes are in no dataset, but in the summary, the manifest and the card.
+    Failed episodes are in no dataset, but in the summary, the manifest and the card. An unfinished run of the same
+    request in ``out`` is continued, a finished one only reported.
 
     Args:
         tasks: to demonstrate. episodes, prompted_episodes: of each, without and with a prompt. out: destination.
         seed_base: episode i has the scene of seed ``seed_base`` + i.
-        perturb: move the arm off its way at random (`datasets.perturbation`); ``action`` is the expert's.
-        policy: the folder of a checkpoint that moves the arm in turn with the expert (`datasets.dagger`).
         formats: ``lerobot``, a LeRobotDataset in ``out``; ``hdf5``, a file per task in the published layout in
             ``out``/hdf5; or both.
         workers: episodes made at a time. executor, executor_options: where (`jobs.executors`); the result is the same.
             On Slurm the call returns when the jobs are submitted, the last of which writes the dataset.
-        resume: continue an unfinished run of the same request in ``out``, and only report a finished one.
         tell: called, before the first episode, with about how large the dataset will be and how long it will take.
-        referent, images, image_size, demonstration_prompt, hold_frames: see `recording.RecordingSettings`.
+        referent, images, image_size, demonstration_prompt, perturb, policy: see `recording.RecordingSettings`.
 
     Raises:
         MemobenchError: nothing to do, ``out`` holds something else or a damaged dataset, another run is writing there,
             its disk has no room (what is finished stays), or an episode could not be run at all (which no later run
             would change).
     """
-    out = Path(out)
     most = episodes if prompted_episodes is None else prompted_episodes
     if not tasks or min(episodes, most, workers) < 1:
         raise MemobenchError(
@@ -116,34 +111,20 @@ def generate(
             "must be at least 1"
         )
     check_executor(executor, executor_options)
-    _check_prompts(tasks, demonstration_prompt)
+    hiding = next((task for task in tasks if task.prompt is not None and not task.prompt.restores), None)
+    if hiding is not None and not demonstration_prompt:
+        raise MemobenchError(
+            f"demonstrations of {hiding.name} were asked for without its demonstration prompt, which hides what is to "
+            "be found; leave out --no-demonstration-prompt"
+        )
     referent = referent_text(referent, drawn=all(task.drawn for task in tasks))
     if perturb and policy is not None:
         raise MemobenchError("the arm is to be moved both at random and by a policy; leave out --perturb or --policy")
-    settings = RecordingSettings(referent, images, image_size, demonstration_prompt, hold_frames, perturb, policy)
-    plan = _Plan(tuple(tasks), episodes, prompted_episodes, seed_base, settings, _checked_formats(formats, settings))
-    if is_finished(out):
-        return _finished(out, plan)
-    check_destination(out)
-    advice = "pass resume=false to start anew or name another folder"
-    with (
-        telling_of_the_disk(out, "what is finished stays, and the same command goes on from there"),
-        episodes_folder(out, plan.request, advice, anew=not resume) as folder,
-    ):
-        jobs = plan.jobs(folder)
-        _tell_of_the_run(plan, jobs, out, workers, tell)
-        complete = run_jobs(
-            jobs,
-            workers=workers,
-            progress=progress,
-            executor=executor,
-            options=options_text(executor, executor_options or {}, NEEDS),
-            logs=_logs(out, executor),
-            finish=partial(_finish_on_slurm, plan, out.absolute(), repo_id),
-        )
-        if not complete:
-            return GenerationSummary(None, summarise([], tasks, out).tasks, submitted=True)
-        return _assemble(plan, jobs, out, repo_id)
+    settings = RecordingSettings(referent, images, image_size, demonstration_prompt, perturb, policy)
+    formats = _checked_formats(formats, settings)
+    plan = _Plan(tuple(tasks), episodes, prompted_episodes, seed_base, settings, formats, repo_id)
+    options = options_text(executor, executor_options or {}, NEEDS)
+    return _carry_out(plan, Path(out), workers, executor=executor, options=options, progress=progress, tell=tell)
 
 
 @dataclass(frozen=True)
@@ -156,6 +137,7 @@ class _Plan:
     seed_base: int
     settings: RecordingSettings
     formats: tuple[str, ...]
+    repo_id: str
 
     def __post_init__(self) -> None:
         names = [task.name for task in self.tasks]
@@ -171,6 +153,7 @@ class _Plan:
             "episodes": self.episodes,
             "prompted_episodes": self.prompted_episodes,
             "seed_base": self.seed_base,
+            "hold_frames": HOLD_FRAMES,
             **asdict(self.settings),
             "policy": self.settings.policy and policy_text(self.settings.policy),
             "task_files": [task_hash(task) for task in self.tasks],
@@ -180,16 +163,13 @@ class _Plan:
     @property
     def made_by(self) -> str:
         """A sentence for the card."""
-        referent, prompts = (
-            self.settings.referent,
-            "" if self.settings.demonstration_prompt else ", demonstration prompts left out",
-        )
+        prompts = "" if self.settings.demonstration_prompt else ", demonstration prompts left out"
         more = "" if self.prompted_episodes is None else f" ({self.prompted_episodes} of those with a prompt)"
         seeds = f"{self.episodes} seeds per task{more} from {self.seed_base} on"
         moved = ", the arm moved off its way at random in two thirds of them" if self.settings.perturb else ""
         if self.settings.policy is not None:
             moved = f", the arm moved by the policy {policy_text(self.settings.policy)} for some steps at a time"
-        return f"`memobench generate`, {seeds}, referent {referent}{prompts}{moved}. {SCRIPTED}"
+        return f"`memobench generate`, {seeds}, referent {self.settings.referent}{prompts}{moved}. {SCRIPTED}"
 
     def jobs(self, folder: Path) -> list[RecordingJob]:
         """Return one job per seed of each task, each with a folder of its own in ``folder``."""
@@ -205,6 +185,47 @@ class _Plan:
 
 
 # --- the run ---
+
+
+def _carry_out(
+    plan: _Plan,
+    out: Path,
+    workers: int = 1,
+    *,
+    executor: str = "processes",
+    options: Mapping[str, Any] | None = None,
+    progress: ProgressCallback | None = None,
+    tell: Callable[[str], None] = lambda _: None,
+) -> GenerationSummary:
+    """Make what is missing, then the dataset; on Slurm that is done by a last job, which calls this again."""
+    if is_finished(out):
+        return _finished(out, plan)
+    check_destination(out)
+    with (
+        telling_of_the_disk(out, "what is finished stays, and the same command goes on from there"),
+        episodes_folder(out, plan.request) as folder,
+    ):
+        jobs = plan.jobs(folder)
+        _tell_of_the_run(plan, jobs, out, workers, tell)
+        complete = run_jobs(
+            jobs,
+            workers=workers,
+            progress=progress,
+            executor=executor,
+            options=options,
+            logs=_logs(out, executor),
+            finish=partial(_carry_out, plan, out.absolute()),
+        )
+        if not complete:
+            return GenerationSummary(None, summarise([], plan.tasks, out).tasks, submitted=True)
+        episodes = [staged(job) for job in jobs]
+        rows = [{**episode.info, "failure": episode.failure} for episode in episodes]
+        summary = summarise(rows, plan.tasks, out)
+        if summary.folder is not None:
+            manifest = {"request": plan.request}
+            assemble(episodes, out, formats=plan.formats, repo_id=plan.repo_id, made_by=plan.made_by, manifest=manifest)
+            shutil.rmtree(out / STAGING)
+        return summary
 
 
 def episodes_of(task: Task, episodes: int, prompted_episodes: int | None) -> int:
@@ -230,45 +251,10 @@ def _checked_formats(formats: Collection[str], settings: RecordingSettings) -> t
     return tuple(name for name in FORMATS if name in given)
 
 
-def _check_prompts(tasks: Sequence[Task], demonstration_prompt: bool) -> None:
-    hiding = next((task for task in tasks if task.prompt is not None and not task.prompt.restores), None)
-    if hiding is not None and not demonstration_prompt:
-        raise MemobenchError(
-            f"demonstrations of {hiding.name} were asked for without its demonstration prompt, which hides what is to "
-            "be found; leave out --no-demonstration-prompt"
-        )
-
-
 def _logs(out: Path, executor: str) -> Path:
     """Slurm's logs outlive the run, and its last job still writes to them when the staging folder is gone."""
     out = out.absolute()
     return out.with_name(f"{out.name}_slurm") if executor == "slurm" else out / STAGING / "logs"
-
-
-def _finish_on_slurm(plan: _Plan, out: Path, repo_id: str) -> None:
-    """Give the same request again when all episodes are there."""
-    generate(
-        plan.tasks,
-        plan.episodes,
-        out,
-        prompted_episodes=plan.prompted_episodes,
-        seed_base=plan.seed_base,
-        **asdict(plan.settings),
-        formats=plan.formats,
-        repo_id=repo_id,
-    )
-
-
-def _assemble(plan: _Plan, jobs: Sequence[RecordingJob], out: Path, repo_id: str) -> GenerationSummary:
-    """Make the dataset of all episodes and leave nothing else."""
-    episodes = [staged(job) for job in jobs]
-    rows = [{**episode.info, "failure": episode.failure} for episode in episodes]
-    summary = summarise(rows, plan.tasks, out)
-    if summary.folder is not None:
-        manifest = {"request": plan.request}
-        assemble(episodes, out, formats=plan.formats, repo_id=repo_id, made_by=plan.made_by, manifest=manifest)
-        shutil.rmtree(out / STAGING)
-    return summary
 
 
 def is_finished(out: Path) -> bool:
@@ -294,28 +280,27 @@ def _finished(out: Path, plan: _Plan) -> GenerationSummary:
     request = plan.request
     earlier = {**earlier, "versions": request["versions"]}  # a finished dataset stays valid under newer versions
     compare_requests(earlier, request, f"{out} already holds a finished dataset", "name another folder")
-    _check_finished(out, plan, manifest)
+    if LEROBOT in plan.formats:
+        check_whole(out)
+    if HDF5 in plan.formats:
+        _check_hdf5(out, Counter(row["task_name"] for row in manifest["episodes"] if row["failure"] is None))
     shutil.rmtree(out / STAGING, ignore_errors=True)
     return summarise(manifest["episodes"], plan.tasks, out)
 
 
-def _check_finished(out: Path, plan: _Plan, manifest: dict[str, Any]) -> None:
-    """Raise where a finished dataset has been damaged since, as far as can be told without reading all of it."""
-    if LEROBOT in plan.formats:
-        check_whole(out)
-    if HDF5 in plan.formats:
-        made = Counter(row["task_name"] for row in manifest["episodes"] if row["failure"] is None)
-        for name, count in made.items():
-            path = out / HDF5_FOLDER / f"{file_name(name, 'a task in the manifest')}{SUFFIX}"
-            try:
-                with PublishedFile(path) as file:
-                    there = len(file.groups())
-            except Unusable as error:
-                raise MemobenchError(f"{path}: {error}; delete {out} and generate again") from None
-            if there != count:
-                raise MemobenchError(
-                    f"{path} has {there} demonstrations, the manifest {count}; delete {out} and generate again"
-                )
+def _check_hdf5(out: Path, made: Mapping[str, int]) -> None:
+    """Raise where a file has not as many demonstrations as were made of its task."""
+    for name, count in made.items():
+        path = out / HDF5_FOLDER / f"{file_name(name, 'a task in the manifest')}{SUFFIX}"
+        try:
+            with PublishedFile(path) as file:
+                there = len(file.groups())
+        except Unusable as error:
+            raise MemobenchError(f"{path}: {error}; delete {out} and generate again") from None
+        if there != count:
+            raise MemobenchError(
+                f"{path} has {there} demonstrations, the manifest {count}; delete {out} and generate again"
+            )
 
 
 def policy_text(checkpoint: str) -> str:

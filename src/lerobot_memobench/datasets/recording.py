@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -25,10 +25,8 @@ from lerobot_memobench.tasks.task import Task
 HOLD_FRAMES = 10
 """Frames kept after success: the last event has a frame, and the expert goes on with what it is at, so that a policy
 which sees less exactly does not stop short of it."""
-
 PERTURBATION = 4
 """Stream of the episode's random numbers that decides how the arm is moved off its way."""
-
 PATIENCE = 40
 """Steps that an episode goes on after the expert is through with its plan: what still falls, slides or has to hold for
 some steps may yet reach the goal. Then it is given up, long before the horizon."""
@@ -39,41 +37,44 @@ Images = dict[str, NDArray[np.uint8]]
 
 @dataclass(frozen=True)
 class RecordingSettings:
-    """Settings of a demonstration beside task and seed."""
+    """Settings of a demonstration beside task and seed.
+
+    Attributes:
+        referent: ``"fixed"``, the task's own goal, or ``"random"``, the seed's; of a strict task ``"drawn"``.
+        images: whether the cameras are recorded. image_size: their height and width, pixels.
+        demonstration_prompt: whether the episode begins with the prompt, where the task has one.
+        perturb: move the arm off its way at random (`datasets.perturbation`).
+        policy: folder of a checkpoint that moves the arm in turn with the expert (`datasets.dagger`).
+    """
 
     referent: str = "fixed"
     images: bool = True
     image_size: int = IMAGE_SIZE
     demonstration_prompt: bool = True
-    hold_frames: int = HOLD_FRAMES
     perturb: bool = False
     policy: str | None = None
 
 
-def record_demonstration(
-    task: Task,
-    seed: int,
-    *,
-    referent: str = "fixed",
-    variant: int = 0,
-    images: bool = True,
-    demonstration_prompt: bool = True,
-    hold_frames: int = HOLD_FRAMES,
-    image_size: int = IMAGE_SIZE,
-    perturb: bool = False,
-    policy: str | None = None,
-) -> Demonstration:
+def record_demonstration(task: Task, seed: int, *, variant: int = 0, **settings: Any) -> Demonstration:
     """Let the scripted expert carry out a task from a seed.
 
     The result may be a failure (``success`` is False): it is then cut off at the horizon. With
     ``referent="random"`` the seed decides the variant; ``variant`` picks one when the referent is fixed.
+
+    Args:
+        settings: fields of `RecordingSettings`.
     """
-    if variant and referent != "fixed":
+    chosen = RecordingSettings(**settings)
+    if variant and chosen.referent != "fixed":
         raise MemobenchError(
-            f"variant {variant} was asked for together with referent={referent!r}; choose variants with 'fixed' only"
+            f"variant {variant} was asked for together with referent={chosen.referent!r}; choose variants with 'fixed' "
+            "only"
         )
-    settings = RecordingSettings(referent, images, image_size, demonstration_prompt, hold_frames, perturb, policy)
-    return record(compiled_episode(task.variant(variant), settings), seed, settings)
+    shown: list[Images] = []
+    demo = record(compiled_episode(task.variant(variant), chosen), seed, chosen, shown.append)
+    if not shown:
+        return demo
+    return replace(demo, images={name: np.stack([images[name] for images in shown]) for name in shown[0]})
 
 
 @lru_cache(maxsize=1)
@@ -82,49 +83,63 @@ def compiled_episode(task: Task, settings: RecordingSettings) -> Episode:
 
     The last task's scene stays compiled: a worker meets a task's seeds one after another.
     """
-    size = settings.image_size
     return Episode(
         task,
         referent=settings.referent,
         demonstration_prompt=settings.demonstration_prompt,
-        render=replace(RenderSettings(), width=size, height=size),
+        render=replace(RenderSettings(), width=settings.image_size, height=settings.image_size),
     )
 
 
-def record(
-    episode: Episode, seed: int, settings: RecordingSettings, show: Callable[[Images], None] | None = None
-) -> Demonstration:
-    """Record an episode. Images go to ``show``, frame by frame, or without it into the demonstration."""
-    if settings.hold_frames < 1:
-        raise MemobenchError(
-            f"hold_frames is {settings.hold_frames}; the last event shows only with at least 1 frame after success"
-        )
+def record(episode: Episode, seed: int, settings: RecordingSettings, show: Callable[[Images], object]) -> Demonstration:
+    """Record an episode; its images go to ``show``, frame by frame, and not into the demonstration."""
     episode.reset(seed)
-    fixture_poses = episode.sim.fixture_poses()
-    tape = _Tape()
+    sim, fixture_poses = episode.sim, episode.sim.fixture_poses()
+    states, proprio, objects, satisfied, actions, executed = [], [], [], [], [], []
     disturb = _disturbance(episode, seed, settings)
     reached = False
     held = idle = 0
-    while held < settings.hold_frames:
-        tape.take(episode)
-        pictures = episode.images() if settings.images else None
+    while held < HOLD_FRAMES:
+        states.append(sim.state())
+        proprio.append(sim.proprio())
+        objects.append(episode.objects())
+        satisfied.append(episode.progress.satisfied)
+        images = episode.images() if settings.images else None
         if isinstance(disturb, Learner):
-            disturb.observe(episode, tape.objects[-1], pictures)
-        if pictures is not None:
-            (show or tape.keep)(pictures)
+            disturb.observe(episode, objects[-1], images)
+        if images is not None:
+            show(images)
         reached = reached or episode.success
-        idle += getattr(episode, "expert_done", False)
+        idle += episode.expert_done
         over = reached or episode.done or idle > PATIENCE
         held += over
         wanted = episode.expert_action()
         acting = disturb is not None and episode.phase == EXECUTION
         done = wanted
         if disturb is not None and acting and not over:
-            done = disturb.executed(wanted, episode.sim.at_detent)
+            done = disturb.executed(wanted, sim.at_detent)
         episode.step(done)
-        tape.executed.append(episode.applied_action)
-        tape.actions.append(np.clip(wanted, -1.0, 1.0) if acting else episode.applied_action)
-    return tape.demonstration(episode, fixture_poses, success=reached and episode.prompt_shown is not False)
+        executed.append(episode.applied_action)
+        actions.append(np.clip(wanted, -1.0, 1.0) if acting else episode.applied_action)
+    assert episode.exec_start is not None
+    labelled, applied = (np.array(found, dtype=np.float32) for found in (actions, executed))
+    return Demonstration(
+        task=episode.task,
+        seed=episode.seed,
+        referent=episode.referent,
+        variant=episode.task.variant_index,
+        states=np.array(states, dtype=np.float64),
+        actions=labelled,
+        executed=None if np.array_equal(labelled, applied) else applied,
+        objects=np.array(objects, dtype=np.float32),
+        proprio=np.array(proprio, dtype=np.float32),
+        images=None,
+        exec_start=episode.exec_start,
+        satisfied=np.array(satisfied, dtype=np.bool_).reshape(len(states), len(episode.task.checkpoints)),
+        success=reached and episode.prompt_shown is not False,
+        fixture_poses=fixture_poses,
+        scene_hash=episode.scene_hash,
+    )
 
 
 def _disturbance(episode: Episode, seed: int, settings: RecordingSettings) -> Perturbation | Learner | None:
@@ -135,67 +150,18 @@ def _disturbance(episode: Episode, seed: int, settings: RecordingSettings) -> Pe
     return Perturbation(rng) if settings.perturb else None
 
 
-@dataclass
-class _Tape:
-    """Columns of the frames so far."""
-
-    states: list[NDArray[np.float64]] = field(default_factory=list)
-    actions: list[NDArray[np.float32]] = field(default_factory=list)
-    executed: list[NDArray[np.float32]] = field(default_factory=list)
-    objects: list[NDArray[np.float32]] = field(default_factory=list)
-    proprio: list[NDArray[np.float32]] = field(default_factory=list)
-    satisfied: list[tuple[bool, ...]] = field(default_factory=list)
-    images: dict[str, list[NDArray[np.uint8]]] = field(default_factory=dict)
-
-    def take(self, episode: Episode) -> None:
-        """Append the frame before the next action."""
-        self.states.append(episode.sim.state())
-        self.proprio.append(episode.sim.proprio())
-        self.objects.append(episode.objects())
-        self.satisfied.append(episode.progress.satisfied)
-
-    def keep(self, images: Images) -> None:
-        """Keep the cameras' frame."""
-        for name, frame in images.items():
-            self.images.setdefault(name, []).append(frame)
-
-    def demonstration(
-        self, episode: Episode, fixture_poses: dict[str, NDArray[np.float64]], *, success: bool
-    ) -> Demonstration:
-        """Return the whole, once the episode is over; the images are given away."""
-        assert episode.exec_start is not None
-        actions, executed = np.array(self.actions, dtype=np.float32), np.array(self.executed, dtype=np.float32)
-        return Demonstration(
-            task=episode.task,
-            seed=episode.seed,
-            referent=episode.referent,
-            variant=episode.task.variant_index,
-            states=np.array(self.states, dtype=np.float64),
-            actions=actions,
-            executed=None if np.array_equal(actions, executed) else executed,
-            objects=np.array(self.objects, dtype=np.float32),
-            proprio=np.array(self.proprio, dtype=np.float32),
-            images={name: np.stack(self.images.pop(name)) for name in list(self.images)} if self.images else None,
-            exec_start=episode.exec_start,
-            satisfied=np.array(self.satisfied, dtype=np.bool_).reshape(len(self.states), len(episode.task.checkpoints)),
-            success=success,
-            fixture_poses=fixture_poses,
-            scene_hash=episode.scene_hash,
-        )
-
-
 def _failure_reason(demo: Demonstration, episode: Episode) -> str | None:
     if episode.fault is not None:
         return episode.fault.why
     if episode.prompt_shown is False:
         return "the demonstration prompt did not show what it had to"
-    if not demo.success:
-        index, count = episode.progress.index, len(demo.task.checkpoints)
-        steps = episode.progress.steps
-        end = "and no longer to be" if episode.lost else "the expert's plan over"
-        how = f"in {episode.horizon} steps" if steps >= episode.horizon else f"by step {steps}, {end}"
-        return f"goal not reached {how} ({index} of {count} checkpoints completed)"
-    return None
+    if demo.success:
+        return None
+    steps = episode.progress.steps
+    end = "and no longer to be" if episode.lost else "the expert's plan over"
+    how = f"in {episode.horizon} steps" if steps >= episode.horizon else f"by step {steps}, {end}"
+    completed = f"{episode.progress.index} of {len(demo.task.checkpoints)} checkpoints completed"
+    return f"goal not reached {how} ({completed})"
 
 
 @dataclass(frozen=True)

@@ -69,60 +69,45 @@ def replay(
         MemobenchError: no such task, the actions are gone, or there are pictures and nothing to draw them with.
     """
     if isinstance(recorded, Demonstration):
-        watch = _PictureCheck(recorded.exec_start, len(recorded), pictures)
-        again = resimulate(recorded.task, recorded.seed, recorded.applied, recorded.exec_start, watch)
-        again = _labelled(again, recorded.actions, referent=recorded.referent, variant=recorded.variant)
-        return (
-            _first_difference(demonstration_columns(recorded), demonstration_columns(again))
-            or watch.difference
-            or _whole_difference(_whole(recorded), _whole(again))
-        )
-    task = (task or get_task(recorded.task_name)).variant(recorded.variant)
-    if "action" not in recorded.columns:
-        raise MemobenchError("its frames have no column 'action' (a tool removed it), so nothing can be played again")
-    wanted = recorded.columns["action"]
-    executed = recorded.columns[EXECUTED_ACTION if EXECUTED_ACTION in recorded.columns else "action"]
+        task, start, wanted, executed = recorded.task, 0, recorded.actions, recorded.applied
+        columns, whole = _columns(recorded, OBJECTS), _whole(recorded)
+    else:
+        task, start = (task or get_task(recorded.task_name)).variant(recorded.variant), recorded.start
+        columns, whole = recorded.columns, recorded.whole
+        if "action" not in columns:
+            raise MemobenchError(
+                "its frames have no column 'action' (a tool removed it), so nothing can be played again"
+            )
+        wanted, executed = columns["action"], columns.get(EXECUTED_ACTION, columns["action"])
     watch = _PictureCheck(recorded.exec_start, len(wanted), pictures)
     again = resimulate(task, recorded.seed, executed, recorded.exec_start, watch)
-    again = _labelled(again, wanted, referent=recorded.referent)
-    columns = demonstration_columns(again, objects_column(recorded.columns))
-    columns = _numbering(task, len(wanted), recorded.start) | columns
-    found = _whole_difference(recorded.whole, _whole(again))
+    again = replace(again, referent=recorded.referent, variant=recorded.variant)
+    if not np.array_equal(wanted, executed):
+        again = replace(again, actions=wanted, executed=again.actions)
+    found = _whole_difference(whole, _whole(again))
     if found is not None and found.column == "digest" and again.executed is not None:
         found = replace(found, column="action (it alone is in the episode's hash and not in its states)")
-    return _first_difference(recorded.columns, columns) or watch.difference or found
-
-
-def _numbering(task: Task, length: int, start: int) -> Columns:
-    """Return what every LeRobotDataset says of the frames of an episode."""
-    frames = np.arange(length)
-    return {
-        "task": [task.language] * length,
+    frames = np.arange(len(wanted))
+    numbering = {
+        "task": [task.language] * len(wanted),
         "frame_index": frames,
         "index": start + frames,
         "timestamp": (frames / CONTROL_HZ).astype(np.float32),
     }
+    replayed = numbering | _columns(again, objects_column(columns))
+    return _first_difference(columns, replayed) or watch.difference or found
 
 
 class _PictureCheck:
-    """Draws some frames while an episode is played again, and keeps the first that was recorded otherwise.
-
-    Args:
-        exec_start: where execution starts. length: frames of the episode.
-        pictures: what was recorded; None where there is nothing to compare.
-    """
+    """Draws some frames while an episode is played again, and keeps the first that was recorded otherwise."""
 
     def __init__(self, exec_start: int, length: int, pictures: Pictures | None) -> None:
         self.difference: Disagreement | None = None
         even = np.linspace(0, length - 1, PICTURES).round().astype(int).tolist()
         self._frames = sorted({*even, min(max(exec_start, 0), length - 1)})
         self._recorded = {} if pictures is None else pictures(self._frames)
-
-    @property
-    def settings(self) -> RenderSettings:
-        """In what size to draw."""
         height, width = next((frames.shape[1:3] for frames in self._recorded.values()), (IMAGE_SIZE, IMAGE_SIZE))
-        return RenderSettings(height=height, width=width)
+        self.settings = RenderSettings(height=height, width=width)
 
     def compare(self, sim: Simulation, frame: int) -> None:
         """Compare the present pictures, where this frame is one of those chosen."""
@@ -197,14 +182,7 @@ def resimulate(
     )
 
 
-def _labelled(again: Demonstration, wanted: NDArray[np.float32], **identity: Any) -> Demonstration:
-    """Say what was to be done in a demonstration that was played again, where something else was done."""
-    if np.array_equal(wanted, again.actions):
-        return replace(again, **identity)
-    return replace(again, actions=wanted, executed=again.actions, **identity)
-
-
-def demonstration_columns(demo: Demonstration, objects: str = OBJECTS) -> Columns:
+def _columns(demo: Demonstration, objects: str) -> Columns:
     """Return states, proprioception and labels under the dataset's column names; ``objects`` is that of the objects."""
     found = {} if demo.objects is None else {objects: demo.objects}
     return {"states": demo.states, "observation.state": demo.proprio, **found, **labels(demo).columns()}

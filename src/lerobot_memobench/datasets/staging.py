@@ -411,38 +411,30 @@ def flush_to_disk(paths: Iterable[Path]) -> None:
 
 
 @contextlib.contextmanager
-def episodes_folder(out: Path, request: dict[str, Any], advice: str, *, anew: bool = False) -> Iterator[Path]:
+def episodes_folder(out: Path, request: dict[str, Any]) -> Iterator[Path]:
     """Hold the destination ``out`` for a run that answers ``request``; yield the folder for its finished episodes.
 
-    Those of an unfinished run of the same request are there already, unless it is to begin ``anew``.
+    Those of an unfinished run of the same request are there already.
 
     Raises:
-        MemobenchError: another run is writing there, or an unfinished one answers another request; ``advice`` ends
-            that sentence.
+        MemobenchError: another run is writing there, or an unfinished one answers another request.
     """
     staging = out / STAGING
     staging.mkdir(parents=True, exist_ok=True)
     with locked(staging, out):
-        folder = staging / "episodes"
-        if anew:
-            shutil.rmtree(folder, ignore_errors=True)
-            (staging / REQUEST_FILE).unlink(missing_ok=True)
         remove_drafts(staging)
-        _check_request(staging, request, out, advice)
+        asked = staging / REQUEST_FILE
+        try:
+            earlier = read_json(asked, dict[str, Any], "delete the folder that it is in to start anew")
+        except FileNotFoundError:
+            write_file(asked, json.dumps(request, indent=1), durable=True)
+        else:
+            advice = f"delete {staging} to start anew or name another folder"
+            compare_requests(earlier, request, f"{out} holds an unfinished run", advice)
+        folder = staging / "episodes"
         folder.mkdir(exist_ok=True)
         clean_temporaries(folder)
         yield folder.absolute()
-
-
-def _check_request(staging: Path, request: dict[str, Any], out: Path, advice: str) -> None:
-    """Remember the request in an unfinished run's folder; raise where it was another one."""
-    path = staging / REQUEST_FILE
-    try:
-        earlier = read_json(path, dict[str, Any], "delete the folder that it is in to start anew")
-    except FileNotFoundError:
-        write_file(path, json.dumps(request, indent=1), durable=True)
-        return
-    compare_requests(earlier, request, f"{out} holds an unfinished run", advice)
 
 
 def compare_requests(earlier: dict[str, Any], request: dict[str, Any], what: str, advice: str) -> None:
