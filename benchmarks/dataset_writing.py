@@ -39,7 +39,13 @@ from lerobot_memobench.datasets.generation import generate
 from lerobot_memobench.datasets.hdf5.reading import PublishedFile
 from lerobot_memobench.datasets.hdf5.writing import write_task_file
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
-from lerobot_memobench.datasets.lerobot_format.layout import dataset_features, image_key
+from lerobot_memobench.datasets.lerobot_format.layout import (
+    EPISODE_INFO,
+    EXECUTED_ACTION,
+    PRIVILEGED,
+    dataset_features,
+    image_key,
+)
 from lerobot_memobench.datasets.recording import record_demonstration
 from lerobot_memobench.datasets.staging import stage_demonstration
 from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ, DEMONSTRATION_SEED
@@ -114,10 +120,11 @@ def frames(demo: Demonstration) -> Iterator[dict[str, np.ndarray]]:
 
 
 def plain_loop(episodes: Iterable[tuple[Demonstration, Iterable[dict[str, np.ndarray]]]], out: Path) -> None:
-    """Write the same columns with LeRobot's own recording loop (which cannot write language rows)."""
+    """Write pictures, state, action and labels with LeRobot's own recording loop (it writes no language rows)."""
     from lerobot.datasets import LeRobotDataset
 
-    features = {key: value for key, value in dataset_features((256, 256)).items() if key != "language_persistent"}
+    others = ("language_persistent", EPISODE_INFO, EXECUTED_ACTION, PRIVILEGED)
+    features = {key: value for key, value in dataset_features((256, 256)).items() if key not in others}
     dataset = LeRobotDataset.create("local/plain", fps=CONTROL_HZ, features=features, root=out, use_videos=True)
     for demo, pictures in episodes:
         columns = {"observation.state": demo.proprio, "action": demo.actions, **labels(demo).columns()}

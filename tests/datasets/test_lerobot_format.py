@@ -196,7 +196,7 @@ def test_policy_features_are_images_state_and_action_only(dataset):
 def test_objects_are_an_input_where_there_are_no_pictures():
     from lerobot.utils.feature_utils import dataset_to_policy_features
 
-    features = dataset_features(None, objects=True)
+    features = dataset_features(None)
     assert "privileged.environment_state" not in features
     assert set(dataset_to_policy_features(features)) == {
         "observation.environment_state",
@@ -303,7 +303,7 @@ def test_card(dataset):
     card = DatasetCard.load(dataset.root / "README.md")
     assert "LeRobot" in card.data.tags
     assert card.data.license == "apache-2.0"
-    for column in dataset_features((SIZE, SIZE), objects=True):
+    for column in dataset_features((SIZE, SIZE)):
         assert f"`{column}`" in card.text
     assert "| object | here | 1 | 2 | 60 | 30.00 | 30.00 | 30.00 | 30 | 0." in card.text
     assert "|  | paper | 5 | 250 | 121,276 | 485.10 | 492.00 | 526.00 | 556 | 44.53 GiB |" in card.text
@@ -340,6 +340,12 @@ def test_failed_writing_leaves_nothing(make_demo, tmp_path):
     with pytest.raises(RuntimeError, match="reader broke"):
         write_dataset(demonstrations(), tmp_path / "ds")
     assert not (tmp_path / "ds").exists()
+
+
+def test_statistics_of_cameras_have_one_order(dataset):
+    """LeRobot puts them together in the order of a set, which differs between processes."""
+    names = list(json.loads((dataset.root / "meta" / "stats.json").read_text()))
+    assert names[-2:] == ["observation.images.image", "observation.images.wrist_image"]
 
 
 def test_mixed_images_are_refused(make_demo, tmp_path):

@@ -36,12 +36,12 @@ INPUTS = {*PICTURES, STATE}
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two short demonstrations as files of others hold them: pictures of the real size, and no objects."""
-    return written(tmp_path_factory.mktemp("others"), pictures=True, objects=False)
+    """Two short demonstrations with pictures of the real size."""
+    return written(tmp_path_factory.mktemp("others"), pictures=True)
 
 
-def written(folder: Path, *, pictures: bool, objects: bool) -> Path:
-    """Two short demonstrations with every column that `memobench generate` writes, as far as asked for."""
+def written(folder: Path, *, pictures: bool) -> Path:
+    """Two short demonstrations with every column that `memobench generate` writes."""
     task = get_task(TASK)
     rng = np.random.default_rng(3)
     satisfied = np.zeros((LENGTH, len(task.checkpoints)), np.bool_)
@@ -59,7 +59,7 @@ def written(folder: Path, *, pictures: bool, objects: bool) -> Path:
             actions=rng.uniform(-1, 1, size=(LENGTH, 7)).astype(np.float32),
             proprio=rng.normal(size=(LENGTH, 8)).astype(np.float32),
             images=dict.fromkeys(("image", "wrist_image"), frames) if pictures else None,
-            objects=rng.normal(size=(LENGTH, SIZE)).astype(np.float32) if objects else None,
+            objects=rng.normal(size=(LENGTH, SIZE)).astype(np.float32),
             exec_start=PROMPT_LENGTH,
             satisfied=satisfied,
             success=True,
@@ -145,7 +145,7 @@ def test_on_pictures(policy: tuple[str, ...], dataset: Path, tmp_path: Path) -> 
 def test_on_objects(policy: tuple[str, ...], pictures: bool, said: str | None, seen: str, tmp_path: Path) -> None:
     """The evaluation shows what the policy was trained on, without a word."""
     of = {"pixels_agent_pos": PICTURES, "environment_state_agent_pos": {OBJECTS}, "both": PICTURES | {OBJECTS}}
-    dataset = written(tmp_path, pictures=pictures, objects=True)
+    dataset = written(tmp_path, pictures=pictures)
     words = policy if said is None else (*policy, f"obs_type={said}")
     protocol = train_and_roll_out(dataset, tmp_path, *words, inputs={STATE} | of[seen])
     assert protocol["obs_type"] == seen

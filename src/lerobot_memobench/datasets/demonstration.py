@@ -45,10 +45,10 @@ class Demonstration:
         satisfied: (T, K) bool, predicate of checkpoint k true at frame t; false throughout the prompt. The
             world is evaluated after a control step, so frame ``exec_start`` (step 0) is false as well.
         success: whether the goal was reached.
+        objects: (T, SIZE) float32, the visible objects (`sim.object_slots`).
         fixture_poses: fixture name to (7,) position and quaternion wxyz.
         model_xml: the scene as MJCF, or empty.
         scene_hash: hash of the initial scene, or empty.
-        objects: (T, SIZE) float32, the visible objects (`sim.object_slots`), or None.
         executed: (T, 7) float32, the actions really applied where the arm was moved off its way; None: ``actions``.
 
     Raises:
@@ -66,10 +66,10 @@ class Demonstration:
     exec_start: int
     satisfied: NDArray[np.bool_]
     success: bool
+    objects: NDArray[np.float32]
     fixture_poses: dict[str, NDArray[np.float64]] = field(default_factory=dict)
     model_xml: str = ""
     scene_hash: str = ""
-    objects: NDArray[np.float32] | None = None
     executed: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
@@ -78,8 +78,7 @@ class Demonstration:
         self._check("actions", self.actions, np.float32, (length, ACTION_DIM))
         self._check("proprio", self.proprio, np.float32, (length, PROPRIO_DIM))
         self._check("satisfied", self.satisfied, np.bool_, (length, len(self.task.checkpoints)))
-        if self.objects is not None:
-            self._check("objects", self.objects, np.float32, (length, None))
+        self._check("objects", self.objects, np.float32, (length, None))
         if self.executed is not None:
             self._check("executed", self.executed, np.float32, (length, ACTION_DIM))
         if self.images is not None:

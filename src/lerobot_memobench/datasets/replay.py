@@ -184,8 +184,12 @@ def resimulate(
 
 def _columns(demo: Demonstration, objects: str) -> Columns:
     """Return states, proprioception and labels under the dataset's column names; ``objects`` is that of the objects."""
-    found = {} if demo.objects is None else {objects: demo.objects}
-    return {"states": demo.states, "observation.state": demo.proprio, **found, **labels(demo).columns()}
+    return {
+        "states": demo.states,
+        "observation.state": demo.proprio,
+        objects: demo.objects,
+        **labels(demo).columns(),
+    }
 
 
 def _whole(demo: Demonstration) -> dict[str, Any]:

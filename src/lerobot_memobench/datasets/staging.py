@@ -149,12 +149,6 @@ class StagedEpisode:
         return bool(self.record["image_stats"])
 
     @property
-    def has_objects(self) -> bool:
-        """Whether visible objects were recorded."""
-        with np.load(self.folder / ARRAYS_FILE, allow_pickle=False) as data:
-            return "objects" in data
-
-    @property
     def hdf5(self) -> Path:
         """The demonstration in the published layout, alone at the root of a file of its own."""
         return self.folder / HDF5_FILE
@@ -294,10 +288,14 @@ class EpisodeStage:
             "image_stats": self._close_videos(),
         }
         if LEROBOT in self._formats:
-            columns: dict[str, Any] = {"states": demo.states, "actions": demo.actions, "proprio": demo.proprio}
-            columns |= {} if demo.objects is None else {"objects": demo.objects}
-            columns |= {} if demo.executed is None else {"executed": demo.executed}
-            columns |= {name: np.asarray(column) for name, column in found.columns().items()}
+            columns: dict[str, Any] = {
+                "states": demo.states,
+                "actions": demo.actions,
+                "proprio": demo.proprio,
+                "objects": demo.objects,
+                **({} if demo.executed is None else {"executed": demo.executed}),
+                **found.columns(),
+            }
             np.savez_compressed(self._temporary / ARRAYS_FILE, **columns)
         if self._hdf5 is not None:
             self._hdf5.finish(demo)

@@ -138,16 +138,13 @@ def _write_lerobot(
     meta = LeRobotDatasetMetadata.create(
         repo_id=repo_id,
         fps=CONTROL_HZ,
-        features=dataset_features(_image_size(written[0]), objects=all(episode.has_objects for episode in written)),
+        features=dataset_features(_image_size(written[0])),
         root=part,
         robot_type=ROBOT_TYPE,
         use_videos=written[0].has_images,
         metadata_buffer_size=len(written) + 1,  # one table: types of its columns come from all episodes
     )
-    frames = _FrameWriter(meta, versions)
-    for episode, place in zip(written, write_videos(meta, written), strict=True):
-        frames.add(episode, place)
-    meta.stats = frames.finish() | _image_statistics(written)
+    meta.stats = _write_frames(meta, written, versions) | _image_statistics(written)
     write_stats(meta.stats, meta.root)
     meta.finalize()
     for path in part.iterdir():
@@ -208,76 +205,66 @@ def _move(build: Path, out: Path) -> None:
 # --- frames, states and metadata ---
 
 
-class _FrameWriter:
-    """Writes data/, states/ and the metadata, one row group per episode, in files of LeRobot's size.
+def _write_frames(
+    meta: LeRobotDatasetMetadata, episodes: Sequence[StagedEpisode], versions: Mapping[str, str] | None
+) -> dict[str, Stats]:
+    """Write data/, states/, videos/ and the metadata; return exact statistics of all numbers.
 
-    The episodes' numbers are kept for the statistics of the whole.
+    Each episode is one row group, in files of LeRobot's size.
     """
-
-    def __init__(self, meta: LeRobotDatasetMetadata, versions: Mapping[str, str] | None) -> None:
-        self._meta, self._versions = meta, versions
-        self._data = ParquetFiles(meta.root, meta.data_path)
-        self._states = ParquetFiles(meta.root, STATES_PATH)
-        self._numbers: dict[str, list[NDArray]] = {}
-        self._episodes = self._frames = 0
-
-    def add(self, episode: StagedEpisode, place: dict[str, Any]) -> None:
-        """Write an episode's rows and its metadata; ``place`` is that of its videos."""
-        meta, number, start = self._meta, self._episodes, self._frames
-        if self._data.size() >= meta.data_files_size_in_mb * 1024**2:
-            self._data.next(meta.chunks_size)
+    data, states = ParquetFiles(meta.root, meta.data_path), ParquetFiles(meta.root, STATES_PATH)
+    numbers: dict[str, list[NDArray]] = {}
+    start = 0
+    for number, (episode, videos) in enumerate(zip(episodes, _write_videos(meta, episodes), strict=True)):
+        if data.size() >= meta.data_files_size_in_mb * 1024**2:
+            data.next(meta.chunks_size)
         if number and number % EPISODES_PER_STATES_FILE == 0:
-            self._states.next(meta.chunks_size)
-        task = str(episode.info["language"])
+            states.next(meta.chunks_size)
+        task, length = str(episode.info["language"]), int(episode.info["frames"])
         meta.save_episode_tasks([task])
         arrays = episode.arrays()
-        record = EpisodeRecord.model_validate(episode.info | {"versions": self._versions})
-        columns = self._columns(arrays, int(episode.info["frames"]), task, record)
-        self._data.write(frames_table(columns, episode, meta.features))
-        self._states.write(states_table(arrays["states"], number))
-        length = len(columns["index"])
-        self._episodes, self._frames = number + 1, start + length
-        place = {
-            "data/chunk_index": self._data.chunk,
-            "data/file_index": self._data.file,
-            "dataset_from_index": start,
-            "dataset_to_index": start + length,
-            **place,
-        }
-        meta.save_episode(number, length, [task], self._count(columns, episode), place | record.in_meta())
-
-    def _columns(self, arrays: dict[str, NDArray], length: int, task: str, record: EpisodeRecord) -> dict[str, NDArray]:
-        task_index = self._meta.get_task_index(task)
-        assert task_index is not None
-        info = np.full(length, "", dtype=object)
-        info[0] = record.in_frames()
-        columns: dict[str, NDArray] = {
-            "observation.state": arrays["proprio"],
-            "action": arrays["actions"],
-            EXECUTED_ACTION: arrays.get("executed", arrays["actions"]),
+        record = EpisodeRecord.model_validate(episode.info | {"versions": versions})
+        numbering = {
             "timestamp": (np.arange(length) / CONTROL_HZ).astype(np.float32),
             "frame_index": np.arange(length),
-            "episode_index": np.full(length, self._episodes),
-            "index": self._frames + np.arange(length),
-            "task_index": np.full(length, task_index),
-            EPISODE_INFO: info,
+            "episode_index": np.full(length, number),
+            "index": start + np.arange(length),
+            "task_index": np.full(length, meta.get_task_index(task)),
         }
-        if "objects" in arrays:
-            columns[objects_column(self._meta.features)] = arrays["objects"]
-        return columns | {key: arrays[key] for key in self._meta.features if key in arrays}
+        columns = _columns(arrays, numbering, record, meta.features)
+        data.write(frames_table(columns, episode, meta.features))
+        states.write(states_table(arrays["states"], number))
+        counted = {key: value for key, value in columns.items() if value.dtype.kind in "bif"}
+        for key, value in counted.items():
+            numbers.setdefault(key, []).append(value)
+        stats = {key: numeric_stats(value) for key, value in counted.items()} | _camera_statistics(episode)
+        place = {
+            "data/chunk_index": data.chunk,
+            "data/file_index": data.file,
+            "dataset_from_index": start,
+            "dataset_to_index": start + length,
+        }
+        meta.save_episode(number, length, [task], stats, place | videos | record.in_meta())
+        start += length
+    data.close()
+    states.close()
+    return {key: numeric_stats(np.concatenate(values)) for key, values in numbers.items()}
 
-    def _count(self, columns: dict[str, NDArray], episode: StagedEpisode) -> dict[str, Stats]:
-        """Return the episode's statistics; keep its numbers."""
-        numbers = {key: value for key, value in columns.items() if value.dtype.kind in "bif"}
-        for key, value in numbers.items():
-            self._numbers.setdefault(key, []).append(value)
-        return {key: numeric_stats(value) for key, value in numbers.items()} | _camera_statistics(episode)
 
-    def finish(self) -> dict[str, Stats]:
-        """End the files; return exact statistics of all numbers."""
-        self._data.close()
-        self._states.close()
-        return {key: numeric_stats(np.concatenate(values)) for key, values in self._numbers.items()}
+def _columns(
+    arrays: Mapping[str, NDArray], numbering: Mapping[str, NDArray], record: EpisodeRecord, features: Collection[str]
+) -> dict[str, NDArray]:
+    info = np.full(len(arrays["actions"]), "", dtype=object)
+    info[0] = record.in_frames()
+    return {
+        "observation.state": arrays["proprio"],
+        "action": arrays["actions"],
+        EXECUTED_ACTION: arrays.get("executed", arrays["actions"]),
+        **numbering,
+        EPISODE_INFO: info,
+        objects_column(features): arrays["objects"],
+        **{key: arrays[key] for key in features if key in arrays},
+    }
 
 
 def numeric_stats(values: NDArray) -> Stats:
@@ -307,8 +294,9 @@ def _image_statistics(episodes: Sequence[StagedEpisode]) -> dict[str, Stats]:
     """Return the statistics of all pixels, over the frames that were sampled of each episode."""
     from lerobot.datasets.compute_stats import aggregate_stats
 
-    found = [_camera_statistics(episode) for episode in episodes if episode.has_images]
-    return aggregate_stats(found) if found else {}
+    found = [_camera_statistics(episode) for episode in episodes]
+    whole = aggregate_stats(found)
+    return {key: whole[key] for key in found[0]}  # LeRobot's come in the order of a set, another one in each process
 
 
 # --- tables and their files ---
@@ -416,40 +404,34 @@ class ParquetFiles:
 # --- videos ---
 
 
-def write_videos(meta: LeRobotDatasetMetadata, episodes: Sequence[StagedEpisode]) -> list[dict[str, Any]]:
+def _write_videos(meta: LeRobotDatasetMetadata, episodes: Sequence[StagedEpisode]) -> list[dict[str, Any]]:
     """Join the episodes' videos below the dataset's root; return each episode's place in them."""
     from lerobot.datasets.io_utils import write_info
-
-    places: list[dict[str, Any]] = [{} for _ in episodes]
-    for camera in CAMERAS if meta.video_keys else ():
-        _write_camera(meta, episodes, camera, places)
-        write_info(meta.info, meta.root)
-    return places
-
-
-def _write_camera(
-    meta: LeRobotDatasetMetadata, episodes: Sequence[StagedEpisode], camera: str, places: list[dict[str, Any]]
-) -> None:
     from lerobot.datasets.utils import update_chunk_file_indices
 
-    key, chunk, file = image_key(camera), 0, 0
+    places: list[dict[str, Any]] = [{} for _ in episodes]
     limit = meta.video_files_size_in_mb * 1024**2
-    for group in _grouped([episode.video(camera).stat().st_size for episode in episodes], limit):
-        assert meta.video_path is not None
-        path = meta.root / meta.video_path.format(video_key=key, chunk_index=chunk, file_index=file)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        join_videos([(episodes[i].video(camera), int(episodes[i].info["frames"])) for i in group], path)
-        frames = 0
-        for i in group:
-            start, frames = frames, frames + int(episodes[i].info["frames"])
-            places[i] |= {
-                f"videos/{key}/chunk_index": chunk,
-                f"videos/{key}/file_index": file,
-                f"videos/{key}/from_timestamp": start / CONTROL_HZ,
-                f"videos/{key}/to_timestamp": frames / CONTROL_HZ,
-            }
-        chunk, file = update_chunk_file_indices(chunk, file, meta.chunks_size)
-        meta.features[key].setdefault("info", video_info(path))
+    for camera in CAMERAS if meta.video_keys else ():
+        key, chunk, file = image_key(camera), 0, 0
+        videos = [(episode.video(camera), int(episode.info["frames"])) for episode in episodes]
+        for group in _grouped([video.stat().st_size for video, _ in videos], limit):
+            assert meta.video_path is not None
+            path = meta.root / meta.video_path.format(video_key=key, chunk_index=chunk, file_index=file)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            join_videos([videos[i] for i in group], path)
+            frames = 0
+            for i in group:
+                start, frames = frames, frames + videos[i][1]
+                places[i] |= {
+                    f"videos/{key}/chunk_index": chunk,
+                    f"videos/{key}/file_index": file,
+                    f"videos/{key}/from_timestamp": start / CONTROL_HZ,
+                    f"videos/{key}/to_timestamp": frames / CONTROL_HZ,
+                }
+            chunk, file = update_chunk_file_indices(chunk, file, meta.chunks_size)
+            meta.features[key].setdefault("info", video_info(path))
+        write_info(meta.info, meta.root)
+    return places
 
 
 def _grouped(sizes: Sequence[int], limit: float) -> list[list[int]]:

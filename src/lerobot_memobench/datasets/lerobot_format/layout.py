@@ -80,7 +80,7 @@ def objects_column(names: Collection[str]) -> str:
     return PRIVILEGED if PRIVILEGED in names else OBJECTS
 
 
-def dataset_features(image_size: tuple[int, int] | None, *, objects: bool = False) -> dict[str, dict[str, Any]]:
+def dataset_features(image_size: tuple[int, int] | None) -> dict[str, dict[str, Any]]:
     """Return LeRobot's description of the columns; ``image_size`` is (height, width), None without images."""
     from lerobot_memobench.sim.object_layout import SIZE
 
@@ -91,8 +91,7 @@ def dataset_features(image_size: tuple[int, int] | None, *, objects: bool = Fals
     if image_size is not None:
         for camera in CAMERAS:
             features[image_key(camera)] = feature("video", (*image_size, 3), ["height", "width", "channels"])
-    if objects:
-        features[OBJECTS if image_size is None else PRIVILEGED] = feature("float32", (SIZE,))
+    features[OBJECTS if image_size is None else PRIVILEGED] = feature("float32", (SIZE,))
     completed = [f"checkpoint_{k}" for k in range(MAX_CHECKPOINTS)]
     return features | {
         "observation.state": feature("float32", (PROPRIO_DIM,), PROPRIO_NAMES),
