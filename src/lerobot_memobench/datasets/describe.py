@@ -173,7 +173,7 @@ def _draw_types(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     types = [name for name in FAMILIES if any(row["memory_type"] == name for row in rows)]
     lengths = {name: np.array([row["length"] for row in rows if row["memory_type"] == name]) for name in types}
     ours = [(lengths[name].mean(), np.percentile(lengths[name], 95)) for name in types]
-    theirs = [(FAMILIES[name].mean, FAMILIES[name].p95) for name in types]
+    theirs = [(FAMILIES[name]["mean"], FAMILIES[name]["p95"]) for name in types]
     for shift, colour, marker, source, spans in (
         (-0.12, OURS, "o", "here", ours),
         (0.12, THEIRS, "s", "paper", theirs),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,26 @@ from lerobot_memobench.paper import raw_tables
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 
 CARD_FILE = "README.md"
-LICENSE = "apache-2.0"
+FRONT_MATTER = """\
+---
+license: apache-2.0
+task_categories:
+- robotics
+tags:
+- LeRobot
+- memobench
+- memory
+- manipulation
+- simulation
+- mujoco
+language:
+- en
+size_categories:
+- {bucket}
+configs:
+- config_name: default
+  data_files: data/*/*.parquet
+---"""
 MADE_BY = "## How it was made"
 """Heading of a card of ours; LeRobot's has none."""
 EDITED = (
@@ -78,25 +96,8 @@ EPISODE_COLUMNS = {
 }
 
 
-@dataclass(frozen=True)
-class FamilyFigures:
-    """A row of the paper's appendix, "Family level statistics"; storage is that of its HDF5 files, GiB."""
-
-    tasks: int
-    episodes: int
-    steps: int
-    mean: float
-    median: float
-    p95: float
-    max: int
-    storage: float
-
-
-FAMILIES: dict[str, FamilyFigures] = {
-    name: FamilyFigures(**{key: value for key, value in row.items() if key != "gib"}, storage=row["gib"])
-    for name in (*MEMORY_TYPES, "total")
-    for row in [raw_tables()["demo_statistics"][name]]
-}
+FAMILIES: dict[str, dict[str, Any]] = {name: raw_tables()["demo_statistics"][name] for name in (*MEMORY_TYPES, "total")}
+"""Rows of the paper's appendix, "Family level statistics"; ``gib`` is the size of its HDF5 files."""
 LENGTH_BUCKETS: dict[tuple[int, int | None], int] = {
     (int(low), int(high) + 1 if high else None): count
     for name, count in raw_tables()["length_buckets"].items()
@@ -121,10 +122,12 @@ def write_card(
         (made_by or f"Written by `lerobot_memobench`. {SCRIPTED}") + " `manifest.json` holds a hash of every episode's "
         "states, actions and labels; `states/` holds the simulator's states (1 + nq + nv numbers per frame).",
         _failures(failed, len(episodes)),
-        _left_out(left_out),
     ]
+    if left_out:
+        made.append(f"**Left out ({len(left_out)}):**\n\n" + "\n".join(f"- {problem}" for problem in left_out))
     infos = [episode.info for episode in solved]
-    text = _card(infos, failed, features, storage_of(folder, solved), made, _loading(repo_id, "<this folder>"))
+    storage = _storage(folder, infos, [episode.video_bytes for episode in solved])
+    text = _card(infos, failed, features, storage, made, _loading(repo_id, "<this folder>"))
     (folder / CARD_FILE).write_text(text, encoding="utf-8")
 
 
@@ -148,7 +151,7 @@ def card_from_frames(folder: Path, rows: Sequence[Mapping[str, Any]], repo_id: s
     infos = [{**row, "frames": row["length"]} for row in rows]
     loading = _loading(repo_id or "local/demonstrations", None if repo_id else "<this folder>")
     made = [f"{EDITED} Storage is shared out by frames."]
-    return _card(infos, [], read_info(folder)["features"], storage_by_frames(folder, infos), made, loading)
+    return _card(infos, [], read_info(folder)["features"], _storage(folder, infos), made, loading)
 
 
 def hub_card(folder: Path, repo_id: str) -> str:
@@ -177,12 +180,12 @@ def _card(
     loading: str,
 ) -> str:
     parts = [
-        _front_matter(len(infos)),
+        FRONT_MATTER.format(bucket="n<1K" if len(infos) < 1000 else "1K<n<10K"),
         "# MEMOBench demonstrations",
         *_introduction(infos, loading),
         MADE_BY,
         *made,
-        *statistics_section(infos, failed, storage),
+        *_statistics(infos, failed, storage),
         "## Columns",
         *_columns(features),
         "## Limitations",
@@ -191,28 +194,6 @@ def _card(
         "Apache-2.0: the demonstrations, and `lerobot_memobench`, which made them.",
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
-
-
-def _front_matter(count: int) -> str:
-    bucket = "n<1K" if count < 1000 else "1K<n<10K"
-    return "\n".join(
-        [
-            "---",
-            f"license: {LICENSE}",
-            "task_categories:",
-            "- robotics",
-            "tags:",
-            *(f"- {tag}" for tag in ("LeRobot", "memobench", "memory", "manipulation", "simulation", "mujoco")),
-            "language:",
-            "- en",
-            "size_categories:",
-            f"- {bucket}",
-            "configs:",
-            "- config_name: default",
-            "  data_files: data/*/*.parquet",
-            "---",
-        ]
-    )
 
 
 def _loading(repo_id: str, root: str | None) -> str:
@@ -272,29 +253,22 @@ def _failures(failed: Sequence[StagedEpisode], asked: int) -> str:
     return f"**{len(failed)} of {asked} seeds asked for have no demonstration here:**\n\n" + "\n".join(lines)
 
 
-def _left_out(problems: Sequence[str]) -> str:
-    if not problems:
-        return ""
-    return f"**Left out ({len(problems)}):**\n\n" + "\n".join(f"- {problem}" for problem in problems)
-
-
 # --- statistics, beside the paper's ---
 
 
-def statistics_section(
+def _statistics(
     written: Sequence[dict[str, Any]], failed: Sequence[StagedEpisode], storage: dict[str, float]
 ) -> list[str]:
-    """Return the paragraphs of the card's statistics, from what is known of each episode."""
     return [
         "## Statistics",
         "Steps are frames: control steps of 50 ms, demonstration prompt included. The paper's rows are those of its "
         "demonstrations (appendix, family level statistics), stored as HDF5; storage here is that of the "
         "LeRobotDataset: videos as they are, everything else in proportion to the frames.",
-        lengths_table(written, storage),
+        _lengths_table(written, storage),
         _prompts(written),
         "How many episodes have which length, in steps (paper: appendix, distribution of lengths):",
-        buckets_table(written),
-        tasks_table(written, failed),
+        _buckets_table(written),
+        _tasks_table(written, failed),
     ]
 
 
@@ -307,30 +281,22 @@ def _prompts(infos: Sequence[dict[str, Any]]) -> str:
     return f"Of these steps the demonstration prompt takes, on average, {' and '.join(parts)}." if parts else ""
 
 
-def storage_of(folder: Path, episodes: Sequence[StagedEpisode]) -> dict[str, float]:
+def _storage(folder: Path, infos: Sequence[Mapping[str, Any]], videos: Sequence[int] | None = None) -> dict[str, float]:
     """Return bytes per memory type, and their ``total``; what belongs to no episode is shared out by frames.
 
     The manifest is not counted: it says what was asked for, and the same episodes are of the same size.
+
+    Args:
+        videos: bytes of each episode's videos; None where nobody knows them.
     """
+    videos = [0] * len(infos) if videos is None else videos
     kept = [folder / part for part in ("data", "meta", "states", "videos")]
     total = sum(path.stat().st_size for part in kept for path in part.rglob("*") if path.is_file())
-    videos = sum(episode.video_bytes for episode in episodes)
-    frames = sum(episode.info["frames"] for episode in episodes)
-    found: dict[str, float] = {"total": float(total)}
-    for episode in episodes:
-        share = episode.video_bytes + (total - videos) * episode.info["frames"] / frames
-        found[episode.info["memory_type"]] = found.get(episode.info["memory_type"], 0.0) + share
-    return found
-
-
-def storage_by_frames(folder: Path, infos: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Return the same of a dataset of which only its files are known: all of it is shared out by frames."""
-    kept = [path for part in ("data", "meta", "videos") for path in (folder / part).rglob("*") if path.is_file()]
-    total = sum(path.stat().st_size for path in kept)
     frames = sum(info["frames"] for info in infos)
     found = {"total": float(total)}
-    for info in infos:
-        found[info["memory_type"]] = found.get(info["memory_type"], 0.0) + total * info["frames"] / frames
+    for info, own in zip(infos, videos, strict=True):
+        share = own + (total - sum(videos)) * info["frames"] / frames
+        found[info["memory_type"]] = found.get(info["memory_type"], 0.0) + share
     return found
 
 
@@ -340,50 +306,43 @@ def ordered_types(infos: Sequence[Mapping[str, Any]]) -> list[str]:
     return [name for name in FAMILIES if name in there] + sorted(there - set(FAMILIES))
 
 
-def lengths_table(infos: Sequence[dict[str, Any]], storage: dict[str, float]) -> str:
+def _lengths_table(infos: Sequence[dict[str, Any]], storage: dict[str, float]) -> str:
     """Return episodes, steps and storage per memory type, and the bytes per frame."""
     rows = []
     for name in [*ordered_types(infos), "total"]:
         chosen = [info for info in infos if name in (info["memory_type"], "total")]
-        rows.append([name, "here", *_lengths(chosen), _bytes(storage.get(name, 0.0))])
+        rows.append([name, "here", *_lengths(_figures(chosen)), _bytes(storage.get(name, 0.0))])
         if name in FAMILIES:
-            rows.append(["", "paper", *_published_lengths(FAMILIES[name])])
+            rows.append(["", "paper", *_lengths(FAMILIES[name]), f"{FAMILIES[name]['gib']:.2f} GiB"])
     header = ["memory type", "", "tasks", "episodes", "steps", "mean", "median", "P95", "max", "storage"]
     frames = sum(info["frames"] for info in infos)
     return markdown(header, rows) + f"\n\n{storage['total'] / frames:,.0f} bytes per frame."
 
 
-def _lengths(infos: Sequence[dict[str, Any]]) -> list[str]:
+def _figures(infos: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return of episodes what `FAMILIES` holds of the paper's."""
     lengths = np.array([info["frames"] for info in infos])
-    tasks = len({info["task_name"] for info in infos})
-    figures = [lengths.mean(), np.median(lengths), np.percentile(lengths, 95)]
-    return [
-        f"{tasks}",
-        f"{len(infos):,}",
-        f"{lengths.sum():,}",
-        *(f"{x:,.2f}" for x in figures),
-        f"{lengths.max():,}",
-    ]
+    return {
+        "tasks": len({info["task_name"] for info in infos}),
+        "episodes": len(infos),
+        "steps": lengths.sum(),
+        "mean": lengths.mean(),
+        "median": np.median(lengths),
+        "p95": np.percentile(lengths, 95),
+        "max": lengths.max(),
+    }
 
 
-def _published_lengths(paper: FamilyFigures) -> list[str]:
-    figures = [paper.mean, paper.median, paper.p95]
-    return [
-        f"{paper.tasks}",
-        f"{paper.episodes:,}",
-        f"{paper.steps:,}",
-        *(f"{x:,.2f}" for x in figures),
-        f"{paper.max:,}",
-        f"{paper.storage:.2f} GiB",
-    ]
+def _lengths(row: Mapping[str, Any]) -> list[str]:
+    whole, parts = ("tasks", "episodes", "steps"), ("mean", "median", "p95")
+    return [*(f"{row[key]:,}" for key in whole), *(f"{row[key]:,.2f}" for key in parts), f"{row['max']:,}"]
 
 
 def _bytes(size: float) -> str:
     return f"{size / 1024**3:.2f} GiB" if size >= 0.1 * 1024**3 else f"{size / 1024**2:.2f} MiB"
 
 
-def buckets_table(infos: Sequence[dict[str, Any]]) -> str:
-    """Return how many episodes have which length, beside the paper's."""
+def _buckets_table(infos: Sequence[dict[str, Any]]) -> str:
     lengths = np.array([info["frames"] for info in infos])
     published = sum(LENGTH_BUCKETS.values())
     rows = []
@@ -395,8 +354,7 @@ def buckets_table(infos: Sequence[dict[str, Any]]) -> str:
     return markdown(["length", "episodes here", "share", "episodes in the paper", "share"], rows)
 
 
-def tasks_table(infos: Sequence[dict[str, Any]], failed: Sequence[StagedEpisode]) -> str:
-    """Return what was solved of each task, and the seeds that were not."""
+def _tasks_table(infos: Sequence[dict[str, Any]], failed: Sequence[StagedEpisode]) -> str:
     rows = []
     for name in sorted({info["task_name"] for info in infos} | {e.info["task_name"] for e in failed}):
         chosen = [info for info in infos if info["task_name"] == name]
