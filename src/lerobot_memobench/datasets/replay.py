@@ -78,7 +78,7 @@ def replay(
             raise MemobenchError(
                 "its frames have no column 'action' (a tool removed it), so nothing can be played again"
             )
-        wanted, executed = columns["action"], columns.get(EXECUTED_ACTION, columns["action"])
+        wanted, executed = columns["action"], columns[EXECUTED_ACTION if EXECUTED_ACTION in columns else "action"]
     watch = _PictureCheck(recorded.exec_start, len(wanted), pictures)
     again = resimulate(task, recorded.seed, executed, recorded.exec_start, watch)
     again = replace(again, referent=recorded.referent, variant=recorded.variant)
