@@ -77,8 +77,8 @@ class Actor:
 
     def replan(self) -> None:
         """One call that takes in an observation and plans."""
-        for queue in self.policy.queues.queues:
-            queue.clear()
+        for row in self.policy.rollout.rows:
+            row.queue.clear()
         self._tick()
         self.policy.select_action(self.batch)
         if self.batch["observation.state"].is_cuda:
@@ -86,14 +86,14 @@ class Actor:
 
     def between(self) -> None:
         """One call that acts by the plan it has."""
-        if not self.policy.queues.queues[0]:
+        if not self.policy.rollout.rows[0].queue:
             self.replan()
         self._tick()
         self.policy.select_action(self.batch)
 
     def bytes_per_frame(self) -> float:
         """Bytes one remembered frame takes, as held."""
-        kept = self.policy.history.rows[0].kept
+        kept = self.policy.rollout.rows[0].kept
         return sum(frame.tokens.nbytes for frame in kept) / len(kept)
 
 

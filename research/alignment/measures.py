@@ -23,7 +23,7 @@ from torch.utils.data import default_collate
 from lerobot_memobench.datasets.feature_cache.reading import FrameLookup, RecordedFrames
 from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, list_episodes
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem.alignment import masked_mean
+from lerobot_memobench.policies.memobench_mem.alignment import SemanticAlignment, masked_mean
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, MASK, STEPS, TOKENS, MemoryBatch
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.sampler import TrainingRun, item
@@ -299,8 +299,11 @@ class Measures:
             newest[torch.arange(len(newest)), seen.mask.sum(dim=1) - 1] = True
             last = repeat(newest, "b f -> b (f p)", p=memory.shape[1] // newest.shape[1])
             found = {"memory": masked_mean(memory, mask), "last_frame": masked_mean(memory, last)}
-            if policy.alignment is not None:
-                found["head"] = policy.alignment.answer(memory, mask, last)
+            head = policy.alignment
+            if isinstance(head, SemanticAlignment):
+                found["head"] = head.embed(memory, mask)
+            elif head is not None:  # of frames
+                found["head"] = head.project(masked_mean(memory, last))
             for name, vectors in found.items():
                 parts.setdefault(name, []).append(vectors.cpu())
         return {name: torch.cat(vectors) for name, vectors in parts.items()}

@@ -13,7 +13,7 @@ from lerobot.rollout.inference.rtc import supports_rtc_inference
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MASK, STEPS
-from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import ActionQueues
+from lerobot_memobench.policies.memobench_mem.rollout import Row
 from tests.support.object_dataset import make_object_dataset
 from tests.support.small_policy import made_for_training
 
@@ -23,12 +23,11 @@ AXIS = torch.tensor([0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0])
 
 def carried_out(*states: torch.Tensor | None) -> list[int]:
     """Return how much is carried out of plans of 16 actions, made one after another where the robot is so."""
-    plans, counts = ActionQueues(7), []
-    plans.resize(1)
+    row, counts = Row(), []
     for state in states:
-        plans.begin(0, torch.zeros(16, 7), 6, state)
-        counts.append(len(plans.queues[0]))
-        plans.queues[0].clear()
+        row.begin_chunk(torch.zeros(16, 7), 6, state)
+        counts.append(len(row.queue))
+        row.queue.clear()
     return counts
 
 
@@ -51,12 +50,11 @@ def test_a_hand_or_a_finger_that_moves_carries_out_some(where: torch.Tensor) -> 
 
 def test_without_a_state_and_after_a_plan_was_dropped_it_is_some() -> None:
     assert carried_out(None, None) == [6, 6]
-    plans = ActionQueues(7)
-    plans.resize(1)
-    plans.begin(0, torch.zeros(16, 7), 6, STATE)
-    plans.drop(0)
-    plans.begin(0, torch.zeros(16, 7), 6, STATE)
-    assert len(plans.queues[0]) == 6
+    row = Row()
+    row.begin_chunk(torch.zeros(16, 7), 6, STATE)
+    row.drop_chunk()
+    row.begin_chunk(torch.zeros(16, 7), 6, STATE)
+    assert len(row.queue) == 6
 
 
 # -- one thread -------------------------------------------------------------------------------------------------------
@@ -177,13 +175,14 @@ def test_a_memory_that_is_offered_every_frame_is_that_of_training(root: Path, cl
         if step % 6 == 0:
             plans.append(policy.predict_action_chunk(batch))
     trained = before(torch.utils.data.default_collate([dataset[12]]))
-    _, steps, mask = policy.history.gather([0])
+    _, steps, mask = policy.rollout.gather([0])
     assert torch.equal(steps, trained[STEPS])
     assert torch.equal(mask, trained[MASK])
     policy.reset()
     stepwise = []
     for step in range(13):  # as LeRobot's synchronous rollout
-        policy.queues.queues = []
+        for row in policy.rollout.rows:
+            row.queue.clear()
         action = policy.select_action(before(observation(dataset, step)))
         if step % 6 == 0:
             stepwise.append(action)

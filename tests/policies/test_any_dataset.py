@@ -26,7 +26,8 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import FrameSampling
-from lerobot_memobench.policies.memobench_mem.memory.mechanism import Frame, MemoryMechanism, RolloutMemory
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import Frame, MemoryMechanism
+from lerobot_memobench.policies.memobench_mem.rollout import Rollout
 from lerobot_memobench.run.lerobot_commands import call_lerobot
 
 IMAGES, STATE, ACTION = "observation.images.", "observation.state", "action"
@@ -126,7 +127,7 @@ def trained_and_acting(robot: Foreign, size: str, tmp_path: Path) -> Any:
     assert actions.shape == (5, robot.action)
     assert actions.isfinite().all()
     assert policy.config.memory_camera == next(iter(robot.cameras))
-    assert [frame.step for frame in policy.history.rows[0].kept] == [
+    assert [frame.step for frame in policy.rollout.rows[0].kept] == [
         step for step in range(5) if step % policy.config.memory_stride == 0
     ]
     return policy
@@ -251,7 +252,7 @@ def test_history_without_reset_is_bounded(caplog: pytest.LogCaptureFixture, monk
     assert FrameSampling.capacity == 8192
     monkeypatch.setattr(FrameSampling, "capacity", 16)
     mechanism = FrameSampling(4)
-    history = RolloutMemory(mechanism, stride=1)
+    history = Rollout(mechanism, stride=1)
     with caplog.at_level(logging.WARNING):
         for step in range(50):
             history.observe([(1, step)], lambda rows, step=step: torch.full((1, 1, 1), step))
@@ -260,13 +261,12 @@ def test_history_without_reset_is_bounded(caplog: pytest.LogCaptureFixture, monk
     assert len(caplog.messages) == 1
     assert "more than 16 remembered frames, of which the latest are kept; call policy.reset()" in caplog.text
 
-    class Episode:
-        def load(self, slots: Any) -> list[Frame]:
-            return [Frame(slot, torch.full((1, 1), slot)) for slot in slots]
+    def load(slots: Any) -> list[Frame]:
+        return [Frame(slot, torch.full((1, 1), slot)) for slot in slots]
 
     for slot in (3, 15, 16, 49):  # as in training
-        wanted = MemoryMechanism.recall(mechanism, Episode(), slot)
-        assert [frame.step for frame in mechanism.recall(Episode(), slot)] == [frame.step for frame in wanted]
+        wanted = MemoryMechanism.recall(mechanism, load, slot)
+        assert [frame.step for frame in mechanism.recall(load, slot)] == [frame.step for frame in wanted]
 
 
 # --- the benchmark between updates ---

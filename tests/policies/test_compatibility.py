@@ -378,7 +378,7 @@ def _remember(policy: MemobenchMemPolicy, observations: list[dict[str, Any]]) ->
     policy.reset()
     for observation in observations:
         policy.observe(observation)
-    return policy.history.gather([0])
+    return policy.rollout.gather([0])
 
 
 def test_a_frame_that_shows_an_earlier_step_is_not_remembered() -> None:

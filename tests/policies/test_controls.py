@@ -232,7 +232,7 @@ def test_without_memory_fusion_it_is_plain_pi05(dataset_root: Path, tmp_path: Pa
     for frame in range(3):
         action = evaluated.select_action(before(_observation(dataset, frame, "put the bowl away")))
         assert torch.isfinite(action).all()
-    assert all(not row.kept for row in evaluated.history.rows)
+    assert all(not row.kept for row in evaluated.rollout.rows)
 
 
 @pytest.mark.parametrize(

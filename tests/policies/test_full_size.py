@@ -17,9 +17,10 @@ from torch import Tensor
 
 from benchmarks.random_weights import fill_buffers, random_policy
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.memory.mechanism import Frame, Row
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import Frame
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
+from lerobot_memobench.policies.memobench_mem.rollout import Row
 
 CAMERA = "observation.images.image"
 FRAMES, PROMPT, CHUNK = 32, 60, 50
@@ -106,11 +107,11 @@ def _plan(policy: MemobenchMemPolicy, batch: dict[str, Tensor]) -> Tensor:
     tokens, steps, _ = _memory(batch)
     kept = [Frame(int(step), seen) for step, seen in zip(steps[0], tokens[0], strict=True)]
     policy.reset()
-    policy.history.rows = [Row(clock=(1, kept[-1].step), position=kept[-1].step, kept=kept)]
+    policy.rollout.rows = [Row(clock=(1, kept[-1].step), position=kept[-1].step, kept=kept)]
     keys = (CAMERA, "observation.state", OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK)
     observation = {key: batch[key] for key in keys} | {"observation.step": torch.tensor([[kept[-1].step + 1.0]])}
     planned = policy.predict_action_chunk(observation)
-    assert len(policy.history.rows[0].kept) == FRAMES + 1
+    assert len(policy.rollout.rows[0].kept) == FRAMES + 1
     return planned
 
 

@@ -171,7 +171,7 @@ def test_rollout_memory_equals_the_gathered_one(trained: Any) -> None:
     policy.reset()
     for frame in range(23):
         policy.observe(before(_join(_observation(dataset, 1, frame), _observation(dataset, 2, frame))))
-    tokens, steps, mask = policy.history.gather([0, 1])
+    tokens, steps, mask = policy.rollout.gather([0, 1])
     batch = before(batch_of(dataset, [40 + 22, 63 + 22]))
     assert torch.equal(steps, batch["memory.steps"])
     assert torch.equal(mask, batch["memory.mask"])

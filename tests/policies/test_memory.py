@@ -12,18 +12,18 @@ from hypothesis import strategies as st
 
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MEMORY_FUSIONS, MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory import MECHANISMS, make_mechanism
-from lerobot_memobench.policies.memobench_mem.memory.encoder import MemoryEncoder, position_features
 from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import FrameSampling, sample_frames
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     MASK,
     STEPS,
     TOKENS,
     Frame,
+    MemoryEncoder,
     MemoryMechanism,
-    RolloutMemory,
 )
 from lerobot_memobench.policies.memobench_mem.network import FUSIONS
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import GatherMemoryProcessorStep
+from lerobot_memobench.policies.memobench_mem.rollout import Rollout
 
 P, D = 3, 2
 
@@ -56,8 +56,8 @@ def test_training_reads_what_a_rollout_reads(name: str, frames: int, length: int
     for slot, frame in enumerate(episode.frames):
         mechanism.write(kept, frame)
         read = mechanism.read(kept)
-        assert same(mechanism.recall(episode, slot), read)
-        assert same(MemoryMechanism.recall(mechanism, episode, slot), read)
+        assert same(mechanism.recall(episode.load, slot), read)
+        assert same(MemoryMechanism.recall(mechanism, episode.load, slot), read)
         assert len(read) <= mechanism.frames <= frames
         assert [frame.step for frame in read] == sorted(frame.step for frame in read)
         assert mechanism.capacity is None or len(kept) <= mechanism.capacity
@@ -81,7 +81,7 @@ def test_rows_of_a_rollout_and_the_cache_agree(name: str) -> None:
         def tokens(self, number: int, slots: Sequence[int]) -> torch.Tensor:
             return torch.stack([frame.tokens for frame in episode.load(slots)])
 
-    history = RolloutMemory(mechanism, stride)
+    history = Rollout(mechanism, stride)
     step = GatherMemoryProcessorStep(frames=mechanism.frames, memory=name)
     for now in range(length):
         history.observe([(1, now)], lambda rows, now=now: episode.frames[now // stride].tokens[None])
@@ -96,7 +96,7 @@ def test_rows_of_a_rollout_and_the_cache_agree(name: str) -> None:
 
 def test_frame_sampling_loads_no_more_than_it_reads() -> None:
     episode = Recorded(90, 1)
-    make_mechanism("frame_sampling", 8).recall(episode, 80)
+    make_mechanism("frame_sampling", 8).recall(episode.load, 80)
     assert episode.loaded == 8
 
 
@@ -156,7 +156,7 @@ def acting(*steps: int) -> list[tuple[int, int]]:
 
 
 def test_rows_start_freeze_and_stay_apart() -> None:
-    memory, new, old = RolloutMemory(FrameSampling(4), stride=1), True, False
+    memory, new, old = Rollout(FrameSampling(4), stride=1), True, False
     assert memory.observe(acting(0, 0), _encode([1.0, 2.0])) == ([0, 0], [new, new], [False, False])
     assert memory.observe(acting(1, 0), _encode([3.0, 99.0])) == ([1, 0], [old, old], [False, True])  # row 1 frozen
     assert memory.observe(acting(2, 1), _encode([5.0, 4.0])) == ([2, 1], [old, old], [False, False])
@@ -171,7 +171,7 @@ def test_rows_start_freeze_and_stay_apart() -> None:
 
 
 def test_stride_and_sampling_of_a_long_history() -> None:
-    memory = RolloutMemory(FrameSampling(4), stride=3)
+    memory = Rollout(FrameSampling(4), stride=3)
     for step in range(20):
         memory.observe(acting(step), _encode([float(step)]))
     tokens, steps, mask = memory.gather([0])
@@ -183,7 +183,7 @@ def test_stride_and_sampling_of_a_long_history() -> None:
 
 
 def test_a_frame_that_was_not_offered_is_noticed() -> None:
-    memory = RolloutMemory(FrameSampling(4), stride=4)
+    memory = Rollout(FrameSampling(4), stride=4)
     for step in (0, 3, 4, 4, 6, 8):  # what lies between two frames that are written may be left out
         memory.observe(acting(step, 1), _encode([1.0, 1.0]))
     assert memory.missed([0, 1]) is None
@@ -196,7 +196,7 @@ def test_a_frame_that_was_not_offered_is_noticed() -> None:
 def test_the_clock_starts_again_with_the_execution() -> None:
     """The prompt's frames stay in the history, whose own time goes on; a clock that counts through tells the same."""
     for first in (0, 3):
-        memory = RolloutMemory(FrameSampling(9), stride=1)
+        memory = Rollout(FrameSampling(9), stride=1)
         clocks = [(0, 0), (0, 1), (0, 2), (1, first), (1, first + 1), (1, first + 1), (1, first + 3)]
         found = [memory.observe([clock], _encode([1.0])) for clock in clocks]
         assert [steps for steps, _, _ in found] == [[0], [1], [2], [3], [4], [4], [6]]
@@ -207,7 +207,7 @@ def test_the_clock_starts_again_with_the_execution() -> None:
 
 
 def test_an_execution_without_a_prompt_begins_again_at_step_0() -> None:
-    memory = RolloutMemory(FrameSampling(4), stride=1)
+    memory = Rollout(FrameSampling(4), stride=1)
     for clock, began in (((1, 0), True), ((1, 1), False), ((1, 0), True), ((1, 0), False)):
         assert memory.observe([clock], _encode([1.0]))[1] == [began]
 
@@ -215,21 +215,13 @@ def test_an_execution_without_a_prompt_begins_again_at_step_0() -> None:
 # -- memory encoder ---------------------------------------------------------------------------------------------------
 
 
-def test_position_features_follow_the_stated_order() -> None:
-    features = position_features(torch.tensor([[0, 7]])).numpy()
-    assert features.shape == (1, 2, 16, 768)
-    k = np.arange(128) / 127
-    token = 4 * 2 + 3  # row 2, column 3 of the 4x4 grid
-    t, y, x = 7.0, 4 * 2 + 2, 4 * 3 + 2
-    expected = np.concatenate(
-        [
-            wave(value / base**k)
-            for value, base in ((t, 10_000.0), (y, 1_000.0), (x, 1_000.0))
-            for wave in (np.sin, np.cos)
-        ]
-    )
-    np.testing.assert_allclose(features[0, 1, token], expected, atol=2e-5)
-    assert not np.allclose(features[0, 0], features[0, 1])
+def position_features(steps: torch.Tensor) -> torch.Tensor:
+    """Return sin t, cos t, sin y, cos y, sin x, cos x, 128 frequencies each, of steps (...): (..., 16, 768)."""
+    y, x = torch.meshgrid(torch.arange(4.0) * 4 + 2, torch.arange(4.0) * 4 + 2, indexing="ij")
+    places = torch.broadcast_tensors(steps[..., None].to(torch.float64), y.flatten(), x.flatten())
+    frequencies = [base ** -(torch.arange(128, dtype=torch.float64) / 127) for base in (10_000.0, 1_000.0, 1_000.0)]
+    angles = [place[..., None] * some for place, some in zip(places, frequencies, strict=True)]
+    return torch.cat([wave for angle in angles for wave in (angle.sin(), angle.cos())], dim=-1).float()
 
 
 def test_encoder_shapes_and_mask() -> None:

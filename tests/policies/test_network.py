@@ -14,7 +14,7 @@ from lerobot_memobench.policies.memobench_mem.fusion import (
     ModulatedNorm,
     SharedMemory,
 )
-from lerobot_memobench.policies.memobench_mem.memory.encoder import MemoryTokens
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryTokens
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, SizedPaliGemmaWithExpert
 from lerobot_memobench.policies.memobench_mem.objects import HAND_DIM
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS

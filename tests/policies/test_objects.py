@@ -21,8 +21,14 @@ from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
 from lerobot_memobench.datasets.lerobot_format.reading import list_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.memory.encoder import MemoryEncoder, PooledMemoryEncoder
-from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, MASK, STEPS, TOKENS
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
+    FRAMES,
+    MASK,
+    STEPS,
+    TOKENS,
+    MemoryEncoder,
+    PooledMemoryEncoder,
+)
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.objects import (
     FEATURES,
@@ -424,7 +430,7 @@ def test_a_hand_that_stands_still_carries_out_a_whole_plan(root: Path) -> None:
         seen = observed(dataset, index, **{"observation.step": torch.tensor([float(step)])})
         seen["observation.state"] = seen["observation.state"] + 0.02 * (index > 30)
         policy.select_action(before(seen))
-        left.append(len(policy.queues.queues[0]))
+        left.append(len(policy.rollout.rows[0].queue))
     assert left == [2, 1, 0, *reversed(range(6)), 2, 1, 0]
 
 

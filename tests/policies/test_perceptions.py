@@ -113,7 +113,7 @@ def test_a_rollout_perceives_and_remembers_what_training_reads(case: Case) -> No
     for frame in range(int(STARTS[1]), index + 1):
         acted = before(case.observed(dataset, frame))
         policy.observe(acted)
-    tokens, steps, mask = policy.history.gather([0])
+    tokens, steps, mask = policy.rollout.gather([0])
     assert torch.equal(steps, trained[STEPS])
     assert torch.equal(mask, trained[MASK])
     assert apart(tokens, trained[TOKENS]) <= case.of.rounding

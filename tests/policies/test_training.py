@@ -139,7 +139,7 @@ def planned(policy: Any, batch: dict[str, Any]) -> torch.Tensor:
             *policy._preprocess_images(batch),
             batch["observation.language.tokens"],
             batch["observation.language.attention_mask"],
-            noise=policy._noise([*range(rows)], [0] * rows),
+            noise=policy._noise([*range(rows)]),
         )[:, :, : policy._action_dim]
 
 

@@ -313,15 +313,15 @@ def _as_loaded(policy: Any, shapes: dict[str, tuple[int, ...]]) -> dict[str, tup
     return {name if name.startswith("model.") else f"model.{name}": tuple(value.shape) for name, value in found.items()}
 
 
-def statistics_shapes(path: str) -> dict[str, tuple[int, ...]]:
+def statistics_shapes(path: str | Path, revision: str | None = None) -> dict[str, tuple[int, ...]]:
     """Return of which observations and actions a checkpoint holds statistics, and their shapes: what it was trained on.
 
     A configuration that was begun from another checkpoint lists that one's features instead. Empty without statistics.
     """
-    file = _file_of(path, PREPROCESSOR_FILE)
+    file = _file_of(path, PREPROCESSOR_FILE, revision)
     if file is None:
         return {}
-    states = [_file_of(path, file_name(name, f"state_file in {file}")) for name in _state_files(file)]
+    states = [_file_of(path, file_name(name, f"state_file in {file}"), revision) for name in _state_files(file)]
     return {
         name.rpartition(".")[0]: shape
         for state in states
@@ -332,24 +332,40 @@ def statistics_shapes(path: str) -> dict[str, tuple[int, ...]]:
 
 
 def _state_files(preprocessor: Path) -> Iterator[str]:
-    """Yield the names of the files of a preprocessor's statistics."""
     for step in read_json(preprocessor, Processor).get("steps", []):
         state = step.get("state_file")
         if str(step.get("registry_name", "")).endswith("normalizer_processor") and isinstance(state, str):
             yield state
 
 
-def _file_of(path: str, name: str) -> Path | None:
-    """Return a file of a checkpoint folder, or of a repository, from which LeRobot would fetch it too; None without."""
-    folder = Path(path).expanduser()
-    if folder.is_dir() or looks_local(path):
+def checkpoint_file(source: str | Path, name: str, revision: str | None = None) -> Path | None:
+    """Return a file of a checkpoint folder, or of a repository, from which it is fetched; None when there is no such
+    file.
+
+    Raises:
+        MemobenchError: the repository cannot be reached.
+    """
+    folder = Path(source).expanduser()
+    if folder.is_dir():
         return folder / name if (folder / name).is_file() else None
     from huggingface_hub import hf_hub_download
-    from huggingface_hub.errors import HfHubHTTPError
+    from huggingface_hub.errors import EntryNotFoundError, HfHubHTTPError, LocalEntryNotFoundError
 
     try:
-        return Path(hf_hub_download(path, name))
-    except (HfHubHTTPError, OSError, ValueError):  # no such file, no such repository, no network: LeRobot says it
+        return Path(hf_hub_download(str(source), name, revision=revision))
+    except LocalEntryNotFoundError as error:
+        raise MemobenchError(f"'{source}' is neither a folder nor reachable on the hub.") from error
+    except EntryNotFoundError:
+        return None
+    except (HfHubHTTPError, OSError, ValueError) as error:
+        raise MemobenchError(f"'{source}' is neither a folder nor a repository that can be read.") from error
+
+
+def _file_of(path: str | Path, name: str, revision: str | None = None) -> Path | None:
+    """Return `checkpoint_file`; None too where it cannot be fetched, which LeRobot says itself."""
+    try:
+        return checkpoint_file(path, name, revision)
+    except MemobenchError:
         return None
 
 

@@ -231,9 +231,9 @@ class RecordedFrames(RecordedTexts):
     1,500 episodes of 500 frames with the slots of objects take 0.7 GiB.
 
     Args:
-        root: folder of the dataset. columns: of which frames are remembered.
+        root: folder of the dataset. columns: of which samples are made.
         table: its phases and texts. texts: the text encoder.
-        remember: from the columns and numbers of frames (n,) to what is remembered of them (n, P, D).
+        remember: from numbers of frames (n,) to what is remembered of them (n, P, D).
         key: identity of what is remembered. stride: every how many frames one is.
     """
 
@@ -244,14 +244,14 @@ class RecordedFrames(RecordedTexts):
         table: FrameTable,
         texts: TextEncoder,
         *,
-        remember: Callable[[Columns, Sequence[int]], Tensor],
+        remember: Callable[[Sequence[int]], Tensor],
         key: str,
         stride: int,
     ) -> None:
         super().__init__(root, table)
         self.columns, self._remember = columns, remember
         self.text_embeddings = texts(self.texts) if self.texts else torch.zeros(0, texts.dim)
-        _, count, dim = remember(columns, [0]).shape
+        _, count, dim = remember([0]).shape
         self.meta = CacheMeta(
             format=FORMAT,
             dataset="",
@@ -270,7 +270,7 @@ class RecordedFrames(RecordedTexts):
     def tokens(self, episode: int, slots: Sequence[int]) -> Tensor:
         """What is remembered (n, P, D) of stored frames of an episode; slot k is its frame k * stride."""
         first = int(self.episodes[episode])
-        return self._remember(self.columns, [first + slot * self.meta.stride for slot in slots])
+        return self._remember([first + slot * self.meta.stride for slot in slots])
 
 
 def read_recorded(root: Path, names: Sequence[str]) -> tuple[dict[str, Tensor], FrameTable]:

@@ -25,7 +25,7 @@ from torch.nn.utils import parameters_to_vector
 
 from lerobot_memobench.datasets.feature_cache.frames import LEVEL_COLUMNS, MEMORY_COLUMN, holds_texts
 from lerobot_memobench.datasets.feature_cache.reading import FrameLookup
-from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import TEXT, TEXT_MASK
 from lerobot_memobench.policies.memobench_mem.training import joint, mean_over_ranks, world_size
@@ -65,10 +65,6 @@ class Alignment(nn.Module, ABC):
     def pairs(self, *usable: Tensor) -> tuple[Tensor, Tensor]:
         """Memory vectors and the texts they belong to, both (N, d_t) and normalised."""
 
-    @abstractmethod
-    def answer(self, memory: Tensor, memory_mask: Tensor, newest: Tensor) -> Tensor:
-        """What the head says (B, d_t) of the present, whose frame's tokens ``newest`` (B, L) marks."""
-
     def numbers(self) -> dict[str, float]:
         """What else is worth a line in the log."""
         return {}
@@ -86,10 +82,6 @@ class SemanticAlignment(Alignment):
     ) -> tuple[Tensor, Tensor]:
         """Pooled memories and their texts."""
         return self.embed(memory, memory_mask), F.normalize(text, dim=-1)
-
-    def answer(self, memory: Tensor, memory_mask: Tensor, newest: Tensor) -> Tensor:
-        """What all of the memory says."""
-        return self.embed(memory, memory_mask)
 
     def forward(self, memory: Tensor, memory_mask: Tensor, text: Tensor) -> Tensor:
         """Loss (scalar) from memory (B, L, d_m), memory_mask (B, L), text (B, d_t)."""
@@ -155,10 +147,6 @@ class FramewiseAlignment(Alignment):
         z, valid = self._frames(memory, memory_mask, text_mask)
         return z[valid], F.normalize(text, dim=-1)[valid]
 
-    def answer(self, memory: Tensor, memory_mask: Tensor, newest: Tensor) -> Tensor:
-        """What the newest frame says."""
-        return self.project(masked_mean(memory, newest))
-
     def forward(self, memory: Tensor, memory_mask: Tensor, text: Tensor, text_mask: Tensor) -> Tensor:
         """Loss (scalar) from memory (B, F*P, d_m), memory_mask (B, F*P), text (B, F, d_t), text_mask (B, F)."""
         z, valid = self._frames(memory, memory_mask, text_mask)
@@ -183,20 +171,12 @@ def make_alignment(name: str, memory_dim: int, text_dim: int, frames: int, token
 
     Its `Alignment.usable` takes texts (B, d_t) and text_mask (B,) with semantic and contrastive, (B, F, d_t) and
     (B, F) with framewise.
-
-    Raises:
-        MemobenchError: unknown name.
     """
     if name == "none":
         return None
-    if name == "semantic":
-        return SemanticAlignment(memory_dim, text_dim)
-    if name == "contrastive":
-        return ContrastiveAlignment(memory_dim, text_dim)
     if name == "framewise":
         return FramewiseAlignment(memory_dim, text_dim, frames, tokens_per_frame)
-    known = ("none", "semantic", "contrastive", "framewise")
-    raise MemobenchError(f"There is no alignment '{name}': {nearest(name, known)}")
+    return {"semantic": SemanticAlignment, "contrastive": ContrastiveAlignment}[name](memory_dim, text_dim)
 
 
 # -- loss of a training step ------------------------------------------------------------------------------------------

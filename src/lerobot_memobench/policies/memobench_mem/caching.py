@@ -89,16 +89,14 @@ def open_frames(root: Path, config: MemobenchMemConfig, encoder: ObservationEnco
         progress = _logged("objects detected in %d of %d episodes")
         halves = make_detections(root, config, encoder.detect, progress=progress).all_tokens()
         columns[DETECTED] = halves.sum(dim=1, dtype=torch.float32)
-    phase = torch.from_numpy(table.phase)
     logger.info("%d frames of %s are read into memory", table.episodes[-1], root)
+    observed = {**columns, OBS_RAW_STATE: columns[OBS_STATE], OBS_PHASE: torch.from_numpy(table.phase)}
     return RecordedFrames(
         root,
         columns,
         table,
         _text_encoder(config),
-        remember=lambda found, frames: encoder.remember(
-            {**found, OBS_RAW_STATE: found[OBS_STATE], OBS_PHASE: phase}, frames
-        ),
+        remember=functools.partial(encoder.remember, observed),
         key=encoder.key,
         stride=config.memory_stride,
     )
@@ -343,7 +341,7 @@ def _with_picture_tokens(
     columns, table = read_recorded(root, names)
     columns |= {encoded_key(camera): cache.all_tokens() for camera, cache in present.items()}
 
-    def remember(_: Any, frames: Sequence[int]) -> Tensor:
+    def remember(frames: Sequence[int]) -> Tensor:
         """Return the pooled tokens of frames of one episode, by their global numbers."""
         if memory is None:  # training asks for none; a sample's shape is asked for all the same
             return torch.zeros(len(frames), encoder.tokens_per_frame, WIDTH)

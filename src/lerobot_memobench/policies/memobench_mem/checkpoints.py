@@ -10,20 +10,28 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from huggingface_hub import hf_hub_download
-from huggingface_hub.errors import EntryNotFoundError, HfHubHTTPError, LocalEntryNotFoundError
 from lerobot.configs import PreTrainedConfig
 from safetensors import safe_open
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.checkpoint import CONFIG_FILE, Processor, read_json
+from lerobot_memobench.policies.checkpoint import (
+    CONFIG_FILE,
+    PREPROCESSOR_FILE,
+    WEIGHTS_FILE,
+    Processor,
+    checkpoint_file,
+    read_json,
+    statistics_shapes,
+)
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 from lerobot_memobench.policies.memobench_mem.training import WeightAverage
 
 logger = logging.getLogger(__name__)
+
+TRAINING_FILE = "training_weights.safetensors"
 
 
 def read_config(source: str | Path, config: PreTrainedConfig | None, revision: str | None) -> MemobenchMemConfig:
@@ -71,12 +79,6 @@ def load_base_weights(model: MemoryPI05, weights: dict[str, Tensor], source: str
     load_exactly(model, placed, source, optional=set(model.memory_parameters()))
 
 
-def save_training_weights(average: WeightAverage, folder: Path) -> None:
-    """Write the trained weights beside a model file that holds their average, for going on."""
-    tensors, metadata = average.state()
-    save_file(tensors, folder / TRAINING_FILE, metadata=metadata)
-
-
 def restore_average(average: WeightAverage, source: str | Path, revision: str | None) -> WeightAverage | None:
     """Go on with a checkpoint's trained weights and their average; None where it has none.
 
@@ -96,39 +98,15 @@ def restore_average(average: WeightAverage, source: str | Path, revision: str | 
 # -- files ------------------------------------------------------------------------------------------------------------
 
 
-MODEL_FILE = "model.safetensors"
-TRAINING_FILE = "training_weights.safetensors"
-PREPROCESSOR_FILE = "policy_preprocessor.json"
-
-
-def checkpoint_file(source: str | Path, name: str, revision: str | None = None) -> Path | None:
-    """A file of a checkpoint folder or hub repository; None when it has no such file.
-
-    Raises:
-        MemobenchError: the repository cannot be reached.
-    """
-    folder = Path(source)
-    if folder.is_dir():
-        return folder / name if (folder / name).is_file() else None
-    try:
-        return Path(hf_hub_download(str(source), name, revision=revision))
-    except LocalEntryNotFoundError as error:
-        raise MemobenchError(f"'{source}' is neither a folder nor reachable on the hub.") from error
-    except EntryNotFoundError:
-        return None
-    except (HfHubHTTPError, ValueError) as error:
-        raise MemobenchError(f"'{source}' is neither a folder nor a repository that can be read.") from error
-
-
 def weights_file(source: str | Path, revision: str | None = None, *, named: str, fix: str) -> Path:
     """The file of a checkpoint's weights.
 
     Raises:
         MemobenchError: it has none; the message calls it ``named`` and ends with ``fix``.
     """
-    path = checkpoint_file(source, MODEL_FILE, revision)
+    path = checkpoint_file(source, WEIGHTS_FILE, revision)
     if path is None:
-        raise MemobenchError(f"{named} has no {MODEL_FILE}; {fix}.")
+        raise MemobenchError(f"{named} has no {WEIGHTS_FILE}; {fix}.")
     return path
 
 
@@ -141,18 +119,9 @@ def require_statistics(source: str | Path, revision: str | None = None) -> None:
         MemobenchError: a file or a statistic is missing.
     """
     fix = "copy the preprocessor files of its training run into it, or train again"
-    path = checkpoint_file(source, PREPROCESSOR_FILE, revision)
-    if path is None:
+    if checkpoint_file(source, PREPROCESSOR_FILE, revision) is None:
         raise MemobenchError(f"The checkpoint '{source}' has no {PREPROCESSOR_FILE}, so it cannot be evaluated; {fix}.")
-    steps = read_json(path, Processor).get("steps", [])
-    step = next((step for step in steps if step.get("registry_name") == "normalizer_processor"), None)
-    state = None if step is None or not step.get("state_file") else step["state_file"]
-    file = None if state is None else checkpoint_file(source, state, revision)
-    present: set[str] = set()
-    if file is not None:
-        with safe_open(file, framework="pt") as tensors:
-            present = {name.rsplit(".", 1)[0] for name in tensors.keys()}  # noqa: SIM118 (not a dict)
-    missing = sorted({"observation.state", "action"} - present)
+    missing = sorted({"observation.state", "action"} - set(statistics_shapes(source, revision)))
     if missing:
         raise MemobenchError(
             f"The checkpoint '{source}' has no dataset statistics for {' and '.join(missing)}, so states and actions "

@@ -23,7 +23,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, SIDE, WIDTH, VisualEncoder, resized
 from lerobot_memobench.policies.compatibility import cure
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MEMORY_GRID
-from lerobot_memobench.policies.memobench_mem.memory.encoder import PooledMemoryEncoder
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import PooledMemoryEncoder
 
 if TYPE_CHECKING:
     from transformers.models.paligemma.modeling_paligemma import PaliGemmaMultiModalProjector

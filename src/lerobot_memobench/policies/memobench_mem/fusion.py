@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from einops import rearrange, repeat
 from torch import Tensor, nn
 
-from lerobot_memobench.policies.memobench_mem.memory.encoder import MemoryTokens
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryTokens
 
 if TYPE_CHECKING:
     from lerobot.policies.pi05.modeling_pi05 import PI05Pytorch

@@ -1,17 +1,15 @@
 """``memobench_mem``: LeRobot's pi0.5 with a visual memory, trained with or without aligning it to subgoal texts.
 
 The policy from its construction to an update (``forward``) and to an action (``select_action``). Its network is in
-`network`, parts of training in `training`, model checkpoints in `checkpoints`.
+`network`, the rows of a rollout in `rollout`, parts of training in `training`, model checkpoints in `checkpoints`.
 """
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import logging
 import threading
-from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +19,10 @@ from lerobot.policies.common.vla_utils import pad_vector
 from lerobot.policies.pi05.modeling_pi05 import PI05Policy
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from transformers.initialization import no_init_weights
 
-from lerobot_memobench.datasets.feature_cache.reading import RecordedFrames
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.weights import load_visual_encoder
 from lerobot_memobench.policies.checkpoint import check_as_trained, check_resumed
@@ -33,13 +30,13 @@ from lerobot_memobench.policies.compatibility import PICTURE_STEP, cure, require
 from lerobot_memobench.policies.memobench_mem.alignment import alignment_loss, make_alignment, require_texts
 from lerobot_memobench.policies.memobench_mem.caching import open_frames
 from lerobot_memobench.policies.memobench_mem.checkpoints import (
+    TRAINING_FILE,
     load_base_weights,
     load_weights,
     read_config,
     require_agreement,
     require_statistics,
     restore_average,
-    save_training_weights,
     weights_file,
 )
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import REGRESSION, MemobenchMemConfig
@@ -52,17 +49,11 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     STEPS,
     TOKENS,
     MemoryBatch,
-    RolloutMemory,
 )
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Precision, attend_fused
-from lerobot_memobench.policies.memobench_mem.objects import HAND_DIM, OBS_PHASE, OBS_RAW_STATE, rotation
-from lerobot_memobench.policies.memobench_mem.sampler import (
-    SamplerSpec,
-    TrainingRun,
-    begin_training,
-    read_from_memory,
-    use_execution_statistics,
-)
+from lerobot_memobench.policies.memobench_mem.objects import OBS_PHASE, OBS_RAW_STATE
+from lerobot_memobench.policies.memobench_mem.rollout import Rollout
+from lerobot_memobench.policies.memobench_mem.sampler import TrainingRun, begin_training
 from lerobot_memobench.policies.memobench_mem.training import (
     TrainingCurve,
     WeightAverage,
@@ -99,8 +90,7 @@ class MemobenchMemPolicy(PI05Policy):
         average: moving average of the trained weights, which evaluation uses; None before training, or without one.
         run: the dataset and its features that it is trained with; None where it only acts.
         curve: how its losses fell.
-        history: frames that the rows of a rollout remember. queues: their action chunks. noise: for sampling chunks.
-        thread: the one that acts.
+        rollout: what is kept of the rows that it acts in.
     """
 
     config_class = MemobenchMemConfig
@@ -152,11 +142,9 @@ class MemobenchMemPolicy(PI05Policy):
         self.average: WeightAverage | None = None
         self.run: TrainingRun | None = None
         self.curve = TrainingCurve()
-        self.history = RolloutMemory(make_mechanism(config.memory, config.memory_frames), config.memory_stride)
-        self.queues, self.noise = ActionQueues(self._action_dim), EpisodeNoise()
-        self.thread = OneThread()
+        self.rollout = Rollout(make_mechanism(config.memory, config.memory_frames), config.memory_stride)
         self.reset()
-        self.thread.forget()
+        self._thread: int | None = None  # whichever acts first
         if dataset_meta is not None and load_base:
             self._begin_training(dataset_meta)
 
@@ -176,7 +164,7 @@ class MemobenchMemPolicy(PI05Policy):
 
     @property
     def _remembers(self) -> bool:
-        return self.history.mechanism.frames > 0
+        return self.rollout.mechanism.frames > 0
 
     def _preprocess_images(self, batch: dict[str, Tensor]) -> PrefixParts:
         """Return what the model is given in the place of images: the observation's parts, and the state's token."""
@@ -201,14 +189,10 @@ class MemobenchMemPolicy(PI05Policy):
         cache = open_frames(Path(meta.root), self.config, self.perception)
         self.run = TrainingRun(self.config, cache, meta)
         begin_training(self.run)
-        if isinstance(cache, RecordedFrames):
-            read_from_memory(self.run)
-            use_execution_statistics(meta.stats, cache, cache.phase != 0)
         if self.config.uses_visual_encoder:
             attend_fused(self.model)
         if self._device.type == "cpu":
             keep_freed_memory()
-        self.config.drop_n_last_frames = SamplerSpec.of_run(self.run)  # type: ignore[assignment]  # a number to nobody but LeRobot's sampler
 
     @property
     def _averages(self) -> bool:
@@ -310,10 +294,9 @@ class MemobenchMemPolicy(PI05Policy):
     def reset(self) -> None:
         """Forget histories and planned actions. LeRobot calls it once per batch of episodes."""
         super().reset()
-        for part in (self.history, self.queues, self.noise):
-            part.reset()
+        self.rollout.reset()
         self._calls = self._planned = 0
-        self.thread.begin()
+        self._thread = threading.get_ident()
         self._acting_rows: list[int] = []
 
     @torch.no_grad()
@@ -324,24 +307,39 @@ class MemobenchMemPolicy(PI05Policy):
         planned from that row alone, so rows of a batch are independent, when the row's execution begins or its last
         chunk is used up. In the prompt phase, where actions have no effect, and for frozen rows nothing is planned.
         """
-        self.thread.check()
+        self._check_thread()
         if self.training:  # a millisecond, if it were said at every step
             self.eval()
-        steps, started, frozen = self.observe(batch)
-        count = len(steps)
-        self.queues.resize(count)
-        prompt = [phase == PROMPT for phase in _column(batch, OBS_PHASE) or [EXECUTION] * count]
-        for row in range(count):
-            if started[row] or prompt[row]:
-                self.queues.drop(row)
-        acting = self._acting_rows = [row for row in range(count) if not prompt[row] and not frozen[row]]
-        wanting = self.queues.wanting(acting)
+        _, _, frozen = self.observe(batch)
+        rows = self.rollout.rows
+        prompt = [phase == PROMPT for phase in _column(batch, OBS_PHASE) or [EXECUTION] * len(rows)]
+        for row, prompted in zip(rows, prompt, strict=True):
+            if prompted:
+                row.drop_chunk()
+        acting = self._acting_rows = [row for row in range(len(rows)) if not prompt[row] and not frozen[row]]
+        wanting = [row for row in acting if not rows[row].queue]
         if wanting:
-            plans = self.plan(batch, wanting, self._noise(wanting, steps))
+            chunks = self.plan(batch, wanting, self._noise(wanting))
             states = batch[OBS_RAW_STATE] if self.config.full_chunk_when_stalled else None
-            for row, plan in zip(wanting, plans.float().cpu(), strict=True):
-                self.queues.begin(row, plan, self.config.n_action_steps, None if states is None else states[row])
-        return self.queues.step(acting).to(self._device)
+            for row, chunk in zip(wanting, chunks.float().cpu(), strict=True):
+                rows[row].begin_chunk(chunk, self.config.n_action_steps, None if states is None else states[row])
+        for row in acting:
+            rows[row].last = rows[row].queue.popleft()
+        none = torch.zeros(self._action_dim)
+        return torch.stack([none if row.last is None else row.last for row in rows]).to(self._device)
+
+    def _check_thread(self) -> None:
+        """Refuse to act in another thread than the one that began, as ``env.max_parallel_tasks`` makes LeRobot do.
+
+        Rollouts one after the other may come from any thread.
+        """
+        if self._thread is None:
+            self._thread = threading.get_ident()
+        if self._thread != threading.get_ident():
+            raise MemobenchError(
+                "Two threads act with one memobench_mem policy, whose memory of one rollout would then enter the "
+                "other; evaluate with --env.max_parallel_tasks=1, and more rows per task by --eval.batch_size."
+            )
 
     def observe(self, batch: dict[str, Tensor]) -> tuple[list[int], list[bool], list[bool]]:
         """Take the current frames of all rows into their histories.
@@ -358,12 +356,11 @@ class MemobenchMemPolicy(PI05Policy):
         phases = _column(batch, OBS_PHASE) if OBS_STEP in batch else None
         clocks = list(zip(phases or [EXECUTION] * count, steps, strict=True))
         self._calls += 1
-        steps, started, frozen = self.history.observe(clocks, lambda rows: self._encode(batch, clocks, rows))
-        self.noise.resize(count)
+        steps, started, frozen = self.rollout.observe(clocks, lambda rows: self._encode(batch, clocks, rows))
+        observed = [key for key in (name, OBS_STATE, OBS_LANGUAGE_TOKENS) if key in batch]
         for row in range(count):
             if started[row]:
-                observed = (key for key in (name, OBS_STATE, OBS_LANGUAGE_TOKENS) if key in batch)
-                self.noise.begin(row, (batch[key][row] for key in observed))
+                self.rollout.rows[row].draw_seed(batch[key][row] for key in observed)
         return steps, started, frozen
 
     def _encode(self, batch: dict[str, Tensor], clocks: list[tuple[int, int]], rows: list[int]) -> Tensor:
@@ -381,7 +378,7 @@ class MemobenchMemPolicy(PI05Policy):
         with self._acting():
             if self._remembers:
                 self._require_history(rows)
-                self.model.set_memory(*self.history.gather(rows).to(self._device))
+                self.model.set_memory(*self.rollout.gather(rows).to(self._device))
             noise = noise.to(self._device)
             actions = self.model.sample_actions(images, image_masks, *words, noise=noise, **kwargs)
         return actions[:, :, : self._action_dim]
@@ -394,19 +391,19 @@ class MemobenchMemPolicy(PI05Policy):
         return [*images, *objects, OBS_STATE, OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK]
 
     def _require_history(self, rows: list[int]) -> None:
-        missed = self.history.missed(rows)
+        missed = self.rollout.missed(rows)
         if missed is not None:
             raise MemobenchError(
-                f"This policy remembers every {self.history.stride} control steps, and was not shown step {missed} of "
+                f"This policy remembers every {self.rollout.stride} control steps, and was not shown step {missed} of "
                 "this episode: its memory would be another one than in training; offer it the observation of every "
                 "control step, by select_action or by observe."
             )
 
-    def _noise(self, rows: list[int], steps: list[int]) -> Tensor:
+    def _noise(self, rows: list[int]) -> Tensor:
         shape = self.config.chunk_size, self.config.max_action_dim
         if self.config.objective == REGRESSION:
             return torch.zeros(len(rows), *shape)
-        return self.noise.draw(rows, steps, shape)
+        return torch.stack([self.rollout.rows[row].noise(shape) for row in rows])
 
     def needs_observation(self) -> bool:
         """Return whether the next observation's pictures or objects are read: it is remembered, or planned from.
@@ -414,7 +411,7 @@ class MemobenchMemPolicy(PI05Policy):
         Asked after an action. Whether the next frame is the first of an execution, where chunks begin, only the
         environment knows: that one is observed in any case, as the first of an episode.
         """
-        return self.history.writes_next() or bool(self.queues.wanting(self._acting_rows))
+        return self.rollout.writes_next() or any(not self.rollout.rows[row].queue for row in self._acting_rows)
 
     def supports_rtc(self) -> bool:
         """Return whether LeRobot's real-time chunking may ask this policy for its chunks.
@@ -443,18 +440,9 @@ class MemobenchMemPolicy(PI05Policy):
                 "plans would not continue the last one; use --inference.type=sync, or train with "
                 "--policy.objective=flow_matching."
             )
-        steps = self._offered(batch)
-        rows = list(range(len(steps)))
-        noise = kwargs.pop("noise", None)
-        return self.plan(batch, rows, self._noise(rows, steps) if noise is None else noise, **kwargs)
-
-    def _offered(self, batch: dict[str, Tensor]) -> list[int]:
-        """Take in the observation of a chunk, unless it was offered before; return each row's control step."""
         if OBS_STEP in batch or not self._remembers or not self._calls:
-            steps, _, _ = self.observe(batch)
-        elif self._calls > self._planned:
-            steps = [row.position for row in self.history.rows]
-        else:
+            self.observe(batch)
+        elif self._calls == self._planned:
             raise MemobenchError(
                 "This policy remembers observations of every control step, and was asked for two plans with no "
                 "observation between them: its memory would be another one than in training; let select_action take "
@@ -462,7 +450,9 @@ class MemobenchMemPolicy(PI05Policy):
                 "--policy.memory_fusion=none."
             )
         self._planned = self._calls
-        return steps
+        rows = list(range(len(self.rollout.rows)))
+        noise = kwargs.pop("noise", None)
+        return self.plan(batch, rows, self._noise(rows) if noise is None else noise, **kwargs)
 
     # -- checkpoints -----------------------------------------------------------------------------------------------
 
@@ -519,7 +509,8 @@ class MemobenchMemPolicy(PI05Policy):
             return
         with self.average.applied():  # in float32, whatever precision it is evaluated in
             super()._save_pretrained(save_directory)
-        save_training_weights(self.average, save_directory)
+        tensors, metadata = self.average.state()
+        save_file(tensors, save_directory / TRAINING_FILE, metadata=metadata)
 
     # -- adapters --------------------------------------------------------------------------------------------------
 
@@ -556,125 +547,3 @@ def _column(batch: dict[str, Tensor], key: str) -> list[int] | None:
     if key not in batch:
         return None
     return [round(value) for value in batch[key].reshape(len(batch[key]), -1)[:, 0].tolist()]
-
-
-# -- rows of a rollout ---------------------------------------------------------------------------------------------
-
-STILL, PER_RADIAN = 0.006, 0.1
-"""How little a hand or a finger may move from one plan to the next to be still, m, and what a radian counts, m."""
-
-
-class ActionQueues:
-    """A queue of planned actions per row, and the action each row took last."""
-
-    def __init__(self, action_dim: int) -> None:
-        self.action_dim = action_dim
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget all plans."""
-        self.queues: list[deque[Tensor]] = []
-        self.last: list[Tensor] = []
-        self.stood: list[Tensor | None] = []
-
-    def resize(self, rows: int) -> None:
-        """Begin anew if the number of rows is another."""
-        if len(self.queues) != rows:
-            self.queues = [deque() for _ in range(rows)]
-            self.last = [torch.zeros(self.action_dim) for _ in range(rows)]
-            self.stood = [None] * rows
-
-    def drop(self, row: int) -> None:
-        """Forget a row's plan; until it has another its action is zero."""
-        self.queues[row].clear()
-        self.last[row] = torch.zeros(self.action_dim)
-        self.stood[row] = None
-
-    def begin(self, row: int, plan: Tensor, count: int, state: Tensor | None = None) -> None:
-        """Take the first actions of a plan (n, A) as a row's.
-
-        Args:
-            count: how many. state: the robot's (8,), as it is, m and rad; with it, a hand that stands as it stood when
-                the row's last plan was made carries out the whole plan. Where each plan would do the next thing later
-                than it is carried out, the hand would stand there for ever.
-        """
-        stands = None
-        if state is not None:
-            turned = rotation(state[None, 3:HAND_DIM]).flatten() * PER_RADIAN
-            stands = torch.cat([state[:3], turned, state[HAND_DIM:]]).cpu()
-        stood, self.stood[row] = self.stood[row], stands
-        still = stands is not None and stood is not None and bool((stands - stood).abs().max() < STILL)
-        self.queues[row].extend(plan if still else plan[:count])
-
-    def wanting(self, rows: Sequence[int]) -> list[int]:
-        """Return those of ``rows`` that have no plan left."""
-        return [row for row in rows if not self.queues[row]]
-
-    def step(self, rows: Sequence[int]) -> Tensor:
-        """Let ``rows`` go on with their plans; return every row's action (B, A), those of others repeated."""
-        for row in rows:
-            self.last[row] = self.queues[row].popleft()
-        return torch.stack(self.last)
-
-
-class EpisodeNoise:
-    """A seed per row of a vector environment, from its episode's first observation and the process's seed.
-
-    Noise drawn from a common generator would make a row's actions depend on how many rows run beside it.
-    """
-
-    def __init__(self) -> None:
-        self.seeds: list[int] = []
-
-    def reset(self) -> None:
-        """Forget all episodes."""
-        self.seeds = []
-
-    def resize(self, rows: int) -> None:
-        """Begin anew if the number of rows is another."""
-        if len(self.seeds) != rows:
-            self.seeds = [0] * rows
-
-    def begin(self, row: int, observed: Iterable[Tensor]) -> None:
-        """Begin a row's episode with its first observation."""
-        digest = hashlib.blake2b(str(torch.initial_seed()).encode(), digest_size=7)
-        for value in observed:
-            digest.update(value.detach().to("cpu").contiguous().numpy().tobytes())
-        self.seeds[row] = int.from_bytes(digest.digest(), "big")
-
-    def draw(self, rows: Sequence[int], steps: Sequence[int], shape: tuple[int, int]) -> Tensor:
-        """Return noise (n, *shape) on the CPU for plans of ``rows`` at ``steps``, those of all rows."""
-        generators = (torch.Generator().manual_seed(self.seeds[row] + steps[row]) for row in rows)
-        return torch.stack([torch.randn(shape, generator=generator) for generator in generators])
-
-
-class OneThread:
-    """Notices when several threads act with one policy, whose histories and plans they would mix.
-
-    ``env.max_parallel_tasks`` above 1 makes LeRobot do so. Rollouts one after the other may come from any thread.
-    """
-
-    def __init__(self) -> None:
-        self._owner: int | None = None
-
-    def begin(self) -> None:
-        """Begin a rollout in this thread."""
-        self._owner = threading.get_ident()
-
-    def forget(self) -> None:
-        """Leave it open to whichever thread acts first."""
-        self._owner = None
-
-    def check(self) -> None:
-        """Refuse to act in another thread than the one that began.
-
-        Raises:
-            MemobenchError: this is another.
-        """
-        if self._owner is None:
-            self.begin()
-        if self._owner != threading.get_ident():
-            raise MemobenchError(
-                "Two threads act with one memobench_mem policy, whose memory of one rollout would then enter the "
-                "other; evaluate with --env.max_parallel_tasks=1, and more rows per task by --eval.batch_size."
-            )

@@ -36,7 +36,7 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
 )
 from lerobot_memobench.policies.memobench_mem.fusion import Context, MemoryFusion, Modulation, Prefix
 from lerobot_memobench.policies.memobench_mem.memory import make_mechanism
-from lerobot_memobench.policies.memobench_mem.memory.encoder import MemoryTokens, PooledMemoryEncoder
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryTokens, PooledMemoryEncoder
 from lerobot_memobench.policies.memobench_mem.objects import DetectionEncoder, ObjectEncoder, ObjectsFromPictures
 from lerobot_memobench.sim.object_slots import classes
 

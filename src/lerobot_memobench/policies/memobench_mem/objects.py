@@ -29,7 +29,7 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
     PrefixParts,
     fingerprint,
 )
-from lerobot_memobench.policies.memobench_mem.memory.encoder import PooledMemoryEncoder
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import PooledMemoryEncoder
 from lerobot_memobench.protocol import CAMERAS
 from lerobot_memobench.sim.object_layout import FIELDS, SIZE, SLOTS, WIDTH, field
 from lerobot_memobench.sim.object_slots import classes

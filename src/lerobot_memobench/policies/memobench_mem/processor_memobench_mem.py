@@ -439,9 +439,11 @@ class WordTokenizerProcessorStep(PromptTokenizerProcessorStep):
 
     def follow(self, run: TrainingRun) -> None:
         """Learn the words of a run's prompts, and take their length."""
-        assert run.config.tokenizer_max_length is not None  # set by the configuration
-        self.max_length = run.config.tokenizer_max_length
-        self.vocabulary = extend(self.vocabulary, run.prompt_texts(), run.config.dimensions.vocabulary)
+        config = run.config
+        assert config.tokenizer_max_length is not None  # set by the configuration
+        self.max_length = config.tokenizer_max_length
+        texts = prompt_texts(config, run.meta, run.cache)
+        self.vocabulary = extend(self.vocabulary, texts, config.dimensions.vocabulary)
         self.__post_init__()
 
     def _tokenize_text(self, text: str | list[str]) -> dict[str, Tensor]:

@@ -46,10 +46,6 @@ class TrainingRun:
     cache: FrameLookup
     meta: Any
 
-    def prompt_texts(self) -> list[str]:
-        """Return every text that prompts are made of."""
-        return prompt_texts(self.config, self.meta, self.cache)
-
     def follow(self, steps: Iterable[Any]) -> None:
         """Hand this to those steps of a preprocessor that ask for it by a method ``follow``."""
         for step in steps:
@@ -73,6 +69,10 @@ def begin_training(run: TrainingRun) -> None:
     setattr(run.config, _LINK, _Trainings([run]))
     setattr(run.meta, _LINK, _Trainings([run, *trainings(run.meta)]))
     hooked_for(run, MAKE_PROCESSORS, _follows)
+    if isinstance(run.cache, RecordedFrames):
+        hooked_for(run, READ_SAMPLE, _reads)
+        _use_execution_statistics(run.meta.stats, run.cache)
+    run.config.drop_n_last_frames = SamplerSpec.of_run(run)  # type: ignore[assignment]  # a number to nobody but LeRobot's sampler
 
 
 def trainings(of: Any) -> list[TrainingRun]:
@@ -296,22 +296,17 @@ STILL = 0.01
 """Added to the standard deviations of actions, so that a number that hardly varies is not blown up to noise."""
 
 
-def use_execution_statistics(stats: dict[str, dict[str, Any]], frames: RecordedFrames, drawn: np.ndarray) -> None:
-    """Replace LeRobot's statistics of states and actions by those of some of the frames (N,) bool, in place.
+def _use_execution_statistics(stats: dict[str, dict[str, Any]], frames: RecordedFrames) -> None:
+    """Replace LeRobot's statistics of states and actions by those of execution frames, in place.
 
     They are what LeRobot then hands to every normaliser: a new policy's, and one that goes on from a checkpoint.
     """
     for key in (OBS_STATE, ACTION):
-        stats[key] = get_feature_stats(frames.columns[key].numpy()[drawn], axis=0, keepdims=False)
+        stats[key] = get_feature_stats(frames.columns[key].numpy()[frames.phase != PROMPT], axis=0, keepdims=False)
     stats[ACTION]["std"] = stats[ACTION]["std"] + STILL
 
 
 # -- samples ---------------------------------------------------------------------------------------------------------
-
-
-def read_from_memory(run: TrainingRun) -> None:
-    """Make the samples of a run's dataset out of main memory while the run lives."""
-    hooked_for(run, READ_SAMPLE, _reads)
 
 
 def _reads(get_item: Callable[..., Any]) -> Callable[..., Any]:

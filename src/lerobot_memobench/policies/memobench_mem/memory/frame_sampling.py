@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from lerobot_memobench.policies.memobench_mem.memory.mechanism import EpisodeFrames, Frame, MemoryMechanism
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import Frame, Load, MemoryMechanism
 
 
 def sample_frames(step: int, max_frames: int) -> list[int]:
@@ -36,7 +36,7 @@ class FrameSampling(MemoryMechanism):
         """Return the chosen frames."""
         return [kept[slot] for slot in sample_frames(len(kept) - 1, self.frames)]
 
-    def recall(self, episode: EpisodeFrames, slot: int) -> list[Frame]:
+    def recall(self, load: Load, slot: int) -> list[Frame]:
         """Load the chosen frames alone."""
         first = max(0, slot + 1 - self.capacity)
-        return episode.load([first + chosen for chosen in sample_frames(slot - first, self.frames)])
+        return load([first + chosen for chosen in sample_frames(slot - first, self.frames)])

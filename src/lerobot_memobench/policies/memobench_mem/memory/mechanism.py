@@ -1,25 +1,26 @@
-"""Interface of memory mechanisms, and the histories that they are asked for: in training and in a rollout.
+"""Interface of memory mechanisms, what training reads by them, and encoders of remembered frames to memory tokens.
 
 A mechanism is a rule without weights: which frames of an episode are kept, and which of them are read for an action
-chunk. Its encoder, which makes memory tokens of the frames read, is learned.
+chunk. Its encoder, which makes memory tokens of the frames read, is learned; the one here is that of RoboMME's pi0.5,
+which joins a frame's tokens with their time and place in the picture.
+
+Shapes: B rows, F frames, P tokens per frame, D their width, d_m width of memory tokens, L memory tokens of a row.
 """
 
 from __future__ import annotations
 
-import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import ClassVar, NamedTuple, Protocol
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
 
 import torch
+import torch.nn.functional as F
+from einops import rearrange, repeat
 from torch import Tensor, nn
 
 from lerobot_memobench.datasets.feature_cache.reading import FrameLookup
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MEMORY_GRID
-from lerobot_memobench.policies.memobench_mem.memory.encoder import MemoryEncoder
-
-logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -30,12 +31,9 @@ class Frame:
     tokens: Tensor
 
 
-class EpisodeFrames(Protocol):
-    """The frames of a recorded episode that a rollout would have offered for writing, numbered 0, 1, 2, ..."""
-
-    def load(self, slots: Sequence[int]) -> list[Frame]:
-        """Load these frames, and no others."""
-        ...
+Load = Callable[[Sequence[int]], list[Frame]]
+"""Loads frames of a recorded episode, and no others, by their numbers 0, 1, 2, ... among those that a rollout would
+have written."""
 
 
 class MemoryMechanism(ABC):
@@ -61,14 +59,14 @@ class MemoryMechanism(ABC):
     def read(self, kept: Sequence[Frame]) -> list[Frame]:
         """Return the frames that a chunk reads of those kept: at most `frames`, the oldest first."""
 
-    def recall(self, episode: EpisodeFrames, slot: int) -> list[Frame]:
+    def recall(self, load: Load, slot: int) -> list[Frame]:
         """Return what training reads at an episode's frame ``slot``: what a rollout reads there.
 
         This loads and writes frames 0 ... ``slot`` one by one. A mechanism whose reading can be told from their number
         alone loads those that it reads instead; a test holds both to the same result.
         """
         kept: list[Frame] = []
-        for frame in episode.load(range(slot + 1)):
+        for frame in load(range(slot + 1)):
             self.write(kept, frame)
         return self.read(kept)
 
@@ -123,126 +121,139 @@ def collate_frames(rows: Sequence[Sequence[Frame]], frames: int) -> MemoryBatch:
     return batch
 
 
-# -- training: frames of a feature cache ------------------------------------------------------------------------------
-
-
-class CachedEpisode:
-    """The stored frames of one episode of a feature cache; see `EpisodeFrames`."""
-
-    def __init__(self, cache: FrameLookup, episode: int) -> None:
-        self.cache, self.episode = cache, episode
-
-    def load(self, slots: Sequence[int]) -> list[Frame]:
-        """Read these frames, and no others, from the cache's file."""
-        tokens = self.cache.tokens(self.episode, slots)
-        return [Frame(slot * self.cache.meta.stride, one) for slot, one in zip(slots, tokens.unbind(), strict=True)]
-
-
 def recall_at(cache: FrameLookup, mechanism: MemoryMechanism, episode: int, frame: int) -> list[Frame]:
-    """Return what ``mechanism`` reads at a frame of an episode, counted from its start."""
-    return mechanism.recall(CachedEpisode(cache, episode), frame // cache.meta.stride)
+    """Return what ``mechanism`` reads in a cache at a frame of an episode, counted from its start."""
+    stride = cache.meta.stride
+
+    def load(slots: Sequence[int]) -> list[Frame]:
+        tokens = cache.tokens(episode, slots)
+        return [Frame(slot * stride, one) for slot, one in zip(slots, tokens.unbind(), strict=True)]
+
+    return mechanism.recall(load, frame // stride)
 
 
-# -- rollouts: frames of the rows of a vector environment -------------------------------------------------------------
+# -- encoders ---------------------------------------------------------------------------------------------------------
 
 
-@dataclass
-class Row:
-    """History of one environment: its last clock, where that is in the episode, and what is kept of it.
+POSITION_DIM = 768
+_FREQUENCIES = 128
+_TIME_BASE, _SPACE_BASE = 10_000.0, 1_000.0
 
-    Attributes:
-        clock: phase and control step since the phase began. position: control step since the episode began.
-        missed: the first step of a frame that was to be written and was not offered; None where all were.
+
+def _waves(values: Tensor, base: float) -> Tensor:
+    """Sines, then cosines, of values (...) at 128 frequencies from 1 down to 1/base: (..., 256) float32."""
+    exponents = torch.arange(_FREQUENCIES, dtype=torch.float32, device=values.device) / (_FREQUENCIES - 1)
+    angles = rearrange(values.to(torch.float32), "... -> ... 1") * base**-exponents
+    return torch.cat([angles.sin(), angles.cos()], dim=-1)
+
+
+class MemoryEncoder(nn.Module):
+    """Vision tokens and their positions to memory tokens: concat(image, SiLU(Linear(position))) -> Linear.
+
+    A Linear of a concatenation is the sum of its parts' Linears. The 16 tokens of a frame share their time and all
+    frames share their grid, so the first Linear is applied to F times and 4 + 4 places instead of F * 16 tokens.
+    Tokens without a ``grid`` are joined with their time alone.
     """
 
-    clock: tuple[int, int] | None = None
-    position: int = 0
-    frozen: bool = False
-    warned: bool = False  # that it is longer than what is kept
-    kept: list[Frame] = field(default_factory=list)
-    missed: int | None = None
+    framewise = True
 
+    def __init__(self, image_dim: int, memory_dim: int, grid: int = MEMORY_GRID) -> None:
+        super().__init__()
+        self.grid = grid
+        self.position = nn.Linear(POSITION_DIM, POSITION_DIM) if grid else nn.Linear(2 * _FREQUENCIES, memory_dim)
+        self.project = nn.Linear(image_dim + self.position.out_features, memory_dim)
 
-class RolloutMemory:
-    """Histories of the rows of a vector environment.
-
-    A row starts anew when its clock goes back (to an earlier phase, or an earlier step of the phase), and is frozen
-    while its clock stays the same (its episode is over, or the environment is waiting), whatever the other rows do.
-
-    Args:
-        mechanism: what is kept and read.
-        stride: every how many control steps a frame is written; an episode's first one always is.
-    """
-
-    def __init__(self, mechanism: MemoryMechanism, stride: int) -> None:
-        self.mechanism, self.stride = mechanism, stride
-        self.rows: list[Row] = []
-
-    def reset(self) -> None:
-        """Forget everything."""
-        self.rows = []
-
-    def observe(
-        self, clocks: Sequence[tuple[int, int]], encode: Callable[[list[int]], Tensor]
-    ) -> tuple[list[int], list[bool], list[bool]]:
-        """Take in one observation per row.
-
-        Args:
-            clocks: of each row its phase (0 prompt, 1 execution) and the control step since that began.
-            encode: from row numbers (n,) to their frames' tokens (n, P, D); called at most once, for the rows whose
-                frames are written.
+    def forward(self, tokens: Tensor, steps: Tensor, frame_mask: Tensor) -> tuple[Tensor, Tensor]:
+        """Encode tokens (B, F, P, D) of control steps (B, F).
 
         Returns:
-            Per row: its control step since the episode began, prompt included; whether a new episode began; and
-            whether the row is frozen.
+            H (B, F*P, d_m) float32 and its mask (B, F*P) bool, from ``frame_mask`` (B, F).
         """
-        if len(self.rows) != len(clocks):
-            self.rows = [Row() for _ in clocks]
-        before = [row.position for row in self.rows]
-        started = [self._tick(row, clock) for row, clock in enumerate(clocks)]
-        for held, begins, last in zip(self.rows, started, before, strict=True):
-            due = (last // self.stride + 1) * self.stride  # the next one that is written
-            if not begins and due < held.position and held.missed is None:
-                held.missed = due
-        steps, frozen = [row.position for row in self.rows], [row.frozen for row in self.rows]
-        wanted = [
-            row for row, step in enumerate(steps) if not frozen[row] and (started[row] or step % self.stride == 0)
-        ]
-        if wanted and self.mechanism.frames:
-            for number, tokens in zip(wanted, encode(wanted).to("cpu"), strict=True):
-                writing, capacity = self.rows[number], self.mechanism.capacity
-                if capacity is not None and len(writing.kept) == capacity and not writing.warned:
-                    writing.warned = True
-                    logger.warning(
-                        "An episode has more than %d remembered frames, of which the latest are kept; call "
-                        "policy.reset() when an episode begins.",
-                        capacity,
-                    )
-                self.mechanism.write(writing.kept, Frame(steps[number], tokens))
-        return steps, started, frozen
+        of_image, of_position = self.project.weight.split([tokens.shape[-1], self.position.out_features], dim=1)
+        image = F.linear(tokens.to(of_image.dtype), of_image, self.project.bias)
+        # A training batch gives its frames one by one (`PooledMemoryEncoder.shared`), of a tenth as many steps.
+        at, places = steps.unique(return_inverse=True) if steps.shape[1] == 1 else (steps, None)
+        positions = F.linear(F.silu(self._positions(at)), of_position)
+        if places is not None:
+            positions = positions.index_select(0, places.flatten()).unflatten(0, places.shape)
+        encoded = image + positions
+        mask = repeat(frame_mask.bool(), "b f -> b (f p)", p=tokens.shape[2])
+        return rearrange(encoded, "b f p d -> b (f p) d"), mask
 
-    def _tick(self, number: int, clock: tuple[int, int]) -> bool:
-        """Set a row's clock; return whether a new episode began."""
-        step, last = clock[1], self.rows[number].clock
-        if last is None or clock < last:
-            self.rows[number] = Row(clock, step)
-            return True
-        row = self.rows[number]
-        row.clock, row.frozen = clock, clock == last
-        if not row.frozen:  # a phase begins at step 0, one after the last of the prompt; or its clock counts through
-            row.position += step - last[1] if step > last[1] else 1 + step
-        return False
+    def _positions(self, steps: Tensor) -> Tensor:
+        """Return `position` of each token (..., 16, 768); of a frame's time alone (..., 1, d_m) without a grid.
 
-    def writes_next(self) -> bool:
-        """Whether the frame after a row's present one is written."""
-        moving = [row.position for row in self.rows if row.clock is not None and not row.frozen]
-        return self.mechanism.frames > 0 and any((step + 1) % self.stride == 0 for step in moving)
+        Its input is sin t, cos t, sin y, cos y, sin x, cos x, 128 frequencies each from 1 down to 1/base. Token i of a
+        grid row lies at 4 i + 2 of the 16 patches (its middle), y runs over rows.
+        """
+        weight = self.position.weight
+        if not self.grid:
+            return rearrange(self.position(_waves(steps, _TIME_BASE).to(weight.dtype)), "... d -> ... 1 d")
+        of_time, of_row, of_column = weight.split(2 * _FREQUENCIES, dim=1)
+        middles = 4.0 * torch.arange(MEMORY_GRID, dtype=torch.float32, device=steps.device) + 2.0
+        grid = _waves(middles, _SPACE_BASE).to(weight.dtype)
+        time = F.linear(_waves(steps, _TIME_BASE).to(weight.dtype), of_time, self.position.bias)
+        rows = rearrange(F.linear(grid, of_row), "y d -> y 1 d")
+        columns = rearrange(F.linear(grid, of_column), "x d -> 1 x d")
+        return rearrange(time, "... d -> ... 1 d") + rearrange(rows + columns, "y x d -> (y x) d")
 
-    def missed(self, rows: Sequence[int]) -> int | None:
-        """Return the first step of some rows' frames that were to be written and were not offered; None: all were."""
-        steps = (self.rows[row].missed for row in rows)
-        return min((step for step in steps if step is not None), default=None)
 
-    def gather(self, rows: Sequence[int]) -> MemoryBatch:
-        """Return what plans of some rows read."""
-        return collate_frames([self.mechanism.read(self.rows[row].kept) for row in rows], self.mechanism.frames)
+class MemoryTokens(NamedTuple):
+    """Tokens that B rows read, L each.
+
+    Attributes:
+        each: (B, L, d), or (U, P, d) of U frames.
+        mask: (B, L) bool, which are real.
+        places: (B, F), which of the U frames each row reads, with F P = L; None where ``each`` lies in rows.
+    """
+
+    each: Tensor
+    mask: Tensor
+    places: Tensor | None = None
+
+    def through(self, made: Callable[[Tensor], Tensor]) -> MemoryTokens:
+        """Return what is made of every token by itself."""
+        return self._replace(each=made(self.each))
+
+    def rows(self) -> Tensor:
+        """Return what each row reads, (B, L, d)."""
+        if self.places is None:
+            return self.each
+        return self.each.index_select(0, self.places.flatten()).unflatten(0, self.places.shape).flatten(1, 2)
+
+
+class PooledMemoryEncoder(nn.Module):
+    """Stored frames to memory tokens: each through a pool, then the mechanism's encoder over the frames.
+
+    Args:
+        pool: from N frames (N, P, D') to their tokens (N, P'', D). encoder: of (B, F, P'', D).
+    """
+
+    def __init__(self, pool: nn.Module, encoder: nn.Module) -> None:
+        super().__init__()
+        self.pool, self.encoder = pool, encoder
+
+    def forward(self, frames: Tensor, steps: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """Encode frames (B, F, P, D') of steps (B, F), of which mask (B, F) are real.
+
+        Returns:
+            H (B, L, d_m) and its mask (B, L).
+        """
+        memory, real = self.encoder(self.pool(frames.flatten(0, 1)).unflatten(0, mask.shape), steps, mask)
+        return memory, real
+
+    def shared(self, frames: Tensor, steps: Tensor, mask: Tensor, numbers: Tensor) -> MemoryTokens:
+        """Encode what `forward` does; a frame that many rows read is pooled once, and, if the encoder is ``framewise``,
+        encoded once.
+
+        Args:
+            numbers: (B, F), equal where frames and their steps are.
+        """
+        unique, places = numbers.unique(return_inverse=True)
+        order = torch.arange(places.numel(), device=places.device)
+        first = places.new_zeros(len(unique)).scatter_(0, places.flatten(), order)
+        pooled = self.pool(frames.flatten(0, 1)[first])
+        if not getattr(self.encoder, "framewise", False):
+            return MemoryTokens(*self.encoder(pooled[places], steps, mask))
+        each, real = self.encoder(pooled.unsqueeze(1), steps.flatten()[first, None], mask.flatten()[first, None])
+        return MemoryTokens(each, real[places].flatten(1, 2), places)

@@ -1,0 +1,168 @@
+"""What the policy keeps of each row of a rollout: its memory, its action chunk, the seed of its noise.
+
+Rows are independent: what one does depends on no other, nor on how many there are.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
+    Frame,
+    MemoryBatch,
+    MemoryMechanism,
+    collate_frames,
+)
+from lerobot_memobench.policies.memobench_mem.objects import HAND_DIM, rotation
+
+logger = logging.getLogger(__name__)
+
+STILL, PER_RADIAN = 0.006, 0.1
+"""How little a hand or a finger may move from one chunk to the next to be still, m, and what a radian counts, m."""
+
+
+@dataclass
+class Row:
+    """One environment's episode.
+
+    Attributes:
+        clock: phase and control step since the phase began. position: control step since the episode began.
+        missed: the first step of a frame that was to be written and was not offered; None where all were.
+        queue: planned actions that are left. last: action (A,) that was taken last; None: none.
+        stood: the robot's pose when the last chunk was planned.
+    """
+
+    clock: tuple[int, int] | None = None
+    position: int = 0
+    frozen: bool = False
+    warned: bool = False  # that it is longer than what is kept
+    kept: list[Frame] = field(default_factory=list)
+    missed: int | None = None
+    seed: int = 0
+    queue: deque[Tensor] = field(default_factory=deque)
+    last: Tensor | None = None
+    stood: Tensor | None = None
+
+    def drop_chunk(self) -> None:
+        """Forget planned actions; until there are others the action is zero."""
+        self.queue.clear()
+        self.last = self.stood = None
+
+    def begin_chunk(self, chunk: Tensor, count: int, state: Tensor | None = None) -> None:
+        """Take the first actions of a chunk (n, A).
+
+        Args:
+            count: how many. state: the robot's (8,), as it is, m and rad; with it, a hand that stands as it stood when
+                the last chunk was planned carries out the whole chunk. Where each chunk would do the next thing later
+                than it is carried out, the hand would stand there for ever.
+        """
+        stands = None
+        if state is not None:
+            turned = rotation(state[None, 3:HAND_DIM]).flatten() * PER_RADIAN
+            stands = torch.cat([state[:3], turned, state[HAND_DIM:]]).cpu()
+        stood, self.stood = self.stood, stands
+        still = stands is not None and stood is not None and bool((stands - stood).abs().max() < STILL)
+        self.queue.extend(chunk if still else chunk[:count])
+
+    def draw_seed(self, observed: Iterable[Tensor]) -> None:
+        """Draw the seed of the episode's noise, from its first observation and the process's seed."""
+        digest = hashlib.blake2b(str(torch.initial_seed()).encode(), digest_size=7)
+        for value in observed:
+            digest.update(value.detach().to("cpu").contiguous().numpy().tobytes())
+        self.seed = int.from_bytes(digest.digest(), "big")
+
+    def noise(self, shape: tuple[int, int]) -> Tensor:
+        """Return noise on the CPU for a chunk that is planned now."""
+        return torch.randn(shape, generator=torch.Generator().manual_seed(self.seed + self.position))
+
+
+class Rollout:
+    """The rows of a vector environment.
+
+    A row starts anew when its clock goes back (to an earlier phase, or an earlier step of the phase), and is frozen
+    while its clock stays the same (its episode is over, or the environment is waiting), whatever the other rows do.
+
+    Args:
+        mechanism: what is kept and read.
+        stride: every how many control steps a frame is written; an episode's first one always is.
+    """
+
+    def __init__(self, mechanism: MemoryMechanism, stride: int) -> None:
+        self.mechanism, self.stride = mechanism, stride
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self.rows: list[Row] = []
+
+    def observe(
+        self, clocks: Sequence[tuple[int, int]], encode: Callable[[list[int]], Tensor]
+    ) -> tuple[list[int], list[bool], list[bool]]:
+        """Take in one observation per row.
+
+        Args:
+            clocks: of each row its phase (0 prompt, 1 execution) and the control step since that began.
+            encode: from row numbers (n,) to their frames' tokens (n, P, D); called at most once, for the rows whose
+                frames are written.
+
+        Returns:
+            Per row: its control step since the episode began, prompt included; whether a new episode began; and
+            whether the row is frozen.
+        """
+        if len(self.rows) != len(clocks):
+            self.rows = [Row() for _ in clocks]
+        before = [row.position for row in self.rows]
+        started = [self._tick(row, clock) for row, clock in enumerate(clocks)]
+        for held, begins, last in zip(self.rows, started, before, strict=True):
+            due = (last // self.stride + 1) * self.stride  # the next one that is written
+            if not begins and due < held.position and held.missed is None:
+                held.missed = due
+        steps, frozen = [row.position for row in self.rows], [row.frozen for row in self.rows]
+        wanted = [
+            row for row, step in enumerate(steps) if not frozen[row] and (started[row] or step % self.stride == 0)
+        ]
+        if wanted and self.mechanism.frames:
+            for number, tokens in zip(wanted, encode(wanted).to("cpu"), strict=True):
+                writing, capacity = self.rows[number], self.mechanism.capacity
+                if capacity is not None and len(writing.kept) == capacity and not writing.warned:
+                    writing.warned = True
+                    logger.warning(
+                        "An episode has more than %d remembered frames, of which the latest are kept; call "
+                        "policy.reset() when an episode begins.",
+                        capacity,
+                    )
+                self.mechanism.write(writing.kept, Frame(steps[number], tokens))
+        return steps, started, frozen
+
+    def _tick(self, number: int, clock: tuple[int, int]) -> bool:
+        """Set a row's clock; return whether a new episode began."""
+        step, last = clock[1], self.rows[number].clock
+        if last is None or clock < last:
+            self.rows[number] = Row(clock, step)
+            return True
+        row = self.rows[number]
+        row.clock, row.frozen = clock, clock == last
+        if not row.frozen:  # a phase begins at step 0, one after the last of the prompt; or its clock counts through
+            row.position += step - last[1] if step > last[1] else 1 + step
+        return False
+
+    def writes_next(self) -> bool:
+        """Whether the frame after a row's present one is written."""
+        moving = [row.position for row in self.rows if row.clock is not None and not row.frozen]
+        return self.mechanism.frames > 0 and any((step + 1) % self.stride == 0 for step in moving)
+
+    def missed(self, rows: Sequence[int]) -> int | None:
+        """Return the first step of some rows' frames that were to be written and were not offered; None: all were."""
+        steps = (self.rows[row].missed for row in rows)
+        return min((step for step in steps if step is not None), default=None)
+
+    def gather(self, rows: Sequence[int]) -> MemoryBatch:
+        """Return what chunks of some rows read."""
+        return collate_frames([self.mechanism.read(self.rows[row].kept) for row in rows], self.mechanism.frames)
