@@ -13,6 +13,7 @@ Privileged object state is read from the dataset's columns.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import logging
 from collections.abc import Callable, Sequence
@@ -80,7 +81,7 @@ def open_frames(root: Path, config: MemobenchMemConfig, encoder: ObservationEnco
     if isinstance(encoder, ImageTowerEncoder):
         if config.memory == "none":
             return RecordedTexts(root, read_frame_table(root))
-        return open_cache(root, config, encoder)
+        return open_cache(root, config, encoder, progress=_logged("feature cache: %d of %d episodes"))
     names = [name for name in RECORDED if name != OBS_ENV_STATE] if config.uses_pictures else RECORDED
     if isinstance(encoder, VisualTokenEncoder):
         return _with_picture_tokens(root, config, encoder, names)
@@ -135,7 +136,7 @@ def cache_dataset(
     if config.uses_visual_encoder:
         memory, present = make_caches(root, config, load_token_encoder(config, weights), **how)
         return (memory or next(iter(present.values()))).folder
-    return _make_pooled(root, config, load_image_tower(config, weights), **how)
+    return open_cache(root, config, load_image_tower(config, weights), **how).folder
 
 
 def cameras_of(root: Path) -> list[str]:
@@ -151,6 +152,42 @@ def _text_encoder(config: MemobenchMemConfig) -> WordTextEncoder | SiglipTextEnc
 
 def _logged(message: str) -> Progress:
     return lambda done, count: logger.info(message, done, count)
+
+
+@dataclass(frozen=True)
+class Features:
+    """Features of a frame, as a `FrameEncoder`: their identity, number and width, and what makes them of frames."""
+
+    key: str
+    tokens_per_frame: int
+    dim: int
+    make: Callable[..., Tensor]
+
+    def __call__(self, frames: Any) -> Tensor:
+        """Return them, (N, tokens_per_frame, dim) bfloat16."""
+        return self.make(frames)
+
+
+def _folder(root: Path, config: MemobenchMemConfig, key: str, begins: str, camera: str, stride: int) -> Path:
+    return find_cache(root, begins, frames_key=key, camera=camera, stride=stride, place=config.cache_place)
+
+
+def _made(
+    root: Path,
+    config: MemobenchMemConfig,
+    frames: Features | ImageTowerEncoder,
+    begins: str,
+    camera: str,
+    stride: int,
+    *,
+    texts_key: str | None = None,
+    **how: Any,
+) -> FeatureCache:
+    """Make or finish a cache of a camera of the dataset, and open it; ``how`` is of `build_feature_cache`."""
+    folder = _folder(root, config, frames.key, begins, camera, stride)
+    where: dict[str, Any] = {"camera": camera, "stride": stride, "place": folder.parent}
+    build_feature_cache(root, folder.name, frames, _text_encoder(config), **where, **how)
+    return FeatureCache.open(root, folder.name, frames_key=frames.key, texts_key=texts_key, **where)
 
 
 # -- the image tower -------------------------------------------------------------------------------------------------
@@ -185,33 +222,19 @@ def load_image_tower(config: MemobenchMemConfig, weights: str | Path | None = No
     return ImageTowerEncoder(tower, projector, config.image_size, config.memory_camera or "")
 
 
-def open_cache(root: Path, config: MemobenchMemConfig, encoder: ImageTowerEncoder) -> FeatureCache:
+def open_cache(root: Path, config: MemobenchMemConfig, encoder: ImageTowerEncoder, **how: Any) -> FeatureCache:
     """Open the cache of pooled tokens of the dataset at ``root``; make or finish it first where that is needed.
+
+    Args:
+        how: of `build_feature_cache`.
 
     Raises:
         MemobenchError: it cannot be made, for want of room say.
     """
-    folder = _make_pooled(root, config, encoder, progress=_logged("feature cache: %d of %d episodes"))
-    return FeatureCache.open(
-        root,
-        folder.name,
-        frames_key=encoder.key,
-        camera=_column(root, encoder),
-        stride=config.memory_stride,
-        texts_key=None if config.align == "none" else _text_encoder(config).key,
-        place=folder.parent,
-    )
-
-
-def _make_pooled(root: Path, config: MemobenchMemConfig, encoder: ImageTowerEncoder, **how: Any) -> Path:
-    where: dict[str, Any] = {"camera": _column(root, encoder), "stride": config.memory_stride}
-    folder = find_cache(root, config.cache_name, frames_key=encoder.key, place=config.cache_place, **where)
-    return build_feature_cache(root, folder.name, encoder, _text_encoder(config), place=folder.parent, **where, **how)
-
-
-def _column(root: Path, encoder: ImageTowerEncoder) -> str:
-    """Return the dataset's column that is remembered: its first camera, where the policy has not chosen yet."""
-    return name_in_data(encoder.memory_input) or next(iter(cameras_of(root)), "")
+    camera = name_in_data(encoder.memory_input) or next(iter(cameras_of(root)), "")  # where none is chosen yet
+    texts_key = None if config.align == "none" else _text_encoder(config).key
+    where = config.cache_name, camera, config.memory_stride
+    return _made(root, config, encoder, *where, texts_key=texts_key, **how)
 
 
 # -- visual encoders -------------------------------------------------------------------------------------------------
@@ -228,41 +251,6 @@ def load_token_encoder(config: MemobenchMemConfig, weights: str | Path | None = 
         load_exactly(tower, read_weights(source, _VISION_PREFIX + "vision_tower."), source, optional=set())
     width = config.dimensions.vlm.width
     return VisualTokenEncoder(tower.to(config.device), [*config.image_features], config.memory_camera or "", width)
-
-
-@dataclass(frozen=True)
-class TokenCache:
-    """A cache of a camera's tokens that is wanted, and the `FrameEncoder` that makes them.
-
-    Attributes:
-        camera: its name at the policy. stride: control steps from a frame to the next. folder: of the cache.
-        key: identity of the tokens. make: tokens of frames, (N, tokens_per_frame, dim) bfloat16.
-    """
-
-    camera: str
-    stride: int
-    folder: Path
-    key: str
-    tokens_per_frame: int
-    make: Callable[[Tensor], Tensor]
-    dim: int = WIDTH
-
-    def __call__(self, images: Tensor) -> Tensor:
-        """Make tokens."""
-        return self.make(images)
-
-    @property
-    def where(self) -> dict[str, Any]:
-        """Arguments by which a cache is found."""
-        return {"camera": name_in_data(self.camera), "stride": self.stride, "place": self.folder.parent}
-
-    def open(self, root: Path) -> FeatureCache:
-        """Open it, which is there."""
-        return FeatureCache.open(root, self.folder.name, frames_key=self.key, **self.where)
-
-    def bytes(self, frames: int) -> int:
-        """Return about how large it is; each episode may remember one frame more."""
-        return -(-frames // self.stride) * self.tokens_per_frame * self.dim * 2
 
 
 def make_caches(
@@ -286,42 +274,36 @@ def make_caches(
         MemobenchError: the dataset lacks a camera, or the disk has no room for all of them.
     """
 
-    def wanted(camera: str, stride: int, begins: str, key: str, *tokens: Any) -> TokenCache:
-        where: dict[str, Any] = {"camera": name_in_data(camera), "stride": stride, "place": config.cache_place}
-        return TokenCache(camera, stride, find_cache(root, begins, frames_key=key, **where), key, *tokens)
-
-    def make(cache: TokenCache, **more: Any) -> None:
-        texts = _text_encoder(config)
-        build_feature_cache(root, cache.folder.name, cache, texts, tell=tell, **cache.where, **how, **more)
-
-    whole = encoder.present_key, GRID**2, encoder.encode
+    whole = Features(encoder.present_key, GRID**2, WIDTH, encoder.encode)
+    pooled = Features(encoder.key, encoder.tokens_per_frame, WIDTH, encoder.pooled)
     cameras = dict.fromkeys(encoder.cameras or [*cameras_of(root), encoder.memory_input])
-    present = [wanted(camera, 1, f"{config.size}-present", *whole) for camera in cameras]
-    pooled = encoder.key, encoder.tokens_per_frame, encoder.pooled
-    memory = None
-    if config.memory != "none":
-        memory = wanted(encoder.memory_input, config.memory_stride, config.cache_name, *pooled)
+    present = {camera: (whole, f"{config.size}-present", name_in_data(camera), 1) for camera in cameras}
+    memory = (pooled, config.cache_name, name_in_data(encoder.memory_input), config.memory_stride)
+    remembers = config.memory != "none"
     frames = int(read_info(root).get("total_frames", 0))
-    sizes = {cache.folder: cache.bytes(frames) for cache in (*present, *([] if memory is None else [memory]))}
+    sizes = {  # about; each episode may remember one frame more
+        _folder(root, config, made.key, begins, camera, stride): -(-frames // stride)
+        * made.tokens_per_frame
+        * WIDTH
+        * 2
+        for made, begins, camera, stride in (*present.values(), *([memory] if remembers else []))
+    }
     tell(
         f"The tokens of the {frames:,} frames of {root} take {in_words(sum(sizes.values()))}: "
         f"{in_words(2 * GRID**2 * WIDTH)} of each of {len(present)} pictures of a frame, and "
         f"{in_words(2 * POOLED**2 * WIDTH)} of every frame that is remembered; what is not there yet is made now."
     )
-    require_room(present[0].folder.parent, sizes)
-    busy = []
-    for cache in present:
-        try:
-            make(cache, wait=_come_back)
-        except _Busy:
-            busy.append(cache)  # whoever trains beside us is at it; the other camera's is made here meanwhile
-    for cache in busy:
-        make(cache)
-    opened = {cache.camera: cache.open(root) for cache in present}
-    if memory is None:
+    require_room(next(iter(sizes)).parent, sizes)
+    opened, how["tell"] = {}, tell
+    for camera, wanted in present.items():
+        # Whoever trains beside us may be at it; the other camera's is made here meanwhile.
+        with contextlib.suppress(_Busy):
+            opened[camera] = _made(root, config, *wanted, wait=_come_back, **how)
+    for camera in [camera for camera in present if camera not in opened]:
+        opened[camera] = _made(root, config, *present[camera], **how)
+    if not remembers:
         return None, opened
-    make(memory, read=opened[memory.camera].tokens)
-    return memory.open(root), opened
+    return _made(root, config, *memory, read=opened[encoder.memory_input].tokens, **how), opened
 
 
 class _Busy(Exception):
@@ -355,26 +337,6 @@ def _with_picture_tokens(
 # -- detectors -------------------------------------------------------------------------------------------------------
 
 
-@dataclass
-class DetectionFeatures:
-    """Slots of detections as a cache holds them; a `FrameEncoder` of pictures by their names and robot states."""
-
-    detect: ObjectsFromPictures
-    tokens_per_frame: int = 2
-    dim: int = SIZE
-
-    @property
-    def key(self) -> str:
-        """Identity of the detections."""
-        return self.detect.key
-
-    def __call__(self, observed: tuple[dict[str, Tensor], Tensor]) -> Tensor:
-        """Return the slots of frames in two parts, (N, 2, SIZE) bfloat16."""
-        slots = self.detect(*observed)
-        rounded = slots.to(torch.bfloat16)
-        return torch.stack([rounded, (slots - rounded.float()).to(torch.bfloat16)], dim=1)
-
-
 def make_detections(root: Path, config: MemobenchMemConfig, detect: ObjectsFromPictures, **how: Any) -> FeatureCache:
     """Make or finish the cache of detections in the pictures of the dataset at ``root``.
 
@@ -384,9 +346,6 @@ def make_detections(root: Path, config: MemobenchMemConfig, detect: ObjectsFromP
     Raises:
         MemobenchError: the dataset lacks a camera, or the disk has no room.
     """
-    where: dict[str, Any] = {"camera": next(iter(VIEWS)), "stride": 1}
-    folder = find_cache(root, "objects", frames_key=detect.key, place=config.cache_place, **where)
-    where["place"] = folder.parent
     readers = {name: frame_reader(root, name) for name in VIEWS}
     recorded = functools.cache(lambda: read_recorded(root, [OBS_STATE]))  # a cache that is whole needs none
 
@@ -395,6 +354,10 @@ def make_detections(root: Path, config: MemobenchMemConfig, detect: ObjectsFromP
         states = columns[OBS_STATE][[int(table.episodes[episode]) + number for number in numbers]]
         return {name: one(episode, numbers) for name, one in readers.items()}, states
 
-    features, texts = DetectionFeatures(detect), _text_encoder(config)
-    build_feature_cache(root, folder.name, features, texts, read=read, **where, **how)
-    return FeatureCache.open(root, folder.name, frames_key=detect.key, **where)
+    def make(observed: tuple[dict[str, Tensor], Tensor]) -> Tensor:
+        slots = detect(*observed)
+        rounded = slots.to(torch.bfloat16)
+        return torch.stack([rounded, (slots - rounded.float()).to(torch.bfloat16)], dim=1)
+
+    features = Features(detect.key, 2, SIZE, make)
+    return _made(root, config, features, "objects", next(iter(VIEWS)), 1, read=read, **how)
