@@ -139,8 +139,11 @@ def without_configuration() -> AbstractContextManager[None]:
     """
 
     def matters(record: logging.LogRecord) -> bool:
-        # It is logged as a printed dictionary.
-        return record.filename != "lerobot_train.py" or not record.getMessage().startswith("{'")
+        # It is logged once, as a printed dictionary.
+        if record.filename != "lerobot_train.py" or not record.getMessage().startswith("{'"):
+            return True
+        logging.getLogger().removeFilter(matters)
+        return False
 
     return _filtered(matters, None)
 

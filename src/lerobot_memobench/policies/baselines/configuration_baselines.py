@@ -28,17 +28,14 @@ class UntrainedConfig(PreTrainedConfig):
     @property
     def observation_delta_indices(self) -> None:
         """No observations of other steps."""
-        return None
 
     @property
     def action_delta_indices(self) -> None:
         """No actions of other steps."""
-        return None
 
     @property
     def reward_delta_indices(self) -> None:
         """No rewards of other steps."""
-        return None
 
     def get_optimizer_preset(self) -> AdamWConfig:
         """LeRobot asks for one before it builds the policy; ``forward`` then refuses to train."""
@@ -46,11 +43,9 @@ class UntrainedConfig(PreTrainedConfig):
 
     def get_scheduler_preset(self) -> LRSchedulerConfig | None:
         """No schedule."""
-        return None
 
     def validate_features(self) -> None:
         """Take the environment's features as they are."""
-        return None
 
 
 @PreTrainedConfig.register_subclass("memobench_expert")

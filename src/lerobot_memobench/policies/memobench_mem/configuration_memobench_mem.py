@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -106,28 +106,25 @@ class Dimensions:
 
 # The VLM's width is also the width d_m of the memory tokens (2048 at full size).
 # LeRobot's attention code fixes 8 heads; widths and head dimensions are free.
+_TINY = Dimensions(
+    vlm=Gemma(width=128, depth=4, mlp_dim=256, num_heads=8, num_kv_heads=1, head_dim=16),
+    expert=Gemma(width=128, depth=4, mlp_dim=256, num_heads=8, num_kv_heads=1, head_dim=16),
+    vision=Vision(width=96, depth=2, mlp_dim=192, num_heads=4, patch=12, image=96),
+    vocabulary=1024,
+    tokenizer="words",
+    tokenizer_max_length=64,
+    text_encoder="words",
+    text_dim=64,
+    learning_rate=1e-3,
+)
 SIZES = {
-    "tiny": Dimensions(
-        vlm=Gemma(width=128, depth=4, mlp_dim=256, num_heads=8, num_kv_heads=1, head_dim=16),
-        expert=Gemma(width=128, depth=4, mlp_dim=256, num_heads=8, num_kv_heads=1, head_dim=16),
-        vision=Vision(width=96, depth=2, mlp_dim=192, num_heads=4, patch=12, image=96),
-        vocabulary=1024,
-        tokenizer="words",
-        tokenizer_max_length=64,
-        text_encoder="words",
-        text_dim=64,
-        learning_rate=1e-3,
-    ),
-    "small": Dimensions(
-        vlm=Gemma(width=128, depth=3, mlp_dim=256, num_heads=8, num_kv_heads=1, head_dim=16),
-        expert=Gemma(width=128, depth=3, mlp_dim=256, num_heads=8, num_kv_heads=1, head_dim=16),
-        vision=Vision(width=96, depth=2, mlp_dim=192, num_heads=4, patch=12, image=96),
+    "tiny": _TINY,
+    "small": replace(
+        _TINY,
+        vlm=replace(_TINY.vlm, depth=3),
+        expert=replace(_TINY.expert, depth=3),
         vocabulary=512,
-        tokenizer="words",
         tokenizer_max_length=48,
-        text_encoder="words",
-        text_dim=64,
-        learning_rate=1e-3,
         recipe=Recipe(
             chunk_size=16,
             n_action_steps=6,

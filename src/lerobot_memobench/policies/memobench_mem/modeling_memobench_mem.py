@@ -313,18 +313,19 @@ class MemobenchMemPolicy(PI05Policy):
         _, _, frozen = self.observe(batch)
         rows = self.rollout.rows
         prompt = [phase == PROMPT for phase in _column(batch, OBS_PHASE) or [EXECUTION] * len(rows)]
-        for row, prompted in zip(rows, prompt, strict=True):
-            if prompted:
+        for number, row in enumerate(rows):
+            if prompt[number]:
                 row.drop_chunk()
         acting = self._acting_rows = [row for row in range(len(rows)) if not prompt[row] and not frozen[row]]
-        wanting = [row for row in acting if not rows[row].queue]
+        wanting = [number for number in acting if not rows[number].queue]
         if wanting:
             chunks = self.plan(batch, wanting, self._noise(wanting))
             states = batch[OBS_RAW_STATE] if self.config.full_chunk_when_stalled else None
-            for row, chunk in zip(wanting, chunks.float().cpu(), strict=True):
-                rows[row].begin_chunk(chunk, self.config.n_action_steps, None if states is None else states[row])
-        for row in acting:
-            rows[row].last = rows[row].queue.popleft()
+            for number, chunk in zip(wanting, chunks.float().cpu(), strict=True):
+                state = None if states is None else states[number]
+                rows[number].begin_chunk(chunk, self.config.n_action_steps, state)
+        for number in acting:
+            rows[number].last = rows[number].queue.popleft()
         none = torch.zeros(self._action_dim)
         return torch.stack([none if row.last is None else row.last for row in rows]).to(self._device)
 

@@ -25,7 +25,7 @@ from transformers.models.gemma import modeling_gemma
 from lerobot_memobench.lerobot_hooks import ATTEND, hooked_for
 from lerobot_memobench.perception.visual_encoder import VisualEncoder
 from lerobot_memobench.perception.weights import load_detector
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import Dimensions, Gemma, MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import Dimensions, MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import (
     LOUD,
     VISION_SEED,
@@ -149,8 +149,8 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
         dims, image_size = config.dimensions, config.image_size[0]
         with torch.device("meta"):
             super().__init__(
-                _gemma(dims.vlm),
-                _gemma(dims.expert),
+                GemmaConfig(**vars(dims.vlm)),
+                GemmaConfig(**vars(dims.expert)),
                 use_adarms=[False, True],
                 precision=config.dtype,
                 image_size=image_size,
@@ -242,10 +242,6 @@ class InstructionCondition(nn.Module):
         """Return what is added to the condition (B, width)."""
         added: Tensor = self.mlp(self.mean)
         return added
-
-
-def _gemma(size: Gemma) -> GemmaConfig:
-    return GemmaConfig(size.width, size.depth, size.mlp_dim, size.num_heads, size.num_kv_heads, size.head_dim)
 
 
 def _resize(vlm: Any, dims: Dimensions, image_size: int) -> Any:

@@ -195,13 +195,10 @@ class ObjectEncoder(nn.Module, ObservationEncoder):
         made, there = self.slot(slots.unflatten(1, (-1, WIDTH)), hand)
         return in_slots(made * LOUD, there)
 
-    def pool(self) -> ObjectPool:
-        """Return the pool of stored frames."""
-        return ObjectPool(self.order, self.kinds, self.tokens_per_frame, self.dim, self.noise)
-
     def memory(self, encoder: nn.Module) -> nn.Module:
         """Return the encoder behind a pool of each frame."""
-        return PooledMemoryEncoder(self.pool(), encoder)
+        pool = ObjectPool(self.order, self.kinds, self.tokens_per_frame, self.dim, self.noise)
+        return PooledMemoryEncoder(pool, encoder)
 
 
 # -- detections -------------------------------------------------------------------------------------------------------

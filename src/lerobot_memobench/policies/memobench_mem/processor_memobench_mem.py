@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -61,7 +61,7 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
 )
 from lerobot_memobench.policies.memobench_mem.memory.none import NoMemory
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE
-from lerobot_memobench.policies.memobench_mem.sampler import TrainingRun, prompt_texts, require_cache, training_run
+from lerobot_memobench.policies.memobench_mem.sampler import TrainingRun, prompt_texts, training_run
 from lerobot_memobench.tasks.memory_text import MARK, with_memory
 
 logger = logging.getLogger(__name__)
@@ -143,12 +143,45 @@ def gathering(config: MemobenchMemConfig) -> dict[str, Any]:
 
 
 @dataclass
+class LookupProcessorStep(ProcessorStep):
+    """A step that looks up the frames of training samples: in its own ``cache``, or in that of the run it follows."""
+
+    cache: FrameLookup | None = field(default=None, repr=False, kw_only=True)
+    _run: TrainingRun | None = field(default=None, init=False, repr=False)
+
+    def frames_of(self, extra: Mapping[str, Any], transition: EnvTransition) -> tuple[FrameLookup, list[int]] | None:
+        """Return the cache, and a training sample's frames by their global indices; None in a rollout.
+
+        LeRobot keeps of a training batch only what its transition knows, which is the frame's ``index``; rollouts carry
+        none.
+
+        Raises:
+            MemobenchError: there is no cache.
+        """
+        if "index" not in extra or transition.get(TransitionKey.ACTION) is None:
+            return None
+        cache = self.cache or (self._run.cache if self._run is not None else None)
+        if cache is None:
+            raise MemobenchError(
+                "The preprocessor of memobench_mem has no feature cache to look up history in: make the policy with "
+                "its dataset_meta first, and then its processors with that policy's configuration, or give "
+                "GatherMemoryProcessorStep a cache."
+            )
+        return cache, extra["index"].reshape(-1).tolist()
+
+    def transform_features(
+        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
+    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
+        """Leave the features as they are."""
+        return features
+
+
+@dataclass
 @ProcessorStepRegistry.register(name="memobench_gather_memory")
-class GatherMemoryProcessorStep(ProcessorStep):
+class GatherMemoryProcessorStep(LookupProcessorStep):
     """Add history, phase and subgoal embeddings to training samples; leave observations of a rollout alone.
 
-    LeRobot keeps of a training batch only what its transition knows, which is the frame's global ``index``; all is
-    looked up by it in the feature cache. Rollouts carry no ``index``; there the policy itself keeps the history.
+    In a rollout the policy itself keeps the history.
 
     Adds ``memory.tokens`` (B, F, P, D), ``memory.steps`` (B, F) int64, ``memory.mask`` (B, F) bool, ``phase`` (B,),
     features of the frames (``observation.encoded.*``), and with an alignment ``memory.text`` and
@@ -165,9 +198,7 @@ class GatherMemoryProcessorStep(ProcessorStep):
     shuffle_subgoals: bool = False
     shuffle_seed: int = 7
     memory: str = FrameSampling.name
-    cache: FrameLookup | None = field(default=None, repr=False)
     mechanism: MemoryMechanism = field(init=False, repr=False)
-    _run: TrainingRun | None = field(default=None, init=False, repr=False)
     _texts: np.ndarray | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -185,10 +216,10 @@ class GatherMemoryProcessorStep(ProcessorStep):
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         """Return the transition with what was looked up."""
         extra = transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}
-        if "index" not in extra or transition.get(TransitionKey.ACTION) is None:
+        found = self.frames_of(extra, transition)
+        if found is None:
             return transition
-        cache = require_cache(self.cache, self._run)
-        indices = extra["index"].reshape(-1).tolist()
+        cache, indices = found
         transition = transition.copy()
         transition[TransitionKey.COMPLEMENTARY_DATA] = {**extra, **self.gather(cache, indices)}
         observation = transition.get(TransitionKey.OBSERVATION) or {}
@@ -243,16 +274,10 @@ class GatherMemoryProcessorStep(ProcessorStep):
         }
         return found if self.memory in (FrameSampling.name, NoMemory.name) else found | {"memory": self.memory}
 
-    def transform_features(
-        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
-    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        """Leave the features as they are."""
-        return features
-
 
 @dataclass
 @ProcessorStepRegistry.register(name="memobench_oracle_memory")
-class OracleMemoryProcessorStep(ProcessorStep):
+class OracleMemoryProcessorStep(LookupProcessorStep):
     """The paper's control: ground-truth memory text behind the instruction, before the prompt is tokenized.
 
     Training samples take it from the dataset's column ``memory``. In a rollout the environment, which alone knows what
@@ -262,9 +287,6 @@ class OracleMemoryProcessorStep(ProcessorStep):
     """
 
     enabled: bool = True
-    cache: FrameLookup | None = field(default=None, repr=False)
-
-    _run: TrainingRun | None = field(default=None, init=False, repr=False)
 
     def follow(self, run: TrainingRun) -> None:
         """Read memory texts out of a run's cache, if its policy does, unless there is a cache of its own."""
@@ -281,9 +303,10 @@ class OracleMemoryProcessorStep(ProcessorStep):
             return transition
         extra = transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}
         tasks = extra.get("task") or []
-        if "index" in extra and transition.get(TransitionKey.ACTION) is not None:
-            cache = require_cache(self.cache, self._run)
-            memories = cache.memory_texts(extra["index"].reshape(-1).tolist())
+        found = self.frames_of(extra, transition)
+        if found is not None:
+            cache, indices = found
+            memories = cache.memory_texts(indices)
             tasks = [with_memory(task, memory) for task, memory in zip(tasks, memories, strict=True)]
         elif not tasks or not all(MARK in task for task in tasks):
             raise MemobenchError(
@@ -297,12 +320,6 @@ class OracleMemoryProcessorStep(ProcessorStep):
     def get_config(self) -> dict[str, Any]:
         """Return what the processor file holds."""
         return {"enabled": self.enabled}
-
-    def transform_features(
-        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
-    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        """Leave the features as they are."""
-        return features
 
 
 @dataclass

@@ -107,22 +107,6 @@ def prompt_texts(config: MemobenchMemConfig, meta: Any | None, cache: FrameLooku
     return tasks
 
 
-def require_cache(own: FrameLookup | None, run: TrainingRun | None) -> FrameLookup:
-    """Return the cache a step was given, or that of the run it follows.
-
-    Raises:
-        MemobenchError: there is none.
-    """
-    cache = own or (run.cache if run is not None else None)
-    if cache is None:
-        raise MemobenchError(
-            "The preprocessor of memobench_mem has no feature cache to look up history in: make the policy with its "
-            "dataset_meta first, and then its processors with that policy's configuration, or give "
-            "GatherMemoryProcessorStep a cache."
-        )
-    return cache
-
-
 # -- frames that are drawn -------------------------------------------------------------------------------------------
 
 

@@ -12,7 +12,7 @@ import binascii
 import json
 import threading
 from contextlib import ExitStack
-from typing import Any, Protocol
+from typing import Any
 
 import httpx
 import msgpack
@@ -34,27 +34,6 @@ REFUSED = "VOc"
 
 class ServerAway(Exception):
     """The server cannot be reached, or went away; it may come back."""
-
-
-class Transport(Protocol):
-    """A connection to a server; it opens as often as it must."""
-
-    def open(self, patience: float) -> dict[str, Any]:
-        """Connect anew within ``patience`` seconds, return what the server says of itself; `ServerAway` if it fails."""
-        ...
-
-    def ask(self, question: dict[str, Any]) -> dict[str, Any]:
-        """Send a question, return the answer.
-
-        Raises:
-            ServerAway: the connection broke.
-            MemobenchError: the server failed, took too long, or is none of this kind.
-        """
-        ...
-
-    def close(self) -> None:
-        """Hang up."""
-        ...
 
 
 def last_line(text: str) -> str:
@@ -88,7 +67,12 @@ class Websocket:
         self._connection: ClientConnection | None = None
 
     def open(self, patience: float) -> dict[str, Any]:
-        """Connect, and return the metadata that the server sends first."""
+        """Connect anew within ``patience`` seconds, and return the metadata that the server sends first.
+
+        Raises:
+            ServerAway: nobody is there.
+            MemobenchError: it is no server of this kind.
+        """
         self.close()
         try:
             return self._connect(max(patience, 1.0))
@@ -136,7 +120,12 @@ class Websocket:
             raise self._foreign(str(error)) from error
 
     def ask(self, question: dict[str, Any]) -> dict[str, Any]:
-        """Send a frame and return the one that comes back."""
+        """Send a frame and return the one that comes back.
+
+        Raises:
+            ServerAway: the connection broke.
+            MemobenchError: the server failed, took too long, or is none of this kind.
+        """
         if self._connection is None:
             raise ServerAway("not connected")
         try:
@@ -157,7 +146,7 @@ class Websocket:
 
 
 class Rest:
-    """A server that is asked by HTTP POST; a subclass knows the path and both formats."""
+    """A server that is asked by HTTP POST, as `Websocket` is; a subclass knows the path and both formats."""
 
     path = ""
 
@@ -262,7 +251,8 @@ class ProcessFrame(Rest):
         return numbers(actions)
 
 
-TRANSPORTS: dict[str, type[Websocket] | type[Rest]] = {
+Transport = Websocket | Rest
+TRANSPORTS: dict[str, type[Transport]] = {
     "websocket": Websocket,
     "act": Act,
     "process_frame": ProcessFrame,
