@@ -127,13 +127,8 @@ def largest_pixel_difference(a: Sequence[Picture], b: Sequence[Picture]) -> int:
     return max(int(np.abs(x.astype(np.int16) - y).max()) for x, y in zip(a, b, strict=True))
 
 
-def differences(frames: Sequence[Sequence[Picture]]) -> NDArray[np.float64]:
-    """Return `difference` of all pairs, (n, n)."""
-    return pairwise_table(frames, difference)
-
-
 def pairwise_table[Item](items: Sequence[Item], measure: Callable[[Item, Item], float]) -> NDArray[np.float64]:
-    """Return a symmetric measure of all pairs, (n, n), with zeros on the diagonal."""
+    """Return a symmetric measure, such as `difference`, of all pairs, (n, n), with zeros on the diagonal."""
     table = np.zeros((len(items), len(items)))
     for i, j in combinations(range(len(items)), 2):
         table[i, j] = table[j, i] = measure(items[i], items[j])

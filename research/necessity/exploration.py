@@ -25,8 +25,8 @@ from research.necessity.demonstrations import (
     answer_of,
     begin,
     difference,
-    differences,
     expert_of,
+    pairwise_table,
     photograph,
     rest_steps,
 )
@@ -328,7 +328,7 @@ def search(laboratory: Laboratory, settings: Settings) -> dict[str, Any]:
     """
     found = explore(laboratory, settings.budget, settings.horizon)
     graph = found.graph
-    graph.pictures = classes(differences(found.pictures), settings.tolerance)
+    graph.pictures = classes(pairwise_table(found.pictures, difference), settings.tolerance)
     groups = [_best(laboratory, found, group, settings) for group in _by_instruction(laboratory)]
     goals = len(laboratory.variants)
     return {

@@ -6,7 +6,6 @@ import io
 import json
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -161,8 +160,9 @@ def _drawn(shown: Sequence[tuple[Result, Strip]]) -> Figure:
             axis.set_yticks([])
             axis.set_xlabel(CAMERAS[k % 2], fontsize=8)
         for axis, frame in ((axes[0], pair["a"]), (axes[2], pair["b"])):
-            axis.set_title(f"step {frame['step']}: {_short(frame['answer'])}", fontsize=9, loc="left")
-        axes[0].set_ylabel(_wrapped(result["task"]), fontsize=8)
+            answer = frame["answer"].strip("()").replace("_1", "").replace("_", " ")
+            axis.set_title(f"step {frame['step']}: {answer}", fontsize=9, loc="left")
+        axes[0].set_ylabel(textwrap.fill(result["task"].replace("_", " "), 26), fontsize=8)
     return plot
 
 
@@ -177,44 +177,27 @@ def _small_png(plot: Figure) -> bytes:
     return buffer.getvalue()
 
 
-def _short(answer: str) -> str:
-    return answer.strip("()").replace("_1", "").replace("_", " ")
-
-
-def _wrapped(name: str, width: int = 26) -> str:
-    return "\n".join(textwrap.wrap(name.replace("_", " "), width))
-
-
 JSON_FILE, MARKDOWN_FILE, FIGURE_FILE = "necessity.json", "necessity.md", "aliased_pairs.png"
 
 
 # --- tables ---
 
 
-@dataclass(frozen=True)
-class Column:
-    """A column: its heading, and what it says under the table."""
-
-    name: str
-    meaning: str
-
-
-COLUMNS = (
-    Column("referent", "what the goal is; *both*: the task has one goal, so the settings are the same"),
-    Column("goals", "goals that may lie behind the same start"),
-    Column("decisions", "times per episode at which the expert turns to something new"),
-    Column("aliased", "pictures at which more than one answer is right: arm at home / as it happens"),
-    Column("chance", "knows the routine, guesses evenly where the picture does not decide; one try each"),
-    Column("fixed map", "best map from pictures to answers, in the demonstrated order"),
-    Column("probabilities", "best probabilities of answers given the picture, same order, one try each"),
-    Column("exact", "fixed map if every pixel could be used (differences above 2 of 255)"),
-    Column("any order", "best map if any order will do that the goal accepts: found, and confirmed in the simulator"),
-    Column(
-        "any order, prob.", "best probabilities found, wrong answers mended as the scene allows, within the horizon"
-    ),
-    Column("expert", "the expert's episodes that reached the goal"),
-    Column("memory needed", "see below"),
-)
+COLUMNS = {
+    "referent": "what the goal is; *both*: the task has one goal, so the settings are the same",
+    "goals": "goals that may lie behind the same start",
+    "decisions": "times per episode at which the expert turns to something new",
+    "aliased": "pictures at which more than one answer is right: arm at home / as it happens",
+    "chance": "knows the routine, guesses evenly where the picture does not decide; one try each",
+    "fixed map": "best map from pictures to answers, in the demonstrated order",
+    "probabilities": "best probabilities of answers given the picture, same order, one try each",
+    "exact": "fixed map if every pixel could be used (differences above 2 of 255)",
+    "any order": "best map if any order will do that the goal accepts: found, and confirmed in the simulator",
+    "any order, prob.": "best probabilities found, wrong answers mended as the scene allows, within the horizon",
+    "expert": "the expert's episodes that reached the goal",
+    "memory needed": "; ".join(f"*{word}*: {meaning}" for word, meaning in VERDICTS.items()),
+}
+"""Heading -> what it says under the table."""
 
 
 def cells(result: Result, referent: str) -> list[str]:
@@ -258,8 +241,8 @@ def terminal_table(results: Sequence[Result]) -> Any:
 
     table = Table(header_style="bold", pad_edge=False)
     table.add_column("task")
-    for column in COLUMNS:
-        table.add_column(column.name, justify="left" if column.name in ("referent", "memory needed") else "right")
+    for name in COLUMNS:
+        table.add_column(name, justify="left" if name in ("referent", "memory needed") else "right")
     before = None
     for memory_type, task, row in rows(results):
         if before not in (None, memory_type):
@@ -271,12 +254,11 @@ def terminal_table(results: Sequence[Result]) -> Any:
 
 def markdown(results: Sequence[Result]) -> str:
     """Return the table, what its columns mean, what follows, and the best maps that were found."""
-    lines = ["| task | " + " | ".join(column.name for column in COLUMNS) + " |"]
+    lines = ["| task | " + " | ".join(COLUMNS) + " |"]
     lines.append("|---|" + "---|" * len(COLUMNS))
     lines += [f"| {memory_type}: `{task}` | " + " | ".join(row) + " |" for memory_type, task, row in rows(results)]
     lines += ["", "Per cent, means over scenes. Columns:", ""]
-    lines += [f"- **{column.name}**: {column.meaning}." for column in COLUMNS[:-1]]
-    lines += ["- **memory needed**: " + "; ".join(f"*{word}*: {meaning}" for word, meaning in VERDICTS.items()) + "."]
+    lines += [f"- **{name}**: {meaning}." for name, meaning in COLUMNS.items()]
     same = max((result["largest_same"] for result in results), default=0.0)
     other = min((result["smallest_different"] for result in results), default=1.0)
     lines += [

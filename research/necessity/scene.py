@@ -15,7 +15,6 @@ from research.necessity.demonstrations import (
     Demonstration,
     Frame,
     difference,
-    differences,
     largest_pixel_difference,
     pairwise_table,
 )
@@ -54,7 +53,7 @@ class Scene:
                 self._owners += [variant.variant_index] * len(demonstration.frames)
                 self._asked += [variant.language] * len(demonstration.frames)
         self._tolerance = tolerance
-        self._differences = differences([frame.at_home for frame in self._frames])
+        self._differences = pairwise_table([frame.at_home for frame in self._frames], difference)
         self._pictures = classes(self._differences, tolerance)
 
     def result(self, seed: int) -> dict[str, Any]:
@@ -62,6 +61,17 @@ class Scene:
         histories = self._histories(self._pictures)
         as_exact = self._histories(classes(pairwise_table(self._frames, _exactly), PIXEL_EXACT))
         as_it_happens = self._histories(classes(pairwise_table(self._frames, _as_it_happens), self._tolerance))
+        in_order = (
+            {
+                "chance": chance(histories),
+                "deterministic": deterministic_ceiling(histories),
+                "stochastic": stochastic_ceiling(histories),
+                "pixel_exact": deterministic_ceiling(as_exact),
+                "as_it_happens": deterministic_ceiling(as_it_happens),
+            }
+            if histories
+            else {}
+        )
         apart = ~np.equal.outer(self._pictures, self._pictures)
         counts = {"at_home": histories, "pixel_exact": as_exact, "as_it_happens": as_it_happens}
         return {
@@ -69,7 +79,7 @@ class Scene:
             "solved": len(histories),
             "decisions": sum(len(history) for history in histories),
             "aliased": {key: len(aliased(found)) for key, found in counts.items()} if histories else {},
-            "in_order": _ceilings(histories, as_exact, as_it_happens) if histories else {},
+            "in_order": in_order,
             "examples": [self._example(seed, i, j) for i, j in self._pairs[:EXAMPLES]],
             "largest_same": float(self._differences[~apart].max(initial=0.0)),
             "smallest_different": float(self._differences[apart].min(initial=1.0)),
@@ -126,16 +136,3 @@ def _exactly(a: Frame, b: Frame) -> float:
 def _as_it_happens(a: Frame, b: Frame) -> float:
     """Return how much two frames differ with the arm where it was; 1 where the hand was elsewhere."""
     return difference(a.observations, b.observations) if np.abs(a.proprio - b.proprio).max() <= SAME_HAND else 1.0
-
-
-def _ceilings(
-    histories: Sequence[History], as_exact: Sequence[History], as_it_happens: Sequence[History]
-) -> dict[str, float]:
-    """Return how far policies without memory can come in the demonstrated order."""
-    return {
-        "chance": chance(histories),
-        "deterministic": deterministic_ceiling(histories),
-        "stochastic": stochastic_ceiling(histories),
-        "pixel_exact": deterministic_ceiling(as_exact),
-        "as_it_happens": deterministic_ceiling(as_it_happens),
-    }

@@ -156,11 +156,6 @@ Result = Mapping[str, Any]
 """What is found about a task: JSON values."""
 
 
-def study(task: Task, referent: str, settings: Settings, out: Path) -> Result:
-    """Return the result of a task under a referent setting; what is not on disk yet is simulated."""
-    return Study(task, referent, settings, out).result()
-
-
 class Study:
     """One task under one referent setting: what is on disk is read, the rest is simulated and kept.
 

@@ -1,14 +1,18 @@
-"""The table of the study in a page of the documentation."""
+"""What the study writes: its table in a page of the documentation, and published tasks beside their strict tasks."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.tasks.catalogue import get_task
 from research.necessity.__main__ import necessity
-from research.necessity.report import PAGE_BEGIN, PAGE_END, put_into_page
+from research.necessity.report import PAGE_BEGIN, PAGE_END, bounds, put_into_page, read_results, side_by_side
+from research.necessity.settings import settings_of, variants_of
 
 
 def test_a_page_gets_the_table_between_its_marks(tmp_path: Path) -> None:
@@ -33,3 +37,63 @@ def test_a_page_without_a_place_is_told_before_anything_is_simulated(tmp_path: P
     with pytest.raises(MemobenchError, match=r"the page .*page\.md"):
         necessity(page=page, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+# --- published and strict tasks in one table, and the settings of drawn tasks ---
+
+STOVE, STRICT_TASK = "turn_on_the_stove_and_turn_it_off", "turn_the_stove_on_and_off_a_given_number_of_times"
+MILK = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
+
+
+def result(task: str, referent: str, found: float | None, confirmed: int = 0) -> dict[str, Any]:
+    in_order = {"chance": 0.2, "deterministic": 1.0, "stochastic": 0.2, "pixel_exact": 0.0, "as_it_happens": 0.0}
+    any_order = None
+    if found is not None:
+        in_order["deterministic"] = 0.0
+        any_order = {"deterministic": found, "stochastic": 0.21, "confirmed": confirmed, "of": 9, "exhausted": True}
+    expert = {"n": 9, "success": 9}
+    return {
+        "task": task,
+        "referent": referent,
+        "variants": 3,
+        "expert": expert,
+        "in_order": in_order,
+        "any_order": any_order,
+    }
+
+
+def test_a_published_task_stands_beside_its_strict_task() -> None:
+    table = side_by_side([result(STOVE, "fixed", None)], [result(STRICT_TASK, "drawn", 1 / 3, 3)])
+    row = next(line for line in table.splitlines() if STRICT_TASK in line)
+    assert row == f"| `{STOVE}` | 100.0 | no | `{STRICT_TASK}` | 3 | 33.3 (3/9) | 21.0 | 0.0 | 9/9 | yes |"
+    assert "From pictures alone 1 of 1 tasks were not solved:" in table
+    assert "best fixed map in any order at most 33.3 %, on average 33.3 %" in table
+    assert "| – | – | `" in side_by_side([], [result(STRICT_TASK, "drawn", 0.0)]), "published tasks may not be measured"
+
+
+def test_bounds_are_told_of_drawn_tasks_that_were_searched() -> None:
+    assert bounds([result(STOVE, "fixed", 0.5, 9)]) == ""
+    assert bounds([result(STRICT_TASK, "drawn", None)]) == ""
+
+
+def test_a_page_shows_both_when_it_is_told_of_the_published_results(tmp_path: Path) -> None:
+    kept = tmp_path / "necessity.json"
+    kept.write_text(json.dumps([result(STOVE, "fixed", None)]))
+    page = tmp_path / "page.md"
+    page.write_text(f"{PAGE_BEGIN}{PAGE_END}")
+    text = put_into_page(page, [result(STRICT_TASK, "drawn", 0.0)], read_results(kept)).read_text()
+    assert f"| `{STOVE}` | 100.0 | no |" in text
+    with pytest.raises(MemobenchError, match="there is no"):
+        read_results(tmp_path / "missing.json")
+    kept.write_text('[{"task": "a"}]')
+    with pytest.raises(MemobenchError, match=r"name the necessity\.json"):
+        read_results(kept)
+
+
+def test_a_drawn_task_has_one_setting_and_all_its_goals() -> None:
+    assert settings_of(get_task(STRICT_TASK), ("fixed", "random")) == ("drawn",)
+    assert [variant.language for variant in variants_of(get_task(STRICT_TASK), "drawn")] == [
+        variant.language for variant in map(get_task(STRICT_TASK).variant, range(3))
+    ]
+    assert settings_of(get_task(MILK), ("fixed", "random")) == ("fixed", "random")
+    assert settings_of(get_task(STOVE), ("random",)) == ("fixed",)
