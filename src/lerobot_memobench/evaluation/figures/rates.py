@@ -235,8 +235,8 @@ def _draw_correlations_panel(place: Any, entries: Sequence[Entry], metric: str, 
     place.set_aspect("equal")
     place.plot([0, 100], [0, 100], color=GRID, lw=0.7, zorder=0)
     if metric == "MSR":
-        shaded = {"facecolor": SHADE, "edgecolor": "none", "zorder": -1}
-        place.add_patch(Rectangle((HIGH_STORAGE, -4), 104 - HIGH_STORAGE, LOW_SUCCESS + 4, **shaded))
+        width, height = 104 - HIGH_STORAGE, LOW_SUCCESS + 4
+        place.add_patch(Rectangle((HIGH_STORAGE, -4), width, height, facecolor=SHADE, edgecolor="none", zorder=-1))
 
 
 def _correlations_legend(figure: Figure, entries: Sequence[Entry], memory_types: Sequence[str], shaded: bool) -> None:
