@@ -12,7 +12,7 @@ Histories of one scene are weighed together: they are what may lie behind the sa
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,9 +74,8 @@ def chance(histories: Sequence[History]) -> float:
     Histories are equally likely. Where every picture has one right answer this is 1.
     """
     answers = right_answers(histories)
-    return _mean(
-        float(np.prod([1.0 / len(answers[decision.picture]) for decision in history])) for history in histories
-    )
+    passes = [float(np.prod([1.0 / len(answers[decision.picture]) for decision in history])) for history in histories]
+    return sum(passes) / len(passes)
 
 
 def deterministic_ceiling(histories: Sequence[History]) -> float:
@@ -106,7 +105,7 @@ def _demands(history: History) -> dict[int, str] | None:
     return demand
 
 
-def stochastic_ceiling(histories: Sequence[History], seed: int = 0) -> float:
+def stochastic_ceiling(histories: Sequence[History]) -> float:
     """Return the success of the best probabilities of answers given the picture; each decision has one try.
 
     For one history the maximum is known: answer each picture as often as it needs each answer. For several, it is
@@ -115,7 +114,7 @@ def stochastic_ceiling(histories: Sequence[History], seed: int = 0) -> float:
     """
     answers = right_answers(histories)
     counts = [Counter((decision.picture, decision.answer) for decision in history) for history in histories]
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     best = deterministic_ceiling(histories)
     for start in range(RESTARTS + 1):
         policy = {
@@ -151,8 +150,3 @@ def _climb(
             if total > 0:
                 policy.update({(picture, answer): used[picture, answer] / total for answer in known})
     return value
-
-
-def _mean(values: Iterable[float]) -> float:
-    found = list(values)
-    return sum(found) / len(found)

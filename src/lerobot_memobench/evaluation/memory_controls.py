@@ -71,9 +71,9 @@ class _Outcomes:
     drawn: NDArray[np.intp]
 
 
-def contrasts(standard: Sequence[Record], other: Sequence[Record], draws: int = DRAWS, seed: int = 0) -> Contrasts:
+def contrasts(standard: Sequence[Record], other: Sequence[Record], draws: int = DRAWS) -> Contrasts:
     """Return, per memory type and on average, each metric under both evaluations; rollouts are paired already."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     others = by_task(other)
     kinds: dict[str, list[dict[str, _Outcomes]]] = {}
     for task, group in by_task(standard).items():
@@ -230,9 +230,7 @@ class PrefixCurve:
     n: int
 
 
-def prefix_curves(
-    normal: Sequence[Record], other: Sequence[Record], draws: int = DRAWS, seed: int = 0
-) -> list[PrefixCurve]:
+def prefix_curves(normal: Sequence[Record], other: Sequence[Record], draws: int = DRAWS) -> list[PrefixCurve]:
     """Return how far the rollouts of both come, per task; rollouts are paired already.
 
     A checkpoint counts when it and all before it were satisfied at some step (paper, prefix completion); the last entry
@@ -242,7 +240,7 @@ def prefix_curves(
     others = by_task(other)
     for task, group in by_task(normal).items():
         a, b = _prefixes(group), _prefixes(others[task])
-        chosen = np.random.default_rng(seed).integers(len(group), size=(draws, len(group)))
+        chosen = np.random.default_rng(0).integers(len(group), size=(draws, len(group)))
         step = (b - a)[chosen].mean(axis=1)
         difference = (b - a).mean(axis=0)
         weights = np.full(len(group), 1 / len(group))

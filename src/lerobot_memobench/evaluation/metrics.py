@@ -172,14 +172,15 @@ Row = dict[str, Rate]
 """Metric -> rate."""
 
 
-def wilson(rate: float, n: float, z: float = Z95) -> tuple[float, float]:
-    """Return the Wilson score interval of a rate over ``n`` trials (95 % by default), within [0, 1].
+def wilson(rate: float, n: float) -> tuple[float, float]:
+    """Return the 95 % Wilson score interval of a rate over ``n`` trials, within [0, 1].
 
     Written out although statsmodels has it: every report and every evaluation's end needs it, and importing statsmodels
     takes longer than all the rest of a report.
     """
     if n < 1 or not 0.0 <= rate <= 1.0:
         raise MemobenchError(f"a Wilson interval needs a rate in [0, 1] over at least one trial, got {rate} over {n}")
+    z = Z95
     centre = rate + z * z / (2 * n)
     spread = z * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
     scale = 1 + z * z / n

@@ -98,9 +98,9 @@ def write_report(directory: str | Path, episodes: int | None = None) -> tuple[Su
     return summary, notes
 
 
-def table(summary: Summary, title: str | None = None) -> RenderableType:
+def table(summary: Summary) -> RenderableType:
     """Return the table of SR, MSR, MUR, MCR per task, memory type and on average, for the terminal."""
-    return terminal_table(replace(rates_table(summary), title=title or ""))
+    return terminal_table(rates_table(summary))
 
 
 def evaluation_markdown(summary: Summary, records: Iterable[Record], notes: Sequence[str] = ()) -> str:

@@ -92,12 +92,12 @@ def rates_table(summary: Summary) -> Table:
     return Table("rates", "", ("task", "n", *METRICS), tuple(rows), strong=frozenset(strong), rules=frozenset(rules))
 
 
-def memory_types_table(summary: Summary, title: str = "Rates by memory type") -> Table:
+def memory_types_table(summary: Summary) -> Table:
     """Return one row per memory type, and the average."""
     rows = [rate_row(name, row) for name, row in summary.memory_types.items()]
     return Table(
         "memory-types",
-        title,
+        "Rates by memory type",
         ("memory type", "n", *METRICS),
         (*rows, rate_row(AVERAGE, summary.average)),
         note=HOW_TO_READ,

@@ -277,11 +277,11 @@ MOST_COLUMNS = 15
 """Columns of a table with groups that fit beside one another in a terminal."""
 
 
-def terminal(report: Report, headings: bool = True) -> RenderableType:
+def terminal(report: Report) -> RenderableType:
     """Return a report for the terminal."""
     parts: list[RenderableType] = []
     for section in report.sections:
-        if headings and section.title:
+        if section.title:
             parts.append(Text(f"\n{section.title}", style="bold underline"))
         parts += [terminal_table(part) for table in section.tables for part in _in_parts(table)]
         parts += [Text(sentence) for sentence in section.sentences]
@@ -294,6 +294,12 @@ def text(report: Report) -> str:
     out = io.StringIO()
     Console(file=out, width=WIDTH, highlight=False, markup=False).print(terminal(report), crop=False)
     return "\n".join(line.rstrip() for line in out.getvalue().splitlines()).strip("\n") + "\n"
+
+
+INDENT = 2
+
+PLAIN = Console(width=10_000, markup=False, highlight=False)
+"""What texts are measured with."""
 
 
 class Unbroken:
@@ -351,12 +357,6 @@ class Unbroken:
             yield row([cells[c][k] for c in range(len(before), len(columns))])
         if self.table.caption:
             yield Text(str(self.table.caption))
-
-
-INDENT = 2
-
-PLAIN = Console(width=10_000, markup=False, highlight=False)
-"""What texts are measured with."""
 
 
 def terminal_table(table: Table) -> RichTable | Unbroken:
