@@ -148,6 +148,8 @@ def test_only_episodes_of_both_are_compared() -> None:
         paired(rollouts([1]), rollouts([1], task="other"))
     with pytest.raises(MemobenchError, match="given twice"):
         paired(rollouts([1]) * 2, rollouts([1]))
+    with pytest.raises(MemobenchError, match=r"other checkpoints in one evaluation \(SUU\) than in the other \(SUC\)"):
+        paired(rollouts([1]), rollouts([1], operations="SUC"))
 
 
 def test_replan_intervals_are_kept_apart() -> None:

@@ -241,11 +241,10 @@ def granularity(
     out: TableOut = None,
 ) -> int:
     """Print the metrics by the language level of the subgoals that a policy was taught with."""
-    from lerobot_memobench.evaluation.controls import granularity_report, rollouts_by_level, with_labels_of_level
+    from lerobot_memobench.evaluation.controls import granularity_report, rollouts_by_level
 
     levels, notes = rollouts_by_level(coarse, intermediate, fine)
-    own = with_labels_of_level(levels)
-    return _show(granularity_report(levels, own, paper=bool(beside)), notes, "granularity", out)
+    return _show(granularity_report(levels, paper=bool(beside)), notes, "granularity", out)
 
 
 def _show(report: Report, notes: Sequence[str], name: str, out: Path | None) -> int:

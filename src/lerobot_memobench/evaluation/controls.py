@@ -18,6 +18,7 @@ from lerobot_memobench.evaluation.metrics import (
     Rate,
     Record,
     Summary,
+    operations,
     percent,
     policy_inputs,
     summarise,
@@ -123,7 +124,7 @@ def paired(a: Sequence[Record], b: Sequence[Record]) -> tuple[list[Record], list
     """Return the rollouts of episodes that both have, in one order, and how many of either had no partner.
 
     Raises:
-        MemobenchError: no episode is in both, or one is in either of them twice.
+        MemobenchError: no episode is in both, one is in either of them twice, or a task differs in its checkpoints.
     """
     tables = []
     for records in (a, b):
@@ -143,6 +144,13 @@ def paired(a: Sequence[Record], b: Sequence[Record]) -> tuple[list[Record], list
             f"the evaluations have no episode in common ({len(a)} and {count_of(len(b), 'rollout')}); compare "
             "evaluations of the same tasks, seeds and referent"
         )
+    for key in common:
+        first, second = (operations(table[key]) for table in tables)
+        if first != second:
+            raise MemobenchError(
+                f"{key[0]!r} has other checkpoints in one evaluation ({first}) than in the other ({second}); compare "
+                "evaluations of one version of the task"
+            )
     alone = len(tables[0]) + len(tables[1]) - 2 * len(common)
     return [tables[0][key] for key in common], [tables[1][key] for key in common], alone
 
@@ -170,19 +178,6 @@ def rollouts_by_level(*folders: Path) -> tuple[dict[str, list[Record]], list[str
     if len(intervals[LEVELS[0]]) > 1:
         notes.append("the evaluations mix replan intervals; the figures are over all of them")
     return levels, notes + inputs
-
-
-def with_labels_of_level(levels: Mapping[str, Sequence[Record]]) -> dict[str, list[Record]]:
-    """Return the rollouts of each level with that level's own operation labels, for the catalogue's tasks."""
-    own = {}
-    for level, records in levels.items():
-        index = LEVELS.index(level)
-        labels = {
-            name: [checkpoint.operations_by_level[index] for checkpoint in get_task(name).checkpoints]
-            for name in {record["task"] for record in records} & set(task_names(suite=None))
-        }
-        own[level] = relabelled(records, labels)
-    return own
 
 
 # --- tables ---
@@ -217,8 +212,14 @@ GRANULARITY_SENTENCE = (
     "the evaluated (intermediate) labels and under those of the level itself."
 )
 
-Levels = Mapping[str, Sequence[Record]]
-"""Level -> rollouts of the policy that was taught at it."""
+
+def _with_labels_of(level: str, records: Sequence[Record]) -> list[Record]:
+    """Return rollouts of the catalogue's tasks with the operation labels of a level, others as they are."""
+    index = LEVELS.index(level)
+    there = {record["task"] for record in records} & set(task_names(suite=None))
+    return relabelled(
+        records, {name: [each.operations_by_level[index] for each in get_task(name).checkpoints] for name in there}
+    )
 
 
 def relabelled(records: Sequence[Record], labels: Mapping[str, Sequence[str]]) -> list[Record]:
@@ -229,32 +230,31 @@ def relabelled(records: Sequence[Record], labels: Mapping[str, Sequence[str]]) -
     """
     result: list[Record] = []
     for record in records:
-        operations = labels.get(record["task"])
-        if operations is None:
+        wanted = labels.get(record["task"])
+        if wanted is None:
             result.append(record)
             continue
-        if len(operations) != len(record["checkpoints"]) or not set(operations) <= set(OPERATIONS):
+        if len(wanted) != len(record["checkpoints"]) or not set(wanted) <= set(OPERATIONS):
             raise MemobenchError(
                 f"a rollout of {record['task']!r} has {len(record['checkpoints'])} checkpoints, its labels are "
-                f"{', '.join(operations)}; the log was written by another version of the task"
+                f"{', '.join(wanted)}; the log was written by another version of the task"
             )
         checkpoints = [
             {**checkpoint, "operation": operation}
-            for checkpoint, operation in zip(record["checkpoints"], operations, strict=True)
+            for checkpoint, operation in zip(record["checkpoints"], wanted, strict=True)
         ]
         result.append({**record, "checkpoints": checkpoints})
     return result
 
 
-def granularity_report(levels: Levels, own_labels: Levels, paper: bool = False) -> Report:
+def granularity_report(levels: Mapping[str, Sequence[Record]], paper: bool = False) -> Report:
     """Return metrics by language level and prefix completion by level.
 
     Args:
-        levels: with the evaluated (intermediate) labels. own_labels: with the level's own.
-        paper: add the published successes.
+        levels: level -> rollouts of the policy that was taught at it. paper: add the published successes.
     """
     summaries = {level: summarise(records) for level, records in levels.items()}
-    own = {level: summarise(records) for level, records in own_labels.items()}
+    own = {level: summarise(_with_labels_of(level, records)) for level, records in levels.items()}
     tables = (_rates(summaries, own), _prefixes(summaries, paper))
     data = {
         level: {
