@@ -127,6 +127,11 @@ def test_an_optimizer_is_chosen_like_a_policy() -> None:
         trained("policy=act", "optimizer.lr=1e-3")
 
 
+def test_a_type_of_a_package_that_lerobot_will_look_for_is_left_to_it() -> None:
+    flags = ["--policy.type=mine", "--policy.discover_packages_path=my_package"]
+    assert trained(*flags, "steps=1") == [*flags, "--steps=1"]
+
+
 def test_a_visual_encoder_has_a_short_form() -> None:
     assert trained("policy=memobench_mem", "visual_encoder=package")[1:] == ["--policy.visual_encoder=package"]
 

@@ -141,6 +141,11 @@ def test_going_on_keeps_the_earlier_batch_size() -> None:
     assert plan_line([*LINE, "output_dir=new", "shards=2"]).batch == 1
 
 
+def test_a_number_of_episodes_that_is_none() -> None:
+    with pytest.raises(MemobenchError, match="found episodes=many and seed=7; expected whole numbers"):
+        plan_line(["env=memobench", "--eval.n_episodes=many"])
+
+
 def test_ten_episodes_are_filmed_unless_another_number_is_given() -> None:
     for words, videos in (([], 10), (["videos=0"], 0), (["env.videos=3"], 3)):
         environment = plan_line([*LINE, *words]).environment

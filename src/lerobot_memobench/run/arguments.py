@@ -234,11 +234,10 @@ def translate(command: str, given: Arguments, config: type | None, file: Mapping
         return LerobotArguments((*given.flags, *(f"--{key}={value}" for key, value in given.pairs)))
     choices = registries(config)
     choosing = {*choices, *({DATASET} & field_types(config).keys())}
-    flags = [
-        *given.flags,
-        *(flag for key, value in given.pairs if key in choosing for flag in choice_flags(config, key, value)),
-    ]
-    others = [(key, value) for key, value in given.pairs if key not in choosing]
+    others = [pair for pair in given.pairs if pair[0] not in choosing]
+    flags = list(given.flags)
+    for key, value in given.pairs:
+        flags += choice_flags(config, key, value) if key in choosing else []
     # Fields of the policy and the environment are known once these are, wherever they stand in the line.
     explicit = [*flags, *(f"--{key}={value}" for key, value in others)]
     found = {key: chosen_class(config, key, explicit, file) for key in choices}
@@ -248,18 +247,21 @@ def translate(command: str, given: Arguments, config: type | None, file: Mapping
         # replan= sets the policy's interval and tells the environment, which writes it down; either may be missing.
         fields = [each for each in short.get(key, ()) if each in known]
         if key in short and not fields:
-            owner, _, name = short[key][0].partition(".")
-            raise MemobenchError(
-                f"{key}= sets {owner}.{name}, which this {owner} ({chosen[owner].__name__}) does not have"
-                if owner in chosen
-                else f"{key}= sets {name} of the {owner}: name one with {owner}="
-            )
+            raise _nothing_to_set(key, short[key][0], chosen)
         try:
             flags += [f"--{each}={checked_value(key, setting_type(known, each), value)}" for each in fields or [key]]
         except KeyError:
             keys = [*known, *short, *OPTIONS.get(command, ())]
             raise MemobenchError(f"lerobot {command} has no setting {key!r}, {nearest(key, keys)}") from None
     return LerobotArguments(tuple(flags), config, chosen)
+
+
+def _nothing_to_set(key: str, target: str, chosen: Mapping[str, type]) -> MemobenchError:
+    owner, _, name = target.partition(".")
+    if owner in chosen:
+        kind = chosen[owner].__name__
+        return MemobenchError(f"{key}= sets {target}, which this {owner} ({kind}) does not have")
+    return MemobenchError(f"{key}= sets {name} of the {owner}: name one with {owner}=")
 
 
 # --- what policy=, env=, dataset= … choose: a registered type, a checkpoint, a repository, a folder ---
@@ -331,7 +333,7 @@ def chosen_class(config: type, key: str, flags: Sequence[str], file: Mapping[str
         path, name = (_text(key, section, word) for word in ("path", "type"))
     if path:
         name = checkpoint_type(path)
-    elif name and name not in known:
+    elif name and name not in known and not any(".discover_packages_path=" in flag for flag in flags):
         raise MemobenchError(f"there is no {key} {name!r}, {nearest(name, known)}")
     return known.get(name) if name else None
 

@@ -414,7 +414,7 @@ def take_run_options(given: Arguments) -> tuple[RunOptions, Arguments]:
         shards=_count("shards", last.get("shards")),
         workers=_count("workers", last.get("workers")),
         executor=last.get("executor", PROCESSES),
-        executor_options=read_options(found.get("executor_option", [])),
+        executor_options=read_options(found["executor_option"]) if "executor_option" in found else {},
     )
     if options.shards and options.shard is not None:
         raise MemobenchError(

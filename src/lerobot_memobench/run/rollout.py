@@ -192,7 +192,8 @@ def _roll(env: Any, policy: Any, settings: dict[str, Any], quiet: bool) -> dict[
             action = _act(env, policy, settings, batch)
             inputs.announce()
             observation, reward, terminated, truncated, info = env.step(action)
-            success = _successes(info, env.num_envs)
+            holds = info.get("final_info", info).get("is_success", False)
+            success = np.broadcast_to(np.asarray(holds, bool), env.num_envs)
             done = terminated | truncated | done | (len(steps) + 1 == limit)
             ever = ever | success
             if recorder is not None:
@@ -225,12 +226,6 @@ def _act(env: Any, policy: Any, through: Mapping[str, Any], batch: dict[str, Any
     action = through["env_postprocessor"]({ACTION: through["postprocessor"](action)})[ACTION]
     found: NDArray[np.float32] = action.to("cpu").numpy()
     return found
-
-
-def _successes(info: dict[str, Any], rows: int) -> NDArray[np.bool_]:
-    """Return which rows' goals hold (rows,)."""
-    holds = info.get("final_info", info).get("is_success", False)
-    return np.broadcast_to(np.asarray(holds, bool), rows)
 
 
 class Inputs:
