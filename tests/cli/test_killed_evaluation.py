@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import random
-import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +14,7 @@ import av
 import pytest
 
 from lerobot_memobench.envs.episode_log import has_log, read_episodes
+from tests.support.fork_server import Fork, ForkServer
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3 * 3600)]
 
@@ -31,85 +28,29 @@ COMMON += ["eval.use_async_envs=false"]  # rows in one process: workers would st
 EXPERT = ["episodes=6", "horizon=70", "env.render_every=10"]
 RANDOM = ["policy=memobench_random", "episodes=6", "horizon=40"]
 
-#: The command in processes that are forked from one that has imported LeRobot, which takes longer than an episode. A
-#: line is a folder for the messages and the words of the command; the answer is the process's number.
-SERVER = """
-import json, os, signal, sys, traceback
-import lerobot.scripts.lerobot_eval, lerobot_memobench.envs.memobench_env, lerobot_memobench.datasets.generation
-from lerobot_memobench.cli.lerobot import main
-signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-for line in sys.stdin:
-    order = json.loads(line)
-    if "wait" in order:
-        found, status = os.waitpid(order["wait"], os.WNOHANG)
-        print(json.dumps(os.waitstatus_to_exitcode(status) if found else None), flush=True)
-        continue
-    pid = os.fork()
-    if pid == 0:
-        os.setsid()
-        messages = os.open(order["messages"], os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-        for stream in (1, 2):
-            os.dup2(messages, stream)
-        try:
-            os._exit(main(order["words"]))
-        except BaseException:
-            traceback.print_exc()
-            os._exit(70)
-    print(pid, flush=True)
-"""
-
-
-class Run:
-    """One start of the command."""
-
-    def __init__(self, server: subprocess.Popen[str], pid: int) -> None:
-        self.server, self.pid, self.status = server, pid, None
-
-    def poll(self) -> int | None:
-        """Exit status, None while it runs; negative for the signal that ended it."""
-        if self.status is None:
-            self.status = ask(self.server, {"wait": self.pid})
-        return self.status
-
-    def wait(self) -> int:
-        while self.poll() is None:
-            time.sleep(0.05)
-        assert self.status is not None
-        return self.status
-
-    def kill(self) -> None:
-        os.kill(self.pid, signal.SIGKILL)
-        assert self.wait() == -signal.SIGKILL
-
-
-def ask(server: subprocess.Popen[str], order: dict[str, Any]) -> Any:
-    assert server.stdin is not None
-    assert server.stdout is not None
-    server.stdin.write(json.dumps(order) + "\n")
-    server.stdin.flush()
-    return json.loads(server.stdout.readline())
+IMPORTED = ("lerobot.scripts.lerobot_eval", "lerobot_memobench.envs.memobench_env")
+IMPORTED += ("lerobot_memobench.datasets.generation", "lerobot_memobench.cli.lerobot")
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[subprocess.Popen[str]]:
-    with subprocess.Popen(
-        [sys.executable, "-c", SERVER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as process:
-        yield process
-        assert process.stdin is not None
-        process.stdin.close()
+def server() -> Iterator[ForkServer]:
+    """Starting Python and importing LeRobot takes longer than an episode."""
+    forks = ForkServer(IMPORTED)
+    yield forks
+    forks.close()
 
 
-def start(server: subprocess.Popen[str], out: Path, settings: list[str], resume: bool = True) -> Run:
+def start(server: ForkServer, out: Path, settings: list[str], resume: bool = True) -> Fork:
     words = ["eval", *COMMON, *settings, f"output_dir={out}", *(["resume=true"] if resume else [])]
-    return Run(server, ask(server, {"words": words, "messages": str(out.with_suffix(".txt"))}))
+    code = f"from lerobot_memobench.cli.lerobot import main; raise SystemExit(main({words!r}))"
+    return server.start(code, out.with_suffix(".txt"))
 
 
 def episodes_in(out: Path) -> int:
     return len(read_episodes(out)) if has_log(out) else 0
 
 
-def kill_sometime(process: Run, out: Path, rng: random.Random, run_s: float) -> bool:
+def kill_sometime(process: Fork, out: Path, rng: random.Random, run_s: float) -> bool:
     """Kill a run at a random moment; return whether there still was one.
 
     A third of the kills fall anywhere in the time that an undisturbed run takes, the others soon after an episode has
@@ -150,7 +91,7 @@ def film_hashes(out: Path) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("settings", [EXPERT, RANDOM], ids=["expert", "random"])
-def test_killed_and_gone_on_with(server: subprocess.Popen[str], tmp_path: Path, settings: list[str]) -> None:
+def test_killed_and_gone_on_with(server: ForkServer, tmp_path: Path, settings: list[str]) -> None:
     undisturbed, killed = tmp_path / "undisturbed", tmp_path / "killed"
     began = time.monotonic()
     assert start(server, undisturbed, settings, resume=False).wait() == 0

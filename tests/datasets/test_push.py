@@ -7,7 +7,6 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -17,16 +16,55 @@ from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.datasets.push import push
 from lerobot_memobench.errors import MemobenchError
 from tests.support import hub_server
+from tests.support.fork_server import ForkServer
 
 REPO = "somebody/memobench"
+IMPORTED = ("lerobot_memobench.datasets.push", "lerobot.datasets.streaming_dataset")
+
+
+@pytest.fixture(scope="module")
+def server():
+    one = hub_server.Hub()
+    yield one
+    one.shutdown()
+    one.server_close()
 
 
 @pytest.fixture
-def hub():
-    server = hub_server.Hub()
-    yield server
-    server.shutdown()
-    server.server_close()
+def hub(server):
+    """The hub, with nothing on it."""
+    server.clear()
+    return server
+
+
+@pytest.fixture(scope="module")
+def machine(server, tmp_path_factory):
+    """Machines that know this hub only: huggingface_hub reads its settings when it is imported.
+
+    The folder of its files is a link that leads to each machine's own.
+    """
+    home = tmp_path_factory.mktemp("machines") / "home"
+    settings = {
+        "HF_ENDPOINT": server.address,
+        "HF_HOME": str(home),
+        # This hub has no Xet storage, the chunked one of the real hub; large files go to it by LFS.
+        "HF_HUB_DISABLE_XET": "1",
+        "HF_HUB_DISABLE_PROGRESS_BARS": "1",
+        "HF_HUB_DISABLE_TELEMETRY": "1",
+        "OMP_NUM_THREADS": "1",
+    }
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("HF_")} | settings
+    forks = ForkServer(IMPORTED, environment)
+
+    def on_machine(code: str, own: Path, token: str | None = hub_server.TOKEN) -> subprocess.CompletedProcess[str]:
+        """Run code on the machine whose folder this is."""
+        own.mkdir(exist_ok=True)
+        home.unlink(missing_ok=True)
+        home.symlink_to(own)
+        return forks.run(code, home.parent, **({} if token is None else {"HF_TOKEN": token}))
+
+    yield on_machine
+    forks.close()
 
 
 @pytest.fixture
@@ -37,23 +75,6 @@ def folder(make_demo, make_task, tmp_path):
         make_demo(["000111", "000011"], task=other, size=64, seed=9, exec_start=2),
     ]
     return write_dataset(demos, tmp_path / "ds", repo_id=REPO)
-
-
-def python(code: str, hub, home: Path, token: str | None = hub_server.TOKEN) -> subprocess.CompletedProcess:
-    """Run code in a process that knows this hub only: huggingface_hub reads its settings when it is imported."""
-    settings = {
-        "HF_ENDPOINT": hub.address,
-        "HF_HOME": str(home),
-        # This hub has no Xet storage, the chunked one of the real hub; large files go to it by LFS.
-        "HF_HUB_DISABLE_XET": "1",
-        "HF_HUB_DISABLE_PROGRESS_BARS": "1",
-        "HF_HUB_DISABLE_TELEMETRY": "1",
-        "OMP_NUM_THREADS": "1",
-    }
-    environment = {k: v for k, v in os.environ.items() if not k.startswith("HF_")} | settings
-    if token is not None:
-        environment["HF_TOKEN"] = token
-    return subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=300)
 
 
 PUSH = """
@@ -82,11 +103,11 @@ print(json.dumps(found))
 """
 
 
-def test_push_load_and_stream(hub, folder, tmp_path):
+def test_push_load_and_stream(hub, machine, folder, tmp_path):
     (folder / "feature_cache").mkdir()
     (folder / "feature_cache" / "big.bin").write_bytes(b"0" * 100)
     code = PUSH.format(folder=str(folder), repo=REPO)
-    pushed = python(code, hub, tmp_path / "home")
+    pushed = machine(code, tmp_path / "home")
     told, address = pushed.stdout.splitlines()
     assert told == f"told: the feature caches in {folder} stay here: they are made anew where the dataset is trained on"
     assert address == f"{hub.address}/datasets/{REPO}", pushed.stderr
@@ -98,11 +119,11 @@ def test_push_load_and_stream(hub, folder, tmp_path):
     assert list(hub.tags[REPO]) == ["v3.0"]
 
     hub.requests.clear()
-    again = python(code, hub, tmp_path / "home")
+    again = machine(code, tmp_path / "home")
     assert again.returncode == 0, again.stderr
     assert not any(request.startswith("PUT /lfs/") for request in hub.requests)
 
-    loaded = python(LOAD.format(repo=REPO), hub, tmp_path / "elsewhere", token=None)
+    loaded = machine(LOAD.format(repo=REPO), tmp_path / "elsewhere", token=None)
     assert loaded.returncode == 0, loaded.stderr
     assert json.loads(loaded.stdout.splitlines()[-1]) == {
         "episodes": 2,
@@ -125,7 +146,7 @@ print(dataset.num_episodes, len(dataset), frames)
 """
 
 
-def test_an_earlier_larger_dataset_leaves_nothing(hub, folder, make_demo, tmp_path):
+def test_an_earlier_larger_dataset_leaves_nothing(hub, machine, folder, make_demo, tmp_path):
     """Its further files would load as frames: LeRobot reads every table below data/."""
     earlier = Path(shutil.copytree(folder, tmp_path / "earlier"))
     table = next((earlier / "data").rglob("*.parquet"))
@@ -133,18 +154,18 @@ def test_an_earlier_larger_dataset_leaves_nothing(hub, folder, make_demo, tmp_pa
     for extra in ("hdf5/old_demo.hdf5", "feature_cache/old/tokens.bin", "states/chunk-000/file-001.parquet"):
         (earlier / extra).parent.mkdir(parents=True, exist_ok=True)
         (earlier / extra).write_bytes(b"old")
-    assert python(PUSH.format(folder=str(earlier), repo=REPO), hub, tmp_path / "home").returncode == 0
+    assert machine(PUSH.format(folder=str(earlier), repo=REPO), tmp_path / "home").returncode == 0
     hub.repos[REPO] |= {"feature_cache/old/tokens.bin": b"old", "hdf5/old_demo.hdf5": b"old", "notes.md": b"mine"}
     hub.requests.clear()
-    pushed = python(PUSH.format(folder=str(folder), repo=REPO), hub, tmp_path / "home")
+    pushed = machine(PUSH.format(folder=str(folder), repo=REPO), tmp_path / "home")
     assert (
         "told: 4 files that this dataset does not have, such as data/chunk-000/file-001.parquet, are" in pushed.stdout
     )
     ours = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
     assert set(hub.repos[REPO]) - {".gitattributes"} == ours | {"notes.md"}
-    loaded = python(COUNT.format(repo=REPO), hub, tmp_path / "elsewhere", token=None)
+    loaded = machine(COUNT.format(repo=REPO), tmp_path / "elsewhere", token=None)
     assert loaded.stdout.split() == ["2", "12", "12"], loaded.stderr
-    again = python(PUSH.format(folder=str(folder), repo=REPO), hub, tmp_path / "home")
+    again = machine(PUSH.format(folder=str(folder), repo=REPO), tmp_path / "home")
     assert "told" not in again.stdout
 
 
@@ -156,11 +177,11 @@ LeRobotDataset({repo!r}, root={folder!r}).push_to_hub()
 """
 
 
-def test_lerobots_own_push_leaves_feature_caches_here(hub, folder, tmp_path):
+def test_lerobots_own_push_leaves_feature_caches_here(hub, machine, folder, tmp_path):
     keep_from_the_hub(folder)
     (folder / "feature_cache" / "tiny").mkdir(parents=True)
     (folder / "feature_cache" / "tiny" / "tokens.bin").write_bytes(b"0" * 100)
-    pushed = python(LEROBOTS_PUSH.format(folder=str(folder), repo=REPO), hub, tmp_path / "home")
+    pushed = machine(LEROBOTS_PUSH.format(folder=str(folder), repo=REPO), tmp_path / "home")
     assert pushed.returncode == 0, pushed.stderr
     assert "meta/info.json" in hub.repos[REPO]
     assert [name for name in hub.repos[REPO] if name.startswith("feature_cache")] == []
@@ -170,14 +191,14 @@ def test_lerobots_own_push_leaves_feature_caches_here(hub, folder, tmp_path):
     assert (folder / ".gitignore").read_text() == "mine\n/feature_cache/\n"
 
 
-def test_the_card_on_the_hub_loads_from_there(hub, folder, tmp_path):
+def test_the_card_on_the_hub_loads_from_there(hub, machine, folder, tmp_path):
     """Its example is run as it stands; the card in the folder says how to load that."""
-    assert python(PUSH.format(folder=str(folder), repo="somebody/else"), hub, tmp_path / "home").returncode == 0
+    assert machine(PUSH.format(folder=str(folder), repo="somebody/else"), tmp_path / "home").returncode == 0
     card = hub.repos["somebody/else"]["README.md"].decode()
     assert 'root="<this folder>"' in (folder / "README.md").read_text()
     (example,) = re.findall(r"```python\n(.*?)```", card, re.DOTALL)
     assert 'LeRobotDataset("somebody/else")' in example
-    ran = python(example + "print(len(dataset), len(execution))", hub, tmp_path / "elsewhere", token=None)
+    ran = machine(example + "print(len(dataset), len(execution))", tmp_path / "elsewhere", token=None)
     assert ran.stdout.split() == ["12", "10"], ran.stderr
     assert card.startswith("---\nlicense: apache-2.0\n")
     for part in (
@@ -189,11 +210,11 @@ def test_the_card_on_the_hub_loads_from_there(hub, folder, tmp_path):
         assert part in card, part
 
 
-def test_a_dataset_without_a_card_is_pushed_with_one(hub, folder, tmp_path):
+def test_a_dataset_without_a_card_is_pushed_with_one(hub, machine, folder, tmp_path):
     for lost in ("README.md", "manifest.json"):
         (folder / lost).unlink()
     shutil.rmtree(folder / "states")
-    assert python(PUSH.format(folder=str(folder), repo=REPO), hub, tmp_path / "home").returncode == 0
+    assert machine(PUSH.format(folder=str(folder), repo=REPO), tmp_path / "home").returncode == 0
     card = hub.repos[REPO]["README.md"].decode()
     for part in (
         "2 demonstrations of 2 robot",
@@ -204,32 +225,32 @@ def test_a_dataset_without_a_card_is_pushed_with_one(hub, folder, tmp_path):
         assert part in card, part
 
 
-def test_a_broken_off_upload_goes_on(hub, folder, tmp_path):
+def test_a_broken_off_upload_goes_on(hub, machine, folder, tmp_path):
     """What arrived is not sent again; what was deleted there is."""
     code = PUSH.format(folder=str(folder), repo=REPO)
     hub.failing.append(f"/api/datasets/{REPO}/commit/main")
-    assert "run the same command again to go on" in python(code, hub, tmp_path / "home").stdout
+    assert "run the same command again to go on" in machine(code, tmp_path / "home").stdout
     assert hub.repos[REPO] == {}
     assert hub.tags[REPO] == {}
     sent = [request for request in hub.requests if request.startswith("PUT /lfs/")]
     assert len(sent) >= 4
     hub.requests.clear()
-    assert python(code, hub, tmp_path / "home").returncode == 0
+    assert machine(code, tmp_path / "home").returncode == 0
     assert not any(request.startswith("PUT /lfs/") for request in hub.requests)
     assert "meta/info.json" in hub.repos[REPO]
 
     del hub.repos[REPO]["manifest.json"]
-    assert python(code, hub, tmp_path / "home").returncode == 0
+    assert machine(code, tmp_path / "home").returncode == 0
     assert "manifest.json" in hub.repos[REPO]
-    assert python(PUSH.format(folder=str(folder), repo="somebody/copy"), hub, tmp_path / "home").returncode == 0
+    assert machine(PUSH.format(folder=str(folder), repo="somebody/copy"), tmp_path / "home").returncode == 0
     assert set(hub.repos["somebody/copy"]) == set(hub.repos[REPO])
 
 
-def test_writing_needs_a_token(hub, folder, tmp_path):
+def test_writing_needs_a_token(hub, machine, folder, tmp_path):
     code = PUSH.format(folder=str(folder), repo=REPO)
-    without = python(code, hub, tmp_path / "home", token=None)
+    without = machine(code, tmp_path / "home", token=None)
     assert without.stdout.startswith(f"refused: there is no token to write to {REPO}: run `hf auth login`")
-    wrong = python(code, hub, tmp_path / "home", token="hf_of_another")
+    wrong = machine(code, tmp_path / "home", token="hf_of_another")
     assert wrong.stdout.startswith(f"refused: the hub refused to write to {REPO} (401): the token is not valid")
     assert hub.repos == {}
     assert not (folder / ".cache").exists()

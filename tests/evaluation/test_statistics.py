@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from statsmodels.stats.multitest import multipletests
 
 from lerobot_memobench.evaluation.statistics import detectable, holm, mcnemar, sign_flip
 
@@ -115,3 +116,5 @@ def test_holm() -> None:
     assert holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
     assert holm([0.6, 0.9]) == [1.0, 1.0]
     assert holm([]) == []
+    values = np.random.default_rng(0).random(200).round(2) ** 3  # with ties
+    assert holm(list(values)) == pytest.approx(multipletests(values, method="holm")[1])

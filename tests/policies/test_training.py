@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import re
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -36,6 +35,7 @@ from lerobot_memobench.policies.memobench_mem.training import (
 )
 from lerobot_memobench.run.training import trained_on
 from tests.support import rank_case
+from tests.support.fork_server import ForkServer
 from tests.support.object_dataset import make_object_dataset
 from tests.support.small_policy import CHUNK, batch_of, losses_in_training, made_for_training, small_config
 from tests.support.synthetic_dataset import make_dataset
@@ -180,9 +180,11 @@ def test_what_guides_denoising_is_refused() -> None:
 @pytest.fixture(scope="module")
 def ranks(tmp_path_factory: pytest.TempPathFactory) -> Any:
     folder = tmp_path_factory.mktemp("ranks")
-    command = [sys.executable, rank_case.__file__]
-    running = [subprocess.Popen([*command, str(rank), str(folder)]) for rank in range(2)]
-    assert [process.wait() for process in running] == [0, 0]
+    forks = ForkServer([rank_case.__name__])
+    code = "from pathlib import Path; from tests.support.rank_case import run_rank; run_rank({}, Path({!r}))"
+    running = [forks.start(code.format(rank, str(folder)), folder / f"{rank}.txt") for rank in range(2)]
+    assert [fork.wait() for fork in running] == [0, 0], [file.read_text() for file in folder.glob("*.txt")]
+    forks.close()
     return [torch.load(folder / f"{rank}.pt") for rank in range(2)]
 
 

@@ -21,13 +21,17 @@ class Hub(ThreadingHTTPServer):
 
     def __init__(self) -> None:
         super().__init__(("127.0.0.1", 0), Handler)
+        self.clear()
+        threading.Thread(target=self.serve_forever, daemon=True).start()
+
+    def clear(self) -> None:
+        """Forget all that was written and asked."""
         self.repos: dict[str, dict[str, bytes]] = {}
         self.large: dict[str, set[str]] = {}
         self.tags: dict[str, dict[str, str]] = {}
         self.blobs: dict[str, bytes] = {}
         self.requests: list[str] = []
         self.failing: list[str] = []  # paths that are refused once
-        threading.Thread(target=self.serve_forever, daemon=True).start()
 
     @property
     def address(self) -> str:

@@ -1,12 +1,13 @@
-"""One rank of a distributed training step, or the whole of it in one process; run as ``rank_case.py RANK FOLDER``."""
+"""One rank of a distributed training step, or the whole of it in one process."""
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import torch
+import torch.distributed as dist
 from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
 
 from lerobot_memobench.policies.memobench_mem.alignment import alignment_loss, make_alignment
 from lerobot_memobench.policies.memobench_mem.training import mean_losses, means_over_ranks
@@ -59,11 +60,8 @@ def step(align: str, has_text: tuple[int, ...], rows: slice, wrap: type[nn.Modul
     return {"loss": loss.detach(), "top1": top1, "norm": norm} | gradients
 
 
-if __name__ == "__main__":
-    import torch.distributed as dist
-    from torch.nn.parallel import DistributedDataParallel
-
-    rank, folder = int(sys.argv[1]), Path(sys.argv[2])
+def run_rank(rank: int, folder: Path) -> None:
+    """Take the steps as one of the ranks and save what came out."""
     dist.init_process_group("gloo", init_method=f"file://{folder / 'meeting'}", rank=rank, world_size=len(RANKS))
 
     def parallel(module: nn.Module) -> nn.Module:

@@ -113,12 +113,14 @@ def detectable(
 
 
 def holm(values: Sequence[float]) -> list[float]:
-    """Return p-values adjusted for their number (Holm 1979), in the same order."""
-    if not values:
-        return []
-    from statsmodels.stats.multitest import multipletests
+    """Return p-values adjusted for their number (Holm 1979), in the same order.
 
-    return [float(p) for p in multipletests(values, method="holm")[1]]
+    Written out: scipy has other procedures only.
+    """
+    p, order = np.asarray(values, dtype=np.float64), np.argsort(values)
+    adjusted = np.empty_like(p)
+    adjusted[order] = np.maximum.accumulate(p[order] * np.arange(p.size, 0, -1)).clip(max=1.0)
+    return [float(value) for value in adjusted]
 
 
 # --- bootstrap intervals ---
