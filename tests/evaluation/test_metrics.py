@@ -141,7 +141,7 @@ def test_mixed_protocols_are_said() -> None:
     assert "20, 5" in intervals
 
 
-def test_lines_of_two_scenes_two_eyes_or_of_nobody_are_said() -> None:
+def test_lines_of_two_scenes_two_inputs_or_of_nobody_are_said() -> None:
     """Of one policy, by other lines of it or by none."""
     whose = {"policy": "act 1", "run": "1", "inputs": "pixels"}
     mine = [rollout("t", "temporal", "S", [1], True, k, **whose) for k in range(3)]
