@@ -376,12 +376,19 @@ def _check_statistics(folder: Path, file: str, step: Mapping[str, Any]) -> None:
         key
         for key, feature in config.get("features", {}).items()
         if str(modes.get(feature.get("type"), "IDENTITY")).upper() != "IDENTITY"
-        and _applies(file, str(feature.get("type")))
+        # The preprocessor normalises observations (and actions in training), the postprocessor actions alone.
+        and (file == PREPROCESSOR_FILE or feature.get("type") == "ACTION")
     ]
     state_file = step.get("state_file")
     present: set[str] = set()
     if isinstance(state_file, str):
-        present = _tensor_names(folder / file_name(state_file, f"state_file in {folder / file}"))
+        path = folder / file_name(state_file, f"state_file in {folder / file}")
+        if not path.is_file():
+            raise MemobenchError(
+                f"the checkpoint {folder} lacks its normalisation statistics ({path.name} is missing); "
+                "copy it whole or train it again"
+            )
+        present = set(_shapes(path))
     missing = [key for key in needed if not any(name.startswith(f"{key}.") for name in present)]
     if missing:
         raise MemobenchError(
@@ -389,17 +396,3 @@ def _check_statistics(folder: Path, file: str, step: Mapping[str, Any]) -> None:
             f"({state_file or file}); copy it whole or train it again, since without them it would act on "
             "raw numbers"
         )
-
-
-def _applies(file: str, feature_type: str) -> bool:
-    """The preprocessor normalises observations (and actions in training), the postprocessor actions alone."""
-    return file == PREPROCESSOR_FILE or feature_type == "ACTION"
-
-
-def _tensor_names(path: Path) -> set[str]:
-    if not path.is_file():
-        raise MemobenchError(
-            f"the checkpoint {path.parent} lacks its normalisation statistics ({path.name} is missing); "
-            "copy it whole or train it again"
-        )
-    return set(_shapes(path))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -68,24 +68,15 @@ class Vision:
     image: int  # pixels per side of the policy's input
 
 
-@dataclass(frozen=True)
-class Recipe:
-    """What is trained how, as far as a size decides it; the first values are the paper's.
-
-    Attributes:
-        chunk_size: actions of a plan. n_action_steps: how many of them are taken before the next plan.
-        min_lr_ratio: learning rate at the end, as a fraction of the highest; below 1 it falls there as a cosine.
-        normalization: LeRobot's mode for states and actions.
-        objective: how actions are learned (`action_objective`).
-    """
-
-    chunk_size: int = 50
-    n_action_steps: int = 50
-    weight_decay: float = 0.0
-    ema_decay: float = 0.999
-    min_lr_ratio: float = 1.0
-    normalization: str = "QUANTILES"
-    objective: str = "flow_matching"
+PAPERS: Mapping[str, Any] = {
+    "chunk_size": 50,
+    "n_action_steps": 50,
+    "optimizer_weight_decay": 0.0,
+    "ema_decay": 0.999,
+    "min_lr_ratio": 1.0,
+    "objective": FLOW_MATCHING,
+}
+"""Defaults of the fields that a size decides: the paper's."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +92,8 @@ class Dimensions:
     text_encoder: str  # "words" (built here) or a folder or repository of a SigLIP model
     text_dim: int
     learning_rate: float
-    recipe: Recipe = field(default_factory=Recipe)
+    normalization: str = "QUANTILES"  # LeRobot's mode for states and actions
+    defaults: Mapping[str, Any] = field(default_factory=lambda: PAPERS)
 
 
 # The VLM's width is also the width d_m of the memory tokens (2048 at full size).
@@ -125,15 +117,15 @@ SIZES = {
         expert=replace(_TINY.expert, depth=3),
         vocabulary=512,
         tokenizer_max_length=48,
-        recipe=Recipe(
-            chunk_size=16,
-            n_action_steps=6,
-            weight_decay=1e-4,
-            ema_decay=0.995,
-            min_lr_ratio=0.02,
-            normalization="MEAN_STD",
-            objective="regression",
-        ),
+        normalization="MEAN_STD",
+        defaults={
+            "chunk_size": 16,
+            "n_action_steps": 6,
+            "optimizer_weight_decay": 1e-4,
+            "ema_decay": 0.995,
+            "min_lr_ratio": 0.02,
+            "objective": REGRESSION,
+        },
     ),
     "pi05": Dimensions(
         vlm=Gemma(width=2048, depth=18, mlp_dim=16_384, num_heads=8, num_kv_heads=1, head_dim=256),
@@ -315,14 +307,11 @@ class MemobenchMemConfig(PI05Config):
         self._choose("memory_fusion", MEMORY_FUSIONS)
         self._choose("subgoal_level", SUBGOAL_LEVELS)
         self._check_encoders()
-        dims, recipe = self.dimensions, self.dimensions.recipe
+        dims = self.dimensions
+        actions, planned = dims.defaults["n_action_steps"], self.chunk_size or dims.defaults["chunk_size"]
         defaults = {
-            "chunk_size": recipe.chunk_size,
-            "n_action_steps": min(recipe.n_action_steps, self.chunk_size or recipe.chunk_size),
-            "ema_decay": recipe.ema_decay,
-            "min_lr_ratio": recipe.min_lr_ratio,
-            "objective": recipe.objective,
-            "optimizer_weight_decay": recipe.weight_decay,
+            **dims.defaults,
+            "n_action_steps": min(actions, planned),
             "optimizer_lr": dims.learning_rate,
             "tokens_per_frame": TOKENS_PER_FRAME[self.perception],
             "memory_stride": MEMORY_STRIDE if self.decodes_no_video else 1,
@@ -336,7 +325,7 @@ class MemobenchMemConfig(PI05Config):
                 setattr(self, name, value)
         self._choose("objective", OBJECTIVES)
         if not self.normalization_mapping:
-            mode = NormalizationMode(recipe.normalization)
+            mode = NormalizationMode(dims.normalization)
             self.normalization_mapping = {"VISUAL": NormalizationMode.IDENTITY, "STATE": mode, "ACTION": mode}
         if self.image_resolution is None:
             side = SIDE if self.uses_visual_encoder else dims.vision.image
