@@ -55,7 +55,7 @@ class MemoryPI05(PI05Pytorch):
     """
 
     def __init__(self, config: MemobenchMemConfig, rtc_processor: Any = None) -> None:
-        with torch.device("meta"):
+        with torch.device("meta"), no_init_weights():
             super().__init__(config, rtc_processor=rtc_processor)
         dims = config.dimensions
         width, vlm_width = dims.expert.width, dims.vlm.width
@@ -147,7 +147,7 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
 
     def __init__(self, config: MemobenchMemConfig) -> None:
         dims, image_size = config.dimensions, config.image_size[0]
-        with torch.device("meta"):
+        with torch.device("meta"), no_init_weights():
             super().__init__(
                 GemmaConfig(**vars(dims.vlm)),
                 GemmaConfig(**vars(dims.expert)),
