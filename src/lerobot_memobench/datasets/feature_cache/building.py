@@ -122,30 +122,7 @@ def build_feature_cache(
     """
     root = Path(root)
     fingerprint, table = dataset_fingerprint(root, camera), read_frame_table(root)
-    meta = _describe(table, fingerprint, frames, texts, camera, stride)
-    progress = progress or (lambda _done, _all: None)
-    work = _Work(root, (place or root / FOLDER) / name, meta, table, texts, tell)
-    if work.is_done:  # read without a lock: it may lie where nobody may write
-        progress(table.num_episodes, table.num_episodes)
-        return work.folder
-    read = read or frame_reader(root, camera)
-    with telling_of_the_disk(work.folder):
-        work.folder.parent.mkdir(parents=True, exist_ok=True)
-        if place is None:
-            keep_from_the_hub(root)
-        with taking_turns(work.folder.parent / f"{name}.lock", partial(wait, work.folder)):
-            begun = work.begin()
-            encoding = Encoding(work.folder, begun, table, batch_size, workers or min(cores(), MOST_THREADS))
-            encoding.run(frames, read, progress)
-            write_meta(work.folder, replace(begun, complete=True))
-    return work.folder
-
-
-def _describe(
-    table: FrameTable, fingerprint: str, frames: FrameEncoder, texts: TextEncoder, camera: str, stride: int
-) -> CacheMeta:
-    """Return what an unfinished cache says of itself."""
-    return CacheMeta(
+    wanted = CacheMeta(
         format=FORMAT,
         dataset=fingerprint,
         frames_key=frames.key,
@@ -159,6 +136,29 @@ def _describe(
         oracle=table.memory is not None,
         complete=False,
     )
+    progress = progress or (lambda _done, _all: None)
+    folder = (place or root / FOLDER) / name
+    there = _fitting(root, folder, wanted)  # read without a lock: it may lie where nobody may write
+    if there is not None and there.complete and (folder / texts_file(there.texts_key, texts.key)).is_file():
+        progress(table.num_episodes, table.num_episodes)
+        return folder
+    read = read or frame_reader(root, camera)
+    with telling_of_the_disk(folder):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        if place is None:
+            keep_from_the_hub(root)
+        with taking_turns(folder.parent / f"{name}.lock", partial(wait, folder)):
+            begun = _fitting(root, folder, wanted)
+            if begun is None:
+                _begin(folder, wanted, table, texts, tell)
+                begun = wanted
+            else:
+                remove_drafts(folder)
+                reserve(folder / TOKENS_FILE, wanted.bytes)
+                _add_embeddings(folder, begun, texts)
+            _encode(folder, begun, table, frames, read, batch_size, workers or min(cores(), MOST_THREADS), progress)
+            _write_meta(folder, replace(begun, complete=True))
+    return folder
 
 
 def keep_from_the_hub(root: Path) -> None:
@@ -173,122 +173,72 @@ def keep_from_the_hub(root: Path) -> None:
             write_file(path, "\n".join([*there, line]) + "\n")
 
 
-@dataclass(frozen=True)
-class _Work:
-    """A cache that is wanted, and what is there of it."""
+def _fitting(root: Path, folder: Path, wanted: CacheMeta) -> CacheMeta | None:
+    """Return what is there and fits, complete or not; begun with another text encoder perhaps."""
+    there = readable_meta(root, folder.name, folder.parent)
+    if there is None or replace(there, complete=False, texts_key=wanted.texts_key) != wanted:
+        return None
+    return there
 
-    root: Path
-    folder: Path
-    meta: CacheMeta
-    table: FrameTable
-    texts: TextEncoder
-    tell: Callable[[str], None]
 
-    @property
-    def fitting(self) -> CacheMeta | None:
-        """What is there and fits, complete or not; begun with another text encoder perhaps."""
-        there = readable_meta(self.root, self.folder.name, self.folder.parent)
-        if there is None or replace(there, complete=False, texts_key=self.meta.texts_key) != self.meta:
-            return None
-        return there
-
-    @property
-    def is_done(self) -> bool:
-        """Whether nothing is left to do."""
-        there = self.fitting
-        if there is None or not there.complete:
-            return False
-        return (self.folder / texts_file(there.texts_key, self.texts.key)).is_file()
-
-    def begin(self) -> CacheMeta:
-        """Make everything but the tokens, for which room is taken; return what is there now."""
-        there = self.fitting
-        if there is None:
-            self._make_room()
-            there = self._begin_anew()
-        else:
-            remove_drafts(self.folder)
-            reserve(self.folder / TOKENS_FILE, self.meta.bytes)
-            add_embeddings(self.folder, there, self.texts)
-        return there
-
-    def _make_room(self) -> None:
-        """Say what will be made, and take away what lies in its place."""
-        if self.folder.exists():
-            self.tell(
-                f"The feature cache {self.folder} cannot be used (its dataset has changed since, or an earlier version "
-                "made it): it is made again."
-            )
-            shutil.rmtree(self.folder)
-        self.tell(
-            f"The feature cache {self.folder} takes {in_words(self.meta.bytes)}: {self.meta.slots:,} frames of "
-            f"{in_words(self.meta.frame_bytes)}; {in_words(free_bytes(self.folder))} are free there."
+def _begin(folder: Path, meta: CacheMeta, table: FrameTable, texts: TextEncoder, tell: Callable[[str], None]) -> None:
+    """Begin a cache in the place of what lies there: its room and its tables; nothing is left where that fails."""
+    if folder.exists():
+        tell(
+            f"The feature cache {folder} cannot be used (its dataset has changed since, or an earlier version made "
+            "it): it is made again."
         )
-
-    def _begin_anew(self) -> CacheMeta:
-        """Begin a cache; nothing of it is left where that fails."""
-        self.folder.mkdir()
-        try:
-            reserve(self.folder / TOKENS_FILE, self.meta.bytes)
-            write_tables(self.folder, self.table, self.texts)
-            write_meta(self.folder, self.meta)
-        except BaseException:
-            shutil.rmtree(self.folder, ignore_errors=True)
-            raise
-        return self.meta
+        shutil.rmtree(folder)
+    tell(
+        f"The feature cache {folder} takes {in_words(meta.bytes)}: {meta.slots:,} frames of "
+        f"{in_words(meta.frame_bytes)}; {in_words(free_bytes(folder))} are free there."
+    )
+    folder.mkdir()
+    try:
+        reserve(folder / TOKENS_FILE, meta.bytes)
+        _write_tables(folder, table, texts)
+        _write_meta(folder, meta)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
 
 
 # --- tokens ---
 
 
-@dataclass(frozen=True)
-class Encoding:
-    """A cache whose tokens are being written.
+def _encode(
+    folder: Path,
+    meta: CacheMeta,
+    table: FrameTable,
+    frames: FrameEncoder,
+    read: FrameReader,
+    batch_size: int,
+    workers: int,
+    progress: Progress,
+) -> None:
+    """Encode every episode that is not marked done; its mark is written after its tokens are on the disk.
 
-    Attributes:
-        folder: of the cache; its file of tokens has its full size.
-        batch_size: frames per pass of the encoder. workers: threads that decode videos ahead of it.
+    Videos are decoded in threads, a few parts ahead; the encoder takes them in their order, so that the file is
+    the same whatever the number of threads, and a killed build has finished the first so many episodes. Tokens
+    are written, not mapped: a disk that refuses a mapped page kills the process (SIGBUS).
     """
-
-    folder: Path
-    meta: CacheMeta
-    table: FrameTable
-    batch_size: int
-    workers: int
-
-    def run(self, frames: FrameEncoder, read: FrameReader, progress: Progress) -> None:
-        """Encode every episode that is not marked done; its mark is written after its tokens are on the disk.
-
-        Videos are decoded in threads, a few parts ahead; the encoder takes them in their order, so that the file is
-        the same whatever the number of threads, and a killed build has finished the first so many episodes. Tokens
-        are written, not mapped: a disk that refuses a mapped page kills the process (SIGBUS).
-        """
-        done = read_done(self.folder, self.table.num_episodes)
-        progress(int(done.sum()), len(done))
-        with (
-            (self.folder / TOKENS_FILE).open("r+b") as file,
-            ThreadPoolExecutor(self.workers, thread_name_prefix="decode") as pool,
-        ):
-            parts = self._parts(np.flatnonzero(done == 0).tolist())
-            for part, images in _ahead(pool, 2 * self.workers, parts, lambda part: read(part.episode, part.frames)):
-                encoded = frames(images).to("cpu", torch.bfloat16).contiguous()
-                file.seek(part.slot * self.meta.frame_bytes)
-                file.write(encoded.view(torch.uint16).numpy().tobytes())
-                if part.last:
-                    file.flush()
-                    os.fsync(file.fileno())
-                    done[part.episode] = 1
-                    write_done(self.folder, done)
-                    progress(int(done.sum()), len(done))
-
-    def _parts(self, episodes: Sequence[int]) -> Iterator[_Part]:
-        slots = slot_starts(self.table.episodes, self.meta.stride)
-        lengths = np.diff(self.table.episodes)
-        for episode in episodes:
-            wanted = list(range(0, int(lengths[episode]), self.meta.stride))
-            for first in range(0, len(wanted), self.batch_size):
-                end = first + self.batch_size
-                yield _Part(episode, wanted[first:end], int(slots[episode]) + first, end >= len(wanted))
+    done = _read_done(folder, table.num_episodes)
+    progress(int(done.sum()), len(done))
+    with (
+        (folder / TOKENS_FILE).open("r+b") as file,
+        ThreadPoolExecutor(workers, thread_name_prefix="decode") as pool,
+    ):
+        parts = _parts(table, meta.stride, batch_size, np.flatnonzero(done == 0).tolist())
+        for part, images in _ahead(pool, 2 * workers, parts, lambda part: read(part.episode, part.frames)):
+            encoded = frames(images).to("cpu", torch.bfloat16).contiguous()
+            file.seek(part.slot * meta.frame_bytes)
+            file.write(encoded.view(torch.uint16).numpy().tobytes())
+            if part.last:
+                file.flush()
+                os.fsync(file.fileno())
+                done[part.episode] = 1
+                _write_done(folder, done)
+                progress(int(done.sum()), len(done))
 
 
 @dataclass(frozen=True)
@@ -299,6 +249,15 @@ class _Part:
     frames: list[int]
     slot: int  # where the first one's tokens go
     last: bool  # of its episode
+
+
+def _parts(table: FrameTable, stride: int, batch_size: int, episodes: Sequence[int]) -> Iterator[_Part]:
+    slots, lengths = slot_starts(table.episodes, stride), np.diff(table.episodes)
+    for episode in episodes:
+        wanted = list(range(0, int(lengths[episode]), stride))
+        for first in range(0, len(wanted), batch_size):
+            end = first + batch_size
+            yield _Part(episode, wanted[first:end], int(slots[episode]) + first, end >= len(wanted))
 
 
 def _ahead[Item, Result](
@@ -323,9 +282,8 @@ def _ahead[Item, Result](
 # --- tables ---
 
 
-def write_tables(folder: Path, table: FrameTable, texts: TextEncoder) -> None:
-    """Write the tables of a cache none of whose episodes is done."""
-    write_done(folder, np.zeros(table.num_episodes, dtype=np.uint8))
+def _write_tables(folder: Path, table: FrameTable, texts: TextEncoder) -> None:
+    _write_done(folder, np.zeros(table.num_episodes, dtype=np.uint8))
     _save_array(folder / "episodes.npy", table.episodes)
     _save_array(folder / "phase.npy", table.phase)
     unique, subgoals = numbered(table)
@@ -339,7 +297,7 @@ def write_tables(folder: Path, table: FrameTable, texts: TextEncoder) -> None:
         _write_json(folder / "memory.json", memories)
 
 
-def add_embeddings(folder: Path, meta: CacheMeta, texts: TextEncoder) -> None:
+def _add_embeddings(folder: Path, meta: CacheMeta, texts: TextEncoder) -> None:
     """Write what another text encoder makes of the texts beside what the cache has; nothing if it is there."""
     path = folder / texts_file(meta.texts_key, texts.key)
     if not path.is_file():
@@ -347,7 +305,7 @@ def add_embeddings(folder: Path, meta: CacheMeta, texts: TextEncoder) -> None:
         _save_embeddings(path, unique, texts)
 
 
-def read_done(folder: Path, episodes: int) -> np.ndarray:
+def _read_done(folder: Path, episodes: int) -> np.ndarray:
     """Return which episodes (E,) are done, uint8; none, where the file is damaged or gone."""
     try:
         done = np.load(folder / DONE_FILE)
@@ -357,19 +315,16 @@ def read_done(folder: Path, episodes: int) -> np.ndarray:
     return done if whole and (done <= 1).all() else np.zeros(episodes, dtype=np.uint8)
 
 
-def write_meta(folder: Path, meta: CacheMeta) -> None:
-    """Write the description of a cache, without which it is none."""
+def _write_done(folder: Path, done: np.ndarray) -> None:
+    _save_array(folder / DONE_FILE, done, durable=True)  # as their tokens are
+
+
+def _write_meta(folder: Path, meta: CacheMeta) -> None:
     _write_json(folder / META_FILE, asdict(meta))
 
 
-def write_done(folder: Path, done: np.ndarray) -> None:
-    """Write which episodes (E,) are done; on the disk before this returns, as their tokens are."""
-    _save_array(folder / DONE_FILE, done, durable=True)
-
-
 def _save_embeddings(path: Path, unique: list[str], texts: TextEncoder) -> None:
-    embeddings = texts(unique).to(torch.float32).numpy() if unique else np.zeros((0, texts.dim), np.float32)
-    _save_array(path, embeddings)
+    _save_array(path, texts(unique).to(torch.float32).numpy() if unique else np.zeros((0, texts.dim), np.float32))
 
 
 def _write_json(path: Path, value: Any) -> None:
