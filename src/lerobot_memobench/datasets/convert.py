@@ -38,7 +38,6 @@ from lerobot_memobench.datasets.staging import (
     LEROBOT,
     STAGING,
     EpisodeStage,
-    StagedEpisode,
     StagedJob,
     compare_requests,
     episode_info,
@@ -170,9 +169,12 @@ def convert(
         run_jobs(jobs, workers=workers, progress=progress, logs=staging / "logs")
         episodes = [staged(job) for job in jobs]
         good = [episode for episode in episodes if episode.failure is None]
-        problems += _failures(jobs, episodes)
-        problems = _told(problems, files, source)
-        notes = _told(notes, files, source)
+        problems += [
+            Problem(str(job.file), f"data/{job.group}", episode.failure)
+            for job, episode in zip(jobs, episodes, strict=True)
+            if episode.failure is not None
+        ]
+        problems, notes = _told(problems, files, source), _told(notes, files, source)
         if good:
             assemble(
                 good,
@@ -247,14 +249,6 @@ def _miscounted(file: PublishedFile) -> list[Problem]:
     if not count:
         reasons.append("it has no demonstrations")
     return [Problem(str(file.path), "data", reason) for reason in reasons]
-
-
-def _failures(jobs: Sequence[ConversionJob], episodes: Sequence[StagedEpisode]) -> list[Problem]:
-    return [
-        Problem(str(job.file), f"data/{job.group}", episode.failure)
-        for job, episode in zip(jobs, episodes, strict=True)
-        if episode.failure is not None
-    ]
 
 
 def _told(problems: Sequence[Problem], files: Sequence[Path], source: Path) -> list[Problem]:

@@ -73,7 +73,8 @@ def push(
     api = HfApi(token=token)
     with _told(repo_id):
         repo_id = api.create_repo(repo_id, repo_type="dataset", private=private, exist_ok=True).repo_id
-        stale = _stale(api, _sizes(folder, parts), repo_id)
+        others = _on_the_hub(api, repo_id).keys() - _sizes(folder, parts).keys()
+        stale = sorted(name for name in others if any(fnmatch(name, part) for part in (*PARTS, HDF5, DERIVED)))
         if stale:
             tell(
                 f"{len(stale)} files that this dataset does not have, such as {stale[0]}, are deleted from {repo_id}; "
@@ -94,7 +95,8 @@ def push(
             repo_type="dataset",
             commit_message="Upload the card",
         )
-        missing = _missing(api, _sizes(folder, parts) | {CARD_FILE: len(card.encode())}, repo_id)
+        there, sizes = _on_the_hub(api, repo_id), _sizes(folder, parts) | {CARD_FILE: len(card.encode())}
+        missing = sorted(name for name, size in sizes.items() if there.get(name) != size)
         if missing:
             raise MemobenchError(
                 f"{len(missing)} files, such as {missing[0]}, did not arrive at {repo_id}; run the same command again"
@@ -136,20 +138,9 @@ def _sizes(folder: Path, parts: list[str]) -> dict[str, int]:
 
 
 def _on_the_hub(api: HfApi, repo_id: str) -> dict[str, int]:
+    """Return the files that the hub holds and their sizes."""
     entries = api.list_repo_tree(repo_id, repo_type="dataset", recursive=True)
     return {entry.path: entry.size for entry in entries if hasattr(entry, "size")}
-
-
-def _stale(api: HfApi, sizes: dict[str, int], repo_id: str) -> list[str]:
-    """Return what the hub holds in the places of a dataset and is not uploaded."""
-    there = [name for name in _on_the_hub(api, repo_id) if name not in sizes]
-    return sorted(name for name in there if any(fnmatch(name, part) for part in (*PARTS, HDF5, DERIVED)))
-
-
-def _missing(api: HfApi, sizes: dict[str, int], repo_id: str) -> list[str]:
-    """Return what the hub does not hold in the size that it has here."""
-    there = _on_the_hub(api, repo_id)
-    return sorted(name for name, size in sizes.items() if there.get(name) != size)
 
 
 def _tag(api: HfApi, folder: Path, repo_id: str) -> None:

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from lerobot.configs import RGBEncoderConfig
 
 
-def default_encoder() -> RGBEncoderConfig:
-    """Return the encoder settings of the module's docstring in LeRobot's own form."""
+def _encoder() -> RGBEncoderConfig:
+    """Return the module's settings in LeRobot's own form."""
     from lerobot.configs import RGBEncoderConfig
 
     return RGBEncoderConfig(vcodec="h264", preset="ultrafast", g=10, crf=23, extra_options={"bf": 0})
@@ -47,8 +47,8 @@ class VideoWriter:
     One thread, so that the bytes do not depend on the machine's cores or on what runs beside.
     """
 
-    def __init__(self, path: Path, encoder: RGBEncoderConfig | None = None, fps: int = CONTROL_HZ) -> None:
-        self._path, self._encoder, self._fps = path, encoder or default_encoder(), fps
+    def __init__(self, path: Path) -> None:
+        self._path = path
         self._container: Any = None
         self._stream: Any = None
 
@@ -57,10 +57,11 @@ class VideoWriter:
         import av
 
         if self._container is None:
-            options = self._encoder.get_codec_options(1, as_strings=True)
+            encoder = _encoder()
+            options = encoder.get_codec_options(1, as_strings=True)
             self._container = av.open(str(self._path), "w")
-            self._stream = self._container.add_stream(self._encoder.vcodec, self._fps, options=options)
-            self._stream.pix_fmt = self._encoder.pix_fmt
+            self._stream = self._container.add_stream(encoder.vcodec, CONTROL_HZ, options=options)
+            self._stream.pix_fmt = encoder.pix_fmt
             self._stream.height, self._stream.width = frame.shape[:2]
         picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
         self._container.mux(self._stream.encode(picture))
@@ -79,10 +80,10 @@ class VideoWriter:
             self._container = None
 
 
-def join_videos(videos: Sequence[tuple[Path, int]], path: Path, fps: int = CONTROL_HZ) -> None:
+def join_videos(videos: Sequence[tuple[Path, int]], path: Path) -> None:
     """Join videos of one encoder, given with their number of frames, without encoding them again.
 
-    Frame i of the whole is at i / ``fps`` s to the tick: the places follow from the frame counts, not from
+    Frame i of the whole is at i / 20 s to the tick: the places follow from the frame counts, not from
     the durations that the files state.
     """
     import av
@@ -109,24 +110,22 @@ def join_videos(videos: Sequence[tuple[Path, int]], path: Path, fps: int = CONTR
                     packet.dts += offset
                     packet.stream = stream
                     target.mux(packet)
-            offset += round(frames / (fps * time_base))
+            offset += round(frames / (CONTROL_HZ * time_base))
 
 
-def video_info(path: Path, encoder: RGBEncoderConfig | None = None) -> dict[str, Any]:
+def video_info(path: Path) -> dict[str, Any]:
     """Return what LeRobot keeps about a video in meta/info.json."""
     import av
     from lerobot.datasets.video_utils import get_video_info
 
     level = av.logging.get_level()
     try:
-        return get_video_info(path, video_encoder=encoder or default_encoder())
+        return get_video_info(path, video_encoder=_encoder())
     finally:
         av.logging.set_level(level)  # LeRobot leaves FFmpeg printing to stderr
 
 
 Stats = dict[str, NDArray]
-
-
 QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
 
 

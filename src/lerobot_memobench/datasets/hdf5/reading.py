@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 IMAGE_NAMES = {"image": "agentview_image", "wrist_image": "robot0_eye_in_hand_image"}
 """Camera of this package -> dataset of the published layout."""
 Image = NDArray[np.uint8]
-EXTRAS = ("seed", "referent", "variant", "success", "fixture_poses", "scene_hash", "satisfied_intervals", "digest")
-"""Attributes of a demonstration that only this package writes."""
 AS_JSON = ("fixture_poses", "satisfied_intervals")
 """Attributes that hold JSON text."""
 SUFFIX = "_demo.hdf5"
@@ -34,6 +32,21 @@ SLICE = 32
 """Frames read at a time."""
 LARGEST = 1e10
 """MuJoCo takes a state with a larger number for an unstable simulation, and puts the initial one in its place."""
+
+
+class Extras(TypedDict, total=False):
+    """Attributes of a demonstration that only this package writes; JSON texts as what they say: fixture to pose (7,),
+    checkpoint to [start, stop) pairs.
+    """
+
+    seed: Whole
+    referent: str
+    variant: Count
+    success: bool
+    fixture_poses: dict[str, Annotated[list[Number], Len(7, 7)]]
+    scene_hash: str
+    satisfied_intervals: list[list[Annotated[list[Count], Len(2, 2)]]]
+    digest: str
 
 
 @dataclass(frozen=True)
@@ -325,26 +338,13 @@ def first_line(error: BaseException) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
-class Extras(TypedDict, total=False):
-    """`EXTRAS`, with what the JSON texts among them say: fixture to pose (7,), checkpoint to [start, stop) pairs."""
-
-    seed: Whole
-    referent: str
-    variant: Count
-    success: bool
-    fixture_poses: dict[str, Annotated[list[Number], Len(7, 7)]]
-    scene_hash: str
-    satisfied_intervals: list[list[Annotated[list[Count], Len(2, 2)]]]
-    digest: str
-
-
 def read_extras(group: h5py.Group) -> dict[str, Any]:
-    """Return those of `EXTRAS` that a group has.
+    """Return those of `Extras` that a group has.
 
     Raises:
         Unusable: one of them is of another type, or no JSON.
     """
-    found = {key: _plain(group.attrs[key]) for key in EXTRAS if key in group.attrs}
+    found = {key: _plain(group.attrs[key]) for key in Extras.__annotations__ if key in group.attrs}
     for key in AS_JSON:
         if isinstance(found.get(key), str):
             try:

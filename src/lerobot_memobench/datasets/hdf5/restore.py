@@ -12,7 +12,7 @@ import json
 import tempfile
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
 
@@ -54,7 +54,7 @@ def restore(task: Task, demo: PublishedDemo) -> Demonstration:
     told = _told_truth(task, demo, exec_start)
     poses = fixture_poses(sim, task, demo)
     ours = "success" in demo.extras
-    found = _read_off(sim, task, demo.states, exec_start, poses, evaluate=not ours, prompt=exec_start if ours else 0)
+    proprio, objects, satisfied, success = _read_off(sim, task, demo.states, exec_start, poses, ours=ours)
     try:
         restored = Demonstration(
             task=task,
@@ -63,20 +63,20 @@ def restore(task: Task, demo: PublishedDemo) -> Demonstration:
             variant=int(demo.extras.get("variant", 0)),
             states=demo.states,
             actions=demo.actions,
-            proprio=found.proprio,
+            proprio=proprio,
             images=None,
             exec_start=exec_start,
-            satisfied=found.satisfied if told is None else told,
-            success=bool(demo.extras.get("success", found.success or (told is not None and told.shape[1] > 0))),
+            satisfied=satisfied if told is None else told,
+            success=bool(demo.extras.get("success", success or (told is not None and told.shape[1] > 0))),
             fixture_poses=poses,
             model_xml=demo.model_file,
             scene_hash=str(demo.extras.get("scene_hash", "")),
-            objects=found.objects,
+            objects=objects,
         )
-        written = demo.extras.get("digest", digest(restored))
+        found = digest(restored)
     except MemobenchError as error:
         raise Unusable(str(error)) from None
-    if written != digest(restored):
+    if demo.extras.get("digest", found) != found:
         raise Unusable("its states, actions or labels are not those that were written (the digest differs)")
     return restored
 
@@ -141,10 +141,7 @@ def fixture_poses(sim: Simulation, task: Task, demo: PublishedDemo) -> dict[str,
     names = list(sim.fixture_poses())
     if "fixture_poses" in demo.extras:
         return {name: np.array(pose) for name, pose in demo.extras["fixture_poses"].items()}
-    try:
-        found = read_fixture_poses(demo.model_file, names) if demo.model_file.strip() else {}
-    except MemobenchError as error:
-        raise Unusable(str(error)) from None
+    found = read_fixture_poses(demo.model_file, names) if demo.model_file.strip() else {}
     return {name: found[name] if name in found else _middle(sim, task, name) for name in names}
 
 
@@ -166,12 +163,12 @@ def read_fixture_poses(xml: str, names: Iterable[str]) -> dict[str, Pose]:
     A fixture is the body of its name, or of its name with robosuite's suffix ``_main``.
 
     Raises:
-        MemobenchError: the text is no XML, or a pose in it is no pose.
+        Unusable: the text is no XML, or a pose in it is no pose.
     """
     try:
         root = ElementTree.fromstring(xml)
     except ElementTree.ParseError as error:
-        raise MemobenchError(f"model_file is no XML ({error})") from None
+        raise Unusable(f"model_file is no XML ({error})") from None
     bodies = {body.get("name"): body for body in root.iter("body")}
     found: dict[str, Pose] = {}
     for name in names:
@@ -191,18 +188,8 @@ def _numbers(body: ElementTree.Element, key: str, default: tuple[float, ...]) ->
     except ValueError:
         values = np.array([])
     if values.shape != (len(default),) or not np.isfinite(values).all():
-        raise MemobenchError(
-            f"model_file gives the body {body.get('name')} {key}={text!r}, expected {len(default)} numbers"
-        )
+        raise Unusable(f"model_file gives the body {body.get('name')} {key}={text!r}, expected {len(default)} numbers")
     return values
-
-
-@dataclass(frozen=True, eq=False)
-class _ReadOff:
-    proprio: NDArray[np.float32]
-    objects: NDArray[np.float32]
-    satisfied: NDArray[np.bool_]
-    success: bool
 
 
 def _read_off(
@@ -212,11 +199,11 @@ def _read_off(
     exec_start: int,
     poses: dict[str, Pose],
     *,
-    evaluate: bool,
-    prompt: int,
-) -> _ReadOff:
-    """Show the states to the simulator one after the other and note what it says; the first ``prompt`` frames are of
-    this package's demonstration prompt.
+    ours: bool,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], bool]:
+    """Show the states to the simulator one after the other; return proprioception, visible objects, truth and success.
+
+    Of a demonstration of ``ours`` the prompt is known, and truth and success are written.
     """
     progress = Progress(task)
     look = ObjectSlots(sim)
@@ -225,19 +212,15 @@ def _read_off(
     for frame, state in enumerate(states):
         sim.set_state(state, poses)
         proprio.append(sim.proprio())
-        sim.highlights = highlights_at(task, sim, frame) if frame < prompt else ()
+        sim.highlights = highlights_at(task, sim, frame) if ours and frame < exec_start else ()
         objects.append(look.observe())
         if frame == exec_start:
             sim.begin_execution()
-        if evaluate and frame > exec_start:  # the world is evaluated after a control step, see Demonstration
+        if not ours and frame > exec_start:  # the world is evaluated after a control step, see Demonstration
             success = progress.step(sim.holds) or success
         satisfied.append(progress.satisfied)
-    return _ReadOff(
-        np.array(proprio, dtype=np.float32),
-        np.array(objects),
-        np.array(satisfied, dtype=np.bool_).reshape(len(states), len(task.checkpoints)),
-        success,
-    )
+    truth = np.array(satisfied, dtype=np.bool_).reshape(len(states), len(task.checkpoints))
+    return np.array(proprio, dtype=np.float32), np.array(objects), truth, success
 
 
 def _check_clock(states: NDArray[np.float64], exec_start: int) -> None:

@@ -150,18 +150,23 @@ def episode_count(folder: Path) -> int:
     Raises:
         MemobenchError: they cannot be read, or disagree.
     """
-    import pyarrow.parquet as pq
-
-    told = int(read_info(folder)["total_episodes"])
-    rows = 0
-    for path in sorted((folder / "meta" / "episodes").rglob("*.parquet")):
-        with undamaged(path):
-            rows += pq.read_metadata(path).num_rows
+    told, rows = int(read_info(folder)["total_episodes"]), _row_count(folder / "meta" / "episodes")
     if rows != told:
         raise MemobenchError(
             f"{folder / INFO_FILE} tells of {count_of(told, 'episode')}, {folder}/meta/episodes of {rows}; {ADVICE}"
         )
     return told
+
+
+def _row_count(folder: Path) -> int:
+    """Return how many rows the tables in a folder say that they have."""
+    import pyarrow.parquet as pq
+
+    rows = 0
+    for path in sorted(folder.rglob("*.parquet")):
+        with undamaged(path):
+            rows += pq.read_metadata(path).num_rows
+    return rows
 
 
 class EpisodeRecord(BaseModel):
@@ -302,17 +307,12 @@ def check_whole(folder: Path) -> None:
     Raises:
         MemobenchError: naming the first file that is cut off or gone, or what is missing of all.
     """
-    import pyarrow.parquet as pq
-
     info = read_info(folder)
     counts = {"data": info.get("total_frames"), "meta/episodes": info["total_episodes"]}
     if (folder / "states").is_dir():
         counts["states"] = info.get("total_frames")
     for part, expected in counts.items():
-        rows = 0
-        for path in sorted((folder / part).rglob("*.parquet")):
-            with undamaged(path):
-                rows += pq.read_metadata(path).num_rows
+        rows = _row_count(folder / part)
         if expected is not None and rows != expected:
             raise MemobenchError(f"{folder / part} holds {rows} rows, {INFO_FILE} tells of {expected}; {ADVICE}")
     cameras = [key for key, feature in info["features"].items() if feature.get("dtype") == "video"]
@@ -362,15 +362,13 @@ def damaged_file(folder: Path) -> str | None:
     import av
     import pyarrow.parquet as pq
 
-    for path in sorted([*folder.glob("data/**/*.parquet"), *folder.glob("meta/**/*.parquet")]):
+    tables = sorted([*folder.glob("data/**/*.parquet"), *folder.glob("meta/**/*.parquet")])
+    for path in [*tables, *sorted(folder.glob("videos/**/*.mp4"))]:
         try:
             with undamaged(path):
-                pq.read_table(path)
-        except MemobenchError as error:
-            return str(error)
-    for path in sorted(folder.glob("videos/**/*.mp4")):
-        try:
-            with undamaged(path):
+                if path.suffix == ".parquet":
+                    pq.read_table(path)
+                    continue
                 _check_video(path, 0)
                 with av.open(str(path)) as container:
                     container.streams.video[0].codec_context.options = {"err_detect": "explode"}
