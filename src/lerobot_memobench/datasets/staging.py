@@ -255,9 +255,7 @@ class EpisodeStage:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        abandoned: list[VideoWriter | EpisodeFile] = [*self._videos.values()]
-        abandoned += [] if self._hdf5 is None else [self._hdf5]
-        for file in abandoned:
+        for file in (*self._videos.values(), *([] if self._hdf5 is None else [self._hdf5])):
             with contextlib.suppress(Exception):  # on a full disk closing fails as well, and all of it is deleted
                 file.abandon()
         shutil.rmtree(self._temporary, ignore_errors=True)
@@ -281,11 +279,18 @@ class EpisodeStage:
         found = labels(demo)
         info = episode_info(demo)
         _check_storable(info, found.columns())
+        for video in self._videos.values():
+            video.close()
+        shown = self._histograms if self._frames else {}
+        stats = {
+            camera: {name: value.tolist() for name, value in histograms.stats().items()}
+            for camera, histograms in shown.items()
+        }
         record = {
             "failure": None,
             "info": info,
             "language_persistent": persistent_rows(found),
-            "image_stats": self._close_videos(),
+            "image_stats": stats,
         }
         if LEROBOT in self._formats:
             columns: dict[str, Any] = {
@@ -301,17 +306,6 @@ class EpisodeStage:
             self._hdf5.finish(demo)
             record["hdf5"] = data_attributes(demo.task)
         return _publish(self._temporary, self._folder, record)
-
-    def _close_videos(self) -> dict[str, dict[str, list[Any]]]:
-        """End the videos; return each camera's statistics, nothing where there were no frames."""
-        for video in self._videos.values():
-            video.close()
-        if not self._frames:
-            return {}
-        return {
-            camera: {name: value.tolist() for name, value in histograms.stats().items()}
-            for camera, histograms in self._histograms.items()
-        }
 
 
 def episode_info(demo: Demonstration) -> dict[str, Any]:

@@ -288,7 +288,13 @@ def read_recorded(root: Path, names: Sequence[str]) -> tuple[dict[str, Tensor], 
         with undamaged(path):
             there = pq.read_schema(path).names
         column_of = {name: objects_column(there) if name == OBJECTS else name for name in names}
-        _require(root, list(column_of.values()), there)
+        missing = [name for name in column_of.values() if name not in there]
+        if missing:
+            raise MemobenchError(
+                f"The dataset {root} has no column '{missing[0]}', which this policy learns from; make it again with "
+                "this version's `memobench generate`, or train with --policy.perception=pixels and no "
+                "--policy.detection_noise."
+            )
         with undamaged(path):
             part = pq.read_table(path, columns=sorted({"index", *column_of.values()}))
         places = part.column("index").to_numpy()
@@ -297,15 +303,6 @@ def read_recorded(root: Path, names: Sequence[str]) -> tuple[dict[str, Tensor], 
             column = columns.setdefault(name, np.empty((frames, *numbers.shape[1:]), numbers.dtype))
             column[places] = numbers
     return {name: torch.from_numpy(column) for name, column in columns.items()}, table
-
-
-def _require(root: Path, names: Sequence[str], there: Sequence[str]) -> None:
-    missing = [name for name in names if name not in there]
-    if missing:
-        raise MemobenchError(
-            f"The dataset {root} has no column '{missing[0]}', which this policy learns from; make it again with this "
-            "version's `memobench generate`, or train with --policy.perception=pixels and no --policy.detection_noise."
-        )
 
 
 def _numbers(column: pa.ChunkedArray) -> np.ndarray:
