@@ -204,7 +204,7 @@ def test_two_runs_at_once(tasks, recorded, tmp_path):
 
 
 def test_a_worker_that_is_killed(tasks, recorded, tmp_path, monkeypatch):
-    def submit(_self, _function, _job):
+    def submit(_self, _function):
         future = Future()
         future.set_exception(BrokenProcessPool("gone"))
         return future
