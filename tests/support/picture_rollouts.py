@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +31,13 @@ def made_detector(path: Path, seed: int) -> Path:
     return path
 
 
+reader_of = functools.cache(frame_reader)
+
+
 def pictures_of(root: Path, index: int) -> dict[str, torch.Tensor]:
     """Return both cameras' pictures of a frame, (1, 3, H, W), as the videos show it."""
     episode = int(np.searchsorted(STARTS, index, "right")) - 1
-    return {camera: frame_reader(root, camera)(episode, [int(index - STARTS[episode])]) for camera in CAMERAS}
+    return {camera: reader_of(root, camera)(episode, [int(index - STARTS[episode])]) for camera in CAMERAS}
 
 
 def observed(root: Path, dataset: Any, index: int) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import make_policy, make_pre_post_processors
@@ -23,7 +24,7 @@ def small_config(**fields: Any) -> MemobenchMemConfig:
 def made_for_training(root: Path, **fields: Any):  # type: ignore[no-untyped-def]
     """Policy, preprocessor, postprocessor and dataset, as lerobot-train makes them."""
     config = small_config(**fields)
-    meta = LeRobotDataset("memobench/synthetic", root=root).meta
+    meta = LeRobotDatasetMetadata("memobench/synthetic", root=root)
     dataset = LeRobotDataset("memobench/synthetic", root=root, delta_timestamps=resolve_delta_timestamps(config, meta))
     torch.manual_seed(0)
     policy = make_policy(config, ds_meta=dataset.meta)
