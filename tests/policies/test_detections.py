@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +30,7 @@ from tests.support.picture_rollouts import (
     pictures_of,
 )
 from tests.support.small_policy import batch_of, made_for_training, small_config
-from tests.support.synthetic_dataset import LENGTHS
+from tests.support.synthetic_dataset import CAMERAS, LENGTHS, make_dataset
 
 ROUNDED = 2**-15
 """What two bfloat16 numbers leave of one, as a share of it."""
@@ -106,6 +108,19 @@ def test_detections_are_kept_for_every_frame(
     assert torch.allclose(batch[DETECTED], truth, rtol=ROUNDED, atol=1e-7)
     assert not torch.equal(seen[0], seen[1])
     assert len(batch[FRAMES].unique()) < batch[MASK].sum(), "moments of an episode share frames"
+
+
+def test_detections_are_of_the_cameras_by_their_names_in_the_dataset(
+    root: Path, finding: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = small_config(**finding)
+    other = make_dataset(tmp_path / "other", cameras=("observation.front", "observation.hand"))
+    renamed = json.dumps(dict(zip(("observation.front", "observation.hand"), CAMERAS, strict=True)))
+    monkeypatch.setattr(sys, "argv", ["lerobot-train", f"--rename_map={renamed}"])
+    named_otherwise = cache_dataset(other, config)
+    monkeypatch.undo()
+    assert json.loads((named_otherwise / "meta.json").read_text())["camera"] == "observation.front"
+    assert (named_otherwise / "tokens.bin").read_bytes() == (cache_dataset(root, config) / "tokens.bin").read_bytes()
 
 
 def test_a_dataset_with_one_camera_is_refused(finding: dict[str, Any], tmp_path: Path) -> None:

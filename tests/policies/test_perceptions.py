@@ -25,8 +25,9 @@ from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MASK, STEPS, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from tests.support.object_dataset import make_object_dataset
-from tests.support.picture_rollouts import CAMERAS, STARTS, made_detector, pictures_of
+from tests.support.picture_rollouts import STARTS, made_detector, pictures_of
 from tests.support.small_policy import batch_of, losses_in_training, made_for_training, small_config
+from tests.support.synthetic_dataset import CAMERAS
 
 WORDS = ("observation.language.tokens", "observation.language.attention_mask")
 

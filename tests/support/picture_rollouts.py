@@ -15,9 +15,8 @@ from lerobot_memobench.perception.detector import Detector
 from lerobot_memobench.perception.visual_encoder import VisualEncoder
 from lerobot_memobench.perception.weights import save_detector
 from research.detector.labels import kinds
-from tests.support.synthetic_dataset import LENGTHS
+from tests.support.synthetic_dataset import CAMERAS, LENGTHS
 
-CAMERAS = ("observation.images.image", "observation.images.wrist_image")
 STARTS = np.cumsum([0, *LENGTHS])
 """First frames of the episodes."""
 

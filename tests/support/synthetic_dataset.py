@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 SIZE = 48  # pixels of the synthetic cameras
+CAMERAS = ("observation.images.image", "observation.images.wrist_image")
 LENGTHS = (40, 23, 31)
 PROMPTS = (0, 8, 0)
 SUBGOALS = (
@@ -17,7 +18,7 @@ SUBGOALS = (
 TASKS = ("put the cream cheese in the basket", "put the bowl away", "fetch cream cheese and butter")
 
 
-def make_dataset(root: Path, seed: int = 0, repeats: int = 1) -> Path:
+def make_dataset(root: Path, seed: int = 0, repeats: int = 1, cameras: tuple[str, str] = CAMERAS) -> Path:
     """Write a LeRobotDataset with this project's columns: three short episodes of coloured squares that move.
 
     With ``repeats`` each of the three tasks has that many episodes, one task after the other.
@@ -32,8 +33,7 @@ def make_dataset(root: Path, seed: int = 0, repeats: int = 1) -> Path:
         root=root,
         use_videos=True,
         features={
-            "observation.images.image": image,
-            "observation.images.wrist_image": image,
+            **dict.fromkeys(cameras, image),
             "observation.state": {"dtype": "float32", "shape": (8,), "names": None},
             "action": {"dtype": "float32", "shape": (7,), "names": None},
             "phase": {"dtype": "int64", "shape": (1,), "names": None},
@@ -55,8 +55,7 @@ def make_dataset(root: Path, seed: int = 0, repeats: int = 1) -> Path:
             k = min(t * len(subgoals) // length, len(subgoals) - 1)
             dataset.add_frame(
                 {
-                    "observation.images.image": frame,
-                    "observation.images.wrist_image": frame[::-1].copy(),
+                    **dict(zip(cameras, (frame, frame[::-1].copy()), strict=True)),
                     "observation.state": (np.sin(t / 5 + np.arange(8)) + 0.05 * rng.normal(size=8)).astype(np.float32),
                     "action": np.tanh(drift + np.sin(t / 5 + np.arange(7))).astype(np.float32),
                     "phase": np.array([int(t >= prompt)]),

@@ -346,12 +346,13 @@ def make_detections(root: Path, config: MemobenchMemConfig, detect: ObjectsFromP
     Raises:
         MemobenchError: the dataset lacks a camera, or the disk has no room.
     """
-    readers = {name: frame_reader(root, name) for name in VIEWS}
-    recorded = functools.cache(lambda: read_recorded(root, [OBS_STATE]))  # a cache that is whole needs none
+    readers = {name: frame_reader(root, name_in_data(name)) for name in VIEWS}
+    measured = name_in_data(OBS_STATE)
+    recorded = functools.cache(lambda: read_recorded(root, [measured]))  # a cache that is whole needs none
 
     def read(episode: int, numbers: list[int]) -> tuple[dict[str, Tensor], Tensor]:
         columns, table = recorded()
-        states = columns[OBS_STATE][[int(table.episodes[episode]) + number for number in numbers]]
+        states = columns[measured][[int(table.episodes[episode]) + number for number in numbers]]
         return {name: one(episode, numbers) for name, one in readers.items()}, states
 
     def make(observed: tuple[dict[str, Tensor], Tensor]) -> Tensor:
@@ -360,4 +361,4 @@ def make_detections(root: Path, config: MemobenchMemConfig, detect: ObjectsFromP
         return torch.stack([rounded, (slots - rounded.float()).to(torch.bfloat16)], dim=1)
 
     features = Features(detect.key, 2, SIZE, make)
-    return _made(root, config, features, "objects", next(iter(VIEWS)), 1, read=read, **how)
+    return _made(root, config, features, "objects", name_in_data(next(iter(VIEWS))), 1, read=read, **how)
