@@ -12,6 +12,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
 
 import functools
+import gc
 
 import pytest
 from draccus.wrappers import docstring
@@ -22,6 +23,12 @@ settings.load_profile("memobench")
 
 # draccus reads the source of every policy's configuration anew for each command line: half a second, hundreds of times.
 docstring.get_attribute_docstring = functools.cache(docstring.get_attribute_docstring)
+
+
+def pytest_collection_finish() -> None:
+    """Keep what the imports made out of Python's garbage collections: a tenth of the time of tests of policies."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)

@@ -25,6 +25,7 @@ def test_functions_count_and_imports_do_not() -> None:
     assert any((trace["SOURCE"] / file).samefile(str(module.__file__)) for file in files)
 
 
+@pytest.mark.slow
 def test_words_to_plan_are_traced_and_listed() -> None:
     command = [sys.executable, str(SCRIPTS / "trace.py"), "words to plan", "--list"]
     said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
