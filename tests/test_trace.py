@@ -7,6 +7,8 @@ import runpy
 import subprocess
 import sys
 
+import pytest
+
 from lerobot_memobench.tasks.catalogue import task_names
 from tests.support.scripts import SCRIPTS
 
