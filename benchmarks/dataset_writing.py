@@ -49,7 +49,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
 from lerobot_memobench.datasets.recording import record_demonstration
 from lerobot_memobench.datasets.staging import stage_demonstration
 from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ, DEMONSTRATION_SEED
-from lerobot_memobench.tasks import get_task
+from lerobot_memobench.tasks.catalogue import get_task
 
 TASK = "turn_on_the_stove_and_turn_it_off"
 WAYS = ("write", "convert", "generate")

@@ -78,7 +78,7 @@ def record(root: Path) -> Path:
     from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
     from lerobot_memobench.datasets.recording import record_demonstration
     from lerobot_memobench.protocol import DEMONSTRATION_SEED
-    from lerobot_memobench.tasks import get_task
+    from lerobot_memobench.tasks.catalogue import get_task
 
     task = get_task(TASK)
     return write_dataset((record_demonstration(task, DEMONSTRATION_SEED + i, images=True) for i in range(2)), root)

@@ -66,7 +66,7 @@ def kinds() -> tuple[str, ...]:
     return (*PARTS, *known_classes())
 
 
-def kinds_of(sim: Simulation, things: tuple[Thing, ...]) -> list[int]:
+def kinds_of(sim: Simulation, things: list[Thing]) -> list[int]:
     """Return the index of the kind of each object of a scene.
 
     Raises:

@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from bddl_text import format_bddl
+
 from lerobot_memobench.io import write_file
-from lerobot_memobench.tasks.bddl import Region, format_bddl, parse_bddl
+from lerobot_memobench.tasks.bddl import Region, parse_bddl
 from lerobot_memobench.tasks.catalogue import CATALOGUE_DIR, get_task
 from lerobot_memobench.tasks.formula import Formula, to_lists
 from lerobot_memobench.tasks.task import BDDL_FILE, METADATA_FILE, STRICT, Prompt, Task

@@ -10,7 +10,8 @@ import pytest
 
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.sim.object_layout import SIZE
-from lerobot_memobench.tasks import Atom, Checkpoint, Task
+from lerobot_memobench.tasks.formula import Atom
+from lerobot_memobench.tasks.task import Checkpoint, Task
 
 MakeTask = Callable[..., Task]
 MakeDemo = Callable[..., Demonstration]

@@ -32,7 +32,7 @@ from lerobot_memobench.datasets.replay import replay
 from lerobot_memobench.datasets.staging import EpisodeStage, stage_demonstration
 from lerobot_memobench.datasets.validate import validate
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.tasks import get_task
+from lerobot_memobench.tasks.catalogue import get_task
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
 BUTTER = "put_the_butter_into_the_bowl_from_the_prompt_video"

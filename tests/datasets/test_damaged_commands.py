@@ -36,7 +36,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import CAMERAS
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import Simulation
-from lerobot_memobench.tasks import get_task
+from lerobot_memobench.tasks.catalogue import get_task
 from tests.support import mutations
 from tests.support.videos import encode_video
 

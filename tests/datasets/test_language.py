@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.datasets.demonstration import labels, persistent_rows
-from lerobot_memobench.tasks import get_task
-from lerobot_memobench.tasks.catalogue import task_names
+from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.memory_text import IMPERATIVES, memory_text, subtask_texts
 
 

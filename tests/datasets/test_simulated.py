@@ -34,8 +34,7 @@ from lerobot_memobench.datasets.validate import Verdict, exit_status, validate
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import checkpoint_folder
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS
-from lerobot_memobench.tasks import get_task
-from lerobot_memobench.tasks.catalogue import task_names
+from lerobot_memobench.tasks.catalogue import get_task, task_names
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
 BUTTER = "put_the_butter_into_the_bowl_from_the_prompt_video"
@@ -365,7 +364,7 @@ SCRIPT = """
 import sys
 from lerobot_memobench.datasets.generation import generate
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS
-from lerobot_memobench.tasks import get_task
+from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.catalogue import task_names
 
 if __name__ == "__main__":
@@ -428,7 +427,7 @@ import sys
 from pathlib import Path
 from lerobot_memobench.datasets.recording import RecordingJob, RecordingSettings
 from lerobot_memobench.datasets.staging import staged
-from lerobot_memobench.tasks import get_task
+from lerobot_memobench.tasks.catalogue import get_task
 
 job = RecordingJob(get_task(sys.argv[1]), int(sys.argv[2]), RecordingSettings(images=False), Path(sys.argv[3]))
 job.run()

@@ -18,10 +18,10 @@ from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.cli.memobench import main as memobench
 from lerobot_memobench.envs.acting import acting
+from lerobot_memobench.envs.command_line import policy_being_run
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode_log import read_episodes, read_protocol_file, write_episodes
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS, policy_inputs
-from lerobot_memobench.envs.prompting import policy_being_run
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import read_protocol, read_runs
 from lerobot_memobench.policies.baselines.configuration_baselines import (

@@ -19,13 +19,12 @@ from numpy.typing import NDArray
 from lerobot_memobench.envs import episode as episode_module
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.envs.observations import BOTH
-from lerobot_memobench.envs.prompting import RESET
+from lerobot_memobench.envs.observations import BOTH, RESET
 from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.protocol import EXECUTION
+from lerobot_memobench.sim.gl.rasterizer import Image
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots, classes
-from lerobot_memobench.sim.rendering import Image
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import Atom

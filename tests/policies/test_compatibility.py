@@ -25,9 +25,9 @@ from lerobot.policies.factory import get_policy_class, make_policy_config
 from safetensors.torch import load_file, save_file
 
 from lerobot_memobench.cli.lerobot import main
+from lerobot_memobench.envs.command_line import read_rename_map
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.envs.prompting import read_rename_map
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint, check_weights, shipped_policies
 from lerobot_memobench.policies.compatibility import SIZE_COUNTS, check_features, check_policy

@@ -390,7 +390,8 @@ def test_auto_is_by_the_policy_that_lerobot_runs(
     line: list[str], found: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import lerobot_policy_memobench  # noqa: F401
-    from lerobot_memobench.envs.prompting import policy_being_run, prompt_in
+    from lerobot_memobench.envs.command_line import policy_being_run
+    from lerobot_memobench.envs.observations import prompt_in
 
     monkeypatch.chdir(tmp_path)
     for folder in ("checkpoint", "run"):

@@ -16,8 +16,8 @@ import pytest
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim import rendering
-from lerobot_memobench.sim.gl.rasterizer import HIGHLIGHTS
-from lerobot_memobench.sim.rendering import Highlight, RenderSettings, close_renderers, gl_backend
+from lerobot_memobench.sim.gl.rasterizer import HIGHLIGHTS, Highlight
+from lerobot_memobench.sim.rendering import RenderSettings, close_renderers, gl_backend
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, NO_OP, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 

@@ -7,9 +7,12 @@ import re
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.tasks.bddl import Region, format_bddl, parse_bddl
+from lerobot_memobench.tasks.bddl import Region, parse_bddl
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import And, Atom, Not
+from tests.support.scripts import load_script
+
+format_bddl = load_script("strict_suite/bddl_text").format_bddl
 
 
 def test_reads_everything(bddl: str) -> None:

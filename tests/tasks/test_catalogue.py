@@ -12,9 +12,8 @@ from pathlib import Path
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.tasks import (
-    Progress,
-    Task,
+from lerobot_memobench.tasks.bddl import parse_bddl
+from lerobot_memobench.tasks.catalogue import (
     get_task,
     load_task,
     resolve_tasks,
@@ -23,9 +22,9 @@ from lerobot_memobench.tasks import (
     task_number,
     task_record,
 )
-from lerobot_memobench.tasks.bddl import parse_bddl
 from lerobot_memobench.tasks.formula import Then, atoms
-from lerobot_memobench.tasks.task import MEMORY_TYPES, SUITES
+from lerobot_memobench.tasks.progress import Progress
+from lerobot_memobench.tasks.task import MEMORY_TYPES, SUITES, Task
 
 COMMAS = "follow_the_prompt_to_determine_the_items,_discard_the_waste_first,_then_plate_the_remaining_item"
 

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.tasks import Progress, get_task, load_task, task_names
+from lerobot_memobench.tasks.catalogue import get_task, load_task, task_names
+from lerobot_memobench.tasks.progress import Progress
 
 PIECES = [
     *'()[]{}",:;- \n\t\x00é😀',

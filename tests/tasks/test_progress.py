@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lerobot_memobench.tasks import Progress, Task, get_task
+from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.formula import (
     And,
     Atom,
@@ -24,7 +24,8 @@ from lerobot_memobench.tasks.formula import (
     parse_formula,
     to_lists,
 )
-from lerobot_memobench.tasks.progress import HOLD_STEPS, Evaluator
+from lerobot_memobench.tasks.progress import HOLD_STEPS, Evaluator, Progress
+from lerobot_memobench.tasks.task import Task
 
 FIRST, SECOND = Atom("on", ("butter_1", "bowl_1")), Atom("on", ("bowl_1", "plate_1"))
 ASSEMBLY = "execute_the_assembly_procedure_demonstrated_in_the_prompt_video"
@@ -107,7 +108,7 @@ def test_reset() -> None:
 
 
 def test_task_without_checkpoints(write_task: Callable[..., Path], bddl: str) -> None:
-    from lerobot_memobench.tasks import load_task
+    from lerobot_memobench.tasks.catalogue import load_task
 
     task = load_task(write_task(bddl, None), require_metadata=False)
     progress = play(task, set(), {Atom("in", ("cup_1", "box_1_top_region"))})

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.tasks.bddl import format_bddl, parse_bddl
+from lerobot_memobench.tasks.bddl import parse_bddl
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks, suite_of, task_index, task_names, task_record
 from lerobot_memobench.tasks.failures import classify_failure
 from lerobot_memobench.tasks.formula import (
@@ -27,7 +27,9 @@ from lerobot_memobench.tasks.formula import (
 )
 from lerobot_memobench.tasks.progress import Progress
 from lerobot_memobench.tasks.task import MEMORY_TYPES, STRICT, Task
+from tests.support.scripts import load_script
 
+format_bddl = load_script("strict_suite/bddl_text").format_bddl
 SCRIPT = Path(__file__).parents[2] / "scripts" / "strict_suite"
 NAMES = task_names(suite=STRICT)
 TIMES = ("once", "twice", "three times")

@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.tasks import get_task
-from lerobot_memobench.tasks.catalogue import load_task
+from lerobot_memobench.tasks.catalogue import get_task, load_task
 from lerobot_memobench.tasks.formula import Atom, format_formula, parse_formula
 from lerobot_memobench.tasks.memory_text import memory_text, with_memory
 from lerobot_memobench.tasks.task import Prompt

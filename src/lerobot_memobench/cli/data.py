@@ -235,7 +235,7 @@ def cache(
     ] = None,
 ) -> None:
     """Encode a dataset once for policies with a memory. Its frames and its subgoals."""
-    from lerobot_memobench.envs.prompting import quiet
+    from lerobot_memobench.envs.command_line import quiet
     from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
     from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 

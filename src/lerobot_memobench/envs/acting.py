@@ -17,9 +17,9 @@ from typing import Any
 
 import yaml
 
+from lerobot_memobench.envs.command_line import in_file, quiet, training_runs
 from lerobot_memobench.envs.episode_log import INPUTS, POLICY
 from lerobot_memobench.envs.observations import policy_inputs
-from lerobot_memobench.envs.prompting import in_file, quiet, training_runs
 from lerobot_memobench.io import file_hash
 
 NOT_THE_CHECKPOINT = (
@@ -82,7 +82,7 @@ def acting(policy: Any | None, obs_type: str, oracle_memory: bool) -> Acting:
     """Return who acts in environments that observe this, by the command line of the process.
 
     Args:
-        policy: as `prompting.policy_being_run` returns it.
+        policy: as `command_line.policy_being_run` returns it.
     """
     if policy is None:
         return NOBODY
@@ -176,6 +176,24 @@ def checkpoint_hash(path: str) -> str:
 
     found = try_to_load_from_cache(path, "config.json")
     return f"{path}@{Path(found).parent.name}" if isinstance(found, str) else path
+
+
+def parameters_of(path: str) -> int | None:
+    """Return about how many parameters a checkpoint's policy has, by the size of its weights, four bytes each.
+
+    Args:
+        path: its folder, or a repository. None is returned for one that is not on this machine.
+    """
+    from huggingface_hub import try_to_load_from_cache
+
+    folder = Path(path).expanduser()
+    if not folder.is_dir():
+        cached = try_to_load_from_cache(path, "config.json")
+        if not isinstance(cached, str):
+            return None
+        folder = Path(cached).parent
+    sizes = [file.stat().st_size for file in folder.glob("*model*.safetensors")]
+    return sum(sizes) // 4 if sizes else None
 
 
 def checkpoint_files(folder: Path) -> dict[str, str]:

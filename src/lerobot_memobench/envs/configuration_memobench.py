@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from datetime import datetime
 from functools import partial
 from itertools import count
 from multiprocessing import get_context
@@ -19,28 +20,23 @@ import gymnasium as gym
 from lerobot.configs import PolicyFeature, PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_memobench.envs.acting import acting
+from lerobot_memobench.envs.acting import acting, parameters_of
+from lerobot_memobench.envs.command_line import policy_being_run, rename_map, training_runs
 from lerobot_memobench.envs.episode_log import SETTINGS, check_protocol
 from lerobot_memobench.envs.observations import (
+    AUTO,
     EVERY,
     METADATA,
     OBJECTS,
     OBS_TYPES,
     PIXELS,
+    PROMPT_IN,
     action_space,
     check_obs_type,
     observation_space,
     policy_features,
     policy_names,
-)
-from lerobot_memobench.envs.prompting import (
-    AUTO,
-    PLACES,
-    parameters_of,
-    policy_being_run,
     prompt_in,
-    rename_map,
-    training_runs,
 )
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.jobs.threads import ACTING, limit_torch, use_threads
@@ -74,7 +70,7 @@ class MemobenchEnvConfig(EnvConfig):
             are drawn by seed whatever is said here: `drawn`.
         demonstration_prompt: whether object and procedural tasks begin with their demonstration prompt.
         prompt_in: `steps`, the policy observes the prompt step by step, with `phase` 0; `reset`, it plays before the
-            first observation; `auto`: in steps for a policy that reads prompts, else in reset (`envs.prompting`).
+            first observation; `auto`: in steps for a policy that reads prompts, else in reset.
         horizon: execution steps per episode.
         render: `fast` (no shadows), `default`, or `high` (four samples per pixel, finer shadows).
         render_every: draw images every so many execution steps and repeat the last in between. Set it to the number
@@ -123,7 +119,7 @@ class MemobenchEnvConfig(EnvConfig):
             ("obs_type", self.obs_type, OBS_TYPES),
             ("suite", self.suite, SUITES),
             ("referent", self.referent, (*REFERENTS, DRAWN) if self.suite == STRICT else REFERENTS),
-            ("prompt_in", self.prompt_in, PLACES),
+            ("prompt_in", self.prompt_in, PROMPT_IN),
             ("render", self.render, ("fast", "default", "high")),
         ):
             if value not in known:
@@ -155,20 +151,8 @@ class MemobenchEnvConfig(EnvConfig):
     @property
     def gym_kwargs(self) -> dict[str, Any]:
         """What every sub-environment is made with, but for what follows from the policy."""
-        return {
-            "obs_type": self.obs_type,
-            "referent": self.referent,
-            "demonstration_prompt": self.demonstration_prompt,
-            "horizon": self.horizon,
-            "render": self.render,
-            "render_every": self.render_every,
-            "replan_steps": self.replan_steps,
-            "expert_action": self.expert_action,
-            "blind_action": self.blind_action,
-            "oracle_memory": self.oracle_memory,
-            "videos": self.videos,
-            "seed_base": self.seed_base,
-        }
+        names = (*SETTINGS, "expert_action", "blind_action", "videos")
+        return {name: getattr(self, name) for name in names if name not in ("suite", "prompt_in")}
 
     @property
     def protocol(self) -> dict[str, Any]:
@@ -194,7 +178,7 @@ class MemobenchEnvConfig(EnvConfig):
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """Return `{memory type: {task id: vector env}}`; nothing is simulated before an env's first reset."""
-        from lerobot_memobench.envs.memobench_env import MemobenchEnv, skip_logged
+        from lerobot_memobench.envs.memobench_env import MemobenchEnv, SkipLogged
 
         policy = policy_being_run()
         self._check_checkpoint(policy)
@@ -215,7 +199,7 @@ class MemobenchEnvConfig(EnvConfig):
         for memory_type, task_id, folder in chosen:
             make: Callable[[], gym.Env[Any, Any]] = partial(MemobenchEnv, str(folder), log_dir=str(log_dir), **settings)
             if self.resume:
-                make = partial(skip_logged, make, log_dir, self.referent, self.seed_base)
+                make = partial(SkipLogged, make, log_dir, self.referent, self.seed_base)
             suites.setdefault(memory_type, {})[task_id] = self._vector([make] * n_envs, use_async_envs)
         return suites
 
@@ -248,21 +232,14 @@ class MemobenchEnvConfig(EnvConfig):
         Each evaluation within a training has its own in there, ``evaluation-1`` and so on: a policy that has learned
         on is another.
         """
-        folder = self._log_folder()
-        if not training_runs():
-            return folder
-        return next(place for k in count(1) if not (place := folder / f"evaluation-{k}").exists())
-
-    def _log_folder(self) -> Path:
-        if self.log_dir is not None:
-            return Path(self.log_dir)
-        from datetime import datetime
-
         from lerobot.configs import parser
 
         # The configuration of an environment does not hold the run's output folder; LeRobot's parser tells it.
-        output = parser.parse_arg("output_dir")
-        return Path(output) if output else Path("outputs/eval") / f"{datetime.now():%Y-%m-%d/%H-%M-%S}_memobench"
+        output = parser.parse_arg("output_dir") or f"outputs/eval/{datetime.now():%Y-%m-%d/%H-%M-%S}_memobench"
+        folder = Path(output if self.log_dir is None else self.log_dir)
+        if not training_runs():
+            return folder
+        return next(place for k in count(1) if not (place := folder / f"evaluation-{k}").exists())
 
 
 def _check_recording(rows: int, obs_type: str) -> None:

@@ -14,18 +14,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.experts.blind import BlindRoutine
+from lerobot_memobench.experts.blind import blind_routine
 from lerobot_memobench.experts.demonstration_prompt import PromptDemonstrator
 from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EXECUTION, HORIZON, PROMPT, PROMPT_HORIZON
+from lerobot_memobench.sim.gl.rasterizer import Image
 from lerobot_memobench.sim.object_slots import ObjectSlots
-from lerobot_memobench.sim.rendering import Image, RenderSettings
+from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import InvalidActionError, Simulation, UnstablePhysicsError, as_action
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.failures import INVALID_ACTION, UNSTABLE_PHYSICS
 from lerobot_memobench.tasks.formula import Atom, atoms
 from lerobot_memobench.tasks.progress import Progress
-from lerobot_memobench.tasks.task import DRAWN, REFERENTS, STRICT, Task, referent_text
+from lerobot_memobench.tasks.task import DEFAULT_LEVEL, DRAWN, REFERENTS, STRICT, Task, referent_text
 
 
 class Fault(NamedTuple):
@@ -95,7 +96,7 @@ class Episode:
         self.drifted = False
         self._wrong: list[Atom] = []
         self._expert: Expert | None = None
-        self._blind: BlindRoutine | None = None
+        self._blind: Iterator[NDArray[np.float32]] | None = None
         self._demonstrator: Iterator[NDArray[np.float32]] | None = None
         hides = task.prompt is not None and not task.prompt.restores
         if self.demonstration_prompt or hides:
@@ -211,8 +212,8 @@ class Episode:
             return np.zeros(ACTION_DIM, dtype=np.float32)
         if self._blind is None:
             routine = get_task(self.published.derived_from) if self.published.derived_from else self.published
-            self._blind = BlindRoutine(routine, self.sim, self._rng(3))
-        return self._blind.act()
+            self._blind = blind_routine(routine, self.sim, self._rng(3))
+        return np.clip(next(self._blind), -1.0, 1.0)
 
     @property
     def expert_done(self) -> bool:
@@ -229,12 +230,12 @@ class Episode:
         """Return what both cameras see now, (256, 256, 3) uint8 each, upright."""
         return {key: self.sim.render(camera) for key, camera in CAMERAS.items()}
 
-    def subgoal(self, level: int = 1) -> str:
-        """Return the text of the checkpoint being worked on, at a language level (0 coarse, 1 intermediate, 2 fine)."""
+    def subgoal(self) -> str:
+        """Return the text of the checkpoint being worked on, at the intermediate level."""
         if not self.task.checkpoints:
             return self.task.language
         index = min(self.progress.index, len(self.task.checkpoints) - 1)
-        return self.task.checkpoints[index].language[level]
+        return self.task.checkpoints[index].language[DEFAULT_LEVEL]
 
 
 def referent_of(task: Task, seed: int) -> Task:

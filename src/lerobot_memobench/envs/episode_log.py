@@ -92,7 +92,7 @@ class EpisodeRecord(Outcome):
     written_at: NotRequired[Number]
 
 
-def episode_record(episode: Episode, *, seed_base: int, replan_steps: int | None, wall_s: float) -> dict[str, Any]:
+def episode_record(episode: Episode, seed_base: int, replan_steps: int | None, wall_s: float) -> dict[str, Any]:
     """Return an episode's line for the log (`docs/evaluate.md` tells its fields).
 
     Args:
@@ -102,12 +102,7 @@ def episode_record(episode: Episode, *, seed_base: int, replan_steps: int | None
     """
     progress, task, fault = episode.progress, episode.task, episode.fault
     failure = classify_failure(
-        task,
-        progress.first_step,
-        episode.success,
-        drift=episode.drifted,
-        lost=episode.lost,
-        cut_off=episode.cut_off,
+        task, progress.first_step, episode.success, episode.drifted, lost=episode.lost, cut_off=episode.cut_off
     )
     return {
         "task": task.name,
@@ -135,7 +130,7 @@ def episode_record(episode: Episode, *, seed_base: int, replan_steps: int | None
     }
 
 
-def not_run_record(task: Task, seed: int, *, seed_base: int, referent: str, why: str) -> dict[str, Any]:
+def not_run_record(task: Task, seed: int, seed_base: int, referent: str, why: str) -> dict[str, Any]:
     """Return the line for the log of an episode that could not be run."""
     return {
         "task": task.name,

@@ -21,12 +21,13 @@ from lerobot_memobench.envs.observations import (
     EVERY,
     METADATA,
     PIXELS,
+    RESET,
+    STEPS,
     Observer,
     action_space,
     blank,
     observation_space,
 )
-from lerobot_memobench.envs.prompting import RESET, STEPS
 from lerobot_memobench.envs.video import BAND, VideoRecorder
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_name
@@ -178,7 +179,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         number = seed - self._seed_base
         recorded = (self._recorded == EVERY or 0 <= number < self._recorded) and self._acting.counts(seed)
         if self._videos is not None and recorded:
-            self._video = VideoRecorder(self._videos / f"{self.task}.{number}.mp4", METADATA["render_fps"])
+            self._video = VideoRecorder(self._videos / f"{self.task}.{number}.mp4")
             self._video.add(self.render())
         with self._noting():
             if self._prompt_in == RESET and self.episode.phase == PROMPT:
@@ -286,17 +287,11 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     def record(self) -> dict[str, Any]:
         """Return the episode's line for the log."""
         self._check_began("record")
-        if self._not_run is not None:
-            found = not_run_record(
-                self._task, self._seed, seed_base=self._seed_base, referent=self._referent, why=self._not_run
-            )
-            return found | self._acting.line
-        found = episode_record(
-            self.episode,
-            seed_base=self._seed_base,
-            replan_steps=self._replan_steps,
-            wall_s=time.monotonic() - self._started,
-        )
+        if self._not_run is None:
+            seconds = time.monotonic() - self._started
+            found = episode_record(self.episode, self._seed_base, self._replan_steps, seconds)
+        else:
+            found = not_run_record(self._task, self._seed, self._seed_base, self._referent, self._not_run)
         return found | self._acting.line
 
     def _observation(self) -> dict[str, Any]:
@@ -340,9 +335,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             gymnasium.error.ResetNeeded, gymnasium.error.ClosedEnvironmentError: as `step`.
         """
         self._check_began("render")
-        if self._not_run is not None:
-            return _black()
-        return self._observer.frame(self.episode)
+        return self._observer.frame(self.episode) if self._not_run is None else _black()
 
     def close(self) -> None:
         """Let the scene go; the next reset compiles or fetches it anew. Closing twice does no harm."""
@@ -363,13 +356,13 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
     would have given them in an undisturbed evaluation. Observations of a skipped episode are blank.
 
     Args:
-        env: a `MemobenchEnv`.
+        make: makes a `MemobenchEnv`.
         log_dir: folder of the log, read once, at the first reset.
         referent, seed_base: as the environment's own.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], log_dir: Path, referent: str, seed_base: int) -> None:
-        super().__init__(env)
+    def __init__(self, make: Callable[[], gym.Env[Any, Any]], log_dir: Path, referent: str, seed_base: int) -> None:
+        super().__init__(make())
         self._log_dir, self._referent, self._seed_base = log_dir, referent, seed_base
         self._logged: dict[int, dict[str, Any]] | None = None
         self._skipped: dict[str, Any] | None = None
@@ -390,9 +383,7 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
 
     def render(self) -> Any:
         """Return what the environment shows; black while it rests."""
-        if self._skipped is None:
-            return self.env.render()
-        return _black()
+        return self.env.render() if self._skipped is None else _black()
 
     def _info(self, success: bool) -> dict[str, Any]:
         return {"is_success": success, "phase": EXECUTION, "checkpoints_completed": 0}
@@ -408,11 +399,6 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
                 if record["task"] == name and record.get("referent", "fixed") == self._referent
             }
         return self._logged
-
-
-def skip_logged(make: Callable[[], gym.Env[Any, Any]], log_dir: Path, referent: str, seed_base: int) -> SkipLogged:
-    """Make an environment and wrap it."""
-    return SkipLogged(make(), log_dir, referent, seed_base)
 
 
 def _black() -> NDArray[np.uint8]:

@@ -20,11 +20,21 @@ if TYPE_CHECKING:
     from lerobot.configs import PolicyFeature
 
     from lerobot_memobench.envs.episode import Episode
-    from lerobot_memobench.sim.rendering import Image
+    from lerobot_memobench.sim.gl.rasterizer import Image
 
 PIXELS, OBJECTS, BOTH = "pixels_agent_pos", "environment_state_agent_pos", "both"
 OBS_TYPES = (PIXELS, OBJECTS, BOTH)
 """Values of ``env.obs_type``, by LeRobot's names: what is observed beside the arm's state."""
+
+AUTO, STEPS, RESET = "auto", "steps", "reset"
+PROMPT_IN = (AUTO, STEPS, RESET)
+"""Values of ``env.prompt_in``: the demonstration prompt plays in steps that the policy observes, or within `reset`.
+
+A policy that reads prompts declares it on the class of its configuration, ``reads_prompt: ClassVar[bool] = True``: it
+waits while `observation.phase` is 0, and plans anew when it becomes 1. Any other policy would act on a recording, and
+its queue would still hold those actions when the scene is restored. To it an episode begins at its first execution
+frame.
+"""
 
 EVERY = -1
 """Value of ``env.videos``: record every episode."""
@@ -95,6 +105,16 @@ def policy_inputs(policy: Any, obs_type: str, oracle_memory: bool = False) -> st
         objects = obs_type != PIXELS and not ignores and (everything or "ENV" in types)
         found = (PIXEL_INPUT,) * pixels + (PRIVILEGED,) * objects
     return ", ".join(found + (MEMORY_TEXT,) * oracle_memory) or NOTHING
+
+
+def reads_prompt(policy: object) -> bool:
+    """Return whether a policy's configuration, or its class, declares that it reads prompts."""
+    return bool(getattr(policy, "reads_prompt", False))
+
+
+def prompt_in(policy: object | None) -> str:
+    """Return `STEPS` or `RESET`, as suits a policy's configuration or its class; `STEPS` where none is known."""
+    return STEPS if policy is None or reads_prompt(policy) else RESET
 
 
 # --- shapes ---

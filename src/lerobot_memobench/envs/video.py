@@ -71,8 +71,11 @@ def annotate(images: dict[str, NDArray[np.uint8]], episode: Episode) -> NDArray[
     prompt = episode.phase == PROMPT
     operations = tuple(checkpoint.operation for checkpoint in episode.task.checkpoints)
     done = 0 if prompt else episode.progress.index
-    frame[:BAND] = _band(width, episode.task.language, operations, done, _now(episode), prompt)
-    clock = _clock("prompt", episode.step_index, prompt) if prompt else _clock("step", episode.exec_steps, prompt)
+    now = "watch the prompt" if prompt else "done" if episode.success else episode.subgoal()
+    frame[:BAND] = _band(width, episode.task.language, operations, done, now, prompt)
+    pieces = ("prompt ", *str(episode.step_index)) if prompt else ("step ", *str(episode.exec_steps))
+    # Only as wide as the clock is, so that it covers nothing.
+    clock = np.concatenate([_piece(piece, prompt) for piece in pieces], axis=1)
     frame[:CLOCK_BOTTOM, width - MARGIN - clock.shape[1] : width - MARGIN] = clock
     np.concatenate(pictures, axis=1, out=frame[BAND:])
     return frame
@@ -96,11 +99,6 @@ def _band(
     return np.asarray(band)
 
 
-def _clock(word: str, number: int, prompt: bool) -> NDArray[np.uint8]:
-    """The upper right corner, (height, width, 3): only as wide as the clock is, so that it covers nothing."""
-    return np.concatenate([_piece(piece, prompt) for piece in (f"{word} ", *str(number))], axis=1)
-
-
 @lru_cache(maxsize=64)
 def _piece(text: str, prompt: bool) -> NDArray[np.uint8]:
     """The clock's word or a digit, (height, width, 3)."""
@@ -118,13 +116,6 @@ def _draw_checkpoint(draw: ImageDraw.ImageDraw, x: int, operation: str, *, done:
         draw.line([(x + 5, 44), (x + 9, 49), (x + 16, 39)], fill=_BACKGROUND, width=3)
     else:
         draw.text((x + 10, 44), operation, fill=colour, font=_font(12), anchor="mm")
-
-
-def _now(episode: Episode) -> str:
-    """What is going on, in words."""
-    if episode.phase == PROMPT:
-        return "watch the prompt"
-    return "done" if episode.success else episode.subgoal()
 
 
 # --- writing ---
@@ -155,11 +146,10 @@ class VideoRecorder:
 
     Args:
         path: the file to be.
-        fps: frames per second.
     """
 
-    def __init__(self, path: Path, fps: int = CONTROL_HZ) -> None:
-        self._path, self._fps = path, fps
+    def __init__(self, path: Path) -> None:
+        self._path = path
         self._writing = ExitStack()
         self._container: Any = None
         self._size: tuple[int, int] | None = None
@@ -241,7 +231,7 @@ class VideoRecorder:
         # Ultrafast costs a tenth of a rendered frame, and more threads only add to it; crf 20 keeps small text
         # readable.
         options = {"preset": "ultrafast", "crf": "20", "threads": "1"}
-        self._stream = self._container.add_stream("libx264", rate=self._fps, options=options)
+        self._stream = self._container.add_stream("libx264", rate=CONTROL_HZ, options=options)
         self._stream.height, self._stream.width = picture.height, picture.width
         self._stream.pix_fmt = FORMAT
 

@@ -14,8 +14,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from lerobot_memobench.envs.observations import OBJECTS, PIXELS, check_obs_type, obs_type_of
-from lerobot_memobench.envs.prompting import prompt_in, quiet, read_rename_map
+from lerobot_memobench.envs.command_line import quiet, read_rename_map
+from lerobot_memobench.envs.observations import OBJECTS, PIXELS, check_obs_type, obs_type_of, prompt_in
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import CARD_FILE, read_card
 from lerobot_memobench.jobs.executors import ELSEWHERE, read_options

@@ -14,8 +14,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from lerobot_memobench.envs.acting import parameters_of
 from lerobot_memobench.envs.episode_log import has_log
-from lerobot_memobench.envs.prompting import parameters_of
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.executors import ELSEWHERE, Needs, check_executor, options_text, run_jobs
 from lerobot_memobench.jobs.processes import ProgressCallback

@@ -23,8 +23,8 @@ import yaml
 
 from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, PRIVILEGED, naming_damage
 from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS as INPUT
-from lerobot_memobench.envs.observations import BOTH, OBJECTS, OBS_TYPES, PIXELS
-from lerobot_memobench.envs.prompting import quiet, reads_prompt
+from lerobot_memobench.envs.command_line import quiet
+from lerobot_memobench.envs.observations import BOTH, OBJECTS, OBS_TYPES, PIXELS, reads_prompt
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.jobs.processes import saying_how_to_go_on
 from lerobot_memobench.jobs.threads import cores

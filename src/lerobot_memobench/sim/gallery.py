@@ -18,7 +18,7 @@ from lerobot_memobench.sim.assets.asset import Asset
 from lerobot_memobench.sim.assets.builder import COLLISION_GROUP, VISUAL_GROUP
 from lerobot_memobench.sim.assets.kitchen import TABLE_TOP, build_kitchen
 from lerobot_memobench.sim.assets.registry import build_asset
-from lerobot_memobench.sim.rendering import Renderer, RenderSettings
+from lerobot_memobench.sim.rendering import RenderSettings, make_renderer
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import PUBLISHED
@@ -59,21 +59,21 @@ def write_gallery(folder: str | Path, suite: str = PUBLISHED) -> list[Path]:
     ]
 
 
-def draw_tasks(names: Sequence[str] | None = None, seed: int = SEED, size: int = 256, columns: int = 6) -> Image.Image:
+def draw_tasks(names: Sequence[str] | None = None, size: int = 256) -> Image.Image:
     """Return the initial scenes of tasks as the agentview camera sees them, all of the catalogue by default."""
     cells = []
     for name in names or task_names():
         task = get_task(name)
         sim = Simulation(task, RenderSettings(size, size, "high"))
-        sim.reset(seed)
+        sim.reset(SEED)
         cells.append((f"{task.memory_type}: {task.title}", sim.render("agentview")))
-    return grid(cells, min(columns, len(cells)), label=11, lines=3)
+    return grid(cells, min(6, len(cells)), label=11, lines=3)
 
 
-def draw_objects(classes: Sequence[str] | None = None, size: int = 112, columns: int = 3) -> Image.Image:
+def draw_objects(classes: Sequence[str] | None = None, size: int = 112) -> Image.Image:
     """Return each class from four sides, all object classes of the catalogue by default."""
     cells = [_cells(name, TURNTABLE, size)[0] for name in classes or catalogue_classes("objects")]
-    return grid(cells, min(columns, len(cells)), label=13, lines=1)
+    return grid(cells, min(3, len(cells)), label=13, lines=1)
 
 
 def draw_fixtures(classes: Sequence[str] | None = None, size: int = 224) -> Image.Image:
@@ -101,14 +101,14 @@ def _cells(class_name: str, views: Sequence[View], size: int) -> list[tuple[str,
     for camera, view in zip(cameras, views, strict=True):
         _add_camera(spec, camera, middle, view, view.distance * float(np.linalg.norm(high - low)) / 2)
     model = spec.compile()
-    data, renderer = mujoco.MjData(model), Renderer(model, RenderSettings(size, size, "high"))
+    data, renderer = mujoco.MjData(model), make_renderer(model, RenderSettings(size, size, "high"))
     words = ("off", "on") if asset.glow else ("closed", "open")
     labels = [f"{class_name}, {word}" for word in words] if asset.articulations else [class_name]
     cells = []
     for label, opened in zip(labels, (False, True), strict=False):
         _open(asset, model, data, opened)
-        cells.append((label, np.hstack([renderer.render(model, data, camera) for camera in cameras])))
-    renderer.close()
+        cells.append((label, np.hstack([renderer.draw(model, data, camera) for camera in cameras])))
+    renderer.free()
     return cells
 
 

@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.assets.asset import Articulation, Asset
+from lerobot_memobench.sim.assets.asset import Articulation
 from lerobot_memobench.sim.assets.builder import VISUAL_GROUP
 from lerobot_memobench.sim.assets.registry import known_classes, split_class
+from lerobot_memobench.sim.gl.rasterizer import Highlight
 from lerobot_memobench.sim.object_layout import FIELDS, SLOTS, STARTS, WIDTH
-from lerobot_memobench.sim.rendering import Highlight
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 
 POINTS = 24
@@ -54,17 +54,18 @@ class Thing:
 
     Attributes:
         kind: index of its class. body: whose pose it has. joint: address of its joint in qpos, None without one.
-        points: (POINTS, 3) on its surface, in the body's frame, m.
     """
 
     kind: int
     body: int
     joint: int | None
-    points: Array
 
 
 class ObjectSlots:
     """Look at one simulation as slots.
+
+    Attributes:
+        things: all that may be seen: each object and fixture, followed by its moving parts.
 
     Raises:
         MemobenchError: the scene holds more things than there are slots, or one of a class that is not registered.
@@ -72,33 +73,27 @@ class ObjectSlots:
 
     def __init__(self, sim: Simulation) -> None:
         self._sim = sim
-        self._things: list[Thing] = []
+        self.things: list[Thing] = []
         self._owner = np.full(sim.model.nbody, -1)
         for name, asset in sim.assets.items():
-            self._add(name, asset)
-        if len(self._things) > SLOTS:
+            self._add(split_class(asset.class_name)[0], sim.model.body(name).id)
+            for articulation in asset.articulations.values():
+                joint = sim.model.joint(articulation.joint)
+                self._add(articulation.kind, int(sim.model.jnt_bodyid[joint.id]), int(joint.qposadr[0]))
+        if len(self.things) > SLOTS:
             raise MemobenchError(
-                f"task {sim.task.name} has {len(self._things)} objects and moving parts, more than the {SLOTS} that "
+                f"task {sim.task.name} has {len(self.things)} objects and moving parts, more than the {SLOTS} that "
                 "an object observation holds; use env.obs_type=pixels_agent_pos"
             )
         for body in range(1, sim.model.nbody):  # parents go first: what hangs on a thing belongs to it
             if self._owner[body] < 0:
                 self._owner[body] = self._owner[sim.model.body_parentid[body]]
-        self._things = [
-            Thing(thing.kind, thing.body, thing.joint, self._surface(index, thing.body))
-            for index, thing in enumerate(self._things)
-        ]
-        self._points = np.concatenate([thing.points for thing in self._things])
-        self._bodies = np.repeat([thing.body for thing in self._things], POINTS)
-        self._of_point = np.repeat(np.arange(len(self._things)), POINTS)
+        self._points = np.concatenate([self._surface(index, thing.body) for index, thing in enumerate(self.things)])
+        self._bodies = np.repeat([thing.body for thing in self.things], POINTS)
+        self._of_point = np.repeat(np.arange(len(self.things)), POINTS)
         self._cameras = [sim.model.camera(name).id for name in MJCF_CAMERAS.values()]
         self._group = np.zeros(6, np.uint8)
         self._group[VISUAL_GROUP] = 1
-
-    @property
-    def things(self) -> tuple[Thing, ...]:
-        """All that may be seen: each object and fixture, followed by its moving parts."""
-        return tuple(self._things)
 
     def owners(self, geoms: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return the index in `things` that each geom belongs to, for ids of any shape; -1 for none and for id -1."""
@@ -107,22 +102,14 @@ class ObjectSlots:
     def observe(self) -> NDArray[np.float32]:
         """Return the slots (SIZE,) of what is visible in the present state."""
         seen = self._visible()
-        rows = [self._row(thing) for thing, visible in zip(self._things, seen, strict=True) if visible]
+        rows = [self._row(thing) for thing, visible in zip(self.things, seen, strict=True) if visible]
         return in_slots(np.array(rows).reshape(-1, WIDTH))
 
-    def _add(self, name: str, asset: Asset) -> None:
-        """Note an instance, and each of its moving parts."""
-        model = self._sim.model
-        self._note(split_class(asset.class_name)[0], model.body(name).id, None)
-        for articulation in asset.articulations.values():
-            joint = model.joint(articulation.joint)
-            self._note(articulation.kind, int(model.jnt_bodyid[joint.id]), int(joint.qposadr[0]))
-
-    def _note(self, kind: str, body: int, joint: int | None) -> None:
+    def _add(self, kind: str, body: int, joint: int | None = None) -> None:
         if kind not in classes():
             raise MemobenchError(f"object observations know no class {kind!r}; use env.obs_type=pixels_agent_pos")
-        self._owner[body] = len(self._things)
-        self._things.append(Thing(classes().index(kind), body, joint, np.empty((0, 3))))
+        self._owner[body] = len(self.things)
+        self.things.append(Thing(classes().index(kind), body, joint))
 
     def _surface(self, index: int, body: int) -> Array:
         """Return POINTS points of a thing's visual geoms, far apart, a little inside, in its body's frame."""
@@ -145,7 +132,7 @@ class ObjectSlots:
         model, data = self._sim.model, self._sim.data
         frames = data.xmat[self._bodies].reshape(-1, 3, 3)
         targets = np.einsum("nij,nj->ni", frames, self._points) + data.xpos[self._bodies]
-        hits = np.zeros(len(self._things), dtype=int)
+        hits = np.zeros(len(self.things), dtype=int)
         for camera in self._cameras:
             origin = data.cam_xpos[camera].copy()
             rays = targets - origin

@@ -13,19 +13,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import mujoco
-import numpy as np
-from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError, nearest, unsupported_system
 from lerobot_memobench.sim.gl.drawlist import build_draw_list
 from lerobot_memobench.sim.gl.rasterizer import Rasterizer
 
-Image = NDArray[np.uint8]
-
 BACKENDS = {"egl": "EGL", "osmesa": "OSMesa"}
 """MuJoCo's headless backends and the system library each needs."""
 
-
+CONTEXT_SIZE = (64, 64)
 DEVICE_ID = "MUJOCO_EGL_DEVICE_ID"
 """MuJoCo's variable for EGL's number of the device to draw on; a user's own choice stays."""
 RANKS = ("MEMOBENCH_WORKER", "LOCAL_RANK", "SLURM_LOCALID", "OMPI_COMM_WORLD_LOCAL_RANK")
@@ -100,20 +96,21 @@ def gl_backend() -> str:
     )
 
 
-def _gl_context(width: int, height: int) -> Any:
+def _gl_context() -> Any:
+    """Open a small context: frames are drawn into framebuffers of their own size."""
     backend = gl_backend()
     os.environ["MUJOCO_GL"] = backend
     try:
         if backend == "egl":
-            context = _egl_context(width, height)
+            context = _egl_context()
         elif backend == "osmesa":
             from mujoco.osmesa import GLContext
 
-            context = GLContext(width, height)
+            context = GLContext(*CONTEXT_SIZE)
         else:
             from mujoco import glfw
 
-            context = glfw.GLContext(width, height)
+            context = glfw.GLContext(*CONTEXT_SIZE)
         context.make_current()
         return context
     except Exception as error:  # each backend fails in its own way: missing driver, no device, no display
@@ -124,7 +121,7 @@ def _gl_context(width: int, height: int) -> Any:
         ) from error
 
 
-def _egl_context(width: int, height: int) -> Any:
+def _egl_context() -> Any:
     """Return an EGL context on the GPU of this process's rank, or on the first device that MuJoCo can open."""
     from mujoco import egl
 
@@ -132,12 +129,12 @@ def _egl_context(width: int, height: int) -> Any:
     if number is not None:
         os.environ[DEVICE_ID] = str(number)
         try:
-            return egl.GLContext(width, height)
+            return egl.GLContext(*CONTEXT_SIZE)
         except Exception:  # it may be another job's
             egl.EGL_DISPLAY = None
         finally:
             del os.environ[DEVICE_ID]
-    return egl.GLContext(width, height)
+    return egl.GLContext(*CONTEXT_SIZE)
 
 
 def egl_device(devices: Mapping[int, int]) -> int | None:
@@ -176,61 +173,6 @@ def _cuda_devices(egl: Any) -> dict[int, int]:
     return found
 
 
-@dataclass(frozen=True)
-class Highlight:
-    """A translucent disc drawn over the scene: the prompt's way of marking a place."""
-
-    position: tuple[float, float, float]
-    radius: float
-    rgba: tuple[float, float, float, float] = (1.0, 0.85, 0.1, 0.55)
-
-
-_DISC_HALF_HEIGHT = 0.001
-
-
-class Renderer:
-    """Draw any simulation of one scene, in the thread that made this.
-
-    Simulations of the same scene share it: meshes and textures are the scene's, poses come with each frame's data.
-    """
-
-    def __init__(self, model: mujoco.MjModel, settings: RenderSettings) -> None:
-        quality = QUALITIES[settings.quality]
-        self._context = _thread.current()
-        draw_list = build_draw_list(model, BACKGROUND, ROOM)
-        self._rasterizer: Rasterizer | None = Rasterizer(
-            model, draw_list, settings.width, settings.height, quality.samples, quality.shadow_map
-        )
-
-    def render(
-        self,
-        model: mujoco.MjModel,
-        data: mujoco.MjData,
-        camera: str,
-        highlights: tuple[Highlight, ...] = (),
-    ) -> Image:
-        """Return the frame of a named camera, (height, width, 3) uint8, upright."""
-        discs = [(np.array(h.position), h.radius, _DISC_HALF_HEIGHT, h.rgba) for h in highlights]
-        return self._ready().draw(model, data, model.camera(camera).id, discs)
-
-    def geoms(self, model: mujoco.MjModel, data: mujoco.MjData, camera: str) -> NDArray[np.int64]:
-        """Return the id of the geom that each pixel of such a frame shows, (height, width), -1 for none."""
-        return self._ready().draw_geoms(model, data, model.camera(camera).id)
-
-    def _ready(self) -> Rasterizer:
-        if self._rasterizer is None:
-            raise MemobenchError("this renderer was closed; make another one")
-        self._context.make_current()
-        return self._rasterizer
-
-    def close(self) -> None:
-        """Free what this holds on the GPU; safe to call twice."""
-        if self._rasterizer is not None:
-            self._context.make_current()
-            self._rasterizer.free()
-            self._rasterizer = None
-
-
 CACHED_RENDERERS = 4
 """Renderers kept per thread: each holds its scene's textures, some 20 MB."""
 
@@ -240,10 +182,10 @@ class _Thread(threading.local):
 
     def __init__(self) -> None:
         self.context: Any = None
-        self.renderers: OrderedDict[tuple[Any, RenderSettings], Renderer] = OrderedDict()
+        self.renderers: OrderedDict[tuple[Any, RenderSettings], Rasterizer] = OrderedDict()
 
-    def current(self) -> Any:
-        """Return this thread's context, opened at the first call and made current.
+    def current(self) -> None:
+        """Make this thread's context current, which is opened at the first call.
 
         Raises:
             MemobenchError: no context can be opened, or the process was forked from one that had drawn.
@@ -257,23 +199,22 @@ class _Thread(threading.local):
             )
         _drawing_process = os.getpid()
         if self.context is None:
-            self.context = _gl_context(64, 64)  # frames are drawn into framebuffers of their own size
+            self.context = _gl_context()
             # Registered after MuJoCo's backend has registered its own closing, and so called before it.
             atexit.unregister(close_renderers)
             atexit.register(close_renderers)
         else:
             self.context.make_current()
-        return self.context
 
     def close(self) -> None:
         """Free renderers and context."""
-        if _drawing_process != os.getpid():
+        if self.context is None or _drawing_process != os.getpid():
             return
+        self.context.make_current()
         while self.renderers:
-            self.renderers.popitem()[1].close()
-        if self.context is not None:
-            self.context.free()
-            self.context = None
+            self.renderers.popitem()[1].free()
+        self.context.free()
+        self.context = None
 
 
 _drawing_process: int | None = None
@@ -281,17 +222,28 @@ _drawing_process: int | None = None
 _thread = _Thread()
 
 
-def get_renderer(key: Any, model: mujoco.MjModel, settings: RenderSettings) -> Renderer:
-    """Return this thread's renderer for a scene, opened at its first frame."""
+def get_renderer(key: Any, model: mujoco.MjModel, settings: RenderSettings) -> Rasterizer:
+    """Return this thread's renderer for a scene, made at its first frame; the thread's context is current.
+
+    Simulations of the same scene share it: meshes and textures are the scene's, poses come with each frame's data.
+    """
     _thread.current()
     renderers = _thread.renderers
     full = (key, settings)
     if full not in renderers:
         while len(renderers) >= CACHED_RENDERERS:
-            renderers.popitem(last=False)[1].close()
-        renderers[full] = Renderer(model, settings)
+            renderers.popitem(last=False)[1].free()
+        renderers[full] = make_renderer(model, settings)
     renderers.move_to_end(full)
     return renderers[full]
+
+
+def make_renderer(model: mujoco.MjModel, settings: RenderSettings) -> Rasterizer:
+    """Return a renderer of one's own for a scene, to be freed by `Rasterizer.free`; see `get_renderer`."""
+    _thread.current()
+    quality = QUALITIES[settings.quality]
+    draw_list = build_draw_list(model, BACKGROUND, ROOM)
+    return Rasterizer(model, draw_list, settings.width, settings.height, quality.samples, quality.shadow_map)
 
 
 def renderer_name() -> str:

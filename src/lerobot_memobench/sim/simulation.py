@@ -17,8 +17,9 @@ from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.protocol import ACTION_DIM
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.controller import CLOSING, make_controller
+from lerobot_memobench.sim.gl.rasterizer import Highlight, Image, Rasterizer
 from lerobot_memobench.sim.placement import Placer
-from lerobot_memobench.sim.rendering import Highlight, Image, Renderer, RenderSettings, get_renderer
+from lerobot_memobench.sim.rendering import RenderSettings, get_renderer
 from lerobot_memobench.sim.scene import AGENTVIEW, SUBSTEPS, get_scene
 from lerobot_memobench.sim.world import Start, World
 from lerobot_memobench.tasks.formula import SINCE_START, Atom
@@ -275,13 +276,13 @@ class Simulation:
         for asset, geom in self._glow:
             lit = self.holds(Atom("turnon", (asset.name,)))
             self.model.geom_rgba[geom] = asset.glow_on if lit else asset.glow_off
-        return self._renderer(camera).render(self.model, self.data, MJCF_CAMERAS[camera], self.highlights)
+        return self._renderer(camera).draw(self.model, self.data, MJCF_CAMERAS[camera], self.highlights)
 
     def geoms(self, camera: str = "agentview") -> NDArray[np.int64]:
         """Return the id of the geom that each pixel of a camera's picture shows, (height, width), -1 for none."""
-        return self._renderer(camera).geoms(self.model, self.data, MJCF_CAMERAS[camera])
+        return self._renderer(camera).draw_geoms(self.model, self.data, MJCF_CAMERAS[camera])
 
-    def _renderer(self, camera: str) -> Renderer:
+    def _renderer(self, camera: str) -> Rasterizer:
         if camera not in MJCF_CAMERAS:
             raise MemobenchError(f"there is no camera {camera!r}; {nearest(camera, MJCF_CAMERAS)}")
         return get_renderer(self._scene.key, self._scene.model, self.render_settings)

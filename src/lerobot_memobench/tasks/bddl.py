@@ -3,8 +3,7 @@
 A file holds ``(define (problem NAME) (:domain ..) (:language ..) (:regions ..) (:fixtures ..) (:objects ..)
 (:obj_of_interest ..) (:init ..) (:goal ..))``. Keywords and predicates are read in any case; names keep theirs, and a
 reference that differs from the declared name only in case means that name. Anything unknown is an error that tells
-file and line; but a region on an undeclared target is let pass until it is used. `format_bddl` writes a problem that
-`parse_bddl` reads back.
+file and line; but a region on an undeclared target is let pass until it is used.
 """
 
 from __future__ import annotations
@@ -23,9 +22,6 @@ from lerobot_memobench.tasks.formula import (
     Atom,
     Formula,
     atoms,
-    children,
-    format_formula,
-    head_of,
     is_operator,
     make_atom,
     make_operator,
@@ -39,8 +35,6 @@ _REQUIRED = (":language", ":fixtures", ":init", ":goal")
 _REGION = "a region such as (NAME (:target FIXTURE) (:ranges ((x1 y1 x2 y2))) (:yaw_rotation ((low high))))"
 _REGION_CLAUSES = (":target", ":ranges", ":yaw_rotation")
 _NOT_IN_INIT = {*LATCHES, *SINCE_START}
-LONGEST_ROW = 110
-"""Columns from which a formula gets a line per child."""
 
 _THING = ("object", "fixture")
 _JOINTED = ("fixture", "region")
@@ -439,58 +433,3 @@ def _check_bottom(reader: Reader, section: Node, support: Mapping[str, str]) -> 
                 raise reader.error(section, found, "a fixture at the bottom")
             chain.append(below)
             below = support.get(below)
-
-
-# --- writing ---
-
-
-def format_bddl(problem: Problem, comment: str = "") -> str:
-    """Return ``problem`` as BDDL text; each line of ``comment`` goes above it."""
-    lines = [f"; {line}" for line in comment.splitlines()]
-    lines += [f"(define (problem {problem.name})"]
-    if problem.domain:
-        lines += [f"  (:domain {problem.domain})"]
-    lines += [f"  (:language {problem.language})"]
-    lines += _section("regions", [_region_row(region) for region in (*problem.regions.values(), *problem.unplaced)])
-    lines += _section("fixtures", _declaration_rows(problem.fixtures))
-    lines += _section("objects", _declaration_rows(problem.objects))
-    lines += _section("obj_of_interest", [" ".join(problem.objects_of_interest)] if problem.objects_of_interest else [])
-    lines += ["", "  (:init", *(f"    {format_formula(atom)}" for atom in problem.init), "  )"]
-    lines += ["", "  (:goal", *_goal(problem.goal, "    "), "  )", ")"]
-    return "\n".join(lines) + "\n"
-
-
-def _section(name: str, rows: list[str]) -> list[str]:
-    return ["", f"  (:{name}", *(f"    {row}" for row in rows), "  )"] if rows else []
-
-
-def _region_row(region: Region) -> str:
-    row = f"({region.name} (:target {region.target})"
-    if region.ranges:
-        boxes = " ".join(f"({' '.join(map(repr, box))})" for box in region.ranges)
-        row += f" (:ranges ({boxes}))"
-    if region.ranges or region.yaw != (0.0, 0.0):
-        row += f" (:yaw_rotation (({region.yaw[0]!r} {region.yaw[1]!r})))"
-    return row + ")"
-
-
-def _declaration_rows(declared: dict[str, str]) -> list[str]:
-    """One line per class, where that keeps the order of declaration, else one per instance."""
-    by_class: dict[str, list[str]] = {}
-    for instance, class_name in declared.items():
-        by_class.setdefault(class_name, []).append(instance)
-    grouped = [instance for names in by_class.values() for instance in names] == list(declared)
-    rows = by_class.items() if grouped else [(class_name, [instance]) for instance, class_name in declared.items()]
-    return [f"{' '.join(names)} - {class_name}" for class_name, names in rows]
-
-
-def _goal(formula: Formula, indent: str) -> list[str]:
-    """One line where it fits, else one child per line."""
-    flat = indent + format_formula(formula)
-    if len(flat) <= LONGEST_ROW or isinstance(formula, Atom):
-        return [flat]
-    rows = [f"{indent}({head_of(formula)}"]
-    for part in children(formula):
-        rows += _goal(part, indent + "  ")
-    rows[-1] += ")"
-    return rows

@@ -22,6 +22,7 @@ from lerobot_memobench.tasks.task import (
     MEMORY_TYPES,
     METADATA_FILE,
     PUBLISHED,
+    STRICT_FAILURES,
     SUITES,
     Checkpoint,
     MemoryType,
@@ -65,19 +66,15 @@ def _folders() -> dict[str, Path]:
     return found
 
 
-def _suite_of(name: str) -> str:
-    return _folders()[name].parent.parent.name
-
-
 def suite_of(name: str) -> str | None:
     """Return the suite of a task of the catalogue, None for a name that is not in it."""
-    return _suite_of(name) if name in _folders() else None
+    return _folders()[name].parent.parent.name if name in _folders() else None
 
 
-def check_suite(suite: str, what: str = "suite") -> str:
-    """Return the name of a suite; an unknown one is an error, in which ``what`` says where it was given."""
+def check_suite(suite: str) -> str:
+    """Return the name of a suite; an unknown one is an error."""
     if suite not in SUITES:
-        raise MemobenchError(f"{what} is {suite!r}; {nearest(suite, SUITES)}")
+        raise MemobenchError(f"suite is {suite!r}; {nearest(suite, SUITES)}")
     return suite
 
 
@@ -86,7 +83,7 @@ def task_names(memory_types: str | Iterable[str] | None = None, suite: str | Non
 
     ``suite=None`` stands for both suites, the published one first.
     """
-    there = [name for name in _folders() if suite is None or _suite_of(name) == check_suite(suite)]
+    there = [name for name in _folders() if suite is None or suite_of(name) == check_suite(suite)]
     if memory_types is None:
         return there
     wanted = [memory_types] if isinstance(memory_types, str) else list(memory_types)
@@ -175,19 +172,17 @@ def _expand(word: str, suite: str) -> list[str]:
         names, numbers = task_names(suite=suite), NUMBERS.fullmatch(word)
         first, last = (0, 0) if numbers is None else (int(numbers[1]), int(numbers[2] or numbers[1]))
         if not 1 <= first <= last <= len(names):
-            wrong = (
-                "that is no whole range; " if numbers is None else "that range runs backwards; " if first > last else ""
-            )
+            backwards = "that range runs backwards; " if first > last else ""
+            wrong = "that is no whole range; " if numbers is None else backwards
             raise MemobenchError(
                 f"found {word} among the tasks; {wrong}those of the {suite} suite are numbered 1 to {len(names)}, "
                 "a range is such as 3-7 (`memobench tasks` lists them)"
             )
         return names[first - 1 : last]
-    if word not in _folders():
-        return []
-    if (own := _suite_of(word)) != suite:
+    own = suite_of(word)
+    if own not in (None, suite):
         raise MemobenchError(f"{word!r} is a task of the {own} suite; say suite={own}, or --suite {own}")
-    return [word]
+    return [] if own is None else [word]
 
 
 def task_record(task: Task, state_dim: int) -> dict[str, Any]:
@@ -258,7 +253,7 @@ def load_task(folder: str | Path, require_metadata: bool = True) -> Task:
     read = require_metadata or path.exists()
     metadata = Metadata.read(path, problem) if read else Metadata(path, problem, {})
     checkpoints = metadata.checkpoints()
-    memory_type = metadata.memory_type() or _infer_memory_type(folder, problem)
+    memory_type = metadata.choice("memory_type", MEMORY_TYPES) or _infer_memory_type(folder, problem)
     stated = "prompt" in metadata.data
     return Task(
         name=folder.name,
@@ -278,10 +273,10 @@ def load_task(folder: str | Path, require_metadata: bool = True) -> Task:
         folder=folder,
         bddl_text=text,
         metadata=metadata.data,
-        suite=metadata.suite(),
+        suite=metadata.choice("suite", SUITES, PUBLISHED),
         derived_from=metadata.text("derived_from") or None,
         drawn=metadata.flag("drawn"),
-        spoilt_as=metadata.spoilt_as(),
+        spoilt_as=metadata.choice("spoilt_as", STRICT_FAILURES),
     )
 
 

@@ -171,22 +171,16 @@ def to_lists(formula: Formula) -> list[Any]:
     """Return ``formula`` as nested lists of lower-case words: the inverse of ``parse_formula``."""
     if isinstance(formula, Atom):
         return [formula.predicate, *formula.args]
-    number = [formula.number] if isinstance(formula, Counted) else []
-    return [type(formula).__name__.lower(), *number, *(to_lists(child) for child in children(formula))]
+    head = [type(formula).__name__.lower(), *([formula.number] if isinstance(formula, Counted) else [])]
+    return [*head, *(to_lists(child) for child in children(formula))]
 
 
 def format_formula(formula: Formula) -> str:
     """Return ``formula`` in BDDL on one line, e.g. ``(And (On a b) (Not (Open c)))``."""
     if isinstance(formula, Atom):
         return f"({' '.join((PREDICATES[formula.predicate][0], *formula.args))})"
-    inside = " ".join(format_formula(child) for child in children(formula))
-    return f"({head_of(formula)} {inside})"
-
-
-def head_of(formula: Formula) -> str:
-    """Return what stands before an operator's formulas in BDDL, e.g. ``And`` or ``Exactly 2``."""
-    word = type(formula).__name__
-    return f"{word} {formula.number}" if isinstance(formula, Counted) else word
+    number = [str(formula.number)] if isinstance(formula, Counted) else []
+    return f"({' '.join([type(formula).__name__, *number, *map(format_formula, children(formula))])})"
 
 
 # --- making: every complaint says where ---
@@ -215,12 +209,9 @@ def make_atom(predicate: str, args: Sequence[str], where: str = "formula") -> At
 def make_operator(
     operator: str, parts: Sequence[Formula], where: str = "formula", number: int | str | None = None
 ) -> Formula:
-    """Return ``operator`` (any case) over its parts; `Hold` and `Exactly` need a ``number`` from 1 on."""
-    key = operator.lower()
-    if key not in OPERATORS:
-        raise MemobenchError(f"{where}: found the operator {operator!r}, {nearest(key, OPERATORS)}")
-    made = OPERATORS[key]
-    counted = [check_number(number, made.__name__, where)] if takes_number(key) else []
+    """Return an operator, one of `OPERATORS` in any case, over its parts; `Hold`, `Exactly` need a number from 1 on."""
+    made = OPERATORS[operator.lower()]
+    counted = [_checked_number(number, made.__name__, where)] if takes_number(operator) else []
     if not parts:
         raise MemobenchError(f"{where}: found {made.__name__} with nothing in it, expected at least one formula")
     if len(parts) != _PARTS.get(made, len(parts)):
@@ -231,8 +222,7 @@ def make_operator(
     return make(*counted, tuple(parts) if made not in _PARTS or made is When else parts[0])
 
 
-def check_number(number: Any, after: str, where: str) -> int:
-    """Return the number that stands after an operator's word; raise where it is none from 1 on."""
+def _checked_number(number: Any, after: str, where: str) -> int:
     if number is None:
         raise MemobenchError(
             f"{where}: found {after} without a number, expected a whole number from 1 to {MAX_NUMBER} before a formula"
@@ -247,18 +237,14 @@ def check_number(number: Any, after: str, where: str) -> int:
 _KEYS = ", ".join(map(repr, OPERATORS))
 
 
-def parse_formula(value: Any, where: str = "formula") -> Formula:
+def parse_formula(value: Any, where: str = "formula", depth: int = 0) -> Formula:
     """Read a formula from nested lists or JSON objects.
 
     ``["And", ["On", "a", "b"]]`` and ``{"and": [["on", "a", "b"]]}`` are the same. Words are read in any
     case, the two shapes may be mixed, and an operator may hold a bare atom instead of a list. A number stands before
     the formula: ``["exactly", 2, ["open", "a"]]``, ``{"exactly": [2, ["open", "a"]]}``. Raises ``MemobenchError``
-    whose message starts with ``where``.
+    whose message starts with ``where``. ``depth`` tells how deep within another formula it stands.
     """
-    return _parse(value, where, 0)
-
-
-def _parse(value: Any, where: str, depth: int) -> Formula:
     if depth > MAX_DEPTH:
         raise MemobenchError(f"{where}: found a formula nested deeper than {MAX_DEPTH} levels, expected a flatter one")
     if isinstance(value, Mapping):
@@ -270,7 +256,7 @@ def _parse(value: Any, where: str, depth: int) -> Formula:
     if is_operator(head):
         numbered = takes_number(head) and items and not isinstance(items[0], (list, tuple, Mapping))
         number, parts = (items[0], items[1:]) if numbered else (None, items)
-        return make_operator(head, [_parse(item, where, depth + 1) for item in parts], where, number)
+        return make_operator(head, [parse_formula(item, where, depth + 1) for item in parts], where, number)
     for item in items:
         if not isinstance(item, str) or not item:
             raise MemobenchError(f"{where}: found {short(item)} as an argument of {head!r}, expected an entity name")

@@ -21,17 +21,11 @@ from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.tasks.bddl import Problem
 from lerobot_memobench.tasks.formula import Formula, parse_formula, rename, short
 from lerobot_memobench.tasks.task import (
-    MEMORY_TYPES,
     OPERATIONS,
-    PUBLISHED,
-    STRICT_FAILURES,
-    SUITES,
     Checkpoint,
-    MemoryType,
     Operation,
     Prompt,
     PromptKind,
-    Suite,
     Texts,
     Variant,
 )
@@ -85,23 +79,12 @@ class Metadata:
         """Return an optional text, "" where it is not given."""
         return _text(self.data, key, str(self.path))
 
-    def _choice(self, key: str, allowed: Sequence[str], default: str | None = None) -> Any:
+    def choice(self, key: str, allowed: Sequence[str], default: str | None = None) -> Any:
+        """Return an optional word, one of those allowed, or the default where it is not given."""
         value = self.data.get(key, default)
         if value != default and value not in allowed:
             raise self._error(key, value, f"one of {', '.join(allowed)}")
         return value
-
-    def memory_type(self) -> MemoryType | None:
-        """Return the memory type, None where the file does not say it."""
-        return cast(MemoryType | None, self._choice("memory_type", MEMORY_TYPES))
-
-    def suite(self) -> Suite:
-        """Return the suite that the task belongs to: the published one unless the file says another."""
-        return cast(Suite, self._choice("suite", SUITES, PUBLISHED))
-
-    def spoilt_as(self) -> str | None:
-        """Return the class of failure of a strict task that can no longer be solved, None where it is not given."""
-        return cast(str | None, self._choice("spoilt_as", STRICT_FAILURES))
 
     def flag(self, key: str) -> bool:
         """Return an optional truth value, False where it is not given."""

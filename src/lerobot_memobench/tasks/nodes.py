@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import ClassVar, override
+from typing import ClassVar
 
 from lerobot_memobench.tasks.formula import (
     LATCHES,
@@ -32,7 +32,7 @@ Read = Callable[[Atom], bool]
 def build(formula: Formula, hold_steps: int) -> Node:
     """Return the tree of a formula; ``hold_steps`` is what each child of `Then` has to hold."""
     if isinstance(formula, Atom):
-        return AtomNode(formula)
+        return _AtomNode(formula)
     parts = [build(child, hold_steps) for child in children(formula)]
     number = hold_steps if isinstance(formula, Then) else formula.number if isinstance(formula, Counted) else 0
     return _NODES[type(formula)](parts, number)
@@ -84,7 +84,7 @@ class Node:
             yield from part.walk()
 
 
-class AtomNode(Node):
+class _AtomNode(Node):
     """What the world, or a latch, says now."""
 
     def __init__(self, atom: Atom) -> None:
@@ -92,18 +92,15 @@ class AtomNode(Node):
         self.atom = atom
         self.latched = False
 
-    @override
     def reset(self) -> None:
         self.latched = False
 
-    @override
     def value(self, read: Read) -> bool:
         now = read(self.atom)
         self.latched = now and self.atom.predicate in LATCHES
         return now
 
     @property
-    @override
     def settled(self) -> bool | None:
         return True if self.latched else None
 
@@ -111,45 +108,39 @@ class AtomNode(Node):
 # --- And, Or, Not: nothing is remembered. Every part is asked in every step, since a nested operator must see it ---
 
 
-class AndNode(Node):
+class _AndNode(Node):
     """True when all parts are."""
 
-    @override
     def value(self, read: Read) -> bool:
         values = [part.value(read) for part in self.parts]
         return all(values)
 
     @property
-    @override
     def settled(self) -> bool | None:
         found = [part.settled for part in self.parts]
         return False if False in found else None if None in found else True
 
 
-class OrNode(Node):
+class _OrNode(Node):
     """True when some part is."""
 
-    @override
     def value(self, read: Read) -> bool:
         values = [part.value(read) for part in self.parts]
         return any(values)
 
     @property
-    @override
     def settled(self) -> bool | None:
         found = [part.settled for part in self.parts]
         return True if True in found else None if None in found else False
 
 
-class NotNode(Node):
+class _NotNode(Node):
     """True when the part is not."""
 
-    @override
     def value(self, read: Read) -> bool:
         return not self.parts[0].value(read)
 
     @property
-    @override
     def settled(self) -> bool | None:
         found = self.parts[0].settled
         return None if found is None else not found
@@ -158,49 +149,44 @@ class NotNode(Node):
 # --- Never, Hold, Exactly: how long, how often ---
 
 
-class NeverNode(Node):
+class _NeverNode(Node):
     """True until the part is once true."""
 
     remembers = ("broken",)
     broken = False
 
-    @override
     def value(self, read: Read) -> bool:
         now = self.parts[0].value(read)
         self.broken = self.broken or now
         return not self.broken
 
     @property
-    @override
     def settled(self) -> bool | None:
         return False if self.broken else True if self.parts[0].settled is False else None
 
 
-class HoldNode(Node):
+class _HoldNode(Node):
     """True when the part has been true for the last ``number`` steps."""
 
     remembers = ("held",)
     held = 0
 
-    @override
     def value(self, read: Read) -> bool:
         self.held = min(self.held + 1, self.number) if self.parts[0].value(read) else 0
         return self.held == self.number
 
     @property
-    @override
     def settled(self) -> bool | None:
         found = self.parts[0].settled
         return None if found and self.held < self.number else found
 
 
-class ExactlyNode(Node):
+class _ExactlyNode(Node):
     """True while the part has come true ``number`` times; counts to one more, all beyond is the same."""
 
     remembers = ("count", "before")
     count, before = 0, False
 
-    @override
     def value(self, read: Read) -> bool:
         now = self.parts[0].value(read)
         self.count = min(self.count + (now and not self.before), self.number + 1)
@@ -208,7 +194,6 @@ class ExactlyNode(Node):
         return self.count == self.number
 
     @property
-    @override
     def settled(self) -> bool | None:
         if self.count > self.number:
             return False
@@ -219,13 +204,12 @@ class ExactlyNode(Node):
 # --- Then, Round, When: what comes before what ---
 
 
-class ThenNode(Node):
+class _ThenNode(Node):
     """Counts how long the current child has held; the next child is first looked at in the step after."""
 
     remembers = ("done", "held")
     done, held = 0, 0
 
-    @override
     def value(self, read: Read) -> bool:
         if self.done < len(self.parts):
             self.held = self.held + 1 if self.parts[self.done].value(read) else 0
@@ -234,20 +218,18 @@ class ThenNode(Node):
         return self.done == len(self.parts)
 
     @property
-    @override
     def settled(self) -> bool | None:
         if self.done == len(self.parts):
             return True
         return False if any(part.settled is False for part in self.parts[self.done :]) else None
 
 
-class RoundNode(Node):
+class _RoundNode(Node):
     """The next part is first looked at in the step after; with a new round all parts begin anew."""
 
     remembers = ("done",)
     done = 0
 
-    @override
     def value(self, read: Read) -> bool:
         self.done += self.parts[self.done].value(read)
         complete = self.done == len(self.parts)
@@ -256,18 +238,16 @@ class RoundNode(Node):
         return complete
 
     @property
-    @override
     def settled(self) -> bool | None:
         return False if any(part.settled is False for part in self.parts[self.done :]) else None
 
 
-class WhenNode(Node):
+class _WhenNode(Node):
     """The first moment of the first part decides, by the second part's value in that step."""
 
     remembers = ("decided",)
     decided: bool | None = None
 
-    @override
     def value(self, read: Read) -> bool:
         moment, then = [part.value(read) for part in self.parts]
         if self.decided is None and moment:
@@ -275,7 +255,6 @@ class WhenNode(Node):
         return self.decided is True
 
     @property
-    @override
     def settled(self) -> bool | None:
         if self.decided is not None:
             return self.decided
@@ -283,13 +262,13 @@ class WhenNode(Node):
 
 
 _NODES: dict[type[Formula], type[Node]] = {
-    And: AndNode,
-    Or: OrNode,
-    Not: NotNode,
-    Never: NeverNode,
-    Hold: HoldNode,
-    Exactly: ExactlyNode,
-    Then: ThenNode,
-    When: WhenNode,
-    Round: RoundNode,
+    And: _AndNode,
+    Or: _OrNode,
+    Not: _NotNode,
+    Never: _NeverNode,
+    Hold: _HoldNode,
+    Exactly: _ExactlyNode,
+    Then: _ThenNode,
+    When: _WhenNode,
+    Round: _RoundNode,
 }

@@ -14,9 +14,9 @@ import pytest
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim import rendering
 from lerobot_memobench.sim.gl.drawlist import DrawList, build_draw_list
-from lerobot_memobench.sim.gl.rasterizer import Rasterizer
+from lerobot_memobench.sim.gl.rasterizer import Highlight, Rasterizer
 from lerobot_memobench.sim.gl.shaders import frame_block
-from lerobot_memobench.sim.rendering import QUALITIES, ROOM, Highlight, Renderer, RenderSettings
+from lerobot_memobench.sim.rendering import QUALITIES, ROOM, RenderSettings, make_renderer
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, NO_OP, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 
@@ -24,9 +24,9 @@ STOVE = "turn_on_the_stove_and_turn_it_off"
 
 
 def rasterizers() -> list[Rasterizer]:
-    found = [renderer._rasterizer for renderer in rendering._thread.renderers.values()]
+    found = list(rendering._thread.renderers.values())
     assert found
-    return [rasterizer for rasterizer in found if rasterizer is not None]
+    return found
 
 
 @pytest.mark.parametrize("quality", QUALITIES)
@@ -128,12 +128,12 @@ def test_frames_equal_those_drawn_plainly(gl: str, monkeypatch: pytest.MonkeyPat
     sims[0].render()  # opens the context, and the renderer that both share
     with monkeypatch.context() as patch:
         patch.setattr(rendering, "build_draw_list", lambda model, *_: plain(model))
-        reference = Renderer(sims[0].model, settings)
+        reference = make_renderer(sims[0].model, settings)
     for state in states(sims, *SCENES[task]):
         for sim in sims:
             for name, camera in MJCF_CAMERAS.items():
                 ours = sim.render(name)
-                theirs = reference.render(sim.model, sim.data, camera, sim.highlights)
+                theirs = reference.draw(sim.model, sim.data, camera, sim.highlights)
                 np.testing.assert_array_equal(ours, theirs, err_msg=f"{state}, {name}")
 
 

@@ -36,7 +36,7 @@ from lerobot_memobench.datasets.feature_cache.reading import (
     read_recorded,
 )
 from lerobot_memobench.datasets.lerobot_format.layout import read_info
-from lerobot_memobench.envs.prompting import name_in_data
+from lerobot_memobench.envs.command_line import name_in_data
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import in_words
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, WIDTH, VisualEncoder

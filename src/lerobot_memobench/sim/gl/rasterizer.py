@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
@@ -28,11 +29,18 @@ from lerobot_memobench.sim.gl.shaders import (
 )
 
 Image = NDArray[np.uint8]
-Disc = tuple[NDArray[np.floating], float, float, Sequence[float]]
-"""A translucent disc: position (3,), radius, half height, m, and rgba."""
-
 HIGHLIGHTS = 16
-"""Translucent discs that fit into a frame."""
+"""Highlights that fit into a frame."""
+DISC_HALF_HEIGHT = 0.001
+
+
+@dataclass(frozen=True)
+class Highlight:
+    """A translucent disc drawn over the scene: the prompt's way of marking a place."""
+
+    position: tuple[float, float, float]
+    radius: float
+    rgba: tuple[float, float, float, float] = (1.0, 0.85, 0.1, 0.55)
 
 
 class Rasterizer:
@@ -152,30 +160,33 @@ class Rasterizer:
 
     # --- draw -----------------------------------------------------------------------------------------------
 
-    def draw(self, model: mujoco.MjModel, data: mujoco.MjData, camera: int, discs: Sequence[Disc] = ()) -> Image:
+    def draw(
+        self, model: mujoco.MjModel, data: mujoco.MjData, camera: str, highlights: Sequence[Highlight] = ()
+    ) -> Image:
         """Return what a camera sees, (height, width, 3) uint8, first row on top.
 
         Args:
             model: an instance of the model that the draw list was made of.
             data: the state to show.
-            camera: its id.
-            discs: translucent discs, drawn in this order.
+            camera: its name.
+            highlights: drawn in this order.
         """
-        if len(discs) > HIGHLIGHTS:
-            raise MemobenchError(f"there are {len(discs)} highlights in a frame; at most {HIGHLIGHTS} can be drawn")
+        count = len(highlights)
+        if count > HIGHLIGHTS:
+            raise MemobenchError(f"there are {count} highlights in a frame; at most {HIGHLIGHTS} can be drawn")
         self._enter()
         self._send_view(model, data, camera)
-        if self._send_geoms(model, data, discs) and self._shadows is not None:
+        if self._send_geoms(model, data, highlights) and self._shadows is not None:
             self._shadows.draw(self._table, self._view.block["light"])
         self._draw_scene(self._target, self._program)
-        if discs:
-            self._draw_discs(len(discs))
+        if count:
+            self._draw_discs(count)
         if self._result != self._target:
             self._resolve()
         return self._read(self._result)
 
-    def draw_geoms(self, model: mujoco.MjModel, data: mujoco.MjData, camera: int) -> NDArray[np.int64]:
-        """Return the id of the geom that each pixel of `draw` shows, (height, width), -1 for none; discs are no geoms.
+    def draw_geoms(self, model: mujoco.MjModel, data: mujoco.MjData, camera: str) -> NDArray[np.int64]:
+        """Return the id of the geom that each pixel of `draw` shows, (height, width), -1 for none, highlights left out.
 
         One sample per pixel, in its middle, whatever the quality of pictures.
         """
@@ -201,22 +212,21 @@ class Rasterizer:
         call.glDisable(GL.GL_BLEND)
         call.glDepthMask(GL.GL_TRUE)
 
-    def _send_view(self, model: mujoco.MjModel, data: mujoco.MjData, camera: int) -> None:
+    def _send_view(self, model: mujoco.MjModel, data: mujoco.MjData, camera: str) -> None:
         GL, call = self._gl, self._call
-        block = self._view.look(model, data, camera)
+        block = self._view.look(model, data, model.camera(camera).id)
         call.glBindBufferBase(GL.GL_UNIFORM_BUFFER, 0, self._view_buffer)  # 0 is where a program's first block reads
         call.glBufferData(GL.GL_UNIFORM_BUFFER, block.nbytes, block.ctypes.data, GL.GL_STREAM_DRAW)
 
-    def _send_geoms(self, model: mujoco.MjModel, data: mujoco.MjData, discs: Sequence[Disc]) -> bool:
+    def _send_geoms(self, model: mujoco.MjModel, data: mujoco.MjData, highlights: Sequence[Highlight]) -> bool:
         """Bring the table up to date; return whether it had to be, False where the last frame was of the same state."""
         GL, call = self._gl, self._call
         rows = len(self._list.geoms)
         self._list.fill(self._table[:rows], model, data)
-        for k, (position, radius, half_height, rgba) in enumerate(discs):
-            row = self._table[rows + k]
-            row[:3] = np.diag([radius, radius, half_height]) @ np.eye(3, 4)
-            row[:3, 3] = position
-            row[3], row[4] = rgba, (0.0, 1.0, 0.3, 0.0)
+        for row, mark in zip(self._table[rows:], highlights, strict=False):
+            row[:3] = np.diag([mark.radius, mark.radius, DISC_HALF_HEIGHT]) @ np.eye(3, 4)
+            row[:3, 3] = mark.position
+            row[3], row[4] = mark.rgba, (0.0, 1.0, 0.3, 0.0)
         state = self._table.tobytes()
         if state == self._sent:
             return False

@@ -1,10 +1,4 @@
-"""Where does the demonstration prompt play: in steps that the policy observes, or within `reset`?
-
-A policy that reads prompts declares it on the class of its configuration, ``reads_prompt: ClassVar[bool] = True``: it
-waits while `observation.phase` is 0, and plans anew when it becomes 1. Any other policy would act on a recording, and
-its queue would still hold those actions when the scene is restored. To it an episode begins at its first execution
-frame.
-"""
+"""What LeRobot's command line says beside the environment: its configuration holds no policy, training or names."""
 
 from __future__ import annotations
 
@@ -19,20 +13,6 @@ import yaml
 
 if TYPE_CHECKING:
     from lerobot.configs import PreTrainedConfig
-
-AUTO, STEPS, RESET = "auto", "steps", "reset"
-PLACES = (AUTO, STEPS, RESET)
-"""Values of ``env.prompt_in``."""
-
-
-def reads_prompt(policy: object) -> bool:
-    """Return whether a policy's configuration, or its class, declares that it reads prompts."""
-    return bool(getattr(policy, "reads_prompt", False))
-
-
-def prompt_in(policy: object | None) -> str:
-    """Return `STEPS` or `RESET`, as suits a policy's configuration or its class; `STEPS` where none is known."""
-    return STEPS if policy is None or reads_prompt(policy) else RESET
 
 
 def policy_being_run() -> PreTrainedConfig | type | None:
@@ -53,24 +33,6 @@ def policy_being_run() -> PreTrainedConfig | type | None:
         known: dict[str, type] = PreTrainedConfig.get_known_choices()
         kind = known.get(str(name or in_file("policy", "type")))
         return kind if kind is None or name is None else draccus.parse(kind, args=told)
-
-
-def parameters_of(path: str) -> int | None:
-    """Return about how many parameters a checkpoint's policy has, by the size of its weights, four bytes each.
-
-    Args:
-        path: its folder, or a repository. None is returned for one that is not on this machine.
-    """
-    from huggingface_hub import try_to_load_from_cache
-
-    folder = Path(path).expanduser()
-    if not folder.is_dir():
-        cached = try_to_load_from_cache(path, "config.json")
-        if not isinstance(cached, str):
-            return None
-        folder = Path(cached).parent
-    sizes = [file.stat().st_size for file in folder.glob("*model*.safetensors")]
-    return sum(sizes) // 4 if sizes else None
 
 
 @contextmanager
