@@ -255,7 +255,8 @@ class EpisodeStage:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for file in (*self._videos.values(), *([] if self._hdf5 is None else [self._hdf5])):
+        files: list[VideoWriter | EpisodeFile] = [*self._videos.values()]
+        for file in files if self._hdf5 is None else [*files, self._hdf5]:
             with contextlib.suppress(Exception):  # on a full disk closing fails as well, and all of it is deleted
                 file.abandon()
         shutil.rmtree(self._temporary, ignore_errors=True)
