@@ -73,7 +73,13 @@ def learning(policy: Any, before: Any, _: Any, dataset: Any) -> Iterator[float]:
 
 
 def alone(root: Path, updates: int = 3, **fields: Any) -> list[float]:
-    run = training(root, **fields)
+    """Return the losses of a training beside which there is no other; made once."""
+    return _alone(root, updates, tuple(sorted(fields.items())))
+
+
+@functools.cache
+def _alone(root: Path, updates: int, fields: tuple[tuple[str, Any], ...]) -> list[float]:
+    run = training(root, **dict(fields))
     return [next(run) for _ in range(updates)]
 
 

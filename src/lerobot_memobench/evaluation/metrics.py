@@ -175,8 +175,8 @@ Row = dict[str, Rate]
 def wilson(rate: float, n: float) -> tuple[float, float]:
     """Return the 95 % Wilson score interval of a rate over ``n`` trials, within [0, 1].
 
-    Written out although statsmodels has it: every report and every evaluation's end needs it, and importing statsmodels
-    takes longer than all the rest of a report.
+    Written out although SciPy has it: every report and every evaluation's end needs it, and importing SciPy's
+    statistics takes longer than all the rest of a report.
     """
     if n < 1 or not 0.0 <= rate <= 1.0:
         raise MemobenchError(f"a Wilson interval needs a rate in [0, 1] over at least one trial, got {rate} over {n}")
