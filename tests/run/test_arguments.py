@@ -17,6 +17,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.run.arguments import (
     LerobotArguments,
     check_task_names,
+    checked_value,
     flag_value,
     recipe_file,
     recipes,
@@ -305,3 +306,13 @@ def test_torch_waits_briefly_in_evaluations_unless_told_otherwise(
     load_command("eval")
     assert os.environ.get("GOMP_SPINCOUNT") == (before.get("GOMP_SPINCOUNT") if chosen else "2000")
     assert os.environ.get("OMP_WAIT_POLICY") == before.get("OMP_WAIT_POLICY")
+
+
+@pytest.mark.parametrize(
+    ("key", "annotation"), [("demonstration_prompt", bool), ("horizon", int), ("resume", bool), ("lr", float)]
+)
+@pytest.mark.parametrize("text", ["null", "none", "~"])
+def test_what_must_have_a_value_is_not_nothing(key: str, annotation: type, text: str) -> None:
+    with pytest.raises(MemobenchError, match=f"{key}={text}: expected"):
+        checked_value(key, annotation, text)
+    assert checked_value(key, annotation | None, text) == "null"

@@ -15,6 +15,8 @@ import lerobot_memobench.registration  # noqa: F401
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.baselines.configuration_baselines import MemobenchBlindConfig, MemobenchRandomConfig
+from lerobot_memobench.policies.checkpoint import shipped_policies
 from lerobot_memobench.run.arguments import LerobotArguments, flag_value, split_arguments
 from lerobot_memobench.run.card import card_of
 from lerobot_memobench.run.plan import EvaluationPlan, Grid, PlannedTask, RunOptions, Shard, plan_line, take_run_options
@@ -232,11 +234,78 @@ def test_the_command_that_goes_on(words: list[str], found: list[str]) -> None:
 
 
 def test_a_policy_of_a_configuration_file_is_the_policy() -> None:
-    Path("eval.yaml").write_text("policy: {type: memobench_blind}\n")
-    for words, offered in ((["config_path=eval.yaml"], "env.blind_action"), ([], "env.expert_action")):
-        plan = plan_line([LINE[0], *words])
-        assert [flag for flag in plan.portable_flags if "action=" in flag] == [f"--{offered}=true"]
-        assert plan.arguments.has("policy.type") is (not words)
+    for section in ("{type: memobench_blind}", "memobench_blind"):
+        Path("eval.yaml").write_text(f"policy: {section}\n")
+        plan = plan_line([LINE[0], "config_path=eval.yaml"])
+        assert [flag for flag in plan.portable_flags if "action=" in flag] == ["--env.blind_action=true"]
+        assert isinstance(plan.policy, MemobenchBlindConfig)
+        plan = plan_line([LINE[0], "--config_path=eval.yaml", "policy=memobench_random"])
+        assert isinstance(plan.policy, MemobenchRandomConfig)
+
+
+def test_a_checkpoint_of_a_configuration_file_takes_settings() -> None:
+    path = shipped_policies()["memobench_small"]
+    Path("eval.yaml").write_text(f"policy: {{path: {path}}}\nenv: {{type: memobench, obs_type: both}}\n")
+    plan = plan_line(["config_path=eval.yaml", "replan=2", "device=cpu"])
+    assert plan.policy_path == str(path)
+    assert plan.policy.n_action_steps == plan.environment.replan_steps == 2
+
+
+def test_settings_of_a_configuration_file_stay() -> None:
+    """The benchmark's defaults hid them: fifty episodes ran where the file said one."""
+    Path("eval.yaml").write_text(
+        "seed: 9\nenv: {type: memobench, horizon: 30, videos: 0, tasks: 9}\neval: {n_episodes: 3, batch_size: 3}\n"
+    )
+    plan = plan_line(["config_path=eval.yaml"])
+    assert (plan.seed, plan.batch, plan.grid.runs) == (9, 3, 3)
+    assert (plan.environment.horizon, plan.environment.videos) == (30, 0)
+    plan = plan_line(["config_path=eval.yaml", "--seed=5", "episodes=2", "horizon=40"])
+    assert (plan.seed, plan.grid.runs, plan.environment.horizon) == (5, 2, 40)
+    for text, said in (("env: memobench\nsede: 1", "no setting 'sede'"), ("env: memobench\neval: 3", "eval=3")):
+        Path("eval.yaml").write_text(text)
+        with pytest.raises(MemobenchError, match=said):
+            plan_line(["config_path=eval.yaml"])
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["policy=memobench_random", "policy=memobench_blind"],
+        ["policy=memobench_random", "--policy.type=memobench_blind"],
+        ["policy=memobench_small", "policy=memobench_small_memoryless"],
+        ["policy=memobench_small", "--policy.type=memobench_blind"],
+        ["--policy.type=memobench_random", "--policy.type=memobench_blind"],
+    ],
+)
+def test_a_policy_is_named_once(words: list[str]) -> None:
+    """LeRobot ran the first, and the card told of the last."""
+    with pytest.raises(MemobenchError, match="two answers to which policy is meant"):
+        plan_line([*LINE[:3], *words])
+
+
+def test_of_a_setting_that_is_given_twice_the_last_counts() -> None:
+    plan = plan_line([*LINE, "--seed=1", "seed=2", "seed=3"])
+    assert plan.seed == 3
+    assert [flag for flag in plan.portable_flags if flag.startswith("--seed=")] == ["--seed=3"]
+
+
+def test_a_policy_of_another_package_is_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "mine_of_test").mkdir()
+    (tmp_path / "mine_of_test" / "__init__.py").write_text(
+        "from dataclasses import dataclass\n"
+        "from lerobot_memobench.policies.baselines.configuration_baselines import MemobenchRandomConfig\n"
+        "from lerobot.configs import PreTrainedConfig\n"
+        "@PreTrainedConfig.register_subclass('mine_of_test')\n@dataclass\n"
+        "class Mine(MemobenchRandomConfig):\n    spread: float = 1.0\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    words = ["--policy.type=mine_of_test", "--policy.discover_packages_path=mine_of_test", "policy.spread=0.5"]
+    plan = plan_line([*LINE[:3], *words])
+    assert plan.policy is not None
+    assert (plan.policy.type, plan.policy.spread) == ("mine_of_test", 0.5)
+    assert not any("action=" in flag for flag in plan.portable_flags)
+    with pytest.raises(MemobenchError, match="policy.discover_packages_path=not_here"):
+        plan_line([*LINE[:3], "policy.discover_packages_path=not_here"])
 
 
 # --- the plan itself ---

@@ -18,7 +18,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash
 from lerobot_memobench.perception.weights import SHIPPED
 from lerobot_memobench.run import rerun
-from lerobot_memobench.run.arguments import field_types
+from lerobot_memobench.run.arguments import field_types, without_none
 from lerobot_memobench.run.card import checkpoint_files, new_card, tree_hash, with_episodes, write_card
 from lerobot_memobench.run.machine import run_facts
 from lerobot_memobench.run.plan import plan_line
@@ -185,12 +185,20 @@ REFUSED = {
 def test_every_setting_is_allowed_or_refused_on_purpose(section: str, config: type) -> None:
     refused = set()
     for name, kind in field_types(config).items():
-        value = {bool: "true", int: "1", float: "1"}.get(kind, "tasks")
+        value = {bool: "true", int: "1", float: "1"}.get(without_none(kind), "tasks")
         try:
             allowed_flags([*BENCHMARK, f"--{section}.{name}={value}"])
         except MemobenchError:
             refused.add(name)
     assert refused == REFUSED[config]
+
+
+def test_a_section_may_be_nothing_and_a_mapping_is_no_number() -> None:
+    flags = ["--env.type=memobench", "--policy.type=memobench_mem", "--policy.rtc_config=null"]
+    assert allowed_flags(flags)[2] == "--policy.rtc_config=null"
+    for name in ("features", "features_map"):
+        with pytest.raises(MemobenchError, match=f"the card sets env.{name}"):
+            allowed_flags([*BENCHMARK, f"--env.{name}=5"])
 
 
 # --- what we write ---

@@ -26,6 +26,8 @@ def policy_being_run() -> PreTrainedConfig | type | None:
 
     path, name = parser.get_path_arg("policy"), parser.get_type_arg("policy")
     told = parser.get_cli_overrides("policy") or []
+    # LeRobot's parser takes these out before draccus reads.
+    told = [flag for flag in told if not flag.startswith("--discover_packages_path")]
     with quiet():
         if path is not None:
             overrides = [*parser.get_yaml_overrides("policy"), *told]

@@ -8,6 +8,7 @@ sentence before anything runs. Short forms stand for LeRobot's names, ``policy=`
 from __future__ import annotations
 
 import dataclasses
+import json
 import logging
 import typing
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -216,7 +217,61 @@ def read_arguments(command: str, given: Arguments) -> LerobotArguments:
     """
     config = config_class(load_command(command))
     register_plugins()
-    return translate(command, given, config, read_config_file(given.value(CONFIG_FILE)))
+    _load_packages(given)
+    file = read_config_file(given.value(CONFIG_FILE))
+    if command == "eval" and config is not None and _is_of_benchmark(given, file):
+        return translate(command, with_file(given.without(CONFIG_FILE), file, config), config, {})
+    return translate(command, given, config, file)
+
+
+def _load_packages(given: Arguments) -> None:
+    """Import the packages that LeRobot is told to look for plugins in, so that what they register is known."""
+    from lerobot.configs import parser
+
+    named = [f"--{key}={value}" for key, value in given.pairs]
+    for flag in (*given.flags, *named):
+        key, _, value = flag.partition("=")
+        if key.endswith(f".{CHOICE_KEYS[-1]}"):
+            try:
+                parser.load_plugin(value)
+            except (parser.PluginLoadError, ImportError) as error:
+                raise MemobenchError(f"{key.removeprefix('--')}={value} cannot be imported ({error})") from None
+
+
+def _is_of_benchmark(given: Arguments, file: Mapping[str, Any]) -> bool:
+    section = file.get("env")
+    in_file = section.get("type") if isinstance(section, Mapping) else section
+    return dict(given.pairs).get("env", given.value("env.type") or in_file) == "memobench"
+
+
+def with_file(given: Arguments, file: Mapping[str, Any], config: type) -> Arguments:
+    """Return a command line that says what a configuration file says where the line does not.
+
+    LeRobot would read the file beneath the line, where the benchmark's defaults would hide it.
+    """
+    chosen = {key for key in registries(config) if dict(given.pairs).get(key) or _is_named(given, key)}
+    found = [
+        (key, value)
+        for key, value in flattened(file, dict(settings(config, {})))
+        if not (key.partition(".")[0] in chosen and key.partition(".")[2] in ("", *CHOICE_KEYS[:2]))
+        and given.value(key) is None
+    ]
+    return replace(given, pairs=[*found, *given.pairs])
+
+
+def _is_named(given: Arguments, key: str) -> bool:
+    return any(given.value(f"{key}.{word}") is not None for word in CHOICE_KEYS[:2])
+
+
+def flattened(file: Mapping[str, Any], known: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
+    """Yield key and value, as typed, of each setting in the content of a configuration file."""
+    for name, value in file.items():
+        key = f"{before}{name}"
+        kind = without_none(known.get(key, Any))
+        if isinstance(value, Mapping) and dataclasses.is_dataclass(kind):
+            yield from flattened(value, known, f"{key}.")
+        else:
+            yield key, value if isinstance(value, str) else json.dumps(value)
 
 
 def translate(command: str, given: Arguments, config: type | None, file: Mapping[str, Any]) -> LerobotArguments:
@@ -238,6 +293,8 @@ def translate(command: str, given: Arguments, config: type | None, file: Mapping
     flags = list(given.flags)
     for key, value in given.pairs:
         flags += choice_flags(config, key, value) if key in choosing else []
+    for key in choosing:
+        _check_named_once(key, given.pairs, flags)
     # Fields of the policy and the environment are known once these are, wherever they stand in the line.
     explicit = [*flags, *(f"--{key}={value}" for key, value in others)]
     found = {key: chosen_class(config, key, explicit, file) for key in choices}
@@ -253,7 +310,17 @@ def translate(command: str, given: Arguments, config: type | None, file: Mapping
         except KeyError:
             keys = [*known, *short, *OPTIONS.get(command, ())]
             raise MemobenchError(f"lerobot {command} has no setting {key!r}, {nearest(key, keys)}") from None
-    return LerobotArguments(tuple(flags), config, chosen)
+    # LeRobot takes the first of some that are given twice and the last of others.
+    once = {flag.partition("=")[0]: flag for flag in flags}
+    return LerobotArguments(tuple(once.values()), config, chosen)
+
+
+def _check_named_once(key: str, pairs: Sequence[tuple[str, str]], flags: Sequence[str]) -> None:
+    named = {f"{key}={value}" for name, value in pairs if name == key}
+    if len(named) < 2:
+        named = {flag for flag in flags if flag.startswith((f"--{key}.type=", f"--{key}.path="))}
+    if len(named) > 1:
+        raise MemobenchError(f"there are two answers to which {key} is meant, {' and '.join(sorted(named))}; name one")
 
 
 def _nothing_to_set(key: str, target: str, chosen: Mapping[str, type]) -> MemobenchError:
@@ -398,6 +465,8 @@ def read_config_file(given: str | None) -> dict[str, Any]:
     if path.is_dir():
         path = path / "train_config.json"
     if not path.is_file():
+        if looks_local(given) or path.suffix in (".yaml", ".yml", ".json"):
+            raise MemobenchError(f"{CONFIG_FILE}={given}: there is no such file")
         return {}  # a repository: LeRobot fetches it
     try:
         content = yaml.safe_load(path.read_bytes())
@@ -420,12 +489,13 @@ PLAIN = {bool: "true or false", int: "a whole number", float: "a number"}
 
 
 def field_types(cls: type) -> dict[str, Any]:
-    """Return field name -> annotation without its None (``int`` for ``int | None``), for the fields that can be set."""
+    """Return field name -> annotation, for the fields that can be set."""
     hints = typing.get_type_hints(cls)
-    return {each.name: _without_none(hints[each.name]) for each in dataclasses.fields(cls) if each.init}
+    return {each.name: hints[each.name] for each in dataclasses.fields(cls) if each.init}
 
 
-def _without_none(annotation: Any) -> Any:
+def without_none(annotation: Any) -> Any:
+    """Return ``int`` for ``int | None``."""
     parts = [part for part in typing.get_args(annotation) if part is not type(None)]
     return parts[0] if is_union(annotation) and len(parts) == 1 else annotation
 
@@ -433,9 +503,9 @@ def _without_none(annotation: Any) -> Any:
 def registries(config: type) -> dict[str, dict[str, type]]:
     """Return field -> name -> class of what may be chosen for it, such as for ``policy``."""
     return {
-        key: {str(name): choice for name, choice in annotation.get_known_choices().items()}
-        for key, annotation in field_types(config).items()
-        if is_choice_type(annotation)
+        key: {str(name): choice for name, choice in kind.get_known_choices().items()}
+        for key, kind in ((name, without_none(annotation)) for name, annotation in field_types(config).items())
+        if is_choice_type(kind)
     }
 
 
@@ -446,13 +516,18 @@ def settings(config: type, chosen: Mapping[str, type], before: str = "") -> Iter
         chosen: dotted key of a choice (``policy``) -> the class chosen for it.
     """
     for name, annotation in field_types(config).items():
-        key = before + name
-        if is_choice_type(annotation):
+        key, kind = before + name, without_none(annotation)
+        if is_choice_type(kind):
             yield from ((f"{key}.{word}", str) for word in CHOICE_KEYS)
-            annotation = chosen.get(key, annotation)
+            annotation = kind = chosen.get(key, kind)
         yield key, annotation
-        if dataclasses.is_dataclass(annotation) and not is_choice_type(annotation):
-            yield from settings(typing.cast(type, annotation), chosen, key + ".")
+        if has_settings(kind):
+            yield from settings(kind, chosen, key + ".")
+
+
+def has_settings(kind: Any) -> bool:
+    """Return whether a type is a section: a dataclass whose fields are settings of their own."""
+    return dataclasses.is_dataclass(kind) and not is_choice_type(kind)
 
 
 def setting_type(known: Mapping[str, Any], key: str) -> Any:
@@ -471,9 +546,10 @@ def setting_type(known: Mapping[str, Any], key: str) -> Any:
             raise KeyError(key)
     if owner == key:
         return known[key]
-    if is_choice_type(known[owner]) and "." not in owner:
+    kind = without_none(known[owner])
+    if is_choice_type(kind) and "." not in owner:
         raise MemobenchError(f"{key!r} needs {owner}=: name one before setting something of it")
-    if dataclasses.is_dataclass(known[owner]) and not is_choice_type(known[owner]):
+    if has_settings(kind):
         raise KeyError(key)
     return Any
 
@@ -484,22 +560,26 @@ def checked_value(key: str, annotation: Any, text: str) -> str:
     Raises:
         MemobenchError: the value cannot be one of this field.
     """
-    if text in ("null", "~"):
-        return text
-    if annotation in PLAIN:
+    kind = without_none(annotation)
+    if text in ("null", "~") or (kind in PLAIN and text.lower() == "none"):  # for text, `align=none` is a value
+        if annotation in PLAIN:
+            raise MemobenchError(f"{key}={text}: expected {PLAIN[annotation]}")
+        return "null"
+    if kind in PLAIN:
         plain = text.lower()
-        if plain == "none":  # for text, a word such as `align=none` is a value
-            return "null"
         try:
-            draccus.decode(annotation, plain)
+            draccus.decode(kind, plain)
         except DecodingError:
-            raise MemobenchError(f"{key}={text}: expected {PLAIN[annotation]}") from None
+            raise MemobenchError(f"{key}={text}: expected {PLAIN[kind]}") from None
         return plain
-    if is_literal(annotation):
-        known = named = [str(value) for value in typing.get_args(annotation)]
-    elif is_enum(annotation):
-        named = list(annotation.__members__)
-        known = [*(str(member.value) for member in annotation), *named]
+    if has_settings(kind):
+        names = [f"{key}.{name}" for name in field_types(kind)]
+        raise MemobenchError(f"{key}={text[:80]}: {key} holds settings; expected one of them, such as {names[0]}=")
+    if is_literal(kind):
+        known = named = [str(value) for value in typing.get_args(kind)]
+    elif is_enum(kind):
+        named = list(kind.__members__)
+        known = [*(str(member.value) for member in kind), *named]
     else:
         return text
     if text not in known:

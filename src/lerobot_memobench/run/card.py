@@ -71,8 +71,6 @@ def _flags_of(plan: EvaluationPlan) -> list[str]:
 
 
 def _protocol_of(plan: EvaluationPlan) -> dict[str, Any]:
-    if plan.grid is None or plan.environment is None:
-        return {}
     names = sorted(task.name for task in plan.grid.tasks)
     environment = plan.environment
     found = {"tasks": names, "episodes": plan.grid.runs, **environment.protocol}
@@ -85,7 +83,7 @@ def _task_files(plan: EvaluationPlan) -> dict[str, str]:
     from lerobot_memobench.datasets.generation import task_hash
     from lerobot_memobench.tasks.catalogue import load_task
 
-    return {} if plan.grid is None else {task.name: task_hash(load_task(task.folder)) for task in plan.grid.tasks}
+    return {task.name: task_hash(load_task(task.folder)) for task in plan.grid.tasks}
 
 
 def with_checkpoint(card: dict[str, Any], path: str | None) -> dict[str, Any]:

@@ -47,7 +47,7 @@ EXPERT = "memobench_expert"
 SCRIPTED = {EXPERT: "env.expert_action", "memobench_blind": "env.blind_action"}
 """Policies whose actions the environment offers, and by which setting it does."""
 OUTPUT, LOG = "output_dir", "env.log_dir"
-PATHS = ("policy.path", "env.task_dir", CONFIG_FILE)
+PATHS = ("policy.path", "env.task_dir")
 """Settings that name what is read."""
 LARGEST_BATCH = 64
 VIDEO_EPISODES = 10
@@ -62,8 +62,9 @@ class EvaluationPlan:
 
     Attributes:
         arguments: LeRobot's, complete but for the folders that are written.
-        policy, environment: their configurations; None when a configuration file (``config_path``) holds them.
-        grid: the episodes it consists of; None when the environment is.
+        policy: its configuration; None where LeRobot has to fetch it first.
+        environment: its configuration.
+        grid: the episodes it consists of.
         output: folder of LeRobot's own files.
         log: folder of the episode log, the report and the card.
         seed: of the run; that of the first episode of each task too.
@@ -74,8 +75,8 @@ class EvaluationPlan:
 
     arguments: LerobotArguments
     policy: PreTrainedConfig | None
-    environment: MemobenchEnvConfig | None
-    grid: Grid | None
+    environment: MemobenchEnvConfig
+    grid: Grid
     output: Path
     log: Path
     seed: int | None
@@ -90,8 +91,8 @@ class EvaluationPlan:
 
     @property
     def draws(self) -> bool:
-        """Whether pictures are drawn, as far as is known."""
-        return self.environment is None or self.environment.draws
+        """Whether pictures are drawn."""
+        return self.environment.draws
 
     @property
     def going_on(self) -> str:
@@ -161,16 +162,14 @@ def make_plan(arguments: LerobotArguments, options: RunOptions, command: Sequenc
     arguments = with_protocol(arguments, options, log, policy)
     if policy is not None:  # else LeRobot's process finds out
         arguments = arguments.default("env.prompt_in", prompt_in(policy))
-    environment = cast("MemobenchEnvConfig | None", env_config(arguments))
+    environment = cast("MemobenchEnvConfig", env_config(arguments))
     check_observations(policy, environment)
     check_as_checkpoint(arguments, policy, environment)
-    if environment is None and options.any:
-        raise MemobenchError("resume=, shard= and shards= cannot go with config_path=; give its settings on the line")
     plan = EvaluationPlan(
         arguments=arguments.without(OUTPUT, LOG),
         policy=policy,
         environment=environment,
-        grid=None if environment is None else make_grid(arguments, environment),
+        grid=make_grid(arguments, environment),
         output=output,
         log=log,
         seed=whole_number(arguments.get("seed")),
@@ -220,7 +219,7 @@ def make_grid(arguments: LerobotArguments, environment: MemobenchEnvConfig) -> G
 
 def with_policy(arguments: LerobotArguments) -> LerobotArguments:
     """Return arguments with the scripted expert where no policy is named; a scripted policy is offered its action."""
-    if "policy" not in arguments.chosen and not arguments.has("policy.path"):
+    if not any(arguments.has(f"policy.{word}") for word in ("type", "path")):
         arguments = arguments.choosing("policy", EXPERT)
     chosen: Any = arguments.chosen.get("policy")
     offered = None if chosen is None else SCRIPTED.get(chosen.get_choice_name(chosen))
@@ -324,7 +323,8 @@ def _parsed(arguments: LerobotArguments, key: str) -> Any:
 def _overrides(arguments: LerobotArguments, key: str) -> list[str]:
     from lerobot.configs import parser
 
-    return parser.get_cli_overrides(key, list(arguments.flags)) or []
+    told = parser.get_cli_overrides(key, list(arguments.flags)) or []
+    return without_flags(told, "discover_packages_path")  # LeRobot's parser takes it out before draccus reads
 
 
 def check_observations(policy: PreTrainedConfig | None, environment: EnvConfig | None) -> None:

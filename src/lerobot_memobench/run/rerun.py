@@ -23,7 +23,7 @@ from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import CARD_FILE, read_card
 from lerobot_memobench.policies.checkpoint import local_folder
-from lerobot_memobench.run.arguments import PLAIN, checked_value, chosen_class, flag_value, setting_type
+from lerobot_memobench.run.arguments import PLAIN, checked_value, chosen_class, flag_value, setting_type, without_none
 from lerobot_memobench.run.arguments import settings as settings_of
 from lerobot_memobench.run.card import checkpoint_files, detector_hash, first_disagreement, tree_hash
 from lerobot_memobench.run.lerobot_commands import config_class, load_command, register_plugins
@@ -240,12 +240,15 @@ def _checked(known: Mapping[str, Any], key: str, value: str) -> str:
         kind = setting_type(known, key)
     except KeyError:
         raise _refused(key, value, "which is no setting of this evaluation") from None
-    if key.rpartition(".")[2] in REACHING_OUT or dataclasses.is_dataclass(kind):
+    if key.rpartition(".")[2] in REACHING_OUT:
         raise _refused(key, value, "which no card sets that is repeated")
     parts = typing.get_args(kind) if is_union(kind) else (kind,)
     may_be_text = any(part in (str, Path, Any, object) for part in parts)
     if value in NOTHING and (key.startswith("policy.") or not may_be_text):
         return value
+    kind = without_none(kind)
+    if dataclasses.is_dataclass(kind) or typing.get_origin(kind) is dict:
+        raise _refused(key, value, "which no card sets that is repeated")
     if may_be_text:
         raise _refused(key, value, "which may name a file or a repository")
     if not (kind in PLAIN or is_enum(kind) or is_literal(kind) or _holds_numbers(value)):

@@ -96,8 +96,8 @@ def run_evaluation(plan: EvaluationPlan, tell: Tell, begin: Tell = lambda text: 
 def _what_is_run(plan: EvaluationPlan) -> str:
     who = portable_path(plan.policy_path) if plan.policy_path else getattr(plan.policy, "type", "the policy")
     grid = plan.grid
-    what = "" if grid is None else f" on {count_of(len(grid.tasks), 'task')}, {count_of(grid.runs, 'episode')} each"
-    return f"evaluating {who}{what}, into {plan.output}"
+    what = f"{count_of(len(grid.tasks), 'task')}, {count_of(grid.runs, 'episode')} each"
+    return f"evaluating {who} on {what}, into {plan.output}"
 
 
 def _run_lerobot(plan: EvaluationPlan, card: dict[str, Any], ranges: Ranges | None, tell: Tell) -> Ended:
@@ -110,8 +110,7 @@ def _run_lerobot(plan: EvaluationPlan, card: dict[str, Any], ranges: Ranges | No
             calm_output(),
             steered(plan.seed, ranges),
         ):
-            if card["protocol"]:
-                write_card(plan.log, card)
+            write_card(plan.log, card)
             left = remainder(plan, ranges)
             with made(left.output):  # LeRobot makes it for videos of its own only
                 status = call_lerobot("eval", left.lerobot_flags)
@@ -126,12 +125,12 @@ def _run_lerobot(plan: EvaluationPlan, card: dict[str, Any], ranges: Ranges | No
 
 def _finish(plan: EvaluationPlan, card: dict[str, Any]) -> EvaluationReport:
     """Write the report of the log, and what was found onto the card."""
-    protocol = {**(card["protocol"] or read_protocol(plan.log)), **read_protocol_file(plan.log)}
+    protocol = {**card["protocol"], **read_protocol_file(plan.log)}
     protocol.pop(POLICY, None)  # a card says more of it; the file has what `auto` came to in LeRobot's process
     # LeRobot runs whole batches: episodes beyond those asked for are no part of the report.
-    limit = None if plan.grid is None else plan.grid.first + max(plan.grid.runs, protocol["episodes"])
+    limit = plan.grid.first + max(plan.grid.runs, protocol["episodes"])
     report = EvaluationReport(plan.log, *write_report(plan.log, limit))
-    records = [record for record in read_episodes(plan.log) if limit is None or record["episode"] < limit]
+    records = [record for record in read_episodes(plan.log) if record["episode"] < limit]
     card = with_checkpoint({**card, "protocol": protocol}, plan.policy_path)
     write_card(plan.log, with_episodes(card, records))
     return report
@@ -185,7 +184,7 @@ def _run_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list
 def missing(plan: EvaluationPlan) -> Ranges | None:
     """Return the runs that are to be made, in whole batches; None for all of them."""
     options = plan.options
-    if plan.grid is None or plan.environment is None or not (options.resume or options.shard is not None):
+    if not (options.resume or options.shard is not None):
         return None
     done = logged(plan.log, plan.environment.referent)
     return plan.grid.ranges(plan.grid.missing(done, options.shard))
@@ -193,7 +192,7 @@ def missing(plan: EvaluationPlan) -> Ranges | None:
 
 def remainder(plan: EvaluationPlan, ranges: Ranges | None) -> EvaluationPlan:
     """Return the plan of what is left: tasks that are done are not opened, episodes that are there are left out."""
-    if ranges is None or plan.grid is None:
+    if ranges is None:
         return plan
     arguments, output = plan.arguments, plan.output
     names = [task.name for task in plan.grid.tasks if task.key in ranges]

@@ -129,8 +129,6 @@ def plan_shards(plan: EvaluationPlan, program: Sequence[str], tell: Tell) -> lis
         MemobenchError: the executor, the number of parts or what is in the folders forbids it.
     """
     options, grid, out = plan.options, plan.grid, plan.output.absolute()
-    assert grid is not None
-    assert plan.environment is not None
     check_executor(options.executor, options.executor_options)
     if options.shards > len(grid.cells()):
         raise MemobenchError(

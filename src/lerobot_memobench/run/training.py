@@ -112,7 +112,7 @@ def take_training_options(given: Arguments) -> tuple[bool | None, str | None, Ar
     obs_type = found.get("obs_type")
     if obs_type is not None and obs_type not in OBS_TYPES:
         raise MemobenchError(f"found obs_type={obs_type}, {nearest(obs_type, OBS_TYPES)}")
-    wanted = checked_value("prompt_frames", bool, found.get("prompt_frames", "null"))
+    wanted = checked_value("prompt_frames", bool | None, found.get("prompt_frames", "null"))
     return {"true": True, "false": False}.get(wanted), obs_type, replace(given, pairs=rest)
 
 
