@@ -337,6 +337,14 @@ def test_states_and_instruction_are_compared(two: Path, tmp_path: Path) -> None:
     )
 
 
+def test_a_number_of_frames_that_are_not_there_is_named(two: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(two, tmp_path / "ds"))
+    info = json.loads((folder / "meta" / "info.json").read_text())
+    (folder / "meta" / "info.json").write_text(json.dumps(info | {"total_frames": 999}))
+    with pytest.raises(MemobenchError, match=r"data holds 12 rows, meta/info\.json tells of 999; the"):
+        validation(folder)
+
+
 def decoded(path: Path) -> np.ndarray:
     with av.open(str(path)) as container:
         return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
@@ -418,10 +426,22 @@ def cut(path: Path) -> None:
         ("data/**/*.parquet", cut),
         ("data/**/*.parquet", zeroed),
         ("meta/episodes/**/*.parquet", cut),
+        ("meta/stats.json", cut),
+        ("meta/stats.json", Path.unlink),
+        ("meta/tasks.parquet", Path.unlink),
         ("videos/*wrist_image/**/*.mp4", cut),
         ("videos/*wrist_image/**/*.mp4", Path.unlink),
     ],
-    ids=["table cut", "table zeroed", "episodes cut", "video cut", "video gone"],
+    ids=[
+        "table cut",
+        "table zeroed",
+        "episodes cut",
+        "statistics cut",
+        "statistics gone",
+        "tasks gone",
+        "video cut",
+        "video gone",
+    ],
 )
 @pytest.mark.parametrize("workers", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_training_names_the_damaged_file(
@@ -433,7 +453,7 @@ def test_training_names_the_damaged_file(
     run = tmp_path / "run"
     assert lerobot([*TRAIN, f"dataset={folder}", f"output_dir={run}", "steps=3", f"num_workers={workers}"]) == 2
     last = capsys.readouterr().err.strip().splitlines()[-1]
-    assert last.startswith(f"lerobot: {path} "), last
+    assert last.startswith((f"lerobot: {path} ", f"lerobot: {path}: ")), last
     assert last.endswith("generate it or take it from its source again"), last
 
 

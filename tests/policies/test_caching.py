@@ -53,7 +53,8 @@ def test_without_pictures_there_is_nothing_to_encode(
     assert main(["cache", str(root), "--size", size]) == 2
     told = capsys.readouterr().err
     assert told == (
-        f"memobench: {root} holds no pictures, so there is nothing to encode; perception=objects needs no cache\n"
+        f"memobench: {root} holds no pictures, which a detector and perception=pixels need; name a dataset with "
+        "pictures, or leave detector out at perception=objects\n"
     )
     assert not (root / FOLDER).exists()
 

@@ -123,6 +123,11 @@ def test_detections_are_of_the_cameras_by_their_names_in_the_dataset(
     assert (named_otherwise / "tokens.bin").read_bytes() == (cache_dataset(root, config) / "tokens.bin").read_bytes()
 
 
+def test_a_dataset_without_pictures_is_refused(finding: dict[str, Any], tmp_path: Path) -> None:
+    with pytest.raises(MemobenchError, match="holds no pictures, which a detector and perception=pixels need"):
+        made_for_training(make_object_dataset(tmp_path / "blind"), **finding)
+
+
 def test_a_dataset_with_one_camera_is_refused(finding: dict[str, Any], tmp_path: Path) -> None:
     with pytest.raises(MemobenchError, match=r"no camera 'observation\.images\.wrist_image'"):
         made_for_training(make_object_dataset(tmp_path / "filmed", pictures=True), **finding)

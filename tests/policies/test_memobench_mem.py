@@ -459,6 +459,19 @@ def test_weights_that_do_not_fit_are_refused(trained: Any, tmp_path: Path) -> No
         MemobenchMemPolicy.from_pretrained(broken)
 
 
+@pytest.mark.parametrize("name", ["model.safetensors", "training_weights.safetensors"])
+def test_weights_that_are_cut_off_are_named(trained: Any, tmp_path: Path, name: str) -> None:
+    dataset, folder = trained[3], trained[4]
+    path = _copy(folder, tmp_path / "a") / name
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    meta = None if name == "model.safetensors" else dataset.meta
+    with pytest.raises(MemobenchError, match=rf"{name} cannot be read \(SafetensorError: .*; copy or train"):
+        MemobenchMemPolicy.from_pretrained(path.parent, dataset_meta=meta)
+    if meta is None:
+        with pytest.raises(MemobenchError, match=rf"{name} cannot be read"):
+            made_for_training(dataset.root, base_weights=str(path.parent))
+
+
 def test_pi05_weights_as_a_start(trained: Any, tmp_path: Path) -> None:
     """A file named as pi0.5's own, at tiny dimensions: everything but the memory comes from it."""
     from lerobot_memobench.policies.memobench_mem.network import MemoryPI05

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 import subprocess
 import sys
 from contextlib import nullcontext
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
@@ -225,6 +227,30 @@ def test_lerobot_train(words: list[str], prompts: bool, root: Path, tmp_path: Pa
 def test_an_unclear_choice_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["train", *WORDS, "prompt_frames=some"]) == 2
     assert "prompt_frames=some: expected true or false" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("word", ["steps=0", "steps=-1", "batch_size=0", "num_workers=-1", "eval.n_episodes=0"])
+@pytest.mark.parametrize("in_a_file", [False, True])
+def test_a_number_that_is_too_small_is_refused(
+    word: str, in_a_file: bool, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [*WORDS, f"dataset={root}", word]
+    if in_a_file:
+        key, _, value = word.rpartition("=")
+        content: Any = int(value)
+        for part in reversed(key.split(".")):
+            content = {part: content}
+        (tmp_path / "recipe.yaml").write_text(yaml.safe_dump({"policy": {"type": "act"}, **content}))
+        words = [f"config_path={tmp_path / 'recipe.yaml'}", f"dataset={root}"]
+    assert main(["train", *words, f"output_dir={tmp_path / 'run'}"]) == 2
+    assert f"lerobot: found {word}; expected at least " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("episodes", "named"), [([7], [7]), ([0, 3], [3]), ([], [])])
+def test_episodes_that_are_not_there_are_refused(root: Path, episodes: list[int], named: list[int]) -> None:
+    told = re.escape(f"found episodes={named}, and the dataset {root} has 3 episodes; name some of 0 to 2")
+    with pytest.raises(MemobenchError, match=told):
+        opened(root, act(), episodes=episodes)
 
 
 @pytest.mark.parametrize("resume", [["--resume=true"], ["--resume"], ["--resume=false"], []])

@@ -27,6 +27,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     MANIFEST_FILE,
     check_whole,
     image_key,
+    naming_damage,
     read_info,
     read_manifest,
     undamaged,
@@ -62,7 +63,7 @@ def describe(folder: Path, out: Path, say: Say = lambda _: None) -> list[Path]:
     """
     rows, hashes = _known(folder, say), folder / MANIFEST_FILE
     check_whole(folder)
-    with undamaged(folder):
+    with undamaged(folder), naming_damage(folder):
         card = own_card(folder, read_info(folder)["total_episodes"])
         tables = card_tables(card or card_from_frames(folder, rows))
         board = storyboard(folder, rows) if (folder / "videos").is_dir() else None

@@ -17,7 +17,14 @@ from numpy.typing import NDArray
 from lerobot_memobench.datasets.feature_cache.frames import FrameReader, frame_reader
 from lerobot_memobench.datasets.hdf5.reading import PublishedFile, Unusable, find_files, usable_or_named
 from lerobot_memobench.datasets.hdf5.restore import restore, task_of
-from lerobot_memobench.datasets.lerobot_format.layout import ADVICE, episode_count, image_key, is_dataset, read_info
+from lerobot_memobench.datasets.lerobot_format.layout import (
+    ADVICE,
+    check_whole,
+    episode_count,
+    image_key,
+    is_dataset,
+    read_info,
+)
 from lerobot_memobench.datasets.lerobot_format.reading import read_episode
 from lerobot_memobench.datasets.replay import Pictures, replay
 from lerobot_memobench.errors import MemobenchError
@@ -100,7 +107,8 @@ def validate(
         progress: called after each episode.
 
     Raises:
-        MemobenchError: there is nothing to check.
+        MemobenchError: there is nothing to check; or every episode agrees, and the dataset tells of others (see
+            `check_whole`).
     """
     folder = Path(folder).absolute()
     if workers < 1:
@@ -121,7 +129,10 @@ def validate(
             futures = {pool.submit(check.run): number for number, check in enumerate(checks)}
             for future in as_completed(futures):
                 note(futures[future], future.result())
-    return [verdicts[number] for number in range(len(checks))]
+    found = [verdicts[number] for number in range(len(checks))]
+    if is_dataset(folder) and not exit_status(found):
+        check_whole(folder)
+    return found
 
 
 def _pictures(folder: Path, episode: int) -> Pictures | None:

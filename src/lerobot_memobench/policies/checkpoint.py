@@ -5,11 +5,12 @@ from __future__ import annotations
 import copy
 import sys
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import file_name
+from lerobot_memobench.io import file_name, refusing
 from lerobot_memobench.io import read_json as read_json_file
 
 if TYPE_CHECKING:
@@ -276,13 +277,15 @@ def differing(
 
 def _shapes(file: Path) -> dict[str, tuple[int, ...]]:
     """Return the shape of every tensor in a file, of which only the head is read."""
-    from safetensors import SafetensorError, safe_open
+    from safetensors import safe_open
 
-    try:
-        with safe_open(file, framework="numpy") as tensors:
-            return {name: tuple(tensors.get_slice(name).get_shape()) for name in tensors.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise MemobenchError(f"{file} cannot be read ({error}); copy or train the checkpoint again") from None
+    with undamaged(file), safe_open(file, framework="numpy") as tensors:
+        return {name: tuple(tensors.get_slice(name).get_shape()) for name in tensors.keys()}  # noqa: SIM118
+
+
+def undamaged(file: Path) -> AbstractContextManager[None]:
+    """As `refusing`, for reading the tensors of a checkpoint's file."""
+    return refusing(lambda why: MemobenchError(f"{file} cannot be read ({why}); {ADVICE}"))
 
 
 def _built_empty(policy: PreTrainedConfig) -> Any | None:

@@ -26,6 +26,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS as INPUT
 from lerobot_memobench.envs.command_line import quiet
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, OBS_TYPES, PIXELS, reads_prompt
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.io import count_of
 from lerobot_memobench.jobs.processes import saying_how_to_go_on
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.lerobot_hooks import OPEN_DATASETS, check_version, install
@@ -47,6 +48,7 @@ from lerobot_memobench.run.arguments import (
     checked_value,
     is_true,
     read_arguments,
+    read_config_file,
     resolve_recipe,
     whole_number,
 )
@@ -62,6 +64,8 @@ They lie in main memory, where no loader would be quicker."""
 TRAIN_CONFIG = "train_config.json"
 """LeRobot's file of a training's whole configuration, in each of its checkpoints."""
 TRAINING_STEP = Path("training_state") / "training_step.json"
+LEAST = {"steps": 1, "batch_size": 1, "num_workers": 0, "eval.batch_size": 0, "eval.n_episodes": 1}
+"""Setting -> the smallest number with which LeRobot trains and evaluates."""
 TRAINED = ("policy.type", "policy.path", "reward_model.type", "reward_model.path")
 """What may say what is trained."""
 
@@ -120,7 +124,7 @@ def complete_training(arguments: LerobotArguments) -> LerobotArguments:
     """Return a training run's arguments with the benchmark's defaults; what is wrong with them is told here.
 
     Raises:
-        MemobenchError: no policy is named, or the dataset or the model checkpoint is none.
+        MemobenchError: no policy is named, a number is too small, or the dataset or the model checkpoint is none.
     """
     from_file = arguments.has(CONFIG_FILE)
     if not from_file:
@@ -130,12 +134,13 @@ def complete_training(arguments: LerobotArguments) -> LerobotArguments:
         named = arguments.has("policy.type") or arguments.has("policy.path")
         if named and not arguments.has("policy.repo_id"):  # LeRobot would ask for one
             arguments = arguments.default("policy.push_to_hub", False)
+    check_numbers(arguments)
     check_dataset(arguments)
     check_same_training(arguments)
     policy = policy_config(arguments)
     check_observations(policy, env_config(arguments))
     steps = whole_number(arguments.get("steps"))
-    if steps is not None and 0 <= steps < 2000 and arguments.get("resume") != "true":
+    if steps is not None and steps < 2000 and arguments.get("resume") != "true":
         # To see the loss of a short run: LeRobot's default is every 200 steps.
         arguments = arguments.default("log_freq", max(1, steps // 10))
     if not from_file and getattr(policy, "decodes_no_video", False):
@@ -143,6 +148,18 @@ def complete_training(arguments: LerobotArguments) -> LerobotArguments:
     if cores() < 4 and not from_file:  # LeRobot's default of 4 loaders would only wait for one another
         arguments = arguments.default("num_workers", cores())
     return arguments
+
+
+def check_numbers(arguments: LerobotArguments) -> None:
+    """Refuse numbers, of the line or else of the configuration file, that are smaller than `LEAST`."""
+    file = read_config_file(arguments.get(CONFIG_FILE))
+    for key, least in LEAST.items():
+        section, _, name = key.rpartition(".")
+        held = file.get(section) if section else file
+        text = arguments.get(key) or (str(held.get(name)) if isinstance(held, dict) else None)
+        number = whole_number(text)
+        if number is not None and number < least:
+            raise MemobenchError(f"found {key}={number}; expected at least {least}")
 
 
 def check_dataset(arguments: LerobotArguments) -> None:
@@ -423,6 +440,7 @@ def _steered(make: Callable[..., Any], prompt_frames: bool | None, obs_type: str
         if prompt_frames is not False:
             _check_streaming(config)
         check_transforms(config.policy, config.dataset.image_transforms.enable)
+        _check_episodes(config.dataset)
         train, held_out = make(config)
         if _reads_objects(config.policy, obs_type):
             for dataset in (train, held_out):
@@ -451,6 +469,27 @@ def _check_streaming(config: Any) -> None:
         raise MemobenchError(
             f"policy={config.policy.type} draws execution frames alone, and dataset.streaming=true leaves no choice of "
             "frames; use dataset.streaming=false, or prompt_frames=false to take execution frames as they come"
+        )
+
+
+def _check_episodes(dataset: Any) -> None:
+    """Refuse to train on episodes that a dataset does not have: LeRobot leaves them out, and fails where none is left.
+
+    Args:
+        dataset: LeRobot's configuration of it.
+    """
+    from lerobot.datasets import LeRobotDatasetMetadata
+
+    if dataset.episodes is None:
+        return
+    total = LeRobotDatasetMetadata(
+        dataset.repo_id, root=dataset.root, revision=dataset.revision, repo_type=dataset.repo_type
+    ).total_episodes
+    absent = [episode for episode in dataset.episodes if episode >= total]
+    if absent or not dataset.episodes:
+        raise MemobenchError(
+            f"found episodes={absent or dataset.episodes}, and the dataset {dataset.root or dataset.repo_id} has "
+            f"{count_of(total, 'episode')}; name some of 0 to {total - 1}, or leave episodes out for all"
         )
 
 

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
-from lerobot_memobench.datasets.lerobot_format.layout import undamaged
+from lerobot_memobench.datasets.lerobot_format.layout import naming_damage, undamaged
 from lerobot_memobench.errors import MemobenchError
 
 if TYPE_CHECKING:
@@ -173,14 +173,16 @@ def frame_reader(root: Path, camera: str) -> FrameReader:
     """Return the reader of a camera of the dataset in ``root``; it decodes what it is asked for in one sweep.
 
     Raises:
-        MemobenchError: the dataset has no such camera, or no pictures at all.
+        MemobenchError: the dataset has no such camera, or no pictures at all, or its metadata is damaged.
     """
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
-    meta = LeRobotDatasetMetadata(root.name, root=root)
+    with naming_damage(root):
+        meta = LeRobotDatasetMetadata(root.name, root=root)
     if not meta.camera_keys:
         raise MemobenchError(
-            f"{root} holds no pictures, so there is nothing to encode; perception=objects needs no cache"
+            f"{root} holds no pictures, which a detector and perception=pixels need; name a dataset with pictures, or "
+            "leave detector out at perception=objects"
         )
     if camera not in meta.camera_keys:
         raise MemobenchError(

@@ -24,6 +24,8 @@ DEFAULT_REPO_ID = "memobench/memobench"
 HDF5_FOLDER = "hdf5"
 MANIFEST_FILE = "manifest.json"
 INFO_FILE = Path("meta") / "info.json"
+STATS_FILE = Path("meta") / "stats.json"
+TASKS_FILE = Path("meta") / "tasks.parquet"
 TOP_LEVEL = (HDF5_FOLDER, "videos", "states", "data", "README.md", MANIFEST_FILE, "meta")
 """Moved into place in this order; with `meta` the folder becomes a dataset, without it the manifest is the last."""
 EPISODE_INFO = "episode_info"
@@ -362,6 +364,13 @@ def damaged_file(folder: Path) -> str | None:
     import av
     import pyarrow.parquet as pq
 
+    for name in (STATS_FILE, TASKS_FILE):
+        if not (folder / name).is_file():
+            return f"{folder / name} is missing; {ADVICE}"
+    try:
+        read_json(folder / STATS_FILE, dict[str, dict[str, Any]], ADVICE, nan=True)
+    except MemobenchError as error:
+        return str(error)
     tables = sorted([*folder.glob("data/**/*.parquet"), *folder.glob("meta/**/*.parquet")])
     for path in [*tables, *sorted(folder.glob("videos/**/*.mp4"))]:
         try:

@@ -24,6 +24,7 @@ from lerobot_memobench.policies.checkpoint import (
     checkpoint_file,
     read_json,
     statistics_shapes,
+    undamaged,
 )
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
@@ -60,9 +61,9 @@ def load_weights(policy: nn.Module, path: Path, source: str | Path, *, remembers
     """Load the weights of checkpoint ``source`` into a policy of this kind; its alignment heads may be missing.
 
     Raises:
-        MemobenchError: they do not fit, or bring no memory to a policy that ``remembers``.
+        MemobenchError: they cannot be read, do not fit, or bring no memory to a policy that ``remembers``.
     """
-    weights = load_file(path)
+    weights = read_tensors(path)
     if remembers and not any(name.startswith("model.memory.") for name in weights):
         raise MemobenchError(
             f"'{source}' holds weights without a memory; to start from pi0.5's weights pass "
@@ -87,9 +88,9 @@ def restore_average(average: WeightAverage, source: str | Path, revision: str | 
     path = checkpoint_file(source, TRAINING_FILE, revision)
     if path is None:
         return None
-    with safe_open(path, framework="pt") as file:
+    with undamaged(path), safe_open(path, framework="pt") as file:
         metadata = file.metadata()
-    new = average.restore(load_file(path), metadata)
+    new = average.restore(read_tensors(path), metadata)
     if new:
         logger.info("The average goes on from '%s'; that of %s begins anew.", source, ", ".join(new))
     return average
@@ -129,14 +130,24 @@ def require_statistics(source: str | Path, revision: str | None = None) -> None:
         )
 
 
+def read_tensors(path: Path) -> dict[str, Tensor]:
+    """Return all tensors of a file.
+
+    Raises:
+        MemobenchError: it is cut off or damaged.
+    """
+    with undamaged(path):
+        return load_file(path)
+
+
 def read_weights(source: str | Path, prefix: str = "") -> dict[str, Tensor]:
     """Weights of a checkpoint whose names start with ``prefix``, without a leading ``model.`` and the prefix.
 
     Raises:
-        MemobenchError: no weights there.
+        MemobenchError: no weights there, or they cannot be read.
     """
     path = weights_file(source, named=f"'{source}'", fix="give the folder or repository of a pi0.5 checkpoint")
-    with safe_open(path, framework="pt") as tensors:
+    with undamaged(path), safe_open(path, framework="pt") as tensors:
         found = {}
         for name in tensors.keys():  # noqa: SIM118 (not a dict)
             short = name.removeprefix("model.")

@@ -19,7 +19,7 @@ from lerobot.policies.common.vla_utils import pad_vector
 from lerobot.policies.pi05.modeling_pi05 import PI05Policy
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 from torch import Tensor, nn
 from transformers.initialization import no_init_weights
 
@@ -34,6 +34,7 @@ from lerobot_memobench.policies.memobench_mem.checkpoints import (
     load_base_weights,
     load_weights,
     read_config,
+    read_tensors,
     require_agreement,
     require_statistics,
     restore_average,
@@ -132,7 +133,7 @@ class MemobenchMemPolicy(PI05Policy):
         if config.base_weights and load_base:
             source = config.base_weights
             path = weights_file(source, named=f"--policy.base_weights='{source}'", fix="give a pi0.5 checkpoint")
-            load_base_weights(self.model, self._fix_pytorch_state_dict_keys(load_file(path), config), source)
+            load_base_weights(self.model, self._fix_pytorch_state_dict_keys(read_tensors(path), config), source)
         elif isinstance(self.perception, VisualTokenEncoder) and load_base:
             assert config.visual_encoder is not None
             self.perception.tower.load_state_dict(load_visual_encoder(config.visual_encoder).state_dict())
