@@ -19,6 +19,7 @@ from lerobot_memobench.run.arguments import (
     check_task_names,
     checked_value,
     flag_value,
+    read_arguments,
     recipe_file,
     recipes,
     split_arguments,
@@ -316,3 +317,20 @@ def test_what_must_have_a_value_is_not_nothing(key: str, annotation: type, text:
     with pytest.raises(MemobenchError, match=f"{key}={text}: expected"):
         checked_value(key, annotation, text)
     assert checked_value(key, annotation | None, text) == "null"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["env=memobench", "env.horizon.x=1"], "no setting 'env.horizon.x'"),
+        (["env=memobench", "policy=act", "policy.type.x=1"], "no setting 'policy.type.x'"),
+        (["env=memobench", "rename_map={"], "rename_map={: expected a mapping"),
+        (["env=memobench", "rename_map=a"], "rename_map=a: expected a mapping"),
+        (["env="], "env= is empty; expected a name"),
+        (["env=memobench", "eval=3"], "eval=3: eval holds settings; expected one of them, such as eval.n_episodes="),
+    ],
+)
+def test_sections_and_mappings_are_told(words: list[str], said: str) -> None:
+    with pytest.raises(MemobenchError) as error:
+        read_arguments("eval", split_arguments(words))
+    assert said in str(error.value)

@@ -304,7 +304,7 @@ def test_a_policy_of_another_package_is_known(tmp_path: Path, monkeypatch: pytes
     assert plan.policy is not None
     assert (plan.policy.type, plan.policy.spread) == ("mine_of_test", 0.5)
     assert not any("action=" in flag for flag in plan.portable_flags)
-    with pytest.raises(MemobenchError, match="policy.discover_packages_path=not_here"):
+    with pytest.raises(MemobenchError, match=r"policy\.discover_packages_path=not_here"):
         plan_line([*LINE[:3], "policy.discover_packages_path=not_here"])
 
 

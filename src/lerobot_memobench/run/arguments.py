@@ -341,7 +341,7 @@ def choice_flags(config: type, key: str, value: str) -> list[str]:
         MemobenchError: there is no such thing, with what is near.
     """
     if not value:
-        raise MemobenchError(f"{key}= is empty; name a {key}")
+        raise MemobenchError(f"{key}= is empty; expected a name")
     if key == DATASET:
         return dataset_flags(value)
     known = registries(config)[key]
@@ -549,7 +549,7 @@ def setting_type(known: Mapping[str, Any], key: str) -> Any:
     kind = without_none(known[owner])
     if is_choice_type(kind) and "." not in owner:
         raise MemobenchError(f"{key!r} needs {owner}=: name one before setting something of it")
-    if has_settings(kind):
+    if has_settings(kind) or kind in (*PLAIN, str) or is_literal(kind) or is_enum(kind):
         raise KeyError(key)
     return Any
 
@@ -575,6 +575,14 @@ def checked_value(key: str, annotation: Any, text: str) -> str:
     if has_settings(kind):
         names = [f"{key}.{name}" for name in field_types(kind)]
         raise MemobenchError(f"{key}={text[:80]}: {key} holds settings; expected one of them, such as {names[0]}=")
+    if typing.get_origin(kind) is dict:
+        try:
+            found = yaml.safe_load(text)
+        except yaml.YAMLError:
+            found = None
+        if not isinstance(found, dict):
+            raise MemobenchError(f'{key}={text[:80]}: expected a mapping, such as {key}=\'{{"name": "other"}}\'')
+        return text
     if is_literal(kind):
         known = named = [str(value) for value in typing.get_args(kind)]
     elif is_enum(kind):

@@ -22,6 +22,7 @@ from draccus.utils import is_enum, is_literal, is_union
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import CARD_FILE, read_card
+from lerobot_memobench.io import count_of
 from lerobot_memobench.policies.checkpoint import local_folder
 from lerobot_memobench.run.arguments import PLAIN, checked_value, chosen_class, flag_value, setting_type, without_none
 from lerobot_memobench.run.arguments import settings as settings_of
@@ -88,7 +89,7 @@ def repeat(
         return status
     problem = first_disagreement(card["episodes"], read_episodes(plan.log))
     if problem is None:
-        say(f"repeated: all {len(card['episodes'])} episodes agree with the card")
+        say(f"repeated: {count_of(len(card['episodes']), 'episode')}, as on the card")
         return 0
     say(f"not repeated: {problem}")
     return 1
