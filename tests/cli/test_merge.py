@@ -72,7 +72,7 @@ def test_a_card_is_repeated(fake_lerobot: Any, capsys: pytest.CaptureFixture[str
     assert lerobot([*COMMAND, "output_dir=out", "seed=9", "horizon=600"]) == 0
     first = [flag for flag in fake_lerobot.calls[0] if "out" not in flag]
     assert memobench(["rerun", "out/card.json", "--out", "again"]) == 0
-    assert "all 8 episodes agree" in capsys.readouterr().out
+    assert "repeated: 8 episodes, as on the card" in capsys.readouterr().out
     assert [flag for flag in fake_lerobot.calls[1] if "again" not in flag] == first
     assert memobench(["rerun", "out", "--out", "folder"]) == 0
     fake_lerobot.changed = {"steps": 5}

@@ -289,6 +289,12 @@ def test_of_a_setting_that_is_given_twice_the_last_counts() -> None:
     assert [flag for flag in plan.portable_flags if flag.startswith("--seed=")] == ["--seed=3"]
 
 
+@pytest.mark.parametrize("more", [[], ["shards=2", "output_dir=out"]])
+def test_a_batch_of_no_episodes_is_refused(more: list[str]) -> None:
+    with pytest.raises(MemobenchError, match="found batch_size=-1; expected how many episodes run at once"):
+        plan_line([*LINE, "batch_size=-1", *more])
+
+
 def test_a_policy_of_another_package_is_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "mine_of_test").mkdir()
     (tmp_path / "mine_of_test" / "__init__.py").write_text(

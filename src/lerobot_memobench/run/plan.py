@@ -252,7 +252,13 @@ def with_batch_size(arguments: LerobotArguments, options: RunOptions, log: Path,
     number of the earlier run: what a policy samples may depend on it. Parts run one at a time: by cores, each machine
     would cut the evaluation differently.
     """
-    if (arguments.get("eval.batch_size") or "0") != "0":
+    given = whole_number(arguments.get("eval.batch_size")) or 0
+    if given < 0:
+        raise MemobenchError(
+            f"found batch_size={given}; expected how many episodes run at once, at least 1, or 0 for as many as suit "
+            "the machine"
+        )
+    if given:
         return arguments
     earlier = earlier_batch_size(log) if options.resume else None
     if earlier is not None:

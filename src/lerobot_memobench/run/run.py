@@ -79,11 +79,6 @@ def run_evaluation(plan: EvaluationPlan, tell: Tell, begin: Tell = lambda text: 
         MemobenchError: the batch is none, the folder holds another evaluation, or weights are missing. Whatever
             LeRobot raises.
     """
-    if plan.batch < 1:
-        raise MemobenchError(
-            f"found batch_size={plan.batch}; expected how many episodes run at once, at least 1, or 0 for as many as "
-            "suit the machine"
-        )
     if plan.policy is not None and plan.policy_path is not None:
         check_weights(plan.policy_path, plan.policy)
     if not plan.options.resume:
