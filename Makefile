@@ -1,6 +1,6 @@
 # The verbs a newcomer needs. Each one sets up first whatever is missing.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check lock
+.PHONY: help setup demo test check docs lock
 
 PYTHON := .venv/bin/python
 ARGS ?=
@@ -25,6 +25,10 @@ check: ## lint, formatting, types and declared dependencies
 	@.venv/bin/ruff format --check .
 	@.venv/bin/mypy
 	@.venv/bin/deptry src research
+
+docs: ## build the documentation site into outputs/site; links that lead nowhere fail (ARGS="serve" to look at it)
+	@scripts/setup
+	@$(PYTHON) -m mkdocs $(or $(ARGS),build --strict)
 
 lock: ## resolve pyproject.toml again into requirements.lock
 	@scripts/setup

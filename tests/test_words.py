@@ -1,4 +1,4 @@
-"""Public names are the field's terms (docs/glossary.md): words that were once our own do not come back."""
+"""Public names are the field's terms (docs/benchmark/glossary.md): words that were once our own do not come back."""
 
 from __future__ import annotations
 

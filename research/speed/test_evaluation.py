@@ -67,7 +67,7 @@ def test_a_total_counts_what_is_before_the_first_step_and_each_step(monkeypatch:
 
 def test_the_documented_benchmarks_are_there() -> None:
     folder = Path(__file__).parents[2]
-    text = (folder / "docs/evaluate.md").read_text()
+    text = (folder / "docs/guides/evaluate.md").read_text()
     assert "python -m research.speed eval_loop" in text
     assert "eval_loop" in BENCHMARKS
     assert "benchmarks/rollouts_total.py" in text

@@ -34,8 +34,8 @@ def unsupported_system() -> str:
     name = SYSTEMS.get(sys.platform, sys.platform)
     place = "WSL2" if name == "Windows" else "a Linux machine, virtual machine or container"
     return (
-        f"{name} cannot run the simulator, which draws with EGL or OSMesa on Linux: use {place}; docs/install.md says "
-        "what works without"
+        f"{name} cannot run the simulator, which draws with EGL or OSMesa on Linux: use {place}; "
+        "docs/start/install.md says what works without"
     )
 
 

@@ -444,8 +444,8 @@ def test_size_and_time_are_told_before_the_first_episode(tasks, recorded, tmp_pa
 
 
 def test_the_estimates_are_those_of_the_full_runs():
-    """docs/full_run, with_images and strict_run: the tables of the runs themselves."""
-    docs = Path(__file__).parents[2] / "docs"
+    """docs/research/full_run, with_images and strict_run: the tables of the runs themselves."""
+    docs = Path(__file__).parents[2] / "docs" / "research"
     for suite, run_of in (("published", "full_run"), ("strict", "strict_run")):
         text = (docs / run_of / "tables.md").read_text()
         for kind, frames in generation.FRAMES[suite].items():

@@ -41,7 +41,7 @@ BUTTER = "put_the_butter_into_the_bowl_from_the_prompt_video"
 HIDDEN = "find_the_tomato_hidden_in_one_of_the_drawers"
 COUNTING = "turn_the_stove_on_and_off_a_given_number_of_times"
 SEED = 10_000
-DOCS = Path(__file__).resolve().parents[2] / "docs"
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "research"
 FULL_RUNS = {"published": DOCS / "full_run" / "manifest.json", "strict": DOCS / "strict_run" / "manifest.json"}
 """Hashes of 1,500 demonstrations, as ``memobench describe`` wrote them."""
 

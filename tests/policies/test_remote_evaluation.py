@@ -73,7 +73,7 @@ def test_a_killed_server_that_is_started_again(tmp_path: Path) -> None:
 
 
 def test_the_server_in_the_docs_serves() -> None:
-    text = (Path(__file__).parents[2] / "docs" / "remote.md").read_text()
+    text = (Path(__file__).parents[2] / "docs" / "guides" / "remote.md").read_text()
     (program,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     port = free_port()
     server = subprocess.Popen([sys.executable, "-c", program.replace("8000", str(port))])

@@ -56,7 +56,7 @@ FRAMES = {
     "published": {"temporal": 390, "spatial": 570, "object": 320, "procedural": 730},
     "strict": {"temporal": 530, "spatial": 860, "object": 330, "procedural": 750},
 }
-"""Frames of a demonstration, prompt included, on average over the full runs (docs/demonstrations.md)."""
+"""Frames of a demonstration, prompt included, on average over the full runs (docs/research/demonstration_runs.md)."""
 FRAME_BYTES, PICTURES_BYTES, HDF5_BYTES = 800, 5_400, 130_000
 """Of a frame in a LeRobotDataset without pictures; of both cameras' videos and of lossless pictures, at 256 × 256."""
 FRAME_SECONDS, PICTURES_SECONDS = 0.0045, 0.011

@@ -93,7 +93,7 @@ class EpisodeRecord(Outcome):
 
 
 def episode_record(episode: Episode, seed_base: int, replan_steps: int | None, wall_s: float) -> dict[str, Any]:
-    """Return an episode's line for the log (`docs/evaluate.md` tells its fields).
+    """Return an episode's line for the log (the site's reference lists its fields).
 
     Args:
         seed_base: the seed that counts as episode 0.

@@ -1,8 +1,8 @@
 """Formulas of goals and checkpoints: trees of atoms under operators, the published four and the strict suite's five.
 
 What an atom means is the world's business; what operators and latches (``wasopen``, ``wasturnedon``) mean over time
-is `tasks.nodes`'s (the table is in ``docs/formulas.md``). Here stand the words of the language; formulas are made,
-checked, from words or from JSON, walked through and written.
+is `tasks.nodes`'s (the table is in ``docs/benchmark/formulas.md``). Here stand the words of the language; formulas are
+made, checked, from words or from JSON, walked through and written.
 """
 
 from __future__ import annotations

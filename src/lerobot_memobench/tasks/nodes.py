@@ -1,6 +1,6 @@
 """Operators over time: one node per place in a formula's tree, with what it remembers of earlier steps.
 
-``docs/formulas.md`` has the same on one page.
+``docs/benchmark/formulas.md`` has the same on one page.
 """
 
 from __future__ import annotations

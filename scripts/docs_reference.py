@@ -1,0 +1,579 @@
+"""The pages of the site that are made from the code, and links that leave ``docs``: a hook of MkDocs (`mkdocs.yml`).
+
+Nothing of it is kept in git. ``python scripts/docs_reference.py FOLDER`` writes the pages down for a look.
+
+Cheap: no simulator is opened. Configurations are read from their source, so torch is not imported.
+"""
+
+from __future__ import annotations
+
+import ast
+import html
+import io
+import re
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, get_args, get_origin, get_type_hints, is_typeddict
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCE = ROOT / "src" / "lerobot_memobench"
+DOCS = ROOT / "docs"
+NECESSITY = {
+    "published": DOCS / "research" / "memory_necessity.md",
+    "strict": DOCS / "research" / "strict_suite.md",
+}
+"""Notes whose tables say what a policy without a memory reaches."""
+SHEET = DOCS / "figures" / "tasks.png"
+"""Initial scenes of the published tasks, by number: six in a row."""
+SHEET_ORIGIN, SHEET_STEP, SHEET_SIDE, SHEET_COLUMNS = 6, (262, 308), 256, 6
+
+COPIES = {
+    "CHANGELOG.md": "changelog.md",
+    "CONTRIBUTING.md": "develop/contributing.md",
+    "research/README.md": "develop/lab.md",
+    "src/lerobot_memobench/policies/shipped/memobench_small/README.md": "research/cards/memobench_small.md",
+    "src/lerobot_memobench/policies/shipped/memobench_small_memoryless/README.md": (
+        "research/cards/memobench_small_memoryless.md"
+    ),
+}
+"""Pages that lie elsewhere in the repository -> where the site has them."""
+
+PUBLIC = {
+    "Tasks": ("tasks.catalogue", "get_task load_task resolve_tasks task_names find_tasks"),
+    "Task": ("tasks.task", "Task Checkpoint Prompt Variant"),
+    "Formulas": ("tasks.formula", ""),
+    "Environment": ("envs.memobench_env", "MemobenchEnv"),
+    "Environment configuration": ("envs.configuration_memobench", "MemobenchEnvConfig"),
+    "Observations": ("envs.observations", "observation_space action_space policy_features policy_inputs reads_prompt"),
+    "Episode log": ("envs.episode_log", "read_episodes EpisodeRecord CheckpointRecord"),
+    "Metrics": ("evaluation.metrics", "Rate Summary summarise report_values wilson"),
+    "Comparison": ("evaluation.comparison", "Comparison Difference compare"),
+    "Datasets": ("datasets.lerobot_format.reading", "episodes_where list_episodes read_episode RecordedEpisode"),
+    "Memory mechanisms": ("policies.memobench_mem.memory.mechanism", "MemoryMechanism"),
+    "Errors": ("errors", "MemobenchError"),
+    "Constants": ("protocol", ""),
+}
+"""Public modules and what of them is shown; "" for everything."""
+
+
+# --- parts of pages ---
+
+
+def cell(text: object) -> str:
+    """Return text as it may stand in a table's cell: one line, its bars and angles escaped."""
+    line = " ".join(str(text).split()).replace("|", "\\|")
+    return re.sub(r"(`[^`]*`)|<", lambda found: found[1] or "&lt;", line)
+
+
+def table(head: list[str], rows: list[list[str]]) -> str:
+    """Return a table in Markdown."""
+    lines = [head, ["---"] * len(head), *([cell(value) for value in row] for row in rows)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def code(text: object) -> str:
+    """Return text as code, "" for none."""
+    return f"`{text}`" if str(text) else ""
+
+
+def plain(docstring: str | None) -> str:
+    """Return a docstring's words in Markdown: double backquotes are single ones there."""
+    return " ".join((docstring or "").replace("``", "`").split())
+
+
+# --- commands ---
+
+
+def short_forms(command: str) -> list[list[str]]:
+    """Return the rows of ``lerobot <command> --help``: short form, what it sets, default."""
+    text = (SOURCE / "cli" / f"lerobot_{command}.txt").read_text()
+    rows = []
+    for typed, lines in re.findall(r"^  (\S.*)\n((?: {8}.*\n)+)", text, re.MULTILINE):
+        words, default = re.fullmatch(r"(.*?)(?: \(default: (.*)\))?", " ".join(lines.split())).groups("")
+        rows.append([typed, words, default])
+    return rows
+
+
+def lerobot_page() -> str:
+    """Return the page of `lerobot eval` and `lerobot train`."""
+    parts = [
+        "# lerobot eval, lerobot train",
+        "Short forms of LeRobot's own flags. Any other setting goes by LeRobot's full name, as `key=value` or "
+        "`--key=value`: `env.render=fast`, `policy.num_inference_steps=5`. An unknown name is refused with the nearest "
+        "known one before anything starts.",
+    ]
+    for command, example in (
+        ("eval", "lerobot eval env=memobench policy=CHECKPOINT tasks=object episodes=10"),
+        ("train", "lerobot train policy=memobench_mem align=contrastive dataset=FOLDER"),
+    ):
+        rows = [
+            [" ".join(code(word.strip(",")) for word in typed.split()), html.escape(words, quote=False), default]
+            for typed, words, default in short_forms(command)
+        ]
+        parts += [f"## lerobot {command}", f"```text\n{example}\n```", table(["short form", "sets", "default"], rows)]
+    fields = [[code(f"env.{name}"), code(default), says] for name, default, says in environment_fields()]
+    parts += ["## Environment settings", table(["setting", "default", "meaning"], fields)]
+    return "\n\n".join(parts) + "\n"
+
+
+def environment_fields() -> Iterator[tuple[str, str, str]]:
+    """Yield name, default and meaning of the environment's settings, from its class's docstring."""
+    tree = class_of(SOURCE / "envs" / "configuration_memobench.py", "MemobenchEnvConfig")
+    says = arguments(ast.get_docstring(tree) or "")
+    for node in tree.body:
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.target.id in says:
+            yield node.target.id, ast.unparse(node.value) if node.value else "", says[node.target.id]
+
+
+def arguments(docstring: str) -> dict[str, str]:
+    """Return name -> meaning of a docstring's ``Args`` or ``Attributes``; names that share a line share a meaning."""
+    found: dict[str, str] = {}
+    block = re.search(r"^(?:Args|Attributes):\n((?:    .*\n?|\n)+)", docstring, re.MULTILINE)
+    for names, says in re.findall(r"^ {4}([\w, ]+): ((?:.|\n(?! {4}\w[\w, ]*: ))*)", block[1] if block else "", re.MULTILINE):
+        found |= dict.fromkeys((name.strip() for name in names.split(",")), plain(says))
+    return found
+
+
+def memobench_page() -> str:
+    """Return the page of `memobench`, from its own help."""
+    import typer
+
+    from lerobot_memobench.cli import memobench
+
+    root: Any = typer.main.get_command(memobench.app)
+    parts = ["# memobench", "```text\nmemobench COMMAND --help\n```"]
+    group = None
+    for name, command in root.commands.items():
+        if command.hidden:
+            continue
+        if command.rich_help_panel != group:
+            group = command.rich_help_panel
+            parts.append(f"## {group}")
+        parts += command_parts(f"memobench {name}", command)
+    return "\n\n".join(parts) + "\n"
+
+
+def command_parts(path: str, command: Any) -> Iterator[str]:
+    """Yield heading, help and options of a command, then of the commands below it."""
+    yield f"### {path}"
+    yield plain(command.help)
+    rows = []
+    for part in command.params:
+        if part.name == "help" or getattr(part, "hidden", False):
+            continue
+        names = " ".join(code(name) for name in (*part.opts, *part.secondary_opts)) if option(part) else code(part.name)
+        default = part.default
+        shown = "" if default is None or default is False or callable(default) else code(default)
+        rows.append([names, plain(getattr(part, "help", "")), "required" if part.required else shown])
+    if rows:
+        yield table(["argument or option", "meaning", "default"], rows)
+    for name, below in getattr(command, "commands", {}).items():
+        yield from command_parts(f"{path} {name}", below)
+
+
+def option(part: Any) -> bool:
+    """Whether a parameter of a command is an option, not an argument."""
+    return bool(part.opts[0].startswith("-"))
+
+
+# --- what is observed and written ---
+
+
+def spaces_page() -> str:
+    """Return the page of observation and action spaces."""
+    from lerobot_memobench import protocol
+    from lerobot_memobench.datasets.lerobot_format.layout import ACTION_NAMES, PROPRIO_NAMES
+    from lerobot_memobench.envs import observations
+    from lerobot_memobench.sim.object_layout import FIELDS, SIZE, SLOTS, STARTS
+
+    space = observations.observation_space(True, 2, observations.BOTH, True)
+    units = {
+        "agent_pos": "end-effector position 3 (m), axis-angle 3 (rad), fingers 2 (m)",
+        "phase": "0 demonstration prompt, 1 execution",
+        "step": "control steps since the phase began",
+        "pixels/image": "third-person camera, RGB, upright",
+        "pixels/wrist_image": "wrist camera, RGB, upright",
+        "picture_step": "step that the pictures show; with `env.render_every` above 1",
+        "environment_state": f"{SLOTS} object slots, see below; with `obs_type=environment_state_agent_pos` or `both`",
+        "expert_action": "action of the scripted expert; with `env.expert_action=true`",
+        "blind_action": "action of the published routine; with `env.blind_action=true`",
+    }
+    at_policy = observations.policy_names(observations.BOTH)
+    rows = []
+    for name, part in flat(space):
+        there = at_policy.get(name, f"observation.{name}")
+        rows.append([code(name), code(there), str(part.shape), str(part.dtype), units[name]])
+    slots = {
+        "present": "1; 0 for an empty slot, all zeros",
+        "class": "index of the class, `memobench objects` lists them",
+        "position": "origin in the world, m",
+        "rotation": "first two columns of the rotation matrix",
+        "joint": "drawer m, door and knob rad, else 0",
+        "highlighted": "1 while it stands in the prompt's highlight",
+    }
+    bounds = {name: "m, ±1 is ±0.05" for name in "xyz"} | {"gripper": "−1 opens, +1 closes"}
+    parts = [
+        "# Observation and action spaces",
+        f"{protocol.CONTROL_HZ} control steps per second. Horizon {protocol.HORIZON:,} execution steps.",
+        "## Observations",
+        table(["environment", "policy", "shape", "type", "content"], rows),
+        "The instruction is text, `task`.",
+        "### State",
+        table(["index", "name"], [[str(k), code(name)] for k, name in enumerate(PROPRIO_NAMES)]),
+        "### Object slots",
+        f"`observation.environment_state` holds {SLOTS} slots, {SIZE} numbers in all. Slots are in the order of class and "
+        "place. They hold what a camera could show at this step: no identity, no goal, no history.",
+        table(
+            ["field", "starts at", "numbers", "content"],
+            [[code(name), str(STARTS[name]), str(size), slots[name]] for name, size in FIELDS.items()],
+        ),
+        "## Actions",
+        f"Shape ({protocol.ACTION_DIM},), float32, each in [−1, 1]: a pose delta of the end effector and the gripper.",
+        table(
+            ["index", "name", "unit"],
+            [[str(k), code(name), bounds.get(name, "rad, ±1 is ±0.5")] for k, name in enumerate(ACTION_NAMES)],
+        ),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def flat(space: Any, above: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield name and space of every leaf of a dictionary of spaces."""
+    for name, part in space.items():
+        if hasattr(part, "spaces"):
+            yield from flat(part, f"{above}{name}/")
+        else:
+            yield above + name, part
+
+
+def dataset_page() -> str:
+    """Return the page of a dataset's columns."""
+    from lerobot_memobench.datasets.lerobot_format.card import COLUMNS, EPISODE_COLUMNS
+    from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS, dataset_features
+    from lerobot_memobench.protocol import IMAGE_SIZE
+
+    features = dataset_features((IMAGE_SIZE, IMAGE_SIZE))
+    features |= {OBJECTS: dataset_features(None)[OBJECTS]}
+    rows = [
+        [code(name), f"{one['dtype']} {tuple(one['shape'])}", COLUMNS[name]]
+        for name, one in features.items()
+        if name in COLUMNS
+    ]
+    parts = [
+        "# Dataset columns",
+        "`memobench generate` writes a LeRobotDataset v3.0.",
+        "## Frames",
+        table(["column", "type", "meaning"], rows),
+        "LeRobot's own columns are there too: `task`, `timestamp`, `frame_index`, `episode_index`, `index`, `task_index`.",
+        "## Episodes",
+        "In `meta/episodes`, and as JSON in `episode_info` of an episode's first frame.",
+        table(["column", "meaning"], [[code(name), says] for name, says in EPISODE_COLUMNS.items()]),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def schemas_page() -> str:
+    """Return the page of log, protocol and card, from the types by which they are read."""
+    from lerobot_memobench.envs import episode_log
+    from lerobot_memobench.evaluation import records
+
+    wanted = [
+        ("episodes.jsonl: one line per rollout", episode_log.EpisodeRecord),
+        ("Checkpoints of a line", episode_log.CheckpointRecord),
+        ("protocol.json", episode_log.WholeProtocol),
+        ("card.json", records.WholeCard),
+        ("Policy of a card", records.Policy),
+        ("Checkpoint of a card", records.Checkpoint),
+        ("One start", records.Start),
+        ("Episodes of a card", records.CardEpisode),
+    ]
+    parts = [
+        "# Log and card schemas",
+        "Files are checked against these types where they are read. Unknown fields pass. `null` is allowed where the type "
+        "says `None`.",
+        table(["field", "meaning"], [[code(name), says] for name, says in LOG_FIELDS.items()]),
+    ]
+    for heading, kind in wanted:
+        parts += [f"## {heading}", plain(kind.__doc__), table(["field", "type", "required"], typed_rows(kind))]
+    return "\n\n".join(parts) + "\n"
+
+
+LOG_FIELDS = {
+    "task, memory_type": "name in the catalogue; temporal, spatial, object or procedural",
+    "episode, seed": "number of the episode and seed of its scene: seed base + episode",
+    "referent, variant": "fixed, random or drawn; which admissible referent or order, 0 is the published one",
+    "replan_steps": "actions executed per prediction, where known",
+    "prompt_steps, prompt_shown": "control steps of the demonstration prompt; whether it showed what it had to",
+    "steps": "execution steps",
+    "success": "the goal held at the end",
+    "checkpoints": "per memory checkpoint its operation, `first_step` (first execution step at which it held) and "
+    "`ordered_step` (at which it held with all earlier ones complete)",
+    "failure": "class of the failure; null for a success",
+    "suite, lost": "of strict tasks: the suite; the goal could no longer be reached",
+    "fault": "why an episode was broken off: an invalid action, unstable physics",
+    "not_run": "why an episode could not be run: it is no rollout, and in no figure",
+    "scene_hash": "hash of the initial scene",
+    "policy, run, inputs": "type and hash of the policy; one start of an evaluation; what the policy was given",
+    "wall_s": "seconds that the episode took",
+}
+
+
+def typed_rows(kind: Any) -> list[list[str]]:
+    """Return name, type and whether it is required of each field of a `TypedDict`."""
+    hints = get_type_hints(kind, include_extras=False)
+    return [[code(name), code(type_name(hint)), "yes" if name in kind.__required_keys__ else ""] for name, hint in hints.items()]
+
+
+def type_name(hint: Any) -> str:
+    """Return a type as it is written, without modules and bounds."""
+    if hint is type(None):
+        return "None"
+    if is_typeddict(hint) or (isinstance(hint, type) and not get_args(hint)):
+        return hint.__name__
+    if get_origin(hint) is not None and str(get_origin(hint)) in ("typing.Literal",):
+        return " or ".join(repr(value) for value in get_args(hint))
+    if get_args(hint):
+        origin = getattr(get_origin(hint), "__name__", "")
+        inner = [type_name(part) for part in get_args(hint)]
+        return " or ".join(inner) if origin in ("Union", "UnionType", "Optional") else f"{origin}[{', '.join(inner)}]"
+    return str(hint).replace("typing.", "")
+
+
+# --- configurations ---
+
+
+def class_of(path: Path, name: str) -> ast.ClassDef:
+    """Return the source of a class."""
+    tree = ast.parse(path.read_text())
+    return next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name)
+
+
+def fields(tree: ast.ClassDef) -> Iterator[tuple[str, str, str, str]]:
+    """Yield name, type, default and the string behind it of a dataclass's fields."""
+    says = arguments(ast.get_docstring(tree) or "")
+    for node, after in zip(tree.body, [*tree.body[1:], None], strict=True):
+        if not (isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)) or "ClassVar" in ast.unparse(node):
+            continue
+        text = after.value.value if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) else ""
+        default = "" if node.value is None else ast.unparse(node.value)
+        found = re.fullmatch(r"field\(default_factory=(.*)\)", default)
+        default = {"FROM_SIZE": "by size", "dict": "{}", "tuple": "()", "list": "[]"}.get(found[1] if found else default, default)
+        yield node.target.id, ast.unparse(node.annotation), default.strip("'\""), plain(text) or says.get(node.target.id, "")
+
+
+POLICIES = {
+    "memobench_mem": ("policies/memobench_mem/configuration_memobench_mem.py", "MemobenchMemConfig"),
+    "remote": ("policies/remote/configuration_remote.py", "RemoteConfig"),
+}
+
+
+def policies_page() -> str:
+    """Return the page of policy configurations, from their source."""
+    parts = [
+        "# Policy configuration",
+        "As `policy.<field>=` of `lerobot eval` and `lerobot train`. `memobench_mem` has LeRobot's fields of `pi05` beside "
+        "these. *by size*: the value follows from `policy.size` and `policy.perception`.",
+    ]
+    for name, (path, kind) in POLICIES.items():
+        if not (SOURCE / path).is_file():
+            path, kind = found_configuration(SOURCE / Path(path).parent)
+        tree = class_of(SOURCE / path, kind)
+        rows = [[code(one), code(hint), code(default), says] for one, hint, default, says in fields(tree)]
+        parts += [f"## {name}", plain((ast.get_docstring(tree) or "").split("\n\n")[0]), table(["field", "type", "default", "meaning"], rows)]
+    return "\n\n".join(parts) + "\n"
+
+
+def found_configuration(folder: Path) -> tuple[str, str]:
+    """Return file and class of the configuration that is registered in a folder."""
+    for path in sorted(folder.glob("configuration_*.py")):
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.ClassDef) and any("register_subclass" in ast.unparse(one) for one in node.decorator_list):
+                return str(path.relative_to(SOURCE)), node.name
+    raise FileNotFoundError(f"{folder} holds no configuration")
+
+
+def python_page() -> str:
+    """Return the page of the Python API: mkdocstrings fills it in."""
+    parts = ["# Python API", "Public modules. Everything else may change from one version to the next."]
+    for heading, (module, names) in PUBLIC.items():
+        parts.append(f"## {heading}")
+        parts += [f"::: lerobot_memobench.{module}.{name}" for name in names.split()] or [f"::: lerobot_memobench.{module}"]
+    return "\n\n".join(parts) + "\n"
+
+
+# --- tasks ---
+
+
+def needs(suite: str) -> dict[str, dict[str, tuple[str, str]]]:
+    """Return task -> referent -> (best rate found without a memory in %, verdict), from the note's table."""
+    found: dict[str, dict[str, tuple[str, str]]] = {}
+    for line in NECESSITY[suite].read_text().splitlines():
+        row = [part.strip() for part in line.strip("| ").split(" | ")]
+        if len(row) == 13 and (name := re.fullmatch(r"\w+: `([^`]+)`", row[0])):
+            rates = [float(text.split()[0]) for text in (row[6], row[9], row[10]) if text != "–"]
+            found.setdefault(name[1], {})[row[1]] = (f"{max(rates):.0f} %", row[12])
+    return found
+
+
+VERDICTS = {
+    "no": "no: the picture decides every step",
+    "order": "no: the picture decides another order that the goal accepts",
+    "yes": "yes: no policy from pictures alone was found",
+}
+OPERATIONS = {"S": "Storage", "U": "Update", "C": "Compression"}
+PROMPTS = {
+    "routine": "the routine is carried out",
+    "pick": "the referent is picked up",
+    "point": "the referent is pointed at",
+    "highlight": "the referent's place is highlighted",
+    "hide": "objects are hidden in drawers",
+}
+
+
+def tasks_page(suite: str) -> str:
+    """Return the cards of a suite's tasks."""
+    from lerobot_memobench.tasks.catalogue import get_task, task_names
+
+    known = needs(suite)
+    title = {"published": "Published tasks", "strict": "Strict tasks"}[suite]
+    parts = [
+        f"# {title}",
+        "A card per task, made from its files. *Without a memory* is the best rate that was found for a policy that "
+        f"decides from pictures alone ([how]({'../research/memory_necessity.md'})): a lower bound. The hand's pose and a "
+        "clock may tell more.",
+    ]
+    kind = None
+    for number, name in enumerate(task_names(suite=suite), 1):
+        task = get_task(name)
+        if task.memory_type != kind:
+            kind = task.memory_type
+            parts.append(f"## {kind.capitalize()}")
+        parts += task_parts(number, task, known.get(name, {}))
+    return "\n\n".join(parts) + "\n"
+
+
+def task_parts(number: int, task: Any, known: dict[str, tuple[str, str]]) -> Iterator[str]:
+    """Yield one task's card."""
+    yield f"### {number}. {task.language.capitalize()} {{ #{slug(task.name)} }}"
+    yield f"`{task.name}`"
+    if task.suite == "published":
+        yield f"![Initial scene of task {number}](../figures/tasks/{number:02}.png){{ width=256 loading=lazy }}"
+    rows = [
+        ["memory type, family", f"{task.memory_type}, {task.family.replace('_', ' ')}"],
+        ["demonstration prompt", PROMPTS[task.prompt.kind] if task.prompt else "none"],
+        ["objects", ", ".join(sorted(set(task.objects.values())))],
+        ["fixtures", ", ".join(sorted(set(task.fixtures.values()) - {"kitchen_table"})) or "table only"],
+        ["admissible goals", str(task.variant_count if hasattr(task, "variant_count") else len(task.variants) + 1)],
+    ]
+    if task.derived_from:
+        rows.append(["in the scene of", f"[`{task.derived_from}`](tasks_published.md#{slug(task.derived_from)})"])
+    for referent, (rate, verdict) in known.items():
+        where = "" if referent in ("both", "drawn") else f", referent {referent}"
+        rows += [
+            [f"needs a memory{where}", VERDICTS.get(verdict, verdict)],
+            [f"without a memory{where}", rate],
+        ]
+    yield table(["", ""], rows)
+    yield table(
+        ["checkpoint", "operation", "text (intermediate)"],
+        [[str(k), OPERATIONS[one.operation], one.language[1]] for k, one in enumerate(task.checkpoints, 1)],
+    )
+
+
+def slug(name: str) -> str:
+    """Return a task's name as an anchor."""
+    return name.replace(",", "")
+
+
+def scene(number: int) -> bytes:
+    """Return the picture of a published task's initial scene, cut out of the sheet of all."""
+    from PIL import Image
+
+    row, column = divmod(number - 1, SHEET_COLUMNS)
+    left, top = SHEET_ORIGIN + SHEET_STEP[0] * column, SHEET_ORIGIN + SHEET_STEP[1] * row
+    kept = io.BytesIO()
+    with Image.open(SHEET) as sheet:
+        sheet.crop((left, top, left + SHEET_SIDE, top + SHEET_SIDE)).save(kept, "PNG")
+    return kept.getvalue()
+
+
+# --- the site ---
+
+PAGES: dict[str, Callable[[], str]] = {
+    "reference/lerobot.md": lerobot_page,
+    "reference/memobench.md": memobench_page,
+    "reference/spaces.md": spaces_page,
+    "reference/dataset.md": dataset_page,
+    "reference/schemas.md": schemas_page,
+    "reference/policies.md": policies_page,
+    "reference/python.md": python_page,
+    "benchmark/tasks_published.md": lambda: tasks_page("published"),
+    "benchmark/tasks_strict.md": lambda: tasks_page("strict"),
+}
+"""Page of the site -> what makes it."""
+
+
+def copy_of(source: str) -> str:
+    """Return a page that lies elsewhere in the repository, its links as they are from its place in the site."""
+    import posixpath
+
+    def moved(found: re.Match[str]) -> str:
+        path, mark, anchor = found[1].partition("#")
+        if not path or ":" in path:
+            return found[0]
+        target = posixpath.normpath(posixpath.join(posixpath.dirname(source), path))
+        return f"]({posixpath.relpath(target, posixpath.dirname('docs/' + COPIES[source]))}{mark}{anchor})"
+
+    text = re.sub(r"\A---\n.*?\n---\n", "", (ROOT / source).read_text(), flags=re.DOTALL)
+    return re.sub(r"\]\(([^()\s]+)\)", moved, text)
+
+
+def at_home(markdown: str, page: str) -> str:
+    """Return a page's Markdown with links that leave ``docs`` turned: to the site's copy, or to the path as code."""
+    import posixpath
+
+    def turned(found: re.Match[str]) -> str:
+        text, link = found[1], found[2]
+        path, mark, anchor = link.partition("#")
+        if not path or re.match(r"[a-z]+:", path):
+            return found[0]
+        target = posixpath.normpath(posixpath.join(posixpath.dirname("docs/" + page), path))
+        if target.startswith("docs/"):
+            return found[0]
+        if target in COPIES:
+            return f"[{text}]({posixpath.relpath(COPIES[target], posixpath.dirname(page) or '.')}{mark}{anchor})"
+        return text if text.strip("`") == target else f"{text} (`{target}`)"
+
+    return re.sub(r"(?<!!)\[([^\[\]]*(?:\[[^\[\]]*\][^\[\]]*)*)\]\(([^()\s]+)\)", turned, markdown)
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """Add the pages that are made (MkDocs calls this)."""
+    from mkdocs.structure.files import File
+
+    sys.path.insert(0, str(ROOT / "src"))
+    for path, make in PAGES.items():
+        files.append(File.generated(config, path, content=make()))
+    for source, path in COPIES.items():
+        files.append(File.generated(config, path, content=copy_of(source)))
+    for number in range(1, 31):
+        files.append(File.generated(config, f"figures/tasks/{number:02}.png", content=scene(number)))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Turn the links of a page that leave the site (MkDocs calls this)."""
+    return at_home(markdown, page.file.src_uri)
+
+
+def main() -> None:
+    """Write the pages that are made into the folder that is named."""
+    out = Path(sys.argv[1])
+    for path, make in PAGES.items():
+        (out / path).parent.mkdir(parents=True, exist_ok=True)
+        (out / path).write_text(make())
+
+
+if __name__ == "__main__":
+    main()
