@@ -130,7 +130,9 @@ def arguments(docstring: str) -> dict[str, str]:
     """Return name -> meaning of a docstring's ``Args`` or ``Attributes``; names that share a line share a meaning."""
     found: dict[str, str] = {}
     block = re.search(r"^(?:Args|Attributes):\n((?:    .*\n?|\n)+)", docstring, re.MULTILINE)
-    for names, says in re.findall(r"^ {4}([\w, ]+): ((?:.|\n(?! {4}\w[\w, ]*: ))*)", block[1] if block else "", re.MULTILINE):
+    for names, says in re.findall(
+        r"^ {4}([\w, ]+): ((?:.|\n(?! {4}\w[\w, ]*: ))*)", block[1] if block else "", re.MULTILINE
+    ):
         found |= dict.fromkeys((name.strip() for name in names.split(",")), plain(says))
     return found
 
@@ -322,7 +324,10 @@ LOG_FIELDS = {
 def typed_rows(kind: Any) -> list[list[str]]:
     """Return name, type and whether it is required of each field of a `TypedDict`."""
     hints = get_type_hints(kind, include_extras=False)
-    return [[code(name), code(type_name(hint)), "yes" if name in kind.__required_keys__ else ""] for name, hint in hints.items()]
+    return [
+        [code(name), code(type_name(hint)), "yes" if name in kind.__required_keys__ else ""]
+        for name, hint in hints.items()
+    ]
 
 
 def type_name(hint: Any) -> str:
@@ -353,13 +358,22 @@ def fields(tree: ast.ClassDef) -> Iterator[tuple[str, str, str, str]]:
     """Yield name, type, default and the string behind it of a dataclass's fields."""
     says = arguments(ast.get_docstring(tree) or "")
     for node, after in zip(tree.body, [*tree.body[1:], None], strict=True):
-        if not (isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)) or "ClassVar" in ast.unparse(node):
+        if not (isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)) or "ClassVar" in ast.unparse(
+            node
+        ):
             continue
         text = after.value.value if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) else ""
         default = "" if node.value is None else ast.unparse(node.value)
         found = re.fullmatch(r"field\(default_factory=(.*)\)", default)
-        default = {"FROM_SIZE": "by size", "dict": "{}", "tuple": "()", "list": "[]"}.get(found[1] if found else default, default)
-        yield node.target.id, ast.unparse(node.annotation), default.strip("'\""), plain(text) or says.get(node.target.id, "")
+        default = {"FROM_SIZE": "by size", "dict": "{}", "tuple": "()", "list": "[]"}.get(
+            found[1] if found else default, default
+        )
+        yield (
+            node.target.id,
+            ast.unparse(node.annotation),
+            default.strip("'\""),
+            plain(text) or says.get(node.target.id, ""),
+        )
 
 
 POLICIES = {
@@ -380,7 +394,11 @@ def policies_page() -> str:
             path, kind = found_configuration(SOURCE / Path(path).parent)
         tree = class_of(SOURCE / path, kind)
         rows = [[code(one), code(hint), code(default), says] for one, hint, default, says in fields(tree)]
-        parts += [f"## {name}", plain((ast.get_docstring(tree) or "").split("\n\n")[0]), table(["field", "type", "default", "meaning"], rows)]
+        parts += [
+            f"## {name}",
+            plain((ast.get_docstring(tree) or "").split("\n\n")[0]),
+            table(["field", "type", "default", "meaning"], rows),
+        ]
     return "\n\n".join(parts) + "\n"
 
 
@@ -388,7 +406,9 @@ def found_configuration(folder: Path) -> tuple[str, str]:
     """Return file and class of the configuration that is registered in a folder."""
     for path in sorted(folder.glob("configuration_*.py")):
         for node in ast.parse(path.read_text()).body:
-            if isinstance(node, ast.ClassDef) and any("register_subclass" in ast.unparse(one) for one in node.decorator_list):
+            if isinstance(node, ast.ClassDef) and any(
+                "register_subclass" in ast.unparse(one) for one in node.decorator_list
+            ):
                 return str(path.relative_to(SOURCE)), node.name
     raise FileNotFoundError(f"{folder} holds no configuration")
 
@@ -398,7 +418,9 @@ def python_page() -> str:
     parts = ["# Python API", "Public modules. Everything else may change from one version to the next."]
     for heading, (module, names) in PUBLIC.items():
         parts.append(f"## {heading}")
-        parts += [f"::: lerobot_memobench.{module}.{name}" for name in names.split()] or [f"::: lerobot_memobench.{module}"]
+        parts += [f"::: lerobot_memobench.{module}.{name}" for name in names.split()] or [
+            f"::: lerobot_memobench.{module}"
+        ]
     return "\n\n".join(parts) + "\n"
 
 

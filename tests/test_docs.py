@@ -1,15 +1,47 @@
-"""Every link within the documents leads somewhere: the file is there, and so is the heading."""
+"""The documents: links lead somewhere, commands are understood, hashes stay in the research notes, README is short."""
 
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
 import re
+import shlex
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer
+
+from lerobot_memobench.cli import memobench
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.run.arguments import joined, read_arguments, resolve_recipe, split_arguments
+from lerobot_memobench.run.plan import take_run_options
+from lerobot_memobench.run.training import take_training_options
+from tests.support.scripts import load_script
+
+reference = load_script("docs_reference")
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("src/**/*.md")])
+DOCS = ROOT / "docs"
+NOTES = DOCS / "research"
+PAGES = sorted([*ROOT.glob("*.md"), *DOCS.glob("**/*.md")])
+DOCUMENTS = [*PAGES, *sorted(ROOT.glob("src/**/*.md"))]
+BY_HAND = [page for page in PAGES if NOTES not in page.parents or page.name == "index.md"]
+"""What is kept up to date; notes are frozen."""
+MADE = {(DOCS / path).resolve() for path in (*reference.PAGES, *reference.COPIES.values())}
+"""Pages that the site's build makes."""
 BLOCK = re.compile(r"```.*?```", re.DOTALL)
 WORDS = re.compile(r"`[^`\n]*`")
 LINK = re.compile(r"\]\(([^()\s]+)\)")
+
+
+def name(document: Path) -> str:
+    """Return a document's place in the repository."""
+    return str(document.relative_to(ROOT))
+
+
+# --- links ---
 
 
 def links(document: Path) -> list[str]:
@@ -25,17 +57,19 @@ def anchors(document: Path) -> set[str]:
 
 
 def broken(document: Path) -> list[str]:
-    """Return a document's links that lead nowhere."""
+    """Return a document's links that lead nowhere. Pages that are made have anchors that only the site's build knows."""
     found = []
     for link in links(document):
         path, _, anchor = link.partition("#")
         there = (document.parent / path).resolve() if path else document
+        if there in MADE:
+            continue
         if not there.exists() or (anchor and anchor not in anchors(there)):
             found.append(link)
     return found
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+@pytest.mark.parametrize("document", DOCUMENTS, ids=name)
 def test_links_lead_somewhere(document: Path) -> None:
     assert not broken(document)
 
@@ -50,19 +84,214 @@ def test_what_leads_nowhere_is_found(tmp_path: Path) -> None:
     assert broken(document) == ["#nowhere", "two.md"]
 
 
+def test_the_readme_needs_no_page_that_only_the_site_has() -> None:
+    assert not [link for link in links(ROOT / "README.md") if (ROOT / link.partition("#")[0]).resolve() in MADE]
+
+
+# --- what belongs into the notes ---
+
+HASH = re.compile(r"\b(?=[0-9a-f]*[0-9])(?=[0-9a-f]*[a-f])[0-9a-f]{7,64}\b")
+PROCESSOR = re.compile(r"\b(Xeon|EPYC|Ryzen|Opteron|Haswell|Skylake|Zen ?\d|A40|A100|H100|H200|llvmpipe)\b")
+
+
+def of_a_laboratory(text: str) -> list[str]:
+    """Return hashes, commits and names of processors in a text."""
+    return [found[0] for pattern in (HASH, PROCESSOR) for found in pattern.finditer(text)]
+
+
+@pytest.mark.parametrize("document", BY_HAND, ids=name)
+def test_hashes_commits_and_processors_stay_in_the_notes(document: Path) -> None:
+    assert not of_a_laboratory(document.read_text())
+
+
+def test_what_belongs_into_the_notes_is_found() -> None:
+    assert of_a_laboratory("log `12cac04f`, commit 7b9c630, 1,500 of 1500000000, defaced, on an EPYC") == [
+        *("12cac04f", "7b9c630", "EPYC"),
+    ]
+
+
+@pytest.mark.parametrize("note", sorted(set(NOTES.glob("*.md")) - {NOTES / "index.md"}), ids=name)
+def test_notes_are_dated(note: Path) -> None:
+    assert re.search(r"\b(20\d\d-\d\d-\d\d|\d{1,2} [A-Z][a-z]+ 20\d\d)\b", "\n".join(note.read_text().splitlines()[:6]))
+
+
+def test_the_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 120
+
+
+def test_every_page_has_its_place_in_the_site() -> None:
+    """The strict build says so too; here it is said without MkDocs."""
+    told = set(re.findall(r"[\w/-]+\.md", (ROOT / "mkdocs.yml").read_text().partition("\nnav:")[2]))
+    there = {str(page.relative_to(DOCS)) for page in DOCS.glob("**/*.md")}
+    assert told == there | set(reference.PAGES) | set(reference.COPIES.values())
+
+
+# --- commands ---
+
+
+def commands(document: Path) -> Iterator[list[str]]:
+    """Yield the words of each command in a document's shell blocks."""
+    for block in re.findall(r"```bash\n(.*?)```", document.read_text(), re.DOTALL):
+        for line in re.sub(r"\\\n\s*", " ", block).splitlines():
+            words: list[str] = []
+            for word in shlex.split(line, comments=True):
+                if word == "&&":
+                    yield words
+                    words = []
+                else:
+                    words.append(word)
+            if words:
+                yield words
+
+
+TYPED = [(document, words) for document in BY_HAND for words in commands(document)]
+
+
+@pytest.mark.parametrize(("document", "words"), TYPED, ids=lambda it: name(it) if isinstance(it, Path) else it[0])
+def test_commands_are_understood(document: Path, words: list[str]) -> None:
+    check(words)
+
+
+def check(words: list[str]) -> None:
+    """Raise where a command is none, or has an argument that it does not know. Nothing is run."""
+    program, *rest = words
+    if program == "accelerate":  # it starts what stands behind `$(which lerobot)`
+        program, rest = "lerobot", rest[rest.index("lerobot)") + 1 :]
+    match program:
+        case "lerobot":
+            check_lerobot(rest[0], rest[1:])
+        case "lerobot-eval" | "lerobot-train":
+            check_lerobot(program.partition("-")[2], [as_pair(word) for word in joined(rest)])
+        case "memobench":
+            check_memobench(rest)
+        case "python":
+            check_python(rest)
+        case "make":
+            assert re.search(rf"^{rest[0]}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
+        case _:
+            assert program in ("source", "pip", "uv"), f"{program} is no command that the documents use"
+
+
+def as_pair(flag: str) -> str:
+    """Return a flag of LeRobot's as a pair: ``--env.type=x`` is ``env=x``."""
+    key, _, value = flag.removeprefix("--").partition("=")
+    return f"{key.removesuffix('.type').removesuffix('.path')}={value}"
+
+
+def check_lerobot(command: str, line: list[str]) -> None:
+    """Read a line as `lerobot` does. Folders and repositories of the documents are not there: a type stands for them."""
+    stand_in = {"policy": "policy=memobench_mem", "dataset": "dataset.root=outputs"}
+    pairs = [stand_in[key] if (key := word.partition("=")[0]) in stand_in and is_place(word) else word for word in line]
+    given = split_arguments(pairs)
+    if command == "eval":
+        given = take_run_options(given)[1]
+    else:
+        given = take_training_options(resolve_recipe(given))[-1]
+    read_arguments(command, given)
+
+
+def is_place(pair: str) -> bool:
+    """Whether a pair's value is a folder or a repository."""
+    key, _, value = pair.partition("=")
+    return key == "dataset" or "/" in value
+
+
+def check_memobench(line: list[str]) -> None:
+    """Parse a line as `memobench` does."""
+    command: Any = typer.main.get_command(memobench.app)
+    path = ["memobench"]
+    if line[0].startswith("-"):
+        assert line in (["--help"], ["--version"])
+        return
+    while hasattr(command, "commands"):
+        if line[:1] == ["--help"]:
+            return
+        command = command.commands[line[0]]
+        path, line = [*path, line[0]], line[1:]
+    if line != ["--help"]:
+        command.make_context(" ".join(path), list(line))
+
+
+def click_error() -> type[Exception]:
+    """Return the error of an option that a command does not know."""
+    try:
+        check_memobench(["tasks", "--no-such"])
+    except Exception as error:
+        return type(error)
+    raise AssertionError("an option that is none was understood")
+
+
+def check_python(line: list[str]) -> None:
+    """See that the script or module is there."""
+    if line[0] == "-m":
+        assert importlib.util.find_spec(line[1]), line[1]
+    elif line[0] != "-c":
+        assert (ROOT / line[0]).is_file(), line[0]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "lerobot eval env=memobench episode=10",
+        "lerobot-eval --env.type=memobench --env.tusks=object",
+        "lerobot train policy=memobench_mem memory_frames=3",
+        "memobench generate --task object",
+        "memobench no_such",
+        "python examples/no_such.py",
+        "make coffee",
+        "roscore",
+    ],
+)
+def test_commands_that_are_not_understood_are_found(line: str) -> None:
+    with pytest.raises((MemobenchError, AssertionError, KeyError, click_error())):
+        check(shlex.split(line))
+
+
+# --- short forms, and pages that are made ---
+
+
 @pytest.mark.parametrize("command", ["eval", "train"])
-def test_the_table_of_short_forms_is_the_help(command: str) -> None:
-    text = (ROOT / "docs" / {"eval": "evaluate.md", "train": "train.md"}[command]).read_text()
+def test_short_forms_are_those_of_the_help(command: str) -> None:
+    """Guides name the most used ones, the reference all."""
+    helped = {word for typed, *_ in reference.short_forms(command) for word in re.findall(r"\w+=", typed)}
+    text = (DOCS / "guides" / {"eval": "evaluate.md", "train": "train.md"}[command]).read_text()
     lines = text[text.index("| short form |") :].split("\n\n")[0].splitlines()[2:]
-    plain = [re.sub(r"\[([^][]*)\]\([^)]*\)", r"\1", line).replace("`", "") for line in lines]
-    rows = [[cell.strip() for cell in line.strip("| ").split(" | ")] for line in plain]
-    assert rows == [row[: len(rows[0])] for row in helped(command)]
+    typed = {word for line in lines for word in re.findall(r"\w+=", line.split("|")[1])}
+    assert typed
+    assert typed <= helped
+    page = reference.lerobot_page().partition(f"## lerobot {command}")[2].partition("\n## ")[0]
+    assert all(f"`{word}`" in page for word in helped)
 
 
-def helped(command: str) -> list[list[str]]:
-    """Return the rows of the help: what is typed, what it sets, what holds without it ("" where nothing is said)."""
-    text = (ROOT / "src/lerobot_memobench/cli" / f"lerobot_{command}.txt").read_text()
-    blocks = re.findall(r"^  (\S.*)\n((?: {8}.*\n)+)", text, re.MULTILINE)
-    told = [(typed, " ".join(explained.split())) for typed, explained in blocks]
-    splits = [(typed, *re.fullmatch(r"(.*?)(?: \(default: (.*)\))?", words).groups("")) for typed, words in told]
-    return [list(row) for row in splits]
+@pytest.mark.parametrize("page", reference.PAGES)
+def test_pages_that_are_made(page: str) -> None:
+    text = reference.PAGES[page]()
+    assert text.startswith("# ")
+    for block in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
+        widths = {len(re.findall(r"(?<!\\)\|", row)) for row in block.splitlines()}
+        assert len(widths) == 1, block
+
+
+def test_every_task_has_a_card() -> None:
+    from lerobot_memobench.tasks.catalogue import task_names
+
+    for suite in ("published", "strict"):
+        text = reference.tasks_page(suite)
+        assert all(f"\n`{one}`\n" in text for one in task_names(suite=suite))
+        assert text.count("needs a memory") >= 30
+    assert reference.scene(30)[:4] == b"\x89PNG"
+
+
+def test_every_setting_of_a_policy_is_in_the_reference() -> None:
+    from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+
+    page = reference.policies_page()
+    own = {field.name for field in dataclasses.fields(MemobenchMemConfig)} & set(MemobenchMemConfig.__annotations__)
+    assert [field for field in own if f"`{field}`" not in page] == []
+
+
+def test_links_that_leave_the_site_are_turned() -> None:
+    text = "[the lab](../../research/README.md), [a](../../src/x.py), [b](b.md), [`src/x.py`](../../src/x.py)"
+    assert reference.at_home(text, "research/index.md") == (
+        "[the lab](../develop/lab.md), a (`src/x.py`), [b](b.md), `src/x.py`"
+    )

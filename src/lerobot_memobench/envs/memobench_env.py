@@ -71,7 +71,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         log_dir: where finished episodes are logged; nowhere when None.
         acting: whose episodes they are; one that it does not count is neither logged nor recorded.
         render_mode: gymnasium's; there is one.
-        others: see `MemobenchEnvConfig`.
+
+    The other arguments are the settings of `MemobenchEnvConfig`.
     """
 
     metadata = METADATA
