@@ -191,19 +191,19 @@ def spaces_page() -> str:
 
     space = observations.observation_space(True, 2, observations.BOTH, True)
     units = {
+        "pixels/image": "third-person camera, RGB, upright",
+        "pixels/wrist_image": "wrist camera, RGB, upright",
         "agent_pos": "end-effector position 3 (m), axis-angle 3 (rad), fingers 2 (m)",
         "phase": "0 demonstration prompt, 1 execution",
         "step": "control steps since the phase began",
-        "pixels/image": "third-person camera, RGB, upright",
-        "pixels/wrist_image": "wrist camera, RGB, upright",
+        "environment_state": f"{SLOTS} object slots, with `env.obs_type` of that name or `both`",
         "picture_step": "step that the pictures show; with `env.render_every` above 1",
-        "environment_state": f"{SLOTS} object slots, see below; with `obs_type=environment_state_agent_pos` or `both`",
-        "expert_action": "action of the scripted expert; with `env.expert_action=true`",
-        "blind_action": "action of the published routine; with `env.blind_action=true`",
+        "expert_action": "the scripted expert's; with `env.expert_action=true`",
+        "blind_action": "the published routine's; with `env.blind_action=true`",
     }
     at_policy = observations.policy_names(observations.BOTH)
     rows = []
-    for name, part in flat(space):
+    for name, part in sorted(flat(space), key=lambda leaf: [*units].index(leaf[0])):
         there = at_policy.get(name, f"observation.{name}")
         rows.append([code(name), code(there), str(part.shape), str(part.dtype), units[name]])
     slots = {
@@ -214,7 +214,7 @@ def spaces_page() -> str:
         "joint": "drawer m, door and knob rad, else 0",
         "highlighted": "1 while it stands in the prompt's highlight",
     }
-    bounds = {name: "m, ±1 is ±0.05" for name in "xyz"} | {"gripper": "−1 opens, +1 closes"}
+    bounds = dict.fromkeys("xyz", "m, ±1 is ±0.05") | {"gripper": "−1 opens, +1 closes"}
     parts = [
         "# Observation and action spaces",
         f"{protocol.CONTROL_HZ} control steps per second. Horizon {protocol.HORIZON:,} execution steps.",
@@ -224,8 +224,8 @@ def spaces_page() -> str:
         "### State",
         table(["index", "name"], [[str(k), code(name)] for k, name in enumerate(PROPRIO_NAMES)]),
         "### Object slots",
-        f"`observation.environment_state` holds {SLOTS} slots, {SIZE} numbers in all. Slots are in the order of class and "
-        "place. They hold what a camera could show at this step: no identity, no goal, no history.",
+        f"`observation.environment_state` holds {SLOTS} slots, {SIZE} numbers in all. Slots are in the order of class "
+        "and place. They hold what a camera could show at this step: no identity, no goal, no history.",
         table(
             ["field", "starts at", "numbers", "content"],
             [[code(name), str(STARTS[name]), str(size), slots[name]] for name, size in FIELDS.items()],
@@ -267,7 +267,8 @@ def dataset_page() -> str:
         "`memobench generate` writes a LeRobotDataset v3.0.",
         "## Frames",
         table(["column", "type", "meaning"], rows),
-        "LeRobot's own columns are there too: `task`, `timestamp`, `frame_index`, `episode_index`, `index`, `task_index`.",
+        "LeRobot's own columns are there too: `task`, `timestamp`, `frame_index`, `episode_index`, `index`, "
+        "`task_index`.",
         "## Episodes",
         "In `meta/episodes`, and as JSON in `episode_info` of an episode's first frame.",
         table(["column", "meaning"], [[code(name), says] for name, says in EPISODE_COLUMNS.items()]),
@@ -292,8 +293,8 @@ def schemas_page() -> str:
     ]
     parts = [
         "# Log and card schemas",
-        "Files are checked against these types where they are read. Unknown fields pass. `null` is allowed where the type "
-        "says `None`.",
+        "Files are checked against these types where they are read. Unknown fields pass. `null` is allowed where the "
+        "type says `None`.",
         table(["field", "meaning"], [[code(name), says] for name, says in LOG_FIELDS.items()]),
     ]
     for heading, kind in wanted:
@@ -386,19 +387,19 @@ def policies_page() -> str:
     """Return the page of policy configurations, from their source."""
     parts = [
         "# Policy configuration",
-        "As `policy.<field>=` of `lerobot eval` and `lerobot train`. `memobench_mem` has LeRobot's fields of `pi05` beside "
-        "these. *by size*: the value follows from `policy.size` and `policy.perception`.",
+        "As `policy.<field>=` of `lerobot eval` and `lerobot train`. `memobench_mem` has LeRobot's fields of `pi05` "
+        "beside these. *by size*: the value follows from `policy.size` and `policy.perception`.",
     ]
     for name, (path, kind) in POLICIES.items():
         if not (SOURCE / path).is_file():
             path, kind = found_configuration(SOURCE / Path(path).parent)
         tree = class_of(SOURCE / path, kind)
-        rows = [[code(one), code(hint), code(default), says] for one, hint, default, says in fields(tree)]
-        parts += [
-            f"## {name}",
-            plain((ast.get_docstring(tree) or "").split("\n\n")[0]),
-            table(["field", "type", "default", "meaning"], rows),
+        rows = [
+            [code(one), code(default), f"{says} *{hint.replace(' | ', ' or ')}*".strip()]
+            for one, hint, default, says in fields(tree)
         ]
+        summary = plain((ast.get_docstring(tree) or "").split("\n\n")[0])
+        parts += [f"## {name}", summary, table(["field", "default", "meaning, type"], rows)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -462,9 +463,14 @@ def tasks_page(suite: str) -> str:
     parts = [
         f"# {title}",
         "A card per task, made from its files. *Without a memory* is the best rate that was found for a policy that "
-        f"decides from pictures alone ([how]({'../research/memory_necessity.md'})): a lower bound. The hand's pose and a "
+        "decides from pictures alone ([how](../research/memory_necessity.md)): a lower bound. The hand's pose and a "
         "clock may tell more.",
     ]
+    if suite == "strict":
+        parts.append(
+            "In counting tasks a clock decides: [what this suite does not "
+            "show](suites.md#what-the-strict-suite-does-not-show)."
+        )
     kind = None
     for number, name in enumerate(task_names(suite=suite), 1):
         task = get_task(name)

@@ -57,7 +57,7 @@ def anchors(document: Path) -> set[str]:
 
 
 def broken(document: Path) -> list[str]:
-    """Return a document's links that lead nowhere. Pages that are made have anchors that only the site's build knows."""
+    """Return a document's links that lead nowhere. Of pages that are made only the site's build knows the anchors."""
     found = []
     for link in links(document):
         path, _, anchor = link.partition("#")
@@ -179,7 +179,7 @@ def as_pair(flag: str) -> str:
 
 
 def check_lerobot(command: str, line: list[str]) -> None:
-    """Read a line as `lerobot` does. Folders and repositories of the documents are not there: a type stands for them."""
+    """Read a line as `lerobot` does. Folders and repositories of the documents are not there: others stand for them."""
     stand_in = {"policy": "policy=memobench_mem", "dataset": "dataset.root=outputs"}
     pairs = [stand_in[key] if (key := word.partition("=")[0]) in stand_in and is_place(word) else word for word in line]
     given = split_arguments(pairs)

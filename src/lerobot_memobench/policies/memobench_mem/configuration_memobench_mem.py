@@ -227,15 +227,18 @@ class MemobenchMemConfig(PI05Config):
 
     # -- alignment
     align: str = "none"
+    """How memory is aligned with checkpoint language: ``none``, ``semantic``, ``contrastive`` or ``framewise``."""
     align_weight: float | None = None
     """Weight of the alignment loss; none or 0: the paper's for this objective (``align=none`` trains without one)."""
     subgoal_level: str = "intermediate"
+    """Level of the language that memory is aligned with: ``coarse``, ``intermediate`` or ``fine``."""
     shuffle_subgoals: bool = False
     """Control of the paper: the subgoal texts of an episode change places among themselves, or with those of other
     episodes where it has fewer than three."""
     shuffle_seed: int = 7
     """Seed of that shuffle; the result is the same for every epoch and on every machine."""
     text_encoder: str | None = None
+    """Encoder of subgoals: ``words`` (a hash of words) or a folder or repository of a SigLIP model; none: the size's."""
 
     # -- memory
     memory_fusion: str = "modulation"
@@ -247,6 +250,7 @@ class MemobenchMemConfig(PI05Config):
     memory_camera: str | None = None
     """Camera whose pictures are remembered; none: the first of the policy's."""
     memory_frames: int = 32
+    """Frames of the history that a chunk reads at most."""
     tokens_per_frame: int = FROM_SIZE
     """Memory tokens of a remembered frame: 16 of a picture; 2, or another number, of objects."""
     memory_stride: int = FROM_SIZE
@@ -270,6 +274,7 @@ class MemobenchMemConfig(PI05Config):
     types or ``prompted`` (tasks that begin with a demonstration prompt), of which the first that a task has counts;
     other tasks weigh 1, and ``{}`` draws all alike. None: ``{}`` where training decodes no video, else frames alike."""
     warmup_fraction: float = 0.05
+    """Share of the updates in which the learning rate rises to its highest."""
     min_lr_ratio: float = FROM_SIZE
     """Learning rate at the end, as a fraction of the highest, to which it falls as a cosine; 1: it stays constant.
     None: the size's, 0.02 at ``small`` and the paper's 1 elsewhere."""
@@ -278,7 +283,9 @@ class MemobenchMemConfig(PI05Config):
     freeze_vision_encoder: bool = True
     """Always: memory tokens are cached from the image tower."""
     chunk_size: int = FROM_SIZE
+    """Actions of a chunk; none: the size's, 16 at ``small``, else 50."""
     n_action_steps: int = FROM_SIZE
+    """Actions executed of a chunk before the next one; none: the size's, 6 at ``small``, else 50."""
     full_chunk_when_stalled: bool = False
     """Whether a whole chunk is executed, and not its first ``n_action_steps``, where the hand stands as it stood at the
     chunk before: on a rim it might stand for ever, and plan each time to let go a little later."""
