@@ -238,7 +238,7 @@ class MemobenchMemConfig(PI05Config):
     shuffle_seed: int = 7
     """Seed of that shuffle; the result is the same for every epoch and on every machine."""
     text_encoder: str | None = None
-    """Encoder of subgoals: ``words`` (a hash of words) or a folder or repository of a SigLIP model; none: the size's."""
+    """Encoder of subgoals: ``words`` (a hash of words), or folder or repository of a SigLIP model; none: the size's."""
 
     # -- memory
     memory_fusion: str = "modulation"
