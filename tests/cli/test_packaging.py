@@ -48,7 +48,7 @@ def test_the_lock_answers_to_pyproject() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     wanted = [
         *project["project"]["dependencies"],
-        *project["dependency-groups"]["dev"],
+        *(line for group in project["dependency-groups"].values() for line in group),
         *project["build-system"]["requires"],
     ]
     locked = pins("requirements.lock")
