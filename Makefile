@@ -28,7 +28,7 @@ check: ## lint, formatting, types and declared dependencies
 
 docs: ## build the documentation site into outputs/site; links that lead nowhere fail (ARGS="serve" to look at it)
 	@scripts/setup
-	@$(PYTHON) -m mkdocs $(or $(ARGS),build --strict)
+	@NO_MKDOCS_2_WARNING=1 $(PYTHON) -m mkdocs $(or $(ARGS),build --strict)
 
 lock: ## resolve pyproject.toml again into requirements.lock
 	@scripts/setup
