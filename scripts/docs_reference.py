@@ -255,8 +255,7 @@ def dataset_page() -> str:
     from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS, dataset_features
     from lerobot_memobench.protocol import IMAGE_SIZE
 
-    features = dataset_features((IMAGE_SIZE, IMAGE_SIZE))
-    features |= {OBJECTS: dataset_features(None)[OBJECTS]}
+    features = {OBJECTS: dataset_features(None)[OBJECTS], **dataset_features((IMAGE_SIZE, IMAGE_SIZE))}
     rows = [
         [code(name), f"{one['dtype']} {tuple(one['shape'])}", COLUMNS[name]]
         for name, one in features.items()
@@ -483,16 +482,22 @@ def tasks_page(suite: str) -> str:
 
 def task_parts(number: int, task: Any, known: dict[str, tuple[str, str]]) -> Iterator[str]:
     """Yield one task's card."""
-    yield f"### {number}. {task.language.capitalize()} {{ #{slug(task.name)} }}"
+    from lerobot_memobench.tasks.catalogue import task_number
+
+    drawn = task.suite == "strict"  # the instruction is one of several
+    title = task.name.replace("_", " ") if drawn else task.language
+    yield f"### {number}. {title.capitalize()} {{ #{slug(task.name)} }}"
     yield f"`{task.name}`"
-    if task.suite == "published":
-        yield f"![Initial scene of task {number}](../figures/tasks/{number:02}.png){{ width=256 loading=lazy }}"
+    scene_of = task_number(task.derived_from or task.name)
+    yield f"![Initial scene](../figures/tasks/{scene_of:02}.png){{ width=256 loading=lazy }}"
+    goals = 1 + len(task.variants) - any(one.replaces_published for one in task.variants)
     rows = [
         ["memory type, family", f"{task.memory_type}, {task.family.replace('_', ' ')}"],
+        ["instruction", f"{task.language}{' (one of those drawn)' if drawn else ''}"],
         ["demonstration prompt", PROMPTS[task.prompt.kind] if task.prompt else "none"],
         ["objects", ", ".join(sorted(set(task.objects.values())))],
         ["fixtures", ", ".join(sorted(set(task.fixtures.values()) - {"kitchen_table"})) or "table only"],
-        ["admissible goals", str(task.variant_count if hasattr(task, "variant_count") else len(task.variants) + 1)],
+        ["admissible goals", str(goals)],
     ]
     if task.derived_from:
         rows.append(["in the scene of", f"[`{task.derived_from}`](tasks_published.md#{slug(task.derived_from)})"])
