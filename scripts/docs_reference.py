@@ -490,14 +490,13 @@ def task_parts(number: int, task: Any, known: dict[str, tuple[str, str]]) -> Ite
     yield f"`{task.name}`"
     scene_of = task_number(task.derived_from or task.name)
     yield f"![Initial scene](../figures/tasks/{scene_of:02}.png){{ width=256 loading=lazy }}"
-    goals = 1 + len(task.variants) - any(one.replaces_published for one in task.variants)
     rows = [
         ["memory type, family", f"{task.memory_type}, {task.family.replace('_', ' ')}"],
         ["instruction", f"{task.language}{' (one of those drawn)' if drawn else ''}"],
         ["demonstration prompt", PROMPTS[task.prompt.kind] if task.prompt else "none"],
         ["objects", ", ".join(sorted(set(task.objects.values())))],
         ["fixtures", ", ".join(sorted(set(task.fixtures.values()) - {"kitchen_table"})) or "table only"],
-        ["admissible goals", str(goals)],
+        ["admissible goals", str(len(task.random_variants))],
     ]
     if task.derived_from:
         rows.append(["in the scene of", f"[`{task.derived_from}`](tasks_published.md#{slug(task.derived_from)})"])
