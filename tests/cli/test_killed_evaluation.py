@@ -67,8 +67,7 @@ def kill_sometime(process: Fork, out: Path, rng: random.Random, run_s: float) ->
         time.sleep(0.01)
     if process.poll() is not None:
         return False
-    process.kill()
-    return True
+    return process.kill()
 
 
 def comparable(out: Path) -> list[dict[str, Any]]:
