@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,16 +25,23 @@ def policy_being_run() -> PreTrainedConfig | type | None:
     from lerobot.configs import PreTrainedConfig, parser
 
     path, name = parser.get_path_arg("policy"), parser.get_type_arg("policy")
-    told = parser.get_cli_overrides("policy") or []
-    # LeRobot's parser takes these out before draccus reads.
-    told = [flag for flag in told if not flag.startswith("--discover_packages_path")]
+    told = overrides("policy")
     with quiet():
         if path is not None:
-            overrides = [*parser.get_yaml_overrides("policy"), *told]
-            return PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+            told = [*parser.get_yaml_overrides("policy"), *told]
+            return PreTrainedConfig.from_pretrained(path, cli_overrides=told)
         known: dict[str, type] = PreTrainedConfig.get_known_choices()
         kind = known.get(str(name or in_file("policy", "type")))
         return kind if kind is None or name is None else draccus.parse(kind, args=told)
+
+
+def overrides(key: str, flags: Sequence[str] | None = None) -> list[str]:
+    """Return what flags, LeRobot's command line when None, set of a choice such as ``policy``, as draccus reads it."""
+    from lerobot.configs import parser
+
+    told = parser.get_cli_overrides(key, flags) or []
+    # LeRobot's parser takes these out before draccus reads.
+    return [flag for flag in told if not flag.startswith("--discover_packages_path")]
 
 
 @contextmanager

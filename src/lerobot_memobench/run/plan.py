@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from lerobot_memobench.envs.command_line import quiet, read_rename_map
+from lerobot_memobench.envs.command_line import overrides, quiet, read_rename_map
 from lerobot_memobench.envs.observations import OBJECTS, PIXELS, check_obs_type, obs_type_of, prompt_in
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import CARD_FILE, read_card
@@ -300,7 +300,7 @@ def policy_config(arguments: LerobotArguments) -> PreTrainedConfig | None:
     from lerobot.configs.policies import PreTrainedConfig
 
     with quiet():
-        return PreTrainedConfig.from_pretrained(path, cli_overrides=_overrides(arguments, "policy"))
+        return PreTrainedConfig.from_pretrained(path, cli_overrides=overrides("policy", arguments.flags))
 
 
 def env_config(arguments: LerobotArguments) -> EnvConfig | None:
@@ -320,17 +320,10 @@ def _parsed(arguments: LerobotArguments, key: str) -> Any:
         return None
     try:
         with quiet():
-            return draccus.parse(arguments.chosen[key], args=_overrides(arguments, key))
+            return draccus.parse(arguments.chosen[key], args=overrides(key, arguments.flags))
     except yaml.YAMLError as error:  # LeRobot reads every value as YAML
         problem = " ".join(str(error).split())
         raise MemobenchError(f"a value of {key}. cannot be read ({problem}); put it in quotes within quotes") from None
-
-
-def _overrides(arguments: LerobotArguments, key: str) -> list[str]:
-    from lerobot.configs import parser
-
-    told = parser.get_cli_overrides(key, list(arguments.flags)) or []
-    return without_flags(told, "discover_packages_path")  # LeRobot's parser takes it out before draccus reads
 
 
 def check_observations(policy: PreTrainedConfig | None, environment: EnvConfig | None) -> None:
@@ -346,9 +339,7 @@ def check_observations(policy: PreTrainedConfig | None, environment: EnvConfig |
         raise MemobenchError(f"env.render_every is {getattr(environment, 'render_every', 1)}; {REFUSAL}")
 
 
-def check_as_checkpoint(
-    arguments: LerobotArguments, policy: PreTrainedConfig | None, environment: EnvConfig | None
-) -> None:
+def check_as_checkpoint(arguments: LerobotArguments, policy: PreTrainedConfig | None, environment: EnvConfig) -> None:
     """Refuse a model checkpoint that is to act under other settings than it was trained for, or on other inputs.
 
     Raises:
@@ -359,8 +350,6 @@ def check_as_checkpoint(
         return
     with quiet():
         check_as_trained(path, policy)
-    if environment is None:
-        return
     from lerobot.envs.utils import env_to_policy_features
 
     renamed = read_rename_map(arguments.get("rename_map"))

@@ -23,7 +23,7 @@ import yaml
 
 from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, PRIVILEGED, naming_damage
 from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS as INPUT
-from lerobot_memobench.envs.command_line import quiet
+from lerobot_memobench.envs.command_line import overrides, quiet
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, OBS_TYPES, PIXELS, reads_prompt
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import count_of
@@ -273,16 +273,14 @@ def check_same_training(arguments: LerobotArguments) -> None:
     if checkpoint is None:
         return
     _check_same_dataset(arguments, checkpoint)
-    chosen = ("--policy.path", "--policy.type", "--policy.discover_packages_path")
-    given = [f for f in arguments.flags if f.startswith("--policy.") and f.partition("=")[0] not in chosen]
+    given = overrides("policy", arguments.flags)
     if not given:
         return
-    from lerobot.configs import parser
     from lerobot.configs.policies import PreTrainedConfig
 
     with quiet():
         begun = PreTrainedConfig.from_pretrained(checkpoint)
-        asked = PreTrainedConfig.from_pretrained(checkpoint, cli_overrides=parser.get_cli_overrides("policy", given))
+        asked = PreTrainedConfig.from_pretrained(checkpoint, cli_overrides=given)
     check_as_begun(checkpoint, asked, begun)
 
 
