@@ -32,4 +32,4 @@ docs: ## build the documentation site into outputs/site; links that lead nowhere
 
 lock: ## resolve pyproject.toml again into requirements.lock
 	@scripts/setup
-	@scripts/lock
+	@scripts/lock $(ARGS)
