@@ -1,4 +1,4 @@
-"""Make the environment ``memobench`` and the policies ``memobench_*`` and ``remote`` known to LeRobot.
+"""Make the environment ``memobench`` and the policies ``memobench_*`` known to LeRobot.
 
 The configuration modules register themselves when imported; they import neither simulator nor model code nor GL.
 """

@@ -248,7 +248,7 @@ def test_a_parts_process_ends_with_the_one_that_wanted_it(tmp_path: Path) -> Non
 @pytest.mark.slow
 def test_a_part_that_fails_says_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["eval", "env=memobench", f"tasks={STOVE}", "episodes=1", f"output_dir={tmp_path / 'out'}", "shards=1"]
-    assert lerobot([*words, "policy=remote", "host=127.0.0.1", "port=1", "policy.connect_timeout=0.1"]) == 2
+    assert lerobot([*words, "policy=memobench_remote", "host=127.0.0.1", "port=1", "policy.connect_timeout=0.1"]) == 2
     error = capsys.readouterr().err
     assert "part 1/1 ended with" in error
     assert "127.0.0.1:1" in error

@@ -12,7 +12,8 @@ import sys
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 assert "memobench" in EnvConfig.get_known_choices()
-assert {"memobench_mem", "memobench_expert", "memobench_random", "remote"} <= set(PreTrainedConfig.get_known_choices())
+policies = {"memobench_mem", "memobench_expert", "memobench_random", "memobench_remote"}
+assert policies <= set(PreTrainedConfig.get_known_choices())
 heavy = {"mujoco", "OpenGL", "robosuite"} & set(sys.modules)
 assert not heavy, heavy
 models = [name for name in sys.modules if "memobench" in name and "modeling" in name]

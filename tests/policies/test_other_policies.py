@@ -378,7 +378,7 @@ def test_a_policy_that_reads_prompts_is_shown_them(
     [
         (["--policy.type=act"], "reset"),
         (["--policy.type", "memobench_mem"], "steps"),
-        (["--policy.type=remote"], "steps"),
+        (["--policy.type=memobench_remote"], "steps"),
         (["--policy.type=memobench_random"], "reset"),
         (["--policy.path=checkpoint"], "reset"),
         (["--config_path=train.yaml"], "reset"),

@@ -200,7 +200,7 @@ def test_addresses() -> None:
 
 
 def test_lerobot_finds_it_and_it_refuses_to_train() -> None:
-    assert get_policy_class("remote") is RemotePolicy
+    assert get_policy_class("memobench_remote") is RemotePolicy
     policy = RemotePolicy(RemoteConfig())
     with pytest.raises(MemobenchError, match="cannot be trained here"):
         policy.forward({})

@@ -20,7 +20,7 @@ from tests.support.remote_case import TASK, batch, free_port, make
 def _evaluate(port: int, out: Path, *words: str) -> int:
     return main(
         [
-            *("eval", "env=memobench", "policy=remote", "host=127.0.0.1", f"port={port}", "replan=10"),
+            *("eval", "env=memobench", "policy=memobench_remote", "host=127.0.0.1", f"port={port}", "replan=10"),
             *(f"tasks={TASK}", "horizon=20", "env.render=fast", "eval.use_async_envs=false", f"output_dir={out}"),
             *words,
         ]

@@ -77,7 +77,7 @@ def test_the_prompt_plays_where_the_policy_can_take_it(words: list[str], found: 
     assert plan.environment.protocol["prompt_in"] == found
 
 
-@pytest.mark.parametrize("policy", [["policy=memobench_mem"], ["policy=remote", "policy.dialect=robomme"]])
+@pytest.mark.parametrize("policy", [["policy=memobench_mem"], ["policy=memobench_remote", "policy.dialect=robomme"]])
 def test_repeated_pictures_are_refused_for_policies_that_remember(policy: list[str]) -> None:
     with pytest.raises(MemobenchError, match=r"env.render_every is 5; leave env.render_every at 1"):
         plan_line(["env=memobench", f"tasks={STOVE}", *policy, "env.render_every=5"])

@@ -85,9 +85,9 @@ HOSTILE = {
     "policy.seed": ["--policy.seed=!!python/object/apply:os.system [x]"],
     "policy.down_dims": ["--policy.type=diffusion", '--policy.down_dims=[16,"x"]'],
     "policy.down_dims ": ["--policy.type=diffusion", "--policy.down_dims=" + "[" * 9999],
-    "policy.host": ["--policy.type=remote", "--policy.host=10.0.0.5"],
-    "policy.servers": ["--policy.type=remote", "--policy.servers=127.0.0.1:1,stranger.example:80"],
-    "policy.host ": ["--policy.type=remote", "--policy.host=127.0.0.1@stranger.example"],
+    "policy.host": ["--policy.type=memobench_remote", "--policy.host=10.0.0.5"],
+    "policy.servers": ["--policy.type=memobench_remote", "--policy.servers=127.0.0.1:1,stranger.example:80"],
+    "policy.host ": ["--policy.type=memobench_remote", "--policy.host=127.0.0.1@stranger.example"],
     "eval.recording_repo_id": ["--eval.recording=true", "--eval.recording_repo_id=stranger/data"],
     "eval.recording_repo_id ": ["--eval.recording_repo_id=none"],
     "env.log_dir ": ["--env.log_dir=none"],
@@ -139,7 +139,7 @@ def test_what_is_no_flag_of_ours(flags: Any, said: str) -> None:
 @pytest.mark.parametrize("label", [":", "=", "a: b: c"])
 def test_a_value_that_is_no_yaml_is_told(label: str) -> None:
     with pytest.raises(MemobenchError, match=r"a value of policy\. cannot be read"):
-        plan_line(["env=memobench", "policy=remote", f"policy.label={label}"])
+        plan_line(["env=memobench", "policy=memobench_remote", f"policy.label={label}"])
 
 
 def test_a_checkpoint_that_the_card_does_not_identify_is_refused() -> None:
@@ -168,8 +168,8 @@ def test_a_repository_is_its_copy_in_the_cache(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_the_user_names_the_server() -> None:
-    flags = ["--env.type=memobench", "--policy.type=remote", "--policy.host=10.0.0.5", "--policy.port=8000"]
-    assert allowed_flags(flags, "gpu1:9000")[1:] == ["--policy.type=remote", "--policy.servers=gpu1:9000"]
+    flags = ["--env.type=memobench", "--policy.type=memobench_remote", "--policy.host=10.0.0.5", "--policy.port=8000"]
+    assert allowed_flags(flags, "gpu1:9000")[1:] == ["--policy.type=memobench_remote", "--policy.servers=gpu1:9000"]
     assert allowed_flags([*flags[:2], "--policy.host=127.0.0.1"])[2] == "--policy.host=127.0.0.1"
     with pytest.raises(MemobenchError, match="for a policy that runs in a server"):
         allowed_flags(BENCHMARK, "gpu1:9000")
@@ -238,7 +238,7 @@ OF_A_POLICY: dict[str, dict[str, st.SearchStrategy[str]]] = {
         "policy.base_weights": st.just("null"),
         "policy.optimizer_betas": st.just("[0.9, 0.99]"),
     },
-    "remote": {
+    "memobench_remote": {
         "host": st.sampled_from(["127.0.0.1", "localhost"]),
         "port": COUNT,
         "dialect": st.sampled_from(["openpi", "robomme"]),

@@ -180,7 +180,7 @@ def allowed_flags(flags: Any, server: str | None = None) -> list[str]:
         raise MemobenchError(f"the card does not say {ENV}={ENVIRONMENT}; only evaluations of ours are repeated")
     named = []
     if server is not None:
-        if settings.get(POLICY_TYPE) != "remote":
+        if settings.get(POLICY_TYPE) != "memobench_remote":
             raise MemobenchError(f"--server {server} is for a policy that runs in a server, and the card's does not")
         settings = {key: value for key, value in settings.items() if key not in (*SERVERS, "policy.port")}
         named = [f"--policy.servers={server}"]

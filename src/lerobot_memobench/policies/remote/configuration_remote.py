@@ -1,4 +1,4 @@
-"""Configuration of the policy that runs in a server: ``lerobot eval env=memobench policy=remote host=… port=…``."""
+"""Configuration of the policy in a server: ``lerobot eval env=memobench policy=memobench_remote host=… port=…``."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ DIALECTS: dict[str, Dialect] = {
 }
 
 
-@PreTrainedConfig.register_subclass("remote")
+@PreTrainedConfig.register_subclass("memobench_remote")
 @dataclass
 class RemoteConfig(UntrainedConfig):
     """Where the server is, what it speaks, and what is done when it goes away.

@@ -94,7 +94,7 @@ class RemotePolicy(UntrainedPolicy):
     """Parameter-less policy that asks a server; see `RemoteConfig`. ``select_action`` returns (B, 7) float32."""
 
     config_class = RemoteConfig
-    name = "remote"
+    name = "memobench_remote"
     why_not_trained = "runs in a server and cannot be trained here"
 
     def __init__(self, config: RemoteConfig, **kwargs: Any) -> None:

@@ -8,7 +8,7 @@ from lerobot_memobench.policies.baselines.processor_baselines import Processors,
 from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
 
 
-def make_remote_pre_post_processors(
+def make_memobench_remote_pre_post_processors(
     config: RemoteConfig, dataset_stats: dict[str, dict[str, Any]] | None = None
 ) -> Processors:
     """Return pre- and post-processor that rename and batch, and never normalise; images stay on the CPU."""
