@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim import rendering
+from lerobot_memobench.sim import rendering, robot
 from lerobot_memobench.sim.gl.rasterizer import HIGHLIGHTS, Highlight
 from lerobot_memobench.sim.rendering import RenderSettings, close_renderers, gl_backend
+from lerobot_memobench.sim.scene import scene_spec
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, NO_OP, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 
@@ -298,20 +299,53 @@ def test_highlights_are_drawn_and_go_away(gl: str, simulate: Simulate) -> None:
         sim.render()
 
 
+def visual_groups() -> mujoco.MjvOption:
+    """Return what MuJoCo's renderer is told to leave out: collision geoms and sites."""
+    option = mujoco.MjvOption()
+    option.geomgroup[:] = 0
+    option.geomgroup[1] = 1
+    option.sitegroup[:] = 0
+    return option
+
+
 def test_looks_like_mujocos_own_renderer(mujoco_renderer: type[mujoco.Renderer], simulate: Simulate) -> None:
     """Same camera, light and textures: only the edges of shadows differ."""
     sim = simulate()
     ours = sim.render()
     model = sim.model
     with mujoco_renderer(model, 256, 256) as renderer:
-        option = mujoco.MjvOption()
-        option.geomgroup[:] = 0
-        option.geomgroup[1] = 1
-        option.sitegroup[:] = 0
-        renderer.update_scene(sim.data, "agentview", option)
+        renderer.update_scene(sim.data, "agentview", visual_groups())
         theirs = renderer.render()
     assert difference(ours, theirs) < 4
     assert (np.abs(ours.astype(int) - theirs).max(axis=2) > 40).mean() < 0.04
+
+
+def test_high_draws_the_whole_arm(
+    mujoco_renderer: type[mujoco.Renderer], simulate: Simulate, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The arm of MuJoCo's own renderer, with every face of robosuite's files; thinned, its covers are torn."""
+    sim = simulate()
+    names = [sim.model.body(body).name for body in sim.model.geom_bodyid]
+    arm = np.array([name.startswith(("robot0", "gripper0")) for name in names])
+    ours = {}
+    for quality in ("default", "high"):
+        sim.render_settings = RenderSettings(quality=quality)
+        ours[quality] = sim.render().astype(int)
+    shown = arm[sim.geoms()] & (sim.geoms() >= 0)
+    assert shown.mean() > 0.03
+    whole = {"xml": robot._arrays()["xml"]}
+    monkeypatch.setattr(robot, "_arrays", lambda: whole)
+    model = scene_spec(sim.task)[0].compile()
+    model.body_pos[:], model.body_quat[:] = sim.model.body_pos, sim.model.body_quat
+    data = mujoco.MjData(model)
+    data.qpos[:] = sim.data.qpos
+    mujoco.mj_forward(model, data)
+    with mujoco_renderer(model, 256, 256) as renderer:
+        renderer.update_scene(data, "agentview", visual_groups())
+        theirs = renderer.render()
+    off = {quality: np.abs(frame - theirs)[shown].mean() for quality, frame in ours.items()}
+    assert off["high"] < 5
+    assert off["default"] > 3 * off["high"]
 
 
 def test_unknown_camera(simulate: Simulate) -> None:

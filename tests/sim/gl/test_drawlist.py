@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.gl.drawlist import build_draw_list, disc
+from lerobot_memobench.sim.gl.drawlist import DrawList, build_draw_list, disc
 
 
 def test_draw_list_has_outward_faces() -> None:
@@ -46,3 +46,50 @@ def test_disc_faces_up() -> None:
     points, _, _, triangles = disc()
     a, b, c = (points[triangles[:, k]] for k in range(3))
     assert np.all(np.cross(b - a, c - a)[:, 2] >= -1e-12)
+
+
+WEDGE = np.array([(0, 0, 0), (0.3, 0, 0), (0, 0.2, 0), (0, 0, 0.1)])
+WEDGE_FACES = np.array([(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)])
+HORN = np.array([0.3, 0.3, 0.4])
+
+
+def wedge(points: np.ndarray, faces: np.ndarray) -> mujoco.MjModel:
+    spec = mujoco.MjSpec()
+    spec.add_mesh(name="wedge", uservert=points.ravel().tolist(), userface=faces.ravel().tolist())
+    turned = np.array([0.8, 0.2, -0.4, 0.4])
+    body = spec.worldbody.add_body(pos=[1.0, 2.0, 3.0], quat=(turned / np.linalg.norm(turned)).tolist())
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="wedge", group=1)
+    return spec.compile()
+
+
+def in_world(draw_list: DrawList, model: mujoco.MjModel, what: str) -> np.ndarray:
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    turned = draw_list.vertices[what] @ data.geom_xmat[0].reshape(3, 3).T
+    return turned + data.geom_xpos[0] if what == "position" else turned
+
+
+def test_a_finer_mesh_stands_where_the_scenes_does() -> None:
+    """The compiler turns each mesh into its own axes, and one with another corner has others."""
+    coarse = wedge(WEDGE, WEDGE_FACES)
+    fine = wedge(np.vstack([WEDGE, HORN]), np.vstack([WEDGE_FACES[:3], (1, 2, 4), (2, 3, 4), (3, 1, 4)]))
+    assert np.abs(coarse.mesh_quat - fine.mesh_quat).max() > 0.05
+    ours, theirs = build_draw_list(coarse, finer=fine), build_draw_list(fine)
+    assert len(ours.indices) == 6 * 3
+    for place in in_world(theirs, fine, "position"):
+        distance = np.linalg.norm(in_world(ours, coarse, "position") - place, axis=1)
+        assert distance.min() < 1e-6
+    assert len(build_draw_list(coarse, finer=mujoco.MjSpec().compile()).indices) == 4 * 3  # it has none of that name
+
+
+def test_edges_of_a_finer_mesh_are_sharp() -> None:
+    """Each corner of a wedge has its faces' normals, as MuJoCo's renderer draws it, not their mean."""
+    model = wedge(WEDGE, WEDGE_FACES)
+    sharp = build_draw_list(model, finer=wedge(WEDGE, WEDGE_FACES))
+    faces = sharp.indices.reshape(-1, 3)
+    a, b, c = (sharp.vertices["position"][faces[:, k]] for k in range(3))
+    flat = np.cross(b - a, c - a)
+    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
+    for corner in range(3):
+        agreement = np.einsum("ij,ij->i", sharp.vertices["normal"][faces[:, corner]], flat)
+        assert agreement.min() > 0.8 - 1e-5

@@ -23,6 +23,8 @@ ROWS = 5
 """Texels per geom in the table: three rows of the pose, colour, material."""
 ROUND = 32
 """Sides of cylinders and spheres."""
+LEAST_AGREEMENT = 0.8
+"""Cosine below which MuJoCo's renderer draws a corner of a mesh with its face's normal: there is an edge."""
 
 _DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], dtype=np.float32)
 """A geom of this colour shows its material's, as in MuJoCo."""
@@ -62,7 +64,10 @@ class DrawList:
 
 
 def build_draw_list(
-    model: mujoco.MjModel, background: tuple[str, ...] = (), shadowless: tuple[str, ...] = ()
+    model: mujoco.MjModel,
+    background: tuple[str, ...] = (),
+    shadowless: tuple[str, ...] = (),
+    finer: mujoco.MjModel | None = None,
 ) -> DrawList:
     """Collect the visual geoms of a model.
 
@@ -70,6 +75,7 @@ def build_draw_list(
         model: a compiled scene.
         background: bodies to draw last, in this order, since they fill what the others leave free.
         shadowless: bodies that cast no shadow.
+        finer: a model whose meshes are drawn in place of the scene's of the same names.
 
     Raises:
         MemobenchError: for a visual geom of a shape that is not drawn here.
@@ -77,7 +83,7 @@ def build_draw_list(
     geoms = np.array(_visual_geoms(model, background), dtype=np.int64)
     parts, indices, start = [], [np.zeros(0, np.uint32)], 0
     for row, geom in enumerate(geoms.tolist()):
-        positions, normals, uv, triangles = triangles_of(model, geom)
+        positions, normals, uv, triangles = triangles_of(model, geom, finer)
         part = np.zeros(len(positions), dtype=VERTEX)
         part["position"], part["normal"], part["uv"], part["geom"] = positions, normals, uv, row
         parts.append(part)
@@ -162,8 +168,13 @@ def _layers(model: mujoco.MjModel) -> tuple[NDArray[np.uint8], dict[int, int]]:
 # --- the triangles of MuJoCo's shapes: meshes, boxes, cylinders, spheres, ellipsoids, capsules ---
 
 
-def triangles_of(model: mujoco.MjModel, geom: int) -> Triangles:
+def triangles_of(model: mujoco.MjModel, geom: int, finer: mujoco.MjModel | None = None) -> Triangles:
     """Return a geom's triangles in its own frame.
+
+    Args:
+        model: a compiled scene.
+        geom: its id.
+        finer: a model whose mesh of the same name is taken, where it has one.
 
     Raises:
         MemobenchError: for a shape that is not drawn here.
@@ -172,7 +183,7 @@ def triangles_of(model: mujoco.MjModel, geom: int) -> Triangles:
     size = np.asarray(model.geom_size[geom])
     match kind:
         case mujoco.mjtGeom.mjGEOM_MESH:
-            return _mesh(model, int(model.geom_dataid[geom]))
+            return _named_mesh(model, int(model.geom_dataid[geom]), finer or model)
         case mujoco.mjtGeom.mjGEOM_BOX:
             return _box(size)
         case mujoco.mjtGeom.mjGEOM_CYLINDER:
@@ -189,27 +200,59 @@ def triangles_of(model: mujoco.MjModel, geom: int) -> Triangles:
     )
 
 
-def _mesh(model: mujoco.MjModel, mesh: int) -> Triangles:
-    """Return a mesh's triangles, one vertex for each combination of point, normal and texture coordinate."""
+def _named_mesh(model: mujoco.MjModel, mesh: int, source: mujoco.MjModel) -> Triangles:
+    """Return another model's mesh of the same name in the frame of this model's mesh, which is also its geom's.
+
+    The compiler moves every mesh into its own centre and principal axes, and a mesh of more faces has others.
+    """
+    other = mujoco.mj_name2id(source, mujoco.mjtObj.mjOBJ_MESH, model.mesh(mesh).name)
+    if source is model or other < 0:
+        return _mesh(model, mesh)
+    here, there = _mesh_axes(model, mesh), _mesh_axes(source, other)
+    points, normals, uv, triangles = _mesh(source, other, LEAST_AGREEMENT)
+    in_file = points @ there.T + source.mesh_pos[other]
+    return (in_file - model.mesh_pos[mesh]) @ here, normals @ there.T @ here, uv, triangles
+
+
+def _mesh_axes(model: mujoco.MjModel, mesh: int) -> NDArray[np.float64]:
+    """Return the rotation (3, 3) from the frame of a compiled mesh to its file's."""
+    axes = np.empty(9)
+    mujoco.mju_quat2Mat(axes, model.mesh_quat[mesh])
+    return axes.reshape(3, 3)
+
+
+def _mesh(model: mujoco.MjModel, mesh: int, agreement: float = -np.inf) -> Triangles:
+    """Return a mesh's triangles, one vertex for each combination of point, normal and texture coordinate.
+
+    Args:
+        model: a compiled model.
+        mesh: its id.
+        agreement: cosine to a face's own normal below which a point's mean normal is not taken.
+    """
     face, faces = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
     point, normal = int(model.mesh_vertadr[mesh]), int(model.mesh_normaladr[mesh])
     uv = int(model.mesh_texcoordadr[mesh])
+    points = model.mesh_face[face : face + faces]
+    normals = model.mesh_normal[normal : normal + int(model.mesh_normalnum[mesh])]
+    normal_of = model.mesh_facenormal[face : face + faces]
+    if uv < 0 and agreement > -1:  # a mesh with texture coordinates comes with normals of its own
+        a, b, c = (model.mesh_vert[point + points[:, corner]] for corner in range(3))
+        flat = np.cross(b - a, c - a)
+        flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
+        edged = np.einsum("fcx,fx->fc", normals[normal_of], flat) < agreement
+        normal_of = np.where(edged, len(normals) + np.arange(faces)[:, None], normal_of)
+        normals = np.concatenate([normals, flat])
     corners = np.stack(
         [
-            model.mesh_face[face : face + faces].ravel(),
-            model.mesh_facenormal[face : face + faces].ravel(),
+            points.ravel(),
+            normal_of.ravel(),
             model.mesh_facetexcoord[face : face + faces].ravel() if uv >= 0 else np.zeros(3 * faces, np.int32),
         ],
         axis=1,
     )
     unique, index = _unique_in_order(corners)
     coordinates = model.mesh_texcoord[uv + unique[:, 2]] if uv >= 0 else np.zeros((len(unique), 2))
-    return (
-        model.mesh_vert[point + unique[:, 0]],
-        model.mesh_normal[normal + unique[:, 1]],
-        coordinates,
-        index.reshape(-1, 3),
-    )
+    return model.mesh_vert[point + unique[:, 0]], normals[unique[:, 1]], coordinates, index.reshape(-1, 3)
 
 
 def _unique_in_order(rows: NDArray[np.integer]) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
