@@ -14,10 +14,14 @@ import pytest
 import typer
 
 from lerobot_memobench.cli import memobench
+from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.metrics import METRICS, Rate, percent
+from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.run.arguments import joined, read_arguments, resolve_recipe, split_arguments
 from lerobot_memobench.run.plan import take_run_options
 from lerobot_memobench.run.training import take_training_options
+from tests.support.logs import rollout
 from tests.support.scripts import load_script
 
 reference = load_script("docs_reference")
@@ -124,6 +128,62 @@ def test_every_page_has_its_place_in_the_site() -> None:
     told = set(re.findall(r"[\w/-]+\.md", (ROOT / "mkdocs.yml").read_text().partition("\nnav:")[2]))
     there = {str(page.relative_to(DOCS)) for page in DOCS.glob("**/*.md")}
     assert told == there | set(reference.PAGES) | set(reference.COPIES.values())
+
+
+# --- figures ---
+
+LOGS = NOTES / "logs"
+FIGURES = ("SR", "MSR", "MUR", "MCR", "rollouts")
+
+
+def published(document: Path) -> Iterator[tuple[str, dict[str, str]]]:
+    """Yield the name of a log and the figures beside it, of every row of a table that links one."""
+    for block in re.findall(r"(?:^\|.*\n)+", document.read_text(), re.MULTILINE):
+        head, _, *rows = ([cell.strip() for cell in line.strip().strip("|").split("|")] for line in block.splitlines())
+        for row in rows:
+            if found := re.search(r"research/logs/([\w-]+)|\]\(logs/([\w-]+)", row[-1]):
+                yield found[1] or found[2], {name: row[head.index(name)] for name in FIGURES}
+
+
+def recomputed(folder: Path) -> dict[str, str]:
+    """Return the same figures from a log, as they are written in a document."""
+    (run,) = read_runs([folder])
+    cells = {metric: in_figures(run.summary.average[metric]) for metric in METRICS}
+    return {**cells, "rollouts": f"{run.summary.rollouts:,}"}
+
+
+def in_figures(rate: Rate) -> str:
+    """Return a rate as documents write it: ``97.9 [96.9–98.5]``."""
+    if rate.value is None or rate.interval is None:
+        return "–"
+    value, low, high = (f"{percent(part):g}" for part in (rate.value, *rate.interval))
+    return f"{value} [{low}–{high}]"
+
+
+@pytest.mark.parametrize("document", [ROOT / "README.md", DOCS / "benchmark" / "results.md"], ids=name)
+def test_published_figures_are_those_of_their_logs(document: Path) -> None:
+    for log, figures in published(document):
+        assert figures == recomputed(LOGS / log), log
+
+
+def test_every_log_is_among_the_results() -> None:
+    there = {folder.name for folder in LOGS.iterdir() if folder.is_dir()}
+    assert {log for log, _ in published(DOCS / "benchmark" / "results.md")} == there
+
+
+def test_logs_are_small() -> None:
+    assert sum(file.stat().st_size for file in LOGS.glob("**/*")) < 300_000
+
+
+def test_figures_of_a_row_are_found(tmp_path: Path) -> None:
+    document = tmp_path / "one.md"
+    head = "| policy | SR | MSR | MUR | MCR | rollouts | |\n|---|---|---|---|---|---:|---|\n"
+    document.write_text(f"{head}| a | 1 | 2 | 3 | – | 1,500 | [log](../research/logs/a) |\n| b | | | | | | |\n")
+    assert list(published(document)) == [("a", {"SR": "1", "MSR": "2", "MUR": "3", "MCR": "–", "rollouts": "1,500"})]
+    records = [rollout("one", "temporal", "S", [k > 0], k > 0, k) for k in range(4)]
+    write_episodes(tmp_path, records)
+    rate = "75 [30.1–95.4]"
+    assert recomputed(tmp_path) == {"SR": rate, "MSR": rate, "MUR": "–", "MCR": "–", "rollouts": "4"}
 
 
 # --- commands ---

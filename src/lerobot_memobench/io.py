@@ -9,12 +9,14 @@ import codecs
 import contextlib
 import errno
 import functools
+import gzip
 import hashlib
 import os
 import re
 import secrets
 import shutil
 import sys
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
@@ -222,8 +224,42 @@ class Malformed(MemobenchError):
     """What was read is not of the expected shape; the message is the reason alone."""
 
 
+PACKED = ".gz"
+"""What ``gzip`` puts behind the name of a file that it compresses."""
+LARGEST_UNPACKED = 256 << 20
+"""Bytes that a compressed file may become: some hundred thousand episodes."""
+
+
+def is_there(path: Path) -> bool:
+    """Return whether there is a file, or the same file compressed by ``gzip``."""
+    return path.is_file() or packed(path).is_file()
+
+
+def packed(path: Path) -> Path:
+    """Return where ``gzip`` puts a file."""
+    return path.with_name(path.name + PACKED)
+
+
+def file_bytes(path: Path) -> bytes:
+    """Return what a file holds; where only the same file compressed by ``gzip`` is there, what that one holds.
+
+    Raises:
+        FileNotFoundError: there is neither. OSError: it cannot be read, is damaged, or becomes too large.
+    """
+    if path.suffix != PACKED and (path.exists() or not packed(path).exists()):
+        return path.read_bytes()
+    try:
+        with gzip.open(path if path.suffix == PACKED else packed(path)) as file:
+            content = file.read(LARGEST_UNPACKED + 1)
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise OSError(f"it is no whole gzip file: {error}") from None
+    if len(content) > LARGEST_UNPACKED:
+        raise OSError(f"it becomes larger than {in_words(LARGEST_UNPACKED)}")
+    return content
+
+
 def read_json(path: Path, schema: Any, advice: str, *, nan: bool = False) -> Any:
-    """Return what a JSON file of ours holds.
+    """Return what a JSON file of ours holds, also where it is compressed (`file_bytes`).
 
     Args:
         schema: the type that it must have. advice: ends the sentence: what to do.
@@ -234,7 +270,7 @@ def read_json(path: Path, schema: Any, advice: str, *, nan: bool = False) -> Any
         MemobenchError: it cannot be read or is not of the schema, named with the place in it.
     """
     try:
-        return checked(parsed(path.read_bytes(), nan=nan), schema)
+        return checked(parsed(file_bytes(path), nan=nan), schema)
     except FileNotFoundError:
         raise
     except OSError as error:

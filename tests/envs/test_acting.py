@@ -133,7 +133,7 @@ def test_object_poses_are_refused_or_named(tmp_path: Path) -> None:
     for file in sorted(out.iterdir()):
         assert f"pixels, {POSES}" in " ".join(file.read_text().split()), file.name
     assert memobench(["html", str(ours), "--out", str(page)]) == 0
-    assert f"policy inputs: pixels, {POSES}" in (page / "index.html").read_text()
+    assert f"inputs: pixels, {POSES}" in (page / "index.html").read_text()
 
     merged = tmp_path / "merged"
     assert merge(merged, [tmp_path / "plain"]) == []

@@ -99,7 +99,7 @@ def test_an_action_that_is_none_ends_its_episode_alone(
     told = "1 rollout was broken off and counts" if sum(cut) == 1 else "3 rollouts were broken off and count"
     assert f"{told} as failed" in notes[0]
     assert words in notes[0]
-    assert json.loads(json.dumps(write_report(tmp_path)[0].failures))["invalid_action"] == sum(cut)
+    assert json.loads(json.dumps(write_report(tmp_path).summary.failures))["invalid_action"] == sum(cut)
     assert words.replace("(", "") in (tmp_path / "report.md").read_text().replace("(", "")
 
 
@@ -203,12 +203,12 @@ def test_a_task_that_cannot_be_run_is_counted_as_not_run(folder: Path, tmp_path:
         env.step(REST[None])
     env.close()
     report = merge_and_report(tmp_path / "merged", [log, other])
-    assert report.summary.rollouts == 1
-    note, nobodys = report.notes
+    assert report.run.summary.rollouts == 1
+    note, nobodys = report.run.notes
     assert nobodys == f"{tmp_path / 'merged'} does not say whose episodes it holds: no part of it did"
     assert note.startswith("a_shelf was not run, and the figures are without that: the expert puts things")
     for _ in range(2):  # and again from the merged file
-        assert write_report(tmp_path / "merged")[1] == [note]
+        assert write_report(tmp_path / "merged").notes == [note]
         assert json.loads((tmp_path / "merged" / "report.json").read_text())["not_run"] == {"a_shelf": 2}
 
 

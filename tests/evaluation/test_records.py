@@ -185,7 +185,7 @@ def test_rollouts_beyond_those_asked_for_are_not_counted(tmp_path: Path) -> None
     (run,) = read_runs([folder])
     assert [row["SR"].n for row in run.summary.tasks.values()] == [3, 3]
     assert run.notes == ["2 rollouts beyond the 3 of each task that were asked for left out"]
-    assert write_report(folder)[0].tasks["one"]["SR"].n == 3
+    assert write_report(folder).summary.tasks["one"]["SR"].n == 3
     assert read_rollouts(folder)[1] == [], "and now they are gone"
     (folder / "card.json").write_text(json.dumps({**told, "policy": {"seed": 9}}))
     logs.evaluation(folder)

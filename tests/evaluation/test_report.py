@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import gzip
 import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pytest
 from rich.console import Console
 
+from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode_log import EpisodeLog
-from lerobot_memobench.evaluation.report import evaluation_markdown, table, write_report
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.headline import headline
+from lerobot_memobench.evaluation.records import read_runs
+from lerobot_memobench.evaluation.report import build, evaluation_markdown, render, table, write_report
 from lerobot_memobench.evaluation.report_tables import failure_line
 from tests.support import logs
 
@@ -29,12 +38,13 @@ def logged(folder: Path, episodes: int = 4) -> Path:
 
 
 def test_files_are_written_beside_the_log(tmp_path: Path) -> None:
-    _, notes = write_report(logged(tmp_path))
+    notes = write_report(logged(tmp_path)).notes
     assert not notes
     assert len((tmp_path / "episodes.jsonl").read_text().splitlines()) == 8
     content = json.loads((tmp_path / "report.json").read_text())
     assert content["average"] == {"n": 8, "SR": 87.5, "MSR": 100.0, "MUR": 87.5, "MCR": None}
-    assert (tmp_path / "report.md").read_text().startswith("# Evaluation report")
+    first = "policy not recorded: published suite, referent fixed, seeds 7 to 10, 4 episodes of each of 2 tasks"
+    assert (tmp_path / "report.md").read_text().startswith(f"# {first}, replan interval 5; inputs: not recorded\n")
     assert not list(tmp_path.glob("*.part"))
 
 
@@ -46,7 +56,7 @@ def test_reporting_again_changes_nothing(tmp_path: Path) -> None:
 
 
 def test_surplus_episodes_of_the_last_batch_are_left_out(tmp_path: Path) -> None:
-    summary, _ = write_report(logged(tmp_path, episodes=4), episodes=3)
+    summary = write_report(logged(tmp_path, episodes=4), episodes=3).summary
     assert summary.tasks["first"]["SR"].n == 3
 
 
@@ -54,23 +64,123 @@ def test_unreadable_lines_become_notes(tmp_path: Path) -> None:
     logged(tmp_path)
     path = next((tmp_path / "episodes").glob("first.*"))
     path.write_bytes(path.read_bytes() + b'{"task": "fir')
-    _, notes = write_report(tmp_path)
+    notes = write_report(tmp_path).notes
     assert len(notes) == 1
     assert notes[0] in (tmp_path / "report.md").read_text()
 
 
 def test_markdown_has_intervals_and_dashes(tmp_path: Path) -> None:
-    summary, _ = write_report(logged(tmp_path))
-    text = evaluation_markdown(summary, [record("first", "temporal", 0, True)])
+    text = evaluation_markdown(write_report(logged(tmp_path)))
     assert "| `first` | 4 | 75.0 [30.1, 95.4] | 100.0 [51.0, 100.0] | 75.0 [30.1, 95.4] | – |" in text
     assert "stale memory | 1" in text
 
 
 def test_terminal_table(tmp_path: Path) -> None:
-    summary, _ = write_report(logged(tmp_path))
+    summary = write_report(logged(tmp_path)).summary
     console = Console(width=100, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
     console.print(table(summary))
     text = console.export_text()
     assert "average of memory types" in text
     assert "87.5" in text
     assert failure_line(summary) == "failed rollouts: 1 stale memory"
+
+
+# --- the first line ---
+
+
+def prompted(folder: Path, policy: dict[str, Any], checkpoint: dict[str, Any] | None = None, **changes: Any) -> Path:
+    """An evaluation whose prompt was seen by ``policy``, with a card where there is a ``checkpoint``."""
+    settings = {**logs.SETTINGS, "replan_steps": 5, "prompt_in": "steps", "policy": policy, **changes}
+    log = EpisodeLog(folder, settings)
+    for k in range(2):
+        log.append(record("first", "object", k, True, prompt_steps=30, inputs="pixels", suite="strict"))
+    if checkpoint is not None:
+        card = {"protocol": {"episodes": 2}, "policy": policy, "checkpoint": checkpoint}
+        (folder / "card.json").write_text(json.dumps(card))
+    return folder
+
+
+STRICT = "strict suite, referent fixed, seeds 7 to 8, 2 episodes of first, replan interval 5"
+
+
+def test_the_first_line_of_lerobot_eval(tmp_path: Path) -> None:
+    run = write_report(prompted(tmp_path, {"type": "act"}, {"path": "user/mine"}))
+    assert headline([run]) == f"act (user/mine): {STRICT}; inputs: pixels, prompt in steps (observed)"
+
+
+def test_the_first_line_of_plain_lerobot_eval(tmp_path: Path) -> None:
+    policy = {"type": "act", "identity": "act 0123456789ab"}
+    run = write_report(prompted(tmp_path, policy, prompt_in="reset"))
+    assert headline([run]) == f"act 0123456789ab: {STRICT}; inputs: pixels, prompt in reset (not observed)"
+
+
+def test_the_first_line_of_a_log_without_a_prompt(tmp_path: Path) -> None:
+    run = write_report(prompted(tmp_path, {}, demonstration_prompt=False))
+    assert headline([run]).endswith("; inputs: pixels, no demonstration prompt")
+
+
+def test_the_first_line_of_several(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        prompted(tmp_path / name, {"type": name.upper()})
+    seen = "inputs: pixels, prompt in steps (observed)"
+    runs = read_runs([f"one={tmp_path}/a", f"two={tmp_path}/b"])
+    assert headline(runs) == f"2 evaluations, {STRICT}; one: A, {seen}; two: B, {seen}"
+    short = replace(runs[1], records=runs[1].records[:1])
+    other = STRICT.replace("seeds 7 to 8, 2 episodes", "seed 7, 1 episode")
+    assert headline([runs[0], short]) == f"2 evaluations; one: A, {seen} ({STRICT}); two: B, {seen} ({other})"
+
+
+def test_every_format_begins_with_it(tmp_path: Path) -> None:
+    runs = read_runs([prompted(tmp_path, {"type": "a_policy"})])
+    line = headline(runs)
+    found = build(runs)
+    assert render(found, runs, "markdown").splitlines()[0] == "# " + line.replace("_", "\\_")
+    assert " ".join(render(found, runs, "table").split()).startswith(line)
+    assert render(found, runs, "latex").startswith(f"% {line}")
+
+
+# --- a log that is kept: compressed ---
+
+
+def kept(folder: Path) -> Path:
+    """Compress an evaluation as ``gzip -9n episodes.jsonl card.json`` does, and leave nothing else."""
+    write_report(prompted(folder, {"type": "act"}, {"path": "user/mine"}))
+    for name in ("episodes.jsonl", "card.json"):
+        (folder / f"{name}.gz").write_bytes(gzip.compress((folder / name).read_bytes()))
+        (folder / name).unlink()
+    shutil.rmtree(folder / "episodes")
+    for name in ("protocol.json", "report.json", "report.md"):
+        (folder / name).unlink()
+    return folder
+
+
+def test_a_compressed_evaluation_is_read_like_any(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    open_, archive = prompted(tmp_path / "a", {"type": "act"}, {"path": "user/mine"}), kept(tmp_path / "b")
+    before = sorted(archive.iterdir())
+    told = []
+    for folder in (open_, archive):
+        assert main(["report", str(folder), "--format", "csv"]) == 0
+        told.append([line.partition(",")[2] for line in capsys.readouterr().out.splitlines()])  # but for its name
+    assert told[0] == told[1]
+    assert len(told[0]) > 10
+    assert main(["compare", str(open_), str(archive)]) == 0
+    assert "2 episodes in both" in capsys.readouterr().out
+    assert sorted(archive.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda data: data[:-12], lambda data: b"no gzip", lambda data: data[:40] + b"x" * 9]
+)
+def test_a_damaged_archive_is_one_sentence(
+    tmp_path: Path, damage: Callable[[bytes], bytes], capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = kept(tmp_path) / "episodes.jsonl.gz"
+    file.write_bytes(damage(file.read_bytes()))
+    assert main(["report", str(tmp_path)]) == 2
+    assert "it is no whole gzip file" in capsys.readouterr().err
+
+
+def test_what_grows_too_large_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lerobot_memobench.io.LARGEST_UNPACKED", 100)
+    with pytest.raises(MemobenchError, match=r"episodes.jsonl.gz cannot be read \(it becomes larger than"):
+        read_runs([kept(tmp_path)])

@@ -153,9 +153,9 @@ def test_episodes_of_nobody_are_not_given_to_a_policy(tmp_path: Path) -> None:
     with pytest.raises(MemobenchError, match=r"lines holds episodes of act 1 and .*other ones of act 2"):
         merge(out, [sources[2], other])
     assert not out.exists()
-    notes = merge_and_report(out, [old, part(tmp_path / "older", [4], settings=None)]).notes
+    notes = merge_and_report(out, [old, part(tmp_path / "older", [4], settings=None)]).run.notes
     assert notes == [f"{out} does not say whose episodes it holds: no part of it did"]
-    assert merge_and_report(tmp_path / "whole", [sources[1]]).notes == []
+    assert merge_and_report(tmp_path / "whole", [sources[1]]).run.notes == []
 
 
 def test_copies_where_there_are_no_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

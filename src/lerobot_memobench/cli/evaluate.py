@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lerobot_memobench.cli.console import WITH_PARENT, console, counting, say, tell
+from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.report import table
-from lerobot_memobench.evaluation.report_tables import failure_line, inputs_phrase
+from lerobot_memobench.evaluation.report_tables import failure_line
 from lerobot_memobench.io import count_of
 from lerobot_memobench.jobs.executors import asked_for
 from lerobot_memobench.jobs.processes import saying_how_to_go_on
@@ -95,11 +96,11 @@ def print_merged(report: EvaluationReport) -> int:
 
 
 def print_figures(report: EvaluationReport) -> None:
-    """Print a report's table, its failures and what a reader must know."""
-    screen = console()
+    """Print a report's first line, its table, its failures and what a reader must know."""
+    screen, run = console(), report.run
     screen.print()
-    screen.print(table(report.summary), crop=False)
-    screen.print(failure_line(report.summary))
-    screen.print(inputs_phrase(report.summary.inputs))
-    for note in report.notes:
+    screen.print(headline([run]), style="bold")
+    screen.print(table(run.summary), crop=False)
+    screen.print(failure_line(run.summary))
+    for note in run.notes:
         screen.print(f"note: {note}")

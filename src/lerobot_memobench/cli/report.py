@@ -81,8 +81,9 @@ def report(
 ) -> None:
     """Report SR, MSR, MUR and MCR of evaluations. Also prefix completion, failures and replan sweeps.
 
-    report.json and report.md of each evaluation are written beside its log as well.
+    report.json and report.md of each evaluation are written beside its log as well, but for a compressed one.
     """
+    from lerobot_memobench.envs.episode_log import is_archive
     from lerobot_memobench.evaluation.records import read_runs
     from lerobot_memobench.evaluation.report import build, render, write_documents, write_report
     from lerobot_memobench.evaluation.tables import terminal
@@ -91,6 +92,8 @@ def report(
     wanted = list(dict.fromkeys(each.value for each in format_ or [ReportFormat.TABLE]))
     paper = with_ is Beside.PAPER
     for run in runs:
+        if is_archive(run.folder):
+            continue
         try:
             write_report(run.folder)
         except OSError as error:  # an archive that is only read
@@ -302,7 +305,6 @@ def show_report(report: Report, name: str, formats: Sequence[ReportFormat] | Non
             out.mkdir(parents=True, exist_ok=True)
             say(write_file(out / f"{name}.{ENDINGS[each]}", WRITERS[each](report)))
         elif each is ReportFormat.TABLE:
-            console().print(report.title, style="bold")
             console().print(terminal(report), crop=False)
         else:
             print(WRITERS[each](report), end="")

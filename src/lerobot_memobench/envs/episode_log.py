@@ -28,7 +28,9 @@ from lerobot_memobench.io import (
     checked,
     count_of,
     cut,
+    file_bytes,
     file_name,
+    packed,
     parsed,
     read_json,
     write_file,
@@ -243,9 +245,10 @@ def notes_on_not_run(records: Sequence[Mapping[str, Any]]) -> list[str]:
 def read_log(directory: str | Path, problems: list[str] | None = None) -> list[dict[str, Any]]:
     """Return all lines logged under ``directory``, sorted by task, episode and referent; also of episodes not run.
 
-    Reads the workers' files and a plain ``episodes.jsonl``; of several lines about the same task, episode and
-    referent the newest counts. Lines that cannot be read, such as the last one of a killed run, are left out,
-    named in ``problems`` (file, line, reason) and logged as warnings; so are episodes with lines of either outcome.
+    Reads the workers' files and ``episodes.jsonl``, also as ``gzip`` compresses it; of several lines about the same
+    task, episode and referent the newest counts. Lines that cannot be read, such as the last one of a killed run, are
+    left out, named in ``problems`` (file, line, reason) and logged as warnings; so are episodes with lines of either
+    outcome.
 
     Raises:
         MemobenchError: there is no such folder, no log in it, or one of several policies.
@@ -302,15 +305,21 @@ def has_log(directory: Path) -> bool:
     return bool(_log_files(directory))
 
 
+def is_archive(directory: Path) -> bool:
+    """Return whether the log in ``directory`` is a compressed one alone: it is kept, and only read."""
+    return _log_files(directory) == [packed(directory / MERGED_FILE)]
+
+
 def _log_files(directory: Path) -> list[Path]:
     """The merged file first: its lines carry no time, and those of the workers' files that do are newer."""
     merged = directory / MERGED_FILE
-    return [merged] * merged.is_file() + sorted((directory / EPISODES_FOLDER).glob("*.jsonl"))
+    whole = [path for path in (packed(merged), merged) if path.is_file()]
+    return whole + sorted((directory / EPISODES_FOLDER).glob("*.jsonl"))
 
 
 def _read_lines(file: Path, problems: list[str]) -> Iterator[dict[str, Any]]:
     try:
-        content = file.read_bytes()
+        content = file_bytes(file)
     except OSError as error:
         problems.append(f"{file} cannot be read ({error.strerror or error}); left out")
         return

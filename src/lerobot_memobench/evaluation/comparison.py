@@ -13,6 +13,7 @@ import numpy as np
 
 from lerobot_memobench.envs.episode_log import OF_THE_POLICY, SETTINGS, differences
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import METRICS, Record, by_task, operations, policy_inputs, value_of
 from lerobot_memobench.evaluation.records import Run
 from lerobot_memobench.evaluation.report_tables import AVERAGE, inputs_phrase
@@ -117,7 +118,8 @@ class Difference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Both evaluations' names, number of pairs, all differences, what a reader must know, and each one's inputs."""
+    """Both evaluations' names, number of pairs, all differences, what a reader must know, each one's inputs, and the
+    report's first line."""
 
     a: str
     b: str
@@ -125,6 +127,7 @@ class Comparison:
     differences: tuple[Difference, ...]
     notes: tuple[str, ...]
     inputs: tuple[str, str]
+    headline: str
 
 
 def compare(
@@ -152,8 +155,10 @@ def compare(
         for metric in METRICS
         if (row := _difference(scope, metric, members, rng, permutations)) is not None
     ]
-    inputs = (policy_inputs([mine for mine, _ in pairs]), policy_inputs([other for _, other in pairs]))
-    return Comparison(a.name, b.name, len(pairs), tuple(_adjusted(rows)), tuple(_notes(a, b, len(pairs))), inputs)
+    notes = tuple(_notes(a, b, len(pairs)))
+    a, b = (replace(run, records=[pair[k] for pair in pairs]) for k, run in enumerate((a, b)))
+    inputs = (policy_inputs(a.records), policy_inputs(b.records))
+    return Comparison(a.name, b.name, len(pairs), tuple(_adjusted(rows)), notes, inputs, headline([a, b]))
 
 
 def _like_pairs(a: Run, b: Run, allow: Collection[str]) -> list[Pair]:
@@ -282,7 +287,9 @@ def comparison_report(found: Comparison) -> Report:
         "differences": [_entry(row) for row in found.differences],
         "notes": list(found.notes),
     }
-    return Report(f"{found.b} against {found.a}", (Section("", tables, (sentence, NOTE), found.notes),), data)
+    return Report(
+        f"{found.b} against {found.a}: {found.headline}", (Section("", tables, (sentence, NOTE), found.notes),), data
+    )
 
 
 def _table(key: str, title: str, found: Comparison, rows: Sequence[Difference], tasks: bool) -> Table:

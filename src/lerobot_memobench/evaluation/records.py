@@ -30,7 +30,7 @@ from lerobot_memobench.envs.episode_log import (
 )
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import Record, Summary, faults, mixtures, summarise
-from lerobot_memobench.io import LARGEST, Count, Name, Whole, count_of, read_json
+from lerobot_memobench.io import LARGEST, Count, Name, Whole, count_of, is_there, read_json
 from lerobot_memobench.tasks.task import PUBLISHED
 
 # --- types of the result card; what its parts mean, `run.card` says ---
@@ -99,6 +99,7 @@ class Card(TypedDict):
 
     protocol: Protocol
     policy: NotRequired[Policy]
+    checkpoint: NotRequired[Checkpoint | None]
     runs: NotRequired[list[StartFacts]]
 
 
@@ -198,7 +199,7 @@ def read_card(path: Path, *, whole: bool = False) -> dict[str, Any]:
 
 def card_of(folder: Path) -> dict[str, Any]:
     """Return what reports take from the card of an evaluation, {} where it has none."""
-    return read_card(folder / CARD_FILE) if (folder / CARD_FILE).is_file() else {}
+    return read_card(folder / CARD_FILE) if is_there(folder / CARD_FILE) else {}
 
 
 # --- evaluations ---

@@ -7,7 +7,7 @@ formats the same keys stand with more beside them: intervals, prefix completion 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,19 +16,18 @@ from rich.console import RenderableType
 
 from lerobot_memobench.envs.episode_log import POLICY, not_run, notes_on_not_run, read_log, write_episodes
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import (
     METRICS,
     Rate,
-    Record,
     Row,
     Summary,
     faults,
     mixtures,
     percent,
     report_values,
-    summarise,
 )
-from lerobot_memobench.evaluation.records import Run, asked_for, sweeps, unlike
+from lerobot_memobench.evaluation.records import Run, asked_for, read_protocol, sweeps, unlike
 from lerobot_memobench.evaluation.report_tables import (
     PAPER_INPUTS,
     beside_paper,
@@ -41,7 +40,6 @@ from lerobot_memobench.evaluation.report_tables import (
     overview,
     pooled_sentence,
     prefix_table,
-    protocol_sentence,
     rates_table,
     sweep,
     tasks_table,
@@ -66,7 +64,7 @@ FILES: dict[str, str] = {
 # --- beside the log ---
 
 
-def write_report(directory: str | Path, episodes: int | None = None) -> tuple[Summary, list[str]]:
+def write_report(directory: str | Path, episodes: int | None = None) -> Run:
     """Read the log under ``directory`` and write ``episodes.jsonl``, ``report.json`` and ``report.md`` into it.
 
     Args:
@@ -74,7 +72,7 @@ def write_report(directory: str | Path, episodes: int | None = None) -> tuple[Su
             last one may hold more than were asked for.
 
     Returns:
-        The figures, and notes a reader must know: unreadable lines, what was not run, mixed protocols.
+        The evaluation, with notes a reader must know: unreadable lines, what was not run, mixed protocols.
 
     Raises:
         MemobenchError: there is no rollout: nothing was run, or nothing could be.
@@ -89,13 +87,13 @@ def write_report(directory: str | Path, episodes: int | None = None) -> tuple[Su
     records = [record for record in logged if "not_run" not in record]
     if logged and not records:
         raise MemobenchError(f"no episode in {directory} could be run; {'; '.join(notes)}")
-    summary = summarise(records)
     notes += faults(records) + mixtures(records)
+    run = Run(directory.name, "", directory, records, read_protocol(directory), notes)
     unrun = {task: len(lines) for task, lines in not_run(logged).items()}
-    figures = {**report_values(summary), **({"not_run": unrun} if unrun else {})}
+    figures = {**report_values(run.summary), **({"not_run": unrun} if unrun else {})}
     write_file(directory / REPORT_JSON, json.dumps(figures, indent=2) + "\n")
-    write_file(directory / REPORT_MARKDOWN, evaluation_markdown(summary, records, notes))
-    return summary, notes
+    write_file(directory / REPORT_MARKDOWN, evaluation_markdown(run))
+    return run
 
 
 def table(summary: Summary) -> RenderableType:
@@ -103,9 +101,9 @@ def table(summary: Summary) -> RenderableType:
     return terminal_table(rates_table(summary))
 
 
-def evaluation_markdown(summary: Summary, records: Iterable[Record], notes: Sequence[str] = ()) -> str:
+def evaluation_markdown(run: Run) -> str:
     """Return the report of one evaluation as Markdown."""
-    return markdown(Report("Evaluation report", (_section(summary, list(records), notes),)))
+    return markdown(Report(headline([run]), (_section(run),)))
 
 
 # --- documents ---
@@ -126,25 +124,26 @@ def build(runs: Sequence[Run], paper: bool = False) -> Report:
         found.append(Section("Evaluations", (overview(runs),), notes=tuple(unlike(runs))))
     found += [sweep(method, group) for method, group in sweeps(runs).items()]
     for run in runs:
-        section = _section(run.summary, run.records, run.notes)
+        section = _section(run)
         if len(runs) > 1:
             where = f"Evaluation in {run.folder}."
             section = replace(section, title=run.name, sentences=(where, *section.sentences))
         found.append(section)
     if paper:
         found.append(beside_paper(runs))
-    return Report("Evaluation report", tuple(found), report_data(runs, paper))
+    return Report(headline(runs), tuple(found), report_data(runs, paper))
 
 
-def _section(summary: Summary, records: Sequence[Record], notes: Sequence[str]) -> Section:
+def _section(run: Run) -> Section:
     """Return the section of one evaluation, without a title."""
+    summary = run.summary
     inputs = inputs_sentence(summary.inputs)
     made = (memory_types_table(summary), tasks_table(summary), prefix_table(summary), failures_table(summary))
     return Section(
         "",
         tuple(replace(each, note=f"{each.note} {inputs}".strip()) for each in made),
-        (protocol_sentence(records), pooled_sentence(summary)),
-        tuple(notes),
+        (pooled_sentence(summary),),
+        tuple(run.notes),
     )
 
 

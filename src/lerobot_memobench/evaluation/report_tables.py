@@ -5,32 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.metrics import METRICS, Rate, Record, Row, Summary, percent, policy_inputs
+from lerobot_memobench.evaluation.metrics import METRICS, Rate, Row, Summary, percent, policy_inputs
 from lerobot_memobench.evaluation.records import Run, unlike
 from lerobot_memobench.evaluation.tables import Cell, Count, Name, Numbers, Section, Table, best_in_columns, figure
 from lerobot_memobench.io import count_of
 from lerobot_memobench.paper import PublishedRow, failure_taxonomy, published_rows
 from lerobot_memobench.tasks.task import MEMORY_TYPES, PUBLISHED
-
-
-def protocol_sentence(records: Sequence[Record]) -> str:
-    """Return how many rollouts there are, of what, under which seeds, referent and replan interval."""
-    extent = f"{count_of(len(records), 'rollout')} of {count_of(len({r['task'] for r in records}), 'task')}"
-    return ", ".join([extent, *settings_phrases(records)]) + "."
-
-
-def settings_phrases(records: Sequence[Record]) -> list[str]:
-    """Return under which seeds, referent and replan interval rollouts were made, and what was seen, as phrases."""
-    seeds = sorted({record["seed"] for record in records if record.get("seed") is not None})
-    referents = sorted({str(record.get("referent", "fixed")) for record in records})
-    replans = sorted({record["replan_steps"] for record in records if record.get("replan_steps") is not None})
-    phrases = []
-    if seeds:
-        phrases.append(f"seeds {seeds[0]} to {seeds[-1]}" if len(seeds) > 1 else f"seed {seeds[0]}")
-    phrases.append(f"referent {', '.join(referents)}")
-    if replans:
-        phrases.append(f"replan interval {', '.join(map(str, replans))}")
-    return [*phrases, inputs_phrase(policy_inputs(records))]
 
 
 def inputs_phrase(words: str) -> str:

@@ -134,7 +134,7 @@ def best_in_columns(rows: tuple[tuple[Cell, ...], ...]) -> frozenset[tuple[int, 
 
 def markdown(report: Report) -> str:
     """Return a report as GitHub's Markdown."""
-    lines = [f"# {report.title}", ""]
+    lines = [f"# {_escaped(report.title)}", ""]
     for section in report.sections:
         lines += [f"## {_escaped(section.title)}", ""] if section.title else []
         for note in section.notes:
@@ -278,8 +278,8 @@ MOST_COLUMNS = 15
 
 
 def terminal(report: Report) -> RenderableType:
-    """Return a report for the terminal."""
-    parts: list[RenderableType] = []
+    """Return a report for the terminal: its title, then the sections."""
+    parts: list[RenderableType] = [Text(report.title, style="bold")]
     for section in report.sections:
         if section.title:
             parts.append(Text(f"\n{section.title}", style="bold underline"))

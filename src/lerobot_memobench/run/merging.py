@@ -23,7 +23,7 @@ from lerobot_memobench.envs.episode_log import (
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import CARD_FILE, read_card, read_protocol
 from lerobot_memobench.evaluation.report import write_report
-from lerobot_memobench.io import draft_of
+from lerobot_memobench.io import draft_of, is_there
 from lerobot_memobench.run.card import disagreement, extended, key_of, remove_card, with_episodes, write_card
 from lerobot_memobench.run.run import VIDEOS, EvaluationReport
 
@@ -34,10 +34,11 @@ SHARDS = "shard-*-of-*"
 def merge_and_report(out: Path, folders: Sequence[Path]) -> EvaluationReport:
     """Merge parts into the folder ``out`` and report the whole; see `merge`."""
     absent = merge(out, folders)
-    report = EvaluationReport(out, *write_report(out), absent)
+    report = EvaluationReport(write_report(out), absent)
     if _tells_whose(read_protocol(out), read_log(out)):
         return report
-    return replace(report, notes=[*report.notes, f"{out} does not say whose episodes it holds: no part of it did"])
+    note = f"{out} does not say whose episodes it holds: no part of it did"
+    return replace(report, run=replace(report.run, notes=[*report.run.notes, note]))
 
 
 def merge(out: Path, folders: Sequence[Path]) -> list[tuple[str, int]]:
@@ -148,7 +149,7 @@ def join(parts: Mapping[Path, Sequence[Mapping[str, Any]]]) -> list[dict[str, An
 
 def _joined_card(folders: Sequence[Path]) -> dict[str, Any] | None:
     """Return one card for all, None where one of them has none: it would say more than is known."""
-    if not all((folder / CARD_FILE).is_file() for folder in folders):
+    if not all(is_there(folder / CARD_FILE) for folder in folders):
         return None
     cards = {folder: read_card(folder / CARD_FILE, whole=True) for folder in folders}
     joined = functools.reduce(lambda card, mine: extended(card, mine, again=False), cards.values())

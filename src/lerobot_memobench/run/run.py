@@ -11,10 +11,9 @@ from typing import Any
 
 from lerobot_memobench.envs.episode_log import POLICY, differences, has_log, read_episodes, read_log, read_protocol_file
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.metrics import Summary
-from lerobot_memobench.evaluation.records import CARD_FILE, read_card, read_protocol
+from lerobot_memobench.evaluation.records import CARD_FILE, Run, read_card, read_protocol
 from lerobot_memobench.evaluation.report import REPORT_MARKDOWN, write_report
-from lerobot_memobench.io import count_of, remove_drafts
+from lerobot_memobench.io import count_of, is_there, remove_drafts
 from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.policies.baselines.configuration_baselines import UntrainedConfig
 from lerobot_memobench.policies.checkpoint import check_weights, portable_path
@@ -38,21 +37,17 @@ class EvaluationReport:
     """What an evaluation found.
 
     Attributes:
-        folder: holds the log, and the report's files.
-        summary: its figures.
-        notes: what a reader must know, such as lines of the log that could not be read.
+        run: its rollouts, figures and notes; its folder holds the log, and the report's files.
         absent: (task, episode) of those that were asked for and are missing.
     """
 
-    folder: Path
-    summary: Summary
-    notes: Sequence[str]
+    run: Run
     absent: Sequence[tuple[str, int]] = ()
 
     @property
     def page(self) -> Path:
         """The report as a file to read."""
-        return self.folder / REPORT_MARKDOWN
+        return self.run.folder / REPORT_MARKDOWN
 
 
 @dataclass(frozen=True)
@@ -130,7 +125,7 @@ def _finish(plan: EvaluationPlan, card: dict[str, Any]) -> EvaluationReport:
     protocol.pop(POLICY, None)  # a card says more of it; the file has what `auto` came to in LeRobot's process
     # LeRobot runs whole batches: episodes beyond those asked for are no part of the report.
     limit = plan.grid.first + max(plan.grid.runs, protocol["episodes"])
-    report = EvaluationReport(plan.log, *write_report(plan.log, limit))
+    report = EvaluationReport(write_report(plan.log, limit))
     records = [record for record in read_episodes(plan.log) if record["episode"] < limit]
     card = with_checkpoint({**card, "protocol": protocol}, plan.policy_path)
     write_card(plan.log, with_episodes(card, records))
@@ -158,7 +153,7 @@ def resumed_card(folder: Path, card: dict[str, Any], tell: Tell) -> dict[str, An
             f"{folder} holds an evaluation with another protocol ({'; '.join(found)}, there and now); repeat its "
             "settings to go on with it, or choose another output_dir="
         )
-    if not path.is_file():
+    if not is_there(path):
         tell(f"note: {folder} has no {CARD_FILE}: whether its episodes are this policy's cannot be checked")
         return card
     earlier = read_card(path, whole=True)

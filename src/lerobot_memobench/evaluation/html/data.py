@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench import __version__
-from lerobot_memobench.envs.episode_log import POLICY
 from lerobot_memobench.envs.video import OPERATION_COLOURS
+from lerobot_memobench.evaluation.headline import given, protocol_phrases, whose
 from lerobot_memobench.evaluation.metrics import (
     Rate,
     Record,
@@ -24,7 +24,7 @@ from lerobot_memobench.evaluation.metrics import (
     percent,
 )
 from lerobot_memobench.evaluation.records import Run, card_of, unlike
-from lerobot_memobench.evaluation.report_tables import outcomes, settings_phrases
+from lerobot_memobench.evaluation.report_tables import outcomes
 from lerobot_memobench.evaluation.tables import OPERATION_NAMES
 from lerobot_memobench.io import count_of
 from lerobot_memobench.protocol import CONTROL_HZ
@@ -112,7 +112,7 @@ def run_data(run: Run, videos: Mapping[int, str]) -> dict[str, Any]:
     return {
         "name": run.name,
         "folder": str(run.folder),
-        "facts": facts(run.records, run.protocol),
+        "facts": facts(run),
         "commands": [shlex.join(start["command"]) for start in starts if start.get("command")],
         "notes": list(run.notes),
         "average": row_data(summary.average),
@@ -122,15 +122,14 @@ def run_data(run: Run, videos: Mapping[int, str]) -> dict[str, Any]:
     }
 
 
-def facts(records: Sequence[Record], protocol: Mapping[str, Any]) -> list[str]:
-    """Return the protocol in words: whose rollouts, tasks, seeds, referent, replan interval, horizon, what was seen."""
-    policy = protocol.get(POLICY, {}).get("type")
-    horizon = protocol.get("horizon")
+def facts(run: Run) -> list[str]:
+    """Return the report's first line in parts: policy, protocol, what was given; then rollouts and horizon."""
+    horizon = run.protocol.get("horizon")
     return [
-        *([f"policy {policy}"] if policy else []),
-        count_of(len(records), "rollout"),
-        count_of(len({record["task"] for record in records}), "task"),
-        *settings_phrases(records),
+        whose(run),
+        *protocol_phrases(run),
+        given(run),
+        count_of(len(run.records), "rollout"),
         *([] if horizon is None else [f"horizon {horizon}"]),
     ]
 

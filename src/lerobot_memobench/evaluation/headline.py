@@ -1,0 +1,90 @@
+"""The first line of every report: whose rollouts they are, under which protocol, and what the policy was given."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from lerobot_memobench.envs.episode_log import POLICY
+from lerobot_memobench.evaluation.metrics import Record, policy_inputs
+from lerobot_memobench.evaluation.records import Run, card_of, one_suite
+from lerobot_memobench.io import count_of, cut
+
+PROMPT_IN = {"steps": "prompt in steps (observed)", "reset": "prompt in reset (not observed)"}
+
+
+def headline(runs: Sequence[Run]) -> str:
+    """Return the first line of a report of one or several evaluations."""
+    if len(runs) == 1:
+        (run,) = runs
+        return f"{whose(run)}: {', '.join(protocol_phrases(run))}; {given(run)}"
+    protocols = [", ".join(protocol_phrases(run)) for run in runs]
+    alike = len(set(protocols)) == 1
+    parts = [
+        f"{run.name}: {whose(run)}, {given(run)}{'' if alike else f' ({protocol})'}"
+        for run, protocol in zip(runs, protocols, strict=True)
+    ]
+    return "; ".join([f"{len(runs)} evaluations{f', {protocols[0]}' if alike else ''}", *parts])
+
+
+def whose(run: Run) -> str:
+    """Return the policy: its type and, where it is known, its checkpoint."""
+    policy = run.protocol[POLICY]
+    name = policy.get("type") or next((str(r["policy"]) for r in run.records if r.get("policy")), None)
+    if name is None:
+        return "policy not recorded"
+    checkpoint = (card_of(run.folder).get("checkpoint") or {}).get("path")
+    if checkpoint is None:
+        identity = str(policy.get("identity") or name)
+        return identity if identity.startswith(str(name)) else str(name)
+    return f"{name} ({cut(str(checkpoint))})"
+
+
+def protocol_phrases(run: Run) -> list[str]:
+    """Return suite, referent, seeds, episodes per task and replan interval of an evaluation's rollouts."""
+    records = run.records
+    return [
+        f"{one_suite(records)} suite",
+        f"referent {', '.join(sorted({str(record.get('referent', 'fixed')) for record in records}))}",
+        *_span("seed", (record.get("seed") for record in records)),
+        _extent(records),
+        *_replan(records),
+    ]
+
+
+def _span(word: str, values: Iterable[Any]) -> list[str]:
+    found = sorted({value for value in values if value is not None})
+    if not found:
+        return []
+    return [f"{word}s {found[0]} to {found[-1]}" if len(found) > 1 else f"{word} {found[0]}"]
+
+
+def _extent(records: Sequence[Record]) -> str:
+    """Return how many episodes there are of how many tasks, of a single one by its name."""
+    counts: dict[str, int] = {}
+    for record in records:
+        counts[record["task"]] = counts.get(record["task"], 0) + 1
+    low, high = min(counts.values()), max(counts.values())
+    episodes = count_of(high, "episode") if low == high else f"{low} to {high} episodes"
+    if len(counts) == 1:
+        return f"{episodes} of {next(iter(counts))}"
+    return f"{episodes} of each of {len(counts)} tasks"
+
+
+def _replan(records: Sequence[Record]) -> list[str]:
+    found = sorted({record["replan_steps"] for record in records if record.get("replan_steps") is not None})
+    return [f"replan interval {', '.join(map(str, found))}"] if found else []
+
+
+def given(run: Run) -> str:
+    """Return what the policy was given: its inputs and, where there was a demonstration prompt, whether it saw it."""
+    return ", ".join([f"inputs: {policy_inputs(run.records)}", *_prompt(run.records, run.protocol)])
+
+
+def _prompt(records: Sequence[Record], protocol: Mapping[str, Any]) -> list[str]:
+    if protocol.get("demonstration_prompt") is False:
+        return ["no demonstration prompt"]
+    if not any(record.get("prompt_steps") for record in records):
+        return []
+    told = protocol.get("prompt_in")
+    return [PROMPT_IN[told]] if told in PROMPT_IN else []
