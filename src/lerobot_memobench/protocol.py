@@ -13,6 +13,9 @@ PROMPT_HORIZON = 1500
 750; with one of them grasped at the fifth try more than 1000."""
 PROMPT, EXECUTION = 0, 1
 """Values of ``phase``: a demonstration prompt plays and actions have no effect; the policy acts."""
+OBS_PHASE, OBS_STEP = CLOCK = ("observation.phase", "observation.step")
+"""A policy's names for an episode's phase and for the control steps since it began. A dataset has columns of these
+names: both are float32, (B,) in a batch, and raw, in training as in a rollout."""
 
 # -- seeds
 

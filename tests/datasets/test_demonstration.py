@@ -119,7 +119,8 @@ def test_columns_are_typed_and_complete(make_demo):
     columns = labels(make_demo(["0010", "0001"])).columns()
     kinds = {name: c.dtype.name for name, c in columns.items() if isinstance(c, np.ndarray)}
     assert kinds == {
-        "phase": "int64",
+        "observation.phase": "float32",
+        "observation.step": "float32",
         "checkpoint.index": "int64",
         "checkpoint.operation": "int64",
         "checkpoint.completed": "bool",

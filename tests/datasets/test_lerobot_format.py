@@ -17,6 +17,7 @@ from lerobot_memobench.datasets.lerobot_format.reading import read_episode
 from lerobot_memobench.datasets.staging import stage_demonstration
 from lerobot_memobench.datasets.video import ImageHistograms
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.protocol import CLOCK
 from tests.support.videos import encode_video
 
 SIZE = 64
@@ -88,7 +89,7 @@ def test_types(dataset):
     assert item["checkpoint.completed"].shape == (6,)
     assert item["checkpoint.event"].dtype == torch.bool
     assert item["action"].dtype == torch.float32
-    for name in ("phase", "checkpoint.index", "checkpoint.operation"):
+    for name in ("checkpoint.index", "checkpoint.operation"):
         assert item[name].dtype == torch.int64
         assert item[name].shape == ()
 
@@ -172,11 +173,22 @@ def test_dataloader_batches(dataset):
         assert isinstance(batch[name], list)
         assert all(isinstance(text, str) for text in batch[name])
     assert batch["checkpoint.completed"].shape == (4, 6)
-    assert batch["phase"].shape == (4,)
+    assert all(batch[name].shape == (4,) and batch[name].dtype == torch.float32 for name in CLOCK)
     assert batch["observation.images.image"].shape == (4, 3, SIZE, SIZE)
 
 
-def test_policy_features_are_images_state_and_action_only(dataset):
+def test_phase_and_step_are_as_in_a_rollout(dataset, demos):
+    """They have no statistics, so that LeRobot normalises them nowhere."""
+    items = [dataset[number] for number in range(len(dataset))]
+    expected = [clock for demo in demos for clock in zip(labels(demo).phase, labels(demo).step, strict=True)]
+    assert [tuple(item[name].item() for name in CLOCK) for item in items] == expected
+    assert expected[len(demos[0]) :][:7] == [(0, 0), (0, 1), (0, 2), (0, 3), (0, 4), (1, 0), (1, 1)]
+    assert all(item[name].dtype == torch.float32 and item[name].shape == () for item in items for name in CLOCK)
+    assert not set(dataset.meta.stats) & set(CLOCK)
+    assert not [name for name in dataset.meta.episodes.column_names if name.startswith("stats/observation.step")]
+
+
+def test_policy_features_are_images_state_clock_and_action_only(dataset):
     """Of objects, plain `lerobot-train` learns nothing where there are pictures."""
     from lerobot.configs import FeatureType
     from lerobot.utils.feature_utils import dataset_to_policy_features
@@ -187,6 +199,7 @@ def test_policy_features_are_images_state_and_action_only(dataset):
         "observation.images.wrist_image",
         "observation.state",
         "action",
+        *CLOCK,
     }
     assert dataset.meta.features["privileged.environment_state"]["shape"] == (208,)
     assert FeatureType.ENV not in {feature.type for feature in features.values()}
@@ -202,6 +215,7 @@ def test_objects_are_an_input_where_there_are_no_pictures():
         "observation.environment_state",
         "observation.state",
         "action",
+        *CLOCK,
     }
 
 

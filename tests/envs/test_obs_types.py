@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from lerobot.configs import FeatureType
 from lerobot.envs import env_to_policy_features, preprocess_observation
 
@@ -168,6 +169,21 @@ def test_a_film_shows_every_step_and_other_episodes_are_not_drawn(
     env.close()
 
 
+@pytest.mark.usefixtures("blind")
+def test_phase_and_step_have_the_shape_of_a_training_batch(tmp_path: Path) -> None:
+    """LeRobot loads a dataset's column of one number as (B,); through its processors a rollout's is alike."""
+    env = vector(DRAWER, 2, tmp_path, obs_type=OBJECTS, horizon=1)
+    observation, _ = env.reset(seed=SEEDS[:2])
+    env.close()
+    assert observation["step"].shape == (2, 1)
+    before, _ = MemobenchEnvConfig().get_env_processors()
+    batch = before(preprocess_observation(observation))
+    for name, value in (("phase", EXECUTION), ("step", 0)):
+        found = batch[f"observation.{name}"]
+        assert (found.shape, found.dtype) == ((2,), torch.float32)
+        assert found.tolist() == [value, value]
+
+
 def test_one_folder_holds_one_kind_of_observations(tmp_path: Path) -> None:
     env = make(DRAWER, log_dir=str(tmp_path), horizon=1)
     env.reset(seed=20_007)
@@ -202,7 +218,9 @@ def policy(kind: str, *seen: FeatureType, **more: Any) -> Any:
     """What is asked of a policy's configuration."""
     images = {"observation.images.image": None} if FeatureType.VISUAL in seen else {}
     objects = True if FeatureType.ENV in seen else None
-    return SimpleNamespace(type=kind, image_features=images, env_state_feature=objects, **more)
+    ours = kind.startswith(("memobench", "mine"))
+    made = type("Config", (SimpleNamespace,), {"__module__": "plugin" if ours else "lerobot.policies"})
+    return made(type=kind, image_features=images, env_state_feature=objects, **more)
 
 
 @pytest.mark.parametrize(
@@ -215,6 +233,7 @@ def policy(kind: str, *seen: FeatureType, **more: Any) -> Any:
         (policy("act", FeatureType.ENV), OBJECTS),
         (policy("diffusion", FeatureType.ENV, FeatureType.VISUAL), BOTH),
         (policy("pi05", FeatureType.ENV, FeatureType.VISUAL), PIXELS),  # trained beside the column, which it ignores
+        (policy("mine", FeatureType.ENV), OBJECTS),  # of somebody's plugin
         (policy("memobench_mem", FeatureType.ENV, FeatureType.VISUAL, perception="objects"), OBJECTS),
         (policy("memobench_mem", perception="pixels"), PIXELS),
     ],

@@ -151,7 +151,7 @@ def _observation(dataset: LeRobotDataset, episode: int, frame: int) -> dict[str,
     keys = ("observation.images.image", "observation.images.wrist_image", "observation.state")
     found = {key: item[key][None] for key in keys}
     found["observation.step"] = torch.tensor([[float(frame)]])
-    found["observation.phase"] = item["phase"].reshape(1, 1).float()
+    found["observation.phase"] = item["observation.phase"].reshape(1, 1).float()
     found["task"] = [item["task"]]
     return found
 

@@ -45,6 +45,7 @@ from lerobot_memobench.policies.memobench_mem.sampler import (
     task_weights,
     weighted_order,
 )
+from lerobot_memobench.protocol import CLOCK
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH
 from lerobot_memobench.sim.object_layout import WIDTH as SLOT_WIDTH
 from lerobot_memobench.sim.object_slots import classes
@@ -67,7 +68,10 @@ def observed(dataset: Any, index: int, **more: Any) -> dict[str, Any]:
     seen = {key: row[key][None] for key in ("observation.state", "observation.environment_state")}
     episode = int(np.searchsorted(STARTS, index, "right")) - 1
     step = index - STARTS[episode]
-    clock = {"observation.step": torch.tensor([float(step)]), "observation.phase": row["phase"].reshape(1).float()}
+    clock = {
+        "observation.step": torch.tensor([float(step)]),
+        "observation.phase": row["observation.phase"].reshape(1).float(),
+    }
     return {**seen, **clock, "task": ["put the butter into the bowl"], **more}
 
 
@@ -146,7 +150,8 @@ def test_samples_from_memory_are_lerobots(root: Path, episodes: list[int] | None
     for row in (0, 12, 38, len(dataset) - 1):
         expected, found = of_lerobot(dataset.reader, row), dataset[row]
         assert expected.keys() - found.keys() <= {
-            *("phase", "simple_subgoal", "grounded_subgoal", "coarse_subgoal", "memory")
+            *("simple_subgoal", "grounded_subgoal", "coarse_subgoal", "memory"),
+            *CLOCK,
         }
         for key, value in found.items():
             assert value == expected[key] if key == "task" else torch.equal(value, expected[key]), key
@@ -309,7 +314,7 @@ def test_the_sampler_draws_prompted_tasks_more_often(tmp_path: Path, monkeypatch
 def test_statistics_are_those_of_execution_frames(root: Path) -> None:
     _, before, _, dataset = made_for_training(root, **OBJECTS)
     hf = dataset.hf_dataset.with_format("numpy")
-    actions = np.asarray(hf["action"])[np.asarray(hf["phase"]).reshape(-1) != 0]
+    actions = np.asarray(hf["action"])[np.asarray(hf["observation.phase"]).reshape(-1) != 0]
     normaliser = next(step for step in before.steps if type(step).__name__ == "NormalizerProcessorStep")
     held = normaliser._tensor_stats["action"]
     assert np.allclose(held["mean"], actions.mean(axis=0), atol=1e-5)

@@ -96,7 +96,6 @@ KEPT = {
     *PICTURES,
     OBJECTS,
     PRIVILEGED,
-    "phase",
     "executed_action",
     "checkpoint.index",
     "checkpoint.operation",

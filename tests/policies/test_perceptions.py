@@ -74,7 +74,10 @@ class Case:
         row = dataset.hf_dataset[index]
         numbers = {key: row[key][None] for key in (OBS_STATE, OBS_ENV_STATE) if key in row}
         step = float(index - STARTS[int(np.searchsorted(STARTS, index, "right")) - 1])
-        clock = {"observation.step": torch.tensor([step]), "observation.phase": row["phase"].reshape(1).float()}
+        clock = {
+            "observation.step": torch.tensor([step]),
+            "observation.phase": row["observation.phase"].reshape(1).float(),
+        }
         pictures = {} if OBS_ENV_STATE in row else pictures_of(self.root, index)
         return {**pictures, **numbers, **clock, "task": [dataset.meta.tasks.index[int(row["task_index"])]]}
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import inspect
+import json
 import re
+import shutil
 import subprocess
 import sys
 from contextlib import nullcontext
@@ -11,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import yaml
 from lerobot.configs.default import DatasetConfig
@@ -18,15 +21,21 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
 from lerobot.datasets import factory as dataset_factory
 from lerobot.datasets.streaming_dataset import StreamingLeRobotDataset
+from lerobot.policies import make_pre_post_processors
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 from lerobot.scripts import lerobot_train
+from lerobot.utils.feature_utils import dataset_to_policy_features
+from torch.utils.data import default_collate
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.datasets import execution_frames
+from lerobot_memobench.datasets.feature_cache.frames import read_frame_table
+from lerobot_memobench.datasets.validate import validate
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import check_resumed
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.protocol import CAMERAS
 from lerobot_memobench.run.training import trained_on
 
 LENGTHS, PROMPTS = (40, 23, 31), (0, 8, 0)
@@ -121,6 +130,47 @@ def test_a_policy_with_phases_is_left_alone_unless_asked(root: Path) -> None:
     assert drawn(opened(root, policy, prompt_frames=False)[0]) == set(range(sum(LENGTHS))) - PROMPT_FRAMES
 
 
+@pytest.mark.parametrize("remembers", [False, True])
+@pytest.mark.parametrize("kind", [ACTConfig, DiffusionConfig])
+def test_phase_and_step_are_no_inputs_and_reach_every_policy_as_they_are(
+    root: Path, kind: Any, remembers: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """LeRobot would take them for two more states, and normalise them."""
+    monkeypatch.setattr(kind, "reads_prompt", remembers, raising=False)
+    policy = kind(device="cpu", push_to_hub=False)
+    train, _ = opened(root, policy)
+    assert set(policy.input_features) == {"observation.state", *(f"observation.images.{name}" for name in CAMERAS)}
+    features = dataset_to_policy_features(train.meta.features)
+    policy.output_features = {"action": features["action"]}
+    before, _ = make_pre_post_processors(policy, dataset_stats=train.meta.stats)
+    batch = before(default_collate([train[START + step] for step in (0, 3)]))
+    assert "observation.step" in train.meta.stats, "LeRobot's own writer gives them statistics"
+    assert batch["observation.phase"].reshape(2, -1)[:, -1].tolist() == [1, 1]
+    assert batch["observation.step"].reshape(2, -1)[:, -1].tolist() == [0, 3]
+
+
+def test_a_dataset_of_an_earlier_version_is_refused_in_one_sentence(root: Path, tmp_path: Path) -> None:
+    """Its prompts would be trained on as if they were executions."""
+    folder = Path(shutil.copytree(root, tmp_path / "earlier"))
+    info = json.loads((folder / "meta/info.json").read_text())
+    info["features"]["phase"] = info["features"].pop("observation.phase") | {"dtype": "int64"}
+    (folder / "meta/info.json").write_text(json.dumps(info))
+    for path in (folder / "data").rglob("*.parquet"):
+        table = pq.read_table(path).drop(["observation.step"])
+        table = table.rename_columns({"observation.phase": "phase"}).replace_schema_metadata(None)
+        place = table.column_names.index("phase")
+        pq.write_table(table.set_column(place, "phase", table.column("phase").cast("int64")), path)
+    del info["features"]["observation.step"]
+    (folder / "meta/info.json").write_text(json.dumps(info))
+    told = r"earlier was made by an earlier version: it has the column phase, and not .*generate or convert it again"
+    with pytest.raises(MemobenchError, match=told):
+        opened(folder, act())
+    with pytest.raises(MemobenchError, match=told):
+        read_frame_table(folder)
+    with pytest.raises(MemobenchError, match=told):
+        validate(folder)
+
+
 def test_histories_do_not_reach_back_into_the_prompt(root: Path) -> None:
     train, _ = opened(root, DiffusionConfig(device="cpu", push_to_hub=False, n_obs_steps=3))
     whole = LeRobotDataset("memobench/synthetic", root=root)
@@ -137,9 +187,11 @@ def test_the_held_out_part_has_no_prompt_either(tmp_path: Path) -> None:
     from tests.support.synthetic_dataset import make_dataset
 
     train, held_out = opened(make_dataset(tmp_path / "two", repeats=2), act(), eval_split=0.5)
-    assert {train[k]["phase"].item() for k in range(0, LENGTHS[0])} == {1}
+    assert {train[k]["observation.phase"].item() for k in range(0, LENGTHS[0])} == {1}
     assert len(held_out) == sum(LENGTHS) - PROMPTS[1]
-    assert {held_out[k]["phase"].item() for k in range(LENGTHS[0], LENGTHS[0] + LENGTHS[1] - PROMPTS[1])} == {1}
+    assert {
+        held_out[k]["observation.phase"].item() for k in range(LENGTHS[0], LENGTHS[0] + LENGTHS[1] - PROMPTS[1])
+    } == {1}
     tasks = held_out.hf_dataset.data.column("task_index").to_numpy()
     assert tasks.tolist() == [held_out.dataset.hf_dataset[k]["task_index"].item() for k in held_out.indices]
 
@@ -154,7 +206,7 @@ def test_a_policy_with_phases_is_tested_on_what_it_learns(tmp_path: Path) -> Non
 
 
 def test_what_is_no_dataset_of_ours_stays_as_it_is(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(execution_frames, "COLUMNS", {"phase", "nothing_of_ours"})
+    monkeypatch.setattr(execution_frames, "COLUMNS", {"observation.phase", "nothing_of_ours"})
     assert drawn(opened(root, act())[0]) == set(range(sum(LENGTHS)))
 
 
@@ -171,7 +223,7 @@ def test_of_a_streamed_dataset_prompts_are_passed_over(root: Path) -> None:
     assert first["observation.state_is_pad"].tolist() == [True, True, False]
     assert (first["observation.state"] == streamed[START]["observation.state"]).all()
     on_disk, _ = opened(root, act())
-    for key in ("observation.state", "action", "action_is_pad", "phase"):
+    for key in ("observation.state", "action", "action_is_pad", "observation.phase"):
         assert np.asarray(streamed[START][key]).tolist() == np.asarray(on_disk[START][key]).tolist()
     assert {int(frame["index"]) for frame in opened(root, act(), True, streaming=True)[0]} == acting | PROMPT_FRAMES
 
@@ -185,7 +237,7 @@ def test_what_cannot_be_streamed_without_prompts_is_refused_in_one_sentence(root
     with pytest.raises(MemobenchError, match=r"memobench_mem draws execution frames alone.*prompt_frames=false"):
         opened(root, ours, streaming=True)
     train, _ = opened(root, ours, prompt_frames=False, streaming=True)
-    assert {int(frame["phase"]) for frame in train} == {1}
+    assert {int(frame["observation.phase"]) for frame in train} == {1}
 
 
 # --- by the commands ---

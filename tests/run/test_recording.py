@@ -45,7 +45,7 @@ def test_batches_of_several_rows_go_on_with_their_datasets(tmp_path: Path) -> No
         assert {item["task"] for item in items} == {"put the butter into the bowl from the prompt video"}
         assert all(item["observation.images.image"].shape == (3, 256, 256) for item in items)
         assert items[0]["observation.images.image"].mean() > 0.1  # something is to be seen
-        assert {item["phase"].item() for item in items} == {1}
+        assert {item["observation.phase"].item() for item in items} == {1}
     assert main([*words, "episodes=6", "resume=true"]) == 0
     (later,) = (out / "continued-1" / "recordings").iterdir()
     assert LeRobotDataset("local/recorded", root=later / "env_1").num_episodes == 1

@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 
 from lerobot_memobench.datasets.lerobot_format.layout import EPISODE_INFO, OBJECTS, PRIVILEGED, EpisodeRecord
+from lerobot_memobench.protocol import CLOCK
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from lerobot_memobench.tasks.catalogue import BOWL
+from tests.support.synthetic_dataset import clock_at
 
 LENGTHS, PROMPTS = (40, 23, 31), (6, 8, 0)
 TASKS = ("put the butter into the bowl", "open the drawer", "put the butter into the bowl")
@@ -60,7 +62,7 @@ def make_object_dataset(
             "observation.state": number | {"shape": (8,)},
             objects: number | {"shape": (SLOTS * WIDTH,)},
             "action": number | {"shape": (7,)},
-            "phase": {"dtype": "int64", "shape": (1,), "names": None},
+            **{name: {"dtype": "float32", "shape": (1,), "names": None} for name in CLOCK},
             **dict.fromkeys(("simple_subgoal", "grounded_subgoal", "coarse_subgoal", "memory"), string),
             **({EPISODE_INFO: string} if records else {}),
         },
@@ -76,7 +78,7 @@ def make_object_dataset(
                 "observation.state": state_at(hand),
                 objects: slots_at(rng, places, lit if t < prompt else None),
                 "action": np.array([*way, 0, 0, 0, 1 if t % 2 else -1], np.float32) * (t >= prompt),
-                "phase": np.array([int(t >= prompt)]),
+                **clock_at(t, prompt),
                 "simple_subgoal": f"reach thing {lit}" if t >= prompt else "",
                 "grounded_subgoal": f"reach thing {lit} at {places[lit][0]:.1f}",
                 "coarse_subgoal": "reach",

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from lerobot_memobench.protocol import CLOCK, EXECUTION, PROMPT
+
 SIZE = 48  # pixels of the synthetic cameras
 CAMERAS = ("observation.images.image", "observation.images.wrist_image")
 LENGTHS = (40, 23, 31)
@@ -16,6 +18,12 @@ SUBGOALS = (
     ("pick up the cream cheese", "pick up the butter", "put both in the basket"),
 )
 TASKS = ("put the cream cheese in the basket", "put the bowl away", "fetch cream cheese and butter")
+
+
+def clock_at(t: int, prompt: int) -> dict[str, np.ndarray]:
+    """Return phase and step of frame t, by the columns' names."""
+    values = (PROMPT, t) if t < prompt else (EXECUTION, t - prompt)
+    return {name: np.array([value], np.float32) for name, value in zip(CLOCK, values, strict=True)}
 
 
 def make_dataset(root: Path, seed: int = 0, repeats: int = 1, cameras: tuple[str, str] = CAMERAS) -> Path:
@@ -36,7 +44,7 @@ def make_dataset(root: Path, seed: int = 0, repeats: int = 1, cameras: tuple[str
             **dict.fromkeys(cameras, image),
             "observation.state": {"dtype": "float32", "shape": (8,), "names": None},
             "action": {"dtype": "float32", "shape": (7,), "names": None},
-            "phase": {"dtype": "int64", "shape": (1,), "names": None},
+            **{name: {"dtype": "float32", "shape": (1,), "names": None} for name in CLOCK},
             "simple_subgoal": string,
             "grounded_subgoal": string,
             "coarse_subgoal": string,
@@ -58,7 +66,7 @@ def make_dataset(root: Path, seed: int = 0, repeats: int = 1, cameras: tuple[str
                     **dict(zip(cameras, (frame, frame[::-1].copy()), strict=True)),
                     "observation.state": (np.sin(t / 5 + np.arange(8)) + 0.05 * rng.normal(size=8)).astype(np.float32),
                     "action": np.tanh(drift + np.sin(t / 5 + np.arange(7))).astype(np.float32),
-                    "phase": np.array([int(t >= prompt)]),
+                    **clock_at(t, prompt),
                     # Some frames carry no text: the cache then looks at the next that does.
                     "simple_subgoal": "" if t % 7 == 3 else subgoals[k],
                     "grounded_subgoal": subgoals[k] + " at (0.1, 0.2)",

@@ -16,7 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, CONTROL_HZ, EXECUTION, PROMPT, PROPRIO_DIM
+from lerobot_memobench.protocol import (
+    ACTION_DIM,
+    CAMERAS,
+    CONTROL_HZ,
+    EXECUTION,
+    OBS_PHASE,
+    OBS_STEP,
+    PROMPT,
+    PROPRIO_DIM,
+)
 from lerobot_memobench.tasks.memory_text import memory_text, subtask_texts
 from lerobot_memobench.tasks.task import LEVELS, OPERATIONS, Task
 
@@ -25,6 +34,8 @@ MAX_CHECKPOINTS = 6
 MIN_FRAMES_BETWEEN_ROWS = 5
 """LeRobot's ``emitted_at`` looks 0.1 s to either side and raises when it finds two rows of a style, so rows
 of one style must be more than 0.2 s apart: at 20 frames/s, at least 5 frames."""
+LATER = ("step", "coarse_subgoal", "subtask")
+"""Labels that an episode's hash leaves out."""
 LanguageRow = dict[str, Any]
 
 
@@ -132,6 +143,7 @@ class Labels:
 
     Attributes:
         phase: (T,) int64, 0 prompt, 1 execution.
+        step: (T,) int64, control steps since that phase began.
         index: (T,) int64, checkpoints completed in order at frames before t: the number of the one worked on.
         operation: (T,) int64, 0 S, 1 U, 2 C of that checkpoint, -1 when none is left.
         completed: (T, 6) bool, checkpoint k has been satisfied at some frame up to and including t.
@@ -146,6 +158,7 @@ class Labels:
     """
 
     phase: NDArray[np.int64]
+    step: NDArray[np.int64]
     index: NDArray[np.int64]
     operation: NDArray[np.int64]
     completed: NDArray[np.bool_]
@@ -160,7 +173,8 @@ class Labels:
     def columns(self) -> dict[str, NDArray | list[str]]:
         """Return the dataset's column names and their T values each."""
         return {
-            "phase": self.phase,
+            OBS_PHASE: self.phase.astype(np.float32),
+            OBS_STEP: self.step.astype(np.float32),
             "checkpoint.index": self.index,
             "checkpoint.operation": self.operation,
             "checkpoint.completed": self.completed,
@@ -195,8 +209,11 @@ def labels(demo: Demonstration) -> Labels:
     subtasks = subtask_texts(task)
     subtasks.append(subtasks[-1])
     memories = [memory_text(task, k) for k in range(len(task.checkpoints) + 1)]
+    frames = np.arange(length, dtype=np.int64)
+    acting = frames >= demo.exec_start
     return Labels(
-        phase=np.where(np.arange(length) < demo.exec_start, PROMPT, EXECUTION).astype(np.int64),
+        phase=np.where(acting, EXECUTION, PROMPT).astype(np.int64),
+        step=np.where(acting, frames - demo.exec_start, frames),
         index=index,
         operation=np.array(codes, dtype=np.int64)[index],
         completed=np.pad(ever, [(0, 0), (0, MAX_CHECKPOINTS - ever.shape[1])]),
@@ -285,7 +302,7 @@ def digest(demo: Demonstration) -> str:
     """Return the sha256 (hex) of an episode: identity, states, actions and the label columns.
 
     Images are left out: they follow from the states, and a renderer may differ in a pixel where physics does
-    not. So are the visible objects, and ``coarse_subgoal`` and ``subtask``, which the other columns and the
+    not. So are the visible objects, and ``step``, ``coarse_subgoal`` and ``subtask``, which the other columns and the
     task decide: they came later than the first datasets, and their hashes stay what they are.
     """
     found = labels(demo)
@@ -300,7 +317,7 @@ def digest(demo: Demonstration) -> str:
     columns: dict[str, NDArray | list[str]] = {"states": demo.states, "actions": demo.actions}
     if demo.executed is not None:
         columns["executed"] = demo.executed
-    columns |= {f.name: getattr(found, f.name) for f in fields(found) if f.name not in ("coarse_subgoal", "subtask")}
+    columns |= {f.name: getattr(found, f.name) for f in fields(found) if f.name not in LATER}
     # Independent of byte order, memory layout and dictionary order.
     sha = hashlib.sha256(json.dumps(identity, sort_keys=True).encode())
     for name in sorted(columns):

@@ -1,8 +1,8 @@
 """A dataset of LeRobot's without the frames of its prompts, in which actions have no effect.
 
 LeRobot draws its samples, and looks back from them, within the bounds that a dataset's metadata tell of each episode.
-Here they begin at the first execution frame, which the column ``phase`` tells: it is there in generated, converted and
-downloaded datasets, and LeRobot's dataset tools keep it.
+Here they begin at the first execution frame, which the column ``observation.phase`` tells: it is there in generated,
+converted and downloaded datasets, and LeRobot's dataset tools keep it.
 """
 
 from __future__ import annotations
@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 from torch.utils.data import Subset
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.protocol import EXECUTION
+from lerobot_memobench.protocol import CLOCK, EXECUTION, OBS_PHASE
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
 
-PHASE = "phase"
-COLUMNS = {PHASE, "simple_subgoal"}
-"""What a dataset of ours has: ``phase`` alone may be anybody's."""
+COLUMNS = {*CLOCK, "simple_subgoal"}
+"""What a dataset of ours has: a phase alone may be anybody's."""
 BEGIN, END = "dataset_from_index", "dataset_to_index"
 
 
@@ -43,7 +42,7 @@ def leave_out_prompts(dataset: Any) -> int | None:
         return None
     episodes = dataset.meta.episodes
     begin, end = (np.array(episodes[name], dtype=np.int64) for name in (BEGIN, END))
-    acting = _column(dataset, PHASE) == EXECUTION
+    acting = _column(dataset, OBS_PHASE) == EXECUTION
     starts = first_frames(begin, end, np.sort(_column(dataset, "index")[acting]))
     starts = np.where(np.isin(np.arange(len(begin)), _column(dataset, "episode_index")), starts, begin)  # those opened
     dataset.meta.episodes = episodes.remove_columns(BEGIN).add_column(BEGIN, starts)
@@ -61,10 +60,10 @@ def _leave_out_of_stream(dataset: Any) -> None:
             f"{past[0]} is asked for earlier frames, which may be of a prompt, and a dataset that is streamed does not "
             "tell where that ends; use dataset.streaming=false, or prompt_frames=true to train on prompts"
         )
-    dataset.hf_dataset = dataset.hf_dataset.filter(_acts, input_columns=[PHASE])
+    dataset.hf_dataset = dataset.hf_dataset.filter(_acts, input_columns=[OBS_PHASE])
 
 
-def _acts(phase: int) -> bool:
+def _acts(phase: float) -> bool:
     return phase == EXECUTION
 
 
@@ -92,7 +91,7 @@ class ExecutionFrames(Subset[Any]):
     """
 
     def __init__(self, dataset: LeRobotDataset) -> None:
-        acting = np.flatnonzero(_column(dataset, PHASE) == EXECUTION)
+        acting = np.flatnonzero(_column(dataset, OBS_PHASE) == EXECUTION)
         super().__init__(dataset, acting.tolist())
         tasks = dataset.hf_dataset.data.table.select(["task_index"])
         self.hf_dataset = SimpleNamespace(data=tasks.take(acting))

@@ -19,6 +19,7 @@ from lerobot_memobench.datasets.hdf5.reading import PublishedFile, Unusable, fin
 from lerobot_memobench.datasets.hdf5.restore import restore, task_of
 from lerobot_memobench.datasets.lerobot_format.layout import (
     ADVICE,
+    check_clock,
     check_whole,
     episode_count,
     image_key,
@@ -162,6 +163,7 @@ def exit_status(verdicts: Sequence[Verdict]) -> int:
 def _checks(folder: Path, tasks: Mapping[str, Task] | None) -> list[_Check]:
     checks: list[_Check] = []
     if is_dataset(folder):
+        check_clock(read_info(folder)["features"], folder)
         total = range(episode_count(folder))
         checks += [_Check(folder, f"episode {index}", index=index, tasks=tasks) for index in total]
     has_files = folder.is_file() or any(path.suffix in (".hdf5", ".h5") for path in folder.rglob("*"))

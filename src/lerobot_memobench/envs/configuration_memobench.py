@@ -203,6 +203,14 @@ class MemobenchEnvConfig(EnvConfig):
             suites.setdefault(memory_type, {})[task_id] = self._vector([make] * n_envs, use_async_envs)
         return suites
 
+    def get_env_processors(self) -> tuple[Any, Any]:
+        """Return what LeRobot does to observations and actions of these environments."""
+        from lerobot.processor import PolicyProcessorPipeline
+
+        from lerobot_memobench.envs.processor_memobench import ClockProcessorStep
+
+        return PolicyProcessorPipeline(steps=[ClockProcessorStep()]), PolicyProcessorPipeline(steps=[])
+
     def _check_checkpoint(self, policy: Any) -> None:
         """Refuse the checkpoint on LeRobot's command line where it was made for something else than is shown here."""
         from lerobot.configs import parser

@@ -64,10 +64,14 @@ def obs_type_of(policy: Any) -> str | None:
     perception = getattr(policy, "perception", None)
     if policy is None or perception is not None:
         return {"objects": OBJECTS, "pixels": PIXELS}.get(str(perception))
-    objects = policy.type in READ_OBJECTS and policy.env_state_feature is not None
+    objects = policy.env_state_feature is not None and not _ignores_objects(policy)
     if policy.image_features:
         return BOTH if objects else PIXELS
     return OBJECTS if objects else None
+
+
+def _ignores_objects(policy: Any) -> bool:
+    return type(policy).__module__.startswith("lerobot.") and policy.type not in READ_OBJECTS
 
 
 def check_obs_type(policy: Any, obs_type: str) -> None:
@@ -100,11 +104,15 @@ def policy_inputs(policy: Any, obs_type: str, oracle_memory: bool = False) -> st
         features = getattr(policy, "input_features", None) or {}
         types = {getattr(feature.type, "value", feature.type) for feature in features.values()}
         everything = not types & {"VISUAL", "ENV"}
-        ignores = type(policy).__module__.startswith("lerobot.") and policy.type not in READ_OBJECTS
         pixels = obs_type != OBJECTS and (everything or "VISUAL" in types)
-        objects = obs_type != PIXELS and not ignores and (everything or "ENV" in types)
+        objects = obs_type != PIXELS and not _ignores_objects(policy) and (everything or "ENV" in types)
         found = (PIXEL_INPUT,) * pixels + (PRIVILEGED,) * objects
     return ", ".join(found + (MEMORY_TEXT,) * oracle_memory) or NOTHING
+
+
+def chooses_inputs(policy: object) -> bool:
+    """Return whether a policy's configuration says by its ``perception`` what the policy reads."""
+    return getattr(policy, "perception", None) is not None
 
 
 def reads_prompt(policy: object) -> bool:

@@ -14,14 +14,13 @@ from typing import Any
 import numpy as np
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.utils.constants import ACTION
+from lerobot.utils.constants import ACTION, OBS_PREFIX
 from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
 from lerobot_memobench.envs.observations import BOTH, policy_names
+from lerobot_memobench.protocol import CLOCK
 
-PHASE = "phase"
-"""Of an observation, and of our datasets: 0 while the prompt plays, 1 in execution. By it prompts can be left out."""
 REPOSITORY = "eval_recording"
 
 
@@ -91,7 +90,8 @@ class Recorder:
                 self._over[row] = True
                 continue
             frame: dict[str, Any] = {name: _value(observation, key, row) for key, name in self._names.items()}
-            frame |= {PHASE: np.asarray(observation[PHASE][row], np.int64), ACTION: action[row], "task": tasks[row]}
+            frame |= {name: observation[name.removeprefix(OBS_PREFIX)][row] for name in CLOCK}
+            frame |= {ACTION: action[row], "task": tasks[row]}
             frame["next.reward"] = np.array([reward[row]], np.float32)
             frame |= {"next.success": np.array([success[row]]), "next.done": np.array([done[row]])}
             dataset.add_frame(frame)
@@ -129,7 +129,7 @@ def _columns(features: Mapping[str, PolicyFeature]) -> dict[str, dict[str, Any]]
     }
     return {
         **found,
-        PHASE: column("int64"),
+        **dict.fromkeys(CLOCK, column("float32")),
         "next.reward": column("float32"),
         "next.success": column("bool"),
         "next.done": column("bool"),

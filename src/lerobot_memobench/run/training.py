@@ -1,9 +1,9 @@
 """``lerobot train policy=…``: defaults and checks before LeRobot's training, and what is added to it while it lasts.
 
 Whether frames of demonstration prompts are trained on is decided where the policy is known for sure: when LeRobot, its
-configuration complete, has opened the datasets. So are a policy's inputs: our datasets hold pictures and, beside them,
-the privileged object state of what shows in them, and LeRobot would give both to its own policies. What this relies on
-is listed in tests/run/test_lerobot_training.py; how it gets there, and out again: `lerobot_hooks`.
+configuration complete, has opened the datasets. So are a policy's inputs: our datasets hold pictures, beside them the
+privileged object state of what shows in them, and phase and step, and LeRobot would take all of them for inputs. What
+this relies on is listed in tests/run/test_lerobot_training.py; how it gets there, and out again: `lerobot_hooks`.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from typing import Any
 
 import yaml
 
-from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, PRIVILEGED, naming_damage
+from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, PRIVILEGED, check_clock, naming_damage
 from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS as INPUT
 from lerobot_memobench.envs.command_line import overrides, quiet
-from lerobot_memobench.envs.observations import BOTH, OBJECTS, OBS_TYPES, PIXELS, reads_prompt
+from lerobot_memobench.envs.observations import BOTH, OBJECTS, OBS_TYPES, PIXELS, chooses_inputs, reads_prompt
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import count_of
 from lerobot_memobench.jobs.processes import saying_how_to_go_on
@@ -38,6 +38,7 @@ from lerobot_memobench.policies.checkpoint import (
     differing,
     read_json,
 )
+from lerobot_memobench.protocol import CLOCK
 from lerobot_memobench.run.arguments import (
     CONFIG_FILE,
     RECIPE,
@@ -408,8 +409,8 @@ def trained_on(prompt_frames: bool | None, obs_type: str | None = None) -> Itera
 
     Args:
         prompt_frames: whether frames of demonstration prompts are trained on; None: where the policy reads prompts.
-        obs_type: kind of observation (`envs.observations.OBS_TYPES`) of a policy that does not; None: pictures where
-            the dataset has them, else objects.
+        obs_type: kind of observation (`envs.observations.OBS_TYPES`) of a policy without a ``perception`` of its own;
+            None: pictures where the dataset has them, else objects.
 
     Raises:
         MemobenchError: the installed LeRobot is another than the one whose training is known here.
@@ -440,6 +441,7 @@ def _steered(make: Callable[..., Any], prompt_frames: bool | None, obs_type: str
         check_transforms(config.policy, config.dataset.image_transforms.enable)
         _check_episodes(config.dataset)
         train, held_out = make(config)
+        check_clock(train.meta.features, train.root)
         if _reads_objects(config.policy, obs_type):
             for dataset in (train, held_out):
                 _take_for_input(dataset)
@@ -492,8 +494,8 @@ def _check_episodes(dataset: Any) -> None:
 
 
 def _reads_objects(policy: Any, obs_type: str | None) -> bool:
-    """Return whether a policy of LeRobot's is to see objects: as it was asked now, or when its training began."""
-    if policy is None or reads_prompt(policy):
+    """Return whether a policy without a ``perception`` is to see objects: as asked now, or when its training began."""
+    if policy is None or chooses_inputs(policy):
         return False
     begun = policy.input_features or {}
     return INPUT in begun if begun else obs_type in (OBJECTS, BOTH)
@@ -523,9 +525,11 @@ def _choose_inputs(policy: Any, features: dict[str, Any], obs_type: str | None) 
     from lerobot.configs import FeatureType
     from lerobot.utils.feature_utils import dataset_to_policy_features
 
-    if policy is None or policy.input_features or reads_prompt(policy):
+    if policy is None or policy.input_features or chooses_inputs(policy):
         return
-    inputs = {key: f for key, f in dataset_to_policy_features(features).items() if f.type is not FeatureType.ACTION}
+    offered = dataset_to_policy_features(features)
+    # A policy with a memory finds the clock in its batches all the same, and as it is: inputs are normalised.
+    inputs = {key: f for key, f in offered.items() if f.type is not FeatureType.ACTION and key not in CLOCK}
     pictures = any(feature.type is FeatureType.VISUAL for feature in inputs.values())
     seen = obs_type or (PIXELS if pictures else OBJECTS)
     unseen = {PIXELS: FeatureType.ENV, OBJECTS: FeatureType.VISUAL}.get(seen)

@@ -15,8 +15,9 @@ import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
-from lerobot_memobench.datasets.lerobot_format.layout import naming_damage, undamaged
+from lerobot_memobench.datasets.lerobot_format.layout import check_clock, naming_damage, undamaged
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.protocol import OBS_PHASE
 
 if TYPE_CHECKING:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -61,11 +62,11 @@ def read_frame_table(root: Path) -> FrameTable:
     Raises:
         MemobenchError: the frames are not numbered 0, 1, 2, ... or an episode is not contiguous.
     """
-    table = _read_columns(root, ["phase", MEMORY_COLUMN, *LEVEL_COLUMNS.values()])
+    table = _read_columns(root, [OBS_PHASE, MEMORY_COLUMN, *LEVEL_COLUMNS.values()])
     there = set(table.column_names)
     return FrameTable(
         episodes=_episodes(root, table),
-        phase=(_numbers(table, "phase") if "phase" in there else np.ones(len(table))).astype(np.uint8),
+        phase=(_numbers(table, OBS_PHASE) if OBS_PHASE in there else np.ones(len(table))).astype(np.uint8),
         subgoals={level: _texts(table, name) for level, name in LEVEL_COLUMNS.items() if name in there},
         memory=_texts(table, MEMORY_COLUMN) if MEMORY_COLUMN in there else None,
     )
@@ -86,6 +87,7 @@ def _read_columns(root: Path, optional: list[str]) -> pa.Table:
         raise MemobenchError(f"{root} holds no frames: there is no parquet file below {root / 'data'}.")
     with undamaged(files[0]):
         present = pq.read_schema(files[0]).names
+    check_clock(present, root)
     columns = [*_PLACE, *(name for name in optional if name in present)]
     tables = []
     for path in files:

@@ -47,7 +47,7 @@ from lerobot_memobench.datasets.staging import (
 from lerobot_memobench.datasets.video import QUANTILES, Stats, join_videos, video_info
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_name, write_file
-from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ
+from lerobot_memobench.protocol import CAMERAS, CLOCK, CONTROL_HZ
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -234,7 +234,8 @@ def _write_frames(
         columns = _columns(arrays, numbering, record, meta.features)
         data.write(frames_table(columns, episode, meta.features))
         states.write(states_table(arrays["states"], number))
-        counted = {key: value for key, value in columns.items() if value.dtype.kind in "bif"}
+        # LeRobot normalises no column without statistics: phase and step reach a policy as they do in a rollout.
+        counted = {key: value for key, value in columns.items() if value.dtype.kind in "bif" and key not in CLOCK}
         for key, value in counted.items():
             numbers.setdefault(key, []).append(value)
         stats = {key: numeric_stats(value) for key, value in counted.items()} | _camera_statistics(episode)

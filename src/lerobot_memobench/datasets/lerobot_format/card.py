@@ -65,7 +65,8 @@ COLUMNS = {
     "privileged.environment_state": "the same where there are pictures: true poses, which LeRobot's own training takes "
     "for no input; `memobench_mem` with `perception=objects` reads them, others by `lerobot train obs_type=both`",
     "executed_action": "what moved the arm: `action`, but where it was moved off its way (`generate --perturb`)",
-    "phase": "0 demonstration prompt (the policy does not act), 1 execution",
+    "observation.phase": "0 demonstration prompt (the policy does not act), 1 execution",
+    "observation.step": "control steps since that phase began",
     "checkpoint.index": "number of checkpoints completed in order before this frame",
     "checkpoint.operation": "of the next one: 0 Storage, 1 Update, 2 Compression; −1 when none is left",
     "checkpoint.completed": "checkpoint k has been satisfied by now; false beyond the task's count",
@@ -205,7 +206,7 @@ from torch.utils.data import Subset
 from lerobot.datasets import LeRobotDataset
 
 dataset = LeRobotDataset({where})
-execution = Subset(dataset, [i for i, phase in enumerate(dataset.hf_dataset["phase"]) if phase == 1])
+execution = Subset(dataset, [i for i, phase in enumerate(dataset.hf_dataset["observation.phase"]) if phase == 1])
 ```"""
 
 
@@ -237,7 +238,8 @@ def _columns(features: Mapping[str, dict[str, Any]]) -> list[str]:
         'memory_type="spatial")` with `from lerobot_memobench.datasets.lerobot_format.reading import episodes_where`):',
         markdown(["column", "meaning"], [[f"`{key}`", meaning] for key, meaning in EPISODE_COLUMNS.items()]),
         "`meta/stats.json` holds mean, standard deviation, range and the quantiles q01, q10, q50, q90, q99; those of "
-        "numbers are exact over all frames, those of images over sampled frames.",
+        "numbers are exact over all frames, those of images over sampled frames. `observation.phase` and "
+        "`observation.step` have none: LeRobot then leaves them as they are, as they arrive in a rollout.",
     ]
 
 

@@ -18,7 +18,7 @@ from lerobot_memobench.datasets.demonstration import MAX_CHECKPOINTS
 from lerobot_memobench.datasets.staging import STAGING
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import Count, Malformed, Whole, count_of, first_fault, parsed, read_json, refusing
-from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, PROPRIO_DIM
+from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, CLOCK, PROPRIO_DIM
 
 DEFAULT_REPO_ID = "memobench/memobench"
 HDF5_FOLDER = "hdf5"
@@ -82,6 +82,22 @@ def objects_column(names: Collection[str]) -> str:
     return PRIVILEGED if PRIVILEGED in names else OBJECTS
 
 
+def check_clock(names: Collection[str], where: Path | str) -> None:
+    """Refuse a dataset of an earlier version: its prompts would be taken for execution.
+
+    Args:
+        names: its columns. where: its folder.
+
+    Raises:
+        MemobenchError: it has the column ``phase`` of that version, and not today's.
+    """
+    if {"phase", "simple_subgoal"} <= set(names) and not set(CLOCK) <= set(names):
+        raise MemobenchError(
+            f"{where} was made by an earlier version: it has the column phase, and not {' and '.join(CLOCK)}; generate "
+            "or convert it again"
+        )
+
+
 def dataset_features(image_size: tuple[int, int] | None) -> dict[str, dict[str, Any]]:
     """Return LeRobot's description of the columns; ``image_size`` is (height, width), None without images."""
     from lerobot_memobench.sim.object_layout import SIZE
@@ -99,7 +115,7 @@ def dataset_features(image_size: tuple[int, int] | None) -> dict[str, dict[str, 
         "observation.state": feature("float32", (PROPRIO_DIM,), PROPRIO_NAMES),
         "action": feature("float32", (ACTION_DIM,), ACTION_NAMES),
         EXECUTED_ACTION: feature("float32", (ACTION_DIM,), ACTION_NAMES),
-        "phase": feature("int64"),
+        **dict.fromkeys(CLOCK, feature("float32")),
         "checkpoint.index": feature("int64"),
         "checkpoint.operation": feature("int64"),
         "checkpoint.completed": feature("bool", (MAX_CHECKPOINTS,), completed),

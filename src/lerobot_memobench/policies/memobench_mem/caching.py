@@ -55,12 +55,12 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
 from lerobot_memobench.policies.memobench_mem.network import SizedPaliGemmaWithExpert
 from lerobot_memobench.policies.memobench_mem.objects import (
     DETECTED,
-    OBS_PHASE,
     OBS_RAW_STATE,
     VIEWS,
     DetectionEncoder,
     ObjectsFromPictures,
 )
+from lerobot_memobench.protocol import OBS_PHASE
 from lerobot_memobench.sim.object_layout import SIZE
 
 logger = logging.getLogger(__name__)

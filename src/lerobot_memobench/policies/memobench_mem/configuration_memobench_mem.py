@@ -23,7 +23,7 @@ from lerobot_memobench.envs.observations import PRIVILEGED as PRIVILEGED_INPUT
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.perception.visual_encoder import SIDE
 from lerobot_memobench.perception.weights import PACKAGE, RANDOM
-from lerobot_memobench.protocol import CAMERAS, IMAGE_SIZE
+from lerobot_memobench.protocol import CAMERAS, CLOCK, IMAGE_SIZE
 
 logger = logging.getLogger(__name__)
 
@@ -554,7 +554,7 @@ class MemobenchMemConfig(PI05Config):
                 the weights to start from.
         """
         unseen = FeatureType.ENV if self.uses_pictures else FeatureType.VISUAL
-        for key in [key for key, feature in self.input_features.items() if feature.type is unseen]:
+        for key in [key for key, one in self.input_features.items() if one.type is unseen or key in CLOCK]:
             del self.input_features[key]
         if self.uses_detector and not self.image_features:
             shape = (3, IMAGE_SIZE, IMAGE_SIZE)

@@ -52,7 +52,7 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     MemoryBatch,
 )
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Precision, attend_fused
-from lerobot_memobench.policies.memobench_mem.objects import OBS_PHASE, OBS_RAW_STATE
+from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE
 from lerobot_memobench.policies.memobench_mem.rollout import Rollout
 from lerobot_memobench.policies.memobench_mem.sampler import TrainingRun, begin_training
 from lerobot_memobench.policies.memobench_mem.training import (
@@ -67,14 +67,14 @@ from lerobot_memobench.policies.memobench_mem.training import (
     quick_gradients,
     quick_products,
 )
-from lerobot_memobench.protocol import EXECUTION, PROMPT
+from lerobot_memobench.protocol import EXECUTION, OBS_PHASE, OBS_STEP, PROMPT
 
 # A saved pipeline is built right after its policy, by the names under which its steps register when imported.
 from lerobot_memobench.policies.memobench_mem import processor_memobench_mem  # noqa: F401  # isort: skip
 
 logger = logging.getLogger(__name__)
 
-OBS_STEP, OBS_PICTURE = "observation.step", f"observation.{PICTURE_STEP}"
+OBS_PICTURE = f"observation.{PICTURE_STEP}"
 OWN_MODULES = (
     *("model.memory", "model.memory_to_expert", "modulator", "alignment"),
     *("model.state_token", "model.instruction", "paligemma_with_expert.perception"),

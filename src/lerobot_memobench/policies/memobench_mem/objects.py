@@ -30,7 +30,7 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
     fingerprint,
 )
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import PooledMemoryEncoder
-from lerobot_memobench.protocol import CAMERAS
+from lerobot_memobench.protocol import CAMERAS, OBS_PHASE
 from lerobot_memobench.sim.object_layout import FIELDS, SIZE, SLOTS, WIDTH, field
 from lerobot_memobench.sim.object_slots import classes
 
@@ -101,7 +101,7 @@ class SlotEncoder(nn.Module):
 # -- object state -----------------------------------------------------------------------------------------------------
 
 
-OBS_RAW_STATE, OBS_PHASE = "observation.raw_state", "observation.phase"
+OBS_RAW_STATE = "observation.raw_state"
 
 
 def frame_row(slots: Tensor, state: Tensor, phase: Tensor) -> Tensor:
