@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 
 class MemobenchError(ValueError):
@@ -37,6 +37,19 @@ def unsupported_system() -> str:
         f"{name} cannot run the simulator, which draws with EGL or OSMesa on Linux: use {place}; "
         "docs/start/install.md says what works without"
     )
+
+
+def check_choice(name: str, value: object, known: Sequence[str]) -> None:
+    """Refuse a setting whose value is none of the known ones.
+
+    Args:
+        name: of the setting, as it was given.
+
+    Raises:
+        MemobenchError: what it is, and the nearest known values.
+    """
+    if value not in known:
+        raise MemobenchError(f"{name} is {value!r}; {nearest(str(value), known)}")
 
 
 def nearest(given: str, known: Iterable[str], count: int = 3) -> str:

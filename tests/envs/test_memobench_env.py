@@ -11,12 +11,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.envs.observations import OBJECTS
 from lerobot_memobench.envs.video import VideoRecorder
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import EXECUTION, PROMPT, PROMPT_HORIZON
@@ -42,14 +40,6 @@ def gl() -> Iterator[None]:
 
 def make(name: str, **settings: Any) -> MemobenchEnv:
     return MemobenchEnv(name, **settings)
-
-
-def test_each_task_of_both_suites_is_an_environment_of_gymnasium() -> None:
-    assert {f"memobench/{name.replace(',', '')}-v0" for name in task_names(suite=None)} <= set(gym.registry)
-    env = gym.make(f"memobench/{STOVE}-v0", obs_type=OBJECTS, render_mode="rgb_array")
-    assert set(env.observation_space.spaces) == {"agent_pos", "phase", "step", "environment_state"}
-    check_env(env.unwrapped, skip_render_check=True)  # each mode would be another scene
-    env.close()
 
 
 def actions(seed: int, steps: int) -> np.ndarray:

@@ -32,13 +32,14 @@ from lerobot_memobench.envs.observations import (
     PIXELS,
     PROMPT_IN,
     action_space,
+    check_counts,
     check_obs_type,
     observation_space,
     policy_features,
     policy_names,
     prompt_in,
 )
-from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.jobs.threads import ACTING, limit_torch, use_threads
 from lerobot_memobench.lerobot_hooks import ROLLOUT, installed
 from lerobot_memobench.protocol import CONTROL_HZ, EVALUATION_SEED, HORIZON
@@ -122,11 +123,8 @@ class MemobenchEnvConfig(EnvConfig):
             ("prompt_in", self.prompt_in, PROMPT_IN),
             ("render", self.render, ("fast", "default", "high")),
         ):
-            if value not in known:
-                raise MemobenchError(f"env.{name} is {value!r}; {nearest(value, known)}")
-        for name, number in (("horizon", self.horizon), ("render_every", self.render_every)):
-            if number < 1:
-                raise MemobenchError(f"env.{name} is {number}; expected a whole number from 1 on")
+            check_choice(f"env.{name}", value, known)
+        check_counts("env.", horizon=self.horizon, render_every=self.render_every)
         if self.videos is not None and self.videos < EVERY:
             raise MemobenchError(f"env.videos is {self.videos}; expected a number of episodes from 0 on, or -1 for all")
         if self.task is not None and self.tasks != "all":
@@ -227,7 +225,9 @@ class MemobenchEnvConfig(EnvConfig):
 
         if use_async_envs:
             # What a vector environment must know before its workers exist.
-            space = observation_space(self.expert_action, self.render_every, self.obs_type, self.blind_action)
+            space = observation_space(
+                self.expert_action, self.render_every, self.obs_type, self.blind_action, self.horizon
+            )
             return _LazyAsyncVectorEnv(make, space, action_space(), METADATA)
         # LeRobot freezes finished rows of its own async envs only; a sync row would be reset and go on.
         return gym.vector.SyncVectorEnv(

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.errors import check_choice
 from lerobot_memobench.experts.blind import blind_routine
 from lerobot_memobench.experts.demonstration_prompt import PromptDemonstrator
 from lerobot_memobench.experts.expert import Expert
@@ -66,9 +66,7 @@ class Episode:
         horizon: int = HORIZON,
         render: RenderSettings | None = None,
     ) -> None:
-        known = (*REFERENTS, DRAWN) if task.drawn else REFERENTS
-        if referent not in known:
-            raise MemobenchError(f"referent is {referent!r}; {nearest(referent, known)}")
+        check_choice("referent", referent, (*REFERENTS, DRAWN) if task.drawn else REFERENTS)
         self.published = task
         self.referent, self.horizon = referent_text(referent, task.drawn), horizon
         self.demonstration_prompt = demonstration_prompt and task.prompt is not None

@@ -20,16 +20,20 @@ from lerobot_memobench.envs.episode_log import EpisodeLog, episode_record, has_l
 from lerobot_memobench.envs.observations import (
     EVERY,
     METADATA,
+    OBS_TYPES,
     PIXELS,
     RESET,
+    REWARDS,
+    SPARSE,
     STEPS,
     Observer,
     action_space,
     blank,
+    check_counts,
     observation_space,
 )
 from lerobot_memobench.envs.video import BAND, VideoRecorder
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.io import file_name
 from lerobot_memobench.protocol import (
     ACTION_DIM,
@@ -70,6 +74,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         task: a name in the catalogue of either suite, or a task's folder.
         log_dir: where finished episodes are logged; nowhere when None.
         acting: whose episodes they are; one that it does not count is neither logged nor recorded.
+        reward: `sparse` or `checkpoints`, see `observations.REWARDS`.
         render_mode: gymnasium's; there is one.
 
     The other arguments are the settings of `MemobenchEnvConfig`.
@@ -86,6 +91,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         referent: str = "fixed",
         demonstration_prompt: bool = True,
         prompt_in: str = STEPS,
+        reward: str = SPARSE,
         horizon: int = HORIZON,
         render: str = "default",
         render_every: int = 1,
@@ -98,6 +104,10 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         acting: Acting = NOBODY,
         render_mode: str = "rgb_array",
     ) -> None:
+        check_choice("obs_type", obs_type, OBS_TYPES)
+        check_choice("reward", reward, REWARDS)
+        check_choice("prompt_in", prompt_in, (STEPS, RESET))
+        check_counts(horizon=horizon, render_every=render_every)
         self.render_mode = render_mode
         self._task = load_task(task) if suite_of(task) is None else get_task(task)
         self.task = self._task.name
@@ -106,7 +116,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._episode: Episode | None = None
         self._oracle_memory = oracle_memory
         self._describe(0)
-        self.observation_space = observation_space(expert_action, render_every, obs_type, blind_action)
+        self._reward = reward
+        self.observation_space = observation_space(expert_action, render_every, obs_type, blind_action, horizon)
         self.action_space = action_space()
         protocol = {
             "suite": self._task.suite,
@@ -196,7 +207,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._observer.needed = True
 
     def step(self, action: ArrayLike) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Advance by one control step of 50 ms. The reward is 1 at success, else 0.
+        """Advance by one control step of 50 ms; of the reward see `observations.REWARDS`.
 
         An episode terminates by success and, of a strict task, by the loss of its goal; the horizon truncates it.
 
@@ -224,8 +235,16 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._observe()
         if episode.done:
             self._end()
-        success, ended = episode.success, episode.success or episode.lost
-        return self._observation(), float(success), ended, episode.done and not ended, self._info()
+        ended = episode.success or episode.lost
+        reward = self._rewarded(episode.progress.index - completed)
+        return self._observation(), reward, ended, episode.done and not ended, self._info()
+
+    def _rewarded(self, completed: int) -> float:
+        """Return the reward of a step in which so many memory checkpoints were completed."""
+        success = self.episode.success
+        if self._reward == SPARSE:
+            return float(success)
+        return (completed + success) / (len(self.episode.task.checkpoints) + 1)
 
     def _observe(self) -> None:
         """Observe the present frame, and record it where the episode is recorded."""

@@ -13,8 +13,18 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.envs.video import annotate
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, CONTROL_HZ, EXECUTION, IMAGE_SIZE, PROMPT, PROPRIO_DIM
-from lerobot_memobench.sim.object_layout import SIZE
+from lerobot_memobench.protocol import (
+    ACTION_DIM,
+    CAMERAS,
+    CONTROL_HZ,
+    EXECUTION,
+    HORIZON,
+    IMAGE_SIZE,
+    PROMPT,
+    PROMPT_HORIZON,
+    PROPRIO_DIM,
+)
+from lerobot_memobench.sim.object_layout import BOUNDS, FIELDS, SIZE, SLOTS
 
 if TYPE_CHECKING:
     from lerobot.configs import PolicyFeature
@@ -35,6 +45,11 @@ waits while `observation.phase` is 0, and plans anew when it becomes 1. Any othe
 its queue would still hold those actions when the scene is restored. To it an episode begins at its first execution
 frame.
 """
+
+SPARSE, CHECKPOINTS = "sparse", "checkpoints"
+REWARDS = (SPARSE, CHECKPOINTS)
+"""Values of ``reward``: 1 at success; or, with K memory checkpoints, 1 / (K + 1) when one is completed in order, and as
+much at success. Either way an episode's rewards add up to 1 at most, and to 1 only where it succeeds."""
 
 EVERY = -1
 """Value of ``env.videos``: record every episode."""
@@ -157,31 +172,49 @@ def _pictures(obs_type: str) -> dict[str, str]:
 
 
 def observation_space(
-    expert_action: bool, render_every: int = 1, obs_type: str = PIXELS, blind_action: bool = False
+    expert_action: bool,
+    render_every: int = 1,
+    obs_type: str = PIXELS,
+    blind_action: bool = False,
+    horizon: int = HORIZON,
 ) -> spaces.Dict:
     """Return the space of observations, with the actions of the scripted expert or the blind routine on request.
 
     Where not every step is drawn, ``picture_step`` tells which step the pictures show.
     """
+    reach = np.repeat(np.array([3.0, 2 * np.pi, 0.1], np.float32), (3, 3, 2))  # m, rad, m
+    steps = spaces.Box(0, max(horizon, PROMPT_HORIZON), (1,), np.float32)
     parts: dict[str, spaces.Space[Any]] = {
-        "agent_pos": spaces.Box(-np.inf, np.inf, (PROPRIO_DIM,), np.float32),
+        "agent_pos": spaces.Box(-reach, reach, (PROPRIO_DIM,), np.float32),
         # LeRobot passes numeric keys that it does not know on as `observation.<key>`, so a policy with a memory can
         # tell by itself when each row of a batch starts and stands still.
         "phase": spaces.Box(PROMPT, EXECUTION, (1,), np.float32),
-        "step": spaces.Box(0, np.inf, (1,), np.float32),
+        "step": steps,
     }
     if obs_type != OBJECTS:
         image = spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
         parts["pixels"] = spaces.Dict(dict.fromkeys(CAMERAS, image))
         if render_every > 1:
-            parts["picture_step"] = spaces.Box(0, np.inf, (1,), np.float32)
+            parts["picture_step"] = steps
     if obs_type != PIXELS:
-        parts["environment_state"] = spaces.Box(-np.inf, np.inf, (SIZE,), np.float32)
+        low, high = (np.tile(np.repeat(ends, [*FIELDS.values()]), SLOTS) for ends in zip(*BOUNDS.values(), strict=True))
+        parts["environment_state"] = spaces.Box(low.astype(np.float32), high.astype(np.float32), (SIZE,), np.float32)
     if expert_action:
         parts["expert_action"] = action_space()
     if blind_action:
         parts["blind_action"] = action_space()
     return spaces.Dict(parts)
+
+
+def check_counts(prefix: str = "", **counts: int) -> None:
+    """Refuse numbers of steps below 1; ``prefix`` stands before a setting's name.
+
+    Raises:
+        MemobenchError: one is.
+    """
+    for name, number in counts.items():
+        if number < 1:
+            raise MemobenchError(f"{prefix}{name} is {number}; expected a whole number from 1 on")
 
 
 def action_space() -> spaces.Space[NDArray[np.float32]]:
@@ -243,7 +276,7 @@ class Observer:
             if self._render_every > 1:
                 found["picture_step"] = np.array([self._picture_clock], dtype=np.float32)
         if self._has_objects:
-            found["environment_state"] = self._objects
+            found["environment_state"] = self._objects.copy()  # repeated where it is not read
         return found
 
     def frame(self, episode: Episode) -> NDArray[np.uint8]:

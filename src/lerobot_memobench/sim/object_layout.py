@@ -17,6 +17,16 @@ FIELDS = {"present": 1, "class": 1, "position": 3, "rotation": 6, "joint": 1, "h
 the prompt.
 """
 
+BOUNDS = {
+    "present": (0, 1),
+    "class": (0, 99),
+    "position": (-10, 10),
+    "rotation": (-1, 1),
+    "joint": (-7, 7),
+    "highlighted": (0, 1),
+}
+"""Field -> between which values its numbers lie. A position is that of a visible thing: the room is 5 m wide."""
+
 WIDTH = sum(FIELDS.values())
 SIZE = SLOTS * WIDTH
 """Length of the observation."""

@@ -13,7 +13,7 @@ from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.errors import MemobenchError, check_choice, nearest
 from lerobot_memobench.tasks.bddl import Problem, parse_bddl
 from lerobot_memobench.tasks.formula import LATCHES, atoms, to_lists
 from lerobot_memobench.tasks.metadata import Metadata, read_text
@@ -73,8 +73,7 @@ def suite_of(name: str) -> str | None:
 
 def check_suite(suite: str) -> str:
     """Return the name of a suite; an unknown one is an error."""
-    if suite not in SUITES:
-        raise MemobenchError(f"suite is {suite!r}; {nearest(suite, SUITES)}")
+    check_choice("suite", suite, SUITES)
     return suite
 
 
