@@ -12,7 +12,7 @@ from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.comparison import Comparison, Difference, compare, comparison_report
 from lerobot_memobench.evaluation.metrics import value_of
-from lerobot_memobench.evaluation.records import read_runs
+from lerobot_memobench.evaluation.records import read_runs, unlike
 from lerobot_memobench.evaluation.report_tables import AVERAGE
 from lerobot_memobench.evaluation.tables import markdown
 from tests.support import logs
@@ -96,6 +96,21 @@ def test_who_sees_the_prompt_is_the_policys_and_told(tmp_path: Path) -> None:
     (a / "protocol.json").write_text(json.dumps(settings))
     (b / "protocol.json").write_text(json.dumps({**settings, "prompt_in": "reset"}))
     assert compared(a, b).notes[0] == "compared although prompt_in: steps and reset"
+
+
+def test_another_mujoco_is_told(tmp_path: Path) -> None:
+    """By the cards: of the refused, why their scenes differ, and as a note of what was allowed."""
+    a, b = logs.evaluation(tmp_path / "a"), logs.evaluation(tmp_path / "b", scene_hash="another")
+    for folder, version in ((a, "3.9.0"), (b, "4.0.0")):
+        card = {"protocol": {}, "runs": [{"versions": {"mujoco": version, "python": "3.12.1"}}]}
+        (folder / "card.json").write_text(json.dumps(card))
+    sentence = "a ran under MuJoCo 3.9.0 and b under 4.0.0: scenes start and move slightly otherwise"
+    with pytest.raises(MemobenchError, match=sentence):
+        compared(a, b)
+    assert sentence in compared(a, b, allow=["scene_hash"]).notes
+    assert unlike(read_runs([a, b])) == [sentence]
+    (b / "card.json").write_text((a / "card.json").read_text())
+    assert sentence not in compared(a, b, allow=["scene_hash"]).notes
 
 
 def test_all_that_must_be_allowed_is_named_at_once(tmp_path: Path) -> None:

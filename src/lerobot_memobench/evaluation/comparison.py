@@ -15,7 +15,7 @@ from lerobot_memobench.envs.episode_log import OF_THE_POLICY, SETTINGS, differen
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import METRICS, Record, by_task, operations, policy_inputs, value_of
-from lerobot_memobench.evaluation.records import Run
+from lerobot_memobench.evaluation.records import Run, other_physics
 from lerobot_memobench.evaluation.report_tables import AVERAGE, inputs_phrase
 from lerobot_memobench.evaluation.statistics import PERMUTATIONS, detectable, holm, mcnemar, sign_flip
 from lerobot_memobench.evaluation.tables import Cell, Count, Name, Numbers, Report, Section, Table, figure
@@ -175,9 +175,10 @@ def _like_pairs(a: Run, b: Run, allow: Collection[str]) -> list[Pair]:
     if found or unlike:
         names += unlike
         options = " ".join(f"--allow {name}" for name in names)
+        reasons = "; ".join([*found, *unlike.values(), *other_physics(a, b)])
         raise MemobenchError(
             f"{a.folder} and {b.folder} are not of the same episodes under one protocol "
-            f"({'; '.join([*found, *unlike.values()])}), so their difference is not the policies' alone; evaluate again"
+            f"({reasons}), so their difference is not the policies' alone; evaluate again"
             + (f", or name what is meant to differ: {options}" if set(names) <= set(ALLOWED) else "")
         )
     return pairs
@@ -185,7 +186,7 @@ def _like_pairs(a: Run, b: Run, allow: Collection[str]) -> list[Pair]:
 
 def _notes(a: Run, b: Run, pairs: int) -> list[str]:
     """Return what a reader must know: what differs, what was left out, what the logs lack."""
-    notes = [f"compared although {note}" for note in differences(a.protocol, b.protocol)]
+    notes = [f"compared although {note}" for note in differences(a.protocol, b.protocol)] + other_physics(a, b)
     left = {run.name: len(run.records) - pairs for run in (a, b)}
     notes += [f"{count_of(count, 'episode')} only in {name} left out" for name, count in left.items() if count]
     return notes + [f"{run.name}: {note}" for run in (a, b) for note in run.notes]

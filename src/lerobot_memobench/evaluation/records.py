@@ -92,6 +92,7 @@ class StartFacts(TypedDict, total=False):
 
     command: list[str]
     batch_size: BatchSize
+    versions: dict[str, str]
 
 
 class Card(TypedDict):
@@ -278,7 +279,18 @@ def unlike(runs: Sequence[Run]) -> list[str]:
                 f"{run.name} was not run as {first} was ({'; '.join(found)}, the first value being that of {first}): "
                 "their figures do not compare; `memobench compare` does so over the episodes in common, where it can"
             )
+        notes += other_physics(runs[0], run)
     return notes
+
+
+def other_physics(a: Run, b: Run) -> list[str]:
+    """Return a sentence where two evaluations ran under different versions of MuJoCo, by their cards."""
+    starts = ([start.get("versions", {}) for start in card_of(run.folder).get("runs", [])] for run in (a, b))
+    mine, other = ({versions["mujoco"] for versions in each if "mujoco" in versions} for each in starts)
+    if not mine or not other or mine == other:
+        return []
+    here, there = (" and ".join(sorted(versions)) for versions in (mine, other))
+    return [f"{a.name} ran under MuJoCo {here} and {b.name} under {there}: scenes start and move slightly otherwise"]
 
 
 def read_rollouts(folder: str | Path) -> tuple[list[dict[str, Any]], list[str]]:

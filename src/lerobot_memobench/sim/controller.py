@@ -41,6 +41,12 @@ POSITION_SCALE, ROTATION_SCALE = 0.05, 0.5
 GRIPPER_SPEED = 0.01
 """Change of the gripper's command (−1 open … 1 closed, ideal range) per physics step."""
 
+MUJOCO = tuple(int(part) for part in mujoco.__version__.split(".")[:2])
+MASS_BY_DATA = MUJOCO >= (3, 10)
+"""`mujoco.mj_fullM` takes (model, data, result); before MuJoCo 3.10 it took (model, result, data.qM)."""
+NEWEST_MUJOCO = (4, 0)
+"""The newest MuJoCo whose functions are called by address here. No later one is: its arguments may be others."""
+
 
 class OSCController:
     """Turn 7-D actions into joint torques and finger targets of one model.
@@ -97,7 +103,10 @@ class OSCController:
         """
         dofs = self._dofs
         mujoco.mj_jacSite(self._model, data, self._jac[:3], self._jac[3:], self._site)
-        mujoco.mj_fullM(self._model, self._mass, data.qM)
+        if MASS_BY_DATA:
+            mujoco.mj_fullM(self._model, data, self._mass)
+        else:
+            mujoco.mj_fullM(self._model, self._mass, data.qM)
         jacobian = self._jac[:, dofs]
         mass = self._mass[dofs, dofs]
         velocity = data.qvel[dofs]
@@ -197,11 +206,13 @@ class CompiledController(OSCController):
     """`OSCController` with a compiled `advance`.
 
     Raises:
-        ImportError, RuntimeError, AttributeError: numba is not installed or cannot keep what it compiles, or numpy
-            has another BLAS.
+        ImportError, RuntimeError, AttributeError: numba is not installed or cannot keep what it compiles, numpy has
+            another BLAS, or MuJoCo is newer than `NEWEST_MUJOCO`.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
+        if MUJOCO > NEWEST_MUJOCO:
+            raise RuntimeError(f"MuJoCo {mujoco.__version__} is not known here")
         from lerobot_memobench.sim import osc_kernel
 
         super().__init__(model)
@@ -209,6 +220,7 @@ class CompiledController(OSCController):
         self._scratch = osc_kernel.scratch(model.nv)
         low, high = self._torque_limits
         self._constants = osc_kernel.Arm(
+            mass_by_data=MASS_BY_DATA,
             site=self._site,
             dof=self._dofs.start,
             qpos=self._qposs.start,
@@ -240,8 +252,8 @@ class CompiledController(OSCController):
 
         # Asked for anew each time: a copied simulation has its own memory.
         state = osc_kernel.State(
-            data.qpos, data.qvel, data.site_xpos[self._site], data.site_xmat[self._site].reshape(3, 3), data.qM,
-            data.qfrc_bias, data.ctrl,
+            data.qpos, data.qvel, data.site_xpos[self._site], data.site_xmat[self._site].reshape(3, 3),
+            data.M if MASS_BY_DATA else data.qM, data.qfrc_bias, data.ctrl,
         )  # fmt: skip
         gripper = self.gripper.copy()
         osc_kernel.advance(

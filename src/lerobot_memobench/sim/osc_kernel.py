@@ -38,8 +38,9 @@ class Functions(NamedTuple):
 
 
 class Arm(NamedTuple):
-    """What an arm's controller knows for good: first velocity and position, gains, limits, actuators."""
+    """What an arm's controller knows for good: MuJoCo's calls, first velocity and position, gains, limits, motors."""
 
+    mass_by_data: bool
     site: int
     dof: int
     qpos: int
@@ -187,7 +188,10 @@ def _torques(f, model, data, arm, position, rotation, x, s):  # type: ignore[no-
         f.site_jacobian,
         (model, data, s.jacobian.ctypes.data, s.jacobian[3:].ctypes.data, np.int32(arm.site)),
     )
-    _call(f.full_mass, (model, s.mass.ctypes.data, x.mass.ctypes.data))
+    if arm.mass_by_data:
+        _call(f.full_mass, (model, data, s.mass.ctypes.data))
+    else:
+        _call(f.full_mass, (model, s.mass.ctypes.data, x.mass.ctypes.data))
     dofs = slice(arm.dof, arm.dof + 7)
     jacobian, mass, velocity = s.jacobian[:, dofs], s.mass[dofs, dofs], x.qvel[dofs]
     third, sixth, seventh = s.factors
