@@ -43,3 +43,8 @@ ACTION_DIM = 7
 """End-effector displacement (6; ±5 cm, ±0.5 rad per unit), gripper (−1 opens, 1 closes)."""
 PROPRIO_DIM = 8
 """End-effector position (3, m), axis-angle (3, rad), fingers (2, m)."""
+
+# -- software
+
+PUBLISHED_MUJOCO = "3.9.0"
+"""MuJoCo of the published figures. Under others scenes drift by fractions of a millimetre."""

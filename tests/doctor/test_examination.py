@@ -10,6 +10,7 @@ import shutil
 import sys
 from dataclasses import asdict
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,19 +22,23 @@ from lerobot_memobench.cli.demo import finding_table
 from lerobot_memobench.doctor import examination
 from lerobot_memobench.doctor.examination import Finding, exit_status
 from lerobot_memobench.doctor.probe import SIDE, TOLERANCE, difference, read_golden, render_golden, run_probe, shrink
+from lerobot_memobench.protocol import PUBLISHED_MUJOCO
 from lerobot_memobench.sim.rendering import BACKENDS
 
 
 def test_supported_versions_come_from_the_requirements() -> None:
     supported = examination.supported_versions()
-    assert supported["lerobot"] == SpecifierSet("==0.6.1")
-    assert not supported["mujoco"].contains("3.17.0")
+    assert supported["lerobot"].contains("0.6.1")
+    assert not supported["lerobot"].contains("0.8.0")
+    assert supported["mujoco"].contains("4.0.0")
+    assert not supported["mujoco"].contains("3.3.6")
+    assert supported["robosuite"] == SpecifierSet("==1.4.1")
     assert not supported["torch"].contains("2.12.0")
 
 
 def test_a_version_out_of_range_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     real = metadata.version
-    monkeypatch.setattr(metadata, "version", lambda name: "4.0.0" if name == "mujoco" else real(name))
+    monkeypatch.setattr(metadata, "version", lambda name: "3.2.0" if name == "mujoco" else real(name))
     findings = {finding.what: finding for finding in examination.package_versions()}
     assert findings["mujoco"].status == "failed"
     assert findings["mujoco"].fix
@@ -46,6 +51,51 @@ def test_a_missing_package_fails(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(metadata, "version", version)
     assert {finding.status for finding in examination.package_versions()} == {"failed"}
+
+
+@pytest.fixture
+def installed(monkeypatch: pytest.MonkeyPatch) -> dict[str, str | None]:
+    """Versions of packages that are installed (None: not) whatever really is, in an environment that pip made."""
+    versions: dict[str, str | None] = {}
+    real = metadata.version
+
+    def version(name: str) -> str:
+        found = versions[name] if name in versions else real(name)
+        if found is None:
+            raise metadata.PackageNotFoundError(name)
+        return found
+
+    monkeypatch.setattr(metadata, "version", version)
+    monkeypatch.setattr(sys, "prefix", "/nowhere")
+    return versions
+
+
+@pytest.mark.parametrize("found", [None, "1.4.0"])
+def test_robosuite_has_a_line_of_its_own(installed: dict[str, str | None], found: str | None) -> None:
+    installed["robosuite"] = found
+    (finding,) = [finding for finding in examination.package_versions() if finding.what == "robosuite"]
+    assert (finding.status, finding.fix) == ("failed", "pip install --no-deps robosuite==1.4.1")
+
+
+def test_two_distributions_of_one_cv2(installed: dict[str, str | None]) -> None:
+    assert examination.opencv().status == "ok"
+    installed["opencv-python"] = "5.0.0.93"
+    finding = examination.opencv()
+    assert finding.status == "warning"
+    assert finding.fix.startswith("pip uninstall -y opencv-python opencv-python-headless && pip install ")
+    assert '"opencv-python-headless<' in finding.fix
+
+
+def test_the_mujoco_of_published_figures(installed: dict[str, str | None]) -> None:
+    lock = (Path(__file__).parents[2] / "requirements.lock").read_text()
+    assert f"\nmujoco=={PUBLISHED_MUJOCO} " in lock
+    installed |= {"mujoco": PUBLISHED_MUJOCO, "mujoco-core": None}
+    assert "as for published figures" in examination.physics().detail
+    installed |= {"mujoco": "4.0.0", "mujoco-core": "4.0.0"}
+    assert f"published figures are of {PUBLISHED_MUJOCO}" in examination.physics().detail
+    installed["mujoco"] = "3.9.0"
+    assert examination.physics().status == "warning"
+    assert "mujoco-core" in examination.physics().fix
 
 
 def test_the_plugin_is_discovered() -> None:

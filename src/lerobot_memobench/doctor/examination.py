@@ -19,7 +19,9 @@ from packaging.specifiers import SpecifierSet
 from lerobot_memobench.doctor.probe import TOLERANCE, run_probe
 from lerobot_memobench.errors import MemobenchError, unsupported_system
 from lerobot_memobench.jobs.threads import cores
+from lerobot_memobench.protocol import PUBLISHED_MUJOCO
 from lerobot_memobench.sim.rendering import BACKENDS, gl_backend
+from lerobot_memobench.sim.robot import INSTALL_ROBOSUITE, ROBOSUITE
 
 DISTRIBUTION = "lerobot_policy_memobench"
 PLUGIN = "LeRobot plugin"
@@ -60,6 +62,7 @@ def examine() -> list[Finding]:
         system(),
         python_version(),
         *package_versions(),
+        physics(),
         opencv(),
         plugin(),
         *rendering(),
@@ -89,7 +92,7 @@ def python_version() -> Finding:
     """Compare the interpreter with the one that is supported."""
     found = ".".join(str(part) for part in sys.version_info[:3])
     good = sys.version_info[:2] == (3, 12)
-    return Finding("Python", "ok" if good else "failed", found, "" if good else "run `make setup`, which uses 3.12")
+    return Finding("Python", "ok" if good else "failed", found, "" if good else "use 3.12, as `make setup` does")
 
 
 def package_versions() -> Iterator[Finding]:
@@ -98,17 +101,33 @@ def package_versions() -> Iterator[Finding]:
     for name in SHOWN:
         found = _installed(name)
         wanted = requirements.get(name, SpecifierSet())
-        if found is None:
-            yield Finding(name, "failed", "not installed", "run `make setup`")
-        elif not wanted.contains(found, prereleases=True):
-            yield Finding(name, "failed", f"{found}; supported is {wanted}", "run `make setup`")
+        if found is None or not wanted.contains(found, prereleases=True):
+            detail = "not installed" if found is None else f"{found}; supported is {wanted}"
+            fix = INSTALL_ROBOSUITE if name == "robosuite" else f'pip install "{name}{wanted}"'
+            yield Finding(name, "failed", detail, _by_setup(fix))
         else:
             yield Finding(name, "ok", found + (f" (supported {wanted})" if str(wanted) else ""))
 
 
+def physics() -> Finding:
+    """Compare MuJoCo with that of the published figures. From 4.0 on its files are those of a second distribution."""
+    found = _installed("mujoco") or "not installed"
+    if found.startswith("3.") and (other := _installed("mujoco-core")):
+        fix = f"pip uninstall -y mujoco mujoco-core mujoco-studio && pip install mujoco=={found}"
+        return Finding("physics", "warning", f"MuJoCo {found} is written over the files of {other}", _by_setup(fix))
+    if found != PUBLISHED_MUJOCO:
+        return Finding("physics", "ok", f"MuJoCo {found}; published figures are of {PUBLISHED_MUJOCO}")
+    return Finding("physics", "ok", f"MuJoCo {found}, as for published figures")
+
+
+def _by_setup(command: str) -> str:
+    """Return what mends this environment: `make setup` where that made it, which brings no pip, else a command."""
+    return "run `make setup`" if (Path(sys.prefix) / ".memobench-setup").exists() else command
+
+
 def supported_versions() -> dict[str, SpecifierSet]:
     """Return package -> versions that both this project and LeRobot accept here."""
-    found: dict[str, SpecifierSet] = {}
+    found = {"robosuite": SpecifierSet(f"=={ROBOSUITE}")}
     for owner in ("lerobot", DISTRIBUTION):
         for requirement in _requirements(owner):
             name = requirement.name.lower().replace("_", "-")
@@ -130,12 +149,14 @@ def _requirements(owner: str) -> Iterator[Requirement]:
 
 def opencv() -> Finding:
     """Two distributions install the same module ``cv2``; the one with windows needs desktop libraries."""
-    names = {"opencv-python", "opencv-python-headless", "opencv-contrib-python"}
+    contrib = "opencv-contrib-python"
+    names = {"opencv-python", "opencv-python-headless", contrib, f"{contrib}-headless"}
     installed = {name: version for name in sorted(names) if (version := _installed(name)) is not None}
     if list(installed) == ["opencv-python-headless"]:
         return Finding("OpenCV", "ok", f"opencv-python-headless {installed['opencv-python-headless']} alone")
-    fix = "run `make setup`, or uninstall all of them and install opencv-python-headless alone"
-    return Finding("OpenCV", "warning", " and ".join(installed) or "not installed", fix)
+    wanted = f'pip install "opencv-python-headless{supported_versions().get("opencv-python-headless", "")}"'
+    fix = f"pip uninstall -y {' '.join(installed)} && {wanted}" if installed else wanted
+    return Finding("OpenCV", "warning", " and ".join(installed) or "not installed", _by_setup(fix))
 
 
 def plugin() -> Finding:
@@ -145,7 +166,7 @@ def plugin() -> Finding:
             PLUGIN,
             "failed",
             f"no installed distribution is named {DISTRIBUTION}, so LeRobot does not look for it",
-            "install the project (`make setup`); a source folder on PYTHONPATH is not enough",
+            "run `make setup`, or `pip install .` in its folder; a source folder on PYTHONPATH is not enough",
         )
     try:
         missing = not_registered()
@@ -153,7 +174,8 @@ def plugin() -> Finding:
         reason = f"importing it fails: {type(error).__name__}: {error}"
         return Finding(PLUGIN, "failed", reason, "mend the import error; LeRobot only logs it")
     if missing:
-        return Finding(PLUGIN, "failed", f"imported, but not registered: {', '.join(missing)}", "run `make setup`")
+        fix = _by_setup(f"pip install --force-reinstall --no-deps {DISTRIBUTION}")
+        return Finding(PLUGIN, "failed", f"imported, but not registered: {', '.join(missing)}", fix)
     return Finding(PLUGIN, "ok", "discovered: env memobench, policies memobench_mem, memobench_expert")
 
 

@@ -24,6 +24,13 @@ from numpy.typing import NDArray
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import draft_of
 
+ROBOSUITE = "1.4.1"
+INSTALL_ROBOSUITE = f"pip install --no-deps robosuite=={ROBOSUITE}"
+"""robosuite is none of our requirements: pip would also install what it requires, a second `cv2` and a keyboard library
+that has to be compiled."""
+ARM_SHA256 = "477a3b019b26022236d3c82372d29d86dc784d1f2bade46103e232c12467e48f"
+"""Of the composed MJCF, without folders, and its meshes."""
+
 BASE_POSITION = (-0.66, 0.0, 0.0)
 """Foot of the mount, m: x = −0.16 − table length / 2 (robosuite's offset for a table of 1 m)."""
 
@@ -57,6 +64,22 @@ Faces = NDArray[np.int32]
 """(M, 3) indices of vertices, counter-clockwise from outside."""
 
 
+def _robosuite_version() -> str:
+    """Return the installed version of robosuite.
+
+    Raises:
+        MemobenchError: it is not installed, or has another arm.
+    """
+    try:
+        found = importlib.metadata.version("robosuite")
+    except importlib.metadata.PackageNotFoundError:
+        found = ""
+    if found != ROBOSUITE:
+        there = f"robosuite {found}" if found else "none"
+        raise MemobenchError(f"the arm is that of robosuite {ROBOSUITE}, found {there}; run: {INSTALL_ROBOSUITE}")
+    return found
+
+
 def _robosuite_xml() -> str:
     """Compose the arm's MJCF with robosuite, quietly: it warns about macro files that nobody needs here."""
     logging.getLogger("robosuite_logs").setLevel(logging.ERROR)
@@ -79,6 +102,10 @@ def _robosuite_xml() -> str:
 def _build() -> dict[str, np.ndarray]:
     """Return the MJCF text and, for each visual mesh, its thinned vertices and faces."""
     xml = _robosuite_xml()
+    if arm_hash(xml) != ARM_SHA256:
+        raise MemobenchError(
+            f"the arm's files are not those of robosuite {ROBOSUITE}; run: {INSTALL_ROBOSUITE} --force-reinstall"
+        )
     arrays: dict[str, np.ndarray] = {"xml": np.array(xml)}
     drawn = set(re.findall(r'group="1"[^>]*\bmesh="([^"]+)"', xml))
     drawn |= set(re.findall(r'\bmesh="([^"]+)"[^>]*group="1"', xml))
@@ -94,10 +121,18 @@ def _build() -> dict[str, np.ndarray]:
     return arrays
 
 
+def arm_hash(xml: str) -> str:
+    """Return the hash of an MJCF text, without folders, and of the mesh files that it names."""
+    digest = hashlib.sha256(re.sub(r'file="[^"]*/', 'file="', xml).encode())
+    for file in re.findall(r'<mesh name="[^"]+" file="([^"]+)"', xml):
+        digest.update(Path(file).read_bytes())
+    return digest.hexdigest()
+
+
 def _cache_file() -> Path:
     """Where the thinned arm is kept between processes, named by all that it depends on."""
     source = Path(__file__).read_bytes()
-    versions = importlib.metadata.version("robosuite") + importlib.metadata.version("fast-simplification")
+    versions = _robosuite_version() + importlib.metadata.version("fast-simplification")
     key = hashlib.sha256(source + versions.encode()).hexdigest()[:16]
     root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return root / "lerobot_memobench" / f"panda-{key}.npz"
