@@ -365,7 +365,7 @@ def fields(tree: ast.ClassDef) -> Iterator[tuple[str, str, str, str]]:
         text = after.value.value if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) else ""
         default = "" if node.value is None else ast.unparse(node.value)
         found = re.fullmatch(r"field\(default_factory=(.*)\)", default)
-        default = {"FROM_SIZE": "by size", "dict": "{}", "tuple": "()", "list": "[]"}.get(
+        default = {"FROM_SIZE": "by size", "BY_DIALECT": "by dialect", "dict": "{}", "tuple": "()", "list": "[]"}.get(
             found[1] if found else default, default
         )
         yield (

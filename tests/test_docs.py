@@ -6,6 +6,7 @@ import dataclasses
 import importlib.util
 import re
 import shlex
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -226,6 +227,8 @@ def check(words: list[str]) -> None:
             check_memobench(rest)
         case "python":
             check_python(rest)
+        case "vla-eval":
+            check_vla_eval(rest)
         case "make":
             assert re.search(rf"^{rest[0]}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
         case _:
@@ -254,6 +257,16 @@ def is_place(pair: str) -> bool:
     """Whether a pair's value is a folder or a repository."""
     key, _, value = pair.partition("=")
     return key == "dataset" or "/" in value
+
+
+def check_vla_eval(line: list[str]) -> None:
+    """Parse a line as vla-evaluation-harness does."""
+    from vla_eval.cli import main
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(sys, "argv", ["vla-eval", *line])
+        patched.setattr(main, "cmd_run", lambda _: None)
+        main.main()
 
 
 def check_memobench(line: list[str]) -> None:

@@ -241,7 +241,7 @@ OF_A_POLICY: dict[str, dict[str, st.SearchStrategy[str]]] = {
     "memobench_remote": {
         "host": st.sampled_from(["127.0.0.1", "localhost"]),
         "port": COUNT,
-        "dialect": st.sampled_from(["openpi", "robomme"]),
+        "dialect": st.sampled_from(["openpi", "robomme", "vla_eval"]),
         "policy.label": st.text("abc ()é", max_size=20),
         "policy.gripper": st.sampled_from(["libero", "rlds"]),
         "policy.timeout": st.just("7.5"),

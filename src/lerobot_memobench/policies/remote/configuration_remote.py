@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from lerobot.configs import PreTrainedConfig
 
@@ -23,10 +23,17 @@ OPENPI_KEYS = {
     "prompt": TASK,
 }
 
+VLA_EVAL_KEYS = {"images.agentview": IMAGE, "images.wrist": WRIST_IMAGE, "states": STATE, "task_description": TASK}
+"""What vla-evaluation-harness's model servers read; a point goes a level down."""
+
 LIBERO, RLDS = "libero", "rlds"
 GRIPPERS = (LIBERO, RLDS)
 """``libero``: −1 opens, 1 closes, as this environment has it. ``rlds``: 1 opens, 0 closes, and the client turns
 whatever lies between into the nearer of both."""
+
+
+WEBSOCKETS = ("websocket", "vla_eval")
+"""Transports that are reached by ``ws://``."""
 
 
 @dataclass(frozen=True)
@@ -34,14 +41,17 @@ class Dialect:
     """One kind of server.
 
     Attributes:
-        transport: ``websocket`` (openpi's), ``act`` (OpenVLA's REST) or ``process_frame`` (MemoryVLA's REST).
+        transport: ``websocket`` (openpi's), ``act`` (OpenVLA's REST), ``process_frame`` (MemoryVLA's REST) or
+            ``vla_eval`` (vla-evaluation-harness's websocket).
         port: where the server listens unless told otherwise.
         keys: the server's name of each thing that is sent -> our name of it.
         image_size: side of the images that are sent, pixels; None for as rendered, where the server resizes itself.
         gripper: meaning of the last number of an action.
+        n_action_steps: actions executed of each answer unless told otherwise.
         memory: the server remembers what it was sent, so that it has to see the episode again when it was restarted.
         shared: it has one memory for all its connections, so it serves one environment at a time.
         buffers: it is sent every frame, in a message of its own before each question (``add_buffer``).
+        history: it is sent the demonstration prompt at once, with the first question of the execution.
     """
 
     transport: str = "websocket"
@@ -49,9 +59,11 @@ class Dialect:
     keys: Mapping[str, str] = field(default_factory=lambda: dict(OPENPI_KEYS))
     image_size: int | None = None
     gripper: str = LIBERO
+    n_action_steps: int = 5
     memory: bool = False
     shared: bool = False
     buffers: bool = False
+    history: bool = False
 
 
 DIALECTS: dict[str, Dialect] = {
@@ -75,7 +87,13 @@ DIALECTS: dict[str, Dialect] = {
         memory=True,
         shared=True,
     ),
+    # vla-eval 0.8: protocol/{messages,numpy_codec,image_codec}.py, connection.py, model_servers/{serve,predict}.py. Its
+    # servers answer one action, and keep the rest of a chunk themselves.
+    "vla_eval": Dialect(transport="vla_eval", keys=VLA_EVAL_KEYS, n_action_steps=1, memory=True, history=True),
 }
+
+BY_DIALECT: Any = None
+"""Value of a field that follows from ``dialect`` unless it is set; `__post_init__` fills it in."""
 
 
 @PreTrainedConfig.register_subclass("memobench_remote")
@@ -88,7 +106,7 @@ class RemoteConfig(UntrainedConfig):
         port: its port; the dialect's usual one when left out.
         servers: several servers, ``host:port,host:port``; environment i of a batch asks server i modulo their number.
         dialect: what the server speaks, one of `DIALECTS`.
-        n_action_steps: actions executed of each answer (``replan=``).
+        n_action_steps: actions executed of each answer (``replan=``); 5, of ``vla_eval`` 1, when left out.
         keys: names of what is sent, ``theirs=ours,…`` with ours one of image, wrist_image, state, task or another
             observation of the environment; replaces the dialect's.
         image_size: side of the images that are sent, padded to a square, pixels; 0 for as rendered.
@@ -96,8 +114,8 @@ class RemoteConfig(UntrainedConfig):
         gripper: meaning of the last number of an action, one of `GRIPPERS`; the dialect's when left out.
         memory: whether the server remembers what it was sent; the dialect's when left out.
         send_prompt: whether it sees the demonstration prompt. Switch it off for a policy without memory, to save time.
-        history_every: steps between the frames of the prompt that it sees; ``n_action_steps`` when left out. A server
-            that buffers frames (robomme) gets all of them.
+        history_every: steps between the frames of the prompt that it sees; ``n_action_steps`` when left out, of
+            ``vla_eval`` 1. A server that buffers frames (robomme) gets all of them.
         connect_timeout: how long the first connection is waited for, s.
         timeout: how long an answer is waited for, s; the first one may include compilation.
         retry: how long a server that went away is waited for, s.
@@ -110,7 +128,7 @@ class RemoteConfig(UntrainedConfig):
     port: int | None = None
     servers: str | None = None
     dialect: str = "openpi"
-    n_action_steps: int = 5
+    n_action_steps: int = BY_DIALECT
     keys: str | None = None
     image_size: int | None = None
     mirror: bool = False
@@ -129,6 +147,8 @@ class RemoteConfig(UntrainedConfig):
             raise MemobenchError(f"policy.dialect is {self.dialect!r}, {nearest(self.dialect, DIALECTS)}")
         if self.gripper is not None and self.gripper not in GRIPPERS:
             raise MemobenchError(f"policy.gripper is {self.gripper!r}, {nearest(self.gripper, GRIPPERS)}")
+        if self.n_action_steps is BY_DIALECT:
+            self.n_action_steps = self.spoken.n_action_steps
         for name in ("n_action_steps", "history_every"):
             number = getattr(self, name)
             if number is not None and number < 1:
@@ -165,6 +185,11 @@ class RemoteConfig(UntrainedConfig):
         return self.spoken.buffers
 
     @property
+    def prompt_stride(self) -> int:
+        """Steps between the frames of the prompt that the server sees."""
+        return 1 if self.spoken.buffers else self.history_every or (1 if self.spoken.history else self.n_action_steps)
+
+    @property
     def max_environments(self) -> int | None:
         """How many environments can be stepped at once; None for any number."""
         return len(self.addresses()) if self.spoken.shared else None
@@ -185,7 +210,7 @@ class RemoteConfig(UntrainedConfig):
 
     def _address(self, text: str) -> str:
         scheme, rest = text.split("://", 1) if "://" in text else ("", text)
-        known = ("ws", "wss") if self.spoken.transport == "websocket" else ("http", "https")
+        known = ("ws", "wss") if self.spoken.transport in WEBSOCKETS else ("http", "https")
         host, _, port = rest.rpartition(":")
         if not host or not port.isdigit() or not 0 < int(port) < 65536 or set(host) & set("/ @?#"):
             raise MemobenchError(

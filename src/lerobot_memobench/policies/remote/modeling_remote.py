@@ -48,7 +48,7 @@ class Actor:
         if self._rests:
             return np.zeros(ACTION_DIM, np.float32)  # the episode has ended, or was never run
         if last is None or self._clock < last:
-            self.session.begin()
+            self.session.begin(row)
             self._queue.clear()
             self._prompt = False
         if phase not in (None, EXECUTION):
@@ -57,7 +57,8 @@ class Actor:
             self.session.execution_starts()
             self._prompt = False
         if self._queue:
-            self.session.watch(row)
+            if self.config.spoken.buffers:
+                self.session.watch(row)
         else:
             self._queue.extend(self.session.ask(row)[: self.config.n_action_steps])
         return self._queue.popleft()
@@ -78,15 +79,14 @@ class Actor:
 
     def _shows_prompt(self, step: int) -> bool:
         """Whether the server sees the prompt's frame at a step."""
-        every = self.config.history_every or self.config.n_action_steps
-        return self.config.send_prompt and (self.config.spoken.buffers or step % every == 0)
+        return self.config.send_prompt and step % self.config.prompt_stride == 0
 
     def _see_prompt(self, row: Row, step: int) -> Action:
         """Show the server the prompt, in which actions have no effect."""
         self._prompt = True
         if self._shows_prompt(step):
-            show = self.session.watch if self.config.spoken.buffers else self.session.ask
-            show(row)
+            waits = self.config.spoken.buffers or self.config.spoken.history
+            (self.session.watch if waits else self.session.ask)(row)
         return np.zeros(ACTION_DIM, np.float32)
 
 

@@ -17,16 +17,34 @@ from torch import Tensor
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.compatibility import PICTURE_STEP, require_fresh
-from lerobot_memobench.policies.remote.configuration_remote import IMAGE, RLDS, STATE, TASK, RemoteConfig
-from lerobot_memobench.policies.remote.transports import TRANSPORTS, ServerAway, Transport
+from lerobot_memobench.policies.remote.configuration_remote import (
+    IMAGE,
+    RLDS,
+    STATE,
+    TASK,
+    WRIST_IMAGE,
+    RemoteConfig,
+)
+from lerobot_memobench.policies.remote.transports import Act, ProcessFrame, Rest, ServerAway, Websocket
+from lerobot_memobench.policies.remote.vla_eval import VlaEval, episode_start, observation, png_map
 from lerobot_memobench.protocol import ACTION_DIM
 
 logger = logging.getLogger(__name__)
+
+Transport = Websocket | Rest
+TRANSPORTS: dict[str, type[Transport]] = {
+    "websocket": Websocket,
+    "vla_eval": VlaEval,
+    "act": Act,
+    "process_frame": ProcessFrame,
+}
 
 PAUSE = 0.5
 """Between two attempts to reach a server, s."""
 FIRST_FRAME = "episode_first_frame"
 RESET = {"reset": True}
+HISTORY = {IMAGE: "video_history", WRIST_IMAGE: "wrist_video_history", STATE: "state_history"}
+"""Our name of what is observed -> that of the demonstration prompt's part of it, with vla-evaluation-harness."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +73,8 @@ class Session:
 
     def _begin_memory(self) -> None:
         self._told: list[Question] = []  # what a restarted server has to hear again
-        self._frames: list[tuple[NDArray[np.uint8], NDArray[np.float32]]] = []  # for the next message to a buffer
+        self._frames: list[dict[str, Any]] = []  # by our names, not sent yet
+        self._opening: dict[str, Any] | None = None  # what tells the server that the episode begins
         self._seen, self._execution_starts = 0, 0
         self._first = True
 
@@ -81,20 +100,25 @@ class Session:
         self._connected = self._fresh = True
         logger.info("connected with the policy server at %s, which says: %s", self.address, metadata or "nothing")
 
-    def begin(self) -> None:
+    def begin(self, row: Row) -> None:
         """Start an episode: a memory in the server, of the connection or of its own, forgets the last one."""
         self.connect()
         self._begin_memory()
+        if self._dialect.buffers:
+            self._opening = dict(RESET)
+        elif self._dialect.transport == "vla_eval":
+            self._opening = episode_start(row.get(TASK))
         if not self._fresh:
             self._again(time.monotonic() + self.config.retry)
-        elif self._dialect.buffers:
-            self._deliver(Question(dict(RESET), remembered=False))
+        elif self._opening is not None:
+            self._deliver(Question(self._opening, remembered=False))
 
     def watch(self, row: Row) -> None:
-        """Note a frame that is not asked about; a server that buffers frames gets it with the next question."""
-        if self._dialect.buffers:
-            require_fresh(row.scalar("step"), row.scalar(PICTURE_STEP))
-            self._frames.append((self._image(row, IMAGE), np.asarray(row.get(STATE), np.float32)))
+        """Note a frame that is not asked about; the server gets it with the next question."""
+        require_fresh(row.scalar("step"), row.scalar(PICTURE_STEP))
+        sent = self._keys.values()
+        names = (IMAGE, STATE) if self._dialect.buffers else [name for name in HISTORY if name in sent]
+        self._frames.append({name: self._value(row, name) for name in names})
 
     def execution_starts(self) -> None:
         """Note that the frames so far showed the prompt."""
@@ -120,25 +144,32 @@ class Session:
     # --- questions ---
 
     def _observation(self, row: Row) -> dict[str, Any]:
-        found = {theirs: self._image(row, ours) for theirs, ours in self._keys.items()}
+        found = {theirs: self._value(row, ours) for theirs, ours in self._keys.items()}
         if self._dialect.transport == "process_frame":
             found[FIRST_FRAME] = str(self._first)  # 'True' and 'False', as MemoryVLA reads them
             self._first = False
+        if self._dialect.transport == "vla_eval":
+            return observation(found, self._history())
         return found
 
-    def _image(self, row: Row, name: str) -> Any:
+    def _history(self) -> dict[str, list[Any]]:
+        """Return the demonstration prompt as it is sent, once per episode."""
+        frames, self._frames = self._frames, []
+        return {HISTORY[name]: [frame[name] for frame in frames] for name in (frames[0] if frames else ())}
+
+    def _value(self, row: Row, name: str) -> Any:
         value = row.get(name)
         if isinstance(value, np.ndarray) and value.ndim == 3:
-            return fit(value, self.config.side, self.config.mirror)
+            image = fit(value, self.config.side, self.config.mirror)
+            return png_map(image) if self._dialect.transport == "vla_eval" else image
         return value
 
     def _buffer(self) -> Question:
-        images, states = zip(*self._frames, strict=True)
-        self._frames = []
-        self._seen += len(images)
+        frames, self._frames = self._frames, []
+        self._seen += len(frames)
         content = {
-            "images": np.stack(images)[:, None],
-            "state": np.stack(states),
+            "images": np.stack([frame[IMAGE] for frame in frames])[:, None],
+            "state": np.stack([frame[STATE] for frame in frames]),
             "add_buffer": True,
             "exec_start_idx": self._execution_starts,
         }
@@ -183,8 +214,8 @@ class Session:
 
     def _tell_again(self, patience: float) -> None:
         self._transport.open(patience)
-        if self._dialect.buffers:
-            self._transport.ask(dict(RESET))
+        if self._opening is not None:
+            self._transport.ask(self._opening)
         for question in self._told:
             self._transport.ask(question.content)
         self._fresh = not self._told

@@ -55,11 +55,13 @@ def reason(error: BaseException) -> str:
 
 
 class Websocket:
-    """openpi's protocol.
+    """openpi's protocol; a subclass greets and asks in another.
 
     Args:
         address: ``ws://host:port``. timeout: how long an answer may take, s.
     """
+
+    protocol = "openpi's websocket protocol"
 
     def __init__(self, address: str, timeout: float) -> None:
         self.address, self.timeout = address, timeout
@@ -80,11 +82,11 @@ class Websocket:
             code = error.response.status_code
             if code >= 500:
                 raise ServerAway(f"HTTP state {code}") from error
-            raise self._foreign(f"it answered with HTTP state {code}") from error
+            raise self.foreign(f"it answered with HTTP state {code}") from error
         except InvalidMessage as error:
             raise ServerAway(str(error)) from error
         except InvalidHandshake as error:
-            raise self._foreign(str(error)) from error
+            raise self.foreign(str(error)) from error
         except (OSError, TimeoutError, WebSocketException) as error:
             raise ServerAway(reason(error)) from error
 
@@ -100,16 +102,28 @@ class Websocket:
             proxy=None,
         )
         self._connection = self._stack.enter_context(connection)
-        metadata = self._receive(patience)
+        return self.greet(patience)
+
+    def greet(self, patience: float) -> dict[str, Any]:
+        """Return what the server says of itself, within ``patience`` seconds."""
+        metadata = self.receive(patience)
         return metadata if isinstance(metadata, dict) else {}
 
-    def _foreign(self, what: str) -> MemobenchError:
+    def foreign(self, what: str) -> MemobenchError:
+        """Return the error of what does not speak this protocol."""
         return MemobenchError(
-            f"what listens at {self.address} is no policy server with openpi's websocket protocol ({what}); check "
+            f"what listens at {self.address} is no policy server with {self.protocol} ({what}); check "
             "host= and port=, or choose another dialect="
         )
 
-    def _receive(self, patience: float) -> Any:
+    def send(self, frame: bytes) -> None:
+        """Send a frame."""
+        if self._connection is None:
+            raise ServerAway("not connected")
+        self._connection.send(frame)
+
+    def receive(self, patience: float) -> Any:
+        """Return the next frame's message, within ``patience`` seconds."""
         assert self._connection is not None
         frame = self._connection.recv(timeout=patience)
         if isinstance(frame, str):
@@ -117,7 +131,7 @@ class Websocket:
         try:
             return unpack(frame)
         except ValueError as error:
-            raise self._foreign(str(error)) from error
+            raise self.foreign(str(error)) from error
 
     def ask(self, question: dict[str, Any]) -> dict[str, Any]:
         """Send a frame and return the one that comes back.
@@ -126,18 +140,20 @@ class Websocket:
             ServerAway: the connection broke.
             MemobenchError: the server failed, took too long, or is none of this kind.
         """
-        if self._connection is None:
-            raise ServerAway("not connected")
         try:
-            self._connection.send(pack(question))
-            answer = self._receive(self.timeout)
+            answer = self.exchange(question)
         except TimeoutError as error:
             raise too_slow(self.address, self.timeout) from error
         except (ConnectionClosed, OSError) as error:
             raise ServerAway(reason(error)) from error
         if not isinstance(answer, dict):
-            raise self._foreign(f"it answered a {type(answer).__name__}, no map")
+            raise self.foreign(f"it answered a {type(answer).__name__}, no map")
         return answer
+
+    def exchange(self, question: dict[str, Any]) -> Any:
+        """Send a question and return the answer."""
+        self.send(pack(question))
+        return self.receive(self.timeout)
 
     def close(self) -> None:
         """Hang up."""
@@ -251,14 +267,6 @@ class ProcessFrame(Rest):
         return numbers(actions)
 
 
-Transport = Websocket | Rest
-TRANSPORTS: dict[str, type[Transport]] = {
-    "websocket": Websocket,
-    "act": Act,
-    "process_frame": ProcessFrame,
-}
-
-
 def jpeg(image: NDArray[np.uint8]) -> bytes:
     """Return an RGB image as JPEG, by the encoder and at the quality that MemoryVLA's clients use."""
     import cv2
@@ -290,6 +298,8 @@ def _pack(value: Any) -> Any:
 
 
 def _unpack(found: dict[Any, Any]) -> Any:
+    if "__ndarray__" in found:
+        return _array(found["data"], found["dtype"], found["shape"])
     if b"__ndarray__" in found:
         return _array(found[b"data"], found[b"dtype"], found[b"shape"])
     if b"__npgeneric__" in found:

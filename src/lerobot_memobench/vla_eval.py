@@ -1,0 +1,290 @@
+"""The benchmark for vla-evaluation-harness (vla-eval): ``lerobot_memobench.vla_eval:MEMOBench`` in its YAML.
+
+Its model servers are evaluated on our tasks, seeds and protocol. Only vla-eval imports this module.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.envs.acting import Acting
+from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.envs.episode_log import check_protocol
+from lerobot_memobench.envs.memobench_env import MemobenchEnv
+from lerobot_memobench.envs.observations import PIXEL_INPUT, RESET, STEPS
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.metrics import PROCESS_METRICS, value_of
+from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EVALUATION_SEED, HORIZON, PROMPT
+from lerobot_memobench.tasks.task import PUBLISHED
+
+try:
+    from vla_eval.benchmarks.base import StepBenchmark, StepResult
+    from vla_eval.render import configure_mujoco_render
+    from vla_eval.specs import (
+        GRIPPER_CLOSE_POS,
+        IMAGE_RGB,
+        LANGUAGE,
+        POSITION_DELTA,
+        ROTATION_AA,
+        STATE_EEF_POS_AA_GRIP,
+        DimSpec,
+    )
+except ImportError as error:
+    raise MemobenchError(
+        f"vla-evaluation-harness is not installed here ({error}): pip install 'vla-eval>=0.8,<0.9'"
+    ) from error
+
+logger = logging.getLogger(__name__)
+
+NAMES = {"image": ("agentview", "video_history"), "wrist_image": ("wrist", "wrist_video_history")}
+"""Our name of a camera -> the harness's names of its picture and of its part of the demonstration prompt."""
+STATES, STATE_HISTORY = "states", "state_history"
+SUCCESS = "success"
+
+
+class MEMOBench(StepBenchmark):
+    """The tasks of one suite: episode i of each has the scene of seed ``seed`` + i, as everywhere in the benchmark.
+
+    Observation: ``images`` with ``agentview`` and ``wrist`` uint8 (256, 256, 3) upright; ``states`` float32 (8,):
+    end-effector position (3, m), axis-angle (3, rad), fingers (2, m); ``task_description``. The first one of an episode
+    with a demonstration prompt holds it too: ``video_history`` and ``wrist_video_history``, lists of pictures,
+    ``state_history``, a list of states, and ``episode_restart``.
+
+    Action: ``actions`` float (7,) or (steps, 7) in [−1, 1], as of `MemobenchEnv`; a chunk is executed open-loop.
+
+    Result: ``success``, and ``MSR``, ``MUR``, ``MCR``, each the share of the operation's memory checkpoints that the
+    episode satisfied; a task without checkpoints of the operation has no such metric, and the harness averages over
+    those that do.
+
+    Args:
+        tasks: `all`, memory types or task names, separated by commas or as a list.
+        suite: `published` or `strict`.
+        referent: `fixed` or `random`.
+        seed: of episode 0.
+        horizon: control steps of an execution. A ``max_steps`` of the harness that is lower ends episodes unlogged.
+        demonstration_prompt: whether object and procedural tasks begin with their demonstration prompt.
+        history_every: steps between the frames of the prompt that are sent.
+        n_action_steps: actions executed of a chunk; all when None.
+        send_wrist_image, send_state, send_video_history: what is sent; the harness takes a model server's wish for
+            what is not set.
+        mirror: send pictures mirrored left to right, as the harness's LIBERO does.
+        quality: of the pictures: `fast`, `default` or `high`.
+        log_dir: folder of the episode log, which ``memobench report`` reads; none is written when None.
+        label: what the model server serves, in your words, for the log.
+    """
+
+    _ALL_RECORD_FIELDS = frozenset({"reward", SUCCESS, "checkpoints_completed", "action", "state"})
+    render_backends = frozenset({"gpu", "cpu"})
+
+    @classmethod
+    def configure_render(cls, mode: str) -> dict[str, str]:
+        """Draw with EGL on a GPU or whatever device there is; with OSMesa where the CPU is asked for."""
+        applied: dict[str, str] = configure_mujoco_render(mode)
+        return applied
+
+    def __init__(
+        self,
+        tasks: str | Sequence[str] = "all",
+        suite: str = PUBLISHED,
+        referent: str = "fixed",
+        seed: int = EVALUATION_SEED,
+        horizon: int = HORIZON,
+        demonstration_prompt: bool = True,
+        history_every: int = 1,
+        n_action_steps: int | None = None,
+        send_wrist_image: bool = True,
+        send_state: bool = True,
+        send_video_history: bool = True,
+        mirror: bool = False,
+        quality: str = "default",
+        log_dir: str | None = None,
+        label: str | None = None,
+    ) -> None:
+        super().__init__()
+        for name, number in (("history_every", history_every), ("n_action_steps", n_action_steps)):
+            if number is not None and number < 1:
+                raise MemobenchError(f"{name} is {number}; expected a whole number from 1 on")
+        self._config = MemobenchEnvConfig(
+            tasks=tasks if isinstance(tasks, str) else ",".join(tasks),
+            suite=suite,
+            referent=referent,
+            seed_base=seed,
+            horizon=horizon,
+            demonstration_prompt=demonstration_prompt,
+            render=quality,
+            replan_steps=n_action_steps,
+        )
+        self._tasks = {folder.name: (memory_type, folder) for memory_type, _, folder in self._config.selected()}
+        self._cameras = [name for name in CAMERAS if send_wrist_image or name != "wrist_image"]
+        self._send_state, self._mirror = send_state, mirror
+        self._history_every, self._n_action_steps = history_every, n_action_steps
+        self._log_dir = log_dir
+        policy = {} if label is None else {"type": "vla_eval", "identity": f"vla_eval {label}"}
+        self._acting = Acting(policy, PIXEL_INPUT)
+        self._prompt_in = STEPS if send_video_history else RESET
+        if log_dir is not None:  # now, not when the first episode has been simulated
+            check_protocol(
+                Path(log_dir), {**self._config.protocol, "prompt_in": self._prompt_in, **self._acting.protocol}
+            )
+        self._env: MemobenchEnv | None = None
+        self._history: dict[str, list[NDArray[Any]]] = {}
+
+    def get_tasks(self) -> list[dict[str, Any]]:
+        """Return the chosen tasks; their suites are the memory types, as in LeRobot."""
+        return [{"name": name, "suite": memory_type} for name, (memory_type, _) in self._tasks.items()]
+
+    def reset(self, task: dict[str, Any]) -> dict[str, Any]:
+        """Start the episode ``task["episode_idx"]`` and play its prompt; return the first frame of the execution.
+
+        Raises:
+            MemobenchError: the episode cannot be run.
+        """
+        if self._env is None or self._env.task != task["name"]:
+            self.cleanup()
+            self._env = self._make(self._tasks[task["name"]][1])
+        observation, info = self._env.reset(seed=self._config.seed_base + int(task.get("episode_idx", 0)))
+        self._history = {}
+        while "fault" not in info and observation["phase"][0] == PROMPT:
+            step = int(observation["step"][0])
+            if step % self._history_every == 0:
+                self._remember(observation)
+            self._env.need_observation((step + 1) % self._history_every == 0)
+            observation, *_, info = self._env.step(np.zeros(ACTION_DIM, np.float32))
+        if "fault" in info:
+            self._env.step(np.zeros(ACTION_DIM, np.float32))  # the step that writes it into the log
+            raise MemobenchError(info["fault"])
+        self._env.need_observation(True)
+        self._recorder.record_video(_video_frame(observation))
+        return observation
+
+    def _remember(self, observation: dict[str, Any]) -> None:
+        """Keep a frame of the prompt for the first observation."""
+        for name in self._cameras:
+            self._history.setdefault(NAMES[name][1], []).append(self._picture(observation, name))
+        if self._send_state:
+            self._history.setdefault(STATE_HISTORY, []).append(observation["agent_pos"])
+
+    def _make(self, folder: Path) -> MemobenchEnv:
+        return MemobenchEnv(
+            str(folder),
+            log_dir=self._log_dir,
+            prompt_in=self._prompt_in,
+            acting=self._acting,
+            **self._config.gym_kwargs,
+        )
+
+    def step(self, action: dict[str, Any]) -> StepResult:
+        """Execute an answer: one action, or as much of a chunk as is executed, up to the episode's end.
+
+        Raises:
+            MemobenchError: the model server answered something else.
+        """
+        env = self._running()
+        for one in _actions(action)[: self._n_action_steps]:
+            observation, reward, terminated, truncated, info = env.step(one)
+            done = terminated or truncated
+            self._recorder.record_video(_video_frame(observation))
+            self._recorder.record_step(
+                reward=reward,
+                success=info["is_success"],
+                checkpoints_completed=info["checkpoints_completed"],
+                action=one,
+                state=observation["agent_pos"],
+            )
+            if done:
+                break
+        return StepResult(obs=observation, reward=reward, done=done, info=info)
+
+    def make_obs(self, raw_obs: dict[str, Any], task: dict[str, Any]) -> dict[str, Any]:
+        """Return the observation as it is sent; the prompt goes with the first one only."""
+        found: dict[str, Any] = {
+            "images": {NAMES[name][0]: self._picture(raw_obs, name) for name in self._cameras},
+            "task_description": self._running().task_description,
+        }
+        if self._send_state:
+            found[STATES] = raw_obs["agent_pos"]
+        if self._history:
+            found |= {**self._history, "episode_restart": True}
+            self._history = {}
+        return found
+
+    def _picture(self, observation: dict[str, Any], name: str) -> NDArray[np.uint8]:
+        picture: NDArray[np.uint8] = observation["pixels"][name]
+        return np.ascontiguousarray(picture[:, ::-1]) if self._mirror else picture
+
+    def get_step_result(self, step_result: StepResult) -> dict[str, Any]:
+        """Return success and what the episode gives to MSR, MUR and MCR; see the class."""
+        env = self._running()
+        if not step_result.done:
+            logger.warning("%s: the harness's max_steps ended an episode, which is not logged; set horizon", env.task)
+        record = env.record()
+        values = {metric: value_of(record, metric) for metric in PROCESS_METRICS}
+        return {
+            SUCCESS: record[SUCCESS],
+            **{metric: value for metric, value in values.items() if value is not None},
+            "failure": record["failure"],
+        }
+
+    def get_metric_keys(self) -> dict[str, str]:
+        """Return what the harness averages over episodes."""
+        return dict.fromkeys((SUCCESS, *PROCESS_METRICS), "mean")
+
+    def get_metadata(self) -> dict[str, Any]:
+        """Return the harness's bound of steps, the horizon, and the suite."""
+        return {"max_steps": self._config.horizon, "suite": self._config.suite}
+
+    def get_action_spec(self) -> dict[str, DimSpec]:
+        """Return the conventions of an action."""
+        return {"position": POSITION_DELTA, "rotation": ROTATION_AA, "gripper": GRIPPER_CLOSE_POS}
+
+    def get_observation_spec(self) -> dict[str, DimSpec]:
+        """Return the conventions of what is sent."""
+        pictures = {NAMES[name][0]: IMAGE_RGB for name in self._cameras}
+        return {**pictures, "language": LANGUAGE, **({"state": STATE_EEF_POS_AA_GRIP} if self._send_state else {})}
+
+    def get_hold_action(self, last_action: dict[str, Any] | None) -> dict[str, Any]:
+        """Return the action of a real-time tick without an answer: stay, with the gripper as it was."""
+        hold = np.zeros(ACTION_DIM, np.float32)
+        hold[-1] = -1.0 if last_action is None else _actions(last_action)[-1, -1]
+        return {"actions": hold}
+
+    def render(self) -> NDArray[np.uint8]:
+        """Return both cameras under what is being remembered and done."""
+        return self._running().render()
+
+    def _running(self) -> MemobenchEnv:
+        if self._env is None:
+            raise MemobenchError("no episode has begun; call start_episode with one of get_tasks()")
+        return self._env
+
+    def cleanup(self) -> None:
+        """Let the scene go."""
+        if self._env is not None:
+            self._env.close()
+            self._env = None
+
+
+def _actions(answer: dict[str, Any]) -> NDArray[np.float32]:
+    """Return the actions of a model server's answer, (steps, 7)."""
+    found: Any = answer.get("actions", answer.get("action"))
+    try:
+        actions = np.array(found, dtype=np.float32, ndmin=2)
+    except (TypeError, ValueError):
+        actions = np.empty((0, 0), np.float32)
+    if actions.ndim != 2 or actions.shape[1] != ACTION_DIM or not len(actions):
+        raise MemobenchError(
+            f"the model server answered actions of shape {np.shape(found)}; expected numbers of shape ({ACTION_DIM},) "
+            f"or (steps, {ACTION_DIM}): six of the end effector's displacement and one of the gripper"
+        )
+    return actions
+
+
+def _video_frame(observation: dict[str, Any]) -> NDArray[np.uint8]:
+    """Return both cameras beside each other."""
+    return np.concatenate([observation["pixels"][name] for name in CAMERAS], axis=1)

@@ -1,0 +1,290 @@
+"""The benchmark in vla-evaluation-harness: by its runner and its servers what lerobot-eval does, bit for bit."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import logging
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import vla_eval
+import yaml
+from vla_eval.config import EvalConfig
+from vla_eval.registry import resolve_import_string
+from vla_eval.specs import check_specs
+
+from lerobot_memobench.cli.lerobot import main
+from lerobot_memobench.envs import episode as episodes
+from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.envs.memobench_env import MemobenchEnv
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.metrics import report_values, summarise
+from lerobot_memobench.protocol import EXECUTION
+from lerobot_memobench.vla_eval import MEMOBench
+from tests.support.remote_case import free_port
+from tests.support.vla_eval_server import DigestServer
+
+ROOT = Path(__file__).parents[2]
+PROMPTED = "put_the_butter_into_the_bowl_from_the_prompt_video"
+UNPROMPTED = "turn_on_the_stove_and_turn_it_off"
+Steps = dict[tuple[str, int], list[tuple[list[float], str, bool]]]
+"""Task and seed -> per execution step the action, a hash of the scene after it, and success."""
+
+
+@contextmanager
+def recorded(monkeypatch: pytest.MonkeyPatch) -> Iterator[Steps]:
+    """Write down what environments in this process do."""
+    found: Steps = {}
+    step = MemobenchEnv.step
+
+    def noted(env: MemobenchEnv, action: Any) -> Any:
+        acting = env.episode.phase == EXECUTION
+        result = step(env, action)
+        if acting:
+            row = ([float(each) for each in action], env.scene_hash(), result[4]["is_success"])
+            found.setdefault((env.task, env.episode.seed), []).append(row)
+        return result
+
+    with monkeypatch.context() as patched:
+        patched.setattr(MemobenchEnv, "step", noted)
+        yield found
+
+
+def by_harness(url: str, episodes: int = 1, **params: Any) -> dict[str, Any]:
+    """Run the benchmark by vla-evaluation-harness's own runner; return its result."""
+    benchmark = {
+        "benchmark": "lerobot_memobench.vla_eval:MEMOBench",
+        "episodes_per_task": episodes,
+        "params": {"seed": 7, **params},
+    }
+    (result,) = vla_eval.run(
+        {"server": {"url": url, "timeout": 120}, "benchmarks": [benchmark]}, docker=False, no_save=True
+    )
+    return result
+
+
+def by_lerobot(out: Path, *words: str, episodes: int = 1) -> None:
+    settings = (f"episodes={episodes}", "eval.use_async_envs=false", f"output_dir={out}")
+    assert main(["eval", "env=memobench", *settings, *words]) == 0
+
+
+def log_of(folder: Path) -> list[dict[str, Any]]:
+    """The log without what differs from run to run."""
+    own = {"wall_s", "policy", "run", "replan_steps"}
+    return [{key: value for key, value in record.items() if key not in own} for record in read_episodes(folder)]
+
+
+def test_both_sides_act_alike(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The actions follow from every bit that the server is sent, prompt included."""
+    monkeypatch.setattr(episodes, "PROMPT_HORIZON", 7)
+    server = DigestServer(steps=3)
+    with vla_eval.serve_background(server) as handle:
+        with recorded(monkeypatch) as theirs:
+            params = {"tasks": [PROMPTED, UNPROMPTED], "horizon": 5, "quality": "fast", "history_every": 3}
+            result = by_harness(handle.url, episodes=2, **params, log_dir=str(tmp_path / "log"), label="digest")
+        heard, server.heard = server.heard, []
+        with recorded(monkeypatch) as ours:
+            words = ("policy=memobench_remote", "dialect=vla_eval", f"port={handle.port}", "batch_size=2")
+            tasks = (f"tasks={PROMPTED},{UNPROMPTED}", "horizon=5", "env.render=fast", "policy.history_every=3")
+            by_lerobot(tmp_path / "run", *words, *tasks, episodes=2)
+    assert set(theirs) == {(task, seed) for task in (PROMPTED, UNPROMPTED) for seed in (7, 8)}
+    assert [len(steps) for steps in theirs.values()] == [5] * 4
+    assert len({str(steps) for steps in theirs.values()}) == 4
+    assert ours == theirs
+    assert sorted(len(obs.get("video_history", ())) for _, _, obs in heard) == [0] * 6 + [3, 3]
+    assert len(server.heard) == len(heard) == 8
+    assert log_of(tmp_path / "log") == log_of(tmp_path / "run")
+    values = report_values(summarise(read_episodes(tmp_path / "log")))
+    for task in result["tasks"]:
+        row = values["tasks"][task["task"]]
+        told = {name: task.get(f"mean_{name}") for name in ("success", "MSR", "MUR", "MCR")}
+        assert [row["n"], row["SR"], row["MSR"], row["MUR"], row["MCR"]] == [
+            task["num_episodes"],
+            *(None if value is None else 100 * value for value in told.values()),
+        ]
+
+
+def played(benchmark: MEMOBench, task: dict[str, Any], expert: bool = True) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Play an episode as the harness does, by the expert's actions; return the first observation and the result."""
+    benchmark._recorder = vla_eval.recording.NullEpisodeRecorder()
+    first = benchmark.make_obs(benchmark.reset(task), task)
+    running = benchmark._running()
+    running.need_observation(False)
+    while True:
+        last = benchmark.step({"actions": running.episode.expert_action() if expert else np.zeros(7)})
+        if benchmark.check_done(last):
+            return first, benchmark.get_step_result(last)
+
+
+def test_the_means_of_the_metrics_are_the_reports(tmp_path: Path) -> None:
+    """A success and a failure of one task; it has no checkpoints of one operation, and so no such metric."""
+    benchmark = MEMOBench(UNPROMPTED, quality="fast", log_dir=str(tmp_path))
+    (task,) = benchmark.get_tasks()
+    _, good = played(benchmark, task | {"episode_idx": 0})
+    short = MEMOBench(UNPROMPTED, quality="fast", horizon=40)
+    _, poor = played(short, task | {"episode_idx": 1})
+    records = [*read_episodes(tmp_path), short._running().record()]
+    row = report_values(summarise(records))["tasks"][UNPROMPTED]
+    assert good["success"]
+    assert not poor["success"]
+    assert 0 < row["SR"] < 100
+    keys = benchmark.get_metric_keys()
+    assert set(keys) == {"success", "MSR", "MUR", "MCR"}
+    for name, metric in (("success", "SR"), ("MSR", "MSR"), ("MUR", "MUR"), ("MCR", "MCR")):
+        found = [result[name] for result in (good, poor) if name in result]
+        assert (round(100 * sum(found) / len(found), 1) if found else None) == row[metric]
+    assert None in row.values()
+    assert poor["failure"]
+    benchmark.cleanup()
+    short.cleanup()
+
+
+def test_what_is_sent() -> None:
+    benchmark = MEMOBench(UNPROMPTED, quality="fast", horizon=2, send_state=False, send_wrist_image=False, mirror=True)
+    plain = MEMOBench(UNPROMPTED, quality="fast", horizon=2)
+    (task,) = benchmark.get_tasks()
+    assert task == {"name": UNPROMPTED, "suite": "temporal"}
+    first, _ = played(benchmark, task, expert=False)
+    whole, _ = played(plain, task, expert=False)
+    assert set(first) == {"images", "task_description"}
+    assert set(whole) == {"images", "task_description", "states"}
+    assert list(whole["images"]) == ["agentview", "wrist"]
+    assert np.array_equal(first["images"]["agentview"], whole["images"]["agentview"][:, ::-1])
+    declared = plain.get_observation_spec()
+    assert check_specs(plain.get_action_spec(), plain.get_action_spec(), declared, declared) == []
+    assert set(declared) == {"agentview", "wrist", "language", "state"}
+    assert set(benchmark.get_observation_spec()) == {"agentview", "language"}
+    held = plain.get_hold_action({"actions": np.full((2, 7), 0.5)})["actions"]
+    assert held.tolist() == [0] * 6 + [0.5]
+    for one in (benchmark, plain):
+        one.cleanup()
+
+
+def test_chunks_are_executed_to_the_end_of_the_episode(caplog: pytest.LogCaptureFixture) -> None:
+    benchmark = MEMOBench(UNPROMPTED, quality="fast", horizon=5, n_action_steps=3)
+    (task,) = benchmark.get_tasks()
+    benchmark._recorder = vla_eval.recording.NullEpisodeRecorder()
+    benchmark.reset(task)
+    last = benchmark.step({"actions": np.zeros((10, 7))})
+    assert (benchmark._running().episode.exec_steps, last.done) == (3, False)
+    with caplog.at_level(logging.WARNING):
+        benchmark.get_step_result(last)
+    assert "max_steps ended an episode" in caplog.text
+    assert benchmark.step({"actions": np.zeros((10, 7))}).done
+    assert benchmark._running().episode.exec_steps == 5
+    for wrong in (np.zeros(8), np.zeros((2, 3, 7)), ["a"], np.zeros((0, 7)), None):
+        with pytest.raises(MemobenchError, match=r"answered actions of shape .*expected numbers of shape \(7,\) or"):
+            benchmark.step({"actions": wrong})
+    benchmark.cleanup()
+
+
+@pytest.mark.parametrize(
+    ("params", "told"),
+    [
+        ({"tasks": "temporaly"}, "temporal"),
+        ({"suite": "strikt"}, "did you mean 'strict'"),
+        ({"history_every": 0}, "history_every is 0"),
+        ({"quality": "best"}, "'best'"),
+    ],
+)
+def test_wrong_settings_are_named(params: dict[str, Any], told: str) -> None:
+    with pytest.raises(MemobenchError, match=told):
+        MEMOBench(**params)
+
+
+def test_a_folder_of_another_policy_is_refused_before_anything_runs(tmp_path: Path) -> None:
+    benchmark = MEMOBench(UNPROMPTED, quality="fast", horizon=1, log_dir=str(tmp_path), label="one")
+    played(benchmark, benchmark.get_tasks()[0], expert=False)
+    benchmark.cleanup()
+    with pytest.raises(MemobenchError, match="holds episodes of another policy"):
+        MEMOBench(UNPROMPTED, quality="fast", horizon=1, log_dir=str(tmp_path), label="another")
+
+
+def test_an_episode_that_cannot_be_run_is_an_error_and_is_logged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: Any) -> None:
+        raise MemobenchError("no such scene")
+
+    benchmark = MEMOBench(UNPROMPTED, log_dir=str(tmp_path))
+    monkeypatch.setattr(episodes.Episode, "reset", broken)
+    with pytest.raises(MemobenchError, match="no such scene"):
+        benchmark.reset(benchmark.get_tasks()[0])
+    problems: list[str] = []
+    assert read_episodes(tmp_path, problems) == []
+    assert "no such scene" in problems[0]
+
+
+def test_tasks_by_suite() -> None:
+    assert len(MEMOBench().get_tasks()) == 30
+    strict = MEMOBench("object", suite="strict", referent="random").get_tasks()
+    assert {task["suite"] for task in strict} == {"object"}
+    assert MEMOBench(horizon=9).get_metadata()["max_steps"] == 9
+
+
+def test_without_vla_eval_one_sentence_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    module = sys.modules.pop("lerobot_memobench.vla_eval")
+    monkeypatch.setitem(sys.modules, "vla_eval.benchmarks.base", None)
+    with pytest.raises(MemobenchError, match=r"not installed here \(.*\): pip install 'vla-eval>=0\.8,<0\.9'"):
+        importlib.import_module("lerobot_memobench.vla_eval")
+    sys.modules["lerobot_memobench.vla_eval"] = module
+
+
+def configuration() -> dict[str, Any]:
+    """The configuration that the guide shows."""
+    text = (ROOT / "docs" / "guides" / "vla_eval.md").read_text()
+    found = yaml.safe_load(text.split("```yaml\n")[1].split("```")[0])
+    assert isinstance(found, dict)
+    return found
+
+
+def test_the_configuration_in_the_guide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    config = EvalConfig.from_dict(configuration()["benchmarks"][0])
+    assert len(resolve_import_string(config.benchmark)(**config.params).get_tasks()) == 30
+    assert (config.episodes_per_task, config.params["seed"]) == (50, 7)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_a_trained_memory_policy_by_three_ways(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From pictures, with and without a prompt: by ``vla-eval run``, by ``dialect=vla_eval``, and in this process."""
+    tasks, port = [PROMPTED, UNPROMPTED], free_port()
+    script = [sys.executable, str(ROOT / "examples" / "vla_eval_server.py"), "memobench_small", "--detector", "package"]
+    server = subprocess.Popen([*script, "--port", str(port), "--device", "cpu"])
+    try:
+        words = (f"tasks={','.join(tasks)}", "batch_size=1")
+        with recorded(monkeypatch) as asked:
+            remote = ("policy=memobench_remote", "dialect=vla_eval", f"port={port}", "policy.connect_timeout=300")
+            by_lerobot(tmp_path / "remote", *remote, *words)
+        config = configuration()
+        config["benchmarks"][0] |= {"episodes_per_task": 1}
+        config["benchmarks"][0]["params"] |= {"tasks": tasks, "log_dir": str(tmp_path / "log")}
+        config["output_dir"] = str(tmp_path / "results")
+        (tmp_path / "memobench.yaml").write_text(yaml.safe_dump(config))
+        command = [str(Path(sys.executable).with_name("vla-eval")), "run", "--no-docker", "-c", "memobench.yaml"]
+        subprocess.run([*command, "--server-url", f"ws://127.0.0.1:{port}"], cwd=tmp_path, check=True)
+    finally:
+        server.kill()
+        server.wait()
+    with recorded(monkeypatch) as direct:
+        by_lerobot(tmp_path / "direct", "policy=memobench_small", "detector=package", *words)
+    assert direct == asked
+    logs = [log_of(tmp_path / name) for name in ("direct", "remote", "log")]
+    for record in logs[0]:
+        assert record.pop("inputs") == "detections"
+    for record in (*logs[1], *logs[2]):
+        assert record.pop("inputs") == "pixels"
+    assert logs[0] == logs[1] == logs[2]
+    assert [record["success"] for record in logs[0]] == [True, True]
+    for number, task in enumerate(tasks):
+        file = tmp_path / "results" / "episodes" / "MEMOBench" / f"task{number:04d}_ep0000_success.jsonl"
+        rows = [json.loads(line) for line in file.read_text().splitlines()]
+        assert [row["action"] for row in rows] == [action for action, _, _ in direct[task, 7]]
