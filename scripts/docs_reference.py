@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import ast
 import html
+import inspect
 import io
 import re
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, get_args, get_origin, get_type_hints, is_typeddict
+from typing import Any, NotRequired, get_args, get_origin, get_type_hints, is_typeddict
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src" / "lerobot_memobench"
@@ -294,40 +295,31 @@ def schemas_page() -> str:
         "# Log and card schemas",
         "Files are checked against these types where they are read. Unknown fields pass. `null` is allowed where the "
         "type says `None`.",
-        table(["field", "meaning"], [[code(name), says] for name, says in LOG_FIELDS.items()]),
     ]
     for heading, kind in wanted:
-        parts += [f"## {heading}", plain(kind.__doc__), table(["field", "type", "required"], typed_rows(kind))]
+        summary = plain((kind.__doc__ or "").partition("\n\n")[0])
+        parts += [f"## {heading}", summary, table(["field", "type", "required", "meaning"], typed_rows(kind))]
     return "\n\n".join(parts) + "\n"
 
 
-LOG_FIELDS = {
-    "task, memory_type": "name in the catalogue; temporal, spatial, object or procedural",
-    "episode, seed": "number of the episode and seed of its scene: seed base + episode",
-    "referent, variant": "fixed, random or drawn; which admissible referent or order, 0 is the published one",
-    "replan_steps": "actions executed per prediction, where known",
-    "prompt_steps, prompt_shown": "control steps of the demonstration prompt; whether it showed what it had to",
-    "steps": "execution steps",
-    "success": "the goal held at the end",
-    "checkpoints": "per memory checkpoint its operation, `first_step` (first execution step at which it held) and "
-    "`ordered_step` (at which it held with all earlier ones complete)",
-    "failure": "class of the failure; null for a success",
-    "suite, lost": "of strict tasks: the suite; the goal could no longer be reached",
-    "fault": "why an episode was broken off: an invalid action, unstable physics",
-    "not_run": "why an episode could not be run: it is no rollout, and in no figure",
-    "scene_hash": "hash of the initial scene",
-    "policy, run, inputs": "type and hash of the policy; one start of an evaluation; what the policy was given",
-    "wall_s": "seconds that the episode took",
-}
-
-
 def typed_rows(kind: Any) -> list[list[str]]:
-    """Return name, type and whether it is required of each field of a `TypedDict`."""
-    hints = get_type_hints(kind, include_extras=False)
+    """Return name, type, whether it is required, and meaning of each field of a `TypedDict`."""
+    hints, says = get_type_hints(kind), meanings(kind)
+    marked = get_type_hints(kind, include_extras=True)  # `__required_keys__` does not see NotRequired in strings
+    optional = {name for name, hint in marked.items() if get_origin(hint) is NotRequired}
+    required = kind.__required_keys__ - optional
     return [
-        [code(name), code(type_name(hint)), "yes" if name in kind.__required_keys__ else ""]
+        [code(name), code(type_name(hint)), "yes" if name in required else "", says.get(name, "").rstrip(".")]
         for name, hint in hints.items()
     ]
+
+
+def meanings(kind: Any) -> dict[str, str]:
+    """Return field -> meaning from the docstrings of a `TypedDict` and of those that it extends."""
+    found: dict[str, str] = {}
+    for base in getattr(kind, "__orig_bases__", ()):
+        found |= meanings(base)
+    return found | arguments(inspect.getdoc(kind) or "")
 
 
 def type_name(hint: Any) -> str:

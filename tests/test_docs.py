@@ -15,10 +15,10 @@ import pytest
 import typer
 
 from lerobot_memobench.cli import memobench
-from lerobot_memobench.envs.episode_log import write_episodes
+from lerobot_memobench.envs import episode_log
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation import records
 from lerobot_memobench.evaluation.metrics import METRICS, Rate, percent
-from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.run.arguments import joined, read_arguments, resolve_recipe, split_arguments
 from lerobot_memobench.run.plan import take_run_options
 from lerobot_memobench.run.training import take_training_options
@@ -148,7 +148,7 @@ def published(document: Path) -> Iterator[tuple[str, dict[str, str]]]:
 
 def recomputed(folder: Path) -> dict[str, str]:
     """Return the same figures from a log, as they are written in a document."""
-    (run,) = read_runs([folder])
+    (run,) = records.read_runs([folder])
     cells = {metric: in_figures(run.summary.average[metric]) for metric in METRICS}
     return {**cells, "rollouts": f"{run.summary.rollouts:,}"}
 
@@ -181,8 +181,7 @@ def test_figures_of_a_row_are_found(tmp_path: Path) -> None:
     head = "| policy | SR | MSR | MUR | MCR | rollouts | |\n|---|---|---|---|---|---:|---|\n"
     document.write_text(f"{head}| a | 1 | 2 | 3 | – | 1,500 | [log](../research/logs/a) |\n| b | | | | | | |\n")
     assert list(published(document)) == [("a", {"SR": "1", "MSR": "2", "MUR": "3", "MCR": "–", "rollouts": "1,500"})]
-    records = [rollout("one", "temporal", "S", [k > 0], k > 0, k) for k in range(4)]
-    write_episodes(tmp_path, records)
+    episode_log.write_episodes(tmp_path, [rollout("one", "temporal", "S", [k > 0], k > 0, k) for k in range(4)])
     rate = "75 [30.1–95.4]"
     assert recomputed(tmp_path) == {"SR": rate, "MSR": rate, "MUR": "–", "MCR": "–", "rollouts": "4"}
 
@@ -232,7 +231,7 @@ def check(words: list[str]) -> None:
         case "make":
             assert re.search(rf"^{rest[0]}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
         case _:
-            assert program in ("source", "pip", "uv"), f"{program} is no command that the documents use"
+            assert program in ("source", "pip", "uv", "gzip"), f"{program} is no command that the documents use"
 
 
 def as_pair(flag: str) -> str:
@@ -343,6 +342,16 @@ def test_pages_that_are_made(page: str) -> None:
     for block in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
         widths = {len(re.findall(r"(?<!\\)\|", row)) for row in block.splitlines()}
         assert len(widths) == 1, block
+
+
+def test_every_field_of_the_log_is_explained() -> None:
+    for kind in (episode_log.EpisodeRecord, episode_log.CheckpointRecord, episode_log.WholeProtocol, records.WholeCard):
+        rows = {name.strip("`"): rest for name, *rest in reference.typed_rows(kind)}
+        assert all(says for *_, says in rows.values()), kind
+    rows = {name.strip("`"): required for name, _, required, _ in reference.typed_rows(episode_log.EpisodeRecord)}
+    assert [name for name, required in rows.items() if required] == [
+        *("task", "memory_type", "episode", "success", "checkpoints"),
+    ]
 
 
 def test_every_task_has_a_card() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import errno
+import io
 import json
 import os
 from pathlib import Path
@@ -45,6 +47,29 @@ def test_report_in_several_formats_to_a_folder(tmp_path: Path) -> None:
     assert set(beside) == {"tasks", "memory_types", "average", "failures", "prefix", "inputs"}
 
 
+def test_every_table_is_written_as_csv_with_the_figures_of_the_json(tmp_path: Path) -> None:
+    a, b = evaluation(tmp_path / "a"), evaluation(tmp_path / "b", successes=3)
+    out = tmp_path / "out"
+    assert main(["report", a, b, "--format", "csv", "--format", "json", "--out", str(out)]) == 0
+    tables = {path.stem: list(csv.DictReader(path.open())) for path in sorted((out / "tables").iterdir())}
+    assert list(tables) == ["failures", "memory-types", "overview", "prefix", "tasks"]
+    found = json.loads((out / "report.json").read_text())["evaluations"]
+    for row, (name, figures) in zip(tables["tasks"], found.items(), strict=True):
+        rates, intervals = figures["tasks"]["a_task"], figures["intervals"]["tasks"]["a_task"]
+        assert row["evaluation"] == name
+        assert row["task"] == "a_task"
+        assert int(row["n"]) == rates["n"]
+        for metric in ("SR", "MSR", "MUR"):
+            assert float(row[metric]) == rates[metric]
+            assert [float(row[f"{metric} {bound}"]) for bound in ("low", "high")] == intervals[metric]
+        assert row["MCR"] == row["MCR low"] == ""
+    prefix = tables["prefix"][0]
+    assert [float(prefix[f"c{k} any order"]) for k in (1, 2)] == found["a"]["prefix"]["a_task"]
+    assert [float(prefix[f"c{k} in order"]) for k in (1, 2)] == found["a"]["ordered_prefix"]["a_task"]
+    assert [row["object SR"] for row in tables["overview"]] == ["", ""]
+    assert [float(row["average SR"]) for row in tables["overview"]] == [50.0, 75.0]
+
+
 def test_report_prints_json_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["report", evaluation(tmp_path / "a"), "--format", "json"]) == 0
     assert json.loads(capsys.readouterr().out)["average"]["SR"] == 50.0
@@ -66,7 +91,9 @@ def test_compare(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "replan_steps: 5 and 20" in capsys.readouterr().err
     assert main(["compare", a, b, "--allow", "replan_steps", "--format", "json"]) == 0
     assert json.loads(capsys.readouterr().out)["differences"][0]["difference"] == 25.0
-    assert main(["compare", a, b, "--allow", "replan_steps", "--format", "csv"]) == 2
+    assert main(["compare", a, b, "--allow", "replan_steps", "--format", "csv"]) == 0
+    first = next(csv.DictReader(io.StringIO(capsys.readouterr().out)))
+    assert (first["metric"], first["pairs"], first["difference"]) == ("SR", "4", "25.0")
 
 
 @pytest.mark.parametrize(

@@ -87,15 +87,9 @@ def test_figures_are_those_of_the_report(tmp_path: Path) -> None:
         "reference_drift": 0,
         "execution_failure": 0,
     }
-    assert run["facts"] == [
-        "policy not recorded",
-        "published suite",
-        "referent fixed",
-        "seeds 7 to 10",
-        f"4 episodes of {STOVE}",
-        "inputs: not recorded",
-        "4 rollouts",
-    ]
+    protocol = f"published suite, referent fixed, seeds 7 to 10, 4 episodes of {STOVE}"
+    assert run["headline"] == f"policy not recorded: {protocol}; inputs: not recorded"
+    assert run["facts"] == ["4 rollouts"]
     assert run["commands"] == []
 
 
@@ -105,7 +99,7 @@ def test_a_result_card_tells_policy_horizon_and_command(tmp_path: Path) -> None:
     card = {"protocol": {"horizon": 200}, "policy": {"type": "memobench_random"}, "runs": [{"command": command}]}
     (tmp_path / "card.json").write_text(json.dumps(card))
     run = page_data(read_runs([tmp_path]), [{}], {})["runs"][0]
-    assert run["facts"][0] == "memobench_random"
+    assert run["headline"].startswith("memobench_random: ")
     assert run["facts"][-1] == "horizon 200"
     assert run["commands"] == ["lerobot eval env=memobench 'output_dir=a folder'"]
 

@@ -6,10 +6,13 @@ browser really shows.
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
@@ -60,16 +63,21 @@ def film(path: Path, frames: int) -> None:
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two runs: `mine` with films of the first stove and butter rollouts, `other` without any."""
+    """Two runs: `mine` with films of the first stove and butter rollouts, `other` with one of a shorter stove."""
     root = tmp_path_factory.mktemp("report with spaces & #signs")
     write_episodes(root / "mine", RECORDS)
     film(root / "mine" / "videos" / f"{STOVE}.0.mp4", 41)
     film(root / "mine" / "videos" / f"{BUTTER}.0.mp4", 36)
     write_episodes(
-        root / "other", [rollout(STOVE, 0, [("S", None, None), ("U", None, None)], failure="storage_failure")]
+        root / "other",
+        [
+            rollout(STOVE, 0, [("S", None, None), ("U", None, None)], failure="storage_failure", steps=25),
+            rollout(BUTTER, 1, [("S", 9, 9)], memory_type="object", prompt_steps=15),
+        ],
     )
+    film(root / "other" / "videos" / f"{STOVE}.0.mp4", 26)
     written = write_html([root / "mine", root / "other"], root / "made")
-    assert written.videos == 2
+    assert written.videos == 3
     (root / "made").rename(root / "moved")  # nothing in it may depend on where it was made
     return root / "moved" / "index.html"
 
@@ -96,19 +104,19 @@ def show(browser: Any, report: Path, address: str = "") -> None:
     browser.open(f"{report.as_uri()}#{address}")
 
 
-def shown_frame(browser: Any) -> int:
+def shown_frame(browser: Any, video: str = "video") -> int:
     """The number of the frame on the screen, read off its grey."""
     from PIL import Image
 
-    box = browser.box("video")
+    box = browser.box(video)
     picture = Image.open(browser.screenshot(Path(browser._log.name).with_suffix(".png")))
     grey = picture.convert("L").getpixel((int(box["x"] + box["width"] / 2), int(box["y"] + box["height"] / 2)))
     return round((grey - 16) / 4)
 
 
 def settle(browser: Any) -> None:
-    """Wait until a seek has arrived on the screen: two frames of the browser after the video says so."""
-    browser.wait("!document.querySelector('video').seeking")
+    """Wait until a seek has arrived on the screen: two frames of the browser after all videos say so."""
+    browser.wait("[...document.querySelectorAll('video')].every((video) => !video.seeking)")
     browser.js("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
 
 
@@ -118,6 +126,7 @@ def playhead(browser: Any) -> int:
 
 def ready(browser: Any) -> None:
     browser.wait("document.querySelector('video')?.readyState >= 2")
+    browser.wait("[...document.querySelectorAll('video')].every((video) => video.readyState >= 2)")
 
 
 def place(frame: int, end: int = 40) -> float:
@@ -132,7 +141,9 @@ def test_the_overview_shows_rates_outcomes_and_tasks(browser: Any, report: Path)
     rows = [" ".join(row.split()) for row in browser.texts(".columns table.rates tbody tr")]
     assert rows[0].startswith("Average mine 7")
     assert any(row.startswith("Temporal mine 4 66.7") for row in rows)  # the mean of 1 of 3 and 1 of 1, not 2 of 4
-    assert browser.texts("#overview h2") == ["mine"]
+    (first,) = browser.texts("#overview h2")
+    assert first.startswith("mine: policy not recorded: published suite, referent fixed, seeds 7 to 9, ")
+    assert first.endswith("; inputs: not recorded")
     assert browser.texts("#overview .key li")[:2] == ["✓\nsuccess\n4", "S\nstorage failure\n1"]
     chips = browser.texts(".tasks tbody tr:nth-child(2) .chip")
     assert [chip.split()[-1] for chip in chips] == ["67", "33"]
@@ -356,7 +367,7 @@ def test_another_run_keeps_the_episode(browser: Any, report: Path) -> None:
     browser.click(".others a")
     browser.wait("document.querySelector('#detail .facts b').innerText === 'Storage failure'")
     assert browser.js("location.hash.includes('run=other')")
-    assert browser.texts("#count") == ["1 of 1 episode, 0 succeeded"]
+    assert browser.texts("#count") == ["2 of 2 episodes, 1 succeeded"]
     browser.choose("#run", "mine")
     browser.wait("document.querySelector('#detail .facts b').innerText === 'Success'")
 
@@ -379,10 +390,132 @@ def test_1500_episodes_are_added_to_the_list_as_they_are_needed(browser: Any, tm
     assert 0 < box["top"] < 900
 
 
+# --- side by side ---
+
+PAIR = f"view=compare&ep={STOVE}.0"
+LEFT, RIGHT = (f".pair > section:nth-child({k}) video" for k in (1, 2))
+
+
+def frames(browser: Any) -> list[int]:
+    """The frames of both videos, by their own times."""
+    return [int(time * FPS) for time in browser.js("[...document.querySelectorAll('video')].map((v) => v.currentTime)")]
+
+
+def test_one_control_moves_both_videos(browser: Any, report: Path) -> None:
+    """The shorter rollout rests on its last frame."""
+    show(browser, report, PAIR)
+    ready(browser)
+    for at, both in ((23, (23, 23)), (7, (7, 7)), (36, (36, 25))):
+        browser.js(
+            f"(() => {{ const e = document.querySelector('.both input'); e.value = {at}; "
+            "e.dispatchEvent(new Event('input', {bubbles: true})); })()"
+        )
+        settle(browser)
+        assert (shown_frame(browser, LEFT), shown_frame(browser, RIGHT)) == both
+        assert [int(n) for n in browser.js(PLAYHEADS)] == list(both)
+
+
+PLAYHEADS = "[...document.querySelectorAll('.timeline [role=slider]')].map((s) => s.getAttribute('aria-valuenow'))"
+
+
+def test_both_timelines_have_one_scale_and_seek_both(browser: Any, report: Path) -> None:
+    show(browser, report, PAIR)
+    ready(browser)
+    ends = browser.js("[...document.querySelectorAll('.phases .mark')].map((m) => m.style.left)")
+    assert ends == ["100%", "62.5%"]
+    browser.click(".pair > section:nth-child(2) .axis", across=place(12))
+    settle(browser)
+    assert (shown_frame(browser, LEFT), shown_frame(browser, RIGHT)) == (12, 12)
+    browser.key("ArrowRight")
+    browser.key("]")
+    settle(browser)
+    assert frames(browser) == [25, 25]  # the end of the shorter one is a mark too
+    browser.key("]")
+    settle(browser)
+    assert frames(browser) == [30, 25]
+
+
+def test_both_play_in_step(browser: Any, report: Path) -> None:
+    show(browser, report, PAIR)
+    ready(browser)
+    browser.choose("[aria-label=Speed]", "0.5")
+    browser.key(" ")
+    browser.wait("document.querySelectorAll('video')[1].currentTime > 0.4")
+    left, right = frames(browser)
+    assert abs(left - right) <= 4
+    browser.key(" ")
+    settle(browser)
+    left, right = frames(browser)
+    assert left == right == int(browser.js("document.querySelector('.both input').value"))
+    browser.key(" ")
+    browser.wait("document.querySelector('.both input').value === '40'")
+    browser.wait("document.querySelectorAll('video')[0].paused")
+    settle(browser)
+    assert frames(browser) == [40, 25]
+
+
+@pytest.mark.parametrize(
+    ("filters", "found"),
+    [
+        ({}, 2),
+        ({"#outcome": "differs"}, 2),
+        ({"#outcome": "first"}, 1),
+        ({"#outcome": "second", "#type": "object"}, 1),
+        ({"#outcome": "neither"}, 0),
+        ({"#outcome": "storage_failure"}, 1),
+        ({"#type": "object"}, 1),
+        ({"#op": "missed-U"}, 1),
+    ],
+)
+def test_pairs_are_filtered(browser: Any, report: Path, filters: dict[str, str], found: int) -> None:
+    show(browser, report, "view=compare")
+    for selector, value in filters.items():
+        browser.choose(selector, value)
+    browser.wait(f"document.querySelector('#count').innerText.startsWith('{found} of 2 pairs')")
+    assert len(browser.texts("#list .row")) == found
+    if not found:
+        assert browser.texts("#detail") == ["No episode is selected."]
+
+
+def test_a_pair_without_videos_still_has_its_timelines(browser: Any, report: Path) -> None:
+    show(browser, report, f"view=compare&ep={BUTTER}.1")
+    assert len(browser.texts(".pair .stage.absent")) == 2
+    browser.click(".pair > section:nth-child(1) .axis", across=20 / 55)
+    assert [int(n) for n in browser.js(PLAYHEADS)] == [20, 20]
+    browser.key("s")
+    browser.key("j")
+    browser.key("k")
+    browser.wait(f"document.querySelector('.row[aria-current]').dataset.id === '{STOVE}.0'")
+
+
+def test_one_run_has_nothing_beside_it(browser: Any, tmp_path: Path) -> None:
+    write_episodes(tmp_path / "run", RECORDS)
+    write_html([tmp_path / "run"], tmp_path / "out")
+    show(browser, tmp_path / "out" / "index.html", "view=compare")
+    assert browser.js("document.querySelector('#to-compare').hidden && !document.querySelector('#overview').hidden")
+
+
+# --- tables to take along ---
+
+
+def test_tables_are_saved_as_csv(browser: Any, report: Path) -> None:
+    show(browser, report)
+    links = browser.js("[...document.querySelectorAll('a.csv')].map((a) => [a.download, a.href])")
+    assert [name for name, _ in links] == [
+        *("mine-memory-types.csv", "mine-failures.csv", "mine-tasks.csv", "mine-prefix.csv"),
+    ]
+    rows = {
+        row["task"]: row
+        for row in csv.DictReader(io.StringIO(unquote(dict(links)["mine-tasks.csv"].partition(",")[2])))
+    }
+    assert rows[STOVE]["SR"] == "33.3"
+    assert rows[NASTY]["MCR"] == "100.0"
+
+
 # --- for everybody ---
 
 
-@pytest.mark.parametrize("address", ["", f"view=episodes&ep={STOVE}.0", f"view=episodes&ep={STOVE}.1"])
+@pytest.mark.parametrize("address", ["", f"view=episodes&ep={STOVE}.0", f"view=episodes&ep={STOVE}.1", PAIR])
 def test_whatever_can_be_used_has_a_name(browser: Any, report: Path, address: str) -> None:
     show(browser, report, address)
     nodes = browser.call("Accessibility.getFullAXTree")["nodes"]
@@ -396,7 +529,7 @@ def test_whatever_can_be_used_has_a_name(browser: Any, report: Path, address: st
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("address", ["", f"view=episodes&ep={STOVE}.1"])
+@pytest.mark.parametrize("address", ["", f"view=episodes&ep={STOVE}.1", PAIR])
 def test_text_stands_out_from_its_ground(browser: Any, report: Path, scheme: str, address: str) -> None:
     """WCAG AA: contrast of 4.5 for every text, computed from the colours the browser paints."""
     browser.colours(scheme)
@@ -437,11 +570,22 @@ CONTRAST = """
 """
 
 
-@pytest.mark.parametrize("address", ["", f"view=episodes&ep={STOVE}.0"])
+@pytest.mark.parametrize("address", ["", f"view=episodes&ep={STOVE}.0", PAIR])
 def test_a_telephone_needs_no_sideways_scrolling(browser: Any, report: Path, address: str) -> None:
     browser.resize(360, 740)
     show(browser, report, address)
     assert browser.js("document.documentElement.scrollWidth") <= 360
+
+
+def test_filters_are_folded_on_a_telephone(browser: Any, report: Path) -> None:
+    show(browser, report, "view=episodes")
+    assert browser.js("document.querySelector('#type').checkVisibility()")
+    browser.resize(390, 800)
+    browser.wait("!document.querySelector('#type').checkVisibility()")
+    browser.click("#more summary")
+    browser.choose("#type", "object")
+    browser.wait("document.querySelector('#more summary').innerText === 'Filters (1)'")
+    assert browser.texts("#count") == ["2 of 7 episodes, 1 succeeded"]
 
 
 def test_the_page_may_not_reach_the_network(chrome: Any, report: Path) -> None:

@@ -16,6 +16,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import count_of, write_file
 
 if TYPE_CHECKING:
+    from lerobot_memobench.evaluation.comparison import Comparison
     from lerobot_memobench.evaluation.records import Run
     from lerobot_memobench.evaluation.tables import Report
 
@@ -47,12 +48,13 @@ Folders = Annotated[
 ]
 Formats = Annotated[
     list[ReportFormat] | None,
-    typer.Option("--format", help="table (default), markdown, latex or json; repeatable."),
+    typer.Option("--format", help="table (default), markdown, csv, latex or json; repeatable."),
 ]
 
 ENDINGS = {
     ReportFormat.TABLE: "txt",
     ReportFormat.MARKDOWN: "md",
+    ReportFormat.CSV: "csv",
     ReportFormat.LATEX: "tex",
     ReportFormat.JSON: "json",
 }
@@ -70,10 +72,7 @@ Runs = Annotated[
 
 def report(
     folders: Runs,
-    format_: Annotated[
-        list[ReportFormat] | None,
-        typer.Option("--format", help="table (default), markdown, csv, latex or json; repeatable."),
-    ] = None,
+    format_: Formats = None,
     with_: With = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder that the report is written to, instead of being printed.")
@@ -126,12 +125,11 @@ def compare(
 ) -> None:
     """Compare two evaluations of the same episodes, pair by pair. McNemar for success, sign-flip for the rates."""
     from lerobot_memobench.evaluation.comparison import compare as compared
-    from lerobot_memobench.evaluation.comparison import comparison_report
     from lerobot_memobench.evaluation.records import read_runs
 
     first, second = read_runs([a, b])
     found = compared(first, second, allow=allow or (), seed=seed, permutations=permutations)
-    show_report(comparison_report(found), "compare", format_, out)
+    show_comparison(found, format_, out)
 
 
 def html(
@@ -289,22 +287,19 @@ def given_runs(folders: list[str] | None, with_: Beside | None) -> tuple[list[Ru
     return runs, paper
 
 
-def show_report(report: Report, name: str, formats: Sequence[ReportFormat] | None, out: Path | None) -> None:
-    """Print a report in the formats wanted, or write it to a folder as ``name`` with the formats' endings.
-
-    Raises:
-        MemobenchError: CSV is wanted.
-    """
+def show_comparison(found: Comparison, formats: Sequence[ReportFormat] | None, out: Path | None) -> None:
+    """Print a comparison in the formats wanted, or write it to a folder as ``compare`` with the formats' endings."""
+    from lerobot_memobench.evaluation.comparison import comparison_csv, comparison_report
     from lerobot_memobench.evaluation.tables import WRITERS, terminal
 
-    wanted = list(dict.fromkeys(formats or [ReportFormat.TABLE]))
-    if ReportFormat.CSV in wanted:
-        raise MemobenchError(f"found --format csv; expected {', '.join(ENDINGS)}: what is told here is no one table")
-    for each in wanted:
-        if out is not None:
-            out.mkdir(parents=True, exist_ok=True)
-            say(write_file(out / f"{name}.{ENDINGS[each]}", WRITERS[each](report)))
-        elif each is ReportFormat.TABLE:
+    report = comparison_report(found)
+    for each in dict.fromkeys(formats or [ReportFormat.TABLE]):
+        if out is None and each is ReportFormat.TABLE:
             console().print(terminal(report), crop=False)
+            continue
+        text = comparison_csv(found) if each is ReportFormat.CSV else WRITERS[each](report)
+        if out is None:
+            print(text, end="")
         else:
-            print(WRITERS[each](report), end="")
+            out.mkdir(parents=True, exist_ok=True)
+            say(write_file(out / f"compare.{ENDINGS[each]}", text))

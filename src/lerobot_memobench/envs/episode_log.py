@@ -54,7 +54,13 @@ WRITTEN_AT = "written_at"
 
 
 class CheckpointRecord(TypedDict):
-    """A checkpoint of a rollout: the execution steps, counted from 1, at which it held first, and first in order."""
+    """A memory checkpoint of a rollout. Execution steps are counted from 1; None: it never held.
+
+    Attributes:
+        operation: Storage, Update or Compression.
+        first_step: execution step at which it held first.
+        ordered_step: execution step at which it held first with all earlier ones complete.
+    """
 
     operation: Literal["S", "U", "C"]
     first_step: Count | None
@@ -62,7 +68,21 @@ class CheckpointRecord(TypedDict):
 
 
 class Outcome(TypedDict, total=False):
-    """Fields of an episode that a log and a card share; logs of other tools leave some of them out."""
+    """Fields of an episode that a log and a card share; logs of other tools leave some of them out.
+
+    Attributes:
+        seed: of the scene: seed base + episode.
+        referent: fixed, random, or drawn (strict tasks).
+        variant: which admissible referent or order; 0 is the published one.
+        replan_steps: actions executed per prediction, where known.
+        prompt_steps: control steps of the demonstration prompt.
+        steps: execution steps.
+        failure: class of the failure; None for a success.
+        suite: of tasks that are not published: strict.
+        lost: of strict tasks: the goal could no longer be reached.
+        fault: why the episode was broken off: an invalid action, unstable physics.
+        scene_hash: hash of the initial scene.
+    """
 
     seed: Whole | None
     referent: Name
@@ -78,7 +98,22 @@ class Outcome(TypedDict, total=False):
 
 
 class EpisodeRecord(Outcome):
-    """A line, as it must be to count as a rollout (see `episode_record`)."""
+    """A line, as it must be to count as a rollout (see `episode_record`).
+
+    Attributes:
+        task: name in the catalogue.
+        memory_type: temporal, spatial, object or procedural.
+        episode: its number.
+        success: whether the goal held at the end.
+        checkpoints: the memory checkpoints, in the task's order.
+        prompt_shown: whether the demonstration prompt showed what it had to; None without one.
+        wall_s: seconds that the episode took.
+        not_run: why the episode could not be run: it is no rollout, and in no figure.
+        policy: type and hash of the policy.
+        run: which start of the evaluation.
+        inputs: what the policy was given.
+        written_at: when the line was written, s since 1970; in the workers' files alone.
+    """
 
     task: Name
     memory_type: Name
@@ -95,7 +130,7 @@ class EpisodeRecord(Outcome):
 
 
 def episode_record(episode: Episode, seed_base: int, replan_steps: int | None, wall_s: float) -> dict[str, Any]:
-    """Return an episode's line for the log (the site's reference lists its fields).
+    """Return an episode's line for the log (`EpisodeRecord` says what its fields mean).
 
     Args:
         seed_base: the seed that counts as episode 0.
@@ -368,7 +403,21 @@ Episodes = Annotated[int, Ge(0), Le(MOST_EPISODES)]
 
 
 class Settings(TypedDict, total=False):
-    """Settings of an evaluation; one in which joined episodes differ is a list of its values."""
+    """Settings of an evaluation; one in which joined episodes differ is a list of its values.
+
+    Attributes:
+        suite: published or strict.
+        seed_base: seed of episode 0.
+        obs_type: what the environment observes.
+        referent: fixed, random or drawn.
+        demonstration_prompt: whether prompted tasks begin with their demonstration prompt.
+        horizon: execution steps after which an episode ends.
+        replan_steps: actions executed per prediction; None for the policy's own number.
+        render: quality of the pictures.
+        render_every: control steps per drawn picture.
+        oracle_memory: whether the instruction tells what was done so far.
+        inputs: what the policy was given.
+    """
 
     suite: Name
     seed_base: Whole | list[Whole]
@@ -400,7 +449,12 @@ class Protocol(Settings, total=False):
 
 
 class WholeProtocol(Settings):
-    """The protocol of a card from which an evaluation is resumed: it says how much was asked for."""
+    """The protocol of a card from which an evaluation is resumed: it says how much was asked for.
+
+    Attributes:
+        tasks: their names, sorted.
+        episodes: asked for of each task.
+    """
 
     tasks: list[Name]
     episodes: Episodes

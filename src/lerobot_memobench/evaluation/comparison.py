@@ -18,7 +18,7 @@ from lerobot_memobench.evaluation.metrics import METRICS, Record, by_task, opera
 from lerobot_memobench.evaluation.records import Run, other_physics
 from lerobot_memobench.evaluation.report_tables import AVERAGE, inputs_phrase
 from lerobot_memobench.evaluation.statistics import PERMUTATIONS, detectable, holm, mcnemar, sign_flip
-from lerobot_memobench.evaluation.tables import Cell, Count, Name, Numbers, Report, Section, Table, figure
+from lerobot_memobench.evaluation.tables import Cell, Count, Name, Numbers, Report, Section, Table, csv_text, figure
 from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 
@@ -291,6 +291,12 @@ def comparison_report(found: Comparison) -> Report:
     return Report(
         f"{found.b} against {found.a}: {found.headline}", (Section("", tables, (sentence, NOTE), found.notes),), data
     )
+
+
+def comparison_csv(found: Comparison) -> str:
+    """Return all differences of a comparison as CSV, one a row."""
+    entries = [_entry(row) for row in found.differences]
+    return csv_text([list(entry.values()) for entry in entries], list(entries[0]))
 
 
 def _table(key: str, title: str, found: Comparison, rows: Sequence[Difference], tasks: bool) -> Table:

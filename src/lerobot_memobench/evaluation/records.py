@@ -45,7 +45,15 @@ class PolicySettings(TypedDict, total=False):
 
 
 class Policy(TypedDict, total=False):
-    """What identifies a policy; {} where nothing is known of it."""
+    """What identifies a policy; {} where nothing is known of it.
+
+    Attributes:
+        type: as it is registered with LeRobot.
+        seed: LeRobot's, of this evaluation.
+        settings: its whole configuration.
+        sha256: hash over the checkpoint's files.
+        detector_sha256: hash of its detector's weights.
+    """
 
     type: Name | None
     seed: Whole | None
@@ -55,7 +63,13 @@ class Policy(TypedDict, total=False):
 
 
 class Checkpoint(TypedDict):
-    """Where a policy's weights were, and the hash of each file."""
+    """Where a policy's weights were, and the hash of each file.
+
+    Attributes:
+        path: folder, repository, or name of a policy of the package.
+        revision: commit of a repository's copy.
+        files: name -> SHA-256.
+    """
 
     path: str
     revision: NotRequired[str | None]
@@ -66,7 +80,17 @@ BatchSize = Annotated[int, Ge(1), Le(LARGEST)]
 
 
 class Start(TypedDict):
-    """One start of the evaluation, on one machine."""
+    """One start of the evaluation, on one machine.
+
+    Attributes:
+        command: as it was typed.
+        batch_size: environments at once.
+        versions: of Python and packages.
+        git_commit: of a checkout of this package.
+        machine: processor, cores, GPU, system.
+        gl: what drew the pictures; {} where none were drawn.
+        times: starts that were alike.
+    """
 
     command: list[str]
     batch_size: BatchSize
@@ -78,7 +102,7 @@ class Start(TypedDict):
 
 
 class CardEpisode(Outcome):
-    """What an episode came to."""
+    """What an episode came to; its fields mean what they mean in the log."""
 
     task: Name
     episode: Whole
@@ -105,7 +129,21 @@ class Card(TypedDict):
 
 
 class WholeCard(TypedDict):
-    """A card from which an evaluation is gone on with, merged or repeated."""
+    """A card from which an evaluation is gone on with, merged or repeated.
+
+    Attributes:
+        format: of the card: 1.
+        written: when.
+        protocol: tasks, episodes, and the settings that must agree for two evaluations to compare.
+        policy: what must agree for an evaluation to be gone on with.
+        checkpoint: of the policy; None where it has none.
+        trained_on: LeRobot's settings of the dataset that it was trained on.
+        task_files: task -> hash of its files.
+        flags: LeRobot's flags, complete but for folders: `memobench rerun` repeats them.
+        shard: the part, or None.
+        runs: each start, on each machine.
+        episodes: what was found.
+    """
 
     format: Literal[1]
     written: NotRequired[str]

@@ -44,7 +44,7 @@ from lerobot_memobench.evaluation.report_tables import (
     sweep,
     tasks_table,
 )
-from lerobot_memobench.evaluation.tables import WRITERS, Report, Section, csv_text, markdown, terminal_table
+from lerobot_memobench.evaluation.tables import WRITERS, Report, Section, csv_tables, csv_text, markdown, terminal_table
 from lerobot_memobench.io import write_file
 from lerobot_memobench.paper import PublishedRow, published_rows
 
@@ -59,6 +59,9 @@ FILES: dict[str, str] = {
     "json": REPORT_JSON,
 }
 """Format -> file that it is written to."""
+
+TABLES = "tables"
+"""Folder of the tables as CSV."""
 
 
 # --- beside the log ---
@@ -157,12 +160,19 @@ def render(found: Report, runs: Sequence[Run], format_: str, paper: bool = False
 
 
 def write_documents(runs: Sequence[Run], out: Path, wanted: Sequence[str], paper: bool = False) -> list[Path]:
-    """Write a report of evaluations into a folder in the formats wanted; return the files."""
+    """Write a report of evaluations into a folder in the formats wanted; return the files.
+
+    CSV is every figure in a row of its own, and each table of the report as a file in ``tables``.
+    """
     found = build(runs, paper)
     if out.exists() and not out.is_dir():
         raise MemobenchError(f"--out {out} is a file; name a folder")
     out.mkdir(parents=True, exist_ok=True)
-    return [write_file(out / FILES[name], render(found, runs, name, paper)) for name in wanted]
+    files = [write_file(out / FILES[name], render(found, runs, name, paper)) for name in wanted]
+    if "csv" in wanted:
+        (out / TABLES).mkdir(exist_ok=True)
+        files += [write_file(out / TABLES / f"{key}.csv", text) for key, text in csv_tables(found).items()]
+    return files
 
 
 OF_EACH_EVALUATION = ("memory-types", "tasks", "prefix", "failures")

@@ -7,7 +7,17 @@ from collections.abc import Iterable, Mapping, Sequence
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import METRICS, Rate, Row, Summary, percent, policy_inputs
 from lerobot_memobench.evaluation.records import Run, unlike
-from lerobot_memobench.evaluation.tables import Cell, Count, Name, Numbers, Section, Table, best_in_columns, figure
+from lerobot_memobench.evaluation.tables import (
+    Cell,
+    Count,
+    Name,
+    Numbers,
+    Orders,
+    Section,
+    Table,
+    best_in_columns,
+    figure,
+)
 from lerobot_memobench.io import count_of
 from lerobot_memobench.paper import PublishedRow, failure_taxonomy, published_rows
 from lerobot_memobench.tasks.task import MEMORY_TYPES, PUBLISHED
@@ -109,10 +119,7 @@ def prefix_table(summary: Summary) -> Table:
     width = max((len(found) for found in summary.prefix.values()), default=0)
     rows = []
     for name, plain in summary.prefix.items():
-        cells: list[Cell] = [
-            Numbers(f"{figure(a.value)} / {figure(b.value)}")
-            for a, b in zip(plain, summary.ordered_prefix[name], strict=True)
-        ]
+        cells: list[Cell] = [Orders(*pair) for pair in zip(plain, summary.ordered_prefix[name], strict=True)]
         labels = " ".join(summary.operations_of[name])
         rows.append((Name(name), labels, *cells, *[Numbers("")] * (width - len(cells))))
     return Table(

@@ -6,9 +6,11 @@ import csv
 import io
 import json
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
+from typing import NamedTuple
 
 from rich import box
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
@@ -35,8 +37,15 @@ class Count(int):
     """A number of things; other integers are labels."""
 
 
-Cell = Rate | str | int | None
-"""A rate (per cent, with its interval where it has one), text, a number; None where nothing applies."""
+class Orders(NamedTuple):
+    """Two rates in one cell: of prefixes in any order, and in order."""
+
+    any_order: Rate
+    in_order: Rate
+
+
+Cell = Rate | Orders | str | int | None
+"""A rate (per cent, with its interval where it has one) or two, text, a number; None where nothing applies."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +119,8 @@ def figure(value: float | None, sign: bool = False) -> str:
 
 def _words(cell: Cell, interval: str | None, escape: Callable[[str], str] = str) -> str:
     """Return a cell as text; ``interval`` is how an interval is written, None for not at all."""
+    if isinstance(cell, Orders):
+        return escape(" / ".join(figure(rate.value) for rate in cell))
     if not isinstance(cell, Rate):
         return escape(NOT_APPLICABLE if cell is None else str(cell))
     value = escape(figure(cell.value))
@@ -434,6 +445,43 @@ WRITERS: Mapping[str, Callable[[Report], str]] = {
     "json": json_text,
 }
 """Format -> what writes a report in it."""
+
+
+def csv_tables(report: Report) -> dict[str, str]:
+    """Return key -> table as CSV, for every table of a report; those of several evaluations under one another."""
+    keys = Counter(table.key for table in report.tables)
+    rows: dict[str, list[dict[str, object]]] = {}
+    for section in report.sections:
+        for table in section.tables:
+            whose = {"evaluation": section.title} if keys[table.key] > 1 else {}
+            rows.setdefault(table.key, []).extend({**whose, **row} for row in _csv_rows(table))
+    found = {}
+    for key, members in rows.items():
+        header = list(dict.fromkeys(name for row in members for name in row))
+        found[key] = csv_text([[row.get(name) for name in header] for row in members], header)
+    return found
+
+
+def _csv_rows(table: Table) -> list[dict[str, object]]:
+    """Return a table's rows as column -> value: rates in per cent, each with the bounds of its interval beside it."""
+    names = [f"{title} {name}".lstrip() for title, name in zip(table.titles, table.header, strict=True)]
+    rates = {c for row in table.rows for c, cell in enumerate(row) if isinstance(cell, Rate)}
+    rows = []
+    for row in table.rows:
+        found: dict[str, object] = {}
+        for column, (name, cell) in enumerate(zip(names, row, strict=True)):
+            if isinstance(cell, Orders):
+                found |= {f"{name} {order.replace('_', ' ')}": percent(r.value) for order, r in cell._asdict().items()}
+            elif column in rates:
+                rate = cell if isinstance(cell, Rate) else Rate(None, 0)
+                found[name] = percent(rate.value)
+                if table.intervals:
+                    low, high = rate.interval or (None, None)
+                    found |= {f"{name} low": percent(low), f"{name} high": percent(high)}
+            elif cell != "":
+                found[name] = cell
+        rows.append(found)
+    return rows
 
 
 def csv_text(rows: Sequence[Sequence[object]], header: Sequence[str]) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 
 from lerobot_memobench import __version__
 from lerobot_memobench.envs.video import OPERATION_COLOURS
-from lerobot_memobench.evaluation.headline import given, protocol_phrases, whose
+from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import (
     Rate,
     Record,
@@ -24,8 +24,9 @@ from lerobot_memobench.evaluation.metrics import (
     percent,
 )
 from lerobot_memobench.evaluation.records import Run, card_of, unlike
+from lerobot_memobench.evaluation.report import build
 from lerobot_memobench.evaluation.report_tables import outcomes
-from lerobot_memobench.evaluation.tables import OPERATION_NAMES
+from lerobot_memobench.evaluation.tables import OPERATION_NAMES, csv_tables
 from lerobot_memobench.io import count_of
 from lerobot_memobench.protocol import CONTROL_HZ
 from lerobot_memobench.tasks.catalogue import find_tasks, get_task, load_task, task_names
@@ -111,10 +112,11 @@ def run_data(run: Run, videos: Mapping[int, str]) -> dict[str, Any]:
     summary, starts = run.summary, card_of(run.folder).get("runs", [])
     return {
         "name": run.name,
-        "folder": str(run.folder),
+        "headline": headline([run]),
         "facts": facts(run),
         "commands": [shlex.join(start["command"]) for start in starts if start.get("command")],
         "notes": list(run.notes),
+        "csv": csv_tables(build([run])),
         "average": row_data(summary.average),
         "memory_types": {name: row_data(row) for name, row in summary.memory_types.items()},
         "tasks": {name: task_data(name, summary) for name in summary.tasks},
@@ -123,15 +125,9 @@ def run_data(run: Run, videos: Mapping[int, str]) -> dict[str, Any]:
 
 
 def facts(run: Run) -> list[str]:
-    """Return the report's first line in parts: policy, protocol, what was given; then rollouts and horizon."""
+    """Return what stands below the first line: how many rollouts there are, and their horizon."""
     horizon = run.protocol.get("horizon")
-    return [
-        whose(run),
-        *protocol_phrases(run),
-        given(run),
-        count_of(len(run.records), "rollout"),
-        *([] if horizon is None else [f"horizon {horizon}"]),
-    ]
+    return [count_of(len(run.records), "rollout"), *([] if horizon is None else [f"horizon {horizon}"])]
 
 
 def task_data(name: str, summary: Summary) -> dict[str, Any]:

@@ -32,7 +32,20 @@ from lerobot_memobench.tasks.catalogue import task_names
 PAGE = "index.html"
 VIDEOS = "videos"
 LEROBOT_INFO = "eval_info.json"
-SCRIPTS = ("dom", "address", "filter", "overview", "list", "lanes", "timeline", "player", "panel", "detail", "main")
+SCRIPTS = (
+    "dom",
+    "address",
+    "filter",
+    "overview",
+    "list",
+    "lanes",
+    "timeline",
+    "player",
+    "panel",
+    "detail",
+    "pair",
+    "main",
+)
 """Parts of the one script, in ``script/``; a later part uses earlier ones."""
 MARK = "memobench html"
 """What the page's ``generator`` says; by it a folder is known as a report."""

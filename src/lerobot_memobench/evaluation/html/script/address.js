@@ -1,6 +1,7 @@
 // What is selected is in the address after #, so a view can be bookmarked, sent to somebody and gone back to.
 
-const KEYS = ["view", "run", "type", "task", "op", "outcome", "q", "ep", "level"];
+const KEYS = ["view", "run", "beside", "type", "task", "op", "outcome", "q", "ep", "level"];
+const VIEWS = DATA.runs.length > 1 ? ["overview", "episodes", "compare"] : ["overview", "episodes"];
 const FILTERS = ["type", "task", "op", "outcome", "q"];
 
 /** The selection that the address holds; unknown values fall back to what is there. */
@@ -9,15 +10,19 @@ function selection() {
   const chosen = Object.fromEntries(KEYS.map((key) => [key, given.get(key) ?? ""]));
   if (!DATA.runs.some((run) => run.name === chosen.run)) chosen.run = DATA.runs[0].name;
   if (!DATA.levels.includes(chosen.level)) chosen.level = "intermediate";
-  if (chosen.view !== "episodes") chosen.view = "overview";
+  if (!VIEWS.includes(chosen.view)) chosen.view = "overview";
+  if (!others(chosen.run).includes(chosen.beside)) chosen.beside = others(chosen.run)[0] ?? "";
   return chosen;
 }
+
+/** The names of the runs beside one. */
+const others = (name) => DATA.runs.map((run) => run.name).filter((it) => it !== name);
 
 /** The address of the present selection with some changes. */
 function address(changes) {
   const next = new URLSearchParams();
   const values = { ...selection(), ...changes };
-  const defaults = { view: "overview", run: DATA.runs[0].name, level: "intermediate" };
+  const defaults = { view: "overview", run: DATA.runs[0].name, level: "intermediate", beside: others(values.run)[0] };
   for (const key of KEYS) if (values[key] && values[key] !== defaults[key]) next.set(key, values[key]);
   return `#${next}`;
 }
@@ -31,4 +36,5 @@ function select(changes, { keepHistory = false } = {}) {
 }
 
 const noFilters = () => Object.fromEntries(FILTERS.map((key) => [key, ""]));
-const currentRun = () => DATA.runs.find((run) => run.name === selection().run);
+const runNamed = (name) => DATA.runs.find((run) => run.name === name);
+const currentRun = () => runNamed(selection().run);

@@ -53,13 +53,22 @@ const detail = {
       .map(([run, episode]) =>
         el("a", { href: address({ run: run.name, ep: episode.id }) }, outcomeMark(episode.outcome), run.name),
       );
-    this.others.replaceChildren(...(links.length ? ["Same episode in ", ...links] : []));
+    const beside = el("a", { href: address({ view: "compare", ep: this.episode.id }) }, "side by side");
+    this.others.replaceChildren(...(links.length ? ["Same episode in ", ...links, beside] : []));
   },
 
   clear() {
-    this.stage?.stop();
+    this.stop();
     this.episode = null;
     byId("detail").replaceChildren(el("p", { class: "hint empty" }, "No episode is selected."));
+  },
+
+  toggle() {
+    this.stage.toggle();
+  },
+
+  stop() {
+    this.stage?.stop();
   },
 
   /** Go to a frame, in the video where there is one. */
@@ -80,29 +89,33 @@ const detail = {
   show(frame) {
     this.frame = Math.min(frame, lastFrame(this.episode));
     this.line.show(this.frame);
-    const now = situation(this.episode, this.frame);
-    const operation =
-      now.phase !== "prompt" && now.checkpoint !== null ? this.episode.checkpoints[now.checkpoint][0] : null;
-    const key = `${now.phase} ${now.checkpoint}`;
-    if (this.now.dataset.key === key) return;
-    this.now.dataset.key = key;
-    this.now.className = `now ${now.phase}`;
-    this.now.replaceChildren(
-      operation ? badge(operation) : "",
-      el("span", {}, el("span", { class: "quiet" }, this.when(now)), subgoalWords(this.episode, now, this.level)),
-    );
-  },
-
-  when({ phase, checkpoint }) {
-    if (phase === "prompt") return "";
-    if (phase === "execution") return "Now: ";
-    return checkpoint === null ? "At the end: " : "Still open at the end: ";
+    showSubgoal(this.now, this.episode, this.frame, this.level);
   },
 };
 
-function episodeFacts(episode, task) {
+/** Write into `line` what is to be done at a frame. */
+function showSubgoal(line, episode, frame, level) {
+  const now = situation(episode, frame);
+  const operation = now.phase !== "prompt" && now.checkpoint !== null ? episode.checkpoints[now.checkpoint][0] : null;
+  const key = `${now.phase} ${now.checkpoint}`;
+  if (line.dataset.key === key) return;
+  line.dataset.key = key;
+  line.className = `now ${now.phase}`;
+  line.replaceChildren(
+    operation ? badge(operation) : "",
+    el("span", {}, el("span", { class: "quiet" }, whenWords(now)), subgoalWords(episode, now, level)),
+  );
+}
+
+function whenWords({ phase, checkpoint }) {
+  if (phase === "prompt") return "";
+  if (phase === "execution") return "Now: ";
+  return checkpoint === null ? "At the end: " : "Still open at the end: ";
+}
+
+function episodeFacts(episode, task, { length = true } = {}) {
   const words = [`episode ${episode.episode}`, episode.seed === null ? null : `seed ${episode.seed}`, task.memory_type];
   if (episode.referent !== "fixed") words.push(`${episode.referent} referent, variant ${episode.variant}`);
-  words.push(plural(episode.steps, "step"), episode.scene ? `scene ${episode.scene.slice(0, 8)}` : null);
+  words.push(length ? plural(episode.steps, "step") : null, episode.scene ? `scene ${episode.scene.slice(0, 8)}` : null);
   return words.filter(Boolean);
 }

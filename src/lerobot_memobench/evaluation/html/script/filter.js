@@ -36,22 +36,41 @@ function hasOperation(episode, op) {
 }
 
 function hasOutcome(episode, outcome) {
-  if (outcome === "failed") return episode.outcome !== "success";
+  if (outcome === "failed") return !solved(episode);
   if (outcome === "no-video") return !episode.video;
   return episode.outcome === outcome;
 }
 
-function filtered(run, chosen) {
+const solved = (episode) => episode.outcome === "success";
+
+/** What a pair of rollouts can be found by, beside the outcomes of either. */
+const PAIR_OUTCOMES = {
+  differs: ["only one succeeded", (a, b) => solved(a) !== solved(b)],
+  first: ["only the first succeeded", (a, b) => solved(a) && !solved(b)],
+  second: ["only the second succeeded", (a, b) => !solved(a) && solved(b)],
+  neither: ["neither succeeded", (a, b) => !solved(a) && !solved(b)],
+};
+
+/** The rollouts of a run that a selection finds; `partners` (by id) leaves those out that have none. */
+function filtered(run, chosen, partners = null) {
   const words = normal(chosen.q).split(" ").filter(Boolean);
   const order = Object.keys(DATA.tasks);
+  const found = ([episode, partner]) => {
+    const both = partner ? [episode, partner] : [episode];
+    const either = (test, value) => !value || both.some((it) => test(it, value));
+    const pairwise = partner && PAIR_OUTCOMES[chosen.outcome]?.[1];
+    return (
+      (!chosen.type || DATA.tasks[episode.task].memory_type === chosen.type) &&
+      (!chosen.task || episode.task === chosen.task) &&
+      either(hasOperation, chosen.op) &&
+      (pairwise ? pairwise(episode, partner) : either(hasOutcome, chosen.outcome)) &&
+      finds(words, both.map(searchText).join(""))
+    );
+  };
   return run.episodes
-    .filter(
-      (episode) =>
-        (!chosen.type || DATA.tasks[episode.task].memory_type === chosen.type) &&
-        (!chosen.task || episode.task === chosen.task) &&
-        (!chosen.op || hasOperation(episode, chosen.op)) &&
-        (!chosen.outcome || hasOutcome(episode, chosen.outcome)) &&
-        finds(words, searchText(episode)),
-    )
+    .map((episode) => [episode, partners?.get(episode.id)])
+    .filter(([, partner]) => !partners || partner)
+    .filter(found)
+    .map(([episode]) => episode)
     .sort((a, b) => order.indexOf(a.task) - order.indexOf(b.task) || a.episode - b.episode);
 }

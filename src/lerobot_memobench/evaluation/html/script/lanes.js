@@ -1,11 +1,12 @@
 // The lanes of a timeline: phases, one per checkpoint, and the axis of time. Together the checkpoints' lanes are a
 // staircase: each is worked on until it holds with all earlier ones complete.
 
-/** What draws on tracks that run from frame 0 to `end`; marks call `seek` with their frame. */
-function trackTools(end, seek) {
-  const at = (frame) => `${(100 * frame) / Math.max(1, end)}%`;
+/** What draws on tracks of `length` frames, frame 0 being `lead` into them; marks call `seek` with their frame. */
+function trackTools(length, lead, seek) {
+  const share = (frames) => `${(100 * frames) / Math.max(1, length)}%`;
+  const at = (frame) => share(frame + lead);
   const span = (from, to, kind, tip, words = "") =>
-    el("span", { class: `span ${kind}`, style: { left: at(from), width: at(to - from) }, "data-tip": tip }, words);
+    el("span", { class: `span ${kind}`, style: { left: at(from), width: share(to - from) }, "data-tip": tip }, words);
   const mark = (frame, kind, tip, content) =>
     el(
       "button",
@@ -85,8 +86,8 @@ function checkpointSteps(episode, k, what, draw) {
   return marks;
 }
 
-function timeSlider(end, draw) {
-  const labels = ticks(end).map((frame) =>
+function timeSlider(end, room, draw) {
+  const labels = ticks(room).map((frame) =>
     el("span", { class: "tick", style: { left: draw.at(frame) } }, `${frame / DATA.fps} s`),
   );
   const range = { "aria-valuemin": "0", "aria-valuemax": end };

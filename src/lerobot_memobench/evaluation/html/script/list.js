@@ -13,22 +13,24 @@ function checkpointMarks(episode) {
   );
 }
 
-function listRow(episode) {
+/** A row of the list; `partner` is the same episode of the run beside. */
+function listRow(episode, partner) {
   return el(
     "li",
     {},
     el(
       "a",
-      { class: "row", "data-id": episode.id, href: address({ view: "episodes", ep: episode.id }) },
+      { class: "row", "data-id": episode.id, href: address({ ep: episode.id }) },
       outcomeMark(episode.outcome),
+      partner ? outcomeMark(partner.outcome) : null,
       el(
         "span",
         { class: "name" },
         `Episode ${episode.episode}${episode.referent === "fixed" ? "" : ` · ${episode.referent}`}`,
       ),
-      checkpointMarks(episode),
-      el("span", { class: "length" }, seconds(episode.prompt + episode.steps)),
-      episode.video ? null : el("span", { class: "visually-hidden" }, "no video"),
+      partner ? null : checkpointMarks(episode),
+      partner ? null : el("span", { class: "length" }, seconds(episode.prompt + episode.steps)),
+      partner || episode.video ? null : el("span", { class: "visually-hidden" }, "no video"),
     ),
   );
 }
@@ -37,10 +39,12 @@ const list = {
   episodes: [],
   shown: 0,
   watcher: null,
+  current: null,
 
-  /** Show these rollouts from the top. */
-  fill(episodes) {
+  /** Show these rollouts from the top; `partners` (by id) stand beside them. */
+  fill(episodes, partners = null) {
     this.episodes = episodes;
+    this.partners = partners;
     this.shown = 0;
     this.task = null;
     this.end = el("div", { class: "end", "aria-hidden": "true" });
@@ -63,7 +67,7 @@ const list = {
         this.task = episode.task;
         this.end.before(el("h3", {}, taskTitle(episode.task)), (this.group = el("ol")));
       }
-      this.group.append(listRow(episode));
+      this.group.append(listRow(episode, this.partners?.get(episode.id)));
     }
     this.shown = Math.min(this.shown + count, this.episodes.length);
     if (this.shown < this.episodes.length) this.watcher.observe(this.end);
@@ -71,6 +75,7 @@ const list = {
 
   /** Mark the selected row, adding rows up to it. */
   mark(id) {
+    this.current = id;
     const place = this.episodes.findIndex((episode) => episode.id === id);
     if (place >= this.shown) this.more(place - this.shown + CHUNK);
     for (const row of byId("list").querySelectorAll("[aria-current]")) row.removeAttribute("aria-current");
@@ -82,8 +87,9 @@ const list = {
   /** Select the rollout that stands `distance` further down. */
   move(distance) {
     if (!this.episodes.length) return;
-    const place = this.episodes.findIndex((episode) => episode.id === detail.episode?.id);
+    const place = this.episodes.findIndex((episode) => episode.id === this.current);
     const next = Math.min(Math.max(place + distance, 0), this.episodes.length - 1);
-    select({ view: "episodes", ep: this.episodes[next].id });
+    const view = selection().view === "compare" ? "compare" : "episodes";
+    select({ view, ep: this.episodes[next].id });
   },
 };

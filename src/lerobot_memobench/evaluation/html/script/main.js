@@ -17,6 +17,7 @@ function fillControls() {
     DATA.levels.map((level) => [level, level]),
   );
   byId("run").parentElement.hidden = DATA.runs.length < 2;
+  byId("to-compare").hidden = DATA.runs.length < 2;
   const types = DATA.memory_types.filter((type) => Object.values(DATA.tasks).some((task) => task.memory_type === type));
   options(byId("type"), [["", "all"], ...types.map((type) => [type, type])]);
   const operations = Object.entries(DATA.operations);
@@ -24,14 +25,6 @@ function fillControls() {
     ["", "all"],
     ...operations.map(([key, { name }]) => [key, `with ${name}`]),
     ...operations.map(([key, { name }]) => [`missed-${key}`, `missed ${name}`]),
-  ]);
-  const outcomes = Object.entries(OUTCOMES).map(([key, { words }]) => [key, words]);
-  options(byId("outcome"), [
-    ["", "all"],
-    outcomes[0],
-    ["failed", "any failure"],
-    ...outcomes.slice(1),
-    ["no-video", "no video"],
   ]);
   byId("legend").append(
     ...operations.map(([key, { name }]) => el("p", {}, shape(key, "full", true), name)),
@@ -48,6 +41,19 @@ function fillTasks(chosen) {
   options(byId("task"), [["", "all"], ...names.map((name) => [name, taskTitle(name)])]);
 }
 
+/** Pairs are found by their difference too. */
+function fillOutcomes(paired) {
+  const outcomes = Object.entries(OUTCOMES).map(([key, { words }]) => [key, words]);
+  options(byId("outcome"), [
+    ["", "all"],
+    ...(paired ? Object.entries(PAIR_OUTCOMES).map(([key, [words]]) => [key, words]) : []),
+    outcomes[0],
+    ["failed", "any failure"],
+    ...outcomes.slice(1),
+    ["no-video", "no video"],
+  ]);
+}
+
 let drawn = {};
 
 /** Draw what has changed since the last time. */
@@ -61,43 +67,62 @@ function draw() {
   for (const [id, view] of [
     ["to-overview", "overview"],
     ["to-episodes", "episodes"],
+    ["to-compare", "compare"],
   ]) {
     byId(id).href = address({ view });
     if (chosen.view === view) byId(id).setAttribute("aria-current", "page");
     else byId(id).removeAttribute("aria-current");
   }
   if (changed("type")) fillTasks(chosen);
-  for (const key of ["run", "level", "type", "task", "op", "outcome"]) byId(key).value = chosen[key];
+  const compared = chosen.view === "compare";
+  if (changed("view")) fillOutcomes(compared);
+  if (changed("run"))
+    options(
+      byId("beside"),
+      others(chosen.run).map((name) => [name, name]),
+    );
+  byId("beside").parentElement.hidden = !compared;
+  for (const key of ["run", "beside", "level", "type", "task", "op", "outcome"]) byId(key).value = chosen[key];
+  const filters = FILTERS.filter((key) => key !== "q" && chosen[key]).length;
+  byId("chosen").textContent = filters ? ` (${filters})` : "";
   if (document.activeElement !== byId("q")) byId("q").value = chosen.q;
-  if (overview) {
-    detail.stage?.stop();
-    drawOverview(run, chosen);
-  } else {
-    drawEpisodes(run, chosen, changed("run", "view", "level", ...FILTERS));
-  }
-  document.title = `${overview ? run.name : detail.episode ? taskTitle(detail.episode.task) : run.name} · MEMOBench`;
+  if (!compared) pair.clear();
+  if (overview) detail.stop();
+  if (overview) drawOverview(run, chosen);
+  else drawEpisodes(run, chosen, changed("run", "beside", "view", "level", ...FILTERS));
+  document.title = `${overview || !list.selected ? run.name : taskTitle(list.selected.task)} · MEMOBench`;
+  if (drawn.view === chosen.view && changed("ep") && byId("more").open === false) byId("detail").scrollIntoView();
   drawn = chosen;
 }
 
 function drawEpisodes(run, chosen, refill) {
+  const beside = chosen.view === "compare" ? runNamed(chosen.beside) : null;
   if (refill) {
-    const found = filtered(run, chosen);
-    const good = found.filter((episode) => episode.outcome === "success").length;
-    byId("count").textContent = `${found.length} of ${plural(run.episodes.length, "episode")}, ${good} succeeded`;
+    const partners = beside && new Map(beside.episodes.map((episode) => [episode.id, episode]));
+    const found = filtered(run, chosen, partners);
+    const good = found.filter(solved).length;
+    const others = partners && found.filter(({ id }) => solved(partners.get(id))).length;
+    const all = partners ? run.episodes.filter(({ id }) => partners.has(id)) : run.episodes;
+    byId("count").textContent = partners
+      ? `${found.length} of ${plural(all.length, "pair")}, ${good} and ${others} succeeded`
+      : `${found.length} of ${plural(all.length, "episode")}, ${good} succeeded`;
     byId("clear").hidden = FILTERS.every((key) => !chosen[key]);
-    list.fill(found);
+    list.fill(found, partners);
   }
   // A filter may have hidden the selected rollout; the first one found then stands for it.
   const episode = list.episodes.find((it) => it.id === chosen.ep) ?? list.episodes[0];
-  if (!episode) return detail.clear();
+  list.selected = episode;
+  if (!episode) return (pair.clear(), detail.clear());
   list.mark(episode.id);
-  if (detail.episode !== episode) detail.stage?.stop();
-  detail.draw(run, episode, chosen);
+  if (beside || detail.episode !== episode) detail.stop();
+  if (!beside) return detail.draw(run, episode, chosen);
+  detail.episode = null;
+  pair.draw([run, beside], [episode, list.partners.get(episode.id)], chosen);
 }
 
 function listen() {
   addEventListener("hashchange", draw);
-  for (const key of ["run", "level", "task", "op", "outcome"])
+  for (const key of ["run", "beside", "level", "task", "op", "outcome"])
     byId(key).addEventListener("change", (event) => select({ [key]: event.target.value }, { keepHistory: true }));
   byId("type").addEventListener("change", (event) =>
     select({ type: event.target.value, task: "" }, { keepHistory: true }),
@@ -118,6 +143,14 @@ function listen() {
   addEventListener("keydown", onKey);
 }
 
+/** Filters stay open where there is room for them; on a phone they are folded. */
+function foldFilters() {
+  const roomy = matchMedia("(min-width: 52rem)");
+  const fold = () => (byId("more").open = roomy.matches);
+  roomy.addEventListener("change", fold);
+  fold();
+}
+
 function setTheme(theme) {
   document.documentElement.dataset.theme = theme;
   try {
@@ -131,20 +164,21 @@ function onKey(event) {
   const typing = event.target.closest("input, select, textarea, dialog");
   if (event.key === "Escape" && event.target === byId("q")) return byId("q").blur();
   if (typing || event.ctrlKey || event.metaKey || event.altKey) return;
-  const player = selection().view === "episodes" && detail.episode;
+  const player = { episodes: detail.episode && detail, compare: pair.sides.length && pair }[selection().view];
   const step = event.shiftKey ? DATA.fps : 1;
   const actions = {
     j: () => list.move(1),
     k: () => list.move(-1),
     o: () => select({ view: "overview" }, { keepHistory: true }),
     e: () => select({ view: "episodes" }, { keepHistory: true }),
-    "/": () => (select({ view: "episodes" }), byId("q").focus()),
+    s: () => select({ view: VIEWS.at(-1) }, { keepHistory: true }),
+    "/": () => (selection().view === "overview" && select({ view: "episodes" }), byId("q").focus()),
     "?": () => byId("keys").showModal(),
-    ArrowRight: player && (() => detail.seek(detail.frame + step)),
-    ArrowLeft: player && (() => detail.seek(detail.frame - step)),
-    "[": player && (() => detail.jump(-1)),
-    "]": player && (() => detail.jump(1)),
-    " ": player && !event.target.closest("button, a") && (() => detail.stage.toggle()),
+    ArrowRight: player && (() => player.seek(Math.round(player.frame) + step)),
+    ArrowLeft: player && (() => player.seek(Math.round(player.frame) - step)),
+    "[": player && (() => player.jump(-1)),
+    "]": player && (() => player.jump(1)),
+    " ": player && !event.target.closest("button, a") && (() => player.toggle()),
   };
   const action = actions[event.key];
   if (!action) return;
@@ -160,6 +194,7 @@ try {
 }
 if (remembered === "light" || remembered === "dark") document.documentElement.dataset.theme = remembered;
 fillControls();
+foldFilters();
 enableTips();
 listen();
 draw();

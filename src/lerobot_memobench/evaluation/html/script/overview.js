@@ -207,10 +207,17 @@ function tasksTable(run, type, level) {
   );
 }
 
+/** A link that saves a table as CSV. */
+function csvLink(run, key, words, short = "CSV") {
+  const file = `${run.name}-${key}.csv`.replace(/[^\w.-]+/g, "_");
+  const href = `data:text/csv;charset=utf-8,${encodeURIComponent(run.csv[key])}`;
+  return el("a", { class: "csv", href, download: file, "aria-label": `${words} as CSV` }, short);
+}
+
 function drawOverview(run, chosen) {
   const types = DATA.memory_types.filter((type) => run.memory_types[type]);
   byId("overview").replaceChildren(
-    el("h2", { id: "overview-title" }, run.name),
+    el("h2", { id: "overview-title" }, DATA.runs.length > 1 ? `${run.name}: ${run.headline}` : run.headline),
     el(
       "p",
       { class: "facts" },
@@ -231,19 +238,19 @@ function drawOverview(run, chosen) {
       el(
         "section",
         {},
-        el("h3", {}, "Rates"),
+        el("h3", {}, "Rates", csvLink(run, "memory-types", "Rates by memory type")),
         el("div", { class: "scroll" }, summaryTable(run)),
         el("p", { class: "hint" }, RATES_HINT),
       ),
       el(
         "section",
         {},
-        el("h3", {}, "How rollouts end"),
+        el("h3", {}, "How rollouts end", csvLink(run, "failures", "Outcomes")),
         outcomeTable(run),
         outcomeLegend(countOutcomes(run, () => true)),
       ),
     ),
-    el("h3", {}, "Tasks"),
+    el("h3", {}, "Tasks", csvLink(run, "tasks", "Rates by task"), csvLink(run, "prefix", "Prefix completion", "checkpoints, CSV")),
     ...types.map((type) => tasksTable(run, type, chosen.level)),
   );
 }

@@ -10,7 +10,7 @@ function taskPanel(run, episode, level) {
     el("div", { class: "scroll" }, taskRates(episode.task, numbers)),
     checkpointTable(episode, numbers, level),
     el("p", { class: "hint" }, "Rollouts that completed a checkpoint and all before it."),
-    goal ? el("p", { class: "goal" }, el("span", { class: "quiet" }, "Goal "), el("code", {}, goal)) : null,
+    goal ? el("details", { class: "goal" }, el("summary", {}, "Goal, as a formula"), el("code", {}, goal)) : null,
   );
 }
 

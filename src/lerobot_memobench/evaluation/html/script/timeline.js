@@ -20,12 +20,13 @@ function missingCheckpoint(episode) {
   return missing < 0 ? null : missing;
 }
 
-/** Make a timeline. `seek` is called with a frame; the result's `show` moves the playhead there. */
-function timeline(episode, level, seek) {
+/** Make a timeline. `seek` is called with a frame; the result's `show` moves the playhead there. The track is `length`
+    frames long, and the rollout begins `lead` frames into it: two rollouts can be drawn on one scale. */
+function timeline(episode, level, seek, length = lastFrame(episode), lead = 0) {
   const end = lastFrame(episode);
-  const draw = trackTools(end, seek);
+  const draw = trackTools(length, lead, seek);
   const lanes = episode.checkpoints.map((_, k) => checkpointLane(episode, k, level, draw));
-  const slider = timeSlider(end, draw);
+  const slider = timeSlider(end, length - lead, draw);
   const clock = el("span", { class: "words clock" });
   const root = el(
     "div",
@@ -34,7 +35,7 @@ function timeline(episode, level, seek) {
     lanes,
     el("div", { class: "lane" }, el("div", { class: "label" }, clock), slider),
   );
-  root.addEventListener("pointerdown", (event) => drag(event, root, slider, end, seek));
+  root.addEventListener("pointerdown", (event) => drag(event, root, slider, (across) => seek(Math.round(across * length) - lead)));
   slider.addEventListener("keydown", (event) => {
     const jump = { Home: -Infinity, End: Infinity, PageUp: -DATA.fps, PageDown: DATA.fps }[event.key];
     if (jump === undefined) return;
@@ -68,12 +69,12 @@ function subgoalWords(episode, now, level) {
   return checkpointText(episode.task, episode.variant, now.checkpoint, level);
 }
 
-/** Seek to the pointer, and follow it while it is held down. Marks seek by their own click. */
-function drag(event, root, slider, end, seek) {
+/** Tell where the pointer is, from 0 to 1, and follow it while it is held down. Marks seek by their own click. */
+function drag(event, root, slider, moved) {
   if (event.button !== 0 || event.target.closest(".mark") || !event.target.closest(".track")) return;
   const follow = ({ clientX }) => {
     const box = slider.getBoundingClientRect();
-    seek(Math.round(((clientX - box.left) / box.width) * end));
+    moved((clientX - box.left) / box.width);
   };
   const stop = () => {
     root.removeEventListener("pointermove", follow);
