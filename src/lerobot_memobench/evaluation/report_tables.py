@@ -12,7 +12,7 @@ from lerobot_memobench.evaluation.tables import (
     Count,
     Name,
     Numbers,
-    Orders,
+    PrefixRates,
     Section,
     Table,
     best_in_columns,
@@ -119,7 +119,7 @@ def prefix_table(summary: Summary) -> Table:
     width = max((len(found) for found in summary.prefix.values()), default=0)
     rows = []
     for name, plain in summary.prefix.items():
-        cells: list[Cell] = [Orders(*pair) for pair in zip(plain, summary.ordered_prefix[name], strict=True)]
+        cells: list[Cell] = [PrefixRates(*pair) for pair in zip(plain, summary.ordered_prefix[name], strict=True)]
         labels = " ".join(summary.operations_of[name])
         rows.append((Name(name), labels, *cells, *[Numbers("")] * (width - len(cells))))
     return Table(

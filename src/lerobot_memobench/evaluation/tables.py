@@ -37,14 +37,14 @@ class Count(int):
     """A number of things; other integers are labels."""
 
 
-class Orders(NamedTuple):
+class PrefixRates(NamedTuple):
     """Two rates in one cell: of prefixes in any order, and in order."""
 
     any_order: Rate
     in_order: Rate
 
 
-Cell = Rate | Orders | str | int | None
+Cell = Rate | PrefixRates | str | int | None
 """A rate (per cent, with its interval where it has one) or two, text, a number; None where nothing applies."""
 
 
@@ -119,7 +119,7 @@ def figure(value: float | None, sign: bool = False) -> str:
 
 def _words(cell: Cell, interval: str | None, escape: Callable[[str], str] = str) -> str:
     """Return a cell as text; ``interval`` is how an interval is written, None for not at all."""
-    if isinstance(cell, Orders):
+    if isinstance(cell, PrefixRates):
         return escape(" / ".join(figure(rate.value) for rate in cell))
     if not isinstance(cell, Rate):
         return escape(NOT_APPLICABLE if cell is None else str(cell))
@@ -470,7 +470,7 @@ def _csv_rows(table: Table) -> list[dict[str, object]]:
     for row in table.rows:
         found: dict[str, object] = {}
         for column, (name, cell) in enumerate(zip(names, row, strict=True)):
-            if isinstance(cell, Orders):
+            if isinstance(cell, PrefixRates):
                 found |= {f"{name} {order.replace('_', ' ')}": percent(r.value) for order, r in cell._asdict().items()}
             elif column in rates:
                 rate = cell if isinstance(cell, Rate) else Rate(None, 0)
