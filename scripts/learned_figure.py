@@ -1,7 +1,7 @@
-"""The README's figure and the differences told with it, of evaluations that need not be of the same size.
+"""Bars and differences of evaluations that need not be of the same size: those of the note on thirty tasks.
 
     python scripts/learned_figure.py "with memory=outputs/eval/small" "without memory=outputs/eval/memoryless" \
-        --out docs/figures/learned.png
+        --out outputs/learned.png
 
 Bars are of all rollouts of the tasks that all arms have; differences from the first arm, and the table by task, of the
 episodes that they have.

@@ -250,3 +250,19 @@ def test_a_folder_gets_pdf_and_png_and_the_same_figure_the_same_pdf(tmp_path: Pa
     assert first[0].read_bytes() == again[0].read_bytes()
     with pytest.raises(MemobenchError, match=r"\.gif"):
         style.save(rollouts.draw_failures(bars), tmp_path / "f.gif", "f")
+
+
+def test_long_titles_are_wrapped_and_not_cut() -> None:
+    """Tasks differ at their titles' ends: no bar and no panel loses its own."""
+    title = " ".join(["put the first thing into the top drawer"] * 3)
+    bars = rollouts.draw_failures([rollouts.Bar(title, "mine", (("success", 1, ""),))])
+    panel = rollouts.draw_prefix([rollouts.Panel(title, "SC", (rollouts.Curve("mine", (50.0, 25.0)),))])
+    told = bars.axes[0].get_yticklabels()[0].get_text(), panel.axes[0].get_title()
+    assert [" ".join(one.split()) for one in told] == [f"{title} mine", title]
+    assert {"S: storage", "C: compression"} < {text.get_text() for text in panel.legends[0].get_texts()}
+
+
+def test_a_figure_tells_how_much_was_run_and_what_was_seen(runs: list[Run]) -> None:
+    told = style.caption(runs, paper=True)
+    assert told.count("2 tasks, 8 rollouts, inputs: ") == 2
+    assert told.endswith("paper: 30 tasks, 1,500 rollouts each, inputs: pixels")

@@ -6,10 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageFont
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim import gallery
+
+STOVE = "turn_on_the_stove_and_turn_it_off"
+BOWLS = "put_the_butter_into_the_bowl_from_the_prompt_video"
 
 
 def test_grid_has_room_for_every_picture() -> None:
@@ -19,6 +22,23 @@ def test_grid_has_room_for_every_picture() -> None:
         assert (sheet == 10 * k).all(axis=2).sum() >= 40 * 60
     with pytest.raises(MemobenchError, match="nothing to draw"):
         gallery.grid([], 2)
+
+
+def test_long_labels_are_wrapped_and_not_cut() -> None:
+    picture = np.full((40, 60, 3), 200, np.uint8)
+    short, long = (gallery.grid([(text, picture)], 1, label=10) for text in ("plate", "put the milk on the plate"))
+    assert long.width == short.width
+    assert long.height > short.height + 10
+    wrapped = gallery._wrapped("put the milk on the plate", ImageFont.load_default(10), 60)
+    assert " ".join(wrapped) == "put the milk on the plate"
+    assert max(ImageFont.load_default(10).getlength(line) for line in wrapped) <= 60
+
+
+def test_tasks_stand_under_their_memory_type(gl: str) -> None:
+    one = gallery.draw_tasks([STOVE], size=64)
+    two = gallery.draw_tasks([STOVE, BOWLS], size=64)
+    assert (one.width, two.width) == (64 + 12, 64 + 12)
+    assert two.height > 2 * one.height - 20
 
 
 def test_figures_are_shrunk_until_they_are_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -38,8 +58,6 @@ def test_folder_that_cannot_be_written(tmp_path: Path) -> None:
 
 
 def test_sheets(gl: str) -> None:
-    tasks = gallery.draw_tasks(["turn_on_the_stove_and_turn_it_off"], size=64)
-    assert tasks.width == 64 + 12
     objects = gallery.draw_objects(["butter", "milk"], size=32)
     assert objects.width == 2 * 4 * 32 + 18
     closed_and_open = np.asarray(gallery.draw_fixtures(["microwave"], size=64)).astype(int)

@@ -66,7 +66,7 @@ def radar(
             ("Main results", [*ours, *published_entries("main")]),
             ("Memory alignment", [*ours, *published_entries("alignment")]),
         ]
-    _save(draw_radar(webs, chosen), out, "radar" if axes is Axes.AVERAGE else "radar_types")
+    _save(draw_radar(webs, chosen), out, "radar" if axes is Axes.AVERAGE else "radar_types", runs, paper)
 
 
 @app.command()
@@ -88,7 +88,7 @@ def correlations(
         raise MemobenchError("the paper publishes no figures per task; leave out --by tasks or --with paper")
     rows = [*(published_entries("main") if paper else ()), *entries_of(runs)]
     by_task = by is Grouping.TASKS or (by is None and not paper)
-    _save(draw_correlations(rows, by_task), out, "correlations")
+    _save(draw_correlations(rows, by_task), out, "correlations", runs, paper)
 
 
 @app.command()
@@ -103,7 +103,7 @@ def failures(
 
     runs, paper = given_runs(folders, with_)
     drawn = [*bars(runs, by is Grouping.TASKS), *([paper_bar()] if paper else [])]
-    _save(draw_failures(drawn), out, "failures")
+    _save(draw_failures(drawn), out, "failures", runs, paper=False)
 
 
 @app.command()
@@ -120,7 +120,7 @@ def prefix(
 
     runs, paper = given_runs(folders, with_)
     drawn = panels(runs, None if tasks is None else _chosen(tasks, runs))
-    _save(draw_prefix([*drawn, *([paper_panel()] if paper else [])]), out, "prefix")
+    _save(draw_prefix([*drawn, *([paper_panel()] if paper else [])]), out, "prefix", runs, paper=False)
 
 
 @app.command()
@@ -138,7 +138,7 @@ def replan(
     runs, paper = given_runs(folders, with_)
     if by is Grouping.TASKS:
         raise MemobenchError("found --by tasks; expected types: replan curves are drawn of averages and memory types")
-    _save(draw_replan(runs, paper, by is Grouping.TYPES), out, "replan")
+    _save(draw_replan(runs, paper, by is Grouping.TYPES), out, "replan", runs, paper)
 
 
 def _chosen(spec: str, runs: list[Run]) -> list[str]:
@@ -152,9 +152,11 @@ def _chosen(spec: str, runs: list[Run]) -> list[str]:
     return [name for name in chosen if name in there] or chosen
 
 
-def _save(figure: Figure, out: Path, name: str) -> None:
-    from lerobot_memobench.evaluation.figures.style import paper_style, save
+def _save(figure: Figure, out: Path, name: str, runs: list[Run], paper: bool) -> None:
+    """Write a figure, and say where it is and what its caption has to tell; ``paper``: of the paper's rows as well."""
+    from lerobot_memobench.evaluation.figures.style import caption, paper_style, save
 
     with paper_style():
         for path in save(figure, out, name):
             say(path)
+    say(caption(runs, paper))

@@ -60,20 +60,21 @@ def write_gallery(folder: str | Path, suite: str = PUBLISHED) -> list[Path]:
 
 
 def draw_tasks(names: Sequence[str] | None = None, size: int = 256) -> Image.Image:
-    """Return the initial scenes of tasks as the agentview camera sees them, all of the catalogue by default."""
-    cells = []
+    """Return the initial scenes of tasks by memory type, as the agentview camera sees them; by default of all."""
+    cells: dict[str, list[tuple[str, Pixels]]] = {}
     for name in names or task_names():
         task = get_task(name)
         sim = Simulation(task, RenderSettings(size, size, "high"))
         sim.reset(SEED)
-        cells.append((f"{task.memory_type}: {task.title}", sim.render("agentview")))
-    return grid(cells, min(6, len(cells)), label=11, lines=3)
+        cells.setdefault(task.memory_type, []).append((task.title, sim.render("agentview")))
+    columns, label = min(5, max(map(len, cells.values()))), size * 19 // 256
+    return stack([grid(found, columns, label, heading=memory_type) for memory_type, found in cells.items()])
 
 
 def draw_objects(classes: Sequence[str] | None = None, size: int = 112) -> Image.Image:
     """Return each class from four sides, all object classes of the catalogue by default."""
     cells = [_cells(name, TURNTABLE, size)[0] for name in classes or catalogue_classes("objects")]
-    return grid(cells, min(3, len(cells)), label=13, lines=1)
+    return grid(cells, min(3, len(cells)), label=20)
 
 
 def draw_fixtures(classes: Sequence[str] | None = None, size: int = 224) -> Image.Image:
@@ -81,7 +82,7 @@ def draw_fixtures(classes: Sequence[str] | None = None, size: int = 224) -> Imag
     cells = []
     for name in classes or catalogue_classes("fixtures"):
         cells += _cells(name, [v._replace(azimuth=v.azimuth + FRONTS.get(name, 0.0)) for v in (FRONT, SIDE)], size)
-    return grid(cells, 2, label=14, lines=1)
+    return grid(cells, 2, label=16)
 
 
 def catalogue_classes(kind: Literal["objects", "fixtures"]) -> list[str]:
@@ -146,31 +147,48 @@ def _add_camera(spec: mujoco.MjSpec, name: str, target: NDArray[np.float64], vie
 # --- sheets ---
 
 
-def grid(cells: Sequence[tuple[str, Pixels]], columns: int, label: int = 12, lines: int = 2) -> Image.Image:
-    """Return pictures of one size in rows, each above its label."""
+def grid(cells: Sequence[tuple[str, Pixels]], columns: int, label: int = 12, heading: str = "") -> Image.Image:
+    """Return pictures of one size in rows, each above its label, under a heading where there is one."""
     if not cells:
         raise MemobenchError("there is nothing to draw: name at least one task or class")
     height, width = cells[0][1].shape[:2]
-    gap, text_height = 6, lines * (label + 3) + 4
-    rows = -(-len(cells) // columns)
-    sheet = Image.new("RGB", (columns * (width + gap) + gap, rows * (height + text_height + gap) + gap), BACKGROUND)
-    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(label)
-    for index, (name, picture) in enumerate(cells):
-        x = gap + index % columns * (width + gap)
-        y = gap + index // columns * (height + text_height + gap)
-        sheet.paste(Image.fromarray(picture), (x, y))
-        words = [""]
-        for word in name.split():
-            longer = f"{words[-1]} {word}".strip()
-            if draw.textlength(longer, font=font) <= width or not words[-1]:
-                words[-1] = longer
-            else:
-                words.append(word)
-        if len(words) > lines:
-            words = [*words[: lines - 1], words[lines - 1] + " …"]
-        for row, line in enumerate(words):
-            draw.text((x + 1, y + height + 2 + row * (label + 3)), line, fill=INK, font=font)
+    gap, line, font = 6, label + 3, ImageFont.load_default(label)
+    labels = [_wrapped(name, font, width) for name, _ in cells]
+    rows = [range(start, min(start + columns, len(cells))) for start in range(0, len(cells), columns)]
+    heights = [height + line * max(len(labels[k]) for k in row) + 2 * gap for row in rows]
+    top = gap + (2 * line if heading else 0)
+    sheet = Image.new("RGB", (columns * (width + gap) + gap, top + sum(heights)), BACKGROUND)
+    draw = ImageDraw.Draw(sheet)
+    draw.text((gap, gap), heading, fill=INK, font=ImageFont.load_default(round(1.3 * label)))
+    for row, tall in zip(rows, heights, strict=True):
+        for column, k in enumerate(row):
+            x = gap + column * (width + gap)
+            sheet.paste(Image.fromarray(cells[k][1]), (x, top))
+            for number, words in enumerate(labels[k]):
+                draw.text((x + 1, top + height + 2 + number * line), words, fill=INK, font=font)
+        top += tall
     return sheet
+
+
+def _wrapped(text: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont, width: int) -> list[str]:
+    """Return a text in lines that are no wider than so many pixels, where its words allow it."""
+    lines: list[str] = []
+    for word in text.split():
+        if lines and font.getlength(f"{lines[-1]} {word}") <= width:
+            lines[-1] += f" {word}"
+        else:
+            lines.append(word)
+    return lines
+
+
+def stack(sheets: Sequence[Image.Image]) -> Image.Image:
+    """Return sheets one under the other."""
+    whole = Image.new("RGB", (max(one.width for one in sheets), sum(one.height for one in sheets)), BACKGROUND)
+    top = 0
+    for one in sheets:
+        whole.paste(one, (0, top))
+        top += one.height
+    return whole
 
 
 def save(sheet: Image.Image, path: str | Path) -> Path:

@@ -35,6 +35,9 @@ if TYPE_CHECKING:
 NARROWEST_LABEL = 5.0
 """Per cent; in narrower parts of a bar there is no room for a figure."""
 
+HEADING = 52
+"""Characters of a line beside a bar."""
+
 PAPER_PARTS = {
     "success": ("success", ""),
     "storage_failure": ("storage_failure", ""),
@@ -141,16 +144,15 @@ def _draw_bar(axis: Any, bar: Bar, place: float) -> None:
 def _failures_label(found: Sequence[Bar], k: int) -> str:
     bar = found[k]
     first = k == 0 or found[k - 1].heading != bar.heading
-    heading = bar.heading.replace("_", " ") if first else ""
-    if len(heading) > 46:
-        heading = heading[:45] + "…"
+    heading = textwrap.fill(bar.heading.replace("_", " "), HEADING) if first else ""
     parts = [heading, literal(bar.name)]
     return "   ".join(part for part in parts if part)
 
 
 # --- prefix completion: one panel per task (paper, ablations) ---
 
-COLUMNS = 5
+COLUMNS = 4
+OPERATIONS = {"S": "storage", "U": "update", "C": "compression"}
 
 
 @dataclass(frozen=True)
@@ -230,12 +232,12 @@ def paper_panel() -> Panel:
 
 
 def draw_prefix(found: Sequence[Panel]) -> Figure:
-    """Draw the panels, at most five in a row."""
+    """Draw the panels, at most `COLUMNS` in a row: as wide as a page."""
     looks = looks_of(curve.identity for panel in found for curve in panel.curves)
     columns = min(COLUMNS, len(found))
     rows = math.ceil(len(found) / columns)
     with paper_style():
-        figure = new_figure(max(2.1 * columns, 3.6), 1.9 * rows + 0.6)
+        figure = new_figure(max(1.85 * columns, 3.6), 1.8 * rows + 0.7)
         places = figure.subplots(rows, columns, sharey=True, squeeze=False)
         for place, panel in zip_longest(places.flat, found):
             if panel is None:
@@ -243,26 +245,32 @@ def draw_prefix(found: Sequence[Panel]) -> Figure:
             else:
                 _draw_prefix_panel(place, panel, looks)
         for place in places[:, 0]:
-            place.set_ylabel("prefix, %")
+            place.set_ylabel("prefix completed, %")
         _prefix_legend(figure, found, looks, columns)
         return figure
 
 
 def _prefix_legend(figure: Figure, found: Sequence[Panel], looks: Mapping[Identity, Line], columns: int) -> None:
     from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
 
-    handles = [Line2D([], [], **look.drawn, ms=4, lw=1.3) for look in looks.values()]
+    handles: list[Any] = [Line2D([], [], **look.drawn, ms=4, lw=1.3) for look in looks.values()]
     labels = [literal(f"paper, {name}" if published else name) for name, published in looks]
     if any(curve.ordered not in (None, curve.plain) for panel in found for curve in panel.curves):
         handles.append(Line2D([], [], color=FAINT, marker="o", mfc="white", ls=":", ms=4, lw=1.0))
         labels.append("in order, where it differs")
-    legend_below(figure, handles, labels, min(len(handles), 2 if columns < 3 else 4))
+    asked = {operation for panel in found for operation in panel.operations}
+    for operation, name in OPERATIONS.items():
+        if operation in asked:
+            handles.append(Patch(facecolor=OPERATION_COLOURS[operation]))
+            labels.append(f"{operation}: {name}")
+    legend_below(figure, handles, labels, min(len(handles), 2 if columns < 3 else 3 if len(looks) % 2 else 4))
 
 
 def _draw_prefix_panel(place: Any, panel: Panel, looks: Mapping[Identity, Line]) -> None:
     for curve in panel.curves:
         _draw_curve(place, curve, looks[curve.identity], shaded=len(panel.curves) <= 3)
-    place.set_title(textwrap.fill(panel.title, 34, max_lines=3, placeholder=" …"), fontsize=6.5, fontweight="normal")
+    place.set_title(textwrap.fill(panel.title, 30), fontsize=7, fontweight="normal")
     place.set_ylim(0, 102)
     place.set_yticks(range(0, 101, 25))
     place.grid(axis="y", color=GRID, lw=0.5)

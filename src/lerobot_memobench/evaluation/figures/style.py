@@ -18,7 +18,7 @@ from lerobot_memobench.envs.video import OPERATION_COLOURS as VIDEO_COLOURS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import METRICS, Row
 from lerobot_memobench.evaluation.records import Run
-from lerobot_memobench.evaluation.report_tables import PAPER_INPUTS, extent
+from lerobot_memobench.evaluation.report_tables import PAPER_EPISODES, PAPER_INPUTS, PAPER_TASKS, count_of, extent
 from lerobot_memobench.io import draft_of
 from lerobot_memobench.paper import published_rows, shuffled_control
 from lerobot_memobench.tasks.task import MEMORY_TYPES
@@ -179,7 +179,7 @@ def save(figure: Figure, out: Path, name: str) -> list[Path]:
         # Without its date, the same figures give the same file.
         metadata = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}.get(path.suffix.lower())
         with draft_of(path) as draft:
-            figure.savefig(draft, dpi=200, metadata=metadata)
+            figure.savefig(draft, dpi=200, metadata=metadata, bbox_inches="tight", pad_inches=0.06)
     return paths
 
 
@@ -241,6 +241,20 @@ def remarks_on(run: Run) -> tuple[str, ...]:
     """Return how much was run and the policy's inputs, each where it is not the paper's."""
     inputs = "" if run.summary.inputs == PAPER_INPUTS else f"inputs: {run.summary.inputs}"
     return tuple(filter(None, (extent(run), inputs)))
+
+
+def caption(runs: Sequence[Run], paper: bool) -> str:
+    """Return what a figure does not say of its rows: tasks, rollouts, and the policies' inputs."""
+    rows = [
+        f"{run.name}: {count_of(len(run.summary.tasks), 'task')}, {count_of(run.summary.rollouts, 'rollout')}, inputs: "
+        f"{run.summary.inputs}"
+        for run in runs
+    ]
+    if paper:
+        rows.append(
+            f"paper: {PAPER_TASKS} tasks, {PAPER_TASKS * PAPER_EPISODES:,} rollouts each, inputs: {PAPER_INPUTS}"
+        )
+    return "; ".join(rows)
 
 
 def with_remarks(name: str, remarks: Iterable[tuple[str, ...]]) -> str:
