@@ -4,26 +4,42 @@ A hook stands in the place of a function of theirs for as long as somebody needs
 calls that function with layers of ours around it. It goes with the last of those. A decorator that somebody else puts
 around it, before or after, stays and is called too: whether a hook stands is told by the function itself, which is kept
 here, and by no attribute that a decorator could copy. What a layer does is beside the code that needs it.
+
+LeRobot 0.6.1 and its main branch were read. A version between that nobody has read is taken by what it is: the function
+must take what is handed to it, and LeRobot must still call it with what a layer reads; else one sentence refuses it.
 """
 
 from __future__ import annotations
 
+import ast
 import functools
+import hashlib
 import importlib
+import importlib.util
 import inspect
+import logging
 import sys
 import threading
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
+from pathlib import Path
 from typing import Any
+
+from packaging.specifiers import SpecifierSet
 
 from lerobot_memobench.errors import MemobenchError
 
 LEROBOT = "0.6.1"
-"""The version of LeRobot whose functions were read."""
+"""The version of LeRobot that requirements.lock pins."""
+READ = (LEROBOT, "0.6.2")
+"""The versions whose functions were read: that one, and what the main branch calls itself."""
+SUPPORTED = SpecifierSet(">=0.6.1,<0.8", prereleases=True)
+"""The versions that pyproject.toml allows."""
+
+logger = logging.getLogger(__name__)
 
 Function = Callable[..., Any]
 Layer = Callable[[Function], Function]
@@ -38,8 +54,9 @@ class Hook:
         module: that holds it. name: its name there; of a method, behind that of its class.
         parameters: what it must take, in this order where they are handed over by place.
         does: what it is made to do. why: what it would do otherwise.
+        caller: a module of theirs that must call it. by_name: the keywords that a layer reads of such a call.
         everywhere: whether it is replaced in each module that imported it by its name too.
-        version: of the package, that was read.
+        package: that it is part of. read: the versions of it that were read.
     """
 
     module: str
@@ -47,8 +64,16 @@ class Hook:
     parameters: tuple[str, ...]
     does: str
     why: str
+    caller: str | None = None
+    by_name: tuple[str, ...] = ()
     everywhere: bool = False
-    version: str = f"lerobot {LEROBOT}"
+    package: str = "lerobot"
+    read: tuple[str, ...] = READ
+
+    @property
+    def version(self) -> str:
+        """The package and the versions of it that were read."""
+        return f"{self.package} {', '.join(self.read)}"
 
 
 RUN_ONE = Hook(
@@ -57,6 +82,8 @@ RUN_ONE = Hook(
     ("policy", "n_episodes", "max_episodes_rendered", "videos_dir", "start_seed", "recording_dir"),
     "run given episodes of a task, and render none",
     "LeRobot runs a task's episodes from the first on, and renders ten of them a second time",
+    caller="lerobot.scripts.lerobot_eval",
+    by_name=("policy", "n_episodes", "max_episodes_rendered", "videos_dir", "start_seed", "recording_dir"),
 )
 ROLLOUT = Hook(
     "lerobot.scripts.lerobot_eval",
@@ -64,6 +91,8 @@ ROLLOUT = Hook(
     ("env", "policy", "seeds"),
     "seed each batch of episodes by itself, and draw only the observations that a policy needs",
     "LeRobot seeds once per run, so a resumed run would draw other numbers, and it draws every picture",
+    caller="lerobot.scripts.lerobot_eval",
+    by_name=("env", "policy", "seeds"),
 )
 INSIDE_SLURM = Hook(
     "lerobot.scripts.lerobot_eval",
@@ -78,6 +107,7 @@ OPEN_DATASETS = Hook(
     ("cfg",),
     "leave frames of demonstration prompts out, choose a policy's inputs, tell a held-out part its training",
     "LeRobot trains on prompts, whose actions have no effect, and takes pictures and object state alike for inputs",
+    caller="lerobot.scripts.lerobot_train",
     everywhere=True,
 )
 MAKE_PROCESSORS = Hook(
@@ -86,6 +116,7 @@ MAKE_PROCESSORS = Hook(
     ("policy_cfg", "pretrained_path", "pretrained_revision"),
     "hand a training to the steps of its policy that are rebuilt from a checkpoint",
     "LeRobot rebuilds saved steps without telling them the policy or the dataset",
+    caller="lerobot.scripts.lerobot_train",
     everywhere=True,
 )
 DRAW_FRAMES = Hook(
@@ -97,6 +128,8 @@ DRAW_FRAMES = Hook(
     ),
     "begin episodes at their execution, and draw frames in groups and tasks in turns, where a policy asks for it",
     "LeRobot draws all frames of all episodes, each once",
+    caller="lerobot.scripts.lerobot_train",
+    by_name=("drop_n_last_frames", "episode_indices_to_use", "shuffle", "seed", "absolute_to_relative_idx"),
 )
 READ_SAMPLE = Hook(
     "lerobot.datasets.dataset_reader",
@@ -104,6 +137,7 @@ READ_SAMPLE = Hook(
     ("self", "idx"),
     "give samples without pictures out of main memory, of the dataset object that such a policy is trained on",
     "LeRobot decodes the videos of every sample, wanted or not",
+    caller="lerobot.datasets.lerobot_dataset",
 )
 ATTEND = Hook(
     "transformers.models.gemma.modeling_gemma",
@@ -111,7 +145,9 @@ ATTEND = Hook(
     ("module", "query", "key", "value", "attention_mask", "scaling"),
     "compute attention in one kernel where a policy with a visual encoder learns",
     "LeRobot's pi0.5 calls this function by its name, whatever `attn_implementation` says",
-    version="transformers 5.5.4",
+    caller="lerobot.policies.pi05.modeling_pi05",
+    package="transformers",
+    read=("5.5.4",),
 )
 HOOKS = (RUN_ONE, ROLLOUT, INSIDE_SLURM, OPEN_DATASETS, MAKE_PROCESSORS, DRAW_FRAMES, READ_SAMPLE, ATTEND)
 
@@ -121,6 +157,7 @@ class _Standing:
 
     def __init__(self, hook: Hook, holder: Any, theirs: Function) -> None:
         _check_parameters(hook, theirs)
+        _check_caller(hook)
         self.hook, self.holder, self.name, self.theirs = hook, holder, hook.name.rpartition(".")[2], theirs
         self.layers: list[Layer] = []
         self.called = theirs
@@ -185,7 +222,7 @@ def install(hook: Hook, layer: Layer) -> Callable[[], None]:
     """Lay something around a function of theirs, outside of what lies there; return what takes it away again.
 
     Raises:
-        MemobenchError: the function does not take what the one that was read takes.
+        MemobenchError: the function does not take what the one that was read takes, or nothing calls it any more.
     """
     with _LOCK:
         places = _places(hook)
@@ -230,7 +267,7 @@ def table() -> str:
 
 
 def check_version(part: str = "evaluation loop") -> None:
-    """Refuse another LeRobot than the one whose loops are known: another one may run other episodes, or unseeded ones.
+    """Refuse a LeRobot beside those that are supported: it may run other episodes, or unseeded ones.
 
     Args:
         part: what is steered, for the message.
@@ -239,11 +276,67 @@ def check_version(part: str = "evaluation loop") -> None:
         MemobenchError: it is installed.
     """
     found = metadata.version("lerobot")
-    if found != LEROBOT:
+    if found not in SUPPORTED:
         raise MemobenchError(
-            f"lerobot {found} is installed, and the benchmark steers the {part} of lerobot {LEROBOT}; install "
+            f"lerobot {found} is installed, and the benchmark steers the {part} of lerobot{SUPPORTED}; install "
             f"lerobot=={LEROBOT} (make setup)"
         )
+    if found not in READ:
+        _say_unread(found)
+
+
+@functools.cache
+def _say_unread(found: str) -> None:
+    logger.warning("lerobot %s was not tried with this version; tried: %s", found, ", ".join(READ))
+
+
+def is_read(function: Function, known: Collection[str]) -> bool:
+    """Return whether a function is one that was read, whatever decorators lie around it.
+
+    Args:
+        known: `digest` of each that was.
+    """
+    return digest(function) in known
+
+
+def digest(function: Function) -> str | None:
+    """Return the first digits of the hash of a function's source; None where it has none."""
+    try:
+        source = inspect.getsource(inspect.unwrap(function))
+    except (OSError, TypeError):
+        return None
+    return hashlib.sha256(source.encode()).hexdigest()[:12]
+
+
+def _advice(hook: Hook) -> str:
+    """Return what to do where a function of theirs is another one."""
+    return (
+        f"{hook.package} {metadata.version(hook.package)} is installed, or something has replaced it; install "
+        f"{hook.package}=={hook.read[0]} (make setup), or leave out what replaces it"
+    )
+
+
+def _check_caller(hook: Hook) -> None:
+    """Refuse to lay anything around a function of a version that nobody has read, if nothing there calls it.
+
+    Raises:
+        MemobenchError: no call in the module that should do so, or none that names what a layer reads of it.
+    """
+    if hook.caller is None or metadata.version(hook.package) in hook.read:
+        return
+    spec = importlib.util.find_spec(hook.caller)
+    source = "" if spec is None or spec.origin is None else Path(spec.origin).read_text(encoding="utf-8")
+    owner, _, name = hook.name.rpartition(".")
+    wanted = owner if name == "__init__" else name
+    for call in (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call)):
+        # A call of it, or one that hands it on, as to functools.partial.
+        called = {ast.unparse(part).rpartition(".")[2] for part in (call.func, *call.args[:1])}
+        if wanted in called and set(hook.by_name) <= {keyword.arg for keyword in call.keywords}:
+            return
+    raise MemobenchError(
+        f"{hook.caller} does not call {wanted}({', '.join(f'{name}=' for name in hook.by_name)}) any more, as in "
+        f"{hook.version}, where it is made to {hook.does}: {_advice(hook)}"
+    )
 
 
 def _check_parameters(hook: Hook, function: Function) -> None:
@@ -252,11 +345,9 @@ def _check_parameters(hook: Hook, function: Function) -> None:
     open_ended = any(parameter.kind is parameter.VAR_KEYWORD for parameter in found.values())
     if open_ended or set(hook.parameters) <= set(found):
         return
-    package, version = hook.version.split()
     raise MemobenchError(
         f"{hook.module}.{hook.name} takes ({', '.join(found)}) and not ({', '.join(hook.parameters)}), as in "
-        f"{hook.version}, where it is made to {hook.does}: {package} {metadata.version(package)} is installed, or "
-        f"something has replaced it; install {package}=={version} (make setup), or leave out what replaces it"
+        f"{hook.version}, where it is made to {hook.does}: {_advice(hook)}"
     )
 
 

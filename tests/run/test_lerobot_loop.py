@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
+import dataclasses
 import inspect
 import pkgutil
 import random
@@ -18,7 +18,17 @@ from lerobot.scripts import lerobot_eval
 
 from lerobot_memobench import lerobot_hooks
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.run.rollout import KEEPS_FRAMES, KNOWN, RECORDS, batch_seed, steered
+from lerobot_memobench.run import rollout as rollouts
+from lerobot_memobench.run.rollout import (
+    KEEPS_FRAMES,
+    KNOWN,
+    LOOPS,
+    RECORDS,
+    batch_seed,
+    needs_observation,
+    sparing,
+    steered,
+)
 
 
 class Env:
@@ -29,7 +39,7 @@ class Env:
 
 # --- what is relied on: where one of these fails, LeRobot's loop is another one ---
 
-MODULE = "src/lerobot_memobench/run/loop, and lerobot/scripts/lerobot_eval.py beside it"
+MODULE = "src/lerobot_memobench/run/rollout.py, and lerobot/scripts/lerobot_eval.py beside it"
 
 PARAMETERS = {
     "run_one": {
@@ -70,27 +80,25 @@ CALLS = {
 
 READ = {
     "lerobot.scripts.lerobot_eval.rollout": (
-        "ed85d8da2c46",
+        LOOPS,
         "src/lerobot_memobench/run/rollout.py takes the same steps in the same order",
     ),
     "lerobot.envs.utils.preprocess_observation": (
-        "10196a71b8af",
+        ("10196a71b8af",),
         "src/lerobot_memobench/run/rollout.py keeps the pictures that it makes, by their names",
     ),
-    "lerobot.policies.act.modeling_act.ACTPolicy.select_action": ("031085d1a22c", LOOKING),
-    "lerobot.policies.pi0.modeling_pi0.PI0Policy.select_action": ("a330b536084c", LOOKING),
-    "lerobot.policies.pi05.modeling_pi05.PI05Policy.select_action": ("a330b536084c", LOOKING),
-    "lerobot.policies.smolvla.modeling_smolvla.SmolVLAPolicy.select_action": ("3b7b12d0066f", LOOKING),
-    "lerobot.policies.smolvla.modeling_smolvla.SmolVLAPolicy._prepare_batch": ("57d81cd4cddd", LOOKING),
+    **{f"{module}.{name}.select_action": (policy.read, LOOKING) for (module, name), policy in KNOWN.items()},
+    "lerobot.policies.smolvla.modeling_smolvla.SmolVLAPolicy._prepare_batch": (("57d81cd4cddd",), LOOKING),
 }
-"""Function that was read -> the first digits of its source's hash, and what was written by it."""
+"""Function that was read -> the first digits of its source's hash in LeRobot 0.6.1 and its main where they differ, and
+what was written by it."""
 
 
-def test_this_is_the_lerobot_whose_loop_is_known() -> None:
+def test_this_is_a_lerobot_whose_loop_is_known() -> None:
     found = metadata.version("lerobot")
-    assert found == lerobot_hooks.LEROBOT, (
+    assert found in lerobot_hooks.READ, (
         f"lerobot {found} is installed. Read {MODULE}: does it still do what the tests below say? Compare the film and "
-        "the log of one killed and resumed evaluation (tests/cli/test_killed_evaluation.py), then change LEROBOT"
+        "the log of one killed and resumed evaluation (tests/cli/test_killed_evaluation.py), then add it to READ"
     )
 
 
@@ -112,28 +120,68 @@ def test_lerobot_calls_what_is_put_in_its_place(function: str, call: str) -> Non
 
 @pytest.mark.parametrize("function", READ)
 def test_lerobot_does_what_was_read(function: str) -> None:
-    found, (known, why) = hash_of(function), READ[function]
-    assert found == known, f"{function} is another one ({found}), and {why}: read it again, then note its hash here"
-
-
-def hash_of(function: str) -> str:
-    """The first digits of the hash of a function's source."""
-    return hashlib.sha256(inspect.getsource(pkgutil.resolve_name(function)).encode()).hexdigest()[:12]
-
-
-def test_all_policies_whose_looking_is_known_were_read() -> None:
-    assert {f"{module}.{name}.select_action" for module, name in KNOWN} <= set(READ)
+    found, (known, why) = lerobot_hooks.digest(pkgutil.resolve_name(function)), READ[function]
+    assert found in known, f"{function} is another one ({found}), and {why}: read it again, then note its hash"
 
 
 def test_another_lerobot_is_refused_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(metadata, "version", lambda name: "0.7.0")
+    monkeypatch.setattr(metadata, "version", lambda name: "0.8.0")
     before = lerobot_eval.run_one, lerobot_eval.rollout
     with (
-        pytest.raises(MemobenchError, match=r"lerobot 0\.7\.0 is installed.* install lerobot==0\.6\.1"),
+        pytest.raises(MemobenchError, match=r"lerobot 0\.8\.0 is installed.* install lerobot==0\.6\.1"),
         steered(7, {}),
     ):
         pass
     assert (lerobot_eval.run_one, lerobot_eval.rollout) == before
+
+
+# --- a version that nobody has read ---
+
+
+@pytest.fixture
+def unread(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metadata, "version", lambda name: "0.7.5")
+
+
+@pytest.mark.usefixtures("unread")
+@pytest.mark.parametrize("hook", lerobot_hooks.HOOKS, ids=lambda hook: hook.name)
+def test_an_unread_version_that_calls_the_same_functions_is_taken(hook: lerobot_hooks.Hook) -> None:
+    lerobot_hooks.install(hook, lambda theirs: theirs)()
+
+
+@pytest.mark.usefixtures("unread")
+def test_an_unread_version_that_calls_another_function_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lerobot_eval, "run_one", lambda *_, **named: None)  # a place that no hook has stood in
+    odd = dataclasses.replace(lerobot_hooks.RUN_ONE, by_name=("episodes",))
+    with pytest.raises(MemobenchError, match=r"lerobot_eval does not call run_one\(episodes=\) any more.*make setup"):
+        lerobot_hooks.install(odd, lambda theirs: theirs)
+
+
+def test_an_unread_loop_rolls_out_itself_and_gets_every_picture() -> None:
+    calls: list[dict[str, Any]] = []
+    policy = SimpleNamespace(parameters=tuple)
+    sparing(lambda env, policy, **named: calls.append(named), lambda: True)(env=None, policy=policy, seeds=[1])
+    assert calls == [{"seeds": [1]}]
+
+
+@pytest.mark.parametrize("read", [True, False])
+def test_an_unread_policy_needs_every_observation(read: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    from lerobot.policies.act.modeling_act import ACTPolicy
+
+    policy = ACTPolicy.__new__(ACTPolicy)
+    vars(policy).update(config=SimpleNamespace(temporal_ensemble_coeff=None), _action_queue=[1])
+    monkeypatch.setattr(rollouts, "is_read", lambda function, known: read)
+    assert needs_observation(policy)() is not read
+
+
+def test_a_visual_memory_needs_every_observation() -> None:
+    """Between two chunks too: its queue takes in one picture per control step."""
+    pi05 = KNOWN["lerobot.policies.pi05.modeling_pi05", "PI05Policy"]
+    acting = {
+        memory: SimpleNamespace(config=SimpleNamespace(use_visual_memory=memory), _action_queue=[1])
+        for memory in (False, True)
+    }
+    assert {memory: pi05.needs(policy) for memory, policy in acting.items()} == {False: False, True: True}
 
 
 # --- what it is made to do ---

@@ -9,8 +9,9 @@ two of these a policy is handed the pictures and objects of the last one, which 
 of an observation is of the present. The environment records videos itself (``env.videos``): LeRobot would render ten
 episodes of each task a second time. What a dataset is asked for of a rollout, `recording` writes.
 
-Written against the loop of one version: what it relies on is listed in tests/run/test_lerobot_loop.py, whose failures
-say what to look at when LeRobot moves on. How it gets there, and out again: `lerobot_hooks`.
+Written against loops that were read: what it relies on is listed in tests/run/test_lerobot_loop.py, whose failures say
+what to look at when LeRobot moves on. A loop or a policy that nobody has read is known by its source, and gets every
+picture. How it gets there, and out again: `lerobot_hooks`.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import logging
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +35,7 @@ from numpy.typing import NDArray
 from tqdm import trange
 
 from lerobot_memobench.jobs.threads import limit_torch
-from lerobot_memobench.lerobot_hooks import INSIDE_SLURM, ROLLOUT, RUN_ONE, check_version, hooked
+from lerobot_memobench.lerobot_hooks import INSIDE_SLURM, ROLLOUT, RUN_ONE, check_version, hooked, is_read
 from lerobot_memobench.run.plan import Range
 from lerobot_memobench.run.recording import Recorder
 
@@ -45,15 +47,41 @@ RECORDS = ("recording_dir", "env_features", "recording_repo_id", "recording_priv
 """Settings by which a rollout is recorded as a dataset; see `recording`."""
 KEEPS_ITS_NOISE = ("memobench_mem",)
 """Policies that seed each episode's noise themselves, from torch's initial seed: it must stay the run's."""
-KNOWN: dict[tuple[str, str], Callable[[Any], bool]] = {
-    ("lerobot.policies.act.modeling_act", "ACTPolicy"): lambda policy: (
-        policy.config.temporal_ensemble_coeff is not None or not policy._action_queue
+LOOPS = ("ed85d8da2c46",)
+"""`lerobot_hooks.digest` of each rollout of LeRobot's whose steps `_roll` takes."""
+
+
+@dataclass(frozen=True)
+class ChunkPolicy:
+    """A policy of LeRobot's that plans action chunks.
+
+    Attributes:
+        needs: whether one of them needs the next observation.
+        read: `lerobot_hooks.digest` of each ``select_action`` by which it does.
+    """
+
+    needs: Callable[[Any], bool]
+    read: tuple[str, ...]
+
+
+KNOWN: dict[tuple[str, str], ChunkPolicy] = {
+    ("lerobot.policies.act.modeling_act", "ACTPolicy"): ChunkPolicy(
+        lambda policy: policy.config.temporal_ensemble_coeff is not None or not policy._action_queue,
+        ("031085d1a22c",),
     ),
-    ("lerobot.policies.pi0.modeling_pi0", "PI0Policy"): lambda policy: not policy._action_queue,
-    ("lerobot.policies.pi05.modeling_pi05", "PI05Policy"): lambda policy: not policy._action_queue,
-    ("lerobot.policies.smolvla.modeling_smolvla", "SmolVLAPolicy"): lambda policy: not policy._queues[ACTION],
+    ("lerobot.policies.pi0.modeling_pi0", "PI0Policy"): ChunkPolicy(
+        lambda policy: not policy._action_queue, ("a330b536084c",)
+    ),
+    # Its visual memory takes in the pictures of every step.
+    ("lerobot.policies.pi05.modeling_pi05", "PI05Policy"): ChunkPolicy(
+        lambda policy: getattr(policy.config, "use_visual_memory", False) or not policy._action_queue,
+        ("a330b536084c", "41d18fe29b12"),
+    ),
+    ("lerobot.policies.smolvla.modeling_smolvla", "SmolVLAPolicy"): ChunkPolicy(
+        lambda policy: not policy._queues[ACTION], ("3b7b12d0066f",)
+    ),
 }
-"""Module and class of LeRobot's policies that plan action chunks -> whether one of them needs the next observation."""
+"""By module and class."""
 
 
 @contextmanager
@@ -74,7 +102,7 @@ def steered(seed: int | None, ranges: Mapping[tuple[str, int], list[Range]] | No
         ranges: by LeRobot's name of a task the runs of it; everything when None.
 
     Raises:
-        MemobenchError: the installed LeRobot is another than the one whose loop is known here.
+        MemobenchError: the installed LeRobot is another than those whose loop is known here.
     """
     check_version()
     from lerobot.scripts import lerobot_eval
@@ -165,11 +193,12 @@ def sparing(
     Args:
         hides_progress: whether the bar over a rollout's steps is left out.
     """
+    known = is_read(rollout, LOOPS)  # another loop may take other steps
 
     @functools.wraps(rollout)
     def run(env: Any, policy: Any, *args: Any, **settings: Any) -> dict[str, Any]:
         limit_torch(sum(parameter.numel() for parameter in getattr(policy, "parameters", tuple)()))
-        if args or any(settings.get(name) for name in KEEPS_FRAMES):
+        if args or not known or any(settings.get(name) for name in KEEPS_FRAMES):
             return rollout(env, policy, *args, **settings)
         return _roll(env, policy, settings, quiet=hides_progress())
 
@@ -266,14 +295,16 @@ def needs_observation(policy: Any) -> Callable[[], bool]:
 
     A policy of ours says so itself, by its method of that name. LeRobot's policies that plan action chunks need one
     when their queue is empty; each is known by the very function that was read, so a subclass that acts in another way,
-    a wrapped policy, and any other need every observation. (`diffusion` queues pictures at every step.)
+    a wrapped policy, one of a LeRobot that acts otherwise, and any other need every observation. (`diffusion` queues
+    pictures at every step.)
     """
     own = getattr(policy, "needs_observation", None)
     if own is not None:
         return own
     acts = getattr(type(policy), "select_action", None)
-    for (module, name), needs in KNOWN.items():
+    for (module, name), known in KNOWN.items():
         # A policy of a module that nobody has imported is not here.
-        if acts is not None and acts is getattr(getattr(sys.modules.get(module), name, None), "select_action", None):
-            return lambda: needs(policy)
+        theirs = getattr(getattr(sys.modules.get(module), name, None), "select_action", None)
+        if acts is not None and acts is theirs and is_read(acts, known.read):
+            return lambda: known.needs(policy)
     return lambda: True

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
+from huggingface_hub.constants import CONFIG_NAME
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.optim import AdamWConfig, LRSchedulerConfig, OptimizerConfig
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
@@ -185,6 +187,11 @@ SINCE_BEGUN = _names(
 )
 """Those of `OF_TRAINING` that a training keeps where it is gone on with: they decide the model's parts and what these
 learn, or stand in the optimizer's saved state, which LeRobot makes from them once."""
+PI05_ALONE = _names(
+    "use_visual_memory use_proprioceptive_memory memory_temporal_attention_every rtc_training_max_delay"
+)
+"""Fields of pi0.5's own in LeRobot's main: its visual memory, and training for real-time chunking. Refused here, and
+not saved, so that a checkpoint goes from one LeRobot to the other."""
 
 FROM_SIZE: Any = None
 """Default of a field that the size or the perception decides; after construction it is set."""
@@ -306,6 +313,14 @@ class MemobenchMemConfig(PI05Config):
             logger.warning("%s", error)
             raise
 
+    def _save_pretrained(self, save_directory: Path) -> None:
+        super()._save_pretrained(save_directory)
+        file = save_directory / CONFIG_NAME
+        saved = json.loads(file.read_text(encoding="utf-8"))
+        if set(PI05_ALONE) & set(saved):  # an earlier LeRobot would refuse the checkpoint for them
+            kept = {name: value for name, value in saved.items() if name not in PI05_ALONE}
+            file.write_text(json.dumps(kept, indent=4), encoding="utf-8")
+
     def _complete(self) -> None:
         """Set the fields that the size and the perception decide, and check every field."""
         self._choose("size", tuple(SIZES))
@@ -352,6 +367,7 @@ class MemobenchMemConfig(PI05Config):
                 "are computed once, before training; leave it out."
             )
         super().__post_init__()
+        self._check_pi05_alone()
         self._check_numbers()
         self._check_perception()
         self._check_objectives()
@@ -364,6 +380,15 @@ class MemobenchMemConfig(PI05Config):
             raise MemobenchError(
                 f"memobench_mem has no {field} '{given}': {nearest(str(given), known)} "
                 f"Pass --policy.{field}=<one of {', '.join(known)}>."
+            )
+
+    def _check_pi05_alone(self) -> None:
+        pi05s = [one for one in fields(self) if one.name in PI05_ALONE]
+        changed = [one.name for one in pi05s if getattr(self, one.name) != one.default]
+        if changed:
+            raise MemobenchError(
+                f"--policy.{changed[0]} is pi0.5's own, and memobench_mem has a memory of its own; leave it out, or "
+                "train policy=pi05."
             )
 
     def _check_encoders(self) -> None:

@@ -59,6 +59,7 @@ from lerobot_memobench.policies.memobench_mem.training import (
     TrainingCurve,
     WeightAverage,
     counted_actions,
+    is_first_rank,
     keep_freed_memory,
     losses_of,
     mean_losses,
@@ -501,18 +502,26 @@ class MemobenchMemPolicy(PI05Policy):
         policy._begin_training(dataset_meta)
         return policy
 
-    def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
-        """Save the averaged weights as the model, and beside it the trained ones for going on and the losses."""
-        self.curve.save(save_directory)
-        if self.average is None or state_dict is not None:
+    def _save_pretrained(self, save_directory: Path, **gathered: Any) -> None:
+        """Save the averaged weights as the model, and beside it the trained ones for going on and the losses.
+
+        Args:
+            gathered: ``state_dict``, where LeRobot 0.6.1 has trained in shards. Later versions call this in every
+                process, and each of them gathers by itself.
+        """
+        writes = is_first_rank()
+        if writes:
+            self.curve.save(save_directory)
+        if self.average is None or gathered.get("state_dict") is not None:
             if self.average is not None:
                 logger.warning("Sharded training: the checkpoint holds the trained weights, not their average.")
-            super()._save_pretrained(save_directory, state_dict=state_dict)
+            super()._save_pretrained(save_directory, **gathered)
             return
         with self.average.applied():  # in float32, whatever precision it is evaluated in
             super()._save_pretrained(save_directory)
-        tensors, metadata = self.average.state()
-        save_file(tensors, save_directory / TRAINING_FILE, metadata=metadata)
+        if writes:
+            tensors, metadata = self.average.state()
+            save_file(tensors, save_directory / TRAINING_FILE, metadata=metadata)
 
     # -- adapters --------------------------------------------------------------------------------------------------
 

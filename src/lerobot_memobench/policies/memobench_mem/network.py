@@ -95,14 +95,15 @@ class MemoryPI05(PI05Pytorch):
         self.fusion.hand_over(memory)
         return memory.rows(), memory.mask
 
-    def embed_prefix(self, images: Any, img_masks: Any, tokens: Tensor, masks: Tensor) -> Prefix:
+    def embed_prefix(self, images: Any, img_masks: Any, tokens: Tensor, masks: Tensor, *histories: Any) -> Prefix:
         """Return LeRobot's prefix (observation, then words), as the fusion changes it.
 
         With a token of the state, the last of the ``images`` is the state (B, dim), and the masks of the others may be
-        of their tokens (B, n), which LeRobot's are not.
+        of their tokens (B, n), which LeRobot's are not. Later versions hand over states too (``histories``): none here,
+        where the configuration refuses pi0.5's own memory.
         """
         if self.state_token is None or self.instruction is None:
-            prefix: Prefix = super().embed_prefix(images, img_masks, tokens, masks)
+            prefix: Prefix = super().embed_prefix(images, img_masks, tokens, masks, *histories)
         else:
             longest = int(masks.sum(dim=1).max())  # padding would be most of so short a prefix
             words, real, _ = super().embed_prefix([], [], tokens[:, :longest], masks[:, :longest])

@@ -113,6 +113,11 @@ def mean_over_ranks(value: Tensor) -> Tensor:
     return value / world_size()
 
 
+def is_first_rank() -> bool:
+    """Return whether this process writes what all of them have in common."""
+    return world_size() == 1 or dist.get_rank() == 0
+
+
 def means_over_ranks(numbers: Mapping[str, Any], device: torch.device | str = "cpu") -> dict[str, Any]:
     """Return the same with each float's mean over the ranks, all of which name the same ones."""
     if world_size() == 1:
