@@ -305,6 +305,6 @@ def needs_observation(policy: Any) -> Callable[[], bool]:
     for (module, name), known in KNOWN.items():
         # A policy of a module that nobody has imported is not here.
         theirs = getattr(getattr(sys.modules.get(module), name, None), "select_action", None)
-        if acts is not None and acts is theirs and is_read(acts, known.read):
+        if theirs is not None and acts is theirs and is_read(theirs, known.read):
             return lambda: known.needs(policy)
     return lambda: True
