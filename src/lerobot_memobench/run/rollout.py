@@ -301,10 +301,10 @@ def needs_observation(policy: Any) -> Callable[[], bool]:
     own = getattr(policy, "needs_observation", None)
     if own is not None:
         return own
-    acts = getattr(type(policy), "select_action", None)
+    acts: Any = getattr(type(policy), "select_action", None)
     for (module, name), known in KNOWN.items():
         # A policy of a module that nobody has imported is not here.
-        theirs = getattr(getattr(sys.modules.get(module), name, None), "select_action", None)
+        theirs: Any = getattr(getattr(sys.modules.get(module), name, None), "select_action", None)
         if theirs is not None and acts is theirs and is_read(theirs, known.read):
             return lambda: known.needs(policy)
     return lambda: True
