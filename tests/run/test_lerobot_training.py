@@ -10,6 +10,7 @@ import subprocess
 import sys
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -53,18 +54,19 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 # --- what is relied on: where one of these fails, LeRobot's training is another one ---
 
+# In its module: LeRobot's main has split `train`.
 CALLS = {
-    (lerobot_train.train, "make_train_eval_datasets(cfg)"): "opens the datasets by it, looked up in its module",
-    (lerobot_train.train, 'dataset.meta.episodes["dataset_from_index"]'): "draws within these bounds",
-    (lerobot_train.train, "episode_indices_to_use=dataset.episodes"): "draws from the episodes that are opened",
+    (lerobot_train, "make_train_eval_datasets(cfg)"): "opens the datasets by it, looked up in its module",
+    (lerobot_train, 'dataset.meta.episodes["dataset_from_index"]'): "draws within these bounds",
+    (lerobot_train, "episode_indices_to_use=dataset.episodes"): "draws from the episodes that are opened",
     (StreamingLeRobotDataset.__iter__, "safe_shard(self.hf_dataset, idx"): "streams the frames that are found there",
     (StreamingLeRobotDataset._get_delta_frames, "dataset_iterator.peek_back"): "looks back in that stream alone",
-    (lerobot_train.train, 'eval_dataset.hf_dataset.data.column("task_index")'): "looks there for held-out tasks",
+    (lerobot_train, 'eval_dataset.hf_dataset.data.column("task_index")'): "looks there for held-out tasks",
     (dataset_factory.make_train_eval_datasets, "return full_dataset, None"): "returns two datasets, or one and None",
 }
 
 
-@pytest.mark.parametrize(("function", "call"), CALLS)
+@pytest.mark.parametrize(("function", "call"), CALLS, ids=lambda part: getattr(part, "__name__", part))
 def test_lerobot_does_what_is_relied_on(function: Any, call: str) -> None:
     assert call in inspect.getsource(function), (
         f"{function.__name__} holds no {call!r} any more; it was relied on that it {CALLS[function, call]}. Look at "
@@ -241,6 +243,20 @@ def test_what_cannot_be_streamed_without_prompts_is_refused_in_one_sentence(root
         opened(root, ours, streaming=True)
     train, _ = opened(root, ours, prompt_frames=False, streaming=True)
     assert {int(frame["observation.phase"]) for frame in train} == {1}
+
+
+@pytest.mark.parametrize(
+    ("section", "told"),
+    [({"parallelism": {"is_sharded": True}}, "dp_shard would train"), ({"ema": {"enable": True}}, "policy.ema_decay")],
+)
+def test_what_lerobots_main_would_do_to_the_weights_is_refused(section: dict[str, Any], told: str, root: Path) -> None:
+    config = TrainPipelineConfig(
+        DatasetConfig("memobench/synthetic", root=str(root)), policy=MemobenchMemConfig(device="cpu", push_to_hub=False)
+    )
+    for name, fields in section.items():
+        setattr(config, name, SimpleNamespace(**fields))
+    with trained_on(None), pytest.raises(MemobenchError, match=told):
+        lerobot_train.make_train_eval_datasets(config)
 
 
 # --- by the commands ---

@@ -439,6 +439,7 @@ def _steered(make: Callable[..., Any], prompt_frames: bool | None, obs_type: str
         if prompt_frames is not False:
             _check_streaming(config)
         check_transforms(config.policy, config.dataset.image_transforms.enable)
+        _check_distribution(config)
         _check_episodes(config.dataset)
         train, held_out = make(config)
         check_clock(train.meta.features, train.root)
@@ -469,6 +470,22 @@ def _check_streaming(config: Any) -> None:
         raise MemobenchError(
             f"policy={config.policy.type} draws execution frames alone, and dataset.streaming=true leaves no choice of "
             "frames; use dataset.streaming=false, or prompt_frames=false to take execution frames as they come"
+        )
+
+
+def _check_distribution(config: Any) -> None:
+    """Refuse what LeRobot's main can do to a policy's weights and memobench_mem does in another way, or not at all."""
+    if getattr(config.policy, "type", None) != "memobench_mem":
+        return
+    if getattr(getattr(config, "parallelism", None), "is_sharded", False):
+        raise MemobenchError(
+            "parallelism.dp_shard would train memobench_mem in shards, which its average of weights is not made for; "
+            "leave it out: each process then holds the whole policy"
+        )
+    if getattr(getattr(config, "ema", None), "enable", False):
+        raise MemobenchError(
+            "ema.enable=true would average weights that memobench_mem averages by itself; leave it out, or set the "
+            "decay by policy.ema_decay"
         )
 
 

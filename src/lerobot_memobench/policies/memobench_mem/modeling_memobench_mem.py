@@ -99,6 +99,7 @@ class MemobenchMemPolicy(PI05Policy):
     name = "memobench_mem"
     config: MemobenchMemConfig
     model: MemoryPI05
+    _fsdp_wrap_modules = None  # to LeRobot's main: it is not trained in shards, whose average would be another one
 
     def __init__(
         self, config: MemobenchMemConfig, *, dataset_meta: Any | None = None, load_base: bool = True, **kwargs: Any

@@ -10,6 +10,7 @@ import logging
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -432,6 +433,10 @@ class PromptTokenizerProcessorStep(TokenizerProcessorStep):
         for row in (unknown | full).nonzero().flatten().tolist():
             warn_of_losses(tokenizer, text if isinstance(text, str) else text[row], self.max_length, bool(full[row]))
         return found
+
+    def save_artifacts(self, save_directory: Path) -> dict[str, str]:
+        """Save no tokenizer, as LeRobot's main does: its name or words stand in the file, which 0.6.1 reads too."""
+        return {}
 
 
 @dataclass

@@ -1,0 +1,82 @@
+"""LeRobot's own memory, pi0.5's visual one: a training, a rollout, and what its queue takes in.
+
+LeRobot 0.6.1 has none; `scripts/lerobot_main` makes an environment that does.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from lerobot_memobench.cli.memobench import main as memobench
+from tests.policies.test_looking import CAMERAS, FEATURES, STEPS, Row, check, execution, observation
+from tests.policies.test_other_policies import TASK, _tiny_paligemma, train_and_roll_out  # noqa: F401 - a fixture
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        importlib.util.find_spec("lerobot.policies.pi05.memory") is None, reason="this LeRobot's pi0.5 has no memory"
+    ),
+    pytest.mark.usefixtures("_tiny_paligemma"),
+]
+
+FRAMES, STRIDE, PLAN = 3, 2, 3
+SIZES = {"chunk_size": 4, "n_action_steps": PLAN, "num_inference_steps": 2, "dtype": "float32"}
+MEMORY = {"memory_frames": FRAMES, "memory_stride": STRIDE, "memory_temporal_attention_every": 1}
+
+
+def pi05(**memory: Any) -> Any:
+    from lerobot.policies.pi05.modeling_pi05 import PI05Config, PI05Policy
+
+    return PI05Policy(PI05Config(**FEATURES, **SIZES, **MEMORY, **memory))
+
+
+def test_it_trains_on_our_data_and_rolls_out(tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    assert memobench(["generate", "--tasks", TASK, "--episodes", "1", "--out", str(data)]) == 0
+    words = {**SIZES, **MEMORY, "use_visual_memory": "true", "tokenizer_max_length": 64}
+    train_and_roll_out(data, tmp_path, "policy=pi05", *(f"policy.{name}={value}" for name, value in words.items()))
+
+
+def test_a_picture_of_every_control_step_is_drawn_for_it() -> None:
+    check(pi05(use_visual_memory=True), execution, range(STEPS))
+
+
+def test_a_history_of_states_needs_no_picture_between_two_chunks() -> None:
+    check(pi05(use_proprioceptive_memory=True), execution, range(0, STEPS, PLAN))
+
+
+def histories(policy: Any, rows: Sequence[Row], of: slice = slice(None)) -> list[Tensor]:
+    """Return the pictures (rows, frames, C, H, W) that the policy is given at each step of some rows."""
+    policy.reset()
+    found = []
+    for time in range(STEPS):
+        batch = {CAMERAS[0]: observation(rows, time)[CAMERAS[0]][of]}
+        found.append(policy._stack_inference_memory(batch)[CAMERAS[0]])
+    return found
+
+
+def test_a_row_of_a_batch_has_the_history_that_it_has_alone() -> None:
+    """In a rollout of LeRobot's, which forgets once and then begins all rows."""
+    policy, rows = pi05(use_visual_memory=True), execution(0)
+    both = histories(policy, rows)
+    for row in range(len(rows)):
+        alone = histories(policy, rows, slice(row, row + 1))
+        assert all(torch.equal(part[row], one[0]) for part, one in zip(both, alone, strict=True))
+    times = range(STEPS - 1 - STRIDE * (FRAMES - 1), STEPS, STRIDE)
+    assert torch.equal(both[-1], torch.stack([observation(rows, time)[CAMERAS[0]] for time in times], dim=1))
+
+
+def test_a_call_is_a_step_to_it() -> None:
+    """Who asks for one chunk per call gives it another history than training did; docs/guides/evaluate.md says so."""
+    policy = pi05(use_visual_memory=True)
+    policy.reset()
+    for time in (0, PLAN):
+        policy.predict_action_chunk(observation(execution(0), time))
+    assert policy._memory_steps_seen == 2
