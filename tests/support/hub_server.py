@@ -232,5 +232,5 @@ ROUTES = [
     (rf"GET /api/datasets/{REPO}/revision/{REVISION}", Handler.info),
     (rf"GET /api/datasets/{REPO}/tree/{REVISION}(/(?P<path>.*))?", Handler.tree),
     (rf"POST /api/datasets/{REPO}/paths-info/{REVISION}", Handler.paths_info),
-    (rf"(GET|HEAD) /datasets/{REPO}/resolve/{REVISION}/(?P<path>.*)", Handler.resolve),
+    (rf"(GET|HEAD) /(datasets/)?{REPO}/resolve/{REVISION}/(?P<path>.*)", Handler.resolve),
 ]
