@@ -28,14 +28,11 @@ from lerobot_memobench.envs.video import OPERATION_COLOURS
 from lerobot_memobench.evaluation.figures.rollouts import OPERATIONS
 from lerobot_memobench.io import draft_of
 from lerobot_memobench.protocol import CONTROL_HZ, EXECUTION
-from lerobot_memobench.run.demo import BACKGROUND, FAILED, HORIZON, POLICIES, SOLVED
-from lerobot_memobench.run.plan import plan_line
-from lerobot_memobench.run.run import run_evaluation
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.tasks.catalogue import BOWL, get_task
 
-EPISODES = 6
-"""Evaluation seeds that are looked through."""
+EPISODES, HORIZON = 6, 400
+"""Evaluation seeds that are looked through, and steps of an execution."""
 STRIDE, SPEED = 4, 2.0
 """Control steps from picture to picture, and how much faster than real they are shown."""
 SIDE, GAP = 272, 6
@@ -46,7 +43,8 @@ LAST = 2.0
 """Seconds that the last picture stays."""
 LARGE, MEDIUM = 25, 21
 """Sizes of letters: still read where a phone shows the film at half its width."""
-INK, FAINT, DEMONSTRATION = (240, 240, 240), (165, 170, 180), (204, 121, 167)
+BACKGROUND, INK, FAINT = (24, 26, 30), (240, 240, 240), (165, 170, 180)
+DEMONSTRATION, SOLVED, FAILED = (204, 121, 167), (0, 158, 115), (213, 94, 0)
 QUALITY = 78
 """Of WebP: what is written in colour keeps its edges, and the file stays below 2 MB."""
 
@@ -91,7 +89,10 @@ Rollout = tuple[dict[str, Any], list[NDArray[np.float32]]]
 
 
 def evaluate(words: Sequence[str], folder: Path) -> dict[int, Rollout]:
-    """Evaluate one of `POLICIES`; return line of the log and actions by seed."""
+    """Evaluate who is chosen by arguments of `lerobot eval`; return line of the log and actions by seed."""
+    from lerobot_memobench.run.plan import plan_line
+    from lerobot_memobench.run.run import run_evaluation
+
     plan = plan_line(
         [
             *("env=memobench", *words, f"tasks={BOWL}", "referent=random", "obs_type=environment_state_agent_pos"),
@@ -197,6 +198,8 @@ def write(film: Sequence[Image.Image], path: Path) -> None:
 
 def main() -> None:
     """Evaluate, choose, draw."""
+    from lerobot_memobench.run.demo import POLICIES
+
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("docs/figures/memory.webp"))
     out = parser.parse_args().out

@@ -33,7 +33,7 @@ def test_the_first_seed_that_tells_them_apart_is_shown(script: dict[str, Any]) -
 def test_a_short_take_waits_and_the_film_begins_anew(script: dict[str, Any], tmp_path: Path) -> None:
     def take(length: int, solved: bool) -> list[Any]:
         last = length - 1
-        shade = [np.full((side, side, 3), 20 * length + k, np.uint8) for k in range(length)]
+        shade = [np.full((side, side, 3), 20 * length + 40 * k, np.uint8) for k in range(length)]
         return [
             script["Shot"](shade[k], EXECUTION if k else PROMPT, k, (solved and k == last,), not solved, solved)
             for k in range(length)
