@@ -228,6 +228,8 @@ def check(words: list[str]) -> None:
             check_python(rest)
         case "vla-eval":
             check_vla_eval(rest)
+        case "lerobot-dataset-viz":
+            check_viewer(rest)
         case "make":
             assert re.search(rf"^{rest[0]}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
         case _:
@@ -266,6 +268,14 @@ def check_vla_eval(line: list[str]) -> None:
         patched.setattr(sys, "argv", ["vla-eval", *line])
         patched.setattr(main, "cmd_run", lambda _: None)
         main.main()
+
+
+def check_viewer(line: list[str]) -> None:
+    """See that LeRobot's viewer knows the flags; its parser cannot be had without running it."""
+    spec = importlib.util.find_spec("lerobot.scripts.lerobot_dataset_viz")
+    assert spec is not None
+    known = set(re.findall(r"add_argument\(\s*\"(--[\w-]+)\"", Path(str(spec.origin)).read_text()))
+    assert not {word for word in line if word.startswith("--")} - known
 
 
 def check_memobench(line: list[str]) -> None:
@@ -308,6 +318,7 @@ def check_python(line: list[str]) -> None:
         "lerobot-eval --env.type=memobench --env.tusks=object",
         "lerobot train policy=memobench_mem memory_frames=3",
         "memobench generate --task object",
+        "lerobot-dataset-viz --episode 0",
         "memobench no_such",
         "python examples/no_such.py",
         "make coffee",

@@ -4,6 +4,7 @@ import hashlib
 import json
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -399,20 +400,15 @@ def test_torchs_own_collate_function_batches_an_episode(dataset):
 
 
 @pytest.mark.slow
-def test_lerobots_viewer_opens_it(dataset, tmp_path):
-    pytest.importorskip("rerun", reason="rerun-sdk is not installed (lerobot's extra viz)")
-    words = [
-        "--repo-id",
-        REPO,
-        "--root",
-        str(dataset.root),
-        "--episode-index",
-        "1",
-        "--save",
-        "1",
-        "--num-workers",
-        "0",
-    ]
+def test_lerobots_viewer_shows_it(dataset, tmp_path):
+    """As docs/guides/data.md says it, without a display: every frame of an episode, and nothing of the others."""
+    reader = pytest.importorskip("rerun.experimental", reason="rerun-sdk is not installed (the extra viz)").RrdReader
+    words = ["--repo-id", REPO, "--root", str(dataset.root), "--episode-index", "1", "--num-workers", "0"]
+    words += ["--display-compressed-images", "--save", "1", "--output-dir", str(tmp_path)]
     command = "from lerobot.scripts.lerobot_dataset_viz import main; main()"
-    subprocess.run([sys.executable, "-c", command, *words, "--output-dir", str(tmp_path)], check=True)
-    assert (tmp_path / "local_test_episode_1.rrd").stat().st_size > 10_000
+    subprocess.run([sys.executable, "-c", command, *words], check=True)
+    shown: Counter[str] = Counter()
+    for chunk in reader(tmp_path / "local_test_episode_1.rrd").store().stream():
+        shown[chunk.entity_path] += chunk.num_rows
+    entities = ("/action", "/state", "/observation.images.image", "/observation.images.wrist_image")
+    assert {entity: shown[entity] for entity in entities} == dict.fromkeys(entities, 30)
