@@ -25,10 +25,8 @@ from lerobot_memobench.sim.object_layout import SLOTS, WIDTH, field
 from lerobot_memobench.sim.object_slots import classes
 
 TASK = "memobench/turn_on_the_stove_and_turn_it_off-v0"
-HORIZON, REPEAT = 200, 5
-"""Control steps of an episode, 10 s, and of one decision."""
-SCENES = 20
-"""Scenes of a test."""
+HORIZON, REPEAT, SCENES = 200, 5, 20
+"""Control steps of an episode (10 s) and of one decision; scenes of a test."""
 KNOB = classes().index("knob")
 
 
@@ -102,7 +100,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the network and its exploration")
     chosen = parser.parse_args()
     torch.set_num_threads(1)
-    file = chosen.out / "model.zip"
+    file, draft = chosen.out / "model.zip", chosen.out / "draft.zip"
     env = Monitor(make(DEMONSTRATION_SEED))
     if file.exists():
         model = RecurrentPPO.load(file, env)
@@ -114,10 +112,10 @@ def main() -> None:
         print(f"before training: {reached(model)} of {SCENES} validation scenes", flush=True)
     while model.num_timesteps < chosen.decisions:
         model.learn(2 * model.n_steps, reset_num_timesteps=False)
-        model.save(chosen.out / "draft.zip")
-        (chosen.out / "draft.zip").replace(file)  # whole, or as it was
-        rewards = [episode["r"] for episode in model.ep_info_buffer]
-        print(f"{model.num_timesteps} decisions: mean reward {np.mean(rewards):.2f}", flush=True)
+        model.save(draft)
+        draft.replace(file)  # whole, or as it was
+        mean = np.mean([episode["r"] for episode in model.ep_info_buffer])
+        print(f"{model.num_timesteps} decisions: mean reward {mean:.2f}", flush=True)
     print(f"after {model.num_timesteps} decisions: {reached(model)} of {SCENES} validation scenes")
 
 

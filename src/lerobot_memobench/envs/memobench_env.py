@@ -74,7 +74,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         task: a name in the catalogue of either suite, or a task's folder.
         log_dir: where finished episodes are logged; nowhere when None.
         acting: whose episodes they are; one that it does not count is neither logged nor recorded.
-        reward: `sparse` or `checkpoints`, see `observations.REWARDS`.
+        reward: `sparse`, 1 at success; or `checkpoints`, of K memory checkpoints 1 / (K + 1) when one is completed in
+            order, and as much at success. An episode's rewards add up to 1 at most, and to 1 only where it succeeds.
         render_mode: gymnasium's; there is one.
 
     The other arguments are the settings of `MemobenchEnvConfig`.
@@ -207,7 +208,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._observer.needed = True
 
     def step(self, action: ArrayLike) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Advance by one control step of 50 ms; of the reward see `observations.REWARDS`.
+        """Advance by one control step of 50 ms; of ``reward`` see the class.
 
         An episode terminates by success and, of a strict task, by the loss of its goal; the horizon truncates it.
 

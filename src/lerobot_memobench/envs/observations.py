@@ -48,8 +48,7 @@ frame.
 
 SPARSE, CHECKPOINTS = "sparse", "checkpoints"
 REWARDS = (SPARSE, CHECKPOINTS)
-"""Values of ``reward``: 1 at success; or, with K memory checkpoints, 1 / (K + 1) when one is completed in order, and as
-much at success. Either way an episode's rewards add up to 1 at most, and to 1 only where it succeeds."""
+"""Values of ``reward``, see `memobench_env.MemobenchEnv`."""
 
 EVERY = -1
 """Value of ``env.videos``: record every episode."""
