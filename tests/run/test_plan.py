@@ -22,6 +22,7 @@ from lerobot_memobench.run.card import card_of
 from lerobot_memobench.run.plan import EvaluationPlan, Grid, PlannedTask, RunOptions, Shard, plan_line, take_run_options
 from lerobot_memobench.run.run import remainder
 from lerobot_memobench.run.shards import executor_options, plan_shards
+from lerobot_memobench.sim import robot
 
 STOVE, DRAWER = "turn_on_the_stove_and_turn_it_off", "check_the_top_drawer_of_the_cabinet"
 LINE = ["env=memobench", f"tasks={STOVE},{DRAWER}", "episodes=4", "policy=memobench_random"]
@@ -198,6 +199,12 @@ def test_a_login_node_needs_no_gl_library(monkeypatch: pytest.MonkeyPatch) -> No
     assert plan_line([*LINE, "output_dir=out", "shards=2", *slurm]).draws
     with pytest.raises(MemobenchError, match="libegl1"):
         plan_line([*LINE, "output_dir=out", "shards=2"])
+
+
+def test_without_the_arm_nothing_begins(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(robot, "ROBOSUITE", "1.4.2")
+    with pytest.raises(MemobenchError, match=r"found robosuite 1\.4\.1; run: pip install --no-deps robosuite"):
+        plan_line([*LINE, "output_dir=out"])
 
 
 @pytest.mark.parametrize(

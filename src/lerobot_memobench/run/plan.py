@@ -177,11 +177,19 @@ def make_plan(arguments: LerobotArguments, options: RunOptions, command: Sequenc
         options=options,
         command=tuple(command),
     )
-    if plan.draws and options.executor not in ELSEWHERE:  # there, each part finds out
-        from lerobot_memobench.sim.rendering import gl_backend
-
-        gl_backend()  # without a library, every episode would fail at its first frame
+    if options.executor not in ELSEWHERE:  # there, each part finds out
+        _check_simulator(plan.draws)
     return plan
+
+
+def _check_simulator(draws: bool) -> None:
+    """Refuse a machine on which every episode would fail: no arm, or nothing to draw with."""
+    from lerobot_memobench.sim.rendering import gl_backend
+    from lerobot_memobench.sim.robot import robosuite_version
+
+    robosuite_version()
+    if draws:
+        gl_backend()
 
 
 def _output(arguments: LerobotArguments, options: RunOptions) -> Path:

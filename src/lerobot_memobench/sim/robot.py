@@ -64,7 +64,7 @@ Faces = NDArray[np.int32]
 """(M, 3) indices of vertices, counter-clockwise from outside."""
 
 
-def _robosuite_version() -> str:
+def robosuite_version() -> str:
     """Return the installed version of robosuite.
 
     Raises:
@@ -132,7 +132,7 @@ def arm_hash(xml: str) -> str:
 def _cache_file() -> Path:
     """Where the thinned arm is kept between processes, named by all that it depends on."""
     source = Path(__file__).read_bytes()
-    versions = _robosuite_version() + importlib.metadata.version("fast-simplification")
+    versions = robosuite_version() + importlib.metadata.version("fast-simplification")
     key = hashlib.sha256(source + versions.encode()).hexdigest()[:16]
     root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return root / "lerobot_memobench" / f"panda-{key}.npz"
