@@ -21,6 +21,7 @@ from lerobot.envs import utils as env_utils
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.observations import policy_features, policy_names
 from lerobot_memobench.evaluation.metrics import METRICS
+from lerobot_memobench.sim.robot import ROBOSUITE
 from lerobot_memobench.tasks.catalogue import load_task, task_names
 from tests.support import hub_server
 from tests.test_docs import check, commands
@@ -51,12 +52,13 @@ def test_all_name_the_distribution_and_its_version() -> None:
     assert f'"{DISTRIBUTION}==${{MEMOBENCH_VERSION}}"' in dockerfile
 
 
-def test_the_image_leaves_out_what_we_leave_out() -> None:
-    dockerfile = (OURS / "Dockerfile.benchmark.memobench").read_text()
-    (line,) = re.findall(r'printf "(.*)" > ', dockerfile)
-    left_out = {one for one in line.split(r"\n") if one}
-    assert left_out <= set(PROJECT["tool"]["uv"]["override-dependencies"])
-    assert {one.split()[0] for one in left_out} == {"opencv-python", "pynput"}
+def test_the_arm_is_installed_as_our_users_install_it() -> None:
+    line = f"install --no-deps robosuite=={ROBOSUITE}"
+    assert line in (ROOT / "docs" / "start" / "install.md").read_text()
+    assert f"pip {line}" in PAGE
+    assert (
+        f"pip {line.replace('install', 'install --no-cache')}" in (OURS / "Dockerfile.benchmark.memobench").read_text()
+    )
 
 
 # --- commands ---

@@ -232,6 +232,8 @@ def check(words: list[str]) -> None:
             check_viewer(rest)
         case "make":
             assert re.search(rf"^{rest[0]}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
+        case _ if program.startswith("scripts/"):
+            assert (ROOT / program).is_file(), program
         case _:
             assert program in ("source", "pip", "uv", "gzip"), f"{program} is no command that the documents use"
 
