@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -73,6 +74,16 @@ def test_saved_and_read_again(tmp_path: Path) -> None:
     config.save_pretrained(tmp_path)
     again = PreTrainedConfig.from_pretrained(tmp_path, cli_overrides=["--n_action_steps=20"])
     assert dataclasses.asdict(again) == dataclasses.asdict(config) | {"n_action_steps": 20}
+
+
+def test_what_is_pi05s_alone_is_refused_and_not_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """LeRobot's main adds such fields, which 0.6.1 would refuse in a checkpoint; a field of both stands for them."""
+    monkeypatch.setattr(configuration_memobench_mem, "PI05_ALONE", ("compile_mode",))
+    with pytest.raises(MemobenchError, match=r"compile_mode is pi0\.5's own.*policy=pi05"):
+        MemobenchMemConfig(device="cpu", compile_mode="default")
+    MemobenchMemConfig(device="cpu").save_pretrained(tmp_path)
+    assert "compile_mode" not in json.loads((tmp_path / "config.json").read_text())
+    assert PreTrainedConfig.from_pretrained(tmp_path) == MemobenchMemConfig(device="cpu")
 
 
 def test_schedule_warms_up_over_a_twentieth_and_stays() -> None:
