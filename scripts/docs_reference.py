@@ -298,18 +298,18 @@ def schemas_page() -> str:
     ]
     for heading, kind in wanted:
         summary = plain((kind.__doc__ or "").partition("\n\n")[0])
-        parts += [f"## {heading}", summary, table(["field", "type", "required", "meaning"], typed_rows(kind))]
+        parts += [f"## {heading}", summary, table(["field", "meaning", "type"], typed_rows(kind))]
     return "\n\n".join(parts) + "\n"
 
 
 def typed_rows(kind: Any) -> list[list[str]]:
-    """Return name, type, whether it is required, and meaning of each field of a `TypedDict`."""
+    """Return name, meaning and type of each field of a `TypedDict`, and by the type whether it is required."""
     hints, says = get_type_hints(kind), meanings(kind)
     marked = get_type_hints(kind, include_extras=True)  # `__required_keys__` does not see NotRequired in strings
     optional = {name for name, hint in marked.items() if get_origin(hint) is NotRequired}
     required = kind.__required_keys__ - optional
     return [
-        [code(name), code(type_name(hint)), "yes" if name in required else "", says.get(name, "").rstrip(".")]
+        [code(name), says.get(name, "").rstrip("."), code(type_name(hint)) + ", required" * (name in required)]
         for name, hint in hints.items()
     ]
 
@@ -589,6 +589,23 @@ def on_files(files: Any, config: Any) -> Any:
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Turn the links of a page that leave the site (MkDocs calls this)."""
     return at_home(markdown, page.file.src_uri)
+
+
+def breakable(page: str) -> str:
+    """Return a page's HTML in which tables fit: names may break behind ``_``, ``.``, ``/`` and ``=``, intervals not."""
+
+    def in_cell(found: re.Match[str]) -> str:
+        parts = re.split(r"(<[^>]*>)", found[2])
+        parts[::2] = [re.sub(r"(?<=[A-Za-z])([_./=])(?=[A-Za-z])", r"\1<wbr>", part) for part in parts[::2]]
+        cell = re.sub(r"\[[\d.]+–[\d.]+\]", r'<span class="interval">\g<0></span>', "".join(parts))
+        return found[1] + cell + found[3]
+
+    return re.sub(r"(<td[^>]*>)(.*?)(</td>)", in_cell, page, flags=re.DOTALL)
+
+
+def on_page_content(content: str, **_: Any) -> str:
+    """Let tables fit (MkDocs calls this)."""
+    return breakable(content)
 
 
 def main() -> None:

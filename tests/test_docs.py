@@ -358,11 +358,16 @@ def test_pages_that_are_made(page: str) -> None:
 
 
 def test_every_field_of_the_log_is_explained() -> None:
-    for kind in (episode_log.EpisodeRecord, episode_log.CheckpointRecord, episode_log.WholeProtocol, records.WholeCard):
-        rows = {name.strip("`"): rest for name, *rest in reference.typed_rows(kind)}
-        assert all(says for *_, says in rows.values()), kind
-    rows = {name.strip("`"): required for name, _, required, _ in reference.typed_rows(episode_log.EpisodeRecord)}
-    assert [name for name, required in rows.items() if required] == [
+    for kind in (
+        episode_log.EpisodeRecord,
+        episode_log.CheckpointRecord,
+        episode_log.WholeProtocol,
+        records.WholeCard,
+        records.CardEpisode,
+    ):
+        assert all(says for _, says, _ in reference.typed_rows(kind)), kind
+    rows = reference.typed_rows(episode_log.EpisodeRecord)
+    assert [name.strip("`") for name, _, kind in rows if kind.endswith("required")] == [
         *("task", "memory_type", "episode", "success", "checkpoints"),
     ]
 
@@ -383,6 +388,14 @@ def test_every_setting_of_a_policy_is_in_the_reference() -> None:
     page = reference.policies_page()
     own = {field.name for field in dataclasses.fields(MemobenchMemConfig)} & set(MemobenchMemConfig.__annotations__)
     assert [field for field in own if f"`{field}`" not in page] == []
+
+
+def test_cells_break_where_names_do_and_not_within_intervals() -> None:
+    page = '<p>a_b</p><td><a href="x_y.html"><code>env.obs_type</code></a> 97.9 [96.9–98.5]</td>'
+    assert reference.breakable(page) == (
+        '<p>a_b</p><td><a href="x_y.html"><code>env.<wbr>obs_<wbr>type</code></a> '
+        '97.9 <span class="interval">[96.9–98.5]</span></td>'
+    )
 
 
 def test_links_that_leave_the_site_are_turned() -> None:

@@ -86,11 +86,17 @@ class Difference:
     """One metric of both evaluations over the same pairs. Rates are fractions.
 
     Attributes:
-        scope: "average", a memory type, or a task. n: pairs.
-        only_a, only_b: pairs in which only one of both succeeded (SR only).
-        p: exact McNemar for SR, sign-flip permutation else; exact: whether every assignment of signs was looked at.
+        scope: "average", a memory type, or a task.
+        metric: SR, MSR, MUR or MCR.
+        n: pairs.
+        a: rate of the first evaluation.
+        b: rate of the second.
+        p: exact McNemar for SR, sign-flip permutation else.
+        exact: whether every assignment of signs was looked at.
         adjusted: p after Holm over the tasks, None but for tasks.
         detectable: smallest true difference that so many pairs show with 80 % power at 5 %; None for above 1.
+        only_a: pairs in which only the first succeeded (SR only).
+        only_b: pairs in which only the second did (SR only).
     """
 
     scope: str

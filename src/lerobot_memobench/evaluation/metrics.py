@@ -303,12 +303,14 @@ class Summary:
     """All figures of a set of rollouts.
 
     Attributes:
-        tasks, memory_types: name -> metrics; a memory type is the mean over its applicable tasks.
+        tasks: name -> metrics.
+        memory_types: name -> metrics, each the mean over its applicable tasks.
         average: mean over the applicable memory types.
         pooled: MSR, MUR, MCR over all checkpoint records of the operation, whatever the task; n counts records.
         pooled_checkpoints: the same over all checkpoint records, whatever the operation.
-        prefix, ordered_prefix: task -> per checkpoint the rate of rollouts in which it and all earlier ones were
-            satisfied, in any order and in order.
+        prefix: task -> per checkpoint the rate of rollouts in which it and all earlier ones were satisfied, in any
+            order.
+        ordered_prefix: the same in order.
         failures: class -> number of failed rollouts.
         failures_of: the same by task.
         memory_type_of: task -> memory type.

@@ -102,7 +102,15 @@ class Start(TypedDict):
 
 
 class CardEpisode(Outcome):
-    """What an episode came to; its fields mean what they mean in the log."""
+    """What an episode came to.
+
+    Attributes:
+        task: name in the catalogue.
+        episode: its number.
+        memory_type: temporal, spatial, object or procedural.
+        success: whether the goal held at the end.
+        checkpoints: the memory checkpoints, in the task's order.
+    """
 
     task: Name
     episode: Whole

@@ -117,13 +117,18 @@ class Task:
 
     Attributes:
         name: the folder's name.
-        objects, fixtures: instance -> class, in the file's order.
+        memory_type: temporal, spatial, object or procedural.
+        family: tasks of the same kind.
+        language: the instruction.
+        objects: instance -> class, in the file's order.
+        fixtures: instance -> class, in the file's order.
         regions: full name (``<target>_<region>``) -> region.
         init: starting state; objects in regions are sampled, others rest on what they name.
         prompt: what the demonstration prompt shows; None for the published temporal and spatial tasks.
         variants: the alternatives to the published task: ``variant(k)`` for k >= 1.
         variant_index: which variant this is.
-        bddl_text, metadata: the files as read.
+        bddl_text: the task file as read.
+        metadata: the metadata file as read.
         suite: what it belongs to; an episode of the strict suite ends when its goal can no longer be reached.
         derived_from: the published task in whose scene it takes place; None for a task of its own.
         drawn: every episode draws its variant by seed, whatever referent is asked for; a variant is not drawn again.
