@@ -161,10 +161,12 @@ def compose(now: dict[str, Shot]) -> Image.Image:
     draw.text((film.width - 8, HEADER // 2), f"{words}  {clock / CONTROL_HZ:4.1f} s", colour, medium, "rm")
     for column, (name, one) in enumerate(now.items()):
         x, top = column * (SIDE + GAP), HEADER + TITLE
-        draw.text((x + SIDE // 2, HEADER + TITLE // 2), name, fill=INK, font=large, anchor="mm")
+        shown = one.phase != EXECUTION
+        if shown:
+            draw.rectangle((x, HEADER, x + SIDE - 1, top - 1), fill=DEMONSTRATION)
+        ink = BACKGROUND if shown else INK
+        draw.text((x + SIDE // 2, HEADER + TITLE // 2), name, fill=ink, font=large, anchor="mm")
         film.paste(Image.fromarray(one.picture), (x, top))
-        if one.phase != EXECUTION:
-            draw.rectangle((x, top, x + SIDE - 1, top + SIDE - 1), outline=DEMONSTRATION, width=4)
         checkpoints(draw, (x + 8, top + SIDE + 7), one)
         end, colour = ("solved", SOLVED) if one.solved else ("wrong bowl", FAILED) if one.drifted else ("", INK)
         draw.text((x + SIDE - 8, top + SIDE + FOOTER // 2), end, fill=colour, font=large, anchor="rm")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-import textwrap
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -150,27 +150,46 @@ def _kind(result: Result) -> str | bool:
 def _drawn(shown: Sequence[tuple[Result, Strip]]) -> Figure:
     from matplotlib.figure import Figure
 
-    plot = Figure(figsize=(10, 3.1 * len(shown)), layout="constrained")
-    grid = plot.subplots(len(shown), 4, squeeze=False)
-    for axes, (result, strip) in zip(grid, shown, strict=True):
+    plot = Figure(figsize=(8.4, 2.75 * len(shown)), layout="constrained")
+    for row, (result, strip) in zip(plot.subfigures(len(shown), 1, squeeze=False)[:, 0], shown, strict=True):
         pair, side = result["examples"][0], strip.height
+        row.suptitle(get_task(result["task"]).title, fontsize=11, fontweight="bold", x=0.01, ha="left")
+        axes = row.subplots(1, 4)
         for k, axis in enumerate(axes):
             axis.imshow(strip.crop((k * side, 0, (k + 1) * side, side)))
             axis.set_xticks([])
             axis.set_yticks([])
-            axis.set_xlabel(CAMERAS[k % 2], fontsize=8)
+            axis.set_xlabel(CAMERAS[k % 2], fontsize=9)
         for axis, frame in ((axes[0], pair["a"]), (axes[2], pair["b"])):
-            answer = frame["answer"].strip("()").replace("_1", "").replace("_", " ")
-            axis.set_title(f"step {frame['step']}: {answer}", fontsize=9, loc="left")
-        axes[0].set_ylabel(textwrap.fill(result["task"].replace("_", " "), 26), fontsize=8)
+            axis.set_title(f"step {frame['step']}: {in_words(frame['answer'])}", fontsize=10, loc="left")
     return plot
+
+
+WORDS = {
+    "open": "open the {}",
+    "close": "close the {}",
+    "turnon": "turn on the {}",
+    "turnoff": "turn off the {}",
+    "on": "put {} on {}",
+    "in": "put {} into {}",
+}
+"""What is done so that an atom holds."""
+
+
+def in_words(answer: str) -> str:
+    """Return an answer, such as ``(open wooden_cabinet_1_top_region)``, as it would be said."""
+    predicate, *names = answer.strip("()").split()
+    things = [re.sub(r"^.*_(top|middle|bottom)_(region|level)$", r"\1 drawer", name) for name in names]
+    things = [re.sub(r"_1$", "", thing).replace("_", " ") for thing in things]
+    template = WORDS.get(predicate.lower(), "")
+    return template.format(*things) if template.count("{}") == len(things) > 0 else " ".join([predicate, *things])
 
 
 def _small_png(plot: Figure) -> bytes:
     from PIL import Image
 
     buffer = io.BytesIO()
-    plot.savefig(buffer, dpi=110 if len(plot.axes) <= 8 else 64, format="png")
+    plot.savefig(buffer, dpi=110, format="png")
     small = Image.open(buffer).convert("RGB").quantize(192, dither=Image.Dither.NONE)
     buffer = io.BytesIO()
     small.save(buffer, "PNG", optimize=True)

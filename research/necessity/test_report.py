@@ -11,7 +11,7 @@ import pytest
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import get_task
 from research.necessity.__main__ import necessity
-from research.necessity.report import PAGE_BEGIN, PAGE_END, bounds, put_into_page, read_results, side_by_side
+from research.necessity.report import PAGE_BEGIN, PAGE_END, bounds, in_words, put_into_page, read_results, side_by_side
 from research.necessity.settings import settings_of, variants_of
 
 
@@ -97,3 +97,17 @@ def test_a_drawn_task_has_one_setting_and_all_its_goals() -> None:
     ]
     assert settings_of(get_task(MILK), ("fixed", "random")) == ("fixed", "random")
     assert settings_of(get_task(STOVE), ("random",)) == ("fixed",)
+
+
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [
+        ("(open wooden_cabinet_1_top_region)", "open the top drawer"),
+        ("(On butter_5 plate_1)", "put butter 5 on plate"),
+        ("(in butter_1 bowl_2)", "put butter into bowl 2"),
+        ("rest", "rest"),
+        ("(sequence a b)", "sequence a b"),
+    ],
+)
+def test_answers_are_titles_and_no_predicates(answer: str, said: str) -> None:
+    assert in_words(answer) == said
