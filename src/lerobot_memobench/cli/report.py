@@ -133,7 +133,7 @@ def compare(
 
 
 def html(
-    folders: Annotated[list[Path], typer.Argument(help="Folders that evaluations have written.")],
+    folders: Runs,
     out: Annotated[Path, typer.Option(help="Folder of the report; an earlier report there is replaced.")] = Path(
         "outputs/html"
     ),
@@ -146,7 +146,7 @@ def html(
         typer.Option(help="Tasks in the published format that the evaluations ran, beside the catalogue's."),
     ] = None,
 ) -> None:
-    """Make a report for the browser. Rates, failures, and each episode's video over its timeline."""
+    """Make a report for the browser. Rates, failures, each episode's video over its timeline, two side by side."""
     from lerobot_memobench.evaluation.html.write import write_html
 
     written = write_html(folders, out, link=link, task_dir=task_dir)

@@ -69,9 +69,10 @@ def write_html(
     """Write the report of one or several evaluations into ``out``; an earlier report there is replaced.
 
     Args:
-        folders: what evaluations have written. link: let videos be symbolic links to where they are, which saves space
-            on another file system but ties the report to this machine. task_dir: task folders in the published format
-            whose texts are to be shown, beside the catalogue.
+        folders: what evaluations have written, or ``NAME=FOLDER``.
+        link: let videos be symbolic links to where they are, which saves space on another file system but ties the
+            report to this machine.
+        task_dir: task folders in the published format whose texts are to be shown, beside the catalogue.
 
     Raises:
         MemobenchError: a folder holds no log, or ``out`` holds something that is no report.
@@ -81,7 +82,7 @@ def write_html(
     runs: list[Run] = []
     chosen: dict[Path, Path] = {}
     addresses: list[dict[int, str]] = []
-    evaluations = read_runs([Path(folder) for folder in folders])
+    evaluations = read_runs(folders)
     for run, slug in zip(evaluations, _slugs([run.name for run in evaluations]), strict=True):
         found, notes = find_videos(run.folder, run.records)
         names = {k: f"{VIDEOS}/{slug}/{episode_id(run.records[k])}.mp4" for k in found}
