@@ -21,11 +21,11 @@ from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.envs.episode_log import read_episodes, read_protocol_file
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import make_vocabulary, make_word_tokenizer
 from lerobot_memobench.protocol import EXECUTION, PROMPT
 from lerobot_memobench.run.lerobot_commands import call_lerobot
 from lerobot_memobench.sim.object_layout import SIZE
 from lerobot_memobench.tasks.catalogue import get_task
+from tests.support.tiny_paligemma import shrink_paligemma, word_tokenizer
 
 TASK = "turn_on_the_stove_and_turn_it_off"
 LENGTH, PROMPT_LENGTH, SIDE = 12, 4, 256
@@ -153,54 +153,9 @@ def test_on_objects(policy: tuple[str, ...], pictures: bool, said: str | None, s
 # --- those with a language model ---
 
 
-def word_tokenizer(**special: str) -> Any:
-    """Return a tokenizer of whole words; ``special`` names tokens as SmolVLM's tokenizer does."""
-    from transformers import PreTrainedTokenizerFast
-
-    plain = make_word_tokenizer(make_vocabulary([get_task(TASK).language], 400))
-    return PreTrainedTokenizerFast(
-        tokenizer_object=plain.backend_tokenizer,
-        extra_special_tokens=special,
-        pad_token="<pad>",
-        unk_token="<unk>",
-        bos_token="<bos>",
-        eos_token="<eos>",
-    )
-
-
 @pytest.fixture
 def _tiny_paligemma(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Give pi0 and pi0.5 small dimensions and a tokenizer that needs no hub."""
-    from lerobot.policies.pi0 import modeling_pi0
-    from lerobot.policies.pi05 import modeling_pi05
-    from lerobot.processor import tokenizer_processor
-
-    class Tokenizers:
-        @staticmethod
-        def from_pretrained(name: str, **options: Any) -> Any:
-            # LeRobot's main puts the tokenizer into the checkpoint.
-            assert name == "google/paligemma-3b-pt-224" or (Path(name) / "tokenizer.json").is_file()
-            return word_tokenizer()
-
-    monkeypatch.setattr(tokenizer_processor, "AutoTokenizer", Tokenizers)
-
-    def shrink(module: Any) -> None:
-        whole = module.PaliGemmaForConditionalGenerationWithPiGemma
-        gemma = module.get_gemma_config("gemma_300m")
-
-        def small(config: Any) -> Any:
-            vision = config.vision_config
-            vision.hidden_size, vision.intermediate_size = 32, 64
-            vision.num_hidden_layers, vision.num_attention_heads = 1, 2
-            vision.projection_dim = config.projection_dim = config.text_config.hidden_size
-            return whole(config=config)
-
-        sizes = {"width": 32, "depth": 2, "mlp_dim": 64, "num_heads": 8, "num_kv_heads": 1, "head_dim": 8}
-        monkeypatch.setattr(module, "PaliGemmaForConditionalGenerationWithPiGemma", small)
-        monkeypatch.setattr(module, "get_gemma_config", lambda variant: type(gemma)(**sizes))
-
-    shrink(modeling_pi0)
-    shrink(modeling_pi05)
+    shrink_paligemma(monkeypatch, get_task(TASK).language)
 
 
 @pytest.mark.slow
@@ -222,6 +177,7 @@ def tiny_smolvlm(tmp_path: Path) -> Path:
 
     folder = tmp_path / "smolvlm"
     tokenizer = word_tokenizer(
+        get_task(TASK).language,
         fake_image_token="<fake_token_around_image>",
         image_token="<image>",
         end_of_utterance_token="<end_of_utterance>",

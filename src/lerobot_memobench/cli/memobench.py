@@ -16,6 +16,7 @@ import typer
 from typer.core import TyperGroup
 
 from lerobot_memobench.cli import data, figures
+from lerobot_memobench.cli.conformance import conformance
 from lerobot_memobench.cli.console import run_app
 from lerobot_memobench.cli.data import cache, generate
 from lerobot_memobench.cli.demo import demo, doctor
@@ -55,7 +56,7 @@ app = typer.Typer(
 COMMANDS: dict[str, tuple[Callable[..., int | None] | tuple[str, typer.Typer], ...]] = {
     "Look around": (tasks, objects, gallery, doctor, demo),
     "Demonstrations": (generate, data.convert, cache, data.validate, data.describe, data.push),
-    "Train": (recipe,),
+    "Train": (recipe, conformance),
     "Results": (report, compare, html, merge, rerun, ("figures", figures.app), ("controls", controls)),
 }
 """Group -> its commands, as ``memobench --help`` lists them."""

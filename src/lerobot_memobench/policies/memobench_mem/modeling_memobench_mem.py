@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +41,12 @@ from lerobot_memobench.policies.memobench_mem.checkpoints import (
     weights_file,
 )
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import REGRESSION, MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.encoders import ObservationEncoder, PrefixParts, VisualTokenEncoder
+from lerobot_memobench.policies.memobench_mem.encoders import (
+    ENCODED,
+    ObservationEncoder,
+    PrefixParts,
+    VisualTokenEncoder,
+)
 from lerobot_memobench.policies.memobench_mem.memory import make_mechanism
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     FRAMES,
@@ -374,15 +379,29 @@ class MemobenchMemPolicy(PI05Policy):
                 require_fresh(clocks[row][1], round(float(batch[OBS_PICTURE][row])))
         return self.perception.remember(batch, rows)
 
-    def plan(self, batch: dict[str, Tensor], rows: list[int], noise: Tensor, **kwargs: Any) -> Tensor:
-        """Return action chunks (n, chunk, A) of some rows of the batch, with their histories and sampling noise."""
-        part = {key: batch[key][rows] for key in self._inputs if key in batch}
+    def plan(
+        self,
+        batch: dict[str, Tensor],
+        rows: list[int],
+        noise: Tensor,
+        history: MemoryBatch | None = None,
+        **kwargs: Any,
+    ) -> Tensor:
+        """Return action chunks (n, chunk, A) of some rows of the batch, with their histories and sampling noise.
+
+        Args:
+            history: what the rows remember; None: what their rollouts do.
+        """
+        inputs = [*self._inputs, *(key for key in batch if key.startswith(ENCODED))]
+        part = {key: batch[key][rows] for key in inputs if key in batch}
         images, image_masks = self._preprocess_images(part)
         words = part[OBS_LANGUAGE_TOKENS], part[OBS_LANGUAGE_ATTENTION_MASK]
         with self._acting():
             if self._remembers:
-                self._require_history(rows)
-                self.model.set_memory(*self.rollout.gather(rows).to(self._device))
+                if history is None:
+                    self._require_history(rows)
+                    history = self.rollout.gather(rows)
+                self.model.set_memory(*history.to(self._device))
             noise = noise.to(self._device)
             actions = self.model.sample_actions(images, image_masks, *words, noise=noise, **kwargs)
         return actions[:, :, : self._action_dim]
@@ -404,10 +423,13 @@ class MemobenchMemPolicy(PI05Policy):
             )
 
     def _noise(self, rows: list[int]) -> Tensor:
+        return self._stacked(lambda row, shape: self.rollout.rows[row].noise(shape), rows)
+
+    def _stacked(self, draw: Callable[[int, tuple[int, int]], Tensor], rows: Iterable[int]) -> Tensor:
+        """Return the noise (n, chunk, max_action_dim) that is drawn for each row; zeros by regression."""
         shape = self.config.chunk_size, self.config.max_action_dim
-        if self.config.objective == REGRESSION:
-            return torch.zeros(len(rows), *shape)
-        return torch.stack([self.rollout.rows[row].noise(shape) for row in rows])
+        regression = self.config.objective == REGRESSION
+        return torch.stack([torch.zeros(shape) if regression else draw(row, shape) for row in rows])
 
     def needs_observation(self) -> bool:
         """Return whether the next observation's pictures or objects are read: it is remembered, or planned from.
@@ -431,8 +453,9 @@ class MemobenchMemPolicy(PI05Policy):
         """Take in one observation per row and plan for all rows: (B, chunk, A), normalised.
 
         A policy that remembers must be offered the observation of every control step by `observe`, this one included,
-        unless it holds its step (``observation.step``); or let `select_action` do so. ``noise``
-        (B, chunk, max_action_dim) replaces the episodes' own; other keywords are LeRobot's real-time chunking ones.
+        unless it holds its step (``observation.step``); or let `select_action` do so. A training batch is answered
+        with the histories that it brings. ``noise`` (B, chunk, max_action_dim) replaces the episodes' own; other
+        keywords are LeRobot's real-time chunking ones.
 
         Raises:
             MemobenchError: observations were left out between two chunks; or real-time chunking, by regression.
@@ -444,6 +467,13 @@ class MemobenchMemPolicy(PI05Policy):
                 "plans would not continue the last one; use --inference.type=sync, or train with "
                 "--policy.objective=flow_matching."
             )
+        noise = kwargs.pop("noise", None)
+        if PHASE in batch:  # of a training
+            samples = range(len(batch[PHASE]))
+            history = MemoryBatch(batch[TOKENS], batch[STEPS], batch[MASK]) if TOKENS in batch else None
+            if noise is None:
+                noise = self._stacked(lambda _, shape: torch.randn(shape), samples)
+            return self.plan(batch, [*samples], noise, history, **kwargs)
         if OBS_STEP in batch or not self._remembers or not self._calls:
             self.observe(batch)
         elif self._calls == self._planned:
@@ -455,7 +485,6 @@ class MemobenchMemPolicy(PI05Policy):
             )
         self._planned = self._calls
         rows = list(range(len(self.rollout.rows)))
-        noise = kwargs.pop("noise", None)
         return self.plan(batch, rows, self._noise(rows) if noise is None else noise, **kwargs)
 
     # -- checkpoints -----------------------------------------------------------------------------------------------

@@ -1,0 +1,39 @@
+"""The checks as tests of pytest: a class to be subclassed in somebody's own tests, one test for each check."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import ClassVar
+
+import pytest
+
+from lerobot_memobench.conformance.checks import CHECKS, Behaviour, Outcome, run_check
+from lerobot_memobench.conformance.subject import load_subject
+
+
+class MemoryConformance:
+    """Check a policy. A check that does not apply is skipped, with its reason.
+
+    Attributes:
+        arguments: as `memobench conformance` takes them, ``("policy=mine", "policy.width=32")``.
+    """
+
+    arguments: ClassVar[Sequence[str]]
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def behaviour(cls) -> Iterator[Behaviour]:
+        """The policy, and what it did; measured once for the class."""
+        with TemporaryDirectory() as folder:
+            yield Behaviour(load_subject(cls.arguments, Path(folder)))
+
+    @pytest.mark.parametrize("check", CHECKS)
+    def test_conformance(self, behaviour: Behaviour, check: str) -> None:
+        """Run one check."""
+        result = run_check(check, behaviour)
+        if result.outcome in (Outcome.NO_MEMORY, Outcome.NOT_CHECKED):
+            pytest.skip(result.sentence)
+        if result.outcome is Outcome.FAILED:
+            pytest.fail(result.sentence, pytrace=False)

@@ -1,0 +1,142 @@
+"""Observations to drive a policy with: a small dataset in the form of `memobench generate`, and episodes out of one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
+from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, CLOCK, EXECUTION, IMAGE_SIZE, OBS_PHASE, PROPRIO_DIM
+from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
+from lerobot_memobench.tasks.catalogue import get_task
+
+TASK = "put_the_milk_picked_up_in_the_prompt_video_on_the_plate"
+PROMPTS = (8, 11, 14)
+"""Frames of the episodes' prompts: they differ, so rows of a batch begin to act at different calls."""
+EXECUTION_FRAMES = 27
+THINGS = 4
+"""Objects of the made-up scenes."""
+
+
+def write_streams(folder: Path, pictures: bool = True, frames: int = EXECUTION_FRAMES) -> Path:
+    """Write a dataset of three short episodes: real columns and shapes, made-up pictures, states and objects.
+
+    Args:
+        frames: of each execution.
+    """
+    return write_dataset((_episode(seed, prompt, pictures, frames) for seed, prompt in enumerate(PROMPTS)), folder)
+
+
+def _episode(seed: int, prompt: int, pictures: bool, frames: int) -> Demonstration:
+    """An episode in which an arm and some things move smoothly, by numbers that the seed decides."""
+    task, rng, length = get_task(TASK), np.random.default_rng(seed), prompt + frames
+    times = np.arange(length)[:, None] / 2
+
+    def moving(width: int) -> NDArray[np.float32]:
+        waves = np.sin(times * rng.uniform(0.5, 1.5, width) + rng.uniform(0, 6, width))
+        return waves.astype(np.float32)
+
+    slots = np.zeros((length, SLOTS, WIDTH), np.float32)
+    position, rotation = STARTS["position"], STARTS["rotation"]
+    for thing in range(THINGS):
+        slots[:, thing, : STARTS["position"]] = [1, 3 + thing]
+        slots[:, thing, position : position + 3] = [0, 0, 0.95] + 0.2 * moving(3)
+        slots[:, thing, rotation : rotation + 6] = [1, 0, 0, 1, 0, 0]
+    return Demonstration(
+        task=task,
+        seed=seed,
+        referent="fixed",
+        variant=0,
+        states=np.zeros((length, 1)),
+        actions=moving(ACTION_DIM),
+        proprio=np.array([0, 0, 1.1, 3.1, 0, 0, 0, 0], np.float32) + 0.1 * moving(PROPRIO_DIM),
+        images={name: _pictures(rng, moving(2)) for name in CAMERAS} if pictures else None,
+        exec_start=prompt,
+        satisfied=np.zeros((length, len(task.checkpoints)), np.bool_),
+        success=True,
+        objects=slots.reshape(length, -1),
+    )
+
+
+def _pictures(rng: np.random.Generator, places: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return a coloured square that moves along places (T, 2) in [-1, 1]."""
+    found = np.full((len(places), IMAGE_SIZE, IMAGE_SIZE, 3), 40, np.uint8)
+    side, colour = IMAGE_SIZE // 4, rng.integers(80, 255, 3)
+    corners = ((places + 1) / 2 * (IMAGE_SIZE - side)).astype(int)
+    for picture, (top, left) in zip(found, corners, strict=True):
+        picture[top : top + side, left : left + side] = colour
+    return found
+
+
+@dataclass(frozen=True)
+class Stream:
+    """What one environment shows, call by call; when it is over it repeats its last frame, as LeRobot's do.
+
+    Attributes:
+        frames: observations by their names at the policy, without a batch dimension.
+        task: the instruction.
+        index: of the first frame in the dataset.
+    """
+
+    frames: tuple[dict[str, Tensor], ...]
+    task: str
+    index: int
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def at(self, call: int) -> dict[str, Tensor]:
+        """Return what is shown at a call."""
+        return self.frames[min(call, len(self) - 1)]
+
+    @property
+    def start(self) -> int:
+        """The first call of the execution."""
+        return next(call for call, frame in enumerate(self.frames) if float(frame[OBS_PHASE]) == EXECUTION)
+
+    def until(self, call: int) -> Stream:
+        """Return the stream that is over after a call."""
+        return replace(self, frames=self.frames[: call + 1])
+
+    def showing(self, other: Stream, calls: Sequence[int]) -> Stream:
+        """Return the stream that shows at some calls what another one does, at its own phase and step."""
+        shown = {call: {**other.at(call), **{name: self.at(call)[name] for name in CLOCK}} for call in calls}
+        return replace(self, frames=tuple(shown.get(call, frame) for call, frame in enumerate(self.frames)))
+
+
+def read_streams(dataset: Any, pictures: bool, objects: str | None, prompts: bool, frames: int) -> Iterator[Stream]:
+    """Yield the beginning of each episode of a LeRobotDataset as a rollout would show it.
+
+    Args:
+        dataset: without delta timestamps.
+        pictures: whether cameras are observed. objects: the column of object state that is; None where none is.
+        prompts: whether the prompt is; else the stream begins with the execution.
+        frames: so many of the execution.
+    """
+    from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
+
+    for episode in dataset.meta.episodes:
+        first, end = episode["dataset_from_index"], episode["dataset_to_index"]
+        phases = [float(phase) for phase in dataset.hf_dataset[first:end][OBS_PHASE]]
+        start = phases.index(EXECUTION)
+        shown: list[dict[str, Tensor]] = []
+        for index in range(first if prompts else first + start, min(first + start + frames, end)):
+            item = dataset[index] if pictures else dataset.hf_dataset[index]
+            frame = {key: item[key] for key in (OBS_STATE, *CLOCK)}
+            frame |= {key: _real(item[key]) for key in item if pictures and key.startswith(f"{OBS_IMAGES}.")}
+            frame |= {} if objects is None else {OBS_ENV_STATE: item[objects]}
+            shown.append(frame)
+        yield Stream(tuple(shown), episode["tasks"][0], first if prompts else first + start)
+
+
+def _real(picture: Tensor) -> Tensor:
+    """Return a picture in [0, 1], as LeRobot's training loop gives it to a policy."""
+    return picture.to(torch.float32) / 255 if picture.dtype == torch.uint8 else picture

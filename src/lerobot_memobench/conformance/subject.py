@@ -1,0 +1,197 @@
+"""A policy that is asked: made or loaded as ``lerobot train`` does, driven as ``lerobot eval`` does."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+
+from lerobot_memobench.conformance.streams import EXECUTION_FRAMES, Stream, read_streams, write_streams
+from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS as OBJECTS_COLUMN
+from lerobot_memobench.datasets.lerobot_format.layout import check_clock, objects_column
+from lerobot_memobench.envs.command_line import quiet
+from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS, obs_type_of, reads_prompt
+from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.protocol import CLOCK
+from lerobot_memobench.run.arguments import read_arguments, split_arguments
+from lerobot_memobench.run.plan import policy_config
+from lerobot_memobench.run.rollout import needs_observation
+from lerobot_memobench.run.training import take_training_options, trained_on
+
+REPLAN = 3
+"""Actions per chunk where none are asked for: several chunks begin within a short stream."""
+STREAMS = 3
+"""Episodes that are needed: a row, and two others beside it."""
+KEYS = ("policy", "dataset", "obs_type")
+
+Actions = NDArray[np.float32]
+"""What a policy answers: (calls, rows, A)."""
+
+
+@dataclass
+class Subject:
+    """A policy with its processors, a dataset, and what its episodes show in a rollout.
+
+    Attributes:
+        dataset: as it is trained on: with the policy's own delta timestamps.
+        streams: `STREAMS` episodes.
+    """
+
+    name: str
+    policy: Any
+    preprocessor: Any
+    postprocessor: Any
+    dataset: Any
+    streams: list[Stream]
+
+    @property
+    def reads_prompt(self) -> bool:
+        """Whether its configuration declares that it reads prompts."""
+        return reads_prompt(self.policy.config)
+
+    def roll(self, streams: Sequence[Stream], *, equal_noise: bool = True, sparing: bool = False) -> Actions:
+        """Reset the policy and let it act on streams, a row each, until the longest is over.
+
+        Args:
+            equal_noise: let every row and every call draw the same noise, so that actions can be compared.
+            sparing: give it earlier pictures and objects again where it says that it does not need those of the
+                present, as evaluations do.
+        """
+        needed, spared = needs_observation(self.policy), dict[str, Tensor]()
+        answers = []
+        self.policy.reset()
+        with EqualNoise() if equal_noise else nullcontext():
+            for call in range(max(len(stream) for stream in streams)):
+                batch = self._batch(streams, call)
+                begins = any(call in (0, stream.start) for stream in streams)
+                costly = [key for key in batch if key.startswith(("observation.images", OBJECTS_COLUMN))]
+                if sparing and call and not begins and not needed():
+                    batch |= {key: spared[key] for key in costly}
+                spared = {key: batch[key] for key in costly}
+                with torch.inference_mode():
+                    action = self.postprocessor(self.policy.select_action(self.preprocessor(batch)))
+                answers.append(action.to("cpu", torch.float32).numpy().copy())
+        return np.stack(answers)
+
+    def _batch(self, streams: Sequence[Stream], call: int) -> dict[str, Any]:
+        shown = [stream.at(call) for stream in streams]
+        batch: dict[str, Any] = {key: torch.stack([frame[key] for frame in shown]) for key in shown[0]}
+        return batch | {"task": [stream.task for stream in streams]}
+
+    def predict(self, stream: Stream, calls: Sequence[int]) -> Actions:
+        """Return the first actions (calls, A) of the chunks that it predicts for samples of a training batch.
+
+        Args:
+            stream: an episode. calls: frames of it, which become the samples.
+        """
+        from lerobot.utils.collate import lerobot_collate_fn
+
+        batch = lerobot_collate_fn([self.dataset[stream.index + call] for call in calls])
+        for key in self.dataset.meta.camera_keys:
+            if key in batch and batch[key].dtype == torch.uint8:
+                batch[key] = batch[key].to(torch.float32) / 255
+        self.policy.reset()
+        with EqualNoise(), torch.inference_mode():
+            chunks = self.policy.predict_action_chunk(self.preprocessor(batch))
+            first: Tensor = self.postprocessor(chunks[:, 0])
+        return first.to("cpu", torch.float32).numpy()
+
+
+class EqualNoise(TorchFunctionMode):
+    """While it lasts, random tensors are the same at every call, and along every axis but the last one.
+
+    What a row draws then depends neither on the number of rows nor on what was drawn before.
+    """
+
+    RANDOM = (
+        *(torch.randn, torch.randn_like, torch.normal, torch.rand, torch.rand_like),
+        *(Tensor.normal_, Tensor.uniform_),
+    )
+
+    def __torch_function__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Call a function of torch's; level what it drew."""
+        found = function(*args, **(kwargs or {}))
+        if function in self.RANDOM:
+            width = found.shape[-1] if found.dim() > 1 else 1
+            found.copy_(torch.rand(width, generator=torch.Generator().manual_seed(width)).to(found))
+        return found
+
+
+def load_subject(words: Sequence[str], folder: Path) -> Subject:
+    """Make or load the policy that is asked, and what it observes.
+
+    Args:
+        words: ``policy=…``, settings of it, ``dataset=…``, ``obs_type=…``, as ``lerobot train`` takes them.
+        folder: empty; a dataset is made in it where none is named.
+
+    Raises:
+        MemobenchError: no policy is named, it cannot be built, or the dataset has too few episodes.
+    """
+    _, obs_type, given = take_training_options(split_arguments(words))
+    for key, _ in given.pairs:
+        if key.partition(".")[0] not in KEYS:
+            raise MemobenchError(f"memobench conformance has no setting {key!r}, {nearest(key, KEYS)}")
+    if given.value("dataset") is None:
+        given = type(given)([*given.pairs, ("dataset", str(write_streams(folder / "streams")))], given.flags)
+    arguments = read_arguments("train", given)
+    if not torch.cuda.is_available():
+        arguments = arguments.default("policy.device", "cpu")
+    if "n_action_steps" in getattr(arguments.chosen.get("policy"), "__dataclass_fields__", ()):
+        arguments = arguments.default("policy.n_action_steps", REPLAN)
+    config: Any = policy_config(arguments)
+    if config is None:
+        raise MemobenchError("name a policy: a checkpoint folder, policy=memobench_small, or a type such as policy=act")
+    path = arguments.get("policy.path")
+    config.pretrained_path = None if path is None else Path(path)
+    with quiet():
+        return _built(config, str(arguments.get("dataset.repo_id")), arguments.get("dataset.root"), obs_type)
+
+
+def _built(config: Any, repository: str, root: str | None, obs_type: str | None) -> Subject:
+    from lerobot import policies  # its functions are looked up where they are called: hooks stand around them
+    from lerobot.configs.default import DatasetConfig
+    from lerobot.configs.train import TrainPipelineConfig
+    from lerobot.datasets import LeRobotDataset, factory
+
+    whole = TrainPipelineConfig(DatasetConfig(repository, root=root), policy=config)
+    with trained_on(None, obs_type):
+        dataset, _ = factory.make_train_eval_datasets(whole)
+    features = dataset.meta.features
+    check_clock(features, dataset.root)
+    if not set(CLOCK) <= set(features):
+        raise MemobenchError(f"{dataset.root} has no {CLOCK[0]}; name a dataset of `memobench generate`, or none")
+    path = config.pretrained_path
+    torch.manual_seed(0)
+    policy = policies.make_policy(config, ds_meta=dataset.meta)
+    if path is None:
+        _begin_somewhere(policy)
+    loaded = {} if path is None else {"preprocessor_overrides": {"device_processor": {"device": config.device}}}
+    before, after = policies.make_pre_post_processors(config, path, dataset_stats=dataset.meta.stats, **loaded)
+    policy.eval()
+    shown = obs_type_of(config) or PIXELS
+    raw = LeRobotDataset(repository, root=dataset.root)
+    objects = objects_column(raw.meta.features) if shown in (OBJECTS, BOTH) else None
+    found = read_streams(raw, shown in (PIXELS, BOTH), objects, reads_prompt(config), EXECUTION_FRAMES)
+    streams = [stream for stream, _ in zip(found, range(STREAMS), strict=False)]
+    if len(streams) < STREAMS:
+        raise MemobenchError(
+            f"{dataset.root} has {len(streams)} episodes; name a dataset of at least {STREAMS}, or none"
+        )
+    return Subject(config.type, policy, before, after, dataset, streams)
+
+
+def _begin_somewhere(policy: Any) -> None:
+    """Draw the weights that begin at zero: a memory behind them would have no effect yet."""
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for weights in policy.parameters():
+            if weights.requires_grad and not weights.any():
+                weights.copy_(0.1 * torch.randn(weights.shape, generator=generator))

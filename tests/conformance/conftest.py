@@ -1,0 +1,33 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "lerobot_policy_window"
+
+
+@pytest.fixture(scope="session")
+def example(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Install the example as a third party's package, as a wheel; LeRobot finds it by itself. Return where it is."""
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    folder = tmp_path_factory.mktemp("site")
+    words = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder / "wheel")]
+    subprocess.run(words, cwd=EXAMPLE, check=True, capture_output=True)
+    (wheel,) = (folder / "wheel").iterdir()
+    zipfile.ZipFile(wheel).extractall(folder)
+    sys.path.insert(0, str(folder))
+    register_third_party_plugins()
+    return folder
+
+
+@pytest.fixture(scope="session")
+def objects(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Streams of object state, without pictures: nothing is encoded or decoded."""
+    from lerobot_memobench.conformance.streams import write_streams
+
+    return write_streams(tmp_path_factory.mktemp("streams") / "objects", pictures=False, frames=13)

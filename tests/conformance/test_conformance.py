@@ -1,0 +1,274 @@
+"""What conforms passes, and of a policy with a flaw exactly what is wrong is named."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lerobot.configs import PreTrainedConfig
+
+from lerobot_memobench.cli.memobench import main
+from lerobot_memobench.conformance import subject as module
+from lerobot_memobench.conformance.checks import CHECKS, Behaviour, Outcome, run_check, run_checks
+from lerobot_memobench.conformance.pytest_class import MemoryConformance
+from lerobot_memobench.conformance.subject import Subject, load_subject
+from tests.support.tiny_paligemma import shrink_paligemma
+
+EXAMPLE = ("policy=window", "policy.width=32", "policy.frames=8", "policy.stride=2")
+MEM = (
+    *("policy=memobench_mem", "policy.size=tiny", "policy.perception=objects", "policy.memory_stride=2"),
+    *("policy.memory_frames=8", "policy.chunk_size=4", "policy.num_inference_steps=1"),
+)
+
+
+@pytest.fixture(scope="module")
+def window(example: Path, objects: Path, tmp_path_factory: pytest.TempPathFactory) -> Subject:
+    return load_subject([*EXAMPLE, f"dataset={objects}"], tmp_path_factory.mktemp("window"))
+
+
+def failed(subject: Subject) -> set[str]:
+    return {result.check for result in run_checks(subject) if result.outcome is Outcome.FAILED}
+
+
+class TestExample(MemoryConformance):
+    """As a researcher writes it, but for the dataset."""
+
+    @pytest.fixture(scope="class", autouse=True)
+    @classmethod
+    def _arguments(cls, example: Path, objects: Path) -> None:
+        cls.arguments = (*EXAMPLE, f"dataset={objects}")
+
+
+def test_the_example_is_an_installed_package(example: Path) -> None:
+    kind = PreTrainedConfig.get_known_choices()["window"]
+    assert Path(__import__(kind.__module__).__file__).parent == example
+
+
+def test_our_policy(objects: Path, tmp_path: Path) -> None:
+    results = run_checks(load_subject([*MEM, f"dataset={objects}"], tmp_path))
+    assert {result.outcome for result in results} == {Outcome.PASSED}, results
+
+
+# --- a policy with one flaw ---
+
+
+def flaws(base: Any) -> dict[str, tuple[type, set[str]]]:
+    """Name -> class of a policy with a flaw, and the checks that name it."""
+
+    class ForgetsNothing(base):
+        def reset(self) -> None:
+            """Keep the rows, of which there are always enough."""
+            self.rows = list(getattr(self, "rows", []))
+
+        def select_action(self, batch: Any, **_: Any) -> Any:
+            count = len(batch["observation.step"])
+            kept, self.rows = self.rows[count:], self.rows[:count] if len(self.rows) >= count else []
+            action = super().select_action(batch)
+            self.rows += kept
+            return action
+
+    class MixesRows(base):
+        def tokens(self, batch: Any) -> Any:
+            found = super().tokens(batch)
+            return found + found.mean(0) if found.dim() == 2 else found
+
+    class SharesItsQueue(base):
+        """One queue for all rows, as LeRobot's policies have: all plan when the first does."""
+
+        def select_action(self, batch: Any, **_: Any) -> Any:
+            if any(not row.queue for row in self.rows):
+                for row in self.rows:
+                    row.queue.clear()
+            return super().select_action(batch)
+
+    class RemembersPlans(base):
+        def select_action(self, batch: Any, **_: Any) -> Any:
+            action = super().select_action(batch)
+            for row in self.rows:
+                if row.clock[0] == 1 and len(row.queue) != self.config.n_action_steps - 1:
+                    row.past.pop()
+            return action
+
+    class DropsThePrompt(base):
+        def select_action(self, batch: Any, **_: Any) -> Any:
+            begins = (batch["observation.phase"] == 1) & (batch["observation.step"] == 0)
+            for row, begin in zip(self.rows, begins, strict=False):
+                if begin:
+                    row.past.clear()
+            return super().select_action(batch)
+
+    class ActsLate(base):
+        """What was planned in the prompt is carried out in the execution."""
+
+        def reset(self) -> None:
+            super().reset()
+            self.before: Any = None
+
+        def select_action(self, batch: Any, **_: Any) -> Any:
+            action = super().select_action(batch)
+            before, self.before = self.before, action
+            return action if before is None else before
+
+    class MindsTheFinished(base):
+        def select_action(self, batch: Any, **_: Any) -> Any:
+            clocks = zip(batch["observation.phase"].tolist(), batch["observation.step"].tolist(), strict=True)
+            if any(row.clock == clock for row, clock in zip(self.rows, clocks, strict=False)):
+                for row in self.rows:
+                    row.queue = deque([torch.zeros(7)])
+            return super().select_action(batch)
+
+    class DrawsItsOwn(base):
+        def select_action(self, batch: Any, **_: Any) -> Any:
+            return super().select_action(batch) + int.from_bytes(os.urandom(2))
+
+    class NeedsNothing(base):
+        def needs_observation(self) -> bool:
+            return False
+
+    history = "same history in training"
+    compared = {"deterministic given a seed", "reset forgets", "rows are independent", history}
+    return {
+        "reset": (ForgetsNothing, compared),
+        "mixed rows": (
+            MixesRows,
+            {"rows are independent", "finished rows change no other", "same history in training"},
+        ),
+        "one queue": (SharesItsQueue, {"rows are independent"}),
+        "per chunk": (RemembersPlans, {"remembers every control step", history}),
+        "prompt": (DropsThePrompt, {"reads the prompt", history}),
+        "late": (ActsLate, {"plans anew after the prompt"}),
+        "finished": (MindsTheFinished, {"finished rows change no other"}),
+        "noise": (DrawsItsOwn, compared),
+        "needs": (NeedsNothing, {"needs_observation is true"}),
+    }
+
+
+NAMES = ("reset", "mixed rows", "one queue", "per chunk", "prompt", "late", "finished", "noise", "needs")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_flaw_is_named(name: str, window: Subject) -> None:
+    base = type(window.policy)
+    window.policy.__class__, expected = flaws(base)[name]
+    try:
+        found = failed(window)
+    finally:
+        window.policy.__class__ = base
+    assert found >= expected if name == "noise" else found == expected
+
+
+def test_another_history_in_training_is_named(window: Subject, monkeypatch: pytest.MonkeyPatch) -> None:
+    reader = window.dataset.reader
+    later = {key: [d - key.startswith("observation.") for d in deltas] for key, deltas in reader.delta_indices.items()}
+    monkeypatch.setattr(reader, "delta_indices", later)
+    assert failed(window) == {"same history in training"}
+
+
+@pytest.mark.parametrize("way", ["raises", "present alone"])
+def test_what_cannot_be_asked_is_not_checked(way: str, window: Subject, monkeypatch: pytest.MonkeyPatch) -> None:
+    policy = window.policy
+    answer = policy.predict_action_chunk
+
+    def predict(batch: Any) -> Any:
+        if way == "raises":
+            raise KeyError("observation.images.image")
+        names = [key for key in batch if key.startswith("observation.") and not key.endswith("_is_pad")]
+        alone = {key: batch[key][:, -1:].expand_as(batch[key]) for key in names}
+        pad = torch.ones_like(batch["observation.state_is_pad"])
+        pad[:, -1] = False
+        return answer({**batch, **alone, "observation.state_is_pad": pad})
+
+    monkeypatch.setattr(policy, "predict_action_chunk", predict)
+    result = run_check("same history in training", Behaviour(window))
+    assert result.outcome is Outcome.NOT_CHECKED
+    assert ("KeyError" if way == "raises" else "its present frames alone") in result.sentence
+
+
+def test_an_error_of_the_policy_is_a_failure(window: Subject, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(batch: Any) -> Any:
+        raise ValueError("no such row")
+
+    monkeypatch.setattr(window.policy, "select_action", broken)
+    result = run_check("remembers", Behaviour(window))
+    assert (result.outcome, result.sentence) == (Outcome.FAILED, "the policy raised ValueError: no such row")
+
+
+# --- on pictures of the real size: LeRobot's policies, ours, the example ---
+
+ACT = (
+    *("policy=act", "policy.pretrained_backbone_weights=null", "policy.dim_model=32", "policy.n_heads=2"),
+    *("policy.dim_feedforward=64", "policy.n_encoder_layers=1", "policy.n_vae_encoder_layers=1"),
+    *("policy.chunk_size=4", "policy.latent_dim=8"),
+)
+DIFFUSION = (
+    *("policy=diffusion", "policy.down_dims=[16,32]", "policy.num_inference_steps=2", "policy.horizon=8"),
+    *("policy.diffusion_step_embed_dim=16", "policy.n_groups=4", "policy.pretrained_backbone_weights=null"),
+    *("policy.crop_shape=[84,84]", "policy.spatial_softmax_num_keypoints=8"),
+)
+PI05 = (
+    *("policy=pi05", "policy.chunk_size=4", "policy.num_inference_steps=2", "policy.dtype=float32"),
+    "policy.tokenizer_max_length=64",
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("words", "wrong"),
+    [
+        (ACT, ["remembers"]),
+        (DIFFUSION, ["reads the prompt"]),
+        (PI05, ["remembers"]),
+        (("policy=window",), []),
+        (("policy=memobench_mem", "policy.size=tiny", "policy.memory_stride=2"), []),
+        (("policy=memobench_small",), []),
+        (("policy=memobench_small_memoryless",), ["remembers"]),
+    ],
+    ids=["act", "diffusion", "pi05", "window", "memobench_mem", "memobench_small", "memobench_small_memoryless"],
+)
+def test_what_fails_is_named_exactly(
+    words: tuple[str, ...], wrong: list[str], example: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shrink_paligemma(monkeypatch, "put the milk picked up in the prompt video on the plate")
+    results = run_checks(load_subject(words, tmp_path))
+    assert [result.check for result in results if result.outcome is Outcome.FAILED] == wrong, results
+    assert not [result for result in results if result.outcome is Outcome.NOT_CHECKED]
+
+
+# --- the command ---
+
+
+def test_the_command(example: Path, objects: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["conformance", *EXAMPLE, f"dataset={objects}"]) == 0
+    out = capsys.readouterr().out
+    assert all(re.search(rf"{re.escape(name)} +│ passed", out) for name in CHECKS)
+    assert "No check failed." in out
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["policy=windo"], "there is no policy 'windo', did you mean 'window'"),
+        (["policy=window", "tasks=all"], "memobench conformance has no setting 'tasks'"),
+        (["policy=window", "policy.widht=3"], "did you mean 'policy.width'"),
+        ([], "name a policy"),
+    ],
+)
+def test_a_wrong_line_is_told_in_one_sentence(
+    words: list[str], told: str, example: Path, objects: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["conformance", *words, f"dataset={objects}"]) == 2
+    assert told in capsys.readouterr().err
+
+
+def test_equal_noise_does_not_depend_on_rows() -> None:
+    with module.EqualNoise():
+        one, many = torch.randn(1, 4, 7), torch.randn(3, 4, 7)
+        assert torch.equal(many, one.expand_as(many))
+        assert torch.equal(torch.normal(0.0, 1.0, (2, 7))[0], one[0, 0])
+        assert torch.equal(torch.empty(5, 7).normal_()[4], one[0, 0])
+    assert not torch.equal(torch.randn(1, 4, 7), one)
