@@ -18,7 +18,7 @@ from lerobot_memobench.cli import memobench
 from lerobot_memobench.envs import episode_log
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation import records
-from lerobot_memobench.evaluation.metrics import METRICS, Rate, percent
+from lerobot_memobench.evaluation.metrics import Rate
 from lerobot_memobench.run.arguments import joined, read_arguments, resolve_recipe, split_arguments
 from lerobot_memobench.run.plan import take_run_options
 from lerobot_memobench.run.training import take_training_options
@@ -26,6 +26,7 @@ from tests.support.logs import rollout
 from tests.support.scripts import load_script
 
 reference = load_script("docs_reference")
+keep_log = load_script("keep_log")
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -133,7 +134,7 @@ def test_every_page_has_its_place_in_the_site() -> None:
 
 # --- figures ---
 
-LOGS = NOTES / "logs"
+LOGS = keep_log.LOGS
 FIGURES = ("SR", "MSR", "MUR", "MCR", "rollouts")
 
 
@@ -146,30 +147,28 @@ def published(document: Path) -> Iterator[tuple[str, dict[str, str]]]:
                 yield found[1] or found[2], {name: row[head.index(name)] for name in FIGURES}
 
 
-def recomputed(folder: Path) -> dict[str, str]:
-    """Return the same figures from a log, as they are written in a document."""
-    (run,) = records.read_runs([folder])
-    cells = {metric: in_figures(run.summary.average[metric]) for metric in METRICS}
-    return {**cells, "rollouts": f"{run.summary.rollouts:,}"}
-
-
-def in_figures(rate: Rate) -> str:
-    """Return a rate as documents write it: ``97.9 [96.9–98.5]``."""
-    if rate.value is None or rate.interval is None:
-        return "–"
-    value, low, high = (f"{percent(part):g}" for part in (rate.value, *rate.interval))
-    return f"{value} [{low}–{high}]"
-
-
 @pytest.mark.parametrize("document", [ROOT / "README.md", DOCS / "benchmark" / "results.md"], ids=name)
 def test_published_figures_are_those_of_their_logs(document: Path) -> None:
     for log, figures in published(document):
-        assert figures == recomputed(LOGS / log), log
+        assert figures == keep_log.figures(LOGS / log), log
 
 
 def test_every_log_is_among_the_results() -> None:
     there = {folder.name for folder in LOGS.iterdir() if folder.is_dir()}
     assert {log for log, _ in published(DOCS / "benchmark" / "results.md")} == there
+
+
+@pytest.mark.parametrize(
+    ("rate", "words"),
+    [
+        (Rate(0.979, 1500), "97.9 [97.0–98.5]"),
+        (Rate(1.0, 1500), "100 [99.7–100]"),
+        (Rate(0.0, 150), "0.0 [0–2.5]"),
+        (Rate(None, 0), "–"),
+    ],
+)
+def test_a_rate_as_documents_write_it(rate: Rate, words: str) -> None:
+    assert keep_log.in_words(rate) == words
 
 
 def test_logs_are_small() -> None:
@@ -182,8 +181,8 @@ def test_figures_of_a_row_are_found(tmp_path: Path) -> None:
     document.write_text(f"{head}| a | 1 | 2 | 3 | – | 1,500 | [log](../research/logs/a) |\n| b | | | | | | |\n")
     assert list(published(document)) == [("a", {"SR": "1", "MSR": "2", "MUR": "3", "MCR": "–", "rollouts": "1,500"})]
     episode_log.write_episodes(tmp_path, [rollout("one", "temporal", "S", [k > 0], k > 0, k) for k in range(4)])
-    rate = "75 [30.1–95.4]"
-    assert recomputed(tmp_path) == {"SR": rate, "MSR": rate, "MUR": "–", "MCR": "–", "rollouts": "4"}
+    rate = "75.0 [30.1–95.4]"
+    assert keep_log.figures(tmp_path) == {"SR": rate, "MSR": rate, "MUR": "–", "MCR": "–", "rollouts": "4"}
 
 
 # --- commands ---
