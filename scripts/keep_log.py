@@ -28,11 +28,12 @@ def figures(folder: Path) -> dict[str, str]:
 
 
 def in_words(rate: Rate) -> str:
-    """Return a rate as documents write it: ``97.9 [96.9–98.5]``, and 100 without a decimal."""
+    """Return a rate as documents write it: ``97.9 [96.9–98.5]``; 0 and 100 without a decimal."""
     if rate.value is None or rate.interval is None:
         return "–"
-    value, low, high = (f"{percent(part):.1f}" for part in (rate.value, *rate.interval))
-    return " [".join((value, f"{low}–{high}]")).replace("100.0", "100").replace(" [0.0–", " [0–")
+    parts = [percent(part) for part in (rate.value, *rate.interval)]
+    value, low, high = (f"{part:.0f}" if part in (0, 100) else f"{part:.1f}" for part in parts)
+    return f"{value} [{low}–{high}]"
 
 
 def main() -> None:
