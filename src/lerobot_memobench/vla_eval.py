@@ -56,7 +56,7 @@ class MEMOBench(StepBenchmark):
     with a demonstration prompt holds it too: ``video_history`` and ``wrist_video_history``, lists of pictures,
     ``state_history``, a list of states, and ``episode_restart``.
 
-    Action: ``actions`` float (7,) or (steps, 7) in [−1, 1], as of `MemobenchEnv`; a chunk is executed open-loop.
+    Action: ``actions`` float (7,) or (steps, 7) in [−1, 1], as of `MemobenchEnv`.
 
     Result: ``success``, and ``MSR``, ``MUR``, ``MCR``, each the share of the operation's memory checkpoints that the
     episode satisfied; a task without checkpoints of the operation has no such metric, and the harness averages over
@@ -70,7 +70,7 @@ class MEMOBench(StepBenchmark):
         horizon: control steps of an execution. A ``max_steps`` of the harness that is lower ends episodes unlogged.
         demonstration_prompt: whether object and procedural tasks begin with their demonstration prompt.
         history_every: steps between the frames of the prompt that are sent.
-        n_action_steps: actions executed of a chunk; all when None.
+        n_action_steps: actions executed of each answer, open-loop.
         send_wrist_image, send_state, send_video_history: what is sent; the harness takes a model server's wish for
             what is not set.
         mirror: send pictures mirrored left to right, as the harness's LIBERO does.
@@ -97,7 +97,7 @@ class MEMOBench(StepBenchmark):
         horizon: int = HORIZON,
         demonstration_prompt: bool = True,
         history_every: int = 1,
-        n_action_steps: int | None = None,
+        n_action_steps: int = 1,
         send_wrist_image: bool = True,
         send_state: bool = True,
         send_video_history: bool = True,
@@ -108,7 +108,7 @@ class MEMOBench(StepBenchmark):
     ) -> None:
         super().__init__()
         for name, number in (("history_every", history_every), ("n_action_steps", n_action_steps)):
-            if number is not None and number < 1:
+            if number < 1:
                 raise MemobenchError(f"{name} is {number}; expected a whole number from 1 on")
         self._config = MemobenchEnvConfig(
             tasks=tasks if isinstance(tasks, str) else ",".join(tasks),
@@ -180,13 +180,18 @@ class MEMOBench(StepBenchmark):
         )
 
     def step(self, action: dict[str, Any]) -> StepResult:
-        """Execute an answer: one action, or as much of a chunk as is executed, up to the episode's end.
+        """Execute the first actions of an answer, up to the episode's end.
 
         Raises:
             MemobenchError: the model server answered something else.
         """
-        env = self._running()
-        for one in _actions(action)[: self._n_action_steps]:
+        env, actions = self._running(), _actions(action)
+        if len(actions) < self._n_action_steps:
+            raise MemobenchError(
+                f"the model server answers {len(actions)} actions at a time, fewer than the {self._n_action_steps} to "
+                f"be executed; set n_action_steps to {len(actions)} or less"
+            )
+        for one in actions[: self._n_action_steps]:
             observation, reward, terminated, truncated, info = env.step(one)
             done = terminated or truncated
             self._recorder.record_video(_video_frame(observation))

@@ -81,7 +81,7 @@ def by_lerobot(out: Path, *words: str, episodes: int = 1) -> None:
 
 def log_of(folder: Path) -> list[dict[str, Any]]:
     """The log without what differs from run to run."""
-    own = {"wall_s", "policy", "run", "replan_steps"}
+    own = {"wall_s", "policy", "run"}
     return [{key: value for key, value in record.items() if key not in own} for record in read_episodes(folder)]
 
 
@@ -185,6 +185,8 @@ def test_chunks_are_executed_to_the_end_of_the_episode(caplog: pytest.LogCapture
     for wrong in (np.zeros(8), np.zeros((2, 3, 7)), ["a"], np.zeros((0, 7)), None):
         with pytest.raises(MemobenchError, match=r"answered actions of shape .*expected numbers of shape \(7,\) or"):
             benchmark.step({"actions": wrong})
+    with pytest.raises(MemobenchError, match=r"answers 2 actions at a time, fewer than the 3 .*n_action_steps to 2"):
+        benchmark.step({"actions": np.zeros((2, 7))})
     benchmark.cleanup()
 
 
@@ -324,9 +326,9 @@ def test_a_trained_memory_policy_by_three_ways(tmp_path: Path, monkeypatch: pyte
     assert direct == asked
     logs = [log_of(tmp_path / name) for name in ("direct", "remote", "log")]
     for record in logs[0]:
-        assert record.pop("inputs") == "detections"
+        assert (record.pop("inputs"), record.pop("replan_steps")) == ("detections", 6)
     for record in (*logs[1], *logs[2]):
-        assert record.pop("inputs") == "pixels"
+        assert (record.pop("inputs"), record.pop("replan_steps")) == ("pixels", 1)
     assert logs[0] == logs[1] == logs[2]
     assert [record["success"] for record in logs[0]] == [True, True]
     for number, task in enumerate(tasks):
