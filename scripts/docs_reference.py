@@ -46,6 +46,7 @@ PUBLIC = {
     "Formulas": ("tasks.formula", ""),
     "Environment": ("envs.memobench_env", "MemobenchEnv"),
     "Environment configuration": ("envs.configuration_memobench", "MemobenchEnvConfig"),
+    "vla-evaluation-harness": ("vla_eval", "MEMOBench"),
     "Observations": ("envs.observations", "observation_space action_space policy_features policy_inputs reads_prompt"),
     "Episode log": ("envs.episode_log", "read_episodes EpisodeRecord CheckpointRecord"),
     "Metrics": ("evaluation.metrics", "Rate Summary summarise report_values wilson"),
