@@ -71,8 +71,10 @@ class MEMOBench(StepBenchmark):
         demonstration_prompt: whether object and procedural tasks begin with their demonstration prompt.
         history_every: steps between the frames of the prompt that are sent.
         n_action_steps: actions executed of each answer, open-loop.
-        send_wrist_image, send_state, send_video_history: what is sent; the harness takes a model server's wish for
-            what is not set.
+        send_wrist_image: whether that picture is sent; of this and the next two the harness takes a model server's
+            wish where they are not set.
+        send_state: whether the state is.
+        send_video_history: whether the prompt is.
         mirror: send pictures mirrored left to right, as the harness's LIBERO does.
         quality: of the pictures: `fast`, `default` or `high`.
         log_dir: folder of the episode log, which ``memobench report`` reads; none is written when None.

@@ -139,7 +139,7 @@ def other_formats(hello: Mapping[str, Any]) -> list[str]:
         for specs in (hello.get("action_spec"), hello.get("observation_spec"))
         for name, spec in (specs.items() if isinstance(specs, dict) else ())
         if name in FORMATS and isinstance(spec, dict)
-        if spec.get("format") not in (FORMATS[name], ANY_FORMAT) and FORMATS[name] not in (spec.get("accepts") or ())
+        if spec.get("format") not in (FORMATS[name], ANY_FORMAT) and FORMATS[name] not in str(spec.get("accepts"))
     ]
 
 
