@@ -26,8 +26,8 @@ NECESSITY = {
 }
 """Notes whose tables say what a policy without a memory reaches."""
 SHEET = DOCS / "figures" / "tasks.png"
-"""Initial scenes of the published tasks, by number: six in a row."""
-SHEET_ORIGIN, SHEET_STEP, SHEET_SIDE, SHEET_COLUMNS = 6, (262, 308), 256, 6
+"""Initial scenes of the published tasks, as `memobench gallery` draws them."""
+SHEET_SIDE = 256
 
 COPIES = {
     "CHANGELOG.md": "changelog.md",
@@ -515,8 +515,10 @@ def scene(number: int) -> bytes:
     """Return the picture of a published task's initial scene, cut out of the sheet of all."""
     from PIL import Image
 
-    row, column = divmod(number - 1, SHEET_COLUMNS)
-    left, top = SHEET_ORIGIN + SHEET_STEP[0] * column, SHEET_ORIGIN + SHEET_STEP[1] * row
+    from lerobot_memobench.sim.gallery import task_places
+    from lerobot_memobench.tasks.catalogue import task_names
+
+    left, top = task_places()[task_names()[number - 1]]
     kept = io.BytesIO()
     with Image.open(SHEET) as sheet:
         sheet.crop((left, top, left + SHEET_SIDE, top + SHEET_SIDE)).save(kept, "PNG")

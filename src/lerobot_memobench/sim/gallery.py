@@ -21,7 +21,7 @@ from lerobot_memobench.sim.assets.registry import build_asset
 from lerobot_memobench.sim.rendering import RenderSettings, make_renderer
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.task import PUBLISHED
+from lerobot_memobench.tasks.task import PUBLISHED, Task
 
 Pixels = NDArray[np.uint8]
 
@@ -61,14 +61,38 @@ def write_gallery(folder: str | Path, suite: str = PUBLISHED) -> list[Path]:
 
 def draw_tasks(names: Sequence[str] | None = None, size: int = 256) -> Image.Image:
     """Return the initial scenes of tasks by memory type, as the agentview camera sees them; by default of all."""
-    cells: dict[str, list[tuple[str, Pixels]]] = {}
-    for name in names or task_names():
-        task = get_task(name)
-        sim = Simulation(task, RenderSettings(size, size, "high"))
-        sim.reset(SEED)
-        cells.setdefault(task.memory_type, []).append((task.title, sim.render("agentview")))
-    columns, label = min(5, max(map(len, cells.values()))), size * 19 // 256
-    return stack([grid(found, columns, label, heading=memory_type) for memory_type, found in cells.items()])
+    sheets = []
+    for memory_type, tasks in _by_type(names).items():
+        cells = []
+        for task in tasks:
+            sim = Simulation(task, RenderSettings(size, size, "high"))
+            sim.reset(SEED)
+            cells.append((task.title, sim.render("agentview")))
+        sheets.append(grid(cells, *_columns_and_label(names, size), memory_type))
+    return stack(sheets)
+
+
+def task_places(names: Sequence[str] | None = None, size: int = 256) -> dict[str, tuple[int, int]]:
+    """Return where in `draw_tasks` each task's picture stands, name -> (left, top), pixels."""
+    found: dict[str, tuple[int, int]] = {}
+    top = 0
+    for memory_type, tasks in _by_type(names).items():
+        titles = [task.title for task in tasks]
+        there = layout(titles, (size, size), *_columns_and_label(names, size), memory_type)
+        found |= {task.name: (x, top + y) for task, (x, y) in zip(tasks, there.places, strict=True)}
+        top += there.height
+    return found
+
+
+def _by_type(names: Sequence[str] | None) -> dict[str, list[Task]]:
+    tasks: dict[str, list[Task]] = {}
+    for task in map(get_task, names or task_names()):
+        tasks.setdefault(task.memory_type, []).append(task)
+    return tasks
+
+
+def _columns_and_label(names: Sequence[str] | None, size: int) -> tuple[int, int]:
+    return min(5, max(map(len, _by_type(names).values()))), size * 19 // 256
 
 
 def draw_objects(classes: Sequence[str] | None = None, size: int = 112) -> Image.Image:
@@ -147,26 +171,45 @@ def _add_camera(spec: mujoco.MjSpec, name: str, target: NDArray[np.float64], vie
 # --- sheets ---
 
 
+GAP = 6
+"""Between pictures, pixels."""
+
+
+class Layout(NamedTuple):
+    """Where the pictures of a grid stand: lines of their labels, (left, top) of each, and the whole's size, pixels."""
+
+    labels: list[list[str]]
+    places: list[tuple[int, int]]
+    width: int
+    height: int
+
+
+def layout(names: Sequence[str], picture: tuple[int, int], columns: int, label: int, heading: str) -> Layout:
+    """Return how `grid` places pictures of one width and height, each row as high as its labels need."""
+    width, height = picture
+    font = ImageFont.load_default(label)
+    labels = [_wrapped(name, font, width) for name in names]
+    top, places = GAP + (2 * (label + 3) if heading else 0), []
+    for start in range(0, len(names), columns):
+        row = labels[start : start + columns]
+        places += [(GAP + column * (width + GAP), top) for column in range(len(row))]
+        top += height + (label + 3) * max(map(len, row)) + 2 * GAP
+    return Layout(labels, places, columns * (width + GAP) + GAP, top)
+
+
 def grid(cells: Sequence[tuple[str, Pixels]], columns: int, label: int = 12, heading: str = "") -> Image.Image:
     """Return pictures of one size in rows, each above its label, under a heading where there is one."""
     if not cells:
         raise MemobenchError("there is nothing to draw: name at least one task or class")
     height, width = cells[0][1].shape[:2]
-    gap, line, font = 6, label + 3, ImageFont.load_default(label)
-    labels = [_wrapped(name, font, width) for name, _ in cells]
-    rows = [range(start, min(start + columns, len(cells))) for start in range(0, len(cells), columns)]
-    heights = [height + line * max(len(labels[k]) for k in row) + 2 * gap for row in rows]
-    top = gap + (2 * line if heading else 0)
-    sheet = Image.new("RGB", (columns * (width + gap) + gap, top + sum(heights)), BACKGROUND)
-    draw = ImageDraw.Draw(sheet)
-    draw.text((gap, gap), heading, fill=INK, font=ImageFont.load_default(round(1.3 * label)))
-    for row, tall in zip(rows, heights, strict=True):
-        for column, k in enumerate(row):
-            x = gap + column * (width + gap)
-            sheet.paste(Image.fromarray(cells[k][1]), (x, top))
-            for number, words in enumerate(labels[k]):
-                draw.text((x + 1, top + height + 2 + number * line), words, fill=INK, font=font)
-        top += tall
+    there = layout([name for name, _ in cells], (width, height), columns, label, heading)
+    sheet = Image.new("RGB", (there.width, there.height), BACKGROUND)
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(label)
+    draw.text((GAP, GAP), heading, fill=INK, font=ImageFont.load_default(round(1.3 * label)))
+    for (_, picture), lines, (x, y) in zip(cells, there.labels, there.places, strict=True):
+        sheet.paste(Image.fromarray(picture), (x, y))
+        for number, words in enumerate(lines):
+            draw.text((x + 1, y + height + 2 + number * (label + 3)), words, fill=INK, font=font)
     return sheet
 
 
