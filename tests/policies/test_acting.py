@@ -92,6 +92,17 @@ def test_rollouts_one_after_the_other_may_come_from_any_thread(acting: Any) -> N
     act()
 
 
+def test_a_new_instruction_drops_planned_actions_and_keeps_the_history(acting: Any) -> None:
+    policy, act = acting
+    policy.reset()
+    act()
+    (row,), history = policy.rollout.rows, policy.rollout.gather([0])
+    assert row.queue
+    policy.drop_queued_actions()
+    assert not row.queue
+    assert all(torch.equal(part, kept) for part, kept in zip(policy.rollout.gather([0]), history, strict=True))
+
+
 # -- real-time chunking -----------------------------------------------------------------------------------------------
 
 OBJECTS: dict[str, Any] = {"perception": "objects", "size": "small", "n_action_steps": 3, "memory_stride": 2}

@@ -307,6 +307,11 @@ class MemobenchMemPolicy(PI05Policy):
         self._thread = threading.get_ident()
         self._acting_rows: list[int] = []
 
+    def drop_queued_actions(self) -> None:
+        """Plan anew at the next step, and keep the histories; LeRobot's main asks for it with a new instruction."""
+        for row in self.rollout.rows:
+            row.drop_chunk()
+
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Return the next action of every row (B, A), normalised.
