@@ -47,4 +47,4 @@ PROPRIO_DIM = 8
 # -- software
 
 PUBLISHED_MUJOCO = "3.9.0"
-"""MuJoCo of the published figures. Under others scenes drift by fractions of a millimetre."""
+"""MuJoCo of the published figures. Under others scenes start and move slightly otherwise."""
