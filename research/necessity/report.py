@@ -190,7 +190,7 @@ def _small_png(plot: Figure) -> bytes:
 
     buffer = io.BytesIO()
     plot.savefig(buffer, dpi=110, format="png")
-    small = Image.open(buffer).convert("RGB").quantize(192, dither=Image.Dither.NONE)
+    small = Image.open(buffer).convert("RGB").quantize(192, kmeans=4, dither=Image.Dither.NONE)
     buffer = io.BytesIO()
     small.save(buffer, "PNG", optimize=True)
     return buffer.getvalue()

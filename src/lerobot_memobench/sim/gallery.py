@@ -257,7 +257,8 @@ def _png(sheet: Image.Image) -> bytes:
     """Return a picture as PNG, with as many colours as fit into `LARGEST_FILE`, or the fewest."""
     for colours in (256, 160, 96):
         buffer = io.BytesIO()
-        reduced = sheet.quantize(colours, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+        # Median cut alone greys what is small and bright, such as a tomato on a table.
+        reduced = sheet.quantize(colours, Image.Quantize.MEDIANCUT, kmeans=4, dither=Image.Dither.NONE)
         reduced.save(buffer, "PNG", optimize=True)
         if buffer.tell() <= LARGEST_FILE:
             break
