@@ -26,8 +26,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.envs.observations import METADATA, action_space, observation_space
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ
+from lerobot_memobench.sim.controller import MASS_BY_DATA
 from lerobot_memobench.sim.rendering import RenderSettings, close_renderers, gl_backend
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
@@ -139,7 +141,13 @@ class Vectored:
 
 
 def stock_robosuite(images: bool = True) -> Any:
-    """Return robosuite's PickPlace as its documentation makes it, without its warnings."""
+    """Return robosuite's PickPlace as its documentation makes it, without its warnings.
+
+    Raises:
+        MemobenchError: its controllers do not run on this MuJoCo.
+    """
+    if MASS_BY_DATA:
+        raise MemobenchError(f"robosuite's controllers need MuJoCo before 3.10, found {mujoco.__version__}")
     os.environ["MUJOCO_GL"] = gl_backend()
     logging.getLogger("robosuite_logs").setLevel(logging.ERROR)
     with warnings.catch_warnings():
