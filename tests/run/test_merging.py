@@ -11,6 +11,7 @@ import pytest
 
 from lerobot_memobench.envs.episode_log import EpisodeLog, read_episodes
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.records import read_card, read_protocol
 from lerobot_memobench.run.card import new_card, policy_facts, write_card
 from lerobot_memobench.run.machine import run_facts
@@ -153,9 +154,13 @@ def test_episodes_of_nobody_are_not_given_to_a_policy(tmp_path: Path) -> None:
     with pytest.raises(MemobenchError, match=r"lines holds episodes of act 1 and .*other ones of act 2"):
         merge(out, [sources[2], other])
     assert not out.exists()
-    notes = merge_and_report(out, [old, part(tmp_path / "older", [4], settings=None)]).run.notes
-    assert notes == [f"{out} does not say whose episodes it holds: no part of it did"]
-    assert merge_and_report(tmp_path / "whole", [sources[1]]).run.notes == []
+    nobodys = merge_and_report(out, [old, part(tmp_path / "older", [4], settings=None)]).run
+    assert nobodys.notes == [f"{out} does not say whose episodes it holds: no part of it did"]
+    whole = merge_and_report(tmp_path / "whole", [sources[1]]).run
+    assert whole.notes == []
+    protocol = "published suite, referent fixed, seed 7, 1 episode of a; inputs: not recorded"
+    assert headline([nobodys]).startswith("policy not recorded: published suite, referent fixed, seeds ")
+    assert headline([whole]) == f"act 1: {protocol}"
 
 
 def test_copies_where_there_are_no_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
