@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ast
 import re
-import textwrap
 from collections.abc import Iterator, Mapping
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -110,47 +109,40 @@ def floors(found: Mapping[str, set[str]]) -> list[list[str]]:
     ]
 
 
-def contents(package: str) -> tuple[int, int, list[str]]:
-    """Return files, lines and the names of the rooms, the folders with modules, in a package."""
+def contents(package: str) -> tuple[int, int]:
+    """Return files and lines of a package."""
     base = SOURCE / PACKAGE / package
     files = sorted(base.rglob("*.py")) if base.is_dir() else [base.with_suffix(".py")]
-    lines = sum(len(path.read_text().splitlines()) for path in files)
-    rooms = sorted({path.parent.name for path in files if path.parent.parent == base})
-    return len(files), lines, rooms
+    return len(files), sum(len(path.read_text().splitlines()) for path in files)
 
 
-WIDTH, HEIGHT, BESIDE, BETWEEN = 3.6, 0.85, 0.5, 0.5
-"""Size of a package's box and what is left beside it and between floors, inches."""
+WIDTH, HEIGHT, BESIDE, BETWEEN = 1.55, 0.52, 0.2, 0.36
+"""Size of a package's box and what is left beside it and between floors, inches: five boxes are as wide as a page."""
 
-INK, DARK, PALE = "#35506b", "#1b2733", "#66788a"
+INK, DARK, PALE = "#35506b", "#1b2733", "#4d5f70"
 
 
 def places(storeys: list[list[str]]) -> dict[str, tuple[float, float]]:
     """Return package -> centre of its box, inches; neighbouring floors are shifted so that arrows pass between."""
     found = {}
     for floor, packages in enumerate(storeys):
-        shift = 0.35 if floor % 2 else -0.35
+        shift = 0.16 if floor % 2 else -0.16
         for k, package in enumerate(packages):
             x = (k - (len(packages) - 1) / 2) * (WIDTH + BESIDE) + shift
             found[package] = x, floor * (HEIGHT + BETWEEN)
     return found
 
 
-def draw_package(axis: Any, package: str, question: str, x: float, y: float) -> None:
-    """Draw a box with the package's name, its size, its question and its rooms."""
+def draw_package(axis: Any, package: str, x: float, y: float) -> None:
+    """Draw a box with the package's name and size; its question stands in the table of docs/develop.md."""
     from matplotlib.patches import FancyBboxPatch
 
-    count, lines, rooms = contents(package)
-    corner, style = (x - WIDTH / 2, y - HEIGHT / 2), "round,pad=0,rounding_size=0.08"
+    count, lines = contents(package)
+    corner, style = (x - WIDTH / 2, y - HEIGHT / 2), "round,pad=0,rounding_size=0.06"
     axis.add_patch(FancyBboxPatch(corner, WIDTH, HEIGHT, boxstyle=style, facecolor="#eef3f8", edgecolor=INK, zorder=2))
-    left, right, top = x - WIDTH / 2 + 0.1, x + WIDTH / 2 - 0.1, y + HEIGHT / 2 - 0.18
-    axis.text(left, top, package, weight="bold", fontsize=11, va="center", zorder=3)
+    axis.text(x, y + 0.1, package, weight="bold", fontsize=11.5, color=DARK, va="center", ha="center", zorder=3)
     size = f"{count} file{'s' * (count > 1)}, {lines:,} lines"
-    axis.text(right, top, size, fontsize=7, va="center", ha="right", color=PALE, zorder=3)
-    told = [(line, 8, DARK) for line in textwrap.wrap(question, 56)]
-    told += [(line, 7, PALE) for line in textwrap.wrap(" · ".join(rooms), 58)]
-    for row, (line, fontsize, colour) in enumerate(told):
-        axis.text(left, top - 0.22 - 0.17 * row, line, fontsize=fontsize, va="center", color=colour, zorder=3)
+    axis.text(x, y - 0.12, size, fontsize=8.5, color=PALE, va="center", ha="center", zorder=3)
 
 
 def draw_arrow(axis: Any, name: str, start: tuple[float, float], end: tuple[float, float]) -> None:
@@ -173,16 +165,16 @@ def draw(picture: Path = PICTURE) -> None:
     matplotlib.rcParams.update({"svg.hashsalt": "architecture", "svg.fonttype": "none", "font.family": "sans-serif"})
     from matplotlib import pyplot as plt
 
-    found, questions = arrows(read_imports()), plan()
+    found = arrows(read_imports())
     centres = places(floors(found))
     xs, ys = zip(*centres.values(), strict=True)
-    left, right = min(xs) - WIDTH / 2 - 0.1, max(xs) + WIDTH / 2 + 0.1
+    left, right = min(xs) - WIDTH / 2 - 0.05, max(xs) + WIDTH / 2 + 0.05
     bottom, top = -HEIGHT / 2 - 0.1, max(ys) + HEIGHT / 2 + 0.1
     figure = plt.figure(figsize=(right - left, top - bottom))
     axis = figure.add_axes((0, 0, 1, 1), xlim=(left, right), ylim=(bottom, top))
     axis.set_axis_off()
     for package, (x, y) in centres.items():
-        draw_package(axis, package, questions[package].partition("?")[0] + "?", x, y)
+        draw_package(axis, package, x, y)
     for here, targets in sorted(direct(found).items()):
         for target in sorted(targets):
             draw_arrow(axis, f"{here}-{target}", centres[here], centres[target])
