@@ -247,7 +247,9 @@ def as_pair(flag: str) -> str:
 
 
 def check_lerobot(command: str, line: list[str]) -> None:
-    """Read a line as `lerobot` does. Folders and repositories of the documents are not there: others stand for them."""
+    """Read a line as `lerobot` does. Folders, repositories and the example of the documents are not there: others stand
+    for them.
+    """
     stand_in = {"policy": "policy=memobench_mem", "dataset": "dataset.root=outputs"}
     pairs = [stand_in[key] if (key := word.partition("=")[0]) in stand_in and is_place(word) else word for word in line]
     given = split_arguments(pairs)
@@ -259,9 +261,9 @@ def check_lerobot(command: str, line: list[str]) -> None:
 
 
 def is_place(pair: str) -> bool:
-    """Whether a pair's value is a folder or a repository."""
+    """Whether a pair's value is a folder, a repository, or the policy of `examples/`."""
     key, _, value = pair.partition("=")
-    return key == "dataset" or "/" in value
+    return key == "dataset" or "/" in value or pair == "policy=window"
 
 
 def check_vla_eval(line: list[str]) -> None:

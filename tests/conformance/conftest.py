@@ -31,3 +31,11 @@ def objects(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from lerobot_memobench.conformance.streams import write_streams
 
     return write_streams(tmp_path_factory.mktemp("streams") / "objects", pictures=False, frames=13)
+
+
+@pytest.fixture(scope="session")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Streams with pictures of the real size."""
+    from lerobot_memobench.conformance.streams import write_streams
+
+    return write_streams(tmp_path_factory.mktemp("streams") / "pictures", frames=13)

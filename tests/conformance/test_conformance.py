@@ -223,7 +223,7 @@ PI05 = (
         (ACT, ["remembers"]),
         (DIFFUSION, ["reads the prompt"]),
         (PI05, ["remembers"]),
-        (("policy=window",), []),
+        (("policy=window", "policy.frames=8", "policy.stride=2"), []),
         (("policy=memobench_mem", "policy.size=tiny", "policy.memory_stride=2"), []),
         (("policy=memobench_small",), []),
         (("policy=memobench_small_memoryless",), ["remembers"]),
@@ -231,10 +231,10 @@ PI05 = (
     ids=["act", "diffusion", "pi05", "window", "memobench_mem", "memobench_small", "memobench_small_memoryless"],
 )
 def test_what_fails_is_named_exactly(
-    words: tuple[str, ...], wrong: list[str], example: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    words: tuple[str, ...], wrong: list[str], example: Path, pictures: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shrink_paligemma(monkeypatch, "put the milk picked up in the prompt video on the plate")
-    results = run_checks(load_subject(words, tmp_path))
+    results = run_checks(load_subject([*words, f"dataset={pictures}"], pictures.parent))
     assert [result.check for result in results if result.outcome is Outcome.FAILED] == wrong, results
     assert not [result for result in results if result.outcome is Outcome.NOT_CHECKED]
 

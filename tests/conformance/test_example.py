@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,18 @@ from lerobot_memobench.conformance.checks import Outcome, run_checks
 from lerobot_memobench.conformance.streams import TASK
 from lerobot_memobench.conformance.subject import load_subject
 from lerobot_memobench.envs.episode_log import read_episodes, read_protocol_file
+from tests.conformance.conftest import EXAMPLE
 
+ROOT = Path(__file__).parents[2]
 TRAIN = ("policy=window", "policy.width=16", "policy.frames=8", "policy.stride=2", "policy.device=cpu")
+
+
+def test_the_guide_shows_the_example_as_it_is() -> None:
+    guide = (ROOT / "docs" / "guides" / "memory_policy.md").read_text()
+    code = (EXAMPLE / "lerobot_policy_window.py").read_text()
+    shown = [block for block in re.findall(r"```python\n(.*?)```", guide, re.DOTALL) if block.startswith("    ")]
+    assert len(shown) == 3
+    assert [block for block in shown if block.strip() not in code] == []
 
 
 @pytest.fixture(scope="module")

@@ -36,8 +36,8 @@ def batch(*steps: int | None, phase: int = 1, task: str = "do it") -> dict[str, 
         "observation.images.image": tensor,
         "observation.images.wrist_image": tensor.flip(-1),
         "observation.state": state,
-        "observation.step": torch.tensor([[float(step or 0)] for step in steps]),
-        "observation.phase": torch.full((len(steps), 1), float(phase)),
+        "observation.step": torch.tensor([float(step or 0) for step in steps]),
+        "observation.phase": torch.full((len(steps),), float(phase)),
         "task": [task] * len(steps),
     }
 

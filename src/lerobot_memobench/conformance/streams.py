@@ -126,6 +126,8 @@ def read_streams(dataset: Any, pictures: bool, objects: str | None, prompts: boo
     for episode in dataset.meta.episodes:
         first, end = episode["dataset_from_index"], episode["dataset_to_index"]
         phases = [float(phase) for phase in dataset.hf_dataset[first:end][OBS_PHASE]]
+        if EXECUTION not in phases:
+            continue
         start = phases.index(EXECUTION)
         shown: list[dict[str, Tensor]] = []
         for index in range(first if prompts else first + start, min(first + start + frames, end)):

@@ -21,7 +21,7 @@ from lerobot_memobench.envs.command_line import quiet
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS, obs_type_of, reads_prompt
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.protocol import CLOCK
-from lerobot_memobench.run.arguments import read_arguments, split_arguments
+from lerobot_memobench.run.arguments import SHORT_FORMS, read_arguments, split_arguments
 from lerobot_memobench.run.plan import policy_config
 from lerobot_memobench.run.rollout import needs_observation
 from lerobot_memobench.run.training import take_training_options, trained_on
@@ -136,9 +136,10 @@ def load_subject(words: Sequence[str], folder: Path) -> Subject:
         MemobenchError: no policy is named, it cannot be built, or the dataset has too few episodes.
     """
     _, obs_type, given = take_training_options(split_arguments(words))
+    short = [key for key, fields in SHORT_FORMS["train"].items() if fields[0].startswith("policy.")]
     for key, _ in given.pairs:
-        if key.partition(".")[0] not in KEYS:
-            raise MemobenchError(f"memobench conformance has no setting {key!r}, {nearest(key, KEYS)}")
+        if key.partition(".")[0] not in KEYS and key not in short:
+            raise MemobenchError(f"memobench conformance has no setting {key!r}, {nearest(key, [*KEYS, *short])}")
     if given.value("dataset") is None:
         given = type(given)([*given.pairs, ("dataset", str(write_streams(folder / "streams")))], given.flags)
     arguments = read_arguments("train", given)

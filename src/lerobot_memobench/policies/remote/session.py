@@ -312,7 +312,7 @@ class Row:
         for key in (f"{OBS_IMAGES}.{name}", OBS_STATE if name == STATE else f"{OBS_STR}.{name}"):
             if key in self.batch:
                 value = self.batch[key][self.number]
-                return to_image(value) if OBS_IMAGES in key else value.float().cpu().numpy()
+                return to_image(value) if OBS_IMAGES in key else value.float().cpu().reshape(-1).numpy()
         known = [key.removeprefix(f"{OBS_IMAGES}.").removeprefix(f"{OBS_STR}.") for key in self.batch if OBS_STR in key]
         raise MemobenchError(
             f"policy.keys names {name!r}, which the environment does not observe; known are "
