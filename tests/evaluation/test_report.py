@@ -134,7 +134,7 @@ def test_every_format_begins_with_it(tmp_path: Path) -> None:
     runs = read_runs([prompted(tmp_path, {"type": "a_policy"})])
     line = headline(runs)
     found = build(runs)
-    assert render(found, runs, "markdown").splitlines()[0] == "# " + line.replace("_", "\\_")
+    assert render(found, runs, "markdown").splitlines()[0] == f"# {line}"
     assert " ".join(render(found, runs, "table").split()).startswith(line)
     assert render(found, runs, "latex").startswith(f"% {line}")
 

@@ -158,4 +158,4 @@ def test_documents_are_written_whole(sweep: list[Run], tmp_path: Path) -> None:
 
 
 def test_an_empty_report_is_still_text() -> None:
-    assert markdown(Report("Title", (Section("", sentences=("a_b",)),))) == "# Title\n\na\\_b\n"
+    assert markdown(Report("Title", (Section("", sentences=("a_b _c_",)),))) == "# Title\n\na_b \\_c\\_\n"

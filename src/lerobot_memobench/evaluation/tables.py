@@ -176,7 +176,8 @@ def markdown_table(table: Table) -> list[str]:
 
 
 def _escaped(words: str) -> str:
-    return re.sub(r"([|*_`<>\\])", r"\\\1", words)
+    """Return text with every character that Markdown would take as a mark escaped; within a word ``_`` is none."""
+    return re.sub(r"([|*`<>\\]|(?<![^\W_])_|_(?![^\W_]))", r"\\\1", words)
 
 
 # --- LaTeX in the style of booktabs ---
