@@ -426,7 +426,18 @@ def test_both_timelines_have_one_scale_and_seek_both(browser: Any, report: Path)
     browser.click(".pair > section:nth-child(2) .axis", across=place(12))
     settle(browser)
     assert (shown_frame(browser, LEFT), shown_frame(browser, RIGHT)) == (12, 12)
+    browser.click(".both input", across=0.2)
+    at = int(browser.js("document.querySelector('.both input').value"))
     browser.key("ArrowRight")
+    browser.key(" ")  # keys work while the control has the focus
+    browser.wait("!document.querySelector('video').paused")
+    browser.key(" ")
+    assert int(browser.js("document.querySelector('.both input').value")) > at
+    browser.key("Home")
+    settle(browser)
+    assert frames(browser) == [0, 0]
+    for _ in range(2):
+        browser.key("]")
     browser.key("]")
     settle(browser)
     assert frames(browser) == [25, 25]  # the end of the shorter one is a mark too

@@ -161,7 +161,7 @@ function setTheme(theme) {
 }
 
 function onKey(event) {
-  const typing = event.target.closest("input, select, textarea, dialog");
+  const typing = event.target.closest("input:not([type=range]), select, textarea, dialog");
   if (event.key === "Escape" && event.target === byId("q")) return byId("q").blur();
   if (typing || event.ctrlKey || event.metaKey || event.altKey) return;
   const player = { episodes: detail.episode && detail, compare: pair.sides.length && pair }[selection().view];
