@@ -147,7 +147,7 @@ ATTEND = Hook(
     "LeRobot's pi0.5 calls this function by its name, whatever `attn_implementation` says",
     caller="lerobot.policies.pi05.modeling_pi05",
     package="transformers",
-    read=("5.5.4",),
+    read=("5.5.4", "5.22.2"),
 )
 HOOKS = (RUN_ONE, ROLLOUT, INSIDE_SLURM, OPEN_DATASETS, MAKE_PROCESSORS, DRAW_FRAMES, READ_SAMPLE, ATTEND)
 
