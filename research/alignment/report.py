@@ -82,7 +82,7 @@ def draw(summary: dict[str, Any], path: Path) -> Path:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(2, 3, figsize=(11.0, 6.6), constrained_layout=True)
+    figure, axes = plt.subplots(2, 3, figsize=(9.2, 6.2), constrained_layout=True)
     _draw_solved(axes.flat[0], {arm: found["all"] for arm, found in summary["outcomes"].items()})
     for axis, (name, title) in zip(axes.flat[1:], PANELS.items(), strict=True):
         _draw_measure(axis, name, {arm: found.get(name) for arm, found in summary["measures"].items()})
@@ -131,7 +131,8 @@ def _draw_bar(axis: Any, place: int, mean: float, values: list[float]) -> None:
 
 
 def _name_arms(axis: Any, arms: dict[str, Any]) -> None:
-    axis.set_xticks(range(len(arms)), arms, rotation=25, fontsize=9)
+    axis.set_xticks(range(len(arms)), arms, rotation=30, fontsize=9, ha="right", rotation_mode="anchor")
+    axis.set_xlim(-0.6, len(arms) - 0.4)  # also where the first or the last has no bar
     axis.spines[["top", "right"]].set_visible(False)
 
 
