@@ -52,7 +52,7 @@ def test_the_storyboard_shows_the_frames_of_the_checkpoints(dataset, tmp_path):
     row = sheet.shape[0] // 2
 
     def bar(line: int, column: int) -> int:
-        top, left = line * row + 20, column * (FRAME + 6)
+        top, left = line * row + 26, column * (FRAME + 6)
         return int(sheet[top : top + FRAME, left : left + FRAME].mean(axis=0).argmax())
 
     scale = FRAME / 64

@@ -196,11 +196,11 @@ def storyboard(folder: Path, rows: Sequence[Mapping[str, Any]]) -> Picture:
     dataset = LeRobotDataset("local/storyboard", root=folder)
     camera = next(key for key in map(image_key, CAMERAS) if key in dataset.meta.features)
     chosen = [next(row for row in rows if row["memory_type"] == name) for name in ordered_types(rows)]
-    caption, title = 40, 20
+    caption, title = 56, 26
     height = FRAME + caption + title
     sheet = Image.new("RGB", (MOST_FRAMES * (FRAME + 6), len(chosen) * height), "white")
     draw = ImageDraw.Draw(sheet)
-    font, bold = ImageFont.load_default(size=10), ImageFont.load_default(size=12)
+    font, bold = ImageFont.load_default(size=13), ImageFont.load_default(size=16)
     for line, row in enumerate(chosen):
         top = line * height
         name = row["task_name"].replace("_", " ")
@@ -211,7 +211,7 @@ def storyboard(folder: Path, rows: Sequence[Mapping[str, Any]]) -> Picture:
             picture = Image.fromarray(pixels).resize((FRAME, FRAME), Image.Resampling.LANCZOS)
             left = column * (FRAME + 6)
             sheet.paste(picture, (left, top + title))
-            words = textwrap.fill(f"{frame}: {text}", 30, max_lines=3, placeholder=" …")
+            words = textwrap.fill(f"{frame}: {text}", 24, max_lines=3, placeholder=" …")
             draw.multiline_text((left + 2, top + title + FRAME + 1), words, fill="black", font=font, spacing=1)
     return sheet
 
