@@ -77,17 +77,19 @@ def make(first_seed: int) -> FirstCheckpoint:
     return FirstCheckpoint(env, first_seed)
 
 
-def reached(model: RecurrentPPO) -> int:
-    """Return in how many validation scenes the policy reaches the checkpoint, without exploring."""
+def reached(model: RecurrentPPO, deterministic: bool = False) -> int:
+    """Return in how many validation scenes the checkpoint is reached, by actions drawn as in training or their mean."""
     env, count = make(VALIDATION_SEED), 0
-    for _ in range(SCENES):
-        observation, _ = env.reset()
-        memory, begins, done = None, True, False
-        while not done:
-            action, memory = model.predict(observation, memory, np.array([begins]), deterministic=True)
-            observation, _, terminated, truncated, info = env.step(action)
-            begins, done = False, terminated or truncated
-        count += info["is_success"]
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        for _ in range(SCENES):
+            observation, _ = env.reset()
+            memory, begins, done = None, True, False
+            while not done:
+                action, memory = model.predict(observation, memory, np.array([begins]), deterministic)
+                observation, _, terminated, truncated, info = env.step(action)
+                begins, done = False, terminated or truncated
+            count += info["is_success"]
     env.close()
     return count
 
@@ -117,6 +119,7 @@ def main() -> None:
         mean = np.mean([episode["r"] for episode in model.ep_info_buffer])
         print(f"{model.num_timesteps} decisions: mean reward {mean:.2f}", flush=True)
     print(f"after {model.num_timesteps} decisions: {reached(model)} of {SCENES} validation scenes")
+    print(f"by the mean of its actions: {reached(model, deterministic=True)}")
 
 
 if __name__ == "__main__":
