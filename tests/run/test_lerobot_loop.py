@@ -6,6 +6,7 @@ import dataclasses
 import inspect
 import pkgutil
 import random
+from contextlib import nullcontext
 from importlib import metadata
 from pathlib import Path
 from types import SimpleNamespace
@@ -162,6 +163,36 @@ def test_an_unread_loop_rolls_out_itself_and_gets_every_picture() -> None:
     policy = SimpleNamespace(parameters=tuple)
     sparing(lambda env, policy, **named: calls.append(named), lambda: True)(env=None, policy=policy, seeds=[1])
     assert calls == [{"seeds": [1]}]
+
+
+class Queueing:
+    """A policy of LeRobot's as far as the loop asks."""
+
+    name = "act"
+
+    def parameters(self) -> tuple[()]:
+        return ()
+
+
+@pytest.mark.parametrize("queue", ["_action_queue", "_queues", None])
+def test_two_rollouts_at_once_share_no_queue(queue: str | None) -> None:
+    """As with env.max_parallel_tasks=2."""
+    policy, calls = Queueing(), []
+    if queue is not None:
+        setattr(policy, queue, [])
+
+    def rollout(env: Any, policy: Any, again: bool = False) -> None:
+        calls.append(again)
+        if again:
+            run(env=env, policy=policy)
+
+    run = sparing(rollout, lambda: True)
+    for _ in range(2):  # one after the other
+        run(env=None, policy=policy)
+    with pytest.raises(MemobenchError, match="act has one queue") if queue else nullcontext():
+        run(env=None, policy=policy, again=True)
+    run(env=None, policy=policy)
+    assert calls == [False, False, True, False] + [False] * (queue is None)
 
 
 @pytest.mark.parametrize("read", [True, False])

@@ -20,11 +20,13 @@ import functools
 import hashlib
 import logging
 import sys
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -34,6 +36,7 @@ from lerobot.utils.constants import ACTION, OBS_IMAGES
 from numpy.typing import NDArray
 from tqdm import trange
 
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.threads import limit_torch
 from lerobot_memobench.lerobot_hooks import INSIDE_SLURM, ROLLOUT, RUN_ONE, check_version, hooked, is_read
 from lerobot_memobench.run.plan import Range
@@ -45,6 +48,10 @@ KEEPS_FRAMES = ("return_observations", "render_callback", "predicted_latents_cal
 """Settings of LeRobot's rollout that make use of every frame, or of what only its own loop does."""
 RECORDS = ("recording_dir", "env_features", "recording_repo_id", "recording_private")
 """Settings by which a rollout is recorded as a dataset; see `recording`."""
+QUEUES = ("_action_queue", "_queues")
+"""Attributes in which LeRobot's policies keep planned actions, or earlier observations."""
+_rolling: WeakKeyDictionary[Any, threading.Lock] = WeakKeyDictionary()
+"""A lock for each such policy that has been rolled out."""
 KEEPS_ITS_NOISE = ("memobench_mem",)
 """Policies that seed each episode's noise themselves, from torch's initial seed: it must stay the run's."""
 LOOPS = ("ed85d8da2c46",)
@@ -198,11 +205,28 @@ def sparing(
     @functools.wraps(rollout)
     def run(env: Any, policy: Any, *args: Any, **settings: Any) -> dict[str, Any]:
         limit_torch(sum(parameter.numel() for parameter in getattr(policy, "parameters", tuple)()))
-        if args or not known or any(settings.get(name) for name in KEEPS_FRAMES):
-            return rollout(env, policy, *args, **settings)
-        return _roll(env, policy, settings, quiet=hides_progress())
+        with _alone(policy):
+            if args or not known or any(settings.get(name) for name in KEEPS_FRAMES):
+                return rollout(env, policy, *args, **settings)
+            return _roll(env, policy, settings, quiet=hides_progress())
 
     return run
+
+
+@contextmanager
+def _alone(policy: Any) -> Iterator[None]:
+    """Refuse a second rollout at once with a policy that has one queue for both, as LeRobot would run them."""
+    queued = any(hasattr(policy, name) for name in QUEUES)
+    if queued and not _rolling.setdefault(policy, threading.Lock()).acquire(blocking=False):
+        raise MemobenchError(
+            f"env.max_parallel_tasks rolls out two tasks at once with one policy, and {policy.name} has one queue, in "
+            "which actions or pictures of both would stand; leave it out, and ask for more rows by eval.batch_size"
+        )
+    try:
+        yield
+    finally:
+        if queued:
+            _rolling[policy].release()
 
 
 def _roll(env: Any, policy: Any, settings: dict[str, Any], quiet: bool) -> dict[str, Any]:
