@@ -366,9 +366,9 @@ class MemobenchMemConfig(PI05Config):
                 "--policy.freeze_vision_encoder=false would train the image tower, whose tokens of remembered frames "
                 "are computed once, before training; leave it out."
             )
-        super().__post_init__()
         self._check_pi05_alone()
-        self._check_numbers()
+        self._check_numbers()  # before LeRobot's main, whose pi0.5 has a memory_stride too
+        super().__post_init__()
         self._check_perception()
         self._check_objectives()
 
