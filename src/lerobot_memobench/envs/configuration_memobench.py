@@ -73,7 +73,8 @@ class MemobenchEnvConfig(EnvConfig):
         prompt_in: `steps`, the policy observes the prompt step by step, with `phase` 0; `reset`, it plays before the
             first observation; `auto`: in steps for a policy that reads prompts, else in reset.
         horizon: execution steps per episode.
-        render: `fast` (no shadows), `default`, or `high` (four samples per pixel, finer shadows).
+        render: `fast` (no shadows), `default`, or `high` (four samples per pixel, finer shadows, the arm's
+            whole meshes: for films, at ten times the cost).
         render_every: draw images every so many execution steps and repeat the last in between. Set it to the number
             of actions a policy executes per prediction: it looks at nothing else. A policy that remembers the frames
             in between refuses it; `observation.picture_step` tells such a one which step it is shown.
