@@ -16,6 +16,7 @@ import numpy as np
 
 from lerobot_memobench.conformance.streams import Stream
 from lerobot_memobench.conformance.subject import Actions, Subject
+from lerobot_memobench.errors import MemobenchError
 
 PROBED = 12
 """Execution frames that are replaced, one at a time, to see what each of them decides."""
@@ -61,16 +62,24 @@ class Behaviour:
 
     Attributes:
         one, two, three: the streams. A check looks at the row of ``one``.
+        alone: the actions (calls, A) of that stream in a batch of its own.
+
+    Raises:
+        MemobenchError: the policy does not act at all.
     """
 
     def __init__(self, subject: Subject) -> None:
         self.subject = subject
         self.one, self.two, self.three = subject.streams
-
-    @cached_property
-    def alone(self) -> Actions:
-        """The actions (calls, A) of the first stream in a batch of its own."""
-        return self.subject.roll([self.one])[:, 0]
+        try:
+            self.alone: Actions = subject.roll([self.one])[:, 0]
+        except MemobenchError:
+            raise
+        except Exception as error:
+            told = f"{type(error).__name__}: {error}"
+            raise MemobenchError(
+                f"{subject.name} does not act on this benchmark's observations: it raised {told}"
+            ) from error
 
     def changes(self, calls: Iterable[int]) -> Actions:
         """Return by how much each call's action changes, where the second stream's frames are shown at some calls."""
