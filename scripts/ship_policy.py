@@ -3,7 +3,9 @@
     python scripts/ship_policy.py outputs/joint/policies/memory-0 memobench_small --rollouts outputs/eval/small
 
 The rollouts are those of the folder that this writes (policy=memobench_small), so that what is told is what is shipped:
-write once without them, evaluate, and write again.
+write once without them, evaluate, and write again. Later rollouts of the same weights are told by
+
+    python scripts/ship_policy.py memobench_small memobench_small --rollouts outputs/eval/later
 """
 
 from __future__ import annotations
@@ -259,13 +261,21 @@ def results(name: str, rollouts: Path) -> list[str]:
     return ["", f"{said} `{file_hash(rollouts / MERGED_FILE)}`:", "", *head, *body]
 
 
+def retell(name: str, rollouts: Path) -> Path:
+    """Put another evaluation of the same weights into the card of the package's policy ``name``; return its folder."""
+    file = SHIPPED / name / "README.md"
+    before, _, _ = file.read_text().partition("\n`lerobot eval env=memobench ")
+    write_file(file, "\n".join([before, *results(name, rollouts)[1:]]) + "\n")
+    return SHIPPED / name
+
+
 def _number(value: float | None) -> str:
     return "–" if value is None else f"{value:.1f}"
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", type=Path, help="output_dir of a training run")
+    parser.add_argument("run", type=Path, help="output_dir of a training run, or the policy's own name")
     parser.add_argument("name", help="by which policy= finds it")
     parser.add_argument("--rollouts", type=Path, help="output_dir of its evaluation")
     parser.add_argument(
@@ -287,4 +297,7 @@ if __name__ == "__main__":
     )
     given = parser.parse_args()
     parts = {whole: parts for whole, *parts in given.merged}
-    print(ship(given.run, given.name, given.rollouts, parts, given.commit))
+    if str(given.run) == given.name and given.rollouts is not None:
+        print(retell(given.name, given.rollouts))
+    else:
+        print(ship(given.run, given.name, given.rollouts, parts, given.commit))
