@@ -26,6 +26,8 @@ from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID
 from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.checkpoint import check_checkpoint
+from lerobot_memobench.protocol import CLOCK
 from lerobot_memobench.run.arguments import (
     OPTIONS,
     SHORT_FORMS,
@@ -557,6 +559,16 @@ def _name_statistics(folder: Path, name: str) -> None:
 def test_a_checkpoint_without_statistics(evaluation: Called, capsys: pytest.CaptureFixture[str]) -> None:
     checkpoint(Path("run"), statistics=("action.mean",))
     assert "statistics for observation.state" in refused(["eval", "env=memobench", "policy=run"], evaluation, capsys)
+
+
+def test_the_clock_has_no_statistics(in_folder: Path) -> None:
+    """`lerobot-train` makes every column `observation.…` an input; these two are to stay raw."""
+    folder = checkpoint(Path("run"))
+    for path in folder.glob("policy_*processor.json"):
+        told = json.loads(path.read_text())
+        told["steps"][0]["config"]["features"] |= {key: {"type": "STATE", "shape": [1]} for key in CLOCK}
+        path.write_text(json.dumps(told))
+    check_checkpoint(str(folder))
 
 
 def test_no_environment_and_no_policy(evaluation: Called, training: Called, capsys: pytest.CaptureFixture[str]) -> None:

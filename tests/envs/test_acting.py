@@ -122,6 +122,7 @@ def test_object_poses_are_refused_or_named(tmp_path: Path) -> None:
     words = [f"tasks={TASK}", "episodes=1", "horizon=3", "env.render=fast", "videos=0"]
     assert main(["eval", "env=memobench", f"policy={policy}", *words, f"output_dir={ours}"]) == 0
     assert read_episodes(ours)[0]["policy"] == record["policy"], "the same policy by both commands"
+    assert memobench(["compare", str(ours), str(tmp_path / "plain")]) == 0, "under one protocol, replan interval too"
     assert json.loads((ours / "card.json").read_text())["protocol"]["inputs"] == f"pixels, {POSES}"
     assert f"| inputs | pixels, {POSES} |" in (ours / "card.md").read_text()
     assert json.loads((ours / "report.json").read_text())["inputs"] == f"pixels, {POSES}"
@@ -156,7 +157,7 @@ def test_two_policies_are_not_one_evaluation(tmp_path: Path) -> None:
 
     with pytest.raises(MemobenchError, match=r"holds episodes of another policy \(policy.identity: act .* another fol"):
         lerobot_eval(second, tmp_path / "out", shown)
-    with pytest.raises(MemobenchError, match="holds episodes of another policy"):
+    with pytest.raises(MemobenchError, match=r"replan_steps: 4 and 2; policy\.identity"):
         lerobot_eval(first, tmp_path / "out", shown, "--policy.n_action_steps=2")
     assert read_episodes(tmp_path / "out") == records
     # The same policy goes on, whatever is said of where it runs, or said that is so anyway.

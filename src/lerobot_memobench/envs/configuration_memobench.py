@@ -78,7 +78,7 @@ class MemobenchEnvConfig(EnvConfig):
         render_every: draw images every so many execution steps and repeat the last in between. Set it to the number
             of actions a policy executes per prediction: it looks at nothing else. A policy that remembers the frames
             in between refuses it; `observation.picture_step` tells such a one which step it is shown.
-        replan_steps: that number, noted in the episode log.
+        replan_steps: that number, noted in the episode log; None for the policy's own `n_action_steps`.
         expert_action: offer the scripted expert's action as `observation.expert_action`.
         blind_action: offer that of the published routine, blind to prompt and instruction, as
             `observation.blind_action`.
@@ -191,8 +191,9 @@ class MemobenchEnvConfig(EnvConfig):
         log_dir = self.resolved_log_dir()
         prompt = prompt_in(policy) if self.prompt_in == AUTO else self.prompt_in
         by = acting(policy, self.obs_type, self.oracle_memory)
-        settings = {**self.gym_kwargs, "prompt_in": prompt, "acting": by}
-        protocol = {**self.protocol, "prompt_in": prompt, **by.protocol}
+        told = {"prompt_in": prompt, "replan_steps": self._replan_steps(policy)}
+        settings = {**self.gym_kwargs, **told, "acting": by}
+        protocol = {**self.protocol, **told, **by.protocol}
         check_protocol(log_dir, protocol)  # now, not when the first episode has been simulated
         suites: dict[str, dict[int, gym.vector.VectorEnv]] = {}
         for memory_type, task_id, folder in chosen:
@@ -209,6 +210,13 @@ class MemobenchEnvConfig(EnvConfig):
         from lerobot_memobench.envs.processor_memobench import ClockProcessorStep
 
         return PolicyProcessorPipeline(steps=[ClockProcessorStep()]), PolicyProcessorPipeline(steps=[])
+
+    def _replan_steps(self, policy: Any) -> int | None:
+        """Return how many actions are executed per prediction; None where only a policy's type is known."""
+        if self.replan_steps is not None or isinstance(policy, type):
+            return self.replan_steps
+        found: int | None = getattr(policy, "n_action_steps", None)
+        return found
 
     def _check_checkpoint(self, policy: Any) -> None:
         """Refuse the checkpoint on LeRobot's command line where it was made for something else than is shown here."""

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, TypedDict
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_name, refusing
 from lerobot_memobench.io import read_json as read_json_file
+from lerobot_memobench.protocol import CLOCK
 
 if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig
@@ -381,6 +382,8 @@ def _check_statistics(folder: Path, file: str, step: Mapping[str, Any]) -> None:
         if str(modes.get(feature.get("type"), "IDENTITY")).upper() != "IDENTITY"
         # The preprocessor normalises observations (and actions in training), the postprocessor actions alone.
         and (file == PREPROCESSOR_FILE or feature.get("type") == "ACTION")
+        # Datasets have no statistics of these, so that they stay raw; `lerobot-train` names them inputs all the same.
+        and key not in CLOCK
     ]
     state_file = step.get("state_file")
     present: set[str] = set()
