@@ -22,8 +22,8 @@ def conformance(
         ),
     ],
 ) -> int:
-    """Check a memory policy: rows independent, reset forgets, the prompt reaches the memory, the same history in
-    training as in a rollout, and what else a memory must do. Status 1 where a check fails.
+    """Check that a policy remembers as it should. Rows are independent, reset forgets, the prompt reaches the memory,
+    training has the history of a rollout, and more. Status 1 where a check fails.
     """
     import tempfile
     from pathlib import Path

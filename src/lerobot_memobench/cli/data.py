@@ -83,9 +83,7 @@ def generate(
         ),
     ] = None,
 ) -> int:
-    """Make a LeRobotDataset of the scripted experts' demonstrations. The same command continues a killed
-    run.
-    """
+    """Make a LeRobotDataset of expert demonstrations. The same command continues a killed run."""
     options = read_options(executor_option or [])
     named: dict[str, Any] = {} if repo_id is None else {"repo_id": repo_id}
     chosen = [get_task(name) for name in resolve_tasks(tasks, suite)]

@@ -16,7 +16,6 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import count_of, write_file
 
 if TYPE_CHECKING:
-    from lerobot_memobench.evaluation.comparison import Comparison
     from lerobot_memobench.evaluation.records import Run
     from lerobot_memobench.evaluation.tables import Report
 
@@ -125,11 +124,12 @@ def compare(
 ) -> None:
     """Compare two evaluations of the same episodes, pair by pair. McNemar for success, sign-flip for the rates."""
     from lerobot_memobench.evaluation.comparison import compare as compared
+    from lerobot_memobench.evaluation.comparison import comparison_csv, comparison_report
     from lerobot_memobench.evaluation.records import read_runs
 
     first, second = read_runs([a, b])
     found = compared(first, second, allow=allow or (), seed=seed, permutations=permutations)
-    show_comparison(found, format_, out)
+    show_report(comparison_report(found), "compare", format_, out, comparison_csv(found))
 
 
 def html(
@@ -287,19 +287,26 @@ def given_runs(folders: list[str] | None, with_: Beside | None) -> tuple[list[Ru
     return runs, paper
 
 
-def show_comparison(found: Comparison, formats: Sequence[ReportFormat] | None, out: Path | None) -> None:
-    """Print a comparison in the formats wanted, or write it to a folder as ``compare`` with the formats' endings."""
-    from lerobot_memobench.evaluation.comparison import comparison_csv, comparison_report
-    from lerobot_memobench.evaluation.tables import WRITERS, terminal
+def show_report(
+    report: Report, name: str, formats: Sequence[ReportFormat] | None, out: Path | None, as_csv: str | None = None
+) -> None:
+    """Print a report in the formats wanted, or write it to a folder as ``name`` with the formats' endings.
 
-    report = comparison_report(found)
+    Args:
+        as_csv: its figures as CSV, one a row; its tables under one another when None.
+    """
+    from lerobot_memobench.evaluation.tables import WRITERS, csv_tables, terminal
+
     for each in dict.fromkeys(formats or [ReportFormat.TABLE]):
         if out is None and each is ReportFormat.TABLE:
             console().print(terminal(report), crop=False)
             continue
-        text = comparison_csv(found) if each is ReportFormat.CSV else WRITERS[each](report)
+        if each is ReportFormat.CSV:
+            text = "\n".join(csv_tables(report).values()) if as_csv is None else as_csv
+        else:
+            text = WRITERS[each](report)
         if out is None:
             print(text, end="")
         else:
             out.mkdir(parents=True, exist_ok=True)
-            say(write_file(out / f"compare.{ENDINGS[each]}", text))
+            say(write_file(out / f"{name}.{ENDINGS[each]}", text))
