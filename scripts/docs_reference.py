@@ -433,7 +433,7 @@ def needs(suite: str) -> dict[str, dict[str, tuple[str, str]]]:
 
 VERDICTS = {
     "no": "no: the picture decides every step",
-    "order": "no: the picture decides another order that the goal accepts",
+    "order": "no: in another order that the goal accepts too, the picture decides every step",
     "yes": "yes: no policy from pictures alone was found",
 }
 OPERATIONS = {"S": "Storage", "U": "Update", "C": "Compression"}

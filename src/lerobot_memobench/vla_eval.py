@@ -17,7 +17,7 @@ from lerobot_memobench.envs.acting import Acting
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode_log import check_protocol
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.envs.observations import PIXEL_INPUT, RESET, STEPS
+from lerobot_memobench.envs.observations import PIXEL_INPUT, RESET, STEPS, check_counts
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import PROCESS_METRICS, value_of
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EVALUATION_SEED, HORIZON, PROMPT
@@ -63,7 +63,7 @@ class MEMOBench(StepBenchmark):
     those that do.
 
     Args:
-        tasks: `all`, memory types or task names, separated by commas or as a list.
+        tasks: `all`, memory types, task names or their numbers, separated by commas or as a list.
         suite: `published` or `strict`.
         referent: `fixed` or `random`.
         seed: of episode 0.
@@ -92,7 +92,7 @@ class MEMOBench(StepBenchmark):
 
     def __init__(
         self,
-        tasks: str | Sequence[str] = "all",
+        tasks: str | int | Sequence[str | int] = "all",
         suite: str = PUBLISHED,
         referent: str = "fixed",
         seed: int = EVALUATION_SEED,
@@ -109,11 +109,11 @@ class MEMOBench(StepBenchmark):
         label: str | None = None,
     ) -> None:
         super().__init__()
-        for name, number in (("history_every", history_every), ("n_action_steps", n_action_steps)):
-            if number < 1:
-                raise MemobenchError(f"{name} is {number}; expected a whole number from 1 on")
+        check_counts(history_every=history_every, n_action_steps=n_action_steps)
+        if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+            raise MemobenchError(f"seed is {seed!r}; expected a whole number from 0 on")
         self._config = MemobenchEnvConfig(
-            tasks=tasks if isinstance(tasks, str) else ",".join(tasks),
+            tasks=str(tasks) if isinstance(tasks, str | int) else ",".join(map(str, tasks)),
             suite=suite,
             referent=referent,
             seed_base=seed,

@@ -202,6 +202,7 @@ def test_every_space_is_bounded() -> None:
         ({"reward": "checkpoint"}, "reward is 'checkpoint'; did you mean 'checkpoints'?"),
         ({"prompt_in": "auto"}, "prompt_in is 'auto'; known are 'reset', 'steps'"),
         ({"horizon": 0}, "horizon is 0; expected a whole number from 1 on"),
+        ({"horizon": "60"}, "horizon is '60'; expected a whole number from 1 on"),
         ({"render": "ultra"}, "render quality 'ultra' is unknown"),
     ],
 )

@@ -196,6 +196,10 @@ def test_chunks_are_executed_to_the_end_of_the_episode(caplog: pytest.LogCapture
         ({"tasks": "temporaly"}, "temporal"),
         ({"suite": "strikt"}, "did you mean 'strict'"),
         ({"history_every": 0}, "history_every is 0"),
+        ({"n_action_steps": "2"}, "n_action_steps is '2'; expected a whole number"),
+        ({"horizon": "60"}, "horizon is '60'; expected a whole number"),
+        ({"seed": "7"}, "seed is '7'; expected a whole number"),
+        ({"tasks": [31]}, "31"),
         ({"quality": "best"}, "'best'"),
     ],
 )

@@ -206,14 +206,14 @@ def observation_space(
 
 
 def check_counts(prefix: str = "", **counts: int) -> None:
-    """Refuse numbers of steps below 1; ``prefix`` stands before a setting's name.
+    """Refuse numbers of steps that are no whole numbers from 1 on; ``prefix`` stands before a setting's name.
 
     Raises:
-        MemobenchError: one is.
+        MemobenchError: one is not.
     """
     for name, number in counts.items():
-        if number < 1:
-            raise MemobenchError(f"{prefix}{name} is {number}; expected a whole number from 1 on")
+        if isinstance(number, bool) or not isinstance(number, int | np.integer) or number < 1:
+            raise MemobenchError(f"{prefix}{name} is {number!r}; expected a whole number from 1 on")
 
 
 def action_space() -> spaces.Space[NDArray[np.float32]]:
