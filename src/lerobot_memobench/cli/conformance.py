@@ -18,7 +18,8 @@ def conformance(
         list[str],
         typer.Argument(
             help="policy=…: a checkpoint folder, a policy of the package or of a plugin, or a type with settings "
-            "policy.x=…; dataset=…: demonstrations to drive it with, made up where none are named; obs_type=…"
+            "policy.x=…; dataset=…: demonstrations to drive it with, made up where none are named; obs_type=…",
+            metavar="policy=…",
         ),
     ],
 ) -> int:
