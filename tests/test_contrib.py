@@ -176,5 +176,6 @@ def test_lerobots_hub_loader_makes_the_environments(
     assert env.num_envs == 2
     assert "stove" in env.call("task_description")[0]
     module = env_utils._load_module_from_path(str(OURS / "envhub" / "env.py"))
-    for cfg in (SimpleNamespace(task="object", fps=30, hub_path="x"), MemobenchEnvConfig(task="object")):
+    of_class = type("Cfg", (), {"task": "object"})()
+    for cfg in (SimpleNamespace(task="object", fps=30, hub_path="x"), MemobenchEnvConfig(task="object"), of_class):
         assert {suite: [*tasks] for suite, tasks in module.make_env(1, cfg=cfg).items()} == {"object": [*range(20, 25)]}

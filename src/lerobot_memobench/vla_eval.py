@@ -76,7 +76,7 @@ class MEMOBench(StepBenchmark):
         send_state: whether the state is.
         send_video_history: whether the prompt is.
         mirror: send pictures mirrored left to right, as the harness's LIBERO does.
-        quality: of the pictures: `fast`, `default` or `high`.
+        render: quality of the pictures: `fast`, `default` or `high`.
         log_dir: folder of the episode log, which ``memobench report`` reads; none is written when None.
         label: what the model server serves, in your words, for the log.
     """
@@ -104,7 +104,7 @@ class MEMOBench(StepBenchmark):
         send_state: bool = True,
         send_video_history: bool = True,
         mirror: bool = False,
-        quality: str = "default",
+        render: str = "default",
         log_dir: str | None = None,
         label: str | None = None,
     ) -> None:
@@ -119,7 +119,7 @@ class MEMOBench(StepBenchmark):
             seed_base=seed,
             horizon=horizon,
             demonstration_prompt=demonstration_prompt,
-            render=quality,
+            render=render,
             replan_steps=n_action_steps,
         )
         self._tasks = {folder.name: (memory_type, folder) for memory_type, _, folder in self._config.selected()}

@@ -91,7 +91,7 @@ def test_both_sides_act_alike(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     server = DigestServer(steps=3)
     with vla_eval.serve_background(server) as handle:
         with recorded(monkeypatch) as theirs:
-            params = {"tasks": [PROMPTED], "horizon": 5, "quality": "fast", "history_every": 3}
+            params = {"tasks": [PROMPTED], "horizon": 5, "render": "fast", "history_every": 3}
             result = by_harness(handle.url, episodes=2, **params, log_dir=str(tmp_path / "log"), label="digest")
         heard, server.heard = server.heard, []
         with recorded(monkeypatch) as ours:
@@ -128,10 +128,10 @@ def played(benchmark: MEMOBench, task: dict[str, Any], expert: bool = True) -> t
 
 def test_the_means_of_the_metrics_are_the_reports(tmp_path: Path) -> None:
     """A success and a failure of one task; it has no checkpoints of one operation, and so no such metric."""
-    benchmark = MEMOBench(UNPROMPTED, quality="fast", log_dir=str(tmp_path))
+    benchmark = MEMOBench(UNPROMPTED, render="fast", log_dir=str(tmp_path))
     (task,) = benchmark.get_tasks()
     _, good = played(benchmark, task | {"episode_idx": 0})
-    short = MEMOBench(UNPROMPTED, quality="fast", horizon=40)
+    short = MEMOBench(UNPROMPTED, render="fast", horizon=40)
     _, poor = played(short, task | {"episode_idx": 1})
     records = [*read_episodes(tmp_path), short._running().record()]
     row = report_values(summarise(records))["tasks"][UNPROMPTED]
@@ -150,8 +150,8 @@ def test_the_means_of_the_metrics_are_the_reports(tmp_path: Path) -> None:
 
 
 def test_what_is_sent() -> None:
-    benchmark = MEMOBench(UNPROMPTED, quality="fast", horizon=2, send_state=False, send_wrist_image=False, mirror=True)
-    plain = MEMOBench(UNPROMPTED, quality="fast", horizon=2)
+    benchmark = MEMOBench(UNPROMPTED, render="fast", horizon=2, send_state=False, send_wrist_image=False, mirror=True)
+    plain = MEMOBench(UNPROMPTED, render="fast", horizon=2)
     (task,) = benchmark.get_tasks()
     assert task == {"name": UNPROMPTED, "suite": "temporal"}
     first, _ = played(benchmark, task, expert=False)
@@ -171,7 +171,7 @@ def test_what_is_sent() -> None:
 
 
 def test_chunks_are_executed_to_the_end_of_the_episode(caplog: pytest.LogCaptureFixture) -> None:
-    benchmark = MEMOBench(UNPROMPTED, quality="fast", horizon=5, n_action_steps=3)
+    benchmark = MEMOBench(UNPROMPTED, render="fast", horizon=5, n_action_steps=3)
     (task,) = benchmark.get_tasks()
     benchmark._recorder = vla_eval.recording.NullEpisodeRecorder()
     benchmark.reset(task)
@@ -200,7 +200,7 @@ def test_chunks_are_executed_to_the_end_of_the_episode(caplog: pytest.LogCapture
         ({"horizon": "60"}, "horizon is '60'; expected a whole number"),
         ({"seed": "7"}, "seed is '7'; expected a whole number"),
         ({"tasks": [31]}, "31"),
-        ({"quality": "best"}, "'best'"),
+        ({"render": "best"}, "'best'"),
     ],
 )
 def test_wrong_settings_are_named(params: dict[str, Any], told: str) -> None:
@@ -209,11 +209,11 @@ def test_wrong_settings_are_named(params: dict[str, Any], told: str) -> None:
 
 
 def test_a_folder_of_another_policy_is_refused_before_anything_runs(tmp_path: Path) -> None:
-    benchmark = MEMOBench(UNPROMPTED, quality="fast", horizon=1, log_dir=str(tmp_path), label="one")
+    benchmark = MEMOBench(UNPROMPTED, render="fast", horizon=1, log_dir=str(tmp_path), label="one")
     played(benchmark, benchmark.get_tasks()[0], expert=False)
     benchmark.cleanup()
     with pytest.raises(MemobenchError, match="holds episodes of another policy"):
-        MEMOBench(UNPROMPTED, quality="fast", horizon=1, log_dir=str(tmp_path), label="another")
+        MEMOBench(UNPROMPTED, render="fast", horizon=1, log_dir=str(tmp_path), label="another")
 
 
 def test_an_episode_that_cannot_be_run_is_an_error_and_is_logged(
@@ -298,7 +298,7 @@ def test_act_by_three_ways(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
             remote = ("policy=memobench_remote", "dialect=vla_eval", f"port={handle.port}")
             by_lerobot(tmp_path / "remote", *remote, *words)
         with recorded(monkeypatch) as theirs:
-            by_harness(handle.url, tasks=UNPROMPTED, horizon=6, quality="fast")
+            by_harness(handle.url, tasks=UNPROMPTED, horizon=6, render="fast")
     assert [len(steps) for steps in direct.values()] == [6]
     assert direct == asked == theirs
 

@@ -22,6 +22,7 @@ from lerobot_memobench.evaluation.tables import (
     Section,
     Table,
     best_in_columns,
+    csv_text,
     latex_text,
     markdown,
     markdown_table,
@@ -65,6 +66,15 @@ def test_the_sweep_names_the_best_interval(sweep: list[Run]) -> None:
 def test_one_interval_is_no_sweep(tmp_path: Path) -> None:
     runs = read_runs([logs.evaluation(tmp_path / "a"), logs.evaluation(tmp_path / "b")])
     assert "replan_sweep" not in json.loads(rendered(runs, "json"))
+
+
+def test_csv_names_are_no_formulas() -> None:
+    text = csv_text([["=cmd()", -3.5, None], ["@SUM(1)", "a, b", "-"]], ["name", "figure", "rest"])
+    assert list(csv.reader(io.StringIO(text))) == [
+        ["name", "figure", "rest"],
+        ["'=cmd()", "-3.5", ""],
+        ["'@SUM(1)", "a, b", "'-"],
+    ]
 
 
 def test_csv_has_one_figure_a_row(sweep: list[Run]) -> None:

@@ -28,5 +28,5 @@ def make_env(
     if isinstance(cfg, MemobenchEnvConfig):
         return cfg.create_envs(n_envs, use_async_envs)
     known = {field.name for field in fields(MemobenchEnvConfig)} - {"fps", "features", "features_map"}
-    asked = {name: value for name, value in vars(cfg).items() if name in known} if cfg is not None else {}
+    asked = {name: getattr(cfg, name) for name in known if hasattr(cfg, name)}
     return MemobenchEnvConfig(**asked).create_envs(n_envs, use_async_envs)

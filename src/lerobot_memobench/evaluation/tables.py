@@ -486,9 +486,17 @@ def _csv_rows(table: Table) -> list[dict[str, object]]:
 
 
 def csv_text(rows: Sequence[Sequence[object]], header: Sequence[str]) -> str:
-    """Return rows as CSV (RFC 4180, but lines end in a plain line feed); None is an empty field."""
+    """Return rows as CSV (RFC 4180, but lines end in a plain line feed); None is an empty field.
+
+    A name that a spreadsheet would take for a formula, of a stranger's log perhaps, stands behind an apostrophe.
+    """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(["" if value is None else value for value in row] for row in rows)
+    writer.writerows([_csv_field(value) for value in row] for row in (header, *rows))
     return out.getvalue()
+
+
+def _csv_field(value: object) -> object:
+    if value is None:
+        return ""
+    return f"'{value}" if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r")) else value
