@@ -104,7 +104,8 @@ def test_a_prompt_within_reset_ends_with_the_objects_of_the_execution() -> None:
     np.testing.assert_array_equal(*shown)
 
 
-@pytest.mark.parametrize("obs_type", [pytest.param(OBJECTS, marks=pytest.mark.slow), BOTH])
+@pytest.mark.slow  # of pictures alone it is no slow test: test_memobench_env.py
+@pytest.mark.parametrize("obs_type", [OBJECTS, BOTH])
 def test_batches_of_one_and_three_sync_and_async(obs_type: str, gl: str, tmp_path: Path) -> None:
     def roll(env: gym.vector.VectorEnv, seeds: list[int]) -> dict[str, Any]:
         env.reset(seed=seeds)
