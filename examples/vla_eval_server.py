@@ -30,9 +30,9 @@ from vla_eval.specs import (
 )
 
 from lerobot_memobench.policies.checkpoint import local_folder
+from lerobot_memobench.protocol import EXECUTION, PROMPT
 
 CAMERAS = {"agentview": "observation.images.image", "wrist": "observation.images.wrist_image"}
-PROMPT, EXECUTION = 0, 1
 
 
 class MemoryPolicyServer(LeRobotModelServer):

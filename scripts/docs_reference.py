@@ -436,7 +436,6 @@ VERDICTS = {
     "order": "no: in another order that the goal accepts too, the picture decides every step",
     "yes": "yes: no policy from pictures alone was found",
 }
-OPERATIONS = {"S": "Storage", "U": "Update", "C": "Compression"}
 PROMPTS = {
     "routine": "the routine is carried out",
     "pick": "the referent is picked up",
@@ -475,6 +474,7 @@ def tasks_page(suite: str) -> str:
 
 def task_parts(number: int, task: Any, known: dict[str, tuple[str, str]]) -> Iterator[str]:
     """Yield one task's card."""
+    from lerobot_memobench.evaluation.tables import OPERATION_NAMES
     from lerobot_memobench.tasks.catalogue import task_number
 
     drawn = task.suite == "strict"  # the instruction is one of several
@@ -502,7 +502,7 @@ def task_parts(number: int, task: Any, known: dict[str, tuple[str, str]]) -> Ite
     yield table(["", ""], rows)
     yield table(
         ["checkpoint", "operation", "text (intermediate)"],
-        [[str(k), OPERATIONS[one.operation], one.language[1]] for k, one in enumerate(task.checkpoints, 1)],
+        [[str(k), OPERATION_NAMES[one.operation], one.language[1]] for k, one in enumerate(task.checkpoints, 1)],
     )
 
 

@@ -25,14 +25,14 @@ from PIL import Image, ImageDraw, ImageFont
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.envs.video import OPERATION_COLOURS
-from lerobot_memobench.evaluation.figures.rollouts import OPERATIONS
+from lerobot_memobench.evaluation.tables import OPERATION_NAMES
 from lerobot_memobench.io import draft_of
 from lerobot_memobench.protocol import CONTROL_HZ, EXECUTION
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.tasks.catalogue import BOWL, get_task
 
-EPISODES, HORIZON = 6, 400
-"""Evaluation seeds that are looked through, and steps of an execution."""
+EPISODES = 6
+"""Evaluation seeds that are looked through."""
 STRIDE, SPEED = 4, 2.0
 """Control steps from picture to picture, and how much faster than real they are shown."""
 SIDE, GAP = 272, 6
@@ -88,18 +88,13 @@ Rollout = tuple[dict[str, Any], list[NDArray[np.float32]]]
 """Line of the log and actions of an episode."""
 
 
-def evaluate(words: Sequence[str], folder: Path) -> dict[int, Rollout]:
-    """Evaluate who is chosen by arguments of `lerobot eval`; return line of the log and actions by seed."""
-    from lerobot_memobench.run.plan import plan_line
+def evaluate(name: str, folder: Path) -> dict[int, Rollout]:
+    """Evaluate one of the demo's policies in this process; return line of the log and actions by seed."""
+    from lerobot_memobench.run.demo import memory_plan
     from lerobot_memobench.run.run import run_evaluation
 
-    plan = plan_line(
-        [
-            *("env=memobench", *words, f"tasks={BOWL}", "referent=random", "obs_type=environment_state_agent_pos"),
-            *(f"episodes={EPISODES}", "videos=0", f"horizon={HORIZON}", "batch_size=1", "eval.use_async_envs=false"),
-            f"output_dir={folder}",
-        ]
-    )
+    here = ("batch_size=1", "eval.use_async_envs=false")
+    plan = memory_plan(name, folder, *here, episodes=EPISODES, videos=0)
     with recorded_actions() as taken:
         status = run_evaluation(plan, print, print).status
     if status:
@@ -118,6 +113,8 @@ def first_difference(found: dict[str, dict[int, Rollout]]) -> int:
 
 def play(seed: int, record: dict[str, Any], actions: Sequence[NDArray[np.float32]]) -> list[Shot]:
     """Go through a recorded episode again and draw it; it must end as the evaluation's did."""
+    from lerobot_memobench.run.demo import HORIZON
+
     episode = Episode(
         get_task(BOWL), referent="random", horizon=HORIZON, render=RenderSettings(2 * SIDE, 2 * SIDE, "high")
     )
@@ -183,7 +180,8 @@ def checkpoints(draw: ImageDraw.ImageDraw, corner: tuple[int, int], one: Shot) -
             draw.line([(x + 7, y + 14), (x + 13, y + 21), (x + 22, y + 8)], fill=BACKGROUND, width=4)
         else:
             draw.text((x + 14, y + 14), checkpoint.operation, colour, ImageFont.load_default(size=18), "mm")
-        draw.text((x + 36, y + 14), OPERATIONS[checkpoint.operation], colour, ImageFont.load_default(size=19), "lm")
+        name = OPERATION_NAMES[checkpoint.operation].lower()
+        draw.text((x + 36, y + 14), name, colour, ImageFont.load_default(size=19), "lm")
         x += 120
 
 
@@ -206,7 +204,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("docs/figures/memory.webp"))
     out = parser.parse_args().out
     with tempfile.TemporaryDirectory() as work:
-        found = {name: evaluate(words, Path(work) / name.replace(" ", "_")) for name, words in POLICIES.items()}
+        found = {name: evaluate(name, Path(work) / name.replace(" ", "_")) for name in POLICIES}
     for name, episodes in found.items():
         print(name, {seed: (record["success"], record["failure"]) for seed, (record, _) in episodes.items()})
     seed = first_difference(found)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
 from typing import Any
 
 import gymnasium as gym
@@ -19,23 +18,11 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import EXECUTION, PROMPT
 from lerobot_memobench.sim.object_layout import BOUNDS, FIELDS
 from lerobot_memobench.sim.object_slots import classes
-from lerobot_memobench.sim.rendering import close_renderers, gl_backend
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
 HIGHLIGHT = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
 STRICT = "put_the_butter_only_into_the_bowl_from_the_prompt_video"
-
-
-@pytest.fixture
-def gl() -> Iterator[None]:
-    """Skip without a GL library."""
-    try:
-        gl_backend()
-    except MemobenchError as error:
-        pytest.skip(str(error))
-    yield
-    close_renderers()
 
 
 def make(name: str, **settings: Any) -> gym.Env[Any, Any]:
@@ -54,7 +41,7 @@ def test_the_module_may_stand_before_the_id() -> None:
 
 
 @pytest.mark.parametrize("name", [STOVE, STRICT])
-def test_it_passes_gymnasiums_checker_without_a_warning(gl: None, name: str) -> None:
+def test_it_passes_gymnasiums_checker_without_a_warning(gl: str, name: str) -> None:
     env = make(name, obs_type=BOTH, reward=CHECKPOINTS)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.envs.video import VideoRecorder
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import EXECUTION, PROMPT, PROMPT_HORIZON
-from lerobot_memobench.sim.rendering import close_renderers, gl_backend
 from lerobot_memobench.tasks.catalogue import task_names
 
 DRAWER = "put_the_tomato_into_the_top_drawer_of_the_cabinet"
@@ -27,15 +25,7 @@ HIGHLIGHT = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_t
 SEEDS = [7, 8, 9, 10]
 
 
-@pytest.fixture(autouse=True)
-def gl() -> Iterator[None]:
-    """Skip without a GL library: every observation holds images."""
-    try:
-        gl_backend()
-    except MemobenchError as error:
-        pytest.skip(str(error))
-    yield
-    close_renderers()
+pytestmark = pytest.mark.usefixtures("gl")  # every observation holds images
 
 
 def make(name: str, **settings: Any) -> MemobenchEnv:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +11,6 @@ from lerobot_memobench.datasets.demonstration import labels
 from lerobot_memobench.datasets.recording import record_demonstration
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.rendering import close_renderers, gl_backend
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.memory_text import NOTHING_YET, with_memory
 
@@ -22,14 +19,7 @@ SWAP = "swap_the_objects_strictly_following_the_3-step_buffered_sequence_shown_i
 SEED = 10_000
 
 
-@pytest.fixture(autouse=True)
-def gl() -> Iterator[None]:
-    try:
-        gl_backend()
-    except MemobenchError as error:
-        pytest.skip(str(error))
-    yield
-    close_renderers()
+pytestmark = pytest.mark.usefixtures("gl")
 
 
 def expected(name: str, referent: str) -> list[str]:

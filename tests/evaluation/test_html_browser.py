@@ -104,6 +104,14 @@ def show(browser: Any, report: Path, address: str = "") -> None:
     browser.open(f"{report.as_uri()}#{address}")
 
 
+def filter_list(browser: Any, report: Path, view: str, filters: dict[str, str], count: str) -> None:
+    """Open a view, choose filters, and wait for what it says it has counted."""
+    show(browser, report, f"view={view}")
+    for selector, value in filters.items():
+        browser.choose(selector, value)
+    browser.wait(f"document.querySelector('#count').innerText.startsWith('{count}')")
+
+
 def shown_frame(browser: Any, video: str = "video") -> int:
     """The number of the frame on the screen, read off its grey."""
     from PIL import Image
@@ -312,10 +320,7 @@ def test_a_video_that_is_gone_is_named(chrome: Any, report: Path, tmp_path: Path
     ],
 )
 def test_filters(browser: Any, report: Path, filters: dict[str, str], found: int) -> None:
-    show(browser, report, "view=episodes")
-    for selector, value in filters.items():
-        browser.choose(selector, value)
-    browser.wait(f"document.querySelector('#count').innerText.startsWith('{found} of 7')")
+    filter_list(browser, report, "episodes", filters, f"{found} of 7")
     assert len(browser.texts("#list .row")) == found
     address = browser.js("location.hash")
     show(browser, report, address[1:])
@@ -479,10 +484,7 @@ def test_both_play_in_step(browser: Any, report: Path) -> None:
     ],
 )
 def test_pairs_are_filtered(browser: Any, report: Path, filters: dict[str, str], found: int) -> None:
-    show(browser, report, "view=compare")
-    for selector, value in filters.items():
-        browser.choose(selector, value)
-    browser.wait(f"document.querySelector('#count').innerText.startsWith('{found} of 2 pairs')")
+    filter_list(browser, report, "compare", filters, f"{found} of 2 pairs")
     assert len(browser.texts("#list .row")) == found
     if not found:
         assert browser.texts("#detail") == ["No episode is selected."]

@@ -29,13 +29,13 @@ def conformance(
     import tempfile
     from pathlib import Path
 
-    from lerobot_memobench.conformance.checks import CHECKS, Behaviour, Outcome, run_check
+    from lerobot_memobench.conformance.checks import Outcome, run_checks
     from lerobot_memobench.conformance.subject import load_subject
 
     with tempfile.TemporaryDirectory() as folder:
-        found = Behaviour(load_subject(settings, Path(folder)))
-        results = [run_check(name, found) for name in CHECKS]
-    table = Table("check", "outcome", "", title=f"Conformance of {found.subject.name}", title_justify="left")
+        subject = load_subject(settings, Path(folder))
+        results = run_checks(subject)
+    table = Table("check", "outcome", "", title=f"Conformance of {subject.name}", title_justify="left")
     for result in results:
         table.add_row(result.check, Text(result.outcome, COLOURS[result.outcome]), result.sentence)
     console().print(table)

@@ -7,7 +7,7 @@ from typing import Any
 
 from lerobot_memobench.envs.episode_log import POLICY
 from lerobot_memobench.evaluation.metrics import Record, policy_inputs
-from lerobot_memobench.evaluation.records import Run, card_of, one_suite
+from lerobot_memobench.evaluation.records import Run, one_suite
 from lerobot_memobench.io import count_of, cut
 
 PROMPT_IN = {"steps": "prompt in steps (observed)", "reset": "prompt in reset (not observed)"}
@@ -33,7 +33,7 @@ def whose(run: Run) -> str:
     name = policy.get("type") or next((str(r["policy"]) for r in run.records if r.get("policy")), None)
     if name is None:
         return "policy not recorded"
-    checkpoint = (card_of(run.folder).get("checkpoint") or {}).get("path")
+    checkpoint = (run.card.get("checkpoint") or {}).get("path")
     if checkpoint is None:
         identity = str(policy.get("identity") or name)
         return identity if identity.startswith(str(name)) else str(name)

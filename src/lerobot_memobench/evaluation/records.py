@@ -276,6 +276,11 @@ class Run:
         return summarise(self.records)
 
     @cached_property
+    def card(self) -> dict[str, Any]:
+        """What reports take from its card, {} where it has none."""
+        return card_of(self.folder)
+
+    @cached_property
     def replan_steps(self) -> int | None:
         """The one interval of all rollouts; the policy's own where none was asked for; None where nobody knows."""
         found = {record.get("replan_steps") for record in self.records}
@@ -331,7 +336,7 @@ def unlike(runs: Sequence[Run]) -> list[str]:
 
 def other_physics(a: Run, b: Run) -> list[str]:
     """Return a sentence where two evaluations ran under different versions of MuJoCo, by their cards."""
-    starts = ([start.get("versions", {}) for start in card_of(run.folder).get("runs", [])] for run in (a, b))
+    starts = ([start.get("versions", {}) for start in run.card.get("runs", [])] for run in (a, b))
     mine, other = ({versions["mujoco"] for versions in each if "mujoco" in versions} for each in starts)
     if not mine or not other or mine == other:
         return []

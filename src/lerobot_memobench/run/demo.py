@@ -139,12 +139,13 @@ def has_policies() -> bool:
     return {word.partition("=")[2] for words in POLICIES.values() for word in words} <= set(shipped_policies())
 
 
-def memory_plan(name: str, folder: Path) -> EvaluationPlan:
-    """Return the plan of the evaluation of one of `POLICIES`."""
+def memory_plan(
+    name: str, folder: Path, *more: str, episodes: int = EPISODES, videos: int = RECORDED
+) -> EvaluationPlan:
+    """Return the plan of the evaluation of one of `POLICIES`, with ``more`` arguments of `lerobot eval`."""
     words = ["env=memobench", *POLICIES[name], f"tasks={BOWL}", "referent=random", f"horizon={HORIZON}"]
-    return plan_line(
-        [*words, f"obs_type={OBJECTS}", f"episodes={EPISODES}", f"videos={RECORDED}", f"output_dir={folder}"]
-    )
+    words += [f"obs_type={OBJECTS}", f"episodes={episodes}", f"videos={videos}", f"output_dir={folder}"]
+    return plan_line([*words, *more])
 
 
 def compare_memories(work: Path, out: Path, evaluate: Callable[[str, Path], int]) -> dict[str, Outcome]:

@@ -26,6 +26,7 @@ from lerobot_memobench.evaluation.figures.style import (
 )
 from lerobot_memobench.evaluation.records import Run
 from lerobot_memobench.evaluation.report_tables import outcomes
+from lerobot_memobench.evaluation.tables import OPERATION_NAMES
 from lerobot_memobench.paper import failure_taxonomy, shuffled_control
 
 if TYPE_CHECKING:
@@ -152,7 +153,6 @@ def _failures_label(found: Sequence[Bar], k: int) -> str:
 # --- prefix completion: one panel per task (paper, ablations) ---
 
 COLUMNS = 4
-OPERATIONS = {"S": "storage", "U": "update", "C": "compression"}
 
 
 @dataclass(frozen=True)
@@ -260,10 +260,10 @@ def _prefix_legend(figure: Figure, found: Sequence[Panel], looks: Mapping[Identi
         handles.append(Line2D([], [], color=FAINT, marker="o", mfc="white", ls=":", ms=4, lw=1.0))
         labels.append("in order, where it differs")
     asked = {operation for panel in found for operation in panel.operations}
-    for operation, name in OPERATIONS.items():
+    for operation, name in OPERATION_NAMES.items():
         if operation in asked:
             handles.append(Patch(facecolor=OPERATION_COLOURS[operation]))
-            labels.append(f"{operation}: {name}")
+            labels.append(f"{operation}: {name.lower()}")
     legend_below(figure, handles, labels, min(len(handles), 2 if columns < 3 else 3 if len(looks) % 2 else 4))
 
 

@@ -18,8 +18,8 @@ from lerobot_memobench.envs.video import OPERATION_COLOURS as VIDEO_COLOURS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import METRICS, Row
 from lerobot_memobench.evaluation.records import Run
-from lerobot_memobench.evaluation.report_tables import PAPER_EPISODES, PAPER_INPUTS, PAPER_TASKS, count_of, extent
-from lerobot_memobench.io import draft_of
+from lerobot_memobench.evaluation.report_tables import PAPER_EPISODES, PAPER_INPUTS, PAPER_TASKS, extent
+from lerobot_memobench.io import count_of, draft_of
 from lerobot_memobench.paper import published_rows, shuffled_control
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 

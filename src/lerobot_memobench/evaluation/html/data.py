@@ -23,7 +23,7 @@ from lerobot_memobench.evaluation.metrics import (
     operations,
     percent,
 )
-from lerobot_memobench.evaluation.records import Run, card_of, unlike
+from lerobot_memobench.evaluation.records import Run, unlike
 from lerobot_memobench.evaluation.report import build
 from lerobot_memobench.evaluation.report_tables import outcomes
 from lerobot_memobench.evaluation.tables import OPERATION_NAMES, csv_tables
@@ -109,7 +109,7 @@ def _variant(record: Record) -> int:
 
 def run_data(run: Run, videos: Mapping[int, str]) -> dict[str, Any]:
     """Return one evaluation: protocol, rates, failures and rollouts."""
-    summary, starts = run.summary, card_of(run.folder).get("runs", [])
+    summary, starts = run.summary, run.card.get("runs", [])
     return {
         "name": run.name,
         "headline": headline([run]),
