@@ -19,14 +19,21 @@ names: both are float32, (B,) in a batch, and raw, in training as in a rollout."
 
 # -- seeds
 
-EVALUATION_SEED = 7
-"""Episode i of an evaluation has the scene of seed 7 + i."""
-EVALUATION_EPISODES = 50
-"""Episodes of each task in an evaluation."""
-DEMONSTRATION_SEED = 10_000
-"""Demonstration i of a task has the scene of seed 10,000 + i."""
-VALIDATION_SEED = 20_000
-"""Seeds from here on are for choosing settings."""
+PAPER, VALIDATION, SEALED = "paper", "validation", "sealed"
+SPLITS = {
+    PAPER: range(7, 57),
+    "demonstrations": range(10_000, 20_000),
+    VALIDATION: range(20_000, 30_000),
+    "detector": range(30_000, 40_000),
+    "detector test": range(40_000, 60_000),
+    SEALED: range(100_007, 100_057),
+}
+"""What the seeds of scenes are for. The paper's were looked at between trainings: for what is developed here, they are
+validation too. The sealed ones are looked at once per release (`memobench test-sealed`)."""
+EVALUATION_SEED, EVALUATION_EPISODES = SPLITS[PAPER].start, len(SPLITS[PAPER])
+"""Episode i of an evaluation has the scene of seed 7 + i, unless another split is asked for; 50 episodes of a task."""
+DEMONSTRATION_SEED, VALIDATION_SEED = SPLITS["demonstrations"].start, SPLITS[VALIDATION].start
+"""Demonstration i of a task has the scene of seed 10,000 + i; settings are chosen on seeds from 20,000 on."""
 UNSEEDED = (1_000_000_000, 2_000_000_000)
 """Between these lie the seeds of episodes for which nobody named one, far above all others."""
 

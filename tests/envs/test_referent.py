@@ -13,8 +13,7 @@ from scipy import stats
 from lerobot_memobench.envs.episode import Episode, referent_of
 from lerobot_memobench.envs.episode_log import episode_record
 from lerobot_memobench.experts.expert import Expert
-from lerobot_memobench.protocol import DEMONSTRATION_SEED as DEMONSTRATION_SEEDS
-from lerobot_memobench.protocol import EVALUATION_SEED as EVALUATION_SEEDS
+from lerobot_memobench.protocol import PAPER, SEALED, SPLITS, VALIDATION
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 
 SEEDS = 400
@@ -23,6 +22,7 @@ FAIR = 1e-6
 
 PUBLISHED_WITH_VARIANTS = [name for name in task_names() if get_task(name).num_variants > 1]
 STRICT_WITH_VARIANTS = [name for name in task_names(suite="strict") if get_task(name).num_variants > 1]
+STACK = "stack_the_bowls_one_by_one_in_the_exact_sequence_shown_in_the_video"
 WITH_VARIANTS = PUBLISHED_WITH_VARIANTS + STRICT_WITH_VARIANTS
 
 
@@ -42,58 +42,56 @@ def test_a_task_with_one_goal_keeps_it(name: str) -> None:
     assert referent_of(get_task(name), 7) is get_task(name)
 
 
-@pytest.mark.parametrize("first", [EVALUATION_SEEDS, DEMONSTRATION_SEEDS])
+@pytest.mark.parametrize("split", [PAPER, "demonstrations", VALIDATION, SEALED])
 @pytest.mark.parametrize("name", WITH_VARIANTS)
-def test_every_admissible_variant_comes_about_equally_often(name: str, first: int) -> None:
+def test_the_first_episodes_of_a_split_show_every_admissible_variant_as_often(name: str, split: str) -> None:
     admissible = get_task(name).random_variants
-    variants = drawn(name, first)
-    counts = [variants.count(k) for k in admissible]
-    assert sum(counts) == SEEDS, "a variant was drawn that is not admissible"
-    assert stats.chisquare(counts).pvalue > FAIR, dict(zip(admissible, counts, strict=True))
+    for episodes in (4, 10, 50, SEEDS):
+        variants = drawn(name, SPLITS[split].start)[:episodes]
+        counts = [variants.count(k) for k in admissible]
+        assert sum(counts) == episodes, "a variant was drawn that is not admissible"
+        assert max(counts) - min(counts) <= 1
+
+
+def test_an_episode_has_its_variant_wherever_an_evaluation_begins() -> None:
+    """Parts, resumed runs and `seed=` draw what the whole evaluation does: the seed alone decides."""
+    assert drawn(STACK, 20_000)[13:40] == drawn(STACK, 20_013, 27)
+
+
+def firsts(name: str, split: str) -> list[int]:
+    """What comes first in each round of a split, as numbers from 0 on."""
+    admissible = get_task(name).random_variants
+    return [admissible.index(k) for k in drawn(name, SPLITS[split].start)[:: len(admissible)]]
 
 
 @pytest.mark.parametrize("name", WITH_VARIANTS)
-def test_consecutive_seeds_do_not_follow_from_one_another(name: str) -> None:
-    """The next seed's variant is independent of this one's: no turns, no repetition with a period."""
-    admissible = list(get_task(name).random_variants)
-    variants = drawn(name, EVALUATION_SEEDS, SEEDS + 1)
-    table = np.zeros((len(admissible), len(admissible)))
-    for now, then in pairwise(variants):
-        table[admissible.index(now), admissible.index(then)] += 1
-    assert stats.chi2_contingency(table).pvalue > FAIR
+def test_rounds_do_not_follow_from_one_another(name: str) -> None:
+    """What comes first in a round is as likely to be any, and no period tells it."""
+    number, found = len(get_task(name).random_variants), firsts(name, VALIDATION)
+    assert stats.chisquare([found.count(k) for k in range(number)]).pvalue > FAIR
     for period in range(1, 17):
-        again = sum(variants[i] == variants[i + period] for i in range(SEEDS - period))
-        test = stats.binomtest(again, SEEDS - period, 1 / len(admissible))
-        assert test.pvalue > FAIR, f"seeds {period} apart agree {again} times of {SEEDS - period}"
+        pairs = list(zip(found, found[period:], strict=False))
+        test = stats.binomtest(sum(a == b for a, b in pairs), len(pairs), 1 / number)
+        assert test.pvalue > FAIR, f"rounds {period} apart agree too often or too rarely"
 
 
 @pytest.mark.parametrize("name", WITH_VARIANTS)
 def test_evaluation_and_demonstration_seeds_share_no_pattern(name: str) -> None:
-    """Episode i of the evaluation and demonstration i agree as often as chance has it, whatever the offset."""
-    admissible = get_task(name).random_variants
-    evaluation = drawn(name, EVALUATION_SEEDS)
-    demonstrations = drawn(name, DEMONSTRATION_SEEDS)
+    """Rounds of the evaluation and of demonstrations agree as often as chance has it, whatever the offset."""
+    evaluation, demonstrations = firsts(name, PAPER), firsts(name, "demonstrations")
     for offset in range(5):
         pairs = list(zip(evaluation[offset:], demonstrations, strict=False))
-        test = stats.binomtest(sum(a == b for a, b in pairs), len(pairs), 1 / len(admissible))
+        test = stats.binomtest(sum(a == b for a, b in pairs), len(pairs), 1 / len(get_task(name).random_variants))
         assert test.pvalue > FAIR
 
 
 def test_tasks_do_not_share_their_draws() -> None:
-    """Two tasks with as many variants do not show the same place at the same seed."""
+    """Two tasks with as many variants do not show the same place in the same round."""
     two = [name for name in WITH_VARIANTS if len(get_task(name).random_variants) == 2]
     assert len(two) > 2
-    places = {name: [get_task(name).random_variants.index(k) for k in drawn(name, EVALUATION_SEEDS)] for name in two}
-    for a, b in pairwise(two):
-        same = sum(x == y for x, y in zip(places[a], places[b], strict=True))
-        assert stats.binomtest(same, SEEDS, 1 / 2).pvalue > FAIR
-
-
-@pytest.mark.parametrize("name", PUBLISHED_WITH_VARIANTS + [n for n in STRICT_WITH_VARIANTS if "_or_the_" not in n])
-def test_the_first_fifty_episodes_show_every_variant_of_small_tasks(name: str) -> None:
-    """The protocol's 50 episodes hold every goal, so that a table of 50 means what it says."""
-    admissible = get_task(name).random_variants
-    assert set(drawn(name, EVALUATION_SEEDS, 50)) == set(admissible)
+    for a, b in pairwise(firsts(name, PAPER) for name in two):
+        same = sum(x == y for x, y in zip(a, b, strict=True))
+        assert stats.binomtest(same, len(a), 1 / 2).pvalue > FAIR
 
 
 # --- what an answer to another prompt counts as ---

@@ -78,6 +78,13 @@ def test_what_differs_is_refused_by_name_and_may_be_allowed(
         assert found.notes[0] == f"compared although {named}"
 
 
+def test_another_variant_of_a_scene_is_another_episode(tmp_path: Path) -> None:
+    a, b = (logs.evaluation(tmp_path / str(k), referent="random", variant=k) for k in (0, 1))
+    with pytest.raises(MemobenchError, match=r"do not have the same variants, the first is .*--allow referent"):
+        compared(a, b)
+    assert compared(a, b, allow=["referent"]).pairs == 8
+
+
 @pytest.mark.parametrize(
     ("setting", "value"), [("horizon", 600), ("render", "fast"), ("seed_base", 1007), ("demonstration_prompt", False)]
 )

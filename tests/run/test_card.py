@@ -11,12 +11,14 @@ from typing import Any
 import huggingface_hub
 import pytest
 
+from lerobot_memobench.envs.episode import referent_of
 from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import read_card
 from lerobot_memobench.run.card import (
     checkpoint_files,
     disagreement,
+    drawn_otherwise,
     extended,
     joined_runs,
     markdown,
@@ -31,7 +33,9 @@ from lerobot_memobench.run.card import (
 )
 from lerobot_memobench.run.machine import run_facts
 from lerobot_memobench.run.merging import merge
+from lerobot_memobench.run.rerun import repeat
 from lerobot_memobench.run.run import resumed_card
+from lerobot_memobench.tasks.catalogue import get_task
 from tests.support import logs
 
 
@@ -242,3 +246,21 @@ def test_a_repository_is_known_once_it_has_been_fetched(tmp_path: Path, monkeypa
     assert sorted(found["checkpoint"]["files"]) == ["config.json", "model.safetensors"]
     assert found["checkpoint"]["revision"] == COMMIT
     assert len(found["policy"]["sha256"]) == 64
+
+
+def test_episodes_that_drew_their_variants_otherwise_are_neither_gone_on_with_nor_repeated(tmp_path: Path) -> None:
+    bowl = "put_the_butter_into_the_bowl_from_the_prompt_video"
+    here = {seed: referent_of(get_task(bowl), seed).variant_index for seed in (7, 8)}
+    lines = [record(bowl, seed - 7, seed=seed, referent="random", variant=k) for seed, k in here.items()]
+    assert drawn_otherwise(lines) is None
+    assert drawn_otherwise([record("of_my_own", variant=5, referent="random", seed=7)]) is None
+    other = (here[8] + 1) % 3
+    lines[1] = lines[1] | {"variant": other}
+    told = f"{bowl}, episode 1: variant {other} there, {here[8]} by its seed here"
+    for line in lines:
+        EpisodeLog(tmp_path, {}).append(line)
+    write_card(tmp_path, with_episodes(card(), lines))
+    with pytest.raises(MemobenchError, match=f"drew their variants otherwise .{told}.: an earlier version"):
+        resumed_card(tmp_path, card(), print)
+    with pytest.raises(MemobenchError, match=f"{told}.*repeat it with that version"):
+        repeat(tmp_path, None, None, lambda plan: 0, print)

@@ -17,7 +17,7 @@ from lerobot_memobench.errors import check_choice
 from lerobot_memobench.experts.blind import blind_routine
 from lerobot_memobench.experts.demonstration_prompt import PromptDemonstrator
 from lerobot_memobench.experts.expert import Expert
-from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EXECUTION, HORIZON, PROMPT, PROMPT_HORIZON
+from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EXECUTION, HORIZON, PROMPT, PROMPT_HORIZON, SPLITS
 from lerobot_memobench.sim.gl.rasterizer import Image
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.rendering import RenderSettings
@@ -237,14 +237,19 @@ class Episode:
 
 
 def referent_of(task: Task, seed: int) -> Task:
-    """Return the variant of a published task that a random referent shows in the episode of a seed.
+    """Return the variant of a task that a random referent shows in the episode of a seed.
 
-    Every admissible variant is equally likely, and which one it is says nothing about where things stand.
+    Variants are drawn in balance: from the first seed of a split on (`protocol.SPLITS`), every run of as many seeds as
+    there are variants shows each of them once, in an order drawn anew. So each is right equally often, in a dataset as
+    in an evaluation, and which one it is says nothing about where things stand.
     """
     if task.num_variants == 1:
         return task
     choices = task.random_variants
-    return task.variant(choices[int(generator(task, seed, 1).integers(len(choices)))])
+    first = max((split.start for split in SPLITS.values() if split.start <= seed), default=0)
+    place = (seed - first) % len(choices)
+    order = generator(task, seed - place, 1).permutation(choices)
+    return task.variant(int(order[place]))
 
 
 def generator(task: Task, seed: int, stream: int) -> np.random.Generator:

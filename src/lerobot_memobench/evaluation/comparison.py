@@ -67,7 +67,11 @@ def unlike_pairs(pairs: Sequence[Pair], allow: Collection[str]) -> dict[str, str
 
     A side that does not tell it does not differ. Other seeds have other scenes, which need no name of their own.
     """
-    for field, name, what in (("seed", "seed_base", "seeds"), ("scene_hash", SCENES, "initial scenes")):
+    for field, name, what in (
+        ("seed", "seed_base", "seeds"),
+        ("scene_hash", SCENES, "initial scenes"),
+        ("variant", "referent", "variants"),
+    ):
         different = [(x, y) for x, y in pairs if None not in (x.get(field), y.get(field)) and x[field] != y[field]]
         if different and not {name, "seed_base"} & set(allow):
             x, y = different[0]

@@ -375,3 +375,22 @@ def first_disagreement(card: Sequence[Mapping[str, Any]], records: Sequence[Mapp
         if problem is not None:
             return problem
     return None
+
+
+def drawn_otherwise(records: Iterable[Mapping[str, Any]]) -> str | None:
+    """Return the first episode of a log or card whose variant is not the one that its seed draws here, None for none.
+
+    Before variants were drawn in balance, each seed drew its own by itself. Tasks of one's own are not looked at.
+    """
+    from lerobot_memobench.envs.episode import referent_of
+    from lerobot_memobench.tasks.catalogue import get_task, suite_of
+
+    for record in records:
+        task, told, seed = record["task"], record.get("variant"), record.get("seed")
+        drawn = record.get("referent", "fixed") != "fixed" and suite_of(task) is not None
+        if not drawn or told is None or seed is None:
+            continue
+        here = referent_of(get_task(task), seed).variant_index
+        if here != told:
+            return f"{task}, episode {record['episode']}: variant {told} there, {here} by its seed here"
+    return None

@@ -26,9 +26,9 @@ from lerobot_memobench.io import count_of
 from lerobot_memobench.policies.checkpoint import local_folder
 from lerobot_memobench.run.arguments import PLAIN, checked_value, chosen_class, flag_value, setting_type, without_none
 from lerobot_memobench.run.arguments import settings as settings_of
-from lerobot_memobench.run.card import checkpoint_files, detector_hash, first_disagreement, tree_hash
+from lerobot_memobench.run.card import checkpoint_files, detector_hash, drawn_otherwise, first_disagreement, tree_hash
 from lerobot_memobench.run.lerobot_commands import config_class, load_command, register_plugins
-from lerobot_memobench.run.machine import gl_facts, versions
+from lerobot_memobench.run.machine import PACKAGES, gl_facts, versions
 from lerobot_memobench.run.plan import ENVIRONMENT, EvaluationPlan, plan_line
 
 ENV, POLICY_TYPE, POLICY_PATH, TASK_DIR = "env.type", "policy.type", "policy.path", "env.task_dir"
@@ -82,6 +82,11 @@ def repeat(
     """
     card = repeatable_card(path, server)
     check_policy(card)
+    if (otherwise := drawn_otherwise(card["episodes"])) is not None:
+        raise MemobenchError(
+            f"the card's episodes drew their variants otherwise ({otherwise}): an earlier version ran them, which did "
+            f"not draw in balance; repeat it with that version ({_version_of(card)})"
+        )
     for note in differences_here(card):
         say(f"note: {note}")
     plan = plan_of_card(card, out)
@@ -93,6 +98,12 @@ def repeat(
         return 0
     say(f"not repeated: {problem}")
     return 1
+
+
+def _version_of(card: Mapping[str, Any]) -> str:
+    """Return the package's version and commit by which a card was last run."""
+    run = card["runs"][-1]
+    return f"{run['versions'].get(PACKAGES[0], 'not known')}, commit {run['git_commit'] or 'not known'}"
 
 
 def repeatable_card(path: Path, server: str | None = None) -> dict[str, Any]:

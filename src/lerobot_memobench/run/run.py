@@ -17,7 +17,15 @@ from lerobot_memobench.io import count_of, is_there, remove_drafts
 from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.policies.baselines.configuration_baselines import UntrainedConfig
 from lerobot_memobench.policies.checkpoint import check_weights, portable_path
-from lerobot_memobench.run.card import card_of, extended, remove_card, with_checkpoint, with_episodes, write_card
+from lerobot_memobench.run.card import (
+    card_of,
+    drawn_otherwise,
+    extended,
+    remove_card,
+    with_checkpoint,
+    with_episodes,
+    write_card,
+)
 from lerobot_memobench.run.lerobot_commands import call_lerobot, without_chatter
 from lerobot_memobench.run.plan import EvaluationPlan, Range
 from lerobot_memobench.run.rollout import calm_output, steered
@@ -152,6 +160,11 @@ def resumed_card(folder: Path, card: dict[str, Any], tell: Tell) -> dict[str, An
         raise MemobenchError(
             f"{folder} holds an evaluation with another protocol ({'; '.join(found)}, there and now); repeat its "
             "settings to go on with it, or choose another output_dir="
+        )
+    if (problem := drawn_otherwise(read_log(folder))) is not None:
+        raise MemobenchError(
+            f"the episodes in {folder} drew their variants otherwise ({problem}): an earlier version ran them, which "
+            "did not draw in balance; go on with that version, or choose another output_dir="
         )
     if not is_there(path):
         tell(f"note: {folder} has no {CARD_FILE}: whether its episodes are this policy's cannot be checked")
