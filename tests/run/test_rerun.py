@@ -219,6 +219,8 @@ OF_THE_RUN = {
     "env.render_every": st.just("1"),
     "env.videos": COUNT,
     "env.oracle_memory": BOOLEAN,
+    "pause_steps": COUNT,
+    "speed": st.sampled_from(["1", "0.5", "0.33"]),
     "env.max_parallel_tasks": COUNT,
     "eval.use_async_envs": BOOLEAN,
     "job_name": st.sampled_from(["mine", "run 7"]),

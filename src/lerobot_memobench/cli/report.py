@@ -184,7 +184,8 @@ def rerun(
 
 
 controls = typer.Typer(
-    help="Report the paper's controls. Oracle memory, shuffled memory, annotation granularity.", no_args_is_help=True
+    help="Report controls. The paper's: oracle memory, shuffled memory, granularity; and pauses, speed, evidence.",
+    no_args_is_help=True,
 )
 
 TableOut = Annotated[Path | None, typer.Option(help="Folder to write the table to, as Markdown, LaTeX and JSON.")]
@@ -246,6 +247,46 @@ def granularity(
 
     levels, notes = rollouts_by_level(coarse, intermediate, fine)
     return _show(granularity_report(levels, paper=bool(beside)), notes, "granularity", out)
+
+
+Plain = Annotated[Path, typer.Argument(help="Evaluation of the policy as it is.")]
+
+
+@controls.command()
+def pauses(
+    plain: Plain,
+    paused: Annotated[Path, typer.Argument(help="Evaluation of the same policy and episodes with pause_steps=.")],
+    draws: Draws = 2000,
+    out: TableOut = None,
+) -> int:
+    """Print what a policy loses when the robot rests now and then. It joins the report of the paused evaluation."""
+    return _pacing("pauses", "pause_steps", plain, paused, draws, out)
+
+
+@controls.command()
+def speed(
+    plain: Plain,
+    slow: Annotated[Path, typer.Argument(help="Evaluation of the same policy and episodes with speed= below 1.")],
+    draws: Draws = 2000,
+    out: TableOut = None,
+) -> int:
+    """Print what a policy loses when every action takes longer. It joins the report of the slower evaluation."""
+    return _pacing("speed", "speed", plain, slow, draws, out)
+
+
+def _pacing(name: str, setting: str, plain: Path, paced: Path, draws: int, out: Path | None) -> int:
+    from lerobot_memobench.envs.episode_log import is_archive
+    from lerobot_memobench.evaluation.pacing_controls import keep_changes, paced_changes, pacing_section
+    from lerobot_memobench.evaluation.report import write_report
+    from lerobot_memobench.evaluation.tables import Report
+
+    found, notes = paced_changes(setting, plain, paced, draws)
+    if not is_archive(paced):
+        keep_changes(paced, found)
+        write_report(paced)
+    section = pacing_section(found)
+    report = Report(section.title, (replace(section, title=""),), {"changes": found})
+    return _show(report, notes, name, out)
 
 
 def _show(report: Report, notes: Sequence[str], name: str, out: Path | None) -> int:

@@ -39,6 +39,7 @@ from lerobot_memobench.envs.observations import (
     policy_names,
     prompt_in,
 )
+from lerobot_memobench.envs.pacing import check_pacing, longest
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.jobs.threads import ACTING, limit_torch, use_threads
 from lerobot_memobench.lerobot_hooks import ROLLOUT, installed
@@ -84,6 +85,9 @@ class MemobenchEnvConfig(EnvConfig):
             `observation.blind_action`.
         oracle_memory: write what has been completed so far behind the instruction (the paper's oracle memory control),
             word for word as the column `memory` of a dataset says it for the same frame.
+        pause_steps: the robot rests for so many control steps at moments that the seed draws: actions have no effect,
+            the scene stands still, and the horizon waits (`pacing`). It begins and ends between two predictions.
+        speed: 1, or 0.5, 0.33 and so on: an action takes two, three control steps, and the horizon is as much longer.
         log_dir: where the episode log goes; LeRobot's output folder when left out.
         videos: record so many episodes of each task, from episode 0 on, as `<log_dir>/videos/<task>.<episode>.mp4`,
             annotated as `render()` is; −1 records every one, none is recorded when left out.
@@ -107,6 +111,8 @@ class MemobenchEnvConfig(EnvConfig):
     expert_action: bool = False
     blind_action: bool = False
     oracle_memory: bool = False
+    pause_steps: int = 0
+    speed: float = 1.0
     log_dir: str | None = None
     videos: int | None = None
     seed_base: int = EVALUATION_SEED
@@ -126,6 +132,7 @@ class MemobenchEnvConfig(EnvConfig):
         ):
             check_choice(f"env.{name}", value, known)
         check_counts("env.", horizon=self.horizon, render_every=self.render_every)
+        check_pacing("env.", self.pause_steps, self.speed)
         if self.videos is not None and self.videos < EVERY:
             raise MemobenchError(f"env.videos is {self.videos}; expected a number of episodes from 0 on, or -1 for all")
         if self.task is not None and self.tasks != "all":
@@ -191,16 +198,18 @@ class MemobenchEnvConfig(EnvConfig):
         log_dir = self.resolved_log_dir()
         prompt = prompt_in(policy) if self.prompt_in == AUTO else self.prompt_in
         by = acting(policy, self.obs_type, self.oracle_memory)
-        told = {"prompt_in": prompt, "replan_steps": self._replan_steps(policy)}
+        replan_steps = self._replan_steps(policy)
+        told = {"prompt_in": prompt, "replan_steps": replan_steps}
         settings = {**self.gym_kwargs, **told, "acting": by}
         protocol = {**self.protocol, **told, **by.protocol}
         check_protocol(log_dir, protocol)  # now, not when the first episode has been simulated
+        most = longest(self.horizon, self.pause_steps, self.speed, replan_steps)
         suites: dict[str, dict[int, gym.vector.VectorEnv]] = {}
         for memory_type, task_id, folder in chosen:
             make: Callable[[], gym.Env[Any, Any]] = partial(MemobenchEnv, str(folder), log_dir=str(log_dir), **settings)
             if self.resume:
                 make = partial(SkipLogged, make, log_dir, self.referent, self.seed_base)
-            suites.setdefault(memory_type, {})[task_id] = self._vector([make] * n_envs, use_async_envs)
+            suites.setdefault(memory_type, {})[task_id] = self._vector([make] * n_envs, use_async_envs, most)
         return suites
 
     def get_env_processors(self) -> tuple[Any, Any]:
@@ -229,14 +238,14 @@ class MemobenchEnvConfig(EnvConfig):
             for check in POLICY_CHECKS:
                 check(path, policy, env_to_policy_features(self), rename_map())
 
-    def _vector(self, make: list[Callable[[], gym.Env[Any, Any]]], use_async_envs: bool) -> gym.vector.VectorEnv:
+    def _vector(
+        self, make: list[Callable[[], gym.Env[Any, Any]]], use_async_envs: bool, most: int
+    ) -> gym.vector.VectorEnv:
         from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 
         if use_async_envs:
             # What a vector environment must know before its workers exist.
-            space = observation_space(
-                self.expert_action, self.render_every, self.obs_type, self.blind_action, self.horizon
-            )
+            space = observation_space(self.expert_action, self.render_every, self.obs_type, self.blind_action, most)
             return _LazyAsyncVectorEnv(make, space, action_space(), METADATA)
         # LeRobot freezes finished rows of its own async envs only; a sync row would be reset and go on.
         return gym.vector.SyncVectorEnv(

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lerobot_memobench.envs.pacing import NOTHING, Pacing, steps_per_action
 from lerobot_memobench.errors import check_choice
 from lerobot_memobench.experts.blind import blind_routine
 from lerobot_memobench.experts.demonstration_prompt import PromptDemonstrator
@@ -44,8 +45,9 @@ class Episode:
         referent: `fixed`, the catalogue's goal, or `random`, one of the task's variants by seed; of the strict suite
             one of the variants always, which is told as `drawn`.
         demonstration_prompt: whether tasks that have a prompt begin with it; what it hides is hidden unseen without.
-        horizon: execution steps before truncation.
+        horizon: execution steps before truncation, of actions at full speed.
         render: size and quality of frames.
+        pause_steps, speed, replan_steps: see `pacing.Pacing`.
 
     Attributes:
         task: the task of this episode: a variant of the given one when the referent is random.
@@ -54,6 +56,7 @@ class Episode:
         exec_start: the frame at which execution began; None during the prompt.
         progress: checkpoints and goal, counted in execution steps.
         applied_action: the action (7,) float32 that really moved the arm in the last step.
+        rested: the last step was one of a pause: the scene stood still, and nothing but the clock went on.
         fault: what broke the execution off; None as long as nothing has.
     """
 
@@ -65,10 +68,15 @@ class Episode:
         demonstration_prompt: bool = True,
         horizon: int = HORIZON,
         render: RenderSettings | None = None,
+        pause_steps: int = 0,
+        speed: float = 1.0,
+        replan_steps: int | None = None,
     ) -> None:
         check_choice("referent", referent, (*REFERENTS, DRAWN) if task.drawn else REFERENTS)
         self.published = task
         self.referent, self.horizon = referent_text(referent, task.drawn), horizon
+        self._limit = horizon * steps_per_action(speed)
+        self._paced = pause_steps, speed, replan_steps
         self.demonstration_prompt = demonstration_prompt and task.prompt is not None
         self.sim = Simulation(task, render)
         self._slots: ObjectSlots | None = None
@@ -89,6 +97,8 @@ class Episode:
         self.progress = Progress(task)
         self.step_index = 0
         self.exec_start: int | None = None
+        self.pacing = Pacing(*self._paced, self._rng(4))
+        self.rested = False
         self.applied_action: NDArray[np.float32] = np.zeros(ACTION_DIM, dtype=np.float32)
         self.prompt_shown: bool | None = None
         self.drifted = False
@@ -137,8 +147,13 @@ class Episode:
         return self.step_index - (self.exec_start or 0)
 
     @property
+    def heeds(self) -> bool:
+        """Whether the next action has an effect: none has during the prompt and in a pause."""
+        return self.phase == EXECUTION and self.pacing.heeds
+
+    @property
     def exec_steps(self) -> int:
-        """Execution steps taken so far."""
+        """Execution steps taken so far, without those of pauses."""
         return self.progress.steps
 
     @property
@@ -154,12 +169,12 @@ class Episode:
     @property
     def cut_off(self) -> bool:
         """The horizon ended it, and is shorter than the protocol's: what was missing might have come."""
-        return self.horizon < HORIZON and self.exec_steps >= self.horizon and not (self.success or self.lost)
+        return self.horizon < HORIZON and self.exec_steps >= self._limit and not (self.success or self.lost)
 
     @property
     def done(self) -> bool:
         """Ended by success, horizon, loss or fault; satisfied checkpoints alone end nothing."""
-        return self.success or self.exec_steps >= self.horizon or self.lost or self.fault is not None
+        return self.success or self.exec_steps >= self._limit or self.lost or self.fault is not None
 
     def step(self, action: ArrayLike) -> None:
         """Advance by one control step; during the prompt the given action has no effect, after a fault nothing has."""
@@ -178,6 +193,8 @@ class Episode:
         if self.fault is not None:
             return
         self.step_index += 1
+        if self.rested:
+            return
         self.progress.step(self.sim.holds)
         self.drifted = self.drifted or any(self.sim.holds(atom) for atom in self._wrong)
 
@@ -185,8 +202,11 @@ class Episode:
         """Carry out what the policy says; return what went wrong."""
         try:
             numbers = as_action(action, np.float32)  # before it is clipped: infinity would become 1
-            self.applied_action = np.clip(numbers, -1.0, 1.0)
-            self.sim.step(self.applied_action)
+            moved = self.pacing.step(np.clip(numbers, -1.0, 1.0))
+            self.rested = moved is None
+            self.applied_action = NOTHING if moved is None else moved
+            if moved is not None:
+                self.sim.step(moved)
         except InvalidActionError as error:
             return Fault(INVALID_ACTION, str(error))
         except UnstablePhysicsError as error:
@@ -194,19 +214,19 @@ class Episode:
         return None
 
     def expert_action(self) -> NDArray[np.float32]:
-        """Return what the scripted expert does now, (7,); zeros during the prompt. Ask once per step."""
-        if self.phase == PROMPT:
+        """Return what the scripted expert does now, (7,); zeros while it has no effect. Ask once per step."""
+        if not self.heeds:
             return np.zeros(ACTION_DIM, dtype=np.float32)
         if self._expert is None:
             self._expert = Expert(self.task, self.sim, self._rng(3))
         return self._expert.act()
 
     def blind_action(self) -> NDArray[np.float32]:
-        """Return what the published routine does now, blind to prompt and instruction, (7,); zeros during the prompt.
+        """Return what the published routine does now, blind to prompt and instruction, (7,).
 
-        Ask once per step.
+        It is zeros while that has no effect. Ask once per step.
         """
-        if self.phase == PROMPT:
+        if not self.heeds:
             return np.zeros(ACTION_DIM, dtype=np.float32)
         if self._blind is None:
             routine = get_task(self.published.derived_from) if self.published.derived_from else self.published

@@ -77,6 +77,7 @@ class Outcome(TypedDict, total=False):
         replan_steps: actions executed per prediction, where known.
         prompt_steps: control steps of the demonstration prompt.
         steps: execution steps.
+        paused_steps: control steps of pauses, where there were to be some.
         failure: class of the failure; None for a success.
         suite: of tasks that are not published: strict.
         lost: of strict tasks: the goal could no longer be reached.
@@ -90,6 +91,7 @@ class Outcome(TypedDict, total=False):
     replan_steps: Count | None
     prompt_steps: Count | None
     steps: Count | None
+    paused_steps: Whole
     failure: Name | None
     suite: Name
     lost: bool
@@ -152,6 +154,7 @@ def episode_record(episode: Episode, seed_base: int, replan_steps: int | None, w
         "prompt_steps": episode.exec_start if episode.exec_start is not None else episode.step_index,
         "prompt_shown": episode.prompt_shown,
         "steps": episode.exec_steps,
+        **({"paused_steps": episode.pacing.paused_steps} if episode.pacing.pauses else {}),
         "success": episode.success,
         "checkpoints": [
             {"operation": checkpoint.operation, "first_step": first, "ordered_step": ordered}
@@ -387,8 +390,12 @@ SETTINGS = (
     "render",
     "render_every",
     "oracle_memory",
+    "pause_steps",
+    "speed",
 )
 """Settings that must agree for two evaluations to be one, or to be compared."""
+UNTOLD: dict[str, Any] = {"suite": PUBLISHED, "pause_steps": 0, "speed": 1.0}
+"""What a protocol means that leaves these out: there was nothing else when it was written."""
 INPUTS = "inputs"
 """Inputs of the policy, in the words of `observations.policy_inputs`; absent where nobody wrote them down."""
 OF_THE_POLICY = ("prompt_in", INPUTS)
@@ -416,6 +423,7 @@ class Settings(TypedDict, total=False):
         render: quality of the pictures.
         render_every: control steps per drawn picture.
         oracle_memory: whether the instruction tells what was done so far.
+        pause_steps, speed: of the execution, see `pacing`.
         inputs: what the policy was given.
     """
 
@@ -429,6 +437,8 @@ class Settings(TypedDict, total=False):
     render: Name | None
     render_every: Count | None
     oracle_memory: bool | None
+    pause_steps: Whole
+    speed: Number
     inputs: Name | None
 
 
@@ -470,8 +480,7 @@ def differences(
 ) -> list[str]:
     """Return the settings in which two protocols differ, each as ``horizon: 1200 and 600``.
 
-    A setting that one of them does not tell (logs of other tools) is not a difference. Where the suite is not told it
-    is the published one: there was no other.
+    A setting that one of them does not tell (logs of other tools) is not a difference, but for `UNTOLD`.
 
     Args:
         extent: whether tasks and number of episodes are compared as well.
@@ -479,8 +488,8 @@ def differences(
         ignore: settings that may differ.
     """
     left_out = {*ignore, POLICY, *(() if extent else EXTENT)}
-    told = {"suite": PUBLISHED, **a}
-    found = _differing({k: v for k, v in told.items() if k not in left_out}, {"suite": PUBLISHED, **b})
+    told = {**UNTOLD, **a}
+    found = _differing({k: v for k, v in told.items() if k not in left_out}, {**UNTOLD, **b})
     if policy:
         found += _differing(a.get(POLICY) or {}, b.get(POLICY) or {}, f"{POLICY}.")
     return found

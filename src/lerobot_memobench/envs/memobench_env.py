@@ -32,6 +32,7 @@ from lerobot_memobench.envs.observations import (
     check_counts,
     observation_space,
 )
+from lerobot_memobench.envs.pacing import check_pacing, longest
 from lerobot_memobench.envs.video import BAND, VideoRecorder
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.io import file_name
@@ -100,6 +101,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         expert_action: bool = False,
         blind_action: bool = False,
         oracle_memory: bool = False,
+        pause_steps: int = 0,
+        speed: float = 1.0,
         videos: int | None = None,
         seed_base: int = EVALUATION_SEED,
         acting: Acting = NOBODY,
@@ -109,6 +112,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         check_choice("reward", reward, REWARDS)
         check_choice("prompt_in", prompt_in, (STEPS, RESET))
         check_counts(horizon=horizon, render_every=render_every)
+        check_pacing("", pause_steps, speed)
         self.render_mode = render_mode
         self._task = load_task(task) if suite_of(task) is None else get_task(task)
         self.task = self._task.name
@@ -118,7 +122,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._oracle_memory = oracle_memory
         self._describe(0)
         self._reward = reward
-        self.observation_space = observation_space(expert_action, render_every, obs_type, blind_action, horizon)
+        self._longest = longest(horizon, pause_steps, speed, replan_steps)
+        self.observation_space = observation_space(expert_action, render_every, obs_type, blind_action, self._longest)
         self.action_space = action_space()
         protocol = {
             "suite": self._task.suite,
@@ -132,6 +137,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             "render": render,
             "render_every": render_every,
             "oracle_memory": oracle_memory,
+            "pause_steps": pause_steps,
+            "speed": speed,
             **acting.protocol,
         }
         self._acting = acting
@@ -146,6 +153,9 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             "demonstration_prompt": demonstration_prompt,
             "horizon": horizon,
             "render": RenderSettings(IMAGE_SIZE, IMAGE_SIZE, render),
+            "pause_steps": pause_steps,
+            "speed": speed,
+            "replan_steps": replan_steps,
         }
         self._prompt_in = prompt_in
         self._replan_steps = replan_steps
@@ -167,9 +177,9 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     @property
     def _max_episode_steps(self) -> int:
-        """Upper bound for LeRobot's loop: what it steps through. The horizon itself counts execution steps."""
+        """Upper bound for LeRobot's loop: what it steps through. The horizon counts execution steps without pauses."""
         prompt = self._settings["demonstration_prompt"] and self._task.prompt is not None and self._prompt_in == STEPS
-        return int(self._settings["horizon"]) + (PROMPT_HORIZON if prompt else 0)
+        return self._longest + (PROMPT_HORIZON if prompt else 0)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -248,9 +258,10 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         return (completed + success) / (len(self.episode.task.checkpoints) + 1)
 
     def _observe(self) -> None:
-        """Observe the present frame, and record it where the episode is recorded."""
-        self._observer.observe(self.episode, recorded=self._video is not None)
-        if self._video is not None:
+        """Observe the present frame, and record it where the episode is recorded: a video skips pauses."""
+        filmed = self._video is not None and not self.episode.rested
+        self._observer.observe(self.episode, recorded=filmed)
+        if self._video is not None and filmed:
             self._video.add(self.render())
 
     def need_observation(self, needed: bool) -> None:

@@ -63,7 +63,7 @@ def gap_closed(standard: float | None, other: float | None) -> float | None:
 
 
 @dataclass(frozen=True)
-class _Outcomes:
+class Outcomes:
     """One metric of one task's paired rollouts: (n,) of either evaluation, and the episodes that are drawn, (D, n)."""
 
     a: Array
@@ -71,36 +71,49 @@ class _Outcomes:
     drawn: NDArray[np.intp]
 
 
-def contrasts(standard: Sequence[Record], other: Sequence[Record], draws: int = DRAWS) -> Contrasts:
-    """Return, per memory type and on average, each metric under both evaluations; rollouts are paired already."""
+def paired_outcomes(
+    standard: Sequence[Record], other: Sequence[Record], draws: int = DRAWS
+) -> dict[str, dict[str, Outcomes]]:
+    """Return task -> applicable metric -> its outcomes under both evaluations; rollouts are paired already."""
     rng = np.random.default_rng(0)
     others = by_task(other)
-    kinds: dict[str, list[dict[str, _Outcomes]]] = {}
+    found: dict[str, dict[str, Outcomes]] = {}
     for task, group in by_task(standard).items():
         drawn = rng.integers(len(group), size=(draws, len(group)))
-        outcomes = {}
+        found[task] = {}
         for metric in METRICS:
             a, b = ([value_of(record, metric) for record in records] for records in (group, others[task]))
             if None not in (*a, *b):
-                outcomes[metric] = _Outcomes(np.array(a, dtype=float), np.array(b, dtype=float), drawn)
-        kinds.setdefault(str(group[0]["memory_type"]), []).append(outcomes)
+                found[task][metric] = Outcomes(np.array(a, dtype=float), np.array(b, dtype=float), drawn)
+    return found
+
+
+def contrasts(standard: Sequence[Record], other: Sequence[Record], draws: int = DRAWS) -> Contrasts:
+    """Return, per memory type and on average, each metric under both evaluations; rollouts are paired already."""
+    outcomes = paired_outcomes(standard, other, draws)
+    memory_type = {record["task"]: str(record["memory_type"]) for record in standard}
+    kinds: dict[str, list[dict[str, Outcomes]]] = {}
+    for task, metrics in outcomes.items():
+        kinds.setdefault(memory_type[task], []).append(metrics)
     scopes = {**{name: [tasks] for name, tasks in kinds.items()}, AVERAGE: list(kinds.values())}
+    return {name: contrasts_of(groups) for name, groups in scopes.items()}
+
+
+def contrasts_of(groups: Sequence[Sequence[Mapping[str, Outcomes]]]) -> dict[str, Contrast]:
+    """Return metric -> contrast of groups of tasks: the mean over applicable groups of means over their tasks."""
     return {
-        name: {
-            metric: _contrast([[task[metric] for task in tasks if metric in task] for tasks in groups])
-            for metric in METRICS
-        }
-        for name, groups in scopes.items()
+        metric: _contrast([[task[metric] for task in tasks if metric in task] for tasks in groups])
+        for metric in METRICS
     }
 
 
-def _contrast(groups: Sequence[Sequence[_Outcomes]]) -> Contrast:
+def _contrast(groups: Sequence[Sequence[Outcomes]]) -> Contrast:
     """Return what memory types of tasks of paired outcomes say of two evaluations: a mean of means, with bootstrap."""
     known = [tasks for tasks in groups if tasks]
     if not known:
         return Contrast(None, None, Estimate(None), Estimate(None))
 
-    def mean(value: Callable[[_Outcomes], Any]) -> Any:
+    def mean(value: Callable[[Outcomes], Any]) -> Any:
         return np.mean([np.mean([value(task) for task in tasks], axis=0) for tasks in known], axis=0)
 
     a, b = float(mean(lambda task: task.a.mean())), float(mean(lambda task: task.b.mean()))

@@ -20,6 +20,7 @@ from lerobot_memobench.envs.episode_log import (
     MOST_EPISODES,
     POLICY,
     SETTINGS,
+    UNTOLD,
     CheckpointRecord,
     Outcome,
     Protocol,
@@ -185,7 +186,7 @@ def read_protocol(folder: str | Path) -> dict[str, Any]:
     folder = Path(folder)
     card = card_of(folder)
     told: dict[str, Any] = {**card.get("protocol", {}), **read_protocol_file(folder)}
-    if not {*EXTENT, *SETTINGS} - {"suite"} <= set(told):  # without a suite it is of the time when there was one
+    if not {*EXTENT, *SETTINGS} - {*UNTOLD} <= set(told):
         told = {**protocol_of_log(read_episodes(folder)), **told}
     return {**told, POLICY: card.get(POLICY) or told.get(POLICY) or {}}
 

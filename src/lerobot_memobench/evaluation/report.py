@@ -27,6 +27,7 @@ from lerobot_memobench.evaluation.metrics import (
     percent,
     report_values,
 )
+from lerobot_memobench.evaluation.pacing_controls import kept_changes, pacing_section
 from lerobot_memobench.evaluation.records import Run, asked_for, read_protocol, sweeps, unlike
 from lerobot_memobench.evaluation.report_tables import (
     PAPER_INPUTS,
@@ -93,7 +94,7 @@ def write_report(directory: str | Path, episodes: int | None = None) -> Run:
     notes += faults(records) + mixtures(records)
     run = Run(directory.name, "", directory, records, read_protocol(directory), notes)
     unrun = {task: len(lines) for task, lines in not_run(logged).items()}
-    figures = {**report_values(run.summary), **({"not_run": unrun} if unrun else {})}
+    figures = {**report_values(run.summary), **control_data(run), **({"not_run": unrun} if unrun else {})}
     write_file(directory / REPORT_JSON, json.dumps(figures, indent=2) + "\n")
     write_file(directory / REPORT_MARKDOWN, evaluation_markdown(run))
     return run
@@ -106,7 +107,7 @@ def table(summary: Summary) -> RenderableType:
 
 def evaluation_markdown(run: Run) -> str:
     """Return the report of one evaluation as Markdown."""
-    return markdown(Report(headline([run]), (_section(run),)))
+    return markdown(Report(headline([run]), (_section(run), *control_sections(run))))
 
 
 # --- documents ---
@@ -131,7 +132,7 @@ def build(runs: Sequence[Run], paper: bool = False) -> Report:
         if len(runs) > 1:
             where = f"Evaluation in {run.folder}."
             section = replace(section, title=run.name, sentences=(where, *section.sentences))
-        found.append(section)
+        found += [section, *control_sections(run)]
     if paper:
         found.append(beside_paper(runs))
     return Report(headline(runs), tuple(found), report_data(runs, paper))
@@ -148,6 +149,18 @@ def _section(run: Run) -> Section:
         (pooled_sentence(summary),),
         tuple(run.notes),
     )
+
+
+def control_sections(run: Run) -> list[Section]:
+    """Return the sections of the controls that were run with an evaluation."""
+    changes = kept_changes(run.folder)
+    return [pacing_section(changes)] if changes else []
+
+
+def control_data(run: Run) -> dict[str, Any]:
+    """Return the figures of the controls that were run with an evaluation, per cent."""
+    changes = kept_changes(run.folder)
+    return {"pacing": changes} if changes else {}
 
 
 def render(found: Report, runs: Sequence[Run], format_: str, paper: bool = False) -> str:
@@ -217,6 +230,7 @@ def run_data(run: Run) -> dict[str, Any]:
     policy = run.protocol[POLICY]
     return {
         **report_values(summary),
+        **control_data(run),
         "name": run.name,
         "method": run.method,
         "replan_steps": run.replan_steps,

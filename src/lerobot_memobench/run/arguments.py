@@ -48,7 +48,10 @@ SHORT_FORMS: dict[str, dict[str, tuple[str, ...]]] = {
     "eval": {
         **COMMON,
         **{key: (f"policy.{key}",) for key in ("host", "port", "dialect")},
-        **{key: (f"env.{key}",) for key in ("demonstration_prompt", "prompt_in", "horizon", "videos")},
+        **{
+            key: (f"env.{key}",)
+            for key in ("demonstration_prompt", "prompt_in", "horizon", "pause_steps", "speed", "videos")
+        },
         "episodes": ("eval.n_episodes",),
         "batch_size": ("eval.batch_size",),
     },

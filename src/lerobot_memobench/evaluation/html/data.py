@@ -23,6 +23,7 @@ from lerobot_memobench.evaluation.metrics import (
     operations,
     percent,
 )
+from lerobot_memobench.evaluation.pacing_controls import kept_changes, pace_phrase
 from lerobot_memobench.evaluation.records import Run, unlike
 from lerobot_memobench.evaluation.report import build
 from lerobot_memobench.evaluation.report_tables import outcomes
@@ -125,9 +126,10 @@ def run_data(run: Run, videos: Mapping[int, str]) -> dict[str, Any]:
 
 
 def facts(run: Run) -> list[str]:
-    """Return what stands below the first line: how many rollouts there are, and their horizon."""
+    """Return what stands below the first line: how many rollouts, their horizon, and controls that were run."""
     horizon = run.protocol.get("horizon")
-    return [count_of(len(run.records), "rollout"), *([] if horizon is None else [f"horizon {horizon}"])]
+    controls = [pace_phrase(each) for each in kept_changes(run.folder)]
+    return [count_of(len(run.records), "rollout"), *([] if horizon is None else [f"horizon {horizon}"]), *controls]
 
 
 def task_data(name: str, summary: Summary) -> dict[str, Any]:
