@@ -11,7 +11,6 @@ import typer
 
 from lerobot_memobench.cli.console import console, counting
 from lerobot_memobench.jobs.processes import Advance
-from lerobot_memobench.protocol import VALIDATION_SEED
 from research.command import run
 
 Tasks = Annotated[
@@ -27,7 +26,7 @@ def train(
     tasks: Tasks = None,
     episodes: Episodes = 8,
     frames: Frames = 22,
-    first_seed: Annotated[int, typer.Option(help="First seed of the episodes, 20000 to 39999.")] = VALIDATION_SEED,
+    first_seed: Annotated[int, typer.Option(help="First seed of the episodes, 30000 to 39999.")] = 30_000,
     updates: Annotated[int, typer.Option(min=1, help="Updates of the weights.")] = 18_000,
     batch: Annotated[int, typer.Option(min=1, help="Images of each.")] = 32,
     seed: Annotated[int, typer.Option(min=0, help="Of first weights, order and augmentation.")] = 0,

@@ -14,14 +14,14 @@ from tests.support.labelled_images import BOWLS, synthetic
 
 
 def test_an_episode_is_made_once_and_the_same_again(gl: str, tmp_path: Path) -> None:
-    pictures = DetectorData([BOWLS], 20_000, 1, 2).pictures(tmp_path, TRAINED)
+    pictures = DetectorData([BOWLS], 30_000, 1, 2).pictures(tmp_path, TRAINED)
     assert PER_FRAME <= len(pictures) <= 2 * PER_FRAME
     (file,) = tmp_path.glob("*.npy")
     first = file.read_bytes()
     made = file.stat().st_mtime_ns
-    DetectorData([BOWLS], 20_000, 1, 2).pictures(tmp_path, TRAINED)
+    DetectorData([BOWLS], 30_000, 1, 2).pictures(tmp_path, TRAINED)
     assert file.stat().st_mtime_ns == made
-    again = EpisodeImages(BOWLS, 20_000, tmp_path / "again.npy", 2)
+    again = EpisodeImages(BOWLS, 30_000, tmp_path / "again.npy", 2)
     again.run()
     assert again.folder.read_bytes() == first
     rows = pictures.rows([0, 1])
@@ -55,10 +55,10 @@ def test_other_arrays_are_no_pictures(tmp_path: Path) -> None:
 def test_a_folder_of_other_kinds_is_refused(tmp_path: Path) -> None:
     (tmp_path / KINDS_FILE).write_text(json.dumps(["sock"]))
     with pytest.raises(MemobenchError, match="other kinds"):
-        DetectorData([BOWLS], 20_000, 1, 1).pictures(tmp_path, TRAINED)
+        DetectorData([BOWLS], 30_000, 1, 1).pictures(tmp_path, TRAINED)
 
 
-@pytest.mark.parametrize(("first", "allowed"), [(7, TRAINED), (39_999, TRAINED), (20_000, TESTED)])
+@pytest.mark.parametrize(("first", "allowed"), [(7, TRAINED), (20_000, TRAINED), (39_999, TRAINED), (30_000, TESTED)])
 def test_seeds_of_training_test_and_evaluation_are_apart(tmp_path: Path, first: int, allowed: range) -> None:
     with pytest.raises(MemobenchError, match="seeds"):
         DetectorData([BOWLS], first, 2, 1).pictures(tmp_path, allowed)

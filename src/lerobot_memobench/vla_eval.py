@@ -20,7 +20,7 @@ from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.envs.observations import PIXEL_INPUT, RESET, STEPS, check_counts
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import PROCESS_METRICS, value_of
-from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EVALUATION_SEED, HORIZON, PROMPT
+from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EVALUATION_SEED, HORIZON, PROMPT, SEALED, SPLITS
 from lerobot_memobench.tasks.task import PUBLISHED
 
 try:
@@ -112,6 +112,11 @@ class MEMOBench(StepBenchmark):
         check_counts(history_every=history_every, n_action_steps=n_action_steps)
         if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
             raise MemobenchError(f"seed is {seed!r}; expected a whole number from 0 on")
+        if seed in SPLITS[SEALED]:
+            raise MemobenchError(
+                f"seed {seed} is of the sealed test, whose runs are counted: `memobench test-sealed "
+                "policy=memobench_remote dialect=vla_eval` runs it with your model server"
+            )
         self._config = MemobenchEnvConfig(
             tasks=str(tasks) if isinstance(tasks, str | int) else ",".join(map(str, tasks)),
             suite=suite,

@@ -119,7 +119,7 @@ def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
 def test_help_lists_every_command_once_in_its_group(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--help"]) == 0
     out = capsys.readouterr().out
-    names = [one if isinstance(one, str) else one.__name__ for one in _names()]
+    names = [one if isinstance(one, str) else one.__name__.replace("_", "-") for one in _names()]
     sections = [line for line in out.splitlines() if line.endswith(":") and not line.startswith(" ")]
     assert sections == ["Options:", *(f"{group}:" for group in COMMANDS)]
     listed = [line.split()[0] for line in out[out.index("Look around:") :].splitlines() if line.startswith("  ")]

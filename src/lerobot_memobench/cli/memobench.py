@@ -21,6 +21,7 @@ from lerobot_memobench.cli.console import run_app
 from lerobot_memobench.cli.data import cache, generate
 from lerobot_memobench.cli.demo import demo, doctor
 from lerobot_memobench.cli.report import compare, controls, html, merge, report, rerun
+from lerobot_memobench.cli.sealed import test_sealed
 from lerobot_memobench.cli.tasks import gallery, objects, recipe, tasks
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.threads import ACTING, LEARNING, use_threads
@@ -57,7 +58,7 @@ COMMANDS: dict[str, tuple[Callable[..., int | None] | tuple[str, typer.Typer], .
     "Look around": (tasks, objects, gallery, doctor, demo),
     "Demonstrations": (generate, data.convert, cache, data.validate, data.describe, data.push),
     "Train": (recipe, conformance),
-    "Results": (report, compare, html, merge, rerun, ("figures", figures.app), ("controls", controls)),
+    "Results": (test_sealed, report, compare, html, merge, rerun, ("figures", figures.app), ("controls", controls)),
 }
 """Group -> its commands, as ``memobench --help`` lists them."""
 
@@ -71,7 +72,8 @@ for group, commands in COMMANDS.items():
         if isinstance(command, tuple):
             app.add_typer(command[1], name=command[0], rich_help_panel=group)
         else:
-            app.command(rich_help_panel=group)(command)
+            flags = {"ignore_unknown_options": command is test_sealed}  # which hands them to LeRobot
+            app.command(rich_help_panel=group, context_settings=flags)(command)
 
 
 def _elsewhere(name: str, example: str) -> None:

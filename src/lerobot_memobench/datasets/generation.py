@@ -46,7 +46,7 @@ from lerobot_memobench.io import file_hash, file_name, free_bytes, in_words, tel
 from lerobot_memobench.jobs.executors import Needs, check_executor, options_text, run_jobs
 from lerobot_memobench.jobs.processes import ProgressCallback
 from lerobot_memobench.jobs.threads import cores
-from lerobot_memobench.protocol import DEMONSTRATION_SEED, IMAGE_SIZE
+from lerobot_memobench.protocol import DEMONSTRATION_SEED, IMAGE_SIZE, SEALED, SPLITS
 from lerobot_memobench.tasks.task import Task, referent_text
 
 WEIGHTS = "model.safetensors"
@@ -109,6 +109,12 @@ def generate(
         raise MemobenchError(
             f"{len(tasks)} tasks, {episodes} episodes ({most} with a prompt), {workers} workers were asked for; each "
             "must be at least 1"
+        )
+    sealed = SPLITS[SEALED]
+    if seed_base <= sealed[-1] and seed_base + most > sealed[0]:
+        raise MemobenchError(
+            f"seeds {seed_base} to {seed_base + most - 1} reach into the sealed test's ({sealed[0]} to {sealed[-1]}), "
+            "which no policy is trained on; choose others, such as --seed-base 10000"
         )
     check_executor(executor, executor_options)
     hiding = next((task for task in tasks if task.prompt is not None and not task.prompt.restores), None)

@@ -22,8 +22,10 @@ from lerobot_memobench.envs.episode_log import INPUTS, POLICY
 from lerobot_memobench.envs.observations import policy_inputs
 from lerobot_memobench.io import file_hash
 
+SEALED_LEDGER = "sealed_tests.jsonl"
+"""Where it is counted how often a policy was run on the sealed seeds (`run.sealed`)."""
 NOT_THE_CHECKPOINT = (
-    *("train_config.json", "README.md", "training_weights.safetensors", ".gitattributes"),
+    *("train_config.json", "README.md", "training_weights.safetensors", ".gitattributes", SEALED_LEDGER),
     *("training_curve.png", "training_curve.json"),
 )
 """Files of a checkpoint folder on which what the policy does at evaluation does not depend."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lerobot_memobench.envs.episode_log import POLICY
 from lerobot_memobench.evaluation.metrics import Record, policy_inputs
 from lerobot_memobench.evaluation.records import Run, one_suite
 from lerobot_memobench.io import count_of, cut
+from lerobot_memobench.protocol import PAPER, SPLITS
 
 PROMPT_IN = {"steps": "prompt in steps (observed)", "reset": "prompt in reset (not observed)"}
 
@@ -46,17 +47,23 @@ def protocol_phrases(run: Run) -> list[str]:
     return [
         f"{one_suite(records)} suite",
         f"referent {', '.join(sorted({str(record.get('referent', 'fixed')) for record in records}))}",
-        *_span("seed", (record.get("seed") for record in records)),
+        *_seeds(run),
         _extent(records),
         *_replan(records),
     ]
 
 
-def _span(word: str, values: Iterable[Any]) -> list[str]:
-    found = sorted({value for value in values if value is not None})
+def _seeds(run: Run) -> list[str]:
+    """Return the seeds, and the split that they are of where it is not the paper's."""
+    found = sorted({record["seed"] for record in run.records if record.get("seed") is not None})
     if not found:
         return []
-    return [f"{word}s {found[0]} to {found[-1]}" if len(found) > 1 else f"{word} {found[0]}"]
+    told = f"seeds {found[0]} to {found[-1]}" if len(found) > 1 else f"seed {found[0]}"
+    name = next((name for name, split in SPLITS.items() if found[0] in split and found[-1] in split), PAPER)
+    if name == PAPER:
+        return [told]
+    number = run.card.get("sealed", {}).get("run")
+    return [f"{told} ({name}{f', run {number} of this policy' if number else ''})"]
 
 
 def _extent(records: Sequence[Record]) -> str:

@@ -102,6 +102,40 @@ class Start(TypedDict):
     times: NotRequired[Count]
 
 
+class SealedStart(TypedDict):
+    """A start of an evaluation on the sealed seeds.
+
+    Attributes:
+        started: when.
+        suite: published or strict.
+        referent: fixed, random or drawn.
+        replan_steps: actions executed per prediction; None for the policy's own number.
+        tasks: how many.
+        episodes: of each.
+    """
+
+    started: str
+    suite: Name
+    referent: Name
+    replan_steps: Count | None
+    tasks: Count
+    episodes: Count
+
+
+class SealedRun(TypedDict):
+    """How often a policy was started on the sealed seeds (`memobench test-sealed`).
+
+    Attributes:
+        release: of this package.
+        run: this start's number, from 1 on, among those of the policy with the release.
+        earlier: the starts before it.
+    """
+
+    release: str
+    run: Count
+    earlier: list[SealedStart]
+
+
 class CardEpisode(Outcome):
     """What an episode came to.
 
@@ -135,6 +169,7 @@ class Card(TypedDict):
     policy: NotRequired[Policy]
     checkpoint: NotRequired[Checkpoint | None]
     runs: NotRequired[list[StartFacts]]
+    sealed: NotRequired[SealedRun]
 
 
 class WholeCard(TypedDict):
@@ -151,6 +186,7 @@ class WholeCard(TypedDict):
         flags: LeRobot's flags, complete but for folders: `memobench rerun` repeats them.
         shard: the part, or None.
         runs: each start, on each machine.
+        sealed: of an evaluation on the sealed seeds: how often they were looked at.
         episodes: what was found.
     """
 
@@ -164,6 +200,7 @@ class WholeCard(TypedDict):
     flags: list[str]
     shard: str | None
     runs: Annotated[list[Start], MinLen(1)]
+    sealed: NotRequired[SealedRun]
     episodes: list[CardEpisode]
 
 

@@ -8,6 +8,7 @@
     task_files    hash of each task's files
     flags         LeRobot's flags, complete but for folders: `memobench rerun` repeats them;  shard: the part, or null
     runs          each start, on each machine: command line, versions, commit, machine, GL
+    sealed        on the sealed seeds alone: how often this policy was run on them with this release, and when
     episodes      what was found: outcome, checkpoints' steps and scene hash of every episode
 
 It is written when an evaluation starts, and again with what was found when it ends. ``card.md`` is the same for people.
@@ -296,8 +297,16 @@ def _protocol_lines(card: Mapping[str, Any]) -> list[str]:
         f"| tasks | {len(tasks)}: {', '.join(tasks)} |",
         f"| episodes of each | {protocol.get('episodes')} |",
         *(f"| {name.replace('_', ' ')} | {value} |" for name, value in {**settings, **others}.items()),
+        *_sealed_line(card.get("sealed")),
         f"| episodes in the log | {len(card['episodes'])} |",
     ]
+
+
+def _sealed_line(sealed: Mapping[str, Any] | None) -> list[str]:
+    if sealed is None:
+        return []
+    before = "; ".join(f"{start['started'][:10]} {start['suite']} {start['referent']}" for start in sealed["earlier"])
+    return [f"| sealed test | run {sealed['run']} with release {sealed['release']}; before it: {before or 'none'} |"]
 
 
 def _policy_lines(card: Mapping[str, Any]) -> list[str]:

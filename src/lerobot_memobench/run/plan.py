@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any, cast
 
 from lerobot_memobench.envs.command_line import overrides, quiet, read_rename_map
 from lerobot_memobench.envs.observations import OBJECTS, PIXELS, check_obs_type, obs_type_of, prompt_in
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.evaluation.records import CARD_FILE, read_card
 from lerobot_memobench.jobs.executors import ELSEWHERE, read_options
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint
 from lerobot_memobench.policies.compatibility import REFUSAL, check_features
-from lerobot_memobench.protocol import EVALUATION_EPISODES, EVALUATION_SEED
+from lerobot_memobench.protocol import EVALUATION_EPISODES, EVALUATION_SEED, PAPER, SEALED, SPLITS, VALIDATION
 from lerobot_memobench.run.arguments import (
     CONFIG_FILE,
     RUN_OPTIONS,
@@ -54,6 +54,8 @@ VIDEO_EPISODES = 10
 """Episodes of each task that are recorded as videos, as many as LeRobot renders of an environment without videos of its
 own; none where only objects are observed, so that nothing is drawn unasked."""
 PROCESSES = "processes"
+EVALUATED = (PAPER, VALIDATION, SEALED)
+"""Splits that ``split=`` names."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,18 @@ class EvaluationPlan:
     def policy_path(self) -> str | None:
         """The model checkpoint or repository that is evaluated, None for a policy that is not loaded."""
         return self.arguments.get("policy.path")
+
+    @property
+    def split(self) -> str | None:
+        """What the seeds of its scenes are for, None for none of `protocol.SPLITS` in particular."""
+        seeds = self.seeds
+        return next((name for name, split in SPLITS.items() if seeds[0] in split and seeds[-1] in split), None)
+
+    @property
+    def seeds(self) -> range:
+        """Seeds of the scenes of each task."""
+        first = self.environment.seed_base + self.grid.first
+        return range(first, first + self.grid.runs)
 
     @property
     def draws(self) -> bool:
@@ -137,7 +151,7 @@ def is_benchmark(arguments: LerobotArguments, options: RunOptions) -> bool:
     if arguments.get("env.type") == ENVIRONMENT:
         return True
     if options.any:
-        raise MemobenchError("resume=, shard= and shards= belong to the benchmark: name it with env=memobench")
+        raise MemobenchError("split=, resume=, shard= and shards= belong to the benchmark: name it with env=memobench")
     path = arguments.get("policy.path")
     if path is not None:
         check_checkpoint(path)
@@ -153,6 +167,9 @@ def make_plan(arguments: LerobotArguments, options: RunOptions, command: Sequenc
     if options.resume and not arguments.has(OUTPUT):
         raise MemobenchError("resume=true needs the folder of the evaluation to go on with: output_dir=<folder>")
     arguments = with_policy(arguments)
+    if options.split is not None:
+        check_choice("split", options.split, EVALUATED)
+        arguments = arguments.default("seed", SPLITS[options.split].start)
     policy = policy_config(arguments)
     output = _output(arguments, options)
     log = Path(arguments.get(LOG) or output)
@@ -177,9 +194,30 @@ def make_plan(arguments: LerobotArguments, options: RunOptions, command: Sequenc
         options=options,
         command=tuple(command),
     )
+    check_split(plan)
     if options.executor not in ELSEWHERE:  # there, each part finds out
         _check_simulator(plan.draws)
     return plan
+
+
+def check_split(plan: EvaluationPlan) -> None:
+    """Refuse seeds outside the split that was named, and the sealed ones where it was not.
+
+    Raises:
+        MemobenchError: they are, with what to say instead.
+    """
+    asked, seeds, sealed = plan.options.split, plan.seeds, SPLITS[SEALED]
+    if asked is not None and plan.split != asked:
+        split = SPLITS[asked]
+        raise MemobenchError(
+            f"split={asked} has the seeds {split[0]} to {split[-1]}, and {seeds[0]} to {seeds[-1]} were asked for; "
+            f"leave seed= out, and ask for at most {len(split)} episodes"
+        )
+    if asked is None and seeds[0] <= sealed[-1] and seeds[-1] >= sealed[0]:
+        raise MemobenchError(
+            f"seeds {seeds[0]} to {seeds[-1]} reach into the sealed test's ({sealed[0]} to {sealed[-1]}), which are "
+            "looked at once per release, by `memobench test-sealed policy=…`; choose settings by split=validation"
+        )
 
 
 def _check_simulator(draws: bool) -> None:
@@ -372,6 +410,7 @@ class RunOptions:
     """How an evaluation is run, as opposed to what is evaluated.
 
     Attributes:
+        split: whose seeds are run, one of `EVALUATED`; None: those that `seed=` says.
         verbose: LeRobot's own messages are shown, too.
         resume: go on with the evaluation in the output folder.
         shard: run this part alone.
@@ -380,6 +419,7 @@ class RunOptions:
         executor, executor_options: see `jobs.executors.run_jobs`.
     """
 
+    split: str | None = None
     verbose: bool = False
     resume: bool = False
     shard: Shard | None = None
@@ -391,7 +431,7 @@ class RunOptions:
     @property
     def any(self) -> bool:
         """Whether something is asked for that only the benchmark's evaluation can do."""
-        return self.resume or self.in_parts
+        return self.resume or self.in_parts or self.split is not None
 
     @property
     def in_parts(self) -> bool:
@@ -411,6 +451,7 @@ def take_run_options(given: Arguments) -> tuple[RunOptions, Arguments]:
             found.setdefault(key, []).append(value)
     last = {key: values[-1] for key, values in found.items()}
     options = RunOptions(
+        split=last.get("split"),
         verbose=is_true("verbose", last.get("verbose")),
         resume=is_true("resume", last.get("resume")),
         shard=Shard.parse(last["shard"]) if "shard" in last else None,

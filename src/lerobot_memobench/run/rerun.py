@@ -24,6 +24,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import CARD_FILE, read_card
 from lerobot_memobench.io import count_of
 from lerobot_memobench.policies.checkpoint import local_folder
+from lerobot_memobench.protocol import SEALED
 from lerobot_memobench.run.arguments import PLAIN, checked_value, chosen_class, flag_value, setting_type, without_none
 from lerobot_memobench.run.arguments import settings as settings_of
 from lerobot_memobench.run.card import checkpoint_files, detector_hash, drawn_otherwise, first_disagreement, tree_hash
@@ -126,7 +127,8 @@ def plan_of_card(card: Mapping[str, Any], out: Path | None = None) -> Evaluation
     """Return the plan of a card's evaluation, to be run in ``out``, or in a folder of the present time."""
     out = out or Path("outputs/eval") / f"{dt.datetime.now():%Y-%m-%d/%H-%M-%S}_rerun"
     shard = [] if card["shard"] is None else [f"shard={card['shard']}"]
-    return plan_line([*card["flags"], f"output_dir={out}", *shard])
+    split = [f"split={SEALED}"] if "sealed" in card else []
+    return plan_line([*card["flags"], f"output_dir={out}", *shard, *split])
 
 
 def check_policy(card: Mapping[str, Any]) -> None:

@@ -29,6 +29,7 @@ from lerobot_memobench.run.card import (
 from lerobot_memobench.run.lerobot_commands import call_lerobot, without_chatter
 from lerobot_memobench.run.plan import EvaluationPlan, Range
 from lerobot_memobench.run.rollout import calm_output, steered
+from lerobot_memobench.run.sealed import RUN_FILE, counted
 
 VIDEOS = "videos"
 """Folder of the videos, in that of the log."""
@@ -114,6 +115,7 @@ def _run_lerobot(plan: EvaluationPlan, card: dict[str, Any], ranges: Ranges | No
             calm_output(),
             steered(plan.seed, ranges),
         ):
+            card = counted(plan, card, tell)
             write_card(plan.log, card)
             left = remainder(plan, ranges)
             with made(left.output):  # LeRobot makes it for videos of its own only
@@ -258,6 +260,8 @@ def held(plan: EvaluationPlan) -> Iterator[None]:
     finally:
         if not has_log(plan.log):
             remove_card(plan.log)
+            if plan.options.shard is None:
+                (plan.output / RUN_FILE).unlink(missing_ok=True)
             for folder in new:
                 _remove_empty(folder)
 

@@ -20,6 +20,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.executors import ELSEWHERE, Needs, check_executor, options_text, run_jobs
 from lerobot_memobench.jobs.processes import ProgressCallback
 from lerobot_memobench.jobs.threads import LARGE, sharing
+from lerobot_memobench.protocol import SEALED
 from lerobot_memobench.run.card import card_of
 from lerobot_memobench.run.merging import SHARDS, merge_and_report
 from lerobot_memobench.run.plan import EvaluationPlan, Shard
@@ -138,7 +139,7 @@ def plan_shards(plan: EvaluationPlan, program: Sequence[str], tell: Tell) -> lis
     jobs = [
         ShardJob(
             program=tuple(program),
-            flags=tuple(plan.portable_flags),
+            flags=(*plan.portable_flags, *((f"split={SEALED}",) if plan.split == SEALED else ())),
             shard=shard,
             out=out,
             episodes=frozenset(episode for cell in grid.cells(shard) for episode in grid.episodes(cell)),

@@ -1,0 +1,164 @@
+"""The sealed seeds: who may run them, and how often they were."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import lerobot_memobench.registration  # noqa: F401
+from lerobot_memobench.cli.memobench import main
+from lerobot_memobench.datasets.generation import generate
+from lerobot_memobench.envs.acting import checkpoint_files
+from lerobot_memobench.envs.episode_log import write_episodes
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.headline import headline
+from lerobot_memobench.evaluation.records import read_runs
+from lerobot_memobench.protocol import SPLITS
+from lerobot_memobench.run.card import card_of, markdown, write_card
+from lerobot_memobench.run.plan import EvaluationPlan, plan_line
+from lerobot_memobench.run.rerun import plan_of_card
+from lerobot_memobench.run.run import held
+from lerobot_memobench.run.sealed import RUN_FILE, counted, user_ledger
+from lerobot_memobench.run.shards import plan_shards
+from lerobot_memobench.tasks.catalogue import get_task
+from tests.support import logs
+
+STOVE = "turn_on_the_stove_and_turn_it_off"
+LINE = ["env=memobench", f"tasks={STOVE}", "policy=memobench_random", "env.videos=0"]
+SEALED = [*LINE, "split=sealed"]
+
+
+@pytest.fixture(autouse=True)
+def in_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+
+
+def begun(plan: EvaluationPlan, told: list[str] | None = None) -> dict[str, Any]:
+    """The card of an evaluation that begins, as it is written."""
+    return counted(plan, card_of(plan), (told if told is not None else []).append)
+
+
+@pytest.mark.parametrize("name", ["paper", "validation", "sealed"])
+def test_a_split_says_which_scenes_are_run(name: str) -> None:
+    plan = plan_line([*LINE, f"split={name}", "episodes=3"])
+    assert list(plan.seeds) == list(SPLITS[name][:3])
+    assert plan.split == name
+    assert plan.environment.seed_base == SPLITS[name].start
+
+
+def test_without_a_split_the_papers_seeds_are_run() -> None:
+    assert plan_line(LINE).seeds == SPLITS["paper"] == range(7, 57)
+    assert plan_line([*LINE, "seed=500"]).split is None
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["seed=100007"], "sealed test.*memobench test-sealed.*split=validation"),
+        (["seed=99999", "episodes=20"], "seeds 99999 to 100018 reach into the sealed"),
+        (["seed=100050", "env.seed_base=7"], "reach into the sealed"),
+        (["split=validation", "seed=7"], "split=validation has the seeds 20000 to 29999, and 7 to 56 were asked for"),
+        (["split=sealed", "episodes=51"], "at most 50 episodes"),
+        (["split=valdation"], "did you mean 'validation'"),
+    ],
+)
+def test_seeds_are_run_under_their_own_name(words: list[str], said: str) -> None:
+    with pytest.raises(MemobenchError, match=said):
+        plan_line([*LINE, *words])
+    assert not user_ledger().exists()
+
+
+def test_nothing_is_taught_on_sealed_seeds(tmp_path: Path) -> None:
+    with pytest.raises(MemobenchError, match="seeds 100050 to 100059 reach into the sealed test's"):
+        generate([get_task(STOVE)], 10, tmp_path / "data", seed_base=100_050)
+
+
+def test_each_start_is_counted_and_told_and_going_on_is_none() -> None:
+    told: list[str] = []
+    plan = plan_line([*SEALED, "output_dir=a", "replan=5", "policy.smoothing=0"])
+    first, again = begun(plan, told), begun(plan, told)
+    assert first["sealed"] == again["sealed"] == {"release": first["sealed"]["release"], "run": 1, "earlier": []}
+    assert told[0].startswith("sealed test: run 1 of this policy with release ")
+    second = begun(plan_line([*SEALED, "output_dir=b", "policy.smoothing=0"]), told)
+    assert second["sealed"]["run"] == 2
+    assert [start["suite"] for start in second["sealed"]["earlier"]] == ["published"]
+    assert "run 2 of this policy" in told[-1]
+    assert "the last before it on 2" in told[-1]
+    assert begun(plan_line([*SEALED, "output_dir=c", "policy.smoothing=0.5"]))["sealed"]["run"] == 1  # another policy
+    assert list(second)[-1] == "episodes"  # the card's writer puts one a line
+    assert "| sealed test | run 2 with release" in markdown(second)
+
+
+def test_other_seeds_are_not_counted() -> None:
+    assert "sealed" not in begun(plan_line([*LINE, "output_dir=a"]))
+    assert not user_ledger().exists()
+
+
+def test_the_parts_of_one_evaluation_are_one_start() -> None:
+    whole = plan_line([*SEALED, "output_dir=a", "shards=2", "episodes=2"])
+    for job in plan_shards(whole, (), print):
+        part = plan_line(job.arguments[1:])
+        assert begun(part)["sealed"]["run"] == 1
+    assert len(user_ledger().read_text().splitlines()) == 1
+
+
+def test_the_count_travels_with_a_checkpoint_and_is_no_part_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "act"
+    folder.mkdir()
+    features = {"observation.environment_state": {"type": "ENV", "shape": [208]}}
+    (folder / "config.json").write_text(json.dumps({"type": "act", "input_features": features}))
+    (folder / "model.safetensors").touch()
+    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
+        (folder / name).write_text(json.dumps({"steps": []}))
+    files, line = checkpoint_files(folder), [f"policy={folder}" if "policy" in word else word for word in SEALED]
+    assert begun(plan_line([*line, "output_dir=a"]))["sealed"]["run"] == 1
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "another_user"))
+    assert begun(plan_line([*line, "output_dir=b"]))["sealed"]["run"] == 2
+    assert checkpoint_files(folder) == files
+
+
+def test_a_damaged_ledger_is_read_as_far_as_it_can_be() -> None:
+    begun(plan_line([*SEALED, "output_dir=a"]))
+    with user_ledger().open("a") as file:
+        file.write('{"run": \nnot JSON\n{"policy": 7}\n')
+    assert begun(plan_line([*SEALED, "output_dir=b"]))["sealed"]["run"] == 2
+
+
+def test_a_run_that_ends_before_its_first_episode_leaves_its_folder_clean() -> None:
+    plan = plan_line([*SEALED, "output_dir=a"])
+    with held(plan):
+        begun(plan)
+        assert Path("a", RUN_FILE).is_file()
+    assert not Path("a").exists()
+
+
+def test_a_report_says_that_its_seeds_are_sealed_and_how_often_they_were_run(tmp_path: Path) -> None:
+    plan = plan_line([*SEALED, "output_dir=a", "episodes=2"])
+    write_episodes(tmp_path / "a", [logs.record(STOVE, k, seed=100_007 + k) for k in range(2)])
+    assert "seeds 100007 to 100008 (sealed), " in headline(read_runs([tmp_path / "a"]))
+    write_card(tmp_path / "a", begun(plan))
+    assert "seeds 100007 to 100008 (sealed, run 1 of this policy), " in headline(read_runs([tmp_path / "a"]))
+
+
+def test_a_sealed_card_is_repeated_as_another_run() -> None:
+    card = begun(plan_line([*SEALED, "output_dir=a"]))
+    plan = plan_of_card(card, Path("b"))
+    assert plan.split == "sealed"
+    assert begun(plan)["sealed"]["run"] == 2
+    with pytest.raises(MemobenchError, match="sealed test"):
+        plan_of_card({key: value for key, value in card.items() if key != "sealed"}, Path("c"))
+
+
+def test_the_command_is_an_evaluation_of_that_split(monkeypatch: pytest.MonkeyPatch) -> None:
+    found: list[list[str]] = []
+    monkeypatch.setattr("lerobot_memobench.cli.lerobot.run", lambda line: found.append(line) or 0)
+    assert main(["test-sealed", "policy=memobench_random", "--output_dir=x", "split=paper"]) == 0
+    assert found == [
+        ["eval", "env=memobench", "policy=memobench_random", "--output_dir=x", "split=paper", "split=sealed"]
+    ]
