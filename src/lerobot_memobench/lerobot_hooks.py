@@ -149,7 +149,27 @@ ATTEND = Hook(
     package="transformers",
     read=("5.5.4", "5.22.2"),
 )
-HOOKS = (RUN_ONE, ROLLOUT, INSIDE_SLURM, OPEN_DATASETS, MAKE_PROCESSORS, DRAW_FRAMES, READ_SAMPLE, ATTEND)
+PREPARE = Hook(
+    "accelerate.accelerator",
+    "Accelerator.prepare",
+    ("self",),
+    "shard a policy's average of weights where it shards the policy",
+    "accelerate knows of a policy and its optimizer, and LeRobot would save weights that are no average",
+    package="accelerate",
+    read=("1.15.0",),
+)
+GATHER_SHARDS = Hook(
+    "lerobot.scripts.lerobot_train",
+    "gather_fsdp_state_dicts",
+    ("model", "optimizer"),
+    "gather the average of a sharded policy's weights beside the weights",
+    "LeRobot saves in one process, in which nothing can be gathered any more",
+    read=(LEROBOT,),
+)
+HOOKS = (
+    *(RUN_ONE, ROLLOUT, INSIDE_SLURM, OPEN_DATASETS, MAKE_PROCESSORS, DRAW_FRAMES, READ_SAMPLE, ATTEND),
+    *(PREPARE, GATHER_SHARDS),
+)
 
 
 class _Standing:

@@ -477,10 +477,17 @@ def _check_distribution(config: Any) -> None:
     """Refuse what LeRobot's main can do to a policy's weights and memobench_mem does in another way, or not at all."""
     if getattr(config.policy, "type", None) != "memobench_mem":
         return
+    from lerobot_memobench.policies.memobench_mem.sharding import shard_plugin
+
     if getattr(getattr(config, "parallelism", None), "is_sharded", False):
         raise MemobenchError(
-            "parallelism.dp_shard would train memobench_mem in shards, which its average of weights is not made for; "
-            "leave it out: each process then holds the whole policy"
+            "parallelism.dp_shard would train memobench_mem in shards by FSDP 2, which its average of weights is not "
+            "made for; leave it out: each process then holds the whole policy"
+        )
+    if config.env is not None and config.env_eval_freq > 0 and shard_plugin() is not None:
+        raise MemobenchError(
+            f"env_eval_freq={config.env_eval_freq} would evaluate a policy of which each process holds a part, as it "
+            "trains in shards (FSDP); use env_eval_freq=0, and `lerobot eval` with a checkpoint"
         )
     if getattr(getattr(config, "ema", None), "enable", False):
         raise MemobenchError(

@@ -60,6 +60,7 @@ from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Precisi
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE
 from lerobot_memobench.policies.memobench_mem.rollout import Rollout
 from lerobot_memobench.policies.memobench_mem.sampler import TrainingRun, begin_training
+from lerobot_memobench.policies.memobench_mem.sharding import check_adapters, prepare_shards
 from lerobot_memobench.policies.memobench_mem.training import (
     TrainingCurve,
     WeightAverage,
@@ -80,6 +81,8 @@ from lerobot_memobench.policies.memobench_mem import processor_memobench_mem  # 
 
 logger = logging.getLogger(__name__)
 
+FSDP_PREFIX = "_fsdp_wrapped_module."
+"""What torch's FSDP puts into the names of what it wraps."""
 OBS_PICTURE = f"observation.{PICTURE_STEP}"
 OWN_MODULES = (
     *("model.memory", "model.memory_to_expert", "modulator", "alignment"),
@@ -104,7 +107,7 @@ class MemobenchMemPolicy(PI05Policy):
     name = "memobench_mem"
     config: MemobenchMemConfig
     model: MemoryPI05
-    _fsdp_wrap_modules = None  # to LeRobot's main: it is not trained in shards, whose average would be another one
+    _fsdp_wrap_modules = None  # to LeRobot's main, whose FSDP is another than that of `sharding`
 
     def __init__(
         self, config: MemobenchMemConfig, *, dataset_meta: Any | None = None, load_base: bool = True, **kwargs: Any
@@ -186,7 +189,8 @@ class MemobenchMemPolicy(PI05Policy):
     def _acting(self) -> Iterator[None]:
         """Compute as a checkpoint saved now would: by the average, in the precision that it is loaded in."""
         wide = self.precision.narrowed()
-        average = contextlib.nullcontext() if self.average is None else self.average.applied(wide)
+        whole = self.average is not None and self.average.whole  # a pass in shards has gathered the trained weights
+        average = self.average.applied(wide) if self.average is not None and whole else contextlib.nullcontext()
         with average, self.precision.computing(self._device):
             yield
 
@@ -201,19 +205,25 @@ class MemobenchMemPolicy(PI05Policy):
             attend_fused(self.model)
         if self._device.type == "cpu":
             keep_freed_memory()
+        prepare_shards(self)
 
     @property
-    def _averages(self) -> bool:
+    def averages(self) -> bool:
         """Whether weights are averaged: not those of adapters, of which peft writes a checkpoint's file."""
         return bool(self.config.ema_decay) and not self.config.use_peft
 
-    def _trained(self) -> dict[str, nn.Parameter]:
-        return {name: parameter for name, parameter in self.named_parameters() if parameter.requires_grad}
+    def trained_parameters(self) -> dict[str, nn.Parameter]:
+        """Return the parameters that learn, by the names that they have in a checkpoint."""
+        return {
+            name.replace(FSDP_PREFIX, ""): parameter
+            for name, parameter in self.named_parameters()
+            if parameter.requires_grad
+        }
 
     def get_optim_params(self) -> list[nn.Parameter]:
         """Return the parameters that learn, in float32: all but the image tower and what pi0.5 never uses."""
         self.precision.settle()
-        return list(self._trained().values())
+        return list(self.trained_parameters().values())
 
     def update(self) -> None:
         """Move the average of the weights; lerobot-train calls this after each optimiser step."""
@@ -239,8 +249,8 @@ class MemobenchMemPolicy(PI05Policy):
             MemobenchError: the batch has no memory, or pictures where it should have their tokens.
         """
         self._require_memory(batch)
-        if self._averages and self.average is None and self.training:
-            self.average = WeightAverage(self._trained(), self.config.ema_decay)
+        if self.averages and self.average is None and self.training:
+            self.average = WeightAverage(self.trained_parameters(), self.config.ema_decay)
         measures = not self.training and not torch.is_grad_enabled()
         quick = self.training and self._device.type == "cpu" and not self.config.uses_visual_encoder
         computing = self._acting() if measures else self.precision.computing(self._device)
@@ -530,8 +540,8 @@ class MemobenchMemPolicy(PI05Policy):
         policy.eval()
         if dataset_meta is None:
             return policy
-        if policy._averages:
-            average = WeightAverage(policy._trained(), policy.config.ema_decay)
+        if policy.averages:
+            average = WeightAverage(policy.trained_parameters(), policy.config.ema_decay)
             policy.average = restore_average(average, source, revision)
         policy.curve = TrainingCurve.read(Path(source))
         policy._begin_training(dataset_meta)
@@ -541,19 +551,18 @@ class MemobenchMemPolicy(PI05Policy):
         """Save the averaged weights as the model, and beside it the trained ones for going on and the losses.
 
         Args:
-            gathered: ``state_dict``, where LeRobot 0.6.1 has trained in shards. Later versions call this in every
-                process, and each of them gathers by itself.
+            gathered: ``state_dict``, where LeRobot 0.6.1 has trained in shards: their average (`sharding`). Later
+                versions call this in every process.
         """
         writes = is_first_rank()
         if writes:
             self.curve.save(save_directory)
-        if self.average is None or gathered.get("state_dict") is not None:
-            if self.average is not None:
-                logger.warning("Sharded training: the checkpoint holds the trained weights, not their average.")
+        if self.average is None:
             super()._save_pretrained(save_directory, **gathered)
             return
-        with self.average.applied():  # in float32, whatever precision it is evaluated in
-            super()._save_pretrained(save_directory)
+        # In float32, whatever precision it is evaluated in.
+        with self.average.applied() if self.average.whole else contextlib.nullcontext():
+            super()._save_pretrained(save_directory, **gathered)
         if writes:
             tensors, metadata = self.average.state()
             save_file(tensors, save_directory / TRAINING_FILE, metadata=metadata)
@@ -565,6 +574,7 @@ class MemobenchMemPolicy(PI05Policy):
 
         The adapters' base is what evaluation loads beneath them: a checkpoint's averaged weights.
         """
+        check_adapters()
         if self.average is not None:
             self.average.keep()
             self.average = None

@@ -174,7 +174,12 @@ class WeightAverage:
     The decay grows from 0.1 to its value as (1 + n) / (10 + n) over the first updates n, so that a short run does not
     evaluate its initial weights; after 9,000 updates it is the given 0.999. Averages are float32 whatever the
     parameters are, because bfloat16 cannot hold steps of a thousandth.
+
+    Attributes:
+        whole: whether this process holds all of it (see `sharding.ShardedAverage`).
     """
+
+    whole = True
 
     def __init__(self, parameters: Mapping[str, nn.Parameter], decay: float) -> None:
         self.decay = decay
