@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from packaging.specifiers import SpecifierSet
+from packaging.version import Version
 
 from lerobot_memobench.errors import MemobenchError
 
@@ -56,6 +57,7 @@ class Hook:
         does: what it is made to do. why: what it would do otherwise.
         caller: a module of theirs that must call it. by_name: the keywords that a layer reads of such a call.
         everywhere: whether it is replaced in each module that imported it by its name too.
+        ends: the first version of LeRobot that does without the function.
         package: that it is part of. read: the versions of it that were read.
     """
 
@@ -67,6 +69,7 @@ class Hook:
     caller: str | None = None
     by_name: tuple[str, ...] = ()
     everywhere: bool = False
+    ends: str | None = None
     package: str = "lerobot"
     read: tuple[str, ...] = READ
 
@@ -164,6 +167,7 @@ GATHER_SHARDS = Hook(
     ("model", "optimizer"),
     "gather the average of a sharded policy's weights beside the weights",
     "LeRobot saves in one process, in which nothing can be gathered any more",
+    ends="0.6.2",
     read=(LEROBOT,),
 )
 HOOKS = (
@@ -273,6 +277,12 @@ def hooked(hook: Hook, layer: Layer) -> Iterator[None]:
 def hooked_for(owner: object, hook: Hook, layer: Layer) -> None:
     """Do as `hooked` for as long as ``owner`` lives."""
     weakref.finalize(owner, install(hook, layer)).atexit = False
+
+
+def there() -> list[Hook]:
+    """Return the hooks whose functions the installed LeRobot has."""
+    found = Version(metadata.version("lerobot"))
+    return [hook for hook in HOOKS if hook.ends is None or found < Version(hook.ends)]
 
 
 def installed() -> list[Hook]:

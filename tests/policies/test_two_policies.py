@@ -184,14 +184,14 @@ def test_a_checkpoint_goes_on_by_its_own_run(root: Path, encoders: tuple[Path, P
 def test_nothing_of_lerobots_is_changed_once_a_training_is_over(root: Path, encoders: tuple[Path, Path]) -> None:
     gc.collect()
     before = lerobot_hooks.installed()
-    places = {hook: pkgutil.resolve_name(f"{hook.module}:{hook.name}") for hook in lerobot_hooks.HOOKS}
+    places = {hook: pkgutil.resolve_name(f"{hook.module}:{hook.name}") for hook in lerobot_hooks.there()}
     made = made_for_training(root, **SEEING | {"visual_encoder": str(encoders[0])})
     assert set(lerobot_hooks.installed()) >= {MAKE_PROCESSORS, DRAW_FRAMES, READ_SAMPLE, ATTEND}
     del made
     gc.collect()
     assert lerobot_hooks.installed() == before
     if not before:
-        assert {hook: pkgutil.resolve_name(f"{hook.module}:{hook.name}") for hook in lerobot_hooks.HOOKS} == places
+        assert {hook: pkgutil.resolve_name(f"{hook.module}:{hook.name}") for hook in lerobot_hooks.there()} == places
 
 
 def frames(seed: int = 0) -> tuple[list[int], list[int]]:
@@ -322,7 +322,7 @@ def test_every_hook_is_listed_in_the_docs() -> None:
 
 
 def test_every_function_that_is_hooked_is_the_one_that_was_read() -> None:
-    for hook in lerobot_hooks.HOOKS:
+    for hook in lerobot_hooks.there():
         found = inspect.signature(inspect.unwrap(pkgutil.resolve_name(f"{hook.module}:{hook.name}"))).parameters
         assert set(hook.parameters) <= set(found), hook
         installed = metadata.version(hook.package)

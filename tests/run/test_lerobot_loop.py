@@ -145,7 +145,7 @@ def unread(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("unread")
-@pytest.mark.parametrize("hook", lerobot_hooks.HOOKS, ids=lambda hook: hook.name)
+@pytest.mark.parametrize("hook", lerobot_hooks.there(), ids=lambda hook: hook.name)
 def test_an_unread_version_that_calls_the_same_functions_is_taken(hook: lerobot_hooks.Hook) -> None:
     lerobot_hooks.install(hook, lambda theirs: theirs)()
 

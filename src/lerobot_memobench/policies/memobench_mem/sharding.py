@@ -12,7 +12,7 @@ import functools
 import weakref
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -20,9 +20,6 @@ from torch import Tensor, nn
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.lerobot_hooks import GATHER_SHARDS, PREPARE, hooked_for
 from lerobot_memobench.policies.memobench_mem.training import WeightAverage
-
-if TYPE_CHECKING:
-    from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 
 UNIT = "GemmaMLP"
 """Name of the class of modules that are sharded each by itself."""
@@ -38,8 +35,11 @@ def shard_plugin() -> Any | None:
     return AcceleratorState().fsdp_plugin
 
 
-def prepare_shards(policy: MemobenchMemPolicy) -> None:
+def prepare_shards(policy: Any) -> None:
     """Say how a policy is sharded, and shard its average with it, where this process trains in shards.
+
+    Args:
+        policy: a `MemobenchMemPolicy` that is about to be trained.
 
     Raises:
         MemobenchError: FSDP was asked for in a way that does not go together with this policy.
@@ -70,7 +70,7 @@ def prepare_shards(policy: MemobenchMemPolicy) -> None:
     hooked_for(policy, GATHER_SHARDS, functools.partial(_gathering, found))
 
 
-def _check(plugin: Any, policy: MemobenchMemPolicy) -> None:
+def _check(plugin: Any, policy: Any) -> None:
     if plugin.fsdp_version != 1:
         raise MemobenchError(
             "this LeRobot gathers a checkpoint's shards by FSDP 1, and --fsdp_version=2 was asked for; leave it out"
@@ -145,7 +145,7 @@ class ShardedAverage(WeightAverage):
         return tensors, {"updates": str(self.updates)}
 
 
-def _preparing(found: weakref.ref[MemobenchMemPolicy], theirs: Callable[..., Any]) -> Callable[..., Any]:
+def _preparing(found: weakref.ref[Any], theirs: Callable[..., Any]) -> Callable[..., Any]:
     """Wrap accelerate's ``prepare``: when it has sharded the policy, its average is sharded in the same way."""
 
     @functools.wraps(theirs)
@@ -163,7 +163,7 @@ def _preparing(found: weakref.ref[MemobenchMemPolicy], theirs: Callable[..., Any
     return run
 
 
-def _gathering(found: weakref.ref[MemobenchMemPolicy], theirs: Callable[..., Any]) -> Callable[..., Any]:
+def _gathering(found: weakref.ref[Any], theirs: Callable[..., Any]) -> Callable[..., Any]:
     """Wrap LeRobot's gathering of a checkpoint's weights: those of the model are the average, as in one process."""
 
     @functools.wraps(theirs)
