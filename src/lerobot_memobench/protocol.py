@@ -11,11 +11,14 @@ HORIZON = 1200
 PROMPT_HORIZON = 1500
 """Control steps after which a demonstration prompt ends, whatever it still had to show. Hiding two things takes some
 750; with one of them grasped at the fifth try more than 1000."""
+IDLE_STEPS = 1200
+"""Control steps that the robot idles at most before the execution of a strict task: the seed draws how many, uniformly
+from 0 on. So the step tells little of what has been done (docs/research/clock.md)."""
 PROMPT, EXECUTION = 0, 1
-"""Values of ``phase``: a demonstration prompt plays and actions have no effect; the policy acts."""
+"""Values of ``phase``: a demonstration prompt plays or the robot idles, and actions have no effect; the policy acts."""
 OBS_PHASE, OBS_STEP = CLOCK = ("observation.phase", "observation.step")
-"""A policy's names for an episode's phase and for the control steps since it began. A dataset has columns of these
-names: both are float32, (B,) in a batch, and raw, in training as in a rollout."""
+"""A policy's names for an episode's phase and for the control steps since it began, of a strict task since the episode
+did. A dataset has columns of these names: both are float32, (B,) in a batch, and raw, in training as in a rollout."""
 
 # -- seeds
 

@@ -54,7 +54,8 @@ class MEMOBench(StepBenchmark):
     Observation: ``images`` with ``agentview`` and ``wrist`` uint8 (256, 256, 3) upright; ``states`` float32 (8,):
     end-effector position (3, m), axis-angle (3, rad), fingers (2, m); ``task_description``. The first one of an episode
     with a demonstration prompt holds it too: ``video_history`` and ``wrist_video_history``, lists of pictures,
-    ``state_history``, a list of states, and ``episode_restart``.
+    ``state_history``, a list of states, and ``episode_restart``. Frames in which a strict task's robot idles are left
+    out. The harness tells no step: a server that counts its answers has a clock that starts with the execution.
 
     Action: ``actions`` float (7,) or (steps, 7) in [−1, 1], as of `MemobenchEnv`.
 
@@ -158,10 +159,10 @@ class MEMOBench(StepBenchmark):
         observation, info = self._env.reset(seed=self._config.seed_base + int(task.get("episode_idx", 0)))
         self._history = {}
         while "fault" not in info and observation["phase"][0] == PROMPT:
-            step = int(observation["step"][0])
-            if step % self._history_every == 0:
+            step, shows = int(observation["step"][0]), not self._env.episode.idling
+            if shows and step % self._history_every == 0:
                 self._remember(observation)
-            self._env.need_observation((step + 1) % self._history_every == 0)
+            self._env.need_observation(shows and (step + 1) % self._history_every == 0)
             observation, *_, info = self._env.step(np.zeros(ACTION_DIM, np.float32))
         if "fault" in info:
             self._env.step(np.zeros(ACTION_DIM, np.float32))  # the step that writes it into the log

@@ -31,6 +31,7 @@ from lerobot_memobench.datasets.perturbation import Perturbation
 from lerobot_memobench.datasets.recording import HOLD_FRAMES, PATIENCE, record_demonstration
 from lerobot_memobench.datasets.replay import replay
 from lerobot_memobench.datasets.validate import Verdict, exit_status, validate
+from lerobot_memobench.envs.episode import first_execution_step
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import checkpoint_folder
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS
@@ -39,6 +40,7 @@ from lerobot_memobench.tasks.catalogue import get_task, task_names
 STOVE = "turn_on_the_stove_and_turn_it_off"
 BUTTER = "put_the_butter_into_the_bowl_from_the_prompt_video"
 HIDDEN = "find_the_tomato_hidden_in_one_of_the_drawers"
+POINTED = "put_only_the_milk_pointed_out_in_the_prompt_video_on_the_plate"
 COUNTING = "turn_the_stove_on_and_off_a_given_number_of_times"
 SEED = 10_000
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "research"
@@ -139,6 +141,24 @@ def test_ray_makes_the_same(tmp_path):
 def test_replay_agrees(stove, butter):
     assert replay(stove) is None
     assert replay(butter) is None
+
+
+@pytest.mark.parametrize("name", [COUNTING, POINTED])
+def test_a_robot_that_idles_is_recorded_at_rest(name):
+    """Its step counts through, its actions are zeros, and what a policy sees is the execution's first frame."""
+    demo = record_demonstration(get_task(name), SEED, images=False, referent="drawn", perturb=True)
+    begins, found = first_execution_step(get_task(name), SEED, True), labels(demo)
+    assert demo.success
+    assert demo.exec_start == begins > 0
+    np.testing.assert_array_equal(found.step, np.arange(len(demo)))
+    np.testing.assert_array_equal(found.phase, np.arange(len(demo)) >= begins)
+    idle = ~demo.actions.any(axis=1)
+    rest = int(np.flatnonzero(idle)[0])
+    assert (rest == 0) == (demo.task.prompt is None)
+    np.testing.assert_array_equal(np.flatnonzero(idle), np.arange(rest, begins))
+    for column in (demo.states, demo.proprio, demo.objects):
+        assert (column[rest:begins] == column[begins]).all()
+    assert replay(demo) is None
 
 
 def test_replay_of_a_hiding_agrees():

@@ -15,7 +15,7 @@ from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.envs.observations import BOTH, CHECKPOINTS, OBJECTS, SPARSE
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.protocol import EXECUTION, PROMPT
+from lerobot_memobench.protocol import EXECUTION, IDLE_STEPS, PROMPT, PROMPT_HORIZON
 from lerobot_memobench.sim.object_layout import BOUNDS, FIELDS
 from lerobot_memobench.sim.object_slots import classes
 from lerobot_memobench.tasks.catalogue import get_task, task_names
@@ -177,7 +177,7 @@ def test_every_space_is_bounded() -> None:
     space = MemobenchEnv(STOVE, obs_type=BOTH, render_every=2, horizon=5000).observation_space
     for part in (*space.spaces.values(), *space["pixels"].values()):
         assert isinstance(part, gym.spaces.Dict) or part.is_bounded()
-    assert space["step"].high == [5000]
+    assert space["step"].high == [PROMPT_HORIZON + IDLE_STEPS + 5000]
     assert list(BOUNDS) == list(FIELDS)
     assert len(classes()) - 1 <= BOUNDS["class"][1]
 

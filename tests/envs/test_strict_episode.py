@@ -12,13 +12,15 @@ import pytest
 from numpy.typing import NDArray
 
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
-from lerobot_memobench.envs.episode import Episode, referent_of
-from lerobot_memobench.envs.episode_log import differences, read_episodes, read_protocol_file
+from lerobot_memobench.envs.episode import Episode, first_execution_step, referent_of
+from lerobot_memobench.envs.episode_log import IDLE, differences, read_episodes, read_protocol_file
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
+from lerobot_memobench.envs.observations import RESET
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.fixtures import turn_knob
 from lerobot_memobench.experts.hand import OPEN, Hand
 from lerobot_memobench.experts.travel import come_home
+from lerobot_memobench.protocol import IDLE_STEPS
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import Atom, Never
@@ -73,6 +75,7 @@ def test_resting_at_once_ends_the_episode_and_is_logged_as_a_miscount(tmp_path: 
         log_dir=str(tmp_path),
         render="fast",
         render_every=10_000,
+        prompt_in=RESET,
         seed_base=7,
     )
     env.reset(seed=20_000)
@@ -107,7 +110,8 @@ def test_rest_in_a_prompt_decides_nothing(monkeypatch: pytest.MonkeyPatch, steps
     episode.reset(20_000)
     while not episode.done:
         episode.step(REST)
-    assert (episode.exec_start, episode.exec_steps, episode.lost) == (steps, 40, True)
+    assert (episode.exec_steps, episode.lost) == (40, True)
+    assert episode.exec_start == first_execution_step(episode.task, 20_000, True)
 
 
 def rounds(episode: Episode, count: int) -> Iterator[NDArray[np.floating[Any]]]:
@@ -128,6 +132,8 @@ def rounds(episode: Episode, count: int) -> Iterator[NDArray[np.floating[Any]]]:
 def test_the_stove_as_often_as_asked_for(asked: int, done: int) -> None:
     episode = Episode(get_task(STOVE))
     episode.reset(seed_of(STOVE, asked - 1))
+    while episode.exec_start is None:
+        episode.step(REST)
     for action in rounds(episode, done):
         if episode.done:
             break
@@ -163,16 +169,16 @@ class Nudge:
 
 
 @pytest.mark.parametrize(
-    ("prompt", "shown", "moved", "steps"),
+    ("prompt", "shown", "moved"),
     [
-        (Prompt("highlight", "butter_1"), True, 0.0, 5),
-        (Prompt("highlight", "butter_1"), False, 0.0, 0),
-        (Prompt("hide", None, (("butter_1", "kitchen_table_plate_region"),)), True, 0.05, 5),
-        (Prompt("hide", None, (("butter_1", "kitchen_table_plate_region"),)), False, 0.05, 0),
+        (Prompt("highlight", "butter_1"), True, 0.0),
+        (Prompt("highlight", "butter_1"), False, 0.0),
+        (Prompt("hide", None, (("butter_1", "kitchen_table_plate_region"),)), True, 0.05),
+        (Prompt("hide", None, (("butter_1", "kitchen_table_plate_region"),)), False, 0.05),
     ],
 )
 def test_the_execution_begins_where_a_hiding_ended_even_unseen(
-    monkeypatch: pytest.MonkeyPatch, prompt: Prompt, shown: bool, moved: float, steps: int
+    monkeypatch: pytest.MonkeyPatch, prompt: Prompt, shown: bool, moved: float
 ) -> None:
     monkeypatch.setattr("lerobot_memobench.envs.episode.PromptDemonstrator", Nudge)
     task = dataclasses.replace(get_task(ASSEMBLY), drawn=False, prompt=prompt)
@@ -182,7 +188,7 @@ def test_the_execution_begins_where_a_hiding_ended_even_unseen(
     episode.reset(20_000)
     while episode.exec_start is None:
         episode.step(REST)
-    assert (episode.exec_start, episode.step_index) == (steps, steps)
+    assert episode.exec_start == episode.step_index == first_execution_step(task, 20_000, shown)
     distance = np.linalg.norm(episode.sim.body_pose("butter_1")[0] - sim.body_pose("butter_1")[0])
     assert distance == pytest.approx(moved, abs=0.005)
     assert episode.sim.holds(Atom("inplace", ("butter_1",)))
@@ -205,3 +211,12 @@ def test_a_protocol_without_a_suite_is_the_published_ones() -> None:
     assert differences({"horizon": 5}, {"suite": "published", "horizon": 5}) == []
     assert differences({"horizon": 5}, {"suite": "strict", "horizon": 5}) == ["suite: published and strict"]
     assert differences({"suite": "strict"}, {}) == ["suite: strict and published"]
+
+
+def test_strict_results_from_before_the_robot_idled_are_of_another_protocol() -> None:
+    now = MemobenchEnvConfig(suite=STRICT).protocol
+    before = {key: value for key, value in now.items() if key != IDLE}
+    assert differences(before, now) == [f"idle: 0 and {IDLE_STEPS}"]
+    assert differences(now, before) == [f"idle: {IDLE_STEPS} and 0"]
+    assert differences(now, now) == []
+    assert IDLE not in MemobenchEnvConfig().protocol

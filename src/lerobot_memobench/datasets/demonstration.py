@@ -52,7 +52,8 @@ class Demonstration:
         actions: (T, 7) float32, OSC pose deltas and gripper: the label of this frame.
         proprio: (T, 8) float32, end-effector position 3, axis-angle 3, gripper joints 2.
         images: ``{"image", "wrist_image"}`` to (T, H, W, 3) uint8, or None.
-        exec_start: the frame at which execution starts; the frames before it are the demonstration prompt.
+        exec_start: the frame at which execution starts; the frames before it are the demonstration prompt, and those
+            in which the robot idles, whose actions are zeros.
         satisfied: (T, K) bool, predicate of checkpoint k true at frame t; false throughout the prompt. The
             world is evaluated after a control step, so frame ``exec_start`` (step 0) is false as well.
         success: whether the goal was reached.
@@ -143,7 +144,7 @@ class Labels:
 
     Attributes:
         phase: (T,) int64, 0 prompt, 1 execution.
-        step: (T,) int64, control steps since that phase began.
+        step: (T,) int64, control steps since that phase began; of a task that idles, since the episode began.
         index: (T,) int64, checkpoints completed in order at frames before t: the number of the one worked on.
         operation: (T,) int64, 0 S, 1 U, 2 C of that checkpoint, -1 when none is left.
         completed: (T, 6) bool, checkpoint k has been satisfied at some frame up to and including t.
@@ -213,7 +214,7 @@ def labels(demo: Demonstration) -> Labels:
     acting = frames >= demo.exec_start
     return Labels(
         phase=np.where(acting, EXECUTION, PROMPT).astype(np.int64),
-        step=np.where(acting, frames - demo.exec_start, frames),
+        step=np.where(acting & (not task.idles), frames - demo.exec_start, frames),
         index=index,
         operation=np.array(codes, dtype=np.int64)[index],
         completed=np.pad(ever, [(0, 0), (0, MAX_CHECKPOINTS - ever.shape[1])]),

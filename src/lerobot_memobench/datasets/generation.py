@@ -56,7 +56,8 @@ FRAMES = {
     "published": {"temporal": 390, "spatial": 570, "object": 320, "procedural": 730},
     "strict": {"temporal": 530, "spatial": 860, "object": 330, "procedural": 750},
 }
-"""Frames of a demonstration, prompt included, on average over the full runs (docs/research/demonstration_runs.md)."""
+"""Frames of a demonstration, prompt included, on average over the full runs (docs/research/demonstration_runs.md).
+Those in which a robot idles take next to no time and room."""
 FRAME_BYTES, PICTURES_BYTES, HDF5_BYTES = 800, 5_400, 130_000
 """Of a frame in a LeRobotDataset without pictures; of both cameras' videos and of lossless pictures, at 256 × 256."""
 FRAME_SECONDS, PICTURES_SECONDS = 0.0045, 0.011

@@ -97,14 +97,18 @@ def record(episode: Episode, seed: int, settings: RecordingSettings, show: Calla
     sim, fixture_poses = episode.sim, episode.sim.fixture_poses()
     states, proprio, objects, satisfied, actions, executed = [], [], [], [], [], []
     disturb = _disturbance(episode, seed, settings)
-    reached = False
+    reached = rests = False
     held = idle = 0
+    images: Images | None = None
     while held < HOLD_FRAMES:
-        states.append(sim.state())
-        proprio.append(sim.proprio())
-        objects.append(episode.objects())
+        if not (rests and episode.idling):  # a scene at rest is observed once
+            state, hand, seen = sim.state(), sim.proprio(), episode.objects()
+            images = episode.images() if settings.images else None
+        rests = episode.idling
+        states.append(state)
+        proprio.append(hand)
+        objects.append(seen)
         satisfied.append(episode.progress.satisfied)
-        images = episode.images() if settings.images else None
         if isinstance(disturb, Learner):
             disturb.observe(episode, objects[-1], images)
         if images is not None:

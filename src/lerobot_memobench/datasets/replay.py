@@ -139,29 +139,34 @@ def resimulate(
 ) -> Demonstration:
     """Apply (T, 7) float32 actions, starting in the scene of ``seed``; return the demonstration they make.
 
-    It has no images; ``watch`` looks at each frame. At frame ``exec_start`` the scene goes back to where it began, as
-    after a demonstration prompt that hides nothing.
+    It has no images; ``watch`` looks at each frame. Where the prompt is over the scene goes back to where it began, but
+    for what was hidden: at frame ``exec_start``, or where the robot begins to idle, which is an action of zeros.
     """
     sim = Simulation(task, None if watch is None else watch.settings)
     sim.reset(seed)
     start, scene_hash, fixture_poses = sim.snapshot(), sim.scene_hash(), sim.fixture_poses()
     progress = Progress(task)
     look = ObjectSlots(sim)
-    states, proprio, objects, satisfied = [], [], [], []
+    states, proprio, satisfied = [], [], []
+    objects: list[NDArray[np.float32]] = []
     success = False
+    rests = False
     for frame, action in enumerate(actions):
-        if frame == exec_start and frame > 0:
+        rested, rests = rests, task.idles and frame < exec_start and not action.any()
+        if frame > 0 and not rested and (rests or frame == exec_start):
             sim.end_prompt(start, () if task.prompt is None else task.prompt.places)
+        if frame > 0 and frame == exec_start:
             sim.begin_execution()
         sim.highlights = highlights_at(task, sim, frame) if frame < exec_start else ()
         if watch is not None:
             watch.compare(sim, frame)
         states.append(sim.state())
         proprio.append(sim.proprio())
-        objects.append(look.observe())
+        objects.append(objects[-1] if rests and rested else look.observe())
         satisfied.append(progress.satisfied)
         success = success or progress.success
-        sim.step(action)
+        if not rests:
+            sim.step(action)
         if frame >= exec_start:
             progress.step(sim.holds)
     return Demonstration(

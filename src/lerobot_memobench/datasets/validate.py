@@ -26,7 +26,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     is_dataset,
     read_info,
 )
-from lerobot_memobench.datasets.lerobot_format.reading import read_episode
+from lerobot_memobench.datasets.lerobot_format.reading import check_idling, read_episode
 from lerobot_memobench.datasets.replay import Pictures, replay
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import refusing
@@ -164,6 +164,7 @@ def _checks(folder: Path, tasks: Mapping[str, Task] | None) -> list[_Check]:
     checks: list[_Check] = []
     if is_dataset(folder):
         check_clock(read_info(folder)["features"], folder)
+        check_idling(folder)
         total = range(episode_count(folder))
         checks += [_Check(folder, f"episode {index}", index=index, tasks=tasks) for index in total]
     has_files = folder.is_file() or any(path.suffix in (".hdf5", ".h5") for path in folder.rglob("*"))

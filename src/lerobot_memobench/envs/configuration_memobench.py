@@ -22,7 +22,7 @@ from lerobot.envs.configs import EnvConfig
 
 from lerobot_memobench.envs.acting import acting, parameters_of
 from lerobot_memobench.envs.command_line import policy_being_run, rename_map, training_runs
-from lerobot_memobench.envs.episode_log import SETTINGS, check_protocol
+from lerobot_memobench.envs.episode_log import SETTINGS, check_protocol, idling
 from lerobot_memobench.envs.observations import (
     AUTO,
     EVERY,
@@ -163,7 +163,8 @@ class MemobenchEnvConfig(EnvConfig):
     @property
     def protocol(self) -> dict[str, Any]:
         """What must agree for two evaluations to be one, or to be compared; without what is still `auto`."""
-        return {name: getattr(self, name) for name in SETTINGS if getattr(self, name) != AUTO}
+        chosen = {name: getattr(self, name) for name in SETTINGS if getattr(self, name) != AUTO}
+        return {**chosen, **idling(self.suite)}
 
     def selected(self) -> list[tuple[str, int, Path]]:
         """Return memory type, task id and folder of each chosen task; unknown names raise `MemobenchError`."""

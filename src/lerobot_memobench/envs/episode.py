@@ -1,4 +1,4 @@
-"""One episode of one seed: settle, show the prompt, let the policy act, keep the books.
+"""One episode of one seed: settle, show the prompt, idle where the task does, let the policy act, keep the books.
 
 The gym environment and the recorder of demonstrations both run on this class, so datasets and a policy's
 observations at evaluation cannot drift apart.
@@ -18,7 +18,16 @@ from lerobot_memobench.errors import check_choice
 from lerobot_memobench.experts.blind import blind_routine
 from lerobot_memobench.experts.demonstration_prompt import PromptDemonstrator
 from lerobot_memobench.experts.expert import Expert
-from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EXECUTION, HORIZON, PROMPT, PROMPT_HORIZON, SPLITS
+from lerobot_memobench.protocol import (
+    ACTION_DIM,
+    CAMERAS,
+    EXECUTION,
+    HORIZON,
+    IDLE_STEPS,
+    PROMPT,
+    PROMPT_HORIZON,
+    SPLITS,
+)
 from lerobot_memobench.sim.gl.rasterizer import Image
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.rendering import RenderSettings
@@ -52,7 +61,6 @@ class Episode:
     Attributes:
         task: the task of this episode: a variant of the given one when the referent is random.
         step_index: control steps since the episode began, prompt included.
-        clock: control steps since the phase began: the same at the first execution frame, however long the prompt was.
         exec_start: the frame at which execution began; None during the prompt.
         progress: checkpoints and goal, counted in execution steps.
         applied_action: the action (7,) float32 that really moved the arm in the last step.
@@ -106,31 +114,48 @@ class Episode:
         self._expert: Expert | None = None
         self._blind: Iterator[NDArray[np.float32]] | None = None
         self._demonstrator: Iterator[NDArray[np.float32]] | None = None
-        hides = task.prompt is not None and not task.prompt.restores
-        if self.demonstration_prompt or hides:
+        self._next_prompt_action: NDArray[np.float32] | None = None
+        if self.demonstration_prompt or (task.prompt is not None and not task.prompt.restores):
             self._prompt = PromptDemonstrator(task, self.sim, self._rng(2))
             self._demonstrator = self._prompt.actions()
             self._next_prompt_action = next(self._demonstrator, None)
-            if self._next_prompt_action is None:
-                self._begin_execution()
-        else:
-            self._begin_execution()
-        if hides and not self.demonstration_prompt:
-            self._hide_unseen()
+        if not self.demonstration_prompt:
+            self._show_unseen()
+        self._starts = first_execution_step(self.published, self.seed, self.demonstration_prompt)
+        self._begin_if_due()
 
-    def _hide_unseen(self) -> None:
+    def _show_unseen(self) -> None:
         """Play the prompt before the first frame: without it there would be nothing to find."""
-        while self.phase == PROMPT:
-            self.step(np.zeros(ACTION_DIM, np.float32))
-        self.step_index = self.exec_start = 0
+        while self._demonstrator is not None:
+            self._step_prompt()
+        self.step_index = 0
 
-    def _begin_execution(self) -> None:
-        """Put the scene back exactly as it was, unless something was hidden in it, and hand over to the policy."""
-        if self.step_index:
-            self.prompt_shown = self._prompt.shown
-            self.sim.end_prompt(self._start, () if self.task.prompt is None else self.task.prompt.places)
+    def _step_prompt(self) -> None:
+        """Show the prompt's next action; when there is none, let the scene rest: nothing is simulated."""
+        if self._next_prompt_action is None:
+            self.applied_action = np.zeros(ACTION_DIM, np.float32)
+        else:
+            self.applied_action = np.asarray(self._next_prompt_action, dtype=np.float32)
+            self.sim.step(self.applied_action)
+        self.step_index += 1
+        if self._demonstrator is None:
+            return
+        longest = self.task.prompt_steps
+        self._next_prompt_action = next(self._demonstrator, None)
+        if self._next_prompt_action is None or self.step_index >= (PROMPT_HORIZON if longest is None else longest):
+            self._end_prompt()
+
+    def _end_prompt(self) -> None:
+        """Put the scene back exactly as it was, unless something was hidden in it."""
+        self.prompt_shown = self._prompt.shown
+        self.sim.end_prompt(self._start, () if self.task.prompt is None else self.task.prompt.places)
+        self._demonstrator = self._next_prompt_action = None
+
+    def _begin_if_due(self) -> None:
+        """Hand over to the policy, where prompt and rest are over."""
+        if self._demonstrator is not None or self.step_index < self._starts:
+            return
         self.sim.begin_execution()
-        self._demonstrator = None
         self.exec_start = self.step_index
         self.progress.reset()
         # What holds already, such as a thing on the plate that it is to leave, is nobody's mistake.
@@ -142,9 +167,18 @@ class Episode:
         return PROMPT if self.exec_start is None else EXECUTION
 
     @property
+    def idling(self) -> bool:
+        """Nothing moves until the execution begins: the prompt is over, or there is none."""
+        return self.phase == PROMPT and self._demonstrator is None
+
+    @property
     def clock(self) -> int:
-        """Control steps since the phase began. Counted through, it would tell how long the prompt was, and so what."""
-        return self.step_index - (self.exec_start or 0)
+        """Control steps as a policy is told them: the same at the first execution frame, whatever the prompt showed.
+
+        They count through where the task idles, which hides when the execution began. Elsewhere they count from the
+        beginning of the phase: prompts take the time that they need, which would tell what they showed.
+        """
+        return self.step_index - (0 if self.task.idles else self.exec_start or 0)
 
     @property
     def heeds(self) -> bool:
@@ -179,14 +213,8 @@ class Episode:
     def step(self, action: ArrayLike) -> None:
         """Advance by one control step; during the prompt the given action has no effect, after a fault nothing has."""
         if self.phase == PROMPT:
-            assert self._demonstrator is not None
-            assert self._next_prompt_action is not None
-            self.applied_action = np.asarray(self._next_prompt_action, dtype=np.float32)
-            self.sim.step(self.applied_action)
-            self.step_index += 1
-            self._next_prompt_action = next(self._demonstrator, None)
-            if self._next_prompt_action is None or self.step_index >= PROMPT_HORIZON:
-                self._begin_execution()
+            self._step_prompt()
+            self._begin_if_due()
             return
         if self.fault is None:
             self.fault = self._act(action)
@@ -270,6 +298,21 @@ def referent_of(task: Task, seed: int) -> Task:
     place = (seed - first) % len(choices)
     order = generator(task, seed - place, 1).permutation(choices)
     return task.variant(int(order[place]))
+
+
+def first_execution_step(task: Task, seed: int, demonstration_prompt: bool) -> int:
+    """Return the step at which the execution of a seed's episode begins, or 0: as soon as its prompt is over.
+
+    The seed draws how long the robot idles, apart from the variant and all else.
+
+    Args:
+        task: as the catalogue has it, before a variant is drawn.
+        demonstration_prompt: whether the prompt, where the task has one, is part of the episode.
+    """
+    if not task.idles:
+        return 0
+    prompt = (task.prompt_steps or 0) if demonstration_prompt else 0
+    return prompt + int(generator(task, seed, 5).integers(IDLE_STEPS, endpoint=True))
 
 
 def generator(task: Task, seed: int, stream: int) -> np.random.Generator:

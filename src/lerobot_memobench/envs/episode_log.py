@@ -35,8 +35,9 @@ from lerobot_memobench.io import (
     read_json,
     write_file,
 )
+from lerobot_memobench.protocol import IDLE_STEPS
 from lerobot_memobench.tasks.failures import classify_failure
-from lerobot_memobench.tasks.task import PUBLISHED, Task
+from lerobot_memobench.tasks.task import PUBLISHED, STRICT, Task
 
 if TYPE_CHECKING:
     from lerobot_memobench.envs.episode import Episode
@@ -75,7 +76,7 @@ class Outcome(TypedDict, total=False):
         referent: fixed, random, or drawn (strict tasks).
         variant: which admissible referent or order; 0 is the published one.
         replan_steps: actions executed per prediction, where known.
-        prompt_steps: control steps of the demonstration prompt.
+        prompt_steps: control steps before the execution: of the demonstration prompt, and of idling.
         steps: execution steps.
         paused_steps: control steps of pauses, where there were to be some.
         failure: class of the failure; None for a success.
@@ -394,7 +395,10 @@ SETTINGS = (
     "speed",
 )
 """Settings that must agree for two evaluations to be one, or to be compared."""
-UNTOLD: dict[str, Any] = {"suite": PUBLISHED, "pause_steps": 0, "speed": 1.0}
+IDLE = "idle"
+"""Control steps that the robot of a strict task idles at most before the execution. It is no choice: protocols hold it
+because the first strict evaluations were without."""
+UNTOLD: dict[str, Any] = {"suite": PUBLISHED, "pause_steps": 0, "speed": 1.0, IDLE: 0}
 """What a protocol means that leaves these out: there was nothing else when it was written."""
 INPUTS = "inputs"
 """Inputs of the policy, in the words of `observations.policy_inputs`; absent where nobody wrote them down."""
@@ -424,6 +428,7 @@ class Settings(TypedDict, total=False):
         render_every: control steps per drawn picture.
         oracle_memory: whether the instruction tells what was done so far.
         pause_steps, speed: of the execution, see `pacing`.
+        idle: see `IDLE`; of strict tasks alone.
         inputs: what the policy was given.
     """
 
@@ -439,6 +444,7 @@ class Settings(TypedDict, total=False):
     oracle_memory: bool | None
     pause_steps: Whole
     speed: Number
+    idle: Count | None
     inputs: Name | None
 
 
@@ -468,6 +474,11 @@ class WholeProtocol(Settings):
 
     tasks: list[Name]
     episodes: Episodes
+
+
+def idling(suite: str) -> dict[str, int]:
+    """Return what the protocol of a suite says of idling: nothing where its tasks do not idle."""
+    return {IDLE: IDLE_STEPS} if suite == STRICT else {}
 
 
 def differences(

@@ -16,7 +16,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from lerobot_memobench.envs.acting import NOBODY, Acting
 from lerobot_memobench.envs.episode import Episode
-from lerobot_memobench.envs.episode_log import EpisodeLog, episode_record, has_log, not_run_record, read_log
+from lerobot_memobench.envs.episode_log import (
+    EpisodeLog,
+    episode_record,
+    has_log,
+    idling,
+    not_run_record,
+    read_log,
+)
 from lerobot_memobench.envs.observations import (
     EVERY,
     METADATA,
@@ -41,6 +48,7 @@ from lerobot_memobench.protocol import (
     EVALUATION_SEED,
     EXECUTION,
     HORIZON,
+    IDLE_STEPS,
     IMAGE_SIZE,
     PROMPT,
     PROMPT_HORIZON,
@@ -60,8 +68,9 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     Observation: ``pixels/image`` and ``pixels/wrist_image`` uint8 (256, 256, 3) upright, or ``environment_state``
     float32 (208,): the visible objects (`sim.object_layout`), or both; ``agent_pos`` float32 (8,): end-effector
     position (3, m), axis-angle (3, rad), fingers (2, m); ``phase`` (1,): 0 while the demonstration prompt plays and
-    actions have no effect, 1 in execution; ``step`` (1,): control steps since the phase began; on request
-    ``expert_action`` (7,), ``blind_action`` (7,).
+    actions have no effect, 1 in execution; ``step`` (1,): control steps since the phase began, of a strict task since
+    the episode began; on request ``expert_action`` (7,), ``blind_action`` (7,). A strict task's robot idles before the
+    execution, with ``phase`` 0.
 
     Action: float32 (7,) in [−1, 1]: end-effector displacement (±5 cm, ±0.5 rad per unit), gripper (−1 opens, 1 closes).
 
@@ -139,6 +148,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             "oracle_memory": oracle_memory,
             "pause_steps": pause_steps,
             "speed": speed,
+            **idling(self._task.suite),
             **acting.protocol,
         }
         self._acting = acting
@@ -178,8 +188,12 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     @property
     def _max_episode_steps(self) -> int:
         """Upper bound for LeRobot's loop: what it steps through. The horizon counts execution steps without pauses."""
-        prompt = self._settings["demonstration_prompt"] and self._task.prompt is not None and self._prompt_in == STEPS
-        return self._longest + (PROMPT_HORIZON if prompt else 0)
+        task = self._task
+        if self._prompt_in == RESET:
+            return self._longest
+        prompt = self._settings["demonstration_prompt"] and task.prompt is not None
+        longest_prompt = PROMPT_HORIZON if task.prompt_steps is None else task.prompt_steps
+        return self._longest + (longest_prompt if prompt else 0) + (IDLE_STEPS if task.idles else 0)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -210,7 +224,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         return self._observation(), self._info()
 
     def _play_prompt(self) -> None:
-        """Let the prompt run to its end, where the scene is restored; it is drawn for a video only."""
+        """Let prompt and rest run to their end; they are drawn for a video only."""
         self._observer.needed = False
         while self.episode.phase == PROMPT:
             self.episode.step(np.zeros(ACTION_DIM, np.float32))

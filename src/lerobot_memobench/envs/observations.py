@@ -19,6 +19,7 @@ from lerobot_memobench.protocol import (
     CONTROL_HZ,
     EXECUTION,
     HORIZON,
+    IDLE_STEPS,
     IMAGE_SIZE,
     PROMPT,
     PROMPT_HORIZON,
@@ -182,7 +183,7 @@ def observation_space(
     Where not every step is drawn, ``picture_step`` tells which step the pictures show.
     """
     reach = np.repeat(np.array([3.0, 2 * np.pi, 0.1], np.float32), (3, 3, 2))  # m, rad, m
-    steps = spaces.Box(0, max(horizon, PROMPT_HORIZON), (1,), np.float32)
+    steps = spaces.Box(0, PROMPT_HORIZON + IDLE_STEPS + horizon, (1,), np.float32)
     parts: dict[str, spaces.Space[Any]] = {
         "agent_pos": spaces.Box(-reach, reach, (PROPRIO_DIM,), np.float32),
         # LeRobot passes numeric keys that it does not know on as `observation.<key>`, so a policy with a memory can
@@ -252,19 +253,23 @@ class Observer:
         """Observe the first frame of an episode."""
         self.needed = True
         self._picture_step: int | None = None
+        self._pictures_rest = self._objects_rest = False
         self.observe(episode, recorded=False)
 
     def observe(self, episode: Episode, *, recorded: bool) -> None:
         """Take in the present frame, as far as it is needed; ``recorded``: in a video."""
         always = episode.done or episode.step_index == episode.exec_start
-        if self._has_objects and (always or self.needed):
-            self._objects = episode.objects()
         due = episode.phase == PROMPT or episode.exec_steps % self._render_every == 0
+        if self._has_objects and (always or self.needed) and not (episode.idling and self._objects_rest):
+            self._objects = episode.objects()
+            self._objects_rest = episode.idling
         if self._has_pictures and (always or (due and (self.needed or recorded))):
             self._draw(episode)
 
     def _draw(self, episode: Episode) -> None:
-        self._images: dict[str, Image] = episode.images()
+        if not (episode.idling and self._pictures_rest):  # a scene at rest is drawn once
+            self._images: dict[str, Image] = episode.images()
+        self._pictures_rest = episode.idling
         self._picture_step, self._picture_clock = episode.step_index, episode.clock
 
     def observation(self) -> dict[str, Any]:

@@ -91,7 +91,8 @@ def given(run: Run) -> str:
 def _prompt(records: Sequence[Record], protocol: Mapping[str, Any]) -> list[str]:
     if protocol.get("demonstration_prompt") is False:
         return ["no demonstration prompt"]
-    if not any(record.get("prompt_steps") for record in records):
+    # A strict task without a prompt idles all the same; it shows nothing then.
+    if not any(record.get("prompt_steps") and record.get("prompt_shown", True) is not None for record in records):
         return []
     told = protocol.get("prompt_in")
     return [PROMPT_IN[told]] if told in PROMPT_IN else []

@@ -19,7 +19,7 @@ from typing import Any
 
 from draccus.utils import is_enum, is_literal, is_union
 
-from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.envs.episode_log import IDLE, idling, read_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import CARD_FILE, read_card
 from lerobot_memobench.io import count_of
@@ -31,6 +31,7 @@ from lerobot_memobench.run.card import checkpoint_files, detector_hash, drawn_ot
 from lerobot_memobench.run.lerobot_commands import config_class, load_command, register_plugins
 from lerobot_memobench.run.machine import PACKAGES, gl_facts, versions
 from lerobot_memobench.run.plan import ENVIRONMENT, EvaluationPlan, plan_line
+from lerobot_memobench.tasks.task import PUBLISHED
 
 ENV, POLICY_TYPE, POLICY_PATH, TASK_DIR = "env.type", "policy.type", "policy.path", "env.task_dir"
 
@@ -118,6 +119,12 @@ def repeatable_card(path: Path, server: str | None = None) -> dict[str, Any]:
     """
     path = path / CARD_FILE if path.is_dir() else path
     card = read_card(path, whole=True)
+    told = card["protocol"]
+    if told.get(IDLE, 0) != idling(told.get("suite", PUBLISHED)).get(IDLE, 0):
+        raise MemobenchError(
+            f"{path} is of strict episodes from before the robot idled, which begin otherwise now; evaluate the policy "
+            "anew instead"
+        )
     if not card["episodes"]:
         raise MemobenchError(f"{path} holds no episodes to compare with; expected that of an evaluation that has ended")
     return {**card, "flags": allowed_flags(card.get("flags"), server)}

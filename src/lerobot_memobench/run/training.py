@@ -21,8 +21,15 @@ from typing import Any
 
 import yaml
 
-from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, PRIVILEGED, check_clock, naming_damage
+from lerobot_memobench.datasets.lerobot_format.layout import (
+    DEFAULT_REPO_ID,
+    EPISODE_INFO,
+    PRIVILEGED,
+    check_clock,
+    naming_damage,
+)
 from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS as INPUT
+from lerobot_memobench.datasets.lerobot_format.reading import check_idling
 from lerobot_memobench.envs.command_line import overrides, quiet
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, OBS_TYPES, PIXELS, chooses_inputs, reads_prompt
 from lerobot_memobench.errors import MemobenchError, nearest
@@ -443,6 +450,8 @@ def _steered(make: Callable[..., Any], prompt_frames: bool | None, obs_type: str
         _check_episodes(config.dataset)
         train, held_out = make(config)
         check_clock(train.meta.features, train.root)
+        if EPISODE_INFO in train.meta.features and not config.dataset.streaming:
+            check_idling(Path(train.root))
         if _reads_objects(config.policy, obs_type):
             for dataset in (train, held_out):
                 _take_for_input(dataset)

@@ -28,6 +28,9 @@ PUBLISHED, STRICT = SUITES
 REFERENTS = ("fixed", "random")
 #: The referent of strict episodes, whatever is asked for (`Task.drawn`).
 DRAWN = "drawn"
+#: Control steps of a strict task's prompt for each thing that it shows, whichever variant that is. The slowest of some
+#: 700 prompts left a sixth of them; the scene rests meanwhile.
+STRICT_PROMPT_STEPS: dict[PromptKind, int] = {"highlight": 100, "point": 300, "pick": 300, "routine": 300, "hide": 600}
 #: Classes of failure that only strict tasks have (`Task.spoilt_as`): the event was done too seldom or too often; the
 #: thing was looked for where it is not.
 STRICT_FAILURES = ("miscount", "wrong_place")
@@ -179,6 +182,21 @@ class Task:
     def title(self) -> str:
         """What the task asks in all of its variants: its instruction, or its name where they differ in it."""
         return self.name.replace("_", " ") if any(one.language for one in self.variants) else self.language
+
+    @property
+    def idles(self) -> bool:
+        """Whether the robot idles before the execution, and the step counts through from the episode's first one."""
+        return self.suite == STRICT
+
+    @property
+    def prompt_steps(self) -> int | None:
+        """Control steps of the prompt, the same for all variants; None: it takes as many as it needs."""
+        if not self.idles:
+            return None
+        if self.prompt is None:
+            return 0
+        shown = {"routine": len(self.checkpoints), "hide": len(self.prompt.places)}.get(self.prompt.kind, 1)
+        return shown * STRICT_PROMPT_STEPS[self.prompt.kind]
 
     @property
     def operations(self) -> str:

@@ -224,7 +224,9 @@ def _read_off(
 
 
 def _check_clock(states: NDArray[np.float64], exec_start: int) -> None:
-    """Raise when the frames are not in the order of their time, which may start anew where execution starts.
+    """Raise when the frames are not in the order of their time, which may start anew where the prompt ends.
+
+    That is where the execution starts, or where the scene is first as it then is: the robot idles in between.
 
     Only a time that runs evenly is taken for a clock: other writers leave zeros or something else there.
     """
@@ -232,7 +234,9 @@ def _check_clock(states: NDArray[np.float64], exec_start: int) -> None:
     ticks = np.unique(np.round(time, 5))
     if len(ticks) < 3 or np.ptp(np.diff(ticks)) > 0.01 * np.diff(ticks).mean():
         return
-    back = [int(frame) for frame in np.flatnonzero(np.diff(time) < 0) + 1 if frame != exec_start]
+    moving = np.flatnonzero((states[:exec_start] != states[exec_start]).any(axis=1))
+    rest = int(moving[-1]) + 1 if moving.size else 0
+    back = [int(frame) for frame in np.flatnonzero(np.diff(time) < 0) + 1 if frame != rest]
     if back:
         raise Unusable(
             f"its states are not in order: frame {back[0]} is earlier ({time[back[0]]:.2f} s) than the one before it "

@@ -25,7 +25,8 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     undamaged,
 )
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.tasks.catalogue import suite_of
+from lerobot_memobench.tasks.catalogue import get_task, suite_of
+from lerobot_memobench.tasks.task import STRICT
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -111,6 +112,28 @@ def check_suite_of(folder: Path, suite: str) -> None:
         if found not in (None, suite):
             raise MemobenchError(
                 f"{folder} holds demonstrations of {name!r}, a task of the {found} suite; say --suite {found}"
+            )
+
+
+def check_idling(folder: Path) -> None:
+    """Refuse a LeRobotDataset with demonstrations of strict tasks from before the robot idled: its steps tell the past.
+
+    Raises:
+        MemobenchError: naming the first such episode.
+    """
+    for place in list_episodes(folder):
+        record = place.record
+        if record is None or record.seed < 0 or suite_of(record.task_name) != STRICT:
+            continue
+        from lerobot_memobench.envs.episode import first_execution_step
+
+        task, found = get_task(record.task_name), record.exec_start_index
+        begins = [first_execution_step(task, record.seed, prompt) for prompt in (True, False)]
+        if found not in begins:
+            raise MemobenchError(
+                f"episode {place.index} of {folder} ({record.task_name}, seed {record.seed}) begins its execution at "
+                f"step {found} and not, as now, at {begins[0]}: strict demonstrations from before the robot idled tell "
+                "by the step what has been done; generate them again"
             )
 
 
