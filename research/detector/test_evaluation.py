@@ -195,7 +195,7 @@ def test_a_detector_of_other_kinds_is_not_tested(tmp_path: Path, capsys: pytest.
 
 def test_a_detector_is_not_trained_on_the_evaluation(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["train", "--out", str(tmp_path), "--first-seed", "7"]) == 2
-    assert "20000 to 39999" in capsys.readouterr().err
+    assert "30000 to 39999" in capsys.readouterr().err
 
 
 def test_the_package_detector_detects_and_its_tokens_are_white(gl: str, tmp_path: Path) -> None:

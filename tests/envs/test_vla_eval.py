@@ -199,6 +199,7 @@ def test_chunks_are_executed_to_the_end_of_the_episode(caplog: pytest.LogCapture
         ({"n_action_steps": "2"}, "n_action_steps is '2'; expected a whole number"),
         ({"horizon": "60"}, "horizon is '60'; expected a whole number"),
         ({"seed": "7"}, "seed is '7'; expected a whole number"),
+        ({"seed": 100_007}, "seed 100007 is of the sealed test.*memobench test-sealed"),
         ({"tasks": [31]}, "31"),
         ({"render": "best"}, "'best'"),
     ],

@@ -157,7 +157,7 @@ def test_a_sealed_card_is_repeated_as_another_run() -> None:
 
 def test_the_command_is_an_evaluation_of_that_split(monkeypatch: pytest.MonkeyPatch) -> None:
     found: list[list[str]] = []
-    monkeypatch.setattr("lerobot_memobench.cli.lerobot.run", lambda line: found.append(line) or 0)
+    monkeypatch.setattr("lerobot_memobench.cli.lerobot.run", lambda line: found.append(line))
     assert main(["test-sealed", "policy=memobench_random", "--output_dir=x", "split=paper"]) == 0
     assert found == [
         ["eval", "env=memobench", "policy=memobench_random", "--output_dir=x", "split=paper", "split=sealed"]
