@@ -35,6 +35,8 @@ SPLITS = {
 validation too. The sealed ones are looked at once per release (`memobench test-sealed`)."""
 EVALUATION_SEED, EVALUATION_EPISODES = SPLITS[PAPER].start, len(SPLITS[PAPER])
 """Episode i of an evaluation has the scene of seed 7 + i, unless another split is asked for; 50 episodes of a task."""
+EVIDENCE_EPISODES = 36
+"""Episodes of each task where each scene is run with each variant: whole scenes, for 2, 3, 6, 9 or 12 variants."""
 DEMONSTRATION_SEED, VALIDATION_SEED = SPLITS["demonstrations"].start, SPLITS[VALIDATION].start
 """Demonstration i of a task has the scene of seed 10,000 + i; settings are chosen on seeds from 20,000 on."""
 UNSEEDED = (1_000_000_000, 2_000_000_000)

@@ -221,6 +221,7 @@ OF_THE_RUN = {
     "env.oracle_memory": BOOLEAN,
     "pause_steps": COUNT,
     "speed": st.sampled_from(["1", "0.5", "0.33"]),
+    "evidence": st.just("false"),
     "env.max_parallel_tasks": COUNT,
     "eval.use_async_envs": BOOLEAN,
     "job_name": st.sampled_from(["mine", "run 7"]),

@@ -274,6 +274,25 @@ def speed(
     return _pacing("speed", "speed", plain, slow, draws, out)
 
 
+@controls.command()
+def evidence(folders: Runs, draws: Draws = 2000, out: TableOut = None) -> int:
+    """Print how often the choice follows the evidence, beside chance. Evaluations with evidence=true, side by side."""
+    from lerobot_memobench.evaluation.evidence_controls import evidence_data, evidence_section, ran_evidence
+    from lerobot_memobench.evaluation.records import read_runs, unlike
+    from lerobot_memobench.evaluation.tables import Report
+
+    runs = read_runs(folders)
+    for run in runs:
+        if not ran_evidence(run.records):
+            raise MemobenchError(
+                f"{run.folder} did not run each scene with each variant; evaluate with evidence=true, of published "
+                "tasks with referent=random"
+            )
+    sections = [replace(evidence_section(run.records, draws), title=run.name) for run in runs]
+    report = Report("Evidence", tuple(sections), {run.name: evidence_data(run.records, draws) for run in runs})
+    return _show(report, unlike(runs), "evidence", out)
+
+
 def _pacing(name: str, setting: str, plain: Path, paced: Path, draws: int, out: Path | None) -> int:
     from lerobot_memobench.envs.episode_log import is_archive
     from lerobot_memobench.evaluation.pacing_controls import keep_changes, paced_changes, pacing_section

@@ -7,7 +7,7 @@ steps the environment, at its first reset.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from functools import partial
@@ -88,6 +88,9 @@ class MemobenchEnvConfig(EnvConfig):
         pause_steps: the robot rests for so many control steps at moments that the seed draws: actions have no effect,
             the scene stands still, and the horizon waits (`pacing`). It begins and ends between two predictions.
         speed: 1, or 0.5, 0.33 and so on: an action takes two, three control steps, and the horizon is as much longer.
+        evidence: run each scene with each of a task's variants, so that only the past differs, and note which one was
+            acted on. Episodes go through the variants of the first scene, then of the next. Tasks that have no
+            variants are left out.
         log_dir: where the episode log goes; LeRobot's output folder when left out.
         videos: record so many episodes of each task, from episode 0 on, as `<log_dir>/videos/<task>.<episode>.mp4`,
             annotated as `render()` is; −1 records every one, none is recorded when left out.
@@ -113,6 +116,7 @@ class MemobenchEnvConfig(EnvConfig):
     oracle_memory: bool = False
     pause_steps: int = 0
     speed: float = 1.0
+    evidence: bool = False
     log_dir: str | None = None
     videos: int | None = None
     seed_base: int = EVALUATION_SEED
@@ -146,6 +150,11 @@ class MemobenchEnvConfig(EnvConfig):
             )
         if self.suite == STRICT:
             self.referent = DRAWN  # each of its tasks draws its own
+        if self.evidence and self.referent == "fixed":
+            raise MemobenchError(
+                "env.evidence=true runs each scene with each variant, and env.referent=fixed the published one alone; "
+                "say referent=random"
+            )
         if self.obs_type != PIXELS:
             self.features, self.features_map = policy_features(self.obs_type), policy_names(self.obs_type)
 
@@ -178,10 +187,25 @@ class MemobenchEnvConfig(EnvConfig):
                         f"{task.folder} holds a task of the {task.suite} suite and env.suite is {self.suite}; say "
                         f"suite={task.suite} for folders of such tasks"
                     )
-            return [(task.memory_type, index, task.folder) for index, task in enumerate(loaded)]
+            tasks = [(task.memory_type, index, task.folder) for index, task in enumerate(loaded)]
+            return self._with_variants(tasks)
         spec = self.task if self.task is not None else self.tasks
         folders = [task_folder(name) for name in resolve_tasks(spec, self.suite)]
-        return [(folder.parent.name, task_index(folder.name), folder) for folder in folders]
+        return self._with_variants([(folder.parent.name, task_index(folder.name), folder) for folder in folders])
+
+    def _with_variants(self, tasks: Sequence[tuple[str, int, Path]]) -> list[tuple[str, int, Path]]:
+        """Return the tasks that `evidence` can be asked of, all where it is not."""
+        from lerobot_memobench.tasks.catalogue import load_task
+
+        if not self.evidence:
+            return [*tasks]
+        found = [task for task in tasks if load_task(task[2]).num_variants > 1]
+        if not found:
+            raise MemobenchError(
+                "env.evidence=true runs each scene with each variant, and none of the chosen tasks has any; choose "
+                "object or procedural tasks, or suite=strict"
+            )
+        return found
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """Return `{memory type: {task id: vector env}}`; nothing is simulated before an env's first reset."""

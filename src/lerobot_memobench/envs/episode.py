@@ -33,6 +33,7 @@ from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import InvalidActionError, Simulation, UnstablePhysicsError, as_action
 from lerobot_memobench.tasks.catalogue import get_task
+from lerobot_memobench.tasks.evidence import Choice
 from lerobot_memobench.tasks.failures import INVALID_ACTION, UNSTABLE_PHYSICS
 from lerobot_memobench.tasks.formula import Atom, atoms
 from lerobot_memobench.tasks.progress import Progress
@@ -66,6 +67,7 @@ class Episode:
         applied_action: the action (7,) float32 that really moved the arm in the last step.
         rested: the last step was one of a pause: the scene stood still, and nothing but the clock went on.
         fault: what broke the execution off; None as long as nothing has.
+        choice: which variant the execution chooses; None where it is not followed.
     """
 
     def __init__(
@@ -94,11 +96,21 @@ class Episode:
     def _rng(self, stream: int) -> np.random.Generator:
         return generator(self.published, self.seed, stream)
 
-    def reset(self, seed: int) -> None:
-        """Start the episode of a seed. Everything that follows is a function of task, settings, seed and actions."""
+    def reset(self, seed: int, variant: int | None = None) -> None:
+        """Start the episode of a seed. Everything that follows is a function of task, settings, seed and actions.
+
+        Args:
+            seed: of the scene.
+            variant: the one that is shown, whatever the seed draws; which one the execution chooses is then followed.
+        """
         self.seed = int(seed)
         self.fault: Fault | None = None
-        self.task = task = self.published if self.referent == "fixed" else referent_of(self.published, self.seed)
+        if variant is None:
+            task = self.published if self.referent == "fixed" else referent_of(self.published, self.seed)
+        else:
+            task = self.published.variant(variant)
+        self.task = task
+        self.choice = None if variant is None else Choice(task)
         self.sim.reset(self.seed)
         self.scene_hash = self.sim.scene_hash()
         self._start = self.sim.snapshot()
@@ -224,6 +236,8 @@ class Episode:
         if self.rested:
             return
         self.progress.step(self.sim.holds)
+        if self.choice is not None:
+            self.choice.step(self.sim.holds)
         self.drifted = self.drifted or any(self.sim.holds(atom) for atom in self._wrong)
 
     def _act(self, action: ArrayLike) -> Fault | None:

@@ -36,6 +36,7 @@ from lerobot_memobench.io import (
     write_file,
 )
 from lerobot_memobench.protocol import IDLE_STEPS
+from lerobot_memobench.tasks.evidence import chance
 from lerobot_memobench.tasks.failures import classify_failure
 from lerobot_memobench.tasks.task import PUBLISHED, STRICT, Task
 
@@ -72,13 +73,16 @@ class Outcome(TypedDict, total=False):
     """Fields of an episode that a log and a card share; logs of other tools leave some of them out.
 
     Attributes:
-        seed: of the scene: seed base + episode.
+        seed: of the scene: seed base + episode, but where each scene is run with each variant.
         referent: fixed, random, or drawn (strict tasks).
         variant: which admissible referent or order; 0 is the published one.
         replan_steps: actions executed per prediction, where known.
         prompt_steps: control steps before the execution: of the demonstration prompt, and of idling.
         steps: execution steps.
         paused_steps: control steps of pauses, where there were to be some.
+        choice: where each scene is run with each variant: which one was acted on, None for no one that could be told.
+        variants: then, of the task: how many there are to choose from.
+        chance: then, of the task: the rate of right choices without the past; None where the instruction tells.
         failure: class of the failure; None for a success.
         suite: of tasks that are not published: strict.
         lost: of strict tasks: the goal could no longer be reached.
@@ -93,6 +97,9 @@ class Outcome(TypedDict, total=False):
     prompt_steps: Count | None
     steps: Count | None
     paused_steps: Whole
+    choice: Count | None
+    variants: Count
+    chance: Number | None
     failure: Name | None
     suite: Name
     lost: bool
@@ -132,11 +139,11 @@ class EpisodeRecord(Outcome):
     written_at: NotRequired[Number]
 
 
-def episode_record(episode: Episode, seed_base: int, replan_steps: int | None, wall_s: float) -> dict[str, Any]:
+def episode_record(episode: Episode, number: int, replan_steps: int | None, wall_s: float) -> dict[str, Any]:
     """Return an episode's line for the log (`EpisodeRecord` says what its fields mean).
 
     Args:
-        seed_base: the seed that counts as episode 0.
+        number: of the episode in its evaluation, from 0 on.
         replan_steps: actions that the policy executes per prediction, where it is known.
         wall_s: seconds that the episode took.
     """
@@ -147,7 +154,7 @@ def episode_record(episode: Episode, seed_base: int, replan_steps: int | None, w
     return {
         "task": task.name,
         "memory_type": task.memory_type,
-        "episode": episode.seed - seed_base,
+        "episode": number,
         "seed": episode.seed,
         "referent": episode.referent,
         "variant": task.variant_index,
@@ -157,6 +164,7 @@ def episode_record(episode: Episode, seed_base: int, replan_steps: int | None, w
         "steps": episode.exec_steps,
         **({"paused_steps": episode.pacing.paused_steps} if episode.pacing.pauses else {}),
         "success": episode.success,
+        **({} if episode.choice is None else evidence_line(task, episode.choice.variant)),
         "checkpoints": [
             {"operation": checkpoint.operation, "first_step": first, "ordered_step": ordered}
             for checkpoint, first, ordered in zip(
@@ -169,6 +177,11 @@ def episode_record(episode: Episode, seed_base: int, replan_steps: int | None, w
         "scene_hash": episode.scene_hash,
         "wall_s": round(wall_s, 3),
     }
+
+
+def evidence_line(task: Task, choice: int | None) -> dict[str, Any]:
+    """Return what the line of an episode says of a choice among a task's variants."""
+    return {"choice": choice, "variants": len(task.random_variants), "chance": chance(task)}
 
 
 def not_run_record(task: Task, seed: int, seed_base: int, referent: str, why: str) -> dict[str, Any]:
@@ -393,12 +406,13 @@ SETTINGS = (
     "oracle_memory",
     "pause_steps",
     "speed",
+    "evidence",
 )
 """Settings that must agree for two evaluations to be one, or to be compared."""
 IDLE = "idle"
 """Control steps that the robot of a strict task idles at most before the execution. It is no choice: protocols hold it
 because the first strict evaluations were without."""
-UNTOLD: dict[str, Any] = {"suite": PUBLISHED, "pause_steps": 0, "speed": 1.0, IDLE: 0}
+UNTOLD: dict[str, Any] = {"suite": PUBLISHED, "pause_steps": 0, "speed": 1.0, "evidence": False, IDLE: 0}
 """What a protocol means that leaves these out: there was nothing else when it was written."""
 INPUTS = "inputs"
 """Inputs of the policy, in the words of `observations.policy_inputs`; absent where nobody wrote them down."""
@@ -428,6 +442,7 @@ class Settings(TypedDict, total=False):
         render_every: control steps per drawn picture.
         oracle_memory: whether the instruction tells what was done so far.
         pause_steps, speed: of the execution, see `pacing`.
+        evidence: whether each scene is run with each variant.
         idle: see `IDLE`; of strict tasks alone.
         inputs: what the policy was given.
     """
@@ -445,6 +460,7 @@ class Settings(TypedDict, total=False):
     pause_steps: Whole
     speed: Number
     idle: Count | None
+    evidence: bool
     inputs: Name | None
 
 

@@ -56,6 +56,7 @@ from lerobot_memobench.protocol import (
 )
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.tasks.catalogue import get_task, load_task, suite_of
+from lerobot_memobench.tasks.evidence import scene_and_variant
 from lerobot_memobench.tasks.memory_text import memory_text, with_memory
 from lerobot_memobench.tasks.task import referent_text
 
@@ -112,6 +113,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         oracle_memory: bool = False,
         pause_steps: int = 0,
         speed: float = 1.0,
+        evidence: bool = False,
         videos: int | None = None,
         seed_base: int = EVALUATION_SEED,
         acting: Acting = NOBODY,
@@ -149,6 +151,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             "pause_steps": pause_steps,
             "speed": speed,
             **idling(self._task.suite),
+            "evidence": evidence,
             **acting.protocol,
         }
         self._acting = acting
@@ -167,7 +170,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             "speed": speed,
             "replan_steps": replan_steps,
         }
-        self._prompt_in = prompt_in
+        self._prompt_in, self._evidence = prompt_in, evidence
         self._replan_steps = replan_steps
         self._expert_action, self._blind_action, self._seed_base = expert_action, blind_action, seed_base
         self._began = self._closed = False
@@ -207,13 +210,17 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._started = time.monotonic()
         self._began, self._closed, self._over, self._not_run = True, False, False, None
         self._discard_video()
+        number = seed - self._seed_base
         with self._noting():
-            self.episode.reset(seed)
+            if self._evidence:
+                scene, variant = scene_and_variant(self._task, number)
+                self.episode.reset(self._seed_base + scene, variant)
+            else:
+                self.episode.reset(seed)
         if self._not_run is not None:
             return blank(self.observation_space), self._info()
         self._describe(0)
         self._observer.begin(self.episode)
-        number = seed - self._seed_base
         recorded = (self._recorded == EVERY or 0 <= number < self._recorded) and self._acting.counts(seed)
         if self._videos is not None and recorded:
             self._video = VideoRecorder(self._videos / f"{self.task}.{number}.mp4")
@@ -335,7 +342,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._check_began("record")
         if self._not_run is None:
             seconds = time.monotonic() - self._started
-            found = episode_record(self.episode, self._seed_base, self._replan_steps, seconds)
+            found = episode_record(self.episode, self._seed - self._seed_base, self._replan_steps, seconds)
         else:
             found = not_run_record(self._task, self._seed, self._seed_base, self._referent, self._not_run)
         return found | self._acting.line

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import ACTION_DIM
 
-GAP = (50, 250)
+GAP = (20, 120)
 """Execution steps between two pauses, drawn uniformly from these, both included."""
 SLOWEST = 10
 """Control steps that an action may take."""

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lerobot_memobench.envs.episode_log import POLICY
+from lerobot_memobench.envs.episode_log import POLICY, UNTOLD
 from lerobot_memobench.evaluation.metrics import Record, policy_inputs
 from lerobot_memobench.evaluation.records import Run, one_suite
 from lerobot_memobench.io import count_of, cut
 from lerobot_memobench.protocol import PAPER, SPLITS
 
+PACE = ("pause_steps", "speed")
 PROMPT_IN = {"steps": "prompt in steps (observed)", "reset": "prompt in reset (not observed)"}
 
 
@@ -42,7 +43,7 @@ def whose(run: Run) -> str:
 
 
 def protocol_phrases(run: Run) -> list[str]:
-    """Return suite, referent, seeds, episodes per task and replan interval of an evaluation's rollouts."""
+    """Return suite, referent, seeds, episodes per task, replan interval and controls of an evaluation's rollouts."""
     records = run.records
     return [
         f"{one_suite(records)} suite",
@@ -50,6 +51,8 @@ def protocol_phrases(run: Run) -> list[str]:
         *_seeds(run),
         _extent(records),
         *_replan(records),
+        *(f"{name}={run.protocol[name]:g}" for name in PACE if run.protocol.get(name, UNTOLD[name]) != UNTOLD[name]),
+        *(["each scene with each variant"] if run.protocol.get("evidence") else []),
     ]
 
 

@@ -87,11 +87,16 @@ def policy_inputs(records: Iterable[Record]) -> str:
     return "; ".join(parts) or NOT_RECORDED
 
 
+def seed_base(record: Record) -> int:
+    """Return the seed of episode 0, from a rollout that tells its own; a scene may be run with each of its variants."""
+    return int(record["seed"]) - int(record["episode"]) // int(record.get("variants") or 1)
+
+
 PROTOCOL: dict[str, Callable[[Record], Any]] = {
     "referent settings": lambda record: str(record.get("referent")),
     "replan intervals": lambda record: str(record.get("replan_steps")),
     "policy inputs": lambda record: record.get("inputs"),
-    "seeds of episode 0": lambda record: None if record.get("seed") is None else record["seed"] - record["episode"],
+    "seeds of episode 0": lambda record: None if record.get("seed") is None else seed_base(record),
 }
 """What should agree within one report -> what a record says of it, None where nothing, which is no difference."""
 

@@ -30,7 +30,7 @@ from lerobot_memobench.envs.episode_log import (
     read_protocol_file,
 )
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.metrics import Record, Summary, faults, mixtures, summarise
+from lerobot_memobench.evaluation.metrics import Record, Summary, faults, mixtures, seed_base, summarise
 from lerobot_memobench.io import LARGEST, Count, Name, Whole, count_of, is_there, read_json
 from lerobot_memobench.tasks.task import PUBLISHED
 
@@ -237,7 +237,7 @@ def protocol_of_log(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
     seeded = all(record.get("seed") is not None for record in records)
     values: dict[str, set[Any]] = {
-        "seed_base": {record["seed"] - record["episode"] for record in records if seeded},
+        "seed_base": {seed_base(record) for record in records if seeded},
         "suite": {one_suite(records)} - {PUBLISHED},
         **{key: {record[key] for record in records if key in record} for key in ("referent", "replan_steps")},
     }

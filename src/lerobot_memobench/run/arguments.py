@@ -50,7 +50,7 @@ SHORT_FORMS: dict[str, dict[str, tuple[str, ...]]] = {
         **{key: (f"policy.{key}",) for key in ("host", "port", "dialect")},
         **{
             key: (f"env.{key}",)
-            for key in ("demonstration_prompt", "prompt_in", "horizon", "pause_steps", "speed", "videos")
+            for key in ("demonstration_prompt", "prompt_in", "horizon", "pause_steps", "speed", "evidence", "videos")
         },
         "episodes": ("eval.n_episodes",),
         "batch_size": ("eval.batch_size",),

@@ -36,7 +36,10 @@ from lerobot_memobench.run.plan import EvaluationPlan
 
 FORMAT = 1
 CARD_MARKDOWN = "card.md"
-OUTCOME = ("success", "steps", "prompt_steps", "variant", "checkpoints", "failure", "fault", "not_run", "scene_hash")
+OUTCOME = (
+    *("success", "steps", "prompt_steps", "variant", "choice", "checkpoints", "failure", "fault", "not_run"),
+    "scene_hash",
+)
 """What two runs of the same episode must agree in."""
 
 
@@ -393,13 +396,17 @@ def drawn_otherwise(records: Iterable[Mapping[str, Any]]) -> str | None:
     """
     from lerobot_memobench.envs.episode import referent_of
     from lerobot_memobench.tasks.catalogue import get_task, suite_of
+    from lerobot_memobench.tasks.evidence import scene_and_variant
 
     for record in records:
         task, told, seed = record["task"], record.get("variant"), record.get("seed")
         drawn = record.get("referent", "fixed") != "fixed" and suite_of(task) is not None
         if not drawn or told is None or seed is None:
             continue
-        here = referent_of(get_task(task), seed).variant_index
+        if "choice" in record:  # each scene was run with each variant
+            here = scene_and_variant(get_task(task), record["episode"])[1]
+        else:
+            here = referent_of(get_task(task), seed).variant_index
         if here != told:
             return f"{task}, episode {record['episode']}: variant {told} there, {here} by its seed here"
     return None

@@ -22,7 +22,15 @@ from lerobot_memobench.jobs.executors import ELSEWHERE, read_options
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint
 from lerobot_memobench.policies.compatibility import REFUSAL, check_features
-from lerobot_memobench.protocol import EVALUATION_EPISODES, EVALUATION_SEED, PAPER, SEALED, SPLITS, VALIDATION
+from lerobot_memobench.protocol import (
+    EVALUATION_EPISODES,
+    EVALUATION_SEED,
+    EVIDENCE_EPISODES,
+    PAPER,
+    SEALED,
+    SPLITS,
+    VALIDATION,
+)
 from lerobot_memobench.run.arguments import (
     CONFIG_FILE,
     RUN_OPTIONS,
@@ -278,7 +286,9 @@ def with_protocol(
     """Return arguments with the protocol's seed and episodes, a batch, a device, the replan interval, videos."""
     import torch
 
-    arguments = arguments.default("seed", EVALUATION_SEED).default("eval.n_episodes", EVALUATION_EPISODES)
+    evidence = is_true("env.evidence", arguments.get("env.evidence"))
+    episodes = EVIDENCE_EPISODES if evidence else EVALUATION_EPISODES
+    arguments = arguments.default("seed", EVALUATION_SEED).default("eval.n_episodes", episodes)
     if whole_number(arguments.get("seed")) is not None:
         arguments = arguments.default("env.seed_base", arguments.get("seed"))  # episodes are counted from the first
     # A policy may serve few environments at once, such as one for each of its servers.

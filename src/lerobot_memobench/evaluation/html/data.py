@@ -12,6 +12,7 @@ from typing import Any
 
 from lerobot_memobench import __version__
 from lerobot_memobench.envs.video import OPERATION_COLOURS
+from lerobot_memobench.evaluation.evidence_controls import evidence_phrase
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import (
     Rate,
@@ -128,7 +129,7 @@ def run_data(run: Run, videos: Mapping[int, str]) -> dict[str, Any]:
 def facts(run: Run) -> list[str]:
     """Return what stands below the first line: how many rollouts, their horizon, and controls that were run."""
     horizon = run.protocol.get("horizon")
-    controls = [pace_phrase(each) for each in kept_changes(run.folder)]
+    controls = [*evidence_phrase(run.records), *map(pace_phrase, kept_changes(run.folder))]
     return [count_of(len(run.records), "rollout"), *([] if horizon is None else [f"horizon {horizon}"]), *controls]
 
 

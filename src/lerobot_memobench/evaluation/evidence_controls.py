@@ -1,0 +1,190 @@
+"""How often does the choice follow the evidence? Each scene was run with each variant: only the past differs.
+
+A policy that knows nothing of the past chooses the same in all variants of a scene, and is right at a rate that is
+known exactly (`tasks.evidence.chance`), whatever the scenes are: there is no luck of the draw.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lerobot_memobench.evaluation.metrics import Record, by_task, percent, wilson
+from lerobot_memobench.evaluation.statistics import DRAWS, Array, Estimate, percentiles
+from lerobot_memobench.evaluation.tables import Cell, Count, Name, Numbers, Section, Table, figure
+from lerobot_memobench.io import count_of
+
+AVERAGE = "average"
+RATES = ("follows", "success", "undecided")
+"""The choice is the evidence's; the goal held at the end; nothing was chosen that could be told."""
+SENTENCE = (
+    "Each scene was run with each variant of its task, so only the past differs. Follows: the first answer that was "
+    "acted on is the one that the evidence asks for. Chance: the best that a policy without the past can reach. "
+    "Per cent, with the 95 % interval of a bootstrap over scenes, at least Wilson's of so many. No chance is told "
+    "where the instruction tells the answer and only what was done so far is evidence; such tasks are in no average."
+)
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Rates of one task, or of several: means over scenes, in each of which every variant weighs the same.
+
+    Attributes:
+        scenes, variants: how many; of several tasks the sum of scenes, and no number of variants.
+        chance: of following without the past; None where the instruction tells.
+        rates: of `RATES`, with intervals.
+    """
+
+    scenes: int
+    variants: int | None
+    chance: float | None
+    rates: Mapping[str, Estimate]
+
+
+@dataclass(frozen=True)
+class _Task:
+    """Rates per scene (S, 3), and the scenes that are drawn (D, S)."""
+
+    variants: int
+    chance: float | None
+    values: Array
+    drawn: Any
+
+
+def ran_evidence(records: Sequence[Record]) -> bool:
+    """Return whether rollouts are of an evaluation in which each scene was run with each variant."""
+    return any(map(_tells, records))
+
+
+def _tells(record: Record) -> bool:
+    return "choice" in record and bool(record.get("variants"))
+
+
+def evidence_of(records: Sequence[Record], draws: int = DRAWS) -> tuple[dict[str, dict[str, Evidence]], list[str]]:
+    """Return the rates by task, memory type and on average, and what a reader must know.
+
+    Args:
+        records: of which those of scenes count that were run with every variant.
+    """
+    rng = np.random.default_rng(0)
+    tasks: dict[str, _Task] = {}
+    kinds: dict[str, list[_Task]] = {}
+    left_out = 0
+    for name, group in by_task(filter(_tells, records)).items():
+        variants = int(group[0]["variants"])
+        scenes: dict[int, dict[int, Record]] = {}
+        for record in group:
+            scenes.setdefault(record.get("seed") or 0, {})[record.get("variant") or 0] = record
+        whole = [list(scene.values()) for scene in scenes.values() if len(scene) == variants]
+        left_out += len(group) - sum(map(len, whole))
+        if not whole:
+            continue
+        values = np.array([np.mean([_outcome(record) for record in scene], axis=0) for scene in whole])
+        drawn = rng.integers(len(whole), size=(draws, len(whole)))
+        tasks[name] = _Task(variants, group[0].get("chance"), values, drawn)
+        kinds.setdefault(str(group[0]["memory_type"]), []).append(tasks[name])
+    notes = [f"{count_of(left_out, 'rollout')} of scenes that were not run with every variant left out"]
+    asked = {name: told for name, group in kinds.items() if (told := [t for t in group if t.chance is not None])}
+    found = {
+        "tasks": {name: _rates([[task]]) for name, task in tasks.items()},
+        "memory_types": {name: _rates([group]) for name, group in asked.items()},
+        AVERAGE: {AVERAGE: _rates(list(asked.values()))} if asked else {},
+    }
+    return found, notes if left_out else []
+
+
+def _outcome(record: Record) -> tuple[bool, bool, bool]:
+    return record["choice"] == record.get("variant"), bool(record["success"]), record["choice"] is None
+
+
+def _rates(groups: Sequence[Sequence[_Task]]) -> Evidence:
+    """Return the mean over groups of the means over their tasks, with intervals over scenes."""
+
+    def mean(values: Sequence[Sequence[Any]]) -> Any:
+        return np.mean([np.mean(group, axis=0) for group in values], axis=0)
+
+    tasks = [task for group in groups for task in group]
+    rates = mean([[task.values.mean(axis=0) for task in group] for group in groups])
+    drawn = mean([[task.values[task.drawn].mean(axis=1) for task in group] for group in groups])
+    weights = [1 / (len(groups) * len(group) * len(task.values)) for group in groups for task in group]
+    scenes = max(1.0, 1 / sum(len(task.values) * weight**2 for task, weight in zip(tasks, weights, strict=True)))
+    estimates = {}
+    for k, name in enumerate(RATES):
+        (low, high), (least, most) = percentiles(drawn[:, k]), wilson(float(rates[k]), scenes)
+        estimates[name] = Estimate(float(rates[k]), min(low, least), max(high, most))
+    alone = len(tasks) == 1
+    chances = [[task.chance for task in group] for group in groups]
+    return Evidence(
+        scenes=sum(len(task.values) for task in tasks),
+        variants=tasks[0].variants if alone else None,
+        chance=tasks[0].chance if alone else float(mean(chances)),
+        rates=estimates,
+    )
+
+
+# --- the report ---
+
+
+def evidence_section(records: Sequence[Record], draws: int = DRAWS) -> Section:
+    """Return the tables of an evaluation in which each scene was run with each variant, with a title."""
+    found, notes = evidence_of(records, draws)
+    header = ("scenes", "variants", "chance", *RATES)
+    kinds = [*found["memory_types"].items(), *found[AVERAGE].items()]
+    tables = [
+        Table("evidence_tasks", "", ("task", *header), tuple(_row(Name(n), e) for n, e in found["tasks"].items()))
+    ]
+    if kinds:
+        rows = tuple(_row(name, each) for name, each in kinds)
+        tables.insert(0, Table("evidence", "", ("memory type", *header), rows, strong=frozenset({len(rows) - 1})))
+    return Section("Evidence", tuple(tables), (SENTENCE,), tuple(notes))
+
+
+def _row(name: str, found: Evidence) -> tuple[Cell, ...]:
+    variants = None if found.variants is None else Count(found.variants)
+    return (name, Count(found.scenes), variants, Numbers(figure(found.chance)), *map(_cell, found.rates.values()))
+
+
+def _cell(found: Estimate) -> Numbers:
+    return Numbers(f"{figure(found.value)} [{figure(found.low)}–{figure(found.high)}]")
+
+
+def evidence_data(records: Sequence[Record], draws: int = DRAWS) -> dict[str, Any]:
+    """Return the same as JSON values, per cent; {} where scenes were not run with each variant."""
+    if not ran_evidence(records):
+        return {}
+    found, _ = evidence_of(records, draws)
+    average = found.pop(AVERAGE)
+    told = {place: {name: _data(each) for name, each in rates.items()} for place, rates in found.items()}
+    for name, group in by_task(filter(_tells, records)).items():
+        if name in told["tasks"]:
+            told["tasks"][name]["choices"] = _choices(group)
+    return {AVERAGE: _data(average[AVERAGE]) if average else None, **told}
+
+
+def _choices(group: Sequence[Record]) -> dict[str, dict[str, int]]:
+    """Return variant that was asked for -> variant that was chosen, "none" among them -> rollouts."""
+    found: dict[str, Counter[str]] = {}
+    for record in group:
+        chosen = "none" if record["choice"] is None else str(record["choice"])
+        found.setdefault(str(record.get("variant")), Counter())[chosen] += 1
+    return {variant: dict(sorted(counts.items())) for variant, counts in sorted(found.items())}
+
+
+def _data(found: Evidence) -> dict[str, Any]:
+    rates = {
+        name: {"percent": percent(rate.value), "low": percent(rate.low), "high": percent(rate.high)}
+        for name, rate in found.rates.items()
+    }
+    return {"scenes": found.scenes, "variants": found.variants, "chance": percent(found.chance), **rates}
+
+
+def evidence_phrase(records: Sequence[Record]) -> list[str]:
+    """Return the average in words, for one line; [] where there is none."""
+    if not ran_evidence(records) or not (average := evidence_of(records)[0][AVERAGE]):
+        return []
+    told = average[AVERAGE]
+    return [f"follows the evidence {figure(told.rates['follows'].value)} %, chance {figure(told.chance)} %"]

@@ -1,0 +1,71 @@
+"""A scene with each of a task's variants: only the past differs. Which variant did an execution choose to act on?
+
+The instruction of most variants is the same, so what is right stands in the past alone: in the demonstration prompt. A
+policy that knows nothing of it gives one answer, the same in all variants, and its rate of right ones is known exactly.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+
+from lerobot_memobench.tasks.formula import Atom, Formula
+from lerobot_memobench.tasks.progress import Evaluator
+from lerobot_memobench.tasks.task import Task
+
+
+def scene_and_variant(task: Task, episode: int) -> tuple[int, int]:
+    """Return which scene an episode has, from 0 on, and which variant: each scene goes through all of them."""
+    choices = task.random_variants
+    return episode // len(choices), choices[episode % len(choices)]
+
+
+def chance(task: Task) -> float | None:
+    """Return the best rate without the past: the most frequent goal of each instruction. None where it tells the goal.
+
+    Two hidden things may have the same goal in several variants: where the other one lies changes nothing.
+    """
+    goals: dict[str, Counter[Formula]] = {}
+    for variant in _variants(task):
+        goals.setdefault(variant.language, Counter())[variant.goal] += 1
+    if all(len(each) == 1 for each in goals.values()):
+        return None
+    return sum(max(each.values()) for each in goals.values()) / len(task.random_variants)
+
+
+def _variants(task: Task) -> list[Task]:
+    return [task.variant(k) for k in task.random_variants]
+
+
+class Choice:
+    """Follows which variant's goal an execution brings about first; call ``step`` once per execution step.
+
+    Args:
+        task: the variant that is being run. The execution chooses among those of its instruction; among all of them
+            where the instruction leaves no choice, such as how often something is to be done.
+    """
+
+    def __init__(self, task: Task) -> None:
+        variants = _variants(task)
+        same = [one for one in variants if one.language == task.language]
+        rivals = same if len({one.goal for one in same}) > 1 else variants
+        # Of variants that share a goal, the one that is run stands for it, else the first.
+        self._variants = {one.goal: one.variant_index for one in reversed(rivals)} | {task.goal: task.variant_index}
+        self._evaluator = Evaluator(self._variants)
+        self._first: int | None = None
+
+    def step(self, holds: Callable[[Atom], bool]) -> None:
+        """Take in the state after one control step."""
+        if self._first is not None:
+            return
+        reached = self._evaluator.step(holds)
+        self._first = next((k for k, now in zip(self._variants.values(), reached, strict=True) if now), None)
+
+    @property
+    def variant(self) -> int | None:
+        """The variant whose goal came true first; else the only one that still can; None where nothing was chosen."""
+        if self._first is not None:
+            return self._first
+        settled = zip(self._variants.values(), self._evaluator.settled, strict=True)
+        left = [k for k, value in settled if value is not False]
+        return left[0] if len(left) == 1 else None

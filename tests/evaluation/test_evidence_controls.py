@@ -1,0 +1,123 @@
+"""Evidence rates against logs made by hand."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lerobot_memobench.cli.memobench import main
+from lerobot_memobench.envs.episode_log import write_episodes
+from lerobot_memobench.evaluation.evidence_controls import evidence_of
+from lerobot_memobench.evaluation.html.data import facts
+from lerobot_memobench.evaluation.metrics import mixtures
+from lerobot_memobench.evaluation.records import protocol_of_log, read_runs
+from tests.support.logs import SETTINGS, rollout
+
+Policy = Callable[[int, int], int | None]
+"""Scene and variant -> what is chosen."""
+
+
+def rollouts(
+    task: str, memory_type: str, policy: Policy, scenes: int = 10, variants: int = 3, chance: float | None = 1 / 3
+) -> list[dict[str, Any]]:
+    found = []
+    for episode in range(scenes * variants):
+        scene, variant = divmod(episode, variants)
+        choice = policy(scene, variant)
+        told = {"seed": 7 + scene, "variant": variant, "choice": choice, "variants": variants, "chance": chance}
+        right = choice == variant
+        found.append(rollout(task, memory_type, "SC", [True, right], right, episode, referent="drawn", **told))
+    return found
+
+
+def remembers(scene: int, variant: int) -> int:
+    return variant
+
+
+def stubborn(scene: int, variant: int) -> int:
+    """Whatever was shown: what it chooses is a matter of the scene."""
+    return scene % 3
+
+
+def hesitant(scene: int, variant: int) -> int | None:
+    return variant if scene % 2 else None
+
+
+def test_who_ignores_the_past_is_exactly_at_chance() -> None:
+    found, notes = evidence_of(rollouts("bowl", "object", stubborn))
+    rate = found["tasks"]["bowl"]
+    assert (rate.scenes, rate.variants, rate.chance) == (10, 3, pytest.approx(1 / 3))
+    assert rate.rates["follows"].value == pytest.approx(1 / 3)
+    assert notes == []
+    low, high = rate.rates["follows"].low, rate.rates["follows"].high
+    assert low is not None
+    assert high is not None
+    assert low < 0.15
+    assert high > 0.6, "ten scenes are few, even where each says the same"
+
+
+def test_an_average_is_of_memory_types_and_without_tasks_whose_instruction_tells() -> None:
+    records = [
+        *rollouts("bowl", "object", remembers),
+        *rollouts("milk", "object", stubborn, variants=2, chance=1 / 2, scenes=9),
+        *rollouts("drawer", "spatial", hesitant),
+        *rollouts("count", "temporal", stubborn, chance=None),
+    ]
+    found, _ = evidence_of(records)
+    assert set(found["memory_types"]) == {"object", "spatial"}
+    milk = found["tasks"]["milk"].rates["follows"].value
+    assert milk == pytest.approx(6 / 18)  # of three answers, the third is none of the two that may be right
+    spatial = found["tasks"]["drawer"].rates
+    assert (spatial["follows"].value, spatial["undecided"].value) == (0.5, 0.5)
+    average = found["average"]["average"]
+    assert average.rates["follows"].value == pytest.approx(((1 + 6 / 18) / 2 + 0.5) / 2)
+    assert average.chance == pytest.approx(((1 / 3 + 1 / 2) / 2 + 1 / 3) / 2)
+    assert average.scenes == 29
+
+
+def test_scenes_that_were_not_run_with_every_variant_are_left_out() -> None:
+    found, notes = evidence_of(rollouts("bowl", "object", remembers)[:-1])
+    assert found["tasks"]["bowl"].scenes == 9
+    assert notes == ["2 rollouts of scenes that were not run with every variant left out"]
+
+
+def test_scenes_repeat_and_are_no_mixture_of_seeds() -> None:
+    records = rollouts("bowl", "object", remembers) + rollouts("milk", "object", remembers, variants=2)
+    assert mixtures(records) == []
+    assert protocol_of_log(records)["seed_base"] == 7
+
+
+def evaluation(folder: Path, policy: Policy) -> str:
+    write_episodes(folder, rollouts("bowl", "object", policy) + rollouts("count", "temporal", policy, chance=None))
+    (folder / "protocol.json").write_text(json.dumps({**SETTINGS, "referent": "drawn", "evidence": True}))
+    return str(folder)
+
+
+def test_the_rate_joins_every_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = evaluation(tmp_path / "run", stubborn)
+    assert main(["report", folder]) == 0
+    assert "each scene with each variant" in " ".join(capsys.readouterr().out.split())
+    written = json.loads((tmp_path / "run" / "report.json").read_text())["evidence"]
+    assert written["average"]["follows"]["percent"] == written["average"]["chance"] == 33.3
+    assert written["tasks"]["count"]["chance"] is None
+    assert written["tasks"]["bowl"]["choices"]["1"] == {"0": 4, "1": 3, "2": 3}
+    assert "## Evidence" in (tmp_path / "run" / "report.md").read_text()
+    assert "follows the evidence 33.3 %, chance 33.3 %" in facts(read_runs([folder])[0])
+
+
+def test_policies_stand_side_by_side(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folders = [evaluation(tmp_path / who.__name__, who) for who in (remembers, stubborn)]
+    assert main(["controls", "evidence", *folders, "--out", str(tmp_path / "out")]) == 0
+    assert "100.0 [" in capsys.readouterr().out
+    written = json.loads((tmp_path / "out" / "evidence.json").read_text())
+    assert [written[name]["average"]["follows"]["percent"] for name in ("remembers", "stubborn")] == [100.0, 33.3]
+
+
+def test_other_evaluations_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_episodes(tmp_path, [rollout("bowl", "object", "S", [True], True, 0)])
+    assert main(["controls", "evidence", str(tmp_path)]) == 2
+    assert "evaluate with evidence=true" in " ".join(capsys.readouterr().err.split())
