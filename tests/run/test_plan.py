@@ -149,6 +149,13 @@ def test_a_number_of_episodes_that_is_none() -> None:
         plan_line(["env=memobench", "--eval.n_episodes=many"])
 
 
+def test_evidence_is_asked_for_in_whole_scenes() -> None:
+    plan = plan_line(["env=memobench", "tasks=object", "referent=random", "evidence=true"])
+    assert plan.grid.runs == 36
+    assert all(plan.grid.runs % variants == 0 for variants in (2, 3, 6, 9, 12))
+    assert plan_line(["env=memobench", "tasks=object", "referent=random", "evidence=true", "episodes=9"]).grid.runs == 9
+
+
 def test_ten_episodes_are_filmed_unless_another_number_is_given() -> None:
     for words, videos in (([], 10), (["videos=0"], 0), (["env.videos=3"], 3)):
         environment = plan_line([*LINE, *words]).environment
