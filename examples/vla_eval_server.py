@@ -4,7 +4,8 @@
 
 The harness's own LeRobot server knows no demonstration prompts. This one hands them to the policy frame by frame, as
 ``lerobot-eval`` does: `observation.phase` is 0 in the prompt and 1 in the execution, `observation.step` counts the
-control steps of each.
+control steps of each. In strict tasks the robot idles in between and the step counts through: the frames in which it
+does look like the execution's first, and are not sent.
 """
 
 from __future__ import annotations
@@ -58,16 +59,19 @@ class MemoryPolicyServer(LeRobotModelServer):
 
     def predict(self, obs: dict[str, Any], ctx: SessionContext) -> dict[str, Any]:
         """Return the action (7,) for an observation; the first one of an episode may hold its prompt."""
+        now = int(obs["step"][0]) if "step" in obs else ctx.step
         if ctx.is_first:
             self._episode = ctx.episode_id
             self._policy.reset()
-            frames = zip(obs.get("video_history", ()), obs.get("wrist_video_history", ()), strict=True)
+            frames = list(zip(obs.get("video_history", ()), obs.get("wrist_video_history", ()), strict=True))
             for step, (image, wrist) in enumerate(frames):
                 images = {"agentview": image, "wrist": wrist}
                 self._act({**obs, "images": images, "states": obs["state_history"][step]}, PROMPT, step)
+            for step in range(len(frames), now):
+                self._act(obs, PROMPT, step)
         if ctx.episode_id != self._episode:
             raise RuntimeError("this server has one memory, and another episode has begun; use one environment")
-        return {"actions": self._act(obs, EXECUTION, ctx.step)}
+        return {"actions": self._act(obs, EXECUTION, now)}
 
     def _act(self, obs: dict[str, Any], phase: int, step: int) -> np.ndarray:
         frame = {key: np.asarray(obs["images"][name]) for name, key in CAMERAS.items()}

@@ -44,7 +44,7 @@ logger = logging.getLogger(__name__)
 
 NAMES = {"image": ("agentview", "video_history"), "wrist_image": ("wrist", "wrist_video_history")}
 """Our name of a camera -> the harness's names of its picture and of its part of the demonstration prompt."""
-STATES, STATE_HISTORY = "states", "state_history"
+STATES, STATE_HISTORY, STEP = "states", "state_history", "step"
 SUCCESS = "success"
 
 
@@ -52,10 +52,10 @@ class MEMOBench(StepBenchmark):
     """The tasks of one suite: episode i of each has the scene of seed ``seed`` + i, as everywhere in the benchmark.
 
     Observation: ``images`` with ``agentview`` and ``wrist`` uint8 (256, 256, 3) upright; ``states`` float32 (8,):
-    end-effector position (3, m), axis-angle (3, rad), fingers (2, m); ``task_description``. The first one of an episode
-    with a demonstration prompt holds it too: ``video_history`` and ``wrist_video_history``, lists of pictures,
-    ``state_history``, a list of states, and ``episode_restart``. Frames in which a strict task's robot idles are left
-    out. The harness tells no step: a server that counts its answers has a clock that starts with the execution.
+    end-effector position (3, m), axis-angle (3, rad), fingers (2, m); ``task_description``; ``step`` float32 (1,) of
+    `MemobenchEnv`. The first one of an episode with a demonstration prompt holds it too: ``video_history`` and
+    ``wrist_video_history``, lists of pictures, ``state_history``, a list of states, and ``episode_restart``. Frames in
+    which a strict task's robot idles are left out: they all are what the first observation shows.
 
     Action: ``actions`` float (7,) or (steps, 7) in [−1, 1], as of `MemobenchEnv`.
 
@@ -159,7 +159,7 @@ class MEMOBench(StepBenchmark):
         observation, info = self._env.reset(seed=self._config.seed_base + int(task.get("episode_idx", 0)))
         self._history = {}
         while "fault" not in info and observation["phase"][0] == PROMPT:
-            step, shows = int(observation["step"][0]), not self._env.episode.idling
+            step, shows = int(observation[STEP][0]), not self._env.episode.idling
             if shows and step % self._history_every == 0:
                 self._remember(observation)
             self._env.need_observation(shows and (step + 1) % self._history_every == 0)
@@ -219,6 +219,7 @@ class MEMOBench(StepBenchmark):
         found: dict[str, Any] = {
             "images": {NAMES[name][0]: self._picture(raw_obs, name) for name in self._cameras},
             "task_description": self._running().task_description,
+            STEP: raw_obs[STEP],
         }
         if self._send_state:
             found[STATES] = raw_obs["agent_pos"]

@@ -24,11 +24,13 @@ from vla_eval.specs import check_specs
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.envs import episode as episodes
+from lerobot_memobench.envs.episode import first_execution_step
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import report_values, summarise
 from lerobot_memobench.protocol import EXECUTION
+from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.vla_eval import MEMOBench
 from tests.support.remote_case import free_port
 from tests.support.vla_eval_server import DigestServer
@@ -36,6 +38,7 @@ from tests.support.vla_eval_server import DigestServer
 ROOT = Path(__file__).parents[2]
 PROMPTED = "put_the_butter_into_the_bowl_from_the_prompt_video"
 UNPROMPTED = "turn_on_the_stove_and_turn_it_off"
+HIGHLIGHT = "put_only_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
 METRICS = {"success": "SR", "MSR": "MSR", "MUR": "MUR", "MCR": "MCR"}
 """The harness's name of a metric -> our report's."""
 Steps = dict[tuple[str, int], list[tuple[list[float], str, bool]]]
@@ -149,6 +152,16 @@ def test_the_means_of_the_metrics_are_the_reports(tmp_path: Path) -> None:
     short.cleanup()
 
 
+def test_frames_in_which_a_strict_robot_idles_are_counted_and_not_sent() -> None:
+    benchmark = MEMOBench(HIGHLIGHT, suite="strict", render="fast", horizon=1, seed=20_000)
+    (task,) = benchmark.get_tasks()
+    first, _ = played(benchmark, task, expert=False)
+    assert first["step"].tolist() == [first_execution_step(get_task(HIGHLIGHT), 20_000, True)]
+    assert len(first["video_history"]) == len(first["state_history"]) == 66, "the highlight alone"
+    assert not np.array_equal(first["video_history"][30], first["images"]["agentview"])
+    benchmark.cleanup()
+
+
 def test_what_is_sent() -> None:
     benchmark = MEMOBench(UNPROMPTED, render="fast", horizon=2, send_state=False, send_wrist_image=False, mirror=True)
     plain = MEMOBench(UNPROMPTED, render="fast", horizon=2)
@@ -156,8 +169,9 @@ def test_what_is_sent() -> None:
     assert task == {"name": UNPROMPTED, "suite": "temporal"}
     first, _ = played(benchmark, task, expert=False)
     whole, _ = played(plain, task, expert=False)
-    assert set(first) == {"images", "task_description"}
-    assert set(whole) == {"images", "task_description", "states"}
+    assert set(first) == {"images", "task_description", "step"}
+    assert set(whole) == {"images", "task_description", "states", "step"}
+    assert whole["step"].tolist() == [0]
     assert list(whole["images"]) == ["agentview", "wrist"]
     assert np.array_equal(first["images"]["agentview"], whole["images"]["agentview"][:, ::-1])
     declared = plain.get_observation_spec()

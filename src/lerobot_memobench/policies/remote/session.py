@@ -149,6 +149,8 @@ class Session:
             found[FIRST_FRAME] = str(self._first)  # 'True' and 'False', as MemoryVLA reads them
             self._first = False
         if self._dialect.transport == "vla_eval":
+            if (step := row.scalar("step")) is not None:
+                found["step"] = np.array([step], np.float32)
             return observation(found, self._history())
         return found
 
