@@ -55,8 +55,12 @@ def necessity(
             help="necessity.json of the published tasks; the page's table then shows them beside their strict tasks."
         ),
     ] = None,
+    memoryless: Annotated[
+        list[Path] | None,
+        typer.Option(help="Evaluation of a trained policy without a memory, shown beside the bounds; repeatable."),
+    ] = None,
 ) -> None:
-    """Find frames that look the same and need different answers. They tell what a policy without memory can reach."""
+    """Find frames that look alike and need different answers: lower bounds of what a policy without memory reaches."""
     from lerobot_memobench.tasks.task import REFERENTS
     from research.necessity.report import (
         around_table,
@@ -67,9 +71,11 @@ def necessity(
     )
     from research.necessity.settings import Settings
     from research.necessity.study import PIECES, make
+    from research.necessity.trained import read_evaluations, with_evaluations
 
     # Now, not after the simulation.
     published = None if beside is None else read_results(beside)
+    evaluated = read_evaluations(memoryless or [])
     if page is not None:
         around_table(page)
     settings = Settings(episodes=episodes, budget=budget, tolerance=tolerance)
@@ -79,7 +85,7 @@ def necessity(
     for piece, unit in PIECES.items():
         with counting(screen, unit) as count:
             make(studies, piece, workers, _telling(count))
-    results = [study.result() for study in studies]
+    results = with_evaluations([study.result() for study in studies], evaluated)
     written = write(out, results)
     if page is not None:
         written.append(put_into_page(page, results, published))

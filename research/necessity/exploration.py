@@ -343,6 +343,7 @@ def search(laboratory: Laboratory, settings: Settings) -> dict[str, Any]:
         "steps": found.steps,
         "complete": graph.complete,
         "exhausted": found.exhausted,
+        "unexplored": 0 if found.exhausted else len(graph.unexplored),
         "policy": [rule for group in groups for rule in group["policy"]],
     }
 

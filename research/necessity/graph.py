@@ -50,9 +50,14 @@ class Graph:
     decided: set[int] = field(default_factory=set)
 
     @property
+    def unexplored(self) -> list[int]:
+        """Nodes that a goal may need and that were not explored."""
+        return [node for node in range(len(self.pictures)) if node not in self.moves and node not in self.decided]
+
+    @property
     def complete(self) -> bool:
         """Every node was explored that a goal needs."""
-        return all(node in self.moves or node in self.decided for node in range(len(self.pictures)))
+        return not self.unexplored
 
     @property
     def answers(self) -> list[str]:

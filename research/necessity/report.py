@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING, Any
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, figure
 from lerobot_memobench.io import read_json, write_file
+from lerobot_memobench.protocol import IDLE_STEPS
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.task import DRAWN, REFERENTS
 from research.necessity.study import KeptResult, Result, pictures_path
+from research.necessity.trained import in_words as rate_in_words
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -24,12 +26,16 @@ if TYPE_CHECKING:
 # --- verdicts ---
 
 VERDICTS = {
-    "no": "pictures decide every step of the demonstrated routine: no memory is needed",
-    "order": "with the arm at home, pictures tell not the demonstrated order but another that the goal accepts",
-    "yes": "no order that was found reaches the goal from pictures alone",
-    "order?": "with the arm at home, pictures do not tell the demonstrated order; other ways were not looked for",
+    "no": "what is observed at the decisions, the hand where it happens to be, decides each: no memory is needed",
+    "order": "it does not decide the demonstrated order, but pictures decide another that the goal accepts",
+    "clock": "what is observed decides together with the step counter",
+    "not found": "no way without a memory was found, though every state was tried that can be reached before the "
+    "horizon: a bound for decisions, not a proof",
+    "cut off": "no way without a memory was found before the search was cut off",
+    "open": "what is observed does not decide the demonstrated order; other ways were not looked for",
     "unknown": "the expert solved none of the scenes, so nothing can be said",
 }
+"""Verdict -> what it means. They rest on what is observed as it happens, not on pictures with the arm taken home."""
 
 
 def verdict(result: Result) -> str:
@@ -37,18 +43,23 @@ def verdict(result: Result) -> str:
     in_order, any_order = result["in_order"], result["any_order"]
     if in_order is None:
         return "unknown"
-    if in_order["deterministic"] >= 1.0:
+    if in_order["as_it_happens"] >= 1.0:
         return "no"
+    if any_order is not None and any_order["confirmed"] == any_order["of"]:
+        return "order"
+    if in_order["with_step"] >= 1.0:
+        return "clock"
     if any_order is None:
-        return "order?"
-    return "order" if any_order["confirmed"] == any_order["of"] else "yes"
+        return "open"
+    return "cut off" if any_order["cut_off"] else "not found"
 
 
 # --- published tasks beside their strict tasks ---
 
 HEADINGS = (
-    *("published task", "best map", "memory needed"),
-    *("its strict task", "goals", "best map", "best prob.", "as it happens", "expert", "memory needed"),
+    *("published task", "best map ≥", "without a memory"),
+    *("its strict task", "goals", "as it happens ≥", "with step ≥", "any order ≥", "any order, prob. ≥", "search"),
+    *("trained policy", "expert", "without a memory"),
 )
 
 
@@ -65,24 +76,34 @@ def side_by_side(published: Sequence[Result], strict: Sequence[Result]) -> str:
 
 
 def _published(result: Result | None) -> list[str]:
-    """Return the cells of a published task: the best map in any order that its goal accepts, and the verdict."""
+    """Return the cells of a published task: the best map that was found, in any order, and the verdict."""
     if result is None or result["in_order"] is None:
         return [NOT_APPLICABLE] * 2
-    found = result["any_order"] or result["in_order"]
-    return [figure(found["deterministic"]), verdict(result)]
+    found = (result["any_order"] or {}).get("deterministic", 0.0)
+    return [figure(max(found, result["in_order"]["as_it_happens"])), verdict(result)]
 
 
 def _strict(result: Result) -> list[str]:
     """Return the cells of a strict task."""
-    in_order, any_order, expert = result["in_order"], result["any_order"], result["expert"]
-    found = [NOT_APPLICABLE] * 2
+    return [str(result["variants"]), *_bounds_of(result), *_expert(result), verdict(result)]
+
+
+def _bounds_of(result: Result) -> list[str]:
+    """Return the cells of the lower bounds that count, how far the search came, and the trained policy's."""
+    in_order, any_order = result["in_order"], result["any_order"]
+    happens = [NOT_APPLICABLE if in_order is None else figure(in_order[key]) for key in ("as_it_happens", "with_step")]
+    found = [NOT_APPLICABLE] * 3
     if any_order is not None:
         found = [
             f"{figure(any_order['deterministic'])} ({any_order['confirmed']}/{any_order['of']})",
-            figure(any_order["stochastic"]) + ("" if any_order["exhausted"] else " ≥"),
+            figure(any_order["stochastic"]),
+            f"cut off, {any_order['unexplored']} states left" if any_order["cut_off"] else "whole",
         ]
-    happens = NOT_APPLICABLE if in_order is None else figure(in_order["as_it_happens"])
-    return [str(result["variants"]), *found, happens, f"{expert['success']}/{expert['n']}", verdict(result)]
+    return [*happens, *found, rate_in_words(result.get("trained"))]
+
+
+def _expert(result: Result) -> list[str]:
+    return [f"{result['expert']['success']}/{result['expert']['n']}"]
 
 
 def bounds(results: Sequence[Result]) -> str:
@@ -91,16 +112,32 @@ def bounds(results: Sequence[Result]) -> str:
     searched = [result for result in drawn if result["any_order"] is not None]
     if not searched:
         return ""
-    needed = sum(verdict(result) == "yes" for result in drawn)
+    open_ones = sum(verdict(result) in ("not found", "cut off") for result in drawn)
     told = [
         f"the {name} at most {figure(max(values))} %, on average {figure(sum(values) / len(values))} %"
         for name, values in (
             ("best fixed map in any order", [result["any_order"]["deterministic"] for result in searched]),
             ("best probabilities in any order", [result["any_order"]["stochastic"] for result in searched]),
-            ("best fixed map with the arm as it happens", [result["in_order"]["as_it_happens"] for result in searched]),
+            ("best fixed map of what is observed", [result["in_order"]["as_it_happens"] for result in searched]),
+            ("same with the step counter", [result["in_order"]["with_step"] for result in searched]),
         )
     ]
-    return f"From pictures alone {needed} of {len(drawn)} tasks were not solved: {'; '.join(told)}."
+    return (
+        f"Without a memory no way was found to {open_ones} of {len(drawn)} tasks. Lower bounds of what such a policy "
+        f"reaches: {'; '.join(told)}. {_cut_off(searched)}"
+    )
+
+
+def _cut_off(searched: Sequence[Result]) -> str:
+    """Return a sentence on how many searches ended before every state had been tried, and by what."""
+    number, cut = sum(r["any_order"]["searches"] for r in searched), sum(r["any_order"]["cut_off"] for r in searched)
+    budgets = sorted({result["settings"]["budget"] for result in searched})
+    left = sum(result["any_order"]["unexplored"] for result in searched)
+    steps = ", ".join(f"{budget:,}" for budget in budgets)
+    return (
+        f"{cut} of {number} searches were cut off by their budget ({steps} control steps for each different start) "
+        f"with {left} states left to try; all end at the horizon."
+    )
 
 
 # --- aliased pairs: frames that look the same and ask for different answers ---
@@ -206,39 +243,42 @@ COLUMNS = {
     "referent": "what the goal is; *both*: the task has one goal, so the settings are the same",
     "goals": "goals that may lie behind the same start",
     "decisions": "times per episode at which the expert turns to something new",
-    "aliased": "pictures at which more than one answer is right: arm at home / as it happens",
-    "chance": "knows the routine, guesses evenly where the picture does not decide; one try each",
-    "fixed map": "best map from pictures to answers, in the demonstrated order",
-    "probabilities": "best probabilities of answers given the picture, same order, one try each",
-    "exact": "fixed map if every pixel could be used (differences above 2 of 255)",
-    "any order": "best map if any order will do that the goal accepts: found, and confirmed in the simulator",
-    "any order, prob.": "best probabilities found, wrong answers mended as the scene allows, within the horizon",
+    "aliased": "frames that are alike and have more than one right answer: as it happens / with the step / arm at home",
+    "as it happens ≥": "best map from what is observed at a decision, the hand where it is, to answers, in the "
+    "demonstrated order",
+    "with step ≥": "the same where the step counter is observed too, as far as it tells: where the robot idles before "
+    f"the execution, steps count as alike up to {IDLE_STEPS:,} apart, which a threshold may beat",
+    "any order ≥": "best map from pictures with the arm at home to answers if any order will do that the goal accepts: "
+    "found, and confirmed in the simulator",
+    "any order, prob. ≥": "best probabilities found, wrong answers mended as the scene allows, within the horizon",
+    "search": "of other orders: *whole*, or *cut off* by its budget with so many states left to try",
+    "trained policy": "SR of a trained policy without a memory, its 95 % interval and number of scenes; empty where "
+    "none was evaluated",
+    "at home": "in the demonstrated order with the arm taken home, which no policy observes: even guesses / best map / "
+    "best probabilities / best map if every pixel could be used (differences above 2 of 255)",
     "expert": "the expert's episodes that reached the goal",
-    "memory needed": "; ".join(f"*{word}*: {meaning}" for word, meaning in VERDICTS.items()),
+    "without a memory": "; ".join(f"*{word}*: {meaning}" for word, meaning in VERDICTS.items()),
 }
 """Heading -> what it says under the table."""
 
 
 def cells(result: Result, referent: str) -> list[str]:
     """Return a row of the table, without the task."""
-    in_order, any_order, counts = result["in_order"], result["any_order"], result["aliased"]
-    found = NOT_APPLICABLE
-    if any_order is not None:
-        found = f"{figure(any_order['deterministic'])} ({any_order['confirmed']}/{any_order['of']})"
-        found += "" if any_order["complete"] else " ≥"
-    expert = result["expert"]
+    in_order, counts = result["in_order"], result["aliased"]
+    alike, at_home = NOT_APPLICABLE, NOT_APPLICABLE
+    if counts is not None:
+        alike = " / ".join(f"{counts[key]:.1f}" for key in ("as_it_happens", "with_step", "at_home"))
+    if in_order is not None:
+        keys = ("chance", "deterministic", "stochastic", "pixel_exact")
+        at_home = " / ".join(figure(in_order[key]) for key in keys)
     return [
         referent,
         str(result["variants"]),
         f"{result['decisions']:.1f}",
-        NOT_APPLICABLE if counts is None else f"{counts['at_home']:.1f} / {counts['as_it_happens']:.1f}",
-        *(
-            NOT_APPLICABLE if in_order is None else figure(in_order[key])
-            for key in ("chance", "deterministic", "stochastic", "pixel_exact")
-        ),
-        found,
-        NOT_APPLICABLE if any_order is None else figure(any_order["stochastic"]),
-        f"{expert['success']}/{expert['n']}",
+        alike,
+        *_bounds_of(result),
+        at_home,
+        *_expert(result),
         verdict(result),
     ]
 
@@ -261,7 +301,7 @@ def terminal_table(results: Sequence[Result]) -> Any:
     table = Table(header_style="bold", pad_edge=False)
     table.add_column("task")
     for name in COLUMNS:
-        table.add_column(name, justify="left" if name in ("referent", "memory needed") else "right")
+        table.add_column(name, justify="left" if name in ("referent", "without a memory") else "right")
     before = None
     for memory_type, task, row in rows(results):
         if before not in (None, memory_type):
@@ -276,7 +316,11 @@ def markdown(results: Sequence[Result]) -> str:
     lines = ["| task | " + " | ".join(COLUMNS) + " |"]
     lines.append("|---|" + "---|" * len(COLUMNS))
     lines += [f"| {memory_type}: `{task}` | " + " | ".join(row) + " |" for memory_type, task, row in rows(results)]
-    lines += ["", "Per cent, means over scenes. Columns:", ""]
+    lines += [
+        "",
+        "Per cent, means over scenes; ≥ is a lower bound of what a policy without a memory reaches. Columns:",
+        "",
+    ]
     lines += [f"- **{name}**: {meaning}." for name, meaning in COLUMNS.items()]
     same = max((result["largest_same"] for result in results), default=0.0)
     other = min((result["smallest_different"] for result in results), default=1.0)

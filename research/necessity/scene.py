@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_memobench.protocol import IDLE_STEPS
 from lerobot_memobench.tasks.task import Task
 from research.necessity.demonstrations import (
     Demonstration,
@@ -53,6 +54,7 @@ class Scene:
                 self._owners += [variant.variant_index] * len(demonstration.frames)
                 self._asked += [variant.language] * len(demonstration.frames)
         self._tolerance = tolerance
+        self._idle = IDLE_STEPS if variants[0].idles else 0
         self._differences = pairwise_table([frame.at_home for frame in self._frames], difference)
         self._pictures = classes(self._differences, tolerance)
 
@@ -60,7 +62,9 @@ class Scene:
         """Return what is kept of a scene; ``aliased`` and ``in_order`` are empty where no demonstration succeeded."""
         histories = self._histories(self._pictures)
         as_exact = self._histories(classes(pairwise_table(self._frames, _exactly), PIXEL_EXACT))
-        as_it_happens = self._histories(classes(pairwise_table(self._frames, _as_it_happens), self._tolerance))
+        seen = pairwise_table(self._frames, _as_it_happens)
+        as_it_happens = self._histories(classes(seen, self._tolerance))
+        with_step = self._histories(classes(np.where(self._told_by_the_step(), 1.0, seen), self._tolerance))
         in_order = (
             {
                 "chance": chance(histories),
@@ -68,12 +72,18 @@ class Scene:
                 "stochastic": stochastic_ceiling(histories),
                 "pixel_exact": deterministic_ceiling(as_exact),
                 "as_it_happens": deterministic_ceiling(as_it_happens),
+                "with_step": deterministic_ceiling(with_step),
             }
             if histories
             else {}
         )
         apart = ~np.equal.outer(self._pictures, self._pictures)
-        counts = {"at_home": histories, "pixel_exact": as_exact, "as_it_happens": as_it_happens}
+        counts = {
+            "at_home": histories,
+            "pixel_exact": as_exact,
+            "as_it_happens": as_it_happens,
+            "with_step": with_step,
+        }
         return {
             "seed": seed,
             "solved": len(histories),
@@ -91,6 +101,14 @@ class Scene:
             return None
         i, j = self._pairs[0]
         return np.concatenate([*self._frames[i].at_home, *self._frames[j].at_home], axis=1)
+
+    def _told_by_the_step(self) -> NDArray[np.bool_]:
+        """Return which frames the step counter tells apart, (n, n): those further apart than the robot idles at most.
+
+        Without idling every step does, which is generous: in other scenes the same decision comes at another step.
+        """
+        steps = np.array([frame.step for frame in self._frames])
+        return np.abs(np.subtract.outer(steps, steps)) > self._idle
 
     def _histories(self, pictures: Sequence[int]) -> list[History]:
         """Return a history per demonstration; what is seen under different instructions can be told apart."""

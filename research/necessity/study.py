@@ -88,10 +88,11 @@ class Example(TypedDict):
 
 Nothing = Annotated[dict[str, Any], MaxLen(0)]
 """Where no demonstration succeeded."""
-Aliased = Annotated[dict[Literal["at_home", "pixel_exact", "as_it_happens"], Number], Len(3, 3)]
+Aliased = Annotated[dict[Literal["at_home", "pixel_exact", "as_it_happens", "with_step"], Number], Len(4, 4)]
 """Pictures at which more than one answer is right."""
 InOrder = Annotated[
-    dict[Literal["chance", "deterministic", "stochastic", "pixel_exact", "as_it_happens"], Number], Len(5, 5)
+    dict[Literal["chance", "deterministic", "stochastic", "pixel_exact", "as_it_happens", "with_step"], Number],
+    Len(6, 6),
 ]
 """How far policies without memory come in the demonstrated order."""
 
@@ -127,6 +128,7 @@ class KeptSearch(TypedDict):
     of: Count
     complete: bool
     exhausted: bool
+    unexplored: Count
     policy: list[Rule]
 
 
@@ -136,6 +138,7 @@ class Found(TypedDict):
     deterministic: Number
     confirmed: Count
     of: Count
+    cut_off: Count
 
 
 class KeptResult(TypedDict):
@@ -179,9 +182,9 @@ class Study:
 
     @property
     def searched(self) -> bool:
-        """Whether other ways to the goal are looked for: without need of a memory there is no search."""
+        """Whether other ways to the goal are looked for: where what is observed decides all, there is no search."""
         in_order = _mean_of([scene["in_order"] for scene in self._all("scene") if scene["in_order"]])
-        return in_order is not None and in_order["deterministic"] < 1.0 and self.settings.budget > 0
+        return in_order is not None and in_order["as_it_happens"] < 1.0 and self.settings.budget > 0
 
     def result(self) -> Result:
         """Return what scenes and searches say together."""
@@ -236,7 +239,9 @@ def _over_searches(searches: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return what the searches of a task say together; the policy is the first one's."""
     return {
         **{key: sum(found[key] for found in searches) / len(searches) for key in ("deterministic", "stochastic")},
-        **{key: sum(found[key] for found in searches) for key in ("confirmed", "of")},
+        **{key: sum(found[key] for found in searches) for key in ("confirmed", "of", "unexplored")},
+        "cut_off": sum(not found["exhausted"] for found in searches),
+        "searches": len(searches),
         **{key: all(found[key] for found in searches) for key in ("complete", "exhausted")},
         "policy": searches[0]["policy"],
     }

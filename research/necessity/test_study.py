@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.task import Task
 from research.necessity.__main__ import main
 from research.necessity.demonstrations import Demonstration, Frame, Picture, difference, pairwise_table, unmatched
+from research.necessity.exploration import Laboratory, search
 from research.necessity.report import markdown, rows, verdict, write
 from research.necessity.scene import PIXEL_EXACT
 from research.necessity.settings import Settings, variants_of
@@ -88,6 +90,7 @@ def test_pictures_are_compared_pixel_by_pixel_as_numpy_would(seed: int, shift: i
 
 # --- the study ---
 
+STRICT_STOVE = "turn_the_stove_on_and_off_a_given_number_of_times"
 PAN = "turn_on_the_stove_and_turn_it_off_then_put_the_frying_pan_on_it"
 STACK = "stack_the_bowls_one_by_one_in_the_exact_sequence_shown_in_the_video"
 MILK = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
@@ -128,14 +131,28 @@ def test_a_picture_met_twice_in_an_episode_is_found(monkeypatch: pytest.MonkeyPa
         "stochastic": pytest.approx(0.25),
         "pixel_exact": 1.0,  # a pixel of difference, if it could be used
         "as_it_happens": 1.0,  # the hand is elsewhere
+        "with_step": 1.0,
     }
-    assert result["aliased"] == {"at_home": 1, "pixel_exact": 0, "as_it_happens": 0}
+    assert result["aliased"] == {"at_home": 1, "pixel_exact": 0, "as_it_happens": 0, "with_step": 0}
     assert result["expert"] == {"n": 2, "success": 2}
     assert [result["examples"][0][side]["answer"] for side in "ab"] == ["on", "pan"]
-    assert verdict(result) == "order?", "nothing was searched"
+    assert verdict(result) == "no", "what is observed, the hand among it, decides"
     files = write(tmp_path, [result])
     assert [path.name for path in files] == ["necessity.json", "necessity.md", "aliased_pairs.png"]
-    assert "| 25.0 | 0.0 | 25.0 | 100.0 |" in files[1].read_text()
+    assert "| 25.0 / 0.0 / 25.0 / 100.0 |" in files[1].read_text()
+
+
+@pytest.mark.parametrize(("task", "told"), [(PAN, "clock"), (STRICT_STOVE, "open")])
+def test_a_step_counter_decides_where_the_robot_does_not_idle(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, task: str, told: str
+) -> None:
+    """The same picture with the hand at the same place asks for two answers, at steps 0 and 20."""
+    shown = demonstration(("on", scene(), 0.0), ("off", scene(gone=True), 0.1), ("pan", scene(), 0.0))
+    by_hand(monkeypatch, dict.fromkeys(range(3), shown))
+    result = study(get_task(task), "drawn" if task == STRICT_STOVE else "fixed", Settings(1, budget=0), tmp_path)
+    assert result["in_order"]["as_it_happens"] == 0.0
+    assert result["in_order"]["with_step"] == float(told == "clock")
+    assert verdict(result) == told
 
 
 def test_results_that_name_a_path_lead_to_no_picture(tmp_path: Path) -> None:
@@ -167,7 +184,7 @@ def test_what_the_instruction_says_can_be_told_apart(monkeypatch: pytest.MonkeyP
     on_off = [("on", dark, 0.0), ("off", lit, 0.1)]
     by_hand(monkeypatch, {k: demonstration(*on_off * (k + 1), ("rest", dark, 0.0)) for k in range(3)})
     result = study(task, "drawn", Settings(episodes=1, budget=0), tmp_path)
-    assert result["aliased"] == {"at_home": 3, "pixel_exact": 3, "as_it_happens": 3}
+    assert result["aliased"] == {"at_home": 3, "pixel_exact": 3, "as_it_happens": 3, "with_step": 3}
     assert result["in_order"]["stochastic"] == pytest.approx((1 / 4 + 4 / 27 + 27 / 256) / 3)
     assert result["in_order"]["as_it_happens"] == 0.0
     other = {k: demonstration((f"take {k}", dark, 0.0)) for k in range(3)}
@@ -231,7 +248,7 @@ def test_the_command_shows_a_table_and_names_its_files(
     assert [(r["referent"], r["memory_needed"]) for r in results] == [
         ("fixed", "no"),
         ("fixed", "no"),
-        ("random", "order?"),
+        ("random", "open"),
     ]
 
 
@@ -249,9 +266,10 @@ def test_stove_and_pan_in_the_simulator(gl: None, tmp_path: Path) -> None:
     assert example["difference"] == 0.0, "the stove looks as it did"
     assert result["in_order"]["pixel_exact"] == 1.0, "some pixels tell, if a policy could use them"
     assert example["largest_pixel_difference"] > PIXEL_EXACT
-    found = result["any_order"]
+    assert result["in_order"]["as_it_happens"] == 1.0, "and the hand, where it happens to be, tells as well"
+    assert verdict(result) == "no"
+    found = search(Laboratory([get_task(PAN)], Simulation(get_task(PAN)), 7), Settings(1, budget=3000))
     assert (found["deterministic"], found["confirmed"], found["complete"]) == (1.0, 1, True)
-    assert verdict(result) == "order"
 
 
 @pytest.mark.slow
@@ -261,7 +279,7 @@ def test_two_cartons_in_the_simulator(gl: None, tmp_path: Path) -> None:
     assert result["in_order"]["chance"] == 0.5
     assert result["in_order"]["deterministic"] == 0.5
     assert result["any_order"]["deterministic"] == 0.5
-    assert verdict(result) == "yes"
+    assert verdict(result) == ("cut off" if result["any_order"]["cut_off"] else "not found")
     fixed = study(get_task(MILK), "fixed", Settings(episodes=1, budget=1500), tmp_path)
     assert fixed["in_order"]["deterministic"] == 1.0
     assert verdict(fixed) == "no"
@@ -277,7 +295,7 @@ def test_counting_in_the_simulator(gl: None, tmp_path: Path) -> None:
     found = result["any_order"]
     assert (found["deterministic"], found["complete"]) == (0.0, True)
     assert 1 / 6 < found["stochastic"] < 1 / 4
-    assert verdict(result) == "yes"
+    assert verdict(result) == ("cut off" if found["cut_off"] else "not found")
 
 
 @pytest.mark.slow
@@ -290,4 +308,4 @@ def test_a_hidden_thing_in_the_simulator(gl: None, tmp_path: Path) -> None:
     found = result["any_order"]
     assert (found["confirmed"], found["of"], found["exhausted"]) == (1, 3, True)
     assert found["deterministic"] == found["stochastic"] == pytest.approx(1 / 3)
-    assert verdict(result) == "yes"
+    assert verdict(result) == "not found"
