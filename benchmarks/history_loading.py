@@ -34,7 +34,7 @@ from lerobot_memobench.datasets.feature_cache.layout import FOLDER
 from lerobot_memobench.datasets.feature_cache.reading import FeatureCache
 from lerobot_memobench.policies.memobench_mem.alignment import WordTextEncoder
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import SIZES
-from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import sample_frames
+from lerobot_memobench.policies.memobench_mem.memory.frames import sample_frames
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import GatherMemoryProcessorStep
 
 CAMERA = "observation.images.image"

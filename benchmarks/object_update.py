@@ -21,12 +21,11 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.utils.constants import OBS_ENV_STATE
-from policies import config, remembered, training_batch, updates
+from policies import config, histories, remembered, training_batch, updates
 from turns import medians
 
 from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, MASK, STEPS, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE, frame_row
 from lerobot_memobench.policies.memobench_mem.training import keep_freed_memory
@@ -82,18 +81,17 @@ def object_batch(settings: MemobenchMemConfig, episodes: int, moments: int) -> d
     torch.manual_seed(0)
     rows, frames = episodes * moments, settings.memory_frames
     numbers = remembered(rows, moments, frames, REMEMBERED)
-    mask = numbers >= 0
     count = episodes * REMEMBERED
     stored = frame_row(scene(count), torch.randn(count, 8), torch.ones(count))
     batch = {key: value for key, value in training_batch(settings, rows).items() if "images" not in key}
-    return batch | {
-        OBS_ENV_STATE: scene(rows),
-        OBS_RAW_STATE: torch.randn(rows, 8),
-        TOKENS: stored[numbers.clamp(min=0)] * mask[..., None, None],
-        STEPS: numbers.clamp(min=0) % REMEMBERED * settings.memory_stride,
-        MASK: mask,
-        FRAMES: numbers,
-    }
+    return (
+        batch
+        | {
+            OBS_ENV_STATE: scene(rows),
+            OBS_RAW_STATE: torch.randn(rows, 8),
+        }
+        | histories(numbers, stored, REMEMBERED, settings.memory_stride)
+    )
 
 
 def updater(settings: MemobenchMemConfig, batch: dict[str, torch.Tensor]) -> Callable[[], None]:

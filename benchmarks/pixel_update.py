@@ -3,9 +3,8 @@
     python benchmarks/pixel_update.py [--moments 6] [--episodes 12] [--repeats 5]
 
 The batch has several moments of each episode, which remember many of the same frames. The other side attends by
-LeRobot's eager attention and encodes each moment's memory by itself. Without a memory only the attention differs. An
-update is forward, backward, clipping, AdamW and the weight average, on one thread; seconds are of the CPU. Prints one
-JSON line: ratio (other side / as it is made) and seconds.
+LeRobot's eager attention. An update is forward, backward, clipping, AdamW and the weight average, on one thread;
+seconds are of the CPU. Prints one JSON line: ratio (other side / as it is made) and seconds.
 """
 
 from __future__ import annotations
@@ -18,13 +17,12 @@ from collections.abc import Callable
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import torch
-from policies import config, remembered, training_batch, updates
+from policies import config, histories, remembered, training_batch, updates
 from turns import medians
 
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, WIDTH
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import encoded_key
-from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, MASK, STEPS, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.network import attend_fused
 from lerobot_memobench.policies.memobench_mem.training import keep_freed_memory
@@ -59,26 +57,19 @@ def pixel_batch(settings: MemobenchMemConfig, episodes: int, moments: int) -> di
     torch.manual_seed(0)
     rows, frames = episodes * moments, settings.memory_frames
     numbers = remembered(rows, moments, frames, SLOTS)
-    mask = numbers >= 0
     stored = torch.randn(episodes * SLOTS, POOLED**2, WIDTH).to(torch.bfloat16)
     batch = {key: value for key, value in training_batch(settings, rows).items() if "images" not in key}
     for camera in settings.image_features:
         batch[encoded_key(camera)] = torch.randn(rows, GRID**2, WIDTH).to(torch.bfloat16)
-    return batch | {
-        TOKENS: stored[numbers.clamp(min=0)] * mask[..., None, None],
-        STEPS: numbers.clamp(min=0) % SLOTS * settings.memory_stride,
-        MASK: mask,
-        FRAMES: numbers,
-    }
+    return batch | histories(numbers, stored, SLOTS, settings.memory_stride)
 
 
 def updater(settings: MemobenchMemConfig, batch: dict[str, torch.Tensor], quick: bool) -> Callable[[], None]:
     """Return a function that makes one update."""
     torch.manual_seed(0)
     policy = MemobenchMemPolicy(settings)
-    if not quick:
-        return updates(policy, {key: value for key, value in batch.items() if key != FRAMES})
-    attend_fused(policy)
+    if quick:
+        attend_fused(policy)
     return updates(policy, batch)
 
 

@@ -16,7 +16,8 @@ from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import
     MemobenchMemConfig,
     Vision,
 )
-from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import sample_frames
+from lerobot_memobench.policies.memobench_mem.memory.frames import sample_frames
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, PLACES, STEPS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 
 # A size between tiny and pi05 that a CPU can train, with the full size's proportions: 256 patches per image, a VLM
@@ -93,15 +94,23 @@ def remembered(rows: int, moments: int, frames: int, kept: int) -> torch.Tensor:
     return numbers
 
 
+def histories(numbers: torch.Tensor, stored: torch.Tensor, kept: int, stride: int) -> dict[str, torch.Tensor]:
+    """Return for a batch the frames of ``stored`` by their ``numbers`` (rows, frames), each once; -1 where none."""
+    unique, places = numbers.unique(return_inverse=True)
+    begins = int(unique[0] < 0)
+    there = unique[begins:]
+    return {FRAMES: stored[there], STEPS: there % kept * stride, PLACES: places - begins}
+
+
 def training_batch(settings: MemobenchMemConfig, rows: int) -> dict[str, torch.Tensor]:
     """A preprocessed training batch with full histories."""
     dims, frames = settings.dimensions, settings.memory_frames
     return observation(settings, rows) | {
         "action": torch.rand(rows, settings.chunk_size, 7),
         "phase": torch.ones(rows, dtype=torch.int64),
-        "memory.tokens": torch.randn(rows, frames, 16, dims.vlm.width).to(torch.bfloat16),
-        "memory.steps": torch.arange(frames).expand(rows, -1) * 11,
-        "memory.mask": torch.ones(rows, frames, dtype=torch.bool),
+        FRAMES: torch.randn(rows * frames, 16, dims.vlm.width).to(torch.bfloat16),
+        STEPS: torch.arange(frames).repeat(rows) * 11,
+        PLACES: torch.arange(rows * frames).reshape(rows, frames),
         "memory.text": torch.nn.functional.normalize(torch.randn(rows, dims.text_dim), dim=-1),
         "memory.text_mask": torch.ones(rows, dtype=torch.bool),
     }

@@ -76,6 +76,7 @@ def count_operations(fields: dict[str, Any]) -> int:
     from torch.utils.flop_counter import FlopCounterMode
 
     from lerobot_memobench.policies.memobench_mem.alignment import make_alignment
+    from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, PLACES, STEPS, Histories
     from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 
     settings = config("pi05", device="cpu", **fields)
@@ -90,9 +91,11 @@ def count_operations(fields: dict[str, Any]) -> int:
     with FlopCounterMode(display=False) as counter:
         loss = torch.zeros((), device="meta")
         if settings.memory_fusion != "none":
-            memory, mask = model.set_memory(batch["memory.tokens"], batch["memory.steps"], batch["memory.mask"])
+            assert model.memory is not None
+            read = model.memory.replay(Histories(batch[FRAMES], batch[STEPS], batch[PLACES]))
+            model.set_memory(read)
             if head is not None:
-                loss = loss + head(memory, mask, batch["memory.text"])
+                loss = loss + head(read.rows(), read.mask, batch["memory.text"])
         tokens, tokens_mask = batch["observation.language.tokens"], batch["observation.language.attention_mask"]
         time = torch.zeros(1, device="meta")
         losses = model(images, [seen, seen], tokens, tokens_mask, actions, torch.zeros_like(actions), time)

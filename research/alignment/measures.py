@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from einops import repeat
 from lerobot.policies import make_pre_post_processors
 from torch import Tensor
 from torch.utils.data import default_collate
@@ -24,7 +23,6 @@ from lerobot_memobench.datasets.feature_cache.reading import FrameLookup, Record
 from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, list_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.alignment import SemanticAlignment, masked_mean
-from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, MASK, STEPS, TOKENS, MemoryBatch
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.sampler import TrainingRun, item
 from lerobot_memobench.protocol import PROMPT
@@ -293,11 +291,10 @@ class Measures:
         """Vectors (N, D) of each frame: ``memory``, ``last_frame``, and with a head its ``head`` embedding (N, d_t)."""
         parts: dict[str, list[Tensor]] = {}
         for _, batch in self._batches(policy, before, asked):
-            seen = MemoryBatch(batch[TOKENS], batch[STEPS], batch[MASK]).to(next(policy.parameters()).device)
-            memory, mask = policy.model.set_memory(*seen, numbers=batch[FRAMES].to(seen.mask.device))
-            newest = torch.zeros_like(seen.mask)
-            newest[torch.arange(len(newest)), seen.mask.sum(dim=1) - 1] = True
-            last = repeat(newest, "b f -> b (f p)", p=memory.shape[1] // newest.shape[1])
+            read = policy.read_memory(batch)
+            memory, mask = read.rows(), read.mask
+            assert read.steps is not None
+            last = mask & (read.steps == read.steps.masked_fill(~mask, -1).amax(dim=1, keepdim=True))
             found = {"memory": masked_mean(memory, mask), "last_frame": masked_mean(memory, last)}
             head = policy.alignment
             if isinstance(head, SemanticAlignment):

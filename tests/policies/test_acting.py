@@ -12,8 +12,8 @@ from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from lerobot.rollout.inference.rtc import supports_rtc_inference
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem.memory.mechanism import MASK, STEPS
 from lerobot_memobench.policies.memobench_mem.rollout import Row
+from tests.support.memory import remembered, trained_on
 from tests.support.object_dataset import make_object_dataset
 from tests.support.small_policy import made_for_training
 
@@ -96,11 +96,12 @@ def test_a_new_instruction_drops_planned_actions_and_keeps_the_history(acting: A
     policy, act = acting
     policy.reset()
     act()
-    (row,), history = policy.rollout.rows, policy.rollout.gather([0])
+    (row,) = policy.rollout.rows
+    history = row.memory
     assert row.queue
     policy.drop_queued_actions()
     assert not row.queue
-    assert all(torch.equal(part, kept) for part, kept in zip(policy.rollout.gather([0]), history, strict=True))
+    assert row.memory is history
 
 
 # -- real-time chunking -----------------------------------------------------------------------------------------------
@@ -186,9 +187,7 @@ def test_a_memory_that_is_offered_every_frame_is_that_of_training(root: Path, cl
         if step % 6 == 0:
             plans.append(policy.predict_action_chunk(batch))
     trained = before(torch.utils.data.default_collate([dataset[12]]))
-    _, steps, mask = policy.rollout.gather([0])
-    assert torch.equal(steps, trained[STEPS])
-    assert torch.equal(mask, trained[MASK])
+    assert remembered(policy, [0])[0][1] == trained_on(trained)[0][1]
     policy.reset()
     stepwise = []
     for step in range(13):  # as LeRobot's synchronous rollout

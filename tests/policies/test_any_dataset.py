@@ -25,9 +25,8 @@ from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import FrameSampling
-from lerobot_memobench.policies.memobench_mem.memory.mechanism import Frame, MemoryMechanism
-from lerobot_memobench.policies.memobench_mem.rollout import Rollout
+from lerobot_memobench.policies.memobench_mem.memory.frames import Frames
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemorySpec
 from lerobot_memobench.run.lerobot_commands import call_lerobot
 
 IMAGES, STATE, ACTION = "observation.images.", "observation.state", "action"
@@ -127,7 +126,7 @@ def trained_and_acting(robot: Foreign, size: str, tmp_path: Path) -> Any:
     assert actions.shape == (5, robot.action)
     assert actions.isfinite().all()
     assert policy.config.memory_camera == next(iter(robot.cameras))
-    assert [frame.step for frame in policy.rollout.rows[0].kept] == [
+    assert [frame.step for frame in policy.rollout.rows[0].memory[0]] == [
         step for step in range(5) if step % policy.config.memory_stride == 0
     ]
     return policy
@@ -249,24 +248,21 @@ def test_more_numbers_than_loaded_weights_have_room_for_are_refused() -> None:
 
 
 def test_history_without_reset_is_bounded(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert FrameSampling.capacity == 8192
-    monkeypatch.setattr(FrameSampling, "capacity", 16)
-    mechanism = FrameSampling(4)
-    history = Rollout(mechanism, stride=1)
+    assert Frames.capacity == 8192
+    monkeypatch.setattr(Frames, "capacity", 16)
+    spec = MemorySpec(dim=2, tokens=1, width=2, expert=2, frames=4, grid=0, stride=1)
+    mechanism = Frames(spec, torch.nn.Identity(), Frames.Settings())
+    state = mechanism.init(1)
     with caplog.at_level(logging.WARNING):
         for step in range(50):
-            history.observe([(1, step)], lambda rows, step=step: torch.full((1, 1, 1), step))
-    assert [frame.step for frame in history.rows[0].kept] == list(range(34, 50))
-    assert [frame.step for frame in mechanism.read(history.rows[0].kept)] == [34, 39, 44, 49]
+            state = mechanism.observe(state, torch.full((1, 1, 2), float(step)), torch.tensor([step]))
+            read = mechanism.read(state)
+            assert read.steps is not None
+            assert read.steps[read.mask].tolist() == list(mechanism.slots(step, 4)), "as in training"
+    assert [frame.step for frame in state[0]] == list(range(34, 50))
+    assert read.steps.tolist() == [[34, 39, 44, 49]]
     assert len(caplog.messages) == 1
     assert "more than 16 remembered frames, of which the latest are kept; call policy.reset()" in caplog.text
-
-    def load(slots: Any) -> list[Frame]:
-        return [Frame(slot, torch.full((1, 1), slot)) for slot in slots]
-
-    for slot in (3, 15, 16, 49):  # as in training
-        wanted = MemoryMechanism.recall(mechanism, load, slot)
-        assert [frame.step for frame in mechanism.recall(load, slot)] == [frame.step for frame in wanted]
 
 
 # --- the benchmark between updates ---

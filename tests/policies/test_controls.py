@@ -108,7 +108,7 @@ def test_subgoal_level_chooses_the_text(dataset_root: Path, align: str, level: s
     batch = before(batch_of(dataset, [EPISODE_1 + 12, 3]))
     found = batch["memory.text"][0]
     if align == "framewise":
-        found = found[batch["memory.mask"][0]][-1]  # the frame itself is the last of its history
+        found = found[batch["memory.text_mask"][0]][-1]  # the frame itself is the last of its history
     torch.testing.assert_close(found, WordTextEncoder(64)([text])[0])
     policy.forward(batch)[0].backward()
 
@@ -232,7 +232,7 @@ def test_without_memory_fusion_it_is_plain_pi05(dataset_root: Path, tmp_path: Pa
     for frame in range(3):
         action = evaluated.select_action(before(_observation(dataset, frame, "put the bowl away")))
         assert torch.isfinite(action).all()
-    assert all(not row.kept for row in evaluated.rollout.rows)
+    assert all(row.memory is None for row in evaluated.rollout.rows)
 
 
 @pytest.mark.parametrize(

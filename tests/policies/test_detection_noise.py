@@ -12,7 +12,7 @@ from lerobot_memobench.policies.memobench_mem.detection_noise import (
     MISSED,
     with_detection_noise,
 )
-from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE, ObjectEncoder, ObjectPool
+from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE, ObjectEncoder
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH, field
 from lerobot_memobench.sim.object_slots import classes, in_slots
 
@@ -120,11 +120,9 @@ def test_slots_stay_in_order_and_empty_ones_empty() -> None:
 def test_only_what_learns_sees_errors() -> None:
     perception = ObjectEncoder(classes(), 2, 32, 1.0)
     batch = {"observation.environment_state": TABLE.reshape(1, SIZE), OBS_RAW_STATE: FAR}
-    memory = perception.memory(torch.nn.Identity())
-    pool = memory.pool
-    assert isinstance(pool, ObjectPool)
-    row = perception.remember(batch, [0])[:, 0]
-    assert torch.equal(row[:, :SIZE], TABLE.reshape(1, SIZE)), "what is kept is what was seen"
+    pool = perception.pool()
+    row = perception.remember(batch, [0])
+    assert torch.equal(row[:, 0, :SIZE], TABLE.reshape(1, SIZE)), "what is kept is what was seen"
 
     def alike() -> tuple[bool, bool]:
         (first,), _ = perception.present(batch)

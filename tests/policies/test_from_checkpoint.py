@@ -17,9 +17,12 @@ from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
 from lerobot.scripts.lerobot_train import train
+from safetensors.torch import load_file
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.memobench_mem import checkpoints
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.fusion import plain_name
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import WordTokenizerProcessorStep, gathering
 from tests.support.small_policy import batch_of
@@ -147,12 +150,29 @@ def test_what_saved_steps_cannot_follow_is_refused(go_on: Any, start: Path, tmp_
         go_on(source=relative)
     with pytest.raises(MemobenchError, match=r"tokenizer_name=google/some would have no effect.*words"):
         go_on("tokenizer_name=google/some", source=start)
-    with pytest.raises(MemobenchError, match="do not fit this policy"):
-        go_on("memory_fusion=none")
     config = PreTrainedConfig.from_pretrained(start)
     config.oracle_memory = True  # type: ignore[attr-defined]
     with pytest.raises(MemobenchError, match=r"oracle_memory=True would have no effect"):
         MemobenchMemPolicy.from_pretrained(start, config=config)
+
+
+@pytest.mark.parametrize("changed", ["memory_fusion=none", "memory_fusion=context"])
+def test_another_memory_begins_anew_and_says_so(
+    go_on: Any, start: Path, changed: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+    monkeypatch.setattr(checkpoints.logger, "warning", lambda text, *of: told.append(text % of))
+    _, written = go_on(changed, "optimizer_lr=0", "ema_decay=0")
+    assert "was trained with memory=frames, and this is memory=" in told[0]
+    held, found = (
+        {plain_name(name): tensor for name, tensor in load_file(folder / "model.safetensors").items()}
+        for folder in (start, written)
+    )
+    of_memory = {name for name in found if "memory" in name or ".modulator." in name}
+    assert bool(of_memory) == ("context" in changed)
+    assert all(torch.equal(found[name], held[name]) for name in found.keys() - of_memory)
+    drawn = [found[name] for name in of_memory if name.startswith("model.memory.encoder.")]
+    assert all(weight.isfinite().all() and weight.any() for weight in drawn)
 
 
 def test_another_head_keeps_the_average_of_everything_else(dataset_root: Path, start: Path) -> None:

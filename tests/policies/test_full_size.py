@@ -17,7 +17,8 @@ from torch import Tensor
 
 from benchmarks.random_weights import fill_buffers, random_policy
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.memory.mechanism import Frame
+from lerobot_memobench.policies.memobench_mem.memory.frames import Frame
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import Histories
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 from lerobot_memobench.policies.memobench_mem.rollout import Row
@@ -52,9 +53,9 @@ def _batch(config: MemobenchMemConfig) -> dict[str, Tensor]:
         "action": torch.rand(1, CHUNK, 7),
         "action_is_pad": torch.zeros(1, CHUNK, dtype=torch.bool),
         "phase": torch.ones(1, dtype=torch.int64),
-        "memory.tokens": torch.randn(1, FRAMES, 16, config.dimensions.vlm.width).to(torch.bfloat16),
-        "memory.steps": torch.arange(FRAMES)[None] * 11,
-        "memory.mask": torch.ones(1, FRAMES, dtype=torch.bool),
+        "memory.frames": torch.randn(FRAMES, 16, config.dimensions.vlm.width).to(torch.bfloat16),
+        "memory.steps": torch.arange(FRAMES) * 11,
+        "memory.places": torch.arange(FRAMES)[None],
     }
 
 
@@ -78,8 +79,8 @@ def _lerobots(policy: MemobenchMemPolicy) -> PI05Pytorch:
     return theirs.eval()
 
 
-def _memory(batch: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    return batch["memory.tokens"], batch["memory.steps"], batch["memory.mask"]
+def _memory(batch: dict[str, Tensor]) -> Histories:
+    return Histories(batch["memory.frames"], batch["memory.steps"], batch["memory.places"])
 
 
 @torch.no_grad()
@@ -95,7 +96,8 @@ def _equals_lerobots(policy: MemobenchMemPolicy, batch: dict[str, Tensor]) -> No
         "noise": torch.randn(actions.shape),
         "time": torch.full((1,), 0.3),
     }
-    policy.model.set_memory(*_memory(batch))
+    assert policy.model.memory is not None
+    policy.model.set_memory(policy.model.memory.replay(_memory(batch)))
     ours = policy.model.forward(**inputs)
     assert torch.isfinite(ours).all()
     assert ours.abs().max() > 0
@@ -104,14 +106,14 @@ def _equals_lerobots(policy: MemobenchMemPolicy, batch: dict[str, Tensor]) -> No
 
 def _plan(policy: MemobenchMemPolicy, batch: dict[str, Tensor]) -> Tensor:
     """The actions planned in the middle of an episode of which 32 frames are remembered."""
-    tokens, steps, _ = _memory(batch)
-    kept = [Frame(int(step), seen) for step, seen in zip(steps[0], tokens[0], strict=True)]
+    seen = _memory(batch)
+    kept = [Frame(int(step), stored) for step, stored in zip(seen.steps, seen.frames, strict=True)]
     policy.reset()
-    policy.rollout.rows = [Row(clock=(1, kept[-1].step), position=kept[-1].step, kept=kept)]
+    policy.rollout.rows = [Row(clock=(1, kept[-1].step), position=kept[-1].step, memory=[kept])]
     keys = (CAMERA, "observation.state", OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK)
     observation = {key: batch[key] for key in keys} | {"observation.step": torch.tensor([[kept[-1].step + 1.0]])}
     planned = policy.predict_action_chunk(observation)
-    assert len(policy.rollout.rows[0].kept) == FRAMES + 1
+    assert len(policy.rollout.rows[0].memory[0]) == FRAMES + 1
     return planned
 
 

@@ -23,7 +23,7 @@ from lerobot_memobench.datasets.feature_cache.reading import FeatureCache
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem, processor_memobench_mem
 from lerobot_memobench.policies.memobench_mem.alignment import WordTextEncoder, make_alignment
-from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import sample_frames
+from lerobot_memobench.policies.memobench_mem.memory.frames import sample_frames
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import (
     GatherMemoryProcessorStep,
@@ -32,6 +32,7 @@ from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import (
     make_vocabulary,
     make_word_tokenizer,
 )
+from tests.support.memory import remembered, trained_on
 from tests.support.small_policy import CHUNK, batch_of, made_for_training, small_config
 
 
@@ -65,12 +66,13 @@ def test_batch_gathers_the_history_of_its_frames(dataset_root: Path) -> None:
     policy, before, _, dataset = made_for_training(dataset_root, align="framewise", memory_stride=2)
     batch = before(batch_of(dataset, [0, 39, 40 + 22, 45]))
     steps = [[2 * slot for slot in sample_frames(frame // 2, 8)] for frame in (0, 39, 22, 5)]
-    assert [row[mask].tolist() for row, mask in zip(batch["memory.steps"], batch["memory.mask"], strict=True)] == steps
+    found = trained_on(batch)
+    assert [read for _, read in found] == steps
     assert batch["phase"].tolist() == [1, 1, 1, 0]
     expected = policy.perception(torch.stack([dataset[40 + step]["observation.images.image"] for step in steps[2]]))
-    torch.testing.assert_close(batch["memory.tokens"][2, : len(steps[2])], expected)
+    torch.testing.assert_close(found[2][0], expected)
     assert batch["memory.text"].shape == (4, 8, 64)
-    assert batch["memory.text_mask"].equal(batch["memory.mask"])
+    assert [int(real.sum()) for real in batch["memory.text_mask"]] == [len(read) for read in steps]
     texts = WordTextEncoder(64)(["put the bowl in the drawer"])
     frame_8 = steps[2].index(next(step for step in steps[2] if 8 <= step < 15))
     torch.testing.assert_close(batch["memory.text"][2, frame_8], texts[0])
@@ -171,12 +173,11 @@ def test_rollout_memory_equals_the_gathered_one(trained: Any) -> None:
     policy.reset()
     for frame in range(23):
         policy.observe(before(_join(_observation(dataset, 1, frame), _observation(dataset, 2, frame))))
-    tokens, steps, mask = policy.rollout.gather([0, 1])
     batch = before(batch_of(dataset, [40 + 22, 63 + 22]))
-    assert torch.equal(steps, batch["memory.steps"])
-    assert torch.equal(mask, batch["memory.mask"])
-    # The same tower, in batches of other sizes: equal up to the last bit of bfloat16.
-    torch.testing.assert_close(tokens, batch["memory.tokens"], rtol=1e-2, atol=1e-2)
+    for (frames, steps), (learned, learned_steps) in zip(remembered(policy, [0, 1]), trained_on(batch), strict=True):
+        assert steps == learned_steps
+        # The same tower, in batches of other sizes: equal up to the last bit of bfloat16.
+        torch.testing.assert_close(frames, learned, rtol=1e-2, atol=1e-2)
 
 
 def _rollout(policy: Any, before: Any, frames: list[list[dict[str, Any]]]) -> torch.Tensor:
@@ -402,7 +403,7 @@ def test_resuming_rebuilds_the_pipeline_and_finds_the_cache(trained: Any) -> Non
     assert (step.frames, step.align, step.cache) == (8, "contrastive", None)
     raw = batch_of(dataset, [3, 50])
     first, second = before(copy.deepcopy(raw)), again(copy.deepcopy(raw))
-    for key in ("memory.tokens", "memory.text", "observation.language.tokens", "action"):
+    for key in ("memory.frames", "memory.text", "observation.language.tokens", "action"):
         assert torch.equal(first[key], second[key]), key
 
 
@@ -450,9 +451,9 @@ def test_weights_that_do_not_fit_are_refused(trained: Any, tmp_path: Path) -> No
     folder = trained[4]
     broken = _copy(folder, tmp_path / "a")
     weights = load_file(broken / "model.safetensors")
-    weights.pop("model.memory.project.weight")
+    weights.pop("model.memory.encoder.project.weight")
     save_file(weights, broken / "model.safetensors")
-    with pytest.raises(MemobenchError, match=r"model.memory.project.weight"):
+    with pytest.raises(MemobenchError, match=r"model.memory.encoder.project.weight"):
         MemobenchMemPolicy.from_pretrained(broken)
     (broken / "model.safetensors").unlink()
     with pytest.raises(MemobenchError, match=r"no model.safetensors"):

@@ -1,124 +1,257 @@
-"""Memory mechanisms, the histories of a rollout and the memory encoder."""
+"""Memory mechanisms: what training reads is what a rollout reads; the rows of a rollout; the encoder of frames."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch import Tensor
 
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MEMORY_FUSIONS, MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.memory import MECHANISMS, make_mechanism
-from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import FrameSampling, sample_frames
+from lerobot_memobench.policies.memobench_mem.memory import OURS, find_mechanism, mechanism_names, read_settings
+from lerobot_memobench.policies.memobench_mem.memory.frames import Frame, MemoryEncoder, sample_frames
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
-    MASK,
+    FRAMES,
+    PLACES,
     STEPS,
-    TOKENS,
-    Frame,
-    MemoryEncoder,
+    Histories,
     MemoryMechanism,
+    MemorySpec,
+    MemoryTokens,
+    Query,
 )
 from lerobot_memobench.policies.memobench_mem.network import FUSIONS
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import GatherMemoryProcessorStep
 from lerobot_memobench.policies.memobench_mem.rollout import Rollout
 
-P, D = 3, 2
+P, D, SUBGOALS = 2, 16, ("close it", "open it", "put it there")
 
 
-class Recorded:
-    """An episode whose frames are loaded when asked for; it counts them."""
-
-    def __init__(self, length: int, stride: int) -> None:
-        values = torch.randn(length, P, D, generator=torch.Generator().manual_seed(length)).to(torch.bfloat16)
-        self.frames = [Frame(slot * stride, tokens) for slot, tokens in enumerate(values)]
-        self.loaded = 0
-
-    def load(self, slots: Sequence[int]) -> list[Frame]:
-        self.loaded += len(slots)
-        return [self.frames[slot] for slot in slots]
+def made(name: str, frames: int = 32, stride: int = 8, seed: int = 0, **changed: Any) -> MemoryMechanism:
+    """Build a mechanism behind a small pool, from stored frames (N, 1, 6) to (N, P, D)."""
+    torch.manual_seed(seed)
+    pool = torch.nn.Sequential(torch.nn.Linear(6, P * D), torch.nn.Unflatten(-1, (P, D)), torch.nn.Flatten(1, 2))
+    spec = MemorySpec(dim=D, tokens=P, width=16, expert=16, frames=frames, grid=0, stride=stride, subgoals=SUBGOALS)
+    return find_mechanism(name)(spec, pool, read_settings(name, changed)).eval()
 
 
-def same(one: Sequence[Frame], other: Sequence[Frame]) -> bool:
-    return [frame.step for frame in one] == [frame.step for frame in other] and all(
-        torch.equal(a.tokens, b.tokens) for a, b in zip(one, other, strict=True)
+def asked(rows: int, seed: int = 1) -> Query:
+    """Return the present of some rows, all of it."""
+    chance = torch.Generator().manual_seed(seed)
+    choices = torch.rand(rows, len(SUBGOALS), generator=chance) < 0.7
+    choices[:, 0] = True
+    return Query(
+        tokens=torch.randn(rows, P, D, generator=chance),
+        words=torch.randn(rows, 5, D, generator=chance),
+        real=torch.arange(5) < torch.randint(1, 6, (rows, 1), generator=chance),
+        choices=choices,
     )
 
 
-@pytest.mark.parametrize("name", MECHANISMS)
-@settings(max_examples=60)
-@given(frames=st.integers(1, 40), length=st.integers(1, 90), stride=st.integers(1, 4))
-def test_training_reads_what_a_rollout_reads(name: str, frames: int, length: int, stride: int) -> None:
-    mechanism, episode = make_mechanism(name, frames), Recorded(length, stride)
-    kept: list[Frame] = []
-    for slot, frame in enumerate(episode.frames):
-        mechanism.write(kept, frame)
-        read = mechanism.read(kept)
-        assert same(mechanism.recall(episode.load, slot), read)
-        assert same(MemoryMechanism.recall(mechanism, episode.load, slot), read)
-        assert len(read) <= mechanism.frames <= frames
-        assert [frame.step for frame in read] == sorted(frame.step for frame in read)
-        assert mechanism.capacity is None or len(kept) <= mechanism.capacity
+def rolled_out(mechanism: MemoryMechanism, frames: Tensor, stride: int, query: Query) -> Any:
+    """Return the state of a row after these stored frames (n, 1, 6), one by one."""
+    state = mechanism.init(1)
+    for number, frame in enumerate(frames.split(1)):
+        state = mechanism.observe(state, frame, torch.tensor([number * stride]), query._replace(tokens=None))
+    return state
 
 
-@pytest.mark.parametrize("name", MECHANISMS)
-def test_rows_of_a_rollout_and_the_cache_agree(name: str) -> None:
+def same(one: MemoryTokens, other: MemoryTokens) -> None:
+    """Compare what rows read: the real tokens, and which they are."""
+    assert torch.equal(one.mask, other.mask)
+    torch.testing.assert_close(one.rows()[one.mask], other.rows()[other.mask], rtol=1e-4, atol=1e-5)
+    if one.steps is not None and other.steps is not None:
+        assert torch.equal(one.steps[one.mask], other.steps[other.mask])
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_training_reads_what_a_rollout_reads(name: str) -> None:
+    """Samples of several episodes, early, late, twice the same, in any order; each equals its own rollout's row."""
+    mechanism, stride = made(name), 8
+    lengths, samples = (60, 1, 23), ((0, 59), (2, 4), (0, 0), (1, 0), (0, 31), (2, 22), (2, 4), (0, 58))
+    stored = torch.randn(sum(lengths), 1, 6)
+    first = np.cumsum([0, *lengths])
+    chosen = [first[episode] + np.array(mechanism.slots(slot, 32)) for episode, slot in samples]
+    places = np.full((len(samples), max(map(len, chosen))), -1)
+    for number, read in enumerate(chosen):
+        places[number, : len(read)] = read
+    steps = torch.cat([torch.arange(length) * stride for length in lengths])
+    own = asked(len(lengths))
+    present = asked(len(samples), 2)  # its own of each sample; words and choices are the episode's
+    of_episode = [episode for episode, _ in samples]
+    query = own.rows(of_episode)._replace(tokens=present.tokens)
+    with torch.no_grad():
+        together = mechanism.replay(Histories(stored, steps, torch.from_numpy(places)), query)
+        states = [
+            rolled_out(mechanism, stored[first[episode] : first[episode] + slot + 1], stride, own.rows([episode]))
+            for episode, slot in samples
+        ]
+        apart = [mechanism.read(state, query.rows([row])) for row, state in enumerate(states)]
+        joined = mechanism.read(mechanism.join(states), query)
+    same(together, joined)
+    for row, alone in enumerate(apart):
+        same(joined._replace(each=joined.rows()[[row]], mask=joined.mask[[row]], places=None, steps=None), alone)
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_what_is_kept_has_a_bound(name: str) -> None:
+    mechanism = made(name, stride=1)
+    bound = min(mechanism.capacity, 300)
+    type(mechanism).capacity, kept = bound, type(mechanism).capacity  # none is filled up to thousands here
+    try:
+        state, sizes = mechanism.init(1), []
+        with torch.no_grad():
+            for step in range(3 * bound + 40):
+                state = mechanism.observe(state, torch.randn(1, 1, 6), torch.tensor([step]), asked(1))
+                sizes.append(held(state))
+            read = mechanism.read(state, asked(1))
+    finally:
+        type(mechanism).capacity = kept
+    assert sizes[-1] == max(sizes) == sizes[bound + 20]
+    assert read.mask.shape == (1, read.rows().shape[1])
+
+
+def held(state: Any) -> int:
+    """Return how many numbers a state holds."""
+    if isinstance(state, Tensor):
+        return state.numel()
+    if isinstance(state, Frame):
+        return state.stored.numel()
+    return sum(map(held, state.values() if isinstance(state, dict) else state))
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_a_state_is_not_changed_by_what_follows(name: str) -> None:
+    mechanism = made(name)
+    with torch.no_grad():
+        state = rolled_out(mechanism, torch.randn(20, 1, 6), 8, asked(1))
+        before = mechanism.read(state, asked(1)).rows()
+        mechanism.observe(state, torch.randn(1, 1, 6), torch.tensor([160]), asked(1))
+        assert torch.equal(mechanism.read(state, asked(1)).rows(), before)
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_gradients_reach_every_weight(name: str) -> None:
+    mechanism = made(name).train()
+    stored, places = torch.randn(40, 1, 6), torch.full((2, 40), -1)
+    for row, slot in zip(places, (2, 39), strict=True):
+        read = torch.tensor(list(mechanism.slots(slot, 32)))
+        row[: len(read)] = read
+    labels = torch.randint(0, len(SUBGOALS), (40,))
+    query = asked(2)._replace(choices=torch.ones(2, len(SUBGOALS), dtype=torch.bool), subgoal=labels[:2])
+    read_tokens = mechanism.replay(Histories(stored, torch.arange(40) * 8, places, labels), query)
+    own = mechanism.losses({})
+    loss = (read_tokens.rows() * torch.randn_like(read_tokens.rows())).sum() + sum(one.sum() for one in own.values())
+    loss.backward()
+    missed = [key for key, weight in mechanism.named_parameters() if weight.grad is None or not weight.grad.any()]
+    assert not missed
+
+
+def test_rows_of_a_rollout_and_the_cache_agree() -> None:
     """The whole way: what a row of a vector environment holds is what the preprocessor looks up for that frame."""
     stride, length = 2, 31
-    episode, mechanism = Recorded(-(-length // stride), stride), make_mechanism(name, 5)
+    stored = torch.randn(-(-length // stride), 1, 6)
 
     class Cache:
         """One episode, as `FeatureCache` has it."""
 
         meta = type("Meta", (), {"stride": stride})
-        episodes, phase, texts = torch.tensor([0, length]).numpy(), torch.ones(length).numpy(), ()
+        episodes, phase, texts = np.array([0, length]), np.ones(length), ()
 
         def locate(self, index: int) -> tuple[int, int]:
             return 0, index
 
-        def tokens(self, number: int, slots: Sequence[int]) -> torch.Tensor:
-            return torch.stack([frame.tokens for frame in episode.load(slots)])
+        def tokens(self, number: int, slots: list[int]) -> Tensor:
+            assert len(slots) <= 5, "no more is loaded than is read"
+            return stored[slots]
 
-    history = Rollout(mechanism, stride)
-    step = GatherMemoryProcessorStep(frames=mechanism.frames, memory=name)
+    mechanism, history, step = made("frames", 5, stride), Rollout(True, stride), GatherMemoryProcessorStep(frames=5)
     for now in range(length):
-        history.observe([(1, now)], lambda rows, now=now: episode.frames[now // stride].tokens[None])
+        history.observe([(1, now)], writing(mechanism, history, stored[None, now // stride]))
         gathered = step.gather(Cache(), [now])  # type: ignore[arg-type]
-        if mechanism.frames == 0:
-            assert not history.rows[0].kept
-            assert set(gathered) == {"phase"}
-            continue
-        for held, looked_up in zip(history.gather([0]), (gathered[key] for key in (TOKENS, STEPS, MASK)), strict=True):
-            assert torch.equal(held, looked_up)
+        looked_up = mechanism.replay(Histories(*(gathered[key] for key in (FRAMES, STEPS, PLACES))))
+        same(looked_up, mechanism.read(history.rows[0].memory))
+    assert set(GatherMemoryProcessorStep(frames=0).gather(Cache(), [3])) == {"phase"}  # type: ignore[arg-type]
 
 
-def test_frame_sampling_loads_no_more_than_it_reads() -> None:
-    episode = Recorded(90, 1)
-    make_mechanism("frame_sampling", 8).recall(episode.load, 80)
-    assert episode.loaded == 8
+def writing(mechanism: MemoryMechanism, rollout: Rollout, frames: Tensor) -> Callable[[list[int]], None]:
+    """Return what writes the present frames (rows, ...) to a rollout's rows."""
+
+    def write(rows: list[int]) -> None:
+        for row in rows:
+            held = rollout.rows[row]
+            state = mechanism.init(1) if held.memory is None else held.memory
+            held.memory = mechanism.observe(state, frames[[row]], torch.tensor([held.position]))
+
+    return write
 
 
 def test_what_the_configuration_names_is_there() -> None:
-    assert {MemobenchMemConfig(device="cpu", memory_fusion=name).memory for name in MEMORY_FUSIONS} <= set(MECHANISMS)
-    assert {*FUSIONS, "none"} == set(MEMORY_FUSIONS)
+    assert {*FUSIONS, "own", "none"} == set(MEMORY_FUSIONS)
+    for name in OURS:
+        config = MemobenchMemConfig(device="cpu", memory=name)
+        assert (config.memory_fusion == "own") == (find_mechanism(name).fusion is not None)
+        assert config.memory_settings == vars(read_settings(name, {}))
+    assert MemobenchMemConfig(device="cpu").memory == "frames"
+    assert MemobenchMemConfig(device="cpu", memory_fusion="none").memory == "none"
+    assert MemobenchMemConfig(device="cpu", memory="none").memory_fusion == "none"
 
 
-@pytest.mark.parametrize("name", MECHANISMS)
-def test_an_encoder_that_looks_at_each_frame_alone_does(name: str) -> None:
-    encoder = make_mechanism(name, 4).encoder(D, 6, grid=0)
-    if not getattr(encoder, "framewise", False):
-        return
-    tokens, steps = torch.randn(2, 4, P, D), torch.randint(0, 90, (2, 4))
-    mask = torch.tensor([[True, True, True, True], [True, True, False, False]])
-    together, real = encoder(tokens, steps, mask)
-    alone, real_alone = encoder(tokens.flatten(0, 1)[:, None], steps.flatten()[:, None], mask.flatten()[:, None])
-    assert torch.equal(real, real_alone.reshape(real.shape))
-    torch.testing.assert_close(together, alone.reshape(together.shape))
+@pytest.mark.parametrize(
+    ("asked_for", "told"),
+    [
+        ({"memory": "bnak"}, "no memory 'bnak'"),
+        ({"memory_fusion": "own"}, "cannot be read"),
+        ({"memory_settings": {"time_code": False}}, "'time_code', which is no setting of memory=frames"),
+        ({"memory_settings": {"time_codes": "perhaps"}}, "cannot be read"),
+        ({"memory_settings": {"time_codes": False, "content": False}}, "says nothing"),
+    ],
+)
+def test_a_memory_that_cannot_be_is_refused_in_a_sentence(asked_for: dict[str, Any], told: str) -> None:
+    with pytest.raises(MemobenchError, match=told):
+        MemobenchMemConfig(device="cpu", **asked_for)
 
 
-# -- frame sampling ---------------------------------------------------------------------------------------------------
+def test_a_package_brings_a_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    from importlib.metadata import EntryPoint
+
+    from lerobot_memobench.policies.memobench_mem import memory
+
+    brought = [
+        EntryPoint("theirs", "lerobot_memobench.policies.memobench_mem.memory.frames:Frames", memory.GROUP),
+        EntryPoint("gone", "no_such_package:Memory", memory.GROUP),
+        EntryPoint("other", "pathlib:Path", memory.GROUP),
+    ]
+    monkeypatch.setattr(memory, "entry_points", lambda group: brought if group == memory.GROUP else [])
+    assert {"theirs", "gone", "other"} <= set(mechanism_names())
+    assert MemobenchMemConfig(device="cpu", memory="theirs").memory_settings == {"time_codes": True, "content": True}
+    for name, told in (("gone", "cannot be imported"), ("other", "no subclass of MemoryMechanism")):
+        with pytest.raises(MemobenchError, match=told):
+            find_mechanism(name)
+
+
+# -- frames -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("off", "matters"), [({}, "both"), ({"time_codes": False}, "content"), ({"content": False}, "time")]
+)
+def test_frames_tell_what_they_are_set_to(off: dict[str, bool], matters: str) -> None:
+    mechanism, query = made("frames", 4, **off), asked(1)
+    with torch.no_grad():
+        stored = torch.randn(3, 1, 6)
+        read = [
+            mechanism.read(rolled_out(mechanism, frames, stride, query)).rows()
+            for frames, stride in ((stored, 8), (stored + 1, 8), (stored, 9))
+        ]
+    assert torch.equal(read[0], read[1]) == (matters == "time")
+    assert torch.equal(read[0], read[2]) == (matters == "content")
 
 
 @settings(max_examples=200, deadline=None)
@@ -146,8 +279,19 @@ def test_all_frames_are_kept_while_they_fit() -> None:
 # -- rows of a rollout ------------------------------------------------------------------------------------------------
 
 
-def _encode(values: list[float]):  # type: ignore[no-untyped-def]
-    return lambda rows: torch.stack([torch.full((16, 2), values[row]) for row in rows])
+class Rows(Rollout):
+    """A rollout whose frames are one number each, kept with their steps."""
+
+    def __init__(self, stride: int) -> None:
+        super().__init__(True, stride)
+
+    def see(self, clocks: list[tuple[int, int]], values: list[float]) -> tuple[list[int], list[bool], list[bool]]:
+        def write(rows: list[int]) -> None:
+            for row in rows:
+                held = self.rows[row]
+                held.memory = [*(held.memory or []), (held.position, values[row])]
+
+        return self.observe(clocks, write)
 
 
 def acting(*steps: int) -> list[tuple[int, int]]:
@@ -156,60 +300,51 @@ def acting(*steps: int) -> list[tuple[int, int]]:
 
 
 def test_rows_start_freeze_and_stay_apart() -> None:
-    memory, new, old = Rollout(FrameSampling(4), stride=1), True, False
-    assert memory.observe(acting(0, 0), _encode([1.0, 2.0])) == ([0, 0], [new, new], [False, False])
-    assert memory.observe(acting(1, 0), _encode([3.0, 99.0])) == ([1, 0], [old, old], [False, True])  # row 1 frozen
-    assert memory.observe(acting(2, 1), _encode([5.0, 4.0])) == ([2, 1], [old, old], [False, False])
-    assert memory.observe(acting(0, 2), _encode([7.0, 6.0])) == ([0, 2], [new, old], [False, False])  # row 0 begins
-    tokens, steps, mask = memory.gather([0, 1])
-    assert steps.tolist() == [[0, 0, 0, 0], [0, 1, 2, 0]]
-    assert mask.tolist() == [[True, False, False, False], [True, True, True, False]]
-    assert tokens[0, 0, 0, 0] == 7
-    assert [float(t[0, 0]) for t in tokens[1]] == [2, 4, 6, 0]
-    alone, _, _ = memory.gather([1])
-    assert torch.equal(alone[0], tokens[1])
+    memory, new, old = Rows(1), True, False
+    assert memory.see(acting(0, 0), [1.0, 2.0]) == ([0, 0], [new, new], [False, False])
+    assert memory.see(acting(1, 0), [3.0, 99.0]) == ([1, 0], [old, old], [False, True])  # row 1 frozen
+    assert memory.see(acting(2, 1), [5.0, 4.0]) == ([2, 1], [old, old], [False, False])
+    assert memory.see(acting(0, 2), [7.0, 6.0]) == ([0, 2], [new, old], [False, False])  # row 0 begins
+    assert [row.memory for row in memory.rows] == [[(0, 7.0)], [(0, 2.0), (1, 4.0), (2, 6.0)]]
 
 
-def test_stride_and_sampling_of_a_long_history() -> None:
-    memory = Rollout(FrameSampling(4), stride=3)
+def test_frames_are_written_every_so_many_steps() -> None:
+    memory = Rows(3)
     for step in range(20):
-        memory.observe(acting(step), _encode([float(step)]))
-    tokens, steps, mask = memory.gather([0])
-    assert steps.tolist() == [[0, 6, 12, 18]]
-    assert mask.all()
-    assert [float(t[0, 0]) for t in tokens[0]] == [0, 6, 12, 18]
+        memory.see(acting(step), [float(step)])
+    assert memory.rows[0].memory == [(step, float(step)) for step in (0, 3, 6, 9, 12, 15, 18)]
     memory.reset()
     assert memory.rows == []
 
 
 def test_a_frame_that_was_not_offered_is_noticed() -> None:
-    memory = Rollout(FrameSampling(4), stride=4)
+    memory = Rows(4)
     for step in (0, 3, 4, 4, 6, 8):  # what lies between two frames that are written may be left out
-        memory.observe(acting(step, 1), _encode([1.0, 1.0]))
+        memory.see(acting(step, 1), [1.0, 1.0])
     assert memory.missed([0, 1]) is None
-    memory.observe(acting(13, 6), _encode([1.0, 1.0]))
+    memory.see(acting(13, 6), [1.0, 1.0])
     assert (memory.missed([0]), memory.missed([1]), memory.missed([0, 1])) == (12, 4, 4)
-    memory.observe(acting(14, 0), _encode([1.0, 1.0]))
+    memory.see(acting(14, 0), [1.0, 1.0])
     assert (memory.missed([0]), memory.missed([1])) == (12, None), "a new episode has missed nothing"
 
 
 def test_the_clock_starts_again_with_the_execution() -> None:
     """The prompt's frames stay in the history, whose own time goes on; a clock that counts through tells the same."""
     for first in (0, 3):
-        memory = Rollout(FrameSampling(9), stride=1)
+        memory = Rows(1)
         clocks = [(0, 0), (0, 1), (0, 2), (1, first), (1, first + 1), (1, first + 1), (1, first + 3)]
-        found = [memory.observe([clock], _encode([1.0])) for clock in clocks]
+        found = [memory.see([clock], [1.0]) for clock in clocks]
         assert [steps for steps, _, _ in found] == [[0], [1], [2], [3], [4], [4], [6]]
         assert [started for _, started, _ in found] == [[True], *[[False]] * 6]
         assert [frozen for _, _, frozen in found] == [[False]] * 5 + [[True], [False]]
-        assert memory.observe([(0, 0)], _encode([1.0])) == ([0], [True], [False])
-        assert len(memory.rows[0].kept) == 1
+        assert memory.see([(0, 0)], [1.0]) == ([0], [True], [False])
+        assert memory.rows[0].memory == [(0, 1.0)]
 
 
 def test_an_execution_without_a_prompt_begins_again_at_step_0() -> None:
-    memory = Rollout(FrameSampling(4), stride=1)
+    memory = Rows(1)
     for clock, began in (((1, 0), True), ((1, 1), False), ((1, 0), True), ((1, 0), False)):
-        assert memory.observe([clock], _encode([1.0]))[1] == [began]
+        assert memory.see([clock], [1.0])[1] == [began]
 
 
 # -- memory encoder ---------------------------------------------------------------------------------------------------
@@ -224,14 +359,6 @@ def position_features(steps: torch.Tensor) -> torch.Tensor:
     return torch.cat([wave for angle in angles for wave in (angle.sin(), angle.cos())], dim=-1).float()
 
 
-def test_encoder_shapes_and_mask() -> None:
-    encoder = MemoryEncoder(image_dim=6, memory_dim=10)
-    mask = torch.tensor([[True, True, False]])
-    memory, token_mask = encoder(torch.randn(1, 3, 16, 6), torch.tensor([[0, 1, 0]]), mask)
-    assert memory.shape == (1, 48, 10)
-    assert token_mask.tolist() == [[True] * 32 + [False] * 16]
-
-
 @pytest.mark.parametrize(
     "steps", [[[9, 4, 700], [4, 9, 1199]], [[9], [4], [700], [4], [9]]], ids=["rows", "one by one"]
 )
@@ -239,9 +366,9 @@ def test_encoder_equals_its_formula_token_by_token(steps: list[list[int]]) -> No
     """concat(image, SiLU(Linear(position))) -> Linear, although the code never builds the concatenations."""
     encoder, seen = MemoryEncoder(image_dim=6, memory_dim=10), torch.tensor(steps)
     tokens = torch.randn(*seen.shape, 16, 6)
-    memory, _ = encoder(tokens, seen, torch.ones_like(seen, dtype=torch.bool))
+    memory = encoder(tokens, seen)
     position = torch.nn.functional.silu(encoder.position(position_features(seen)))
-    expected = encoder.project(torch.cat([tokens, position], dim=-1)).flatten(1, 2)
+    expected = encoder.project(torch.cat([tokens, position], dim=-1))
     torch.testing.assert_close(memory, expected, rtol=1e-5, atol=1e-5)
     weights = [*encoder.parameters()]
     for made, by_formula in zip(

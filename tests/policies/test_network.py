@@ -18,6 +18,7 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryToke
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, SizedPaliGemmaWithExpert
 from lerobot_memobench.policies.memobench_mem.objects import HAND_DIM
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS
+from tests.support.memory import histories
 
 CHUNK, BATCH, FRAMES = 6, 2, 5
 
@@ -60,6 +61,14 @@ def _losses(model: PI05Pytorch, inputs: dict) -> torch.Tensor:
     return model.forward(**inputs)
 
 
+def _hand_over(model: MemoryPI05, frames: torch.Tensor, steps: torch.Tensor, mask: torch.Tensor) -> MemoryTokens:
+    """Let the next passes read these frames (B, F, 16, D)."""
+    assert model.memory is not None
+    memory = model.memory.replay(histories(frames, steps, mask))
+    model.set_memory(memory)
+    return memory
+
+
 def _actions(model: PI05Pytorch, inputs: dict) -> torch.Tensor:
     keys = ("images", "img_masks", "tokens", "masks", "noise")
     return model.sample_actions(**{key: inputs[key] for key in keys})
@@ -93,7 +102,7 @@ def test_without_modulation_the_policy_is_pi05_output_for_output() -> None:
     assert type(plain).forward is PI05Pytorch.forward
     assert type(ours).sample_actions is PI05Pytorch.sample_actions
     inputs = _inputs(ours.config)
-    ours.set_memory(*_memory(ours.config))
+    _hand_over(ours, *_memory(ours.config))
     assert torch.equal(_losses(plain, inputs), _losses(ours, inputs))
     assert torch.equal(_actions(plain, inputs), _actions(ours, inputs))
 
@@ -106,15 +115,15 @@ def test_modulation_reaches_both_paths() -> None:
                 parameter.normal_(std=0.2)
     inputs = _inputs(ours.config)
     tokens, steps, mask = _memory(ours.config)
-    ours.set_memory(tokens, steps, mask)
+    _hand_over(ours, tokens, steps, mask)
     losses, actions = _losses(ours, inputs), _actions(ours, inputs)
     assert not torch.allclose(losses, _losses(plain, inputs))
     assert not torch.allclose(actions, _actions(plain, inputs))
     # Padding says nothing, real tokens and their times do.
     changed = torch.where(mask[:, :, None, None], tokens, torch.full_like(tokens, 50.0))
-    ours.set_memory(changed, steps, mask)
+    _hand_over(ours, changed, steps, mask)
     torch.testing.assert_close(_actions(ours, inputs), actions)
-    ours.set_memory(tokens, steps + 40, mask)
+    _hand_over(ours, tokens, steps + 40, mask)
     assert not torch.allclose(_actions(ours, inputs), actions)
 
 
@@ -124,7 +133,7 @@ def test_all_masked_memory_is_finite(memory_fusion: str) -> None:
     ours.train()
     inputs = _inputs(ours.config)
     tokens, steps, mask = _memory(ours.config)
-    ours.set_memory(tokens, steps, torch.zeros_like(mask))
+    _hand_over(ours, tokens, steps, torch.zeros_like(mask))
     loss = _losses(ours, inputs).mean()
     loss.backward()
     assert torch.isfinite(loss)
@@ -136,11 +145,11 @@ def test_context_memory_joins_the_prefix_and_padding_says_nothing() -> None:
     _, ours = _pair("context")
     inputs = _inputs(ours.config)
     tokens, steps, mask = _memory(ours.config)
-    ours.set_memory(tokens, steps, mask)
+    _hand_over(ours, tokens, steps, mask)
     actions = _actions(ours, inputs)
-    ours.set_memory(torch.where(mask[:, :, None, None], tokens, torch.full_like(tokens, 50.0)), steps, mask)
+    _hand_over(ours, torch.where(mask[:, :, None, None], tokens, torch.full_like(tokens, 50.0)), steps, mask)
     torch.testing.assert_close(_actions(ours, inputs), actions)
-    ours.set_memory(-tokens, steps, mask)
+    _hand_over(ours, -tokens, steps, mask)
     assert not torch.allclose(_actions(ours, inputs), actions)
 
 
@@ -170,7 +179,7 @@ def test_gradients_reach_memory_expert_and_vlm_but_not_the_tower() -> None:
             if ".modulation." in name:
                 parameter.normal_(std=0.2)
     ours.train()
-    ours.set_memory(*_memory(ours.config))
+    _hand_over(ours, *_memory(ours.config))
     _losses(ours, _inputs(ours.config)).mean().backward()
     with_gradient = {name for name, p in ours.named_parameters() if p.grad is not None and p.grad.abs().sum() > 0}
     trained = {name for name, p in ours.named_parameters() if p.requires_grad}
@@ -191,7 +200,7 @@ def test_gradient_checkpointing_gives_the_same_gradients() -> None:
 
     def gradients() -> list[torch.Tensor]:
         ours.zero_grad()
-        ours.set_memory(*_memory(ours.config))
+        _hand_over(ours, *_memory(ours.config))
         _losses(ours, _inputs(ours.config)).mean().backward()
         return [p.grad.clone() for p in ours.memory_parameters().values()]
 
@@ -224,9 +233,9 @@ def test_full_size_runs_in_shape(memory_fusion: str) -> None:
     config = _config(size="pi05", memory_fusion=memory_fusion)
     with torch.device("meta"):
         ours = MemoryPI05(config)
-    memory, mask = ours.set_memory(*_memory(config, "meta"))
-    assert memory.shape == (BATCH, FRAMES * 16, 2048)
-    assert mask.shape == (BATCH, FRAMES * 16)
+    memory = _hand_over(ours, *_memory(config, "meta"))
+    assert memory.rows().shape == (BATCH, FRAMES * 16, 2048)
+    assert memory.mask.shape == (BATCH, FRAMES * 16)
     assert _losses(ours, _inputs(config, "meta")).shape == (BATCH, CHUNK, 32)
 
 

@@ -21,13 +21,13 @@ from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
 from lerobot_memobench.datasets.lerobot_format.reading import list_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.memory.frames import Frames
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     FRAMES,
-    MASK,
+    PLACES,
     STEPS,
-    TOKENS,
-    MemoryEncoder,
-    PooledMemoryEncoder,
+    Histories,
+    MemorySpec,
 )
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.objects import (
@@ -282,7 +282,7 @@ def test_batches_hold_frames_of_few_episodes_and_no_prompt(root: Path) -> None:
     assert set(drawn) <= execution
     batch = before(next(iter(loader)))
     assert len(batch["episode_index"].unique()) <= 3
-    assert len(batch[FRAMES].unique()) < batch[MASK].sum(), "frames of an episode share their memory"
+    assert len(batch[FRAMES]) < (batch[PLACES] >= 0).sum(), "frames of an episode share their memory"
 
 
 def test_of_some_episodes_no_other_frame_is_drawn(root: Path) -> None:
@@ -299,7 +299,7 @@ def test_of_some_episodes_no_other_frame_is_drawn(root: Path) -> None:
     drawn = [int(dataset[row]["index"]) for _ in range(20) for row in sampler]
     assert set(drawn) == {int(STARTS[k]) + frame for k in (1, 2) for frame in range(PROMPTS[k], LENGTHS[k])}
     assert np.mean([frame < STARTS[2] for frame in drawn]) == pytest.approx(1 / 2, abs=0.06)
-    assert before(batch_of(dataset, list(range(4))))[MASK].any()
+    assert before(batch_of(dataset, list(range(4))))[FRAMES].any()
 
 
 def test_the_sampler_draws_prompted_tasks_more_often(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -392,7 +392,7 @@ def test_no_memory_is_nothing_in_training_and_in_a_rollout(root: Path) -> None:
     policy, before, _, dataset = made_for_training(root, **OBJECTS | {"memory_fusion": "none"})
     assert not [name for name, _ in policy.named_parameters() if "memory" in name or "modulat" in name]
     batch = before(batch_of(dataset, [30]))
-    assert TOKENS not in batch
+    assert FRAMES not in batch
     noise = torch.randn(1, policy.config.chunk_size, 32, generator=torch.Generator().manual_seed(0))
     plans = []
     for history in ([], [0, 1, 2, 3], [41, 42, 43]):
@@ -406,24 +406,25 @@ def test_no_memory_is_nothing_in_training_and_in_a_rollout(root: Path) -> None:
 
 
 def test_memory_that_is_masked_is_nothing(root: Path) -> None:
-    """What lies in the padding of a memory changes no loss; a real frame does."""
+    """A frame that a sample does not remember changes no loss; a real one does."""
     policy, before, _, dataset = made_for_training(root, **OBJECTS)
     with torch.no_grad():
         for name, parameter in policy.named_parameters():
             if ".modulation." in name:
                 parameter.normal_(std=0.2)
     batch = before(batch_of(dataset, [int(STARTS[2]) + 3]))
-    assert batch[MASK].sum() == 4 < batch[MASK].shape[1]
+    assert batch[PLACES].tolist() == [[0, 1, 2, 3]]
 
-    def loss(tokens: torch.Tensor) -> float:
+    def loss(frames: torch.Tensor) -> float:
         torch.manual_seed(3)
-        return float(policy.forward(batch | {TOKENS: tokens, FRAMES: batch[STEPS] + 1000 * ~batch[MASK]})[0])
+        steps = torch.arange(len(frames))
+        return float(policy.forward(batch | {FRAMES: frames, STEPS: steps})[0])
 
-    changed = batch[TOKENS].clone()
-    changed[:, 4:] = torch.randn_like(changed[:, 4:]) * 0.1
-    assert loss(changed) == pytest.approx(loss(batch[TOKENS]), abs=1e-6)
-    changed[:, 1] = changed[:, 1] * 0.9
-    assert loss(changed) != pytest.approx(loss(batch[TOKENS]), abs=1e-6)
+    frames = batch[FRAMES]
+    assert loss(torch.cat([frames, frames * 0.1])) == pytest.approx(loss(frames), abs=1e-6)
+    changed = frames.clone()
+    changed[1] = changed[1] * 0.9
+    assert loss(changed) != pytest.approx(loss(frames), abs=1e-6)
 
 
 def test_a_hand_that_stands_still_carries_out_a_whole_plan(root: Path) -> None:
@@ -485,7 +486,7 @@ def test_training_goes_on_from_a_checkpoint_with_other_settings(saved: tuple[Any
     again = make_policy(config, ds_meta=LeRobotDataset("memobench/objects", root=root).meta)
     pre, _ = make_pre_post_processors(config, pretrained_path=str(folder))
     batch = pre(batch_of(dataset, [10, 60]))
-    assert batch[TOKENS].shape[1] == 5
+    assert batch[PLACES].shape[1] == 5
     assert batch["memory.text"].shape[:2] == (2, 5)
     again.train().forward(batch)[0].backward()
     trained = policy.average.average["model.memory.pool.slot.mlp.0.weight"]
@@ -507,10 +508,10 @@ def test_another_perceptions_weights_are_refused(saved: tuple[Any, Any, Any, Pat
 # -- slots ------------------------------------------------------------------------------------------------------------
 
 KINDS = len(classes())
-PLACES = np.array([[0.0, 0.1, 0.9], [0.1, -0.1, 0.95], [-0.1, 0.0, 1.0]])
+WHERE = np.array([[0.0, 0.1, 0.9], [0.1, -0.1, 0.95], [-0.1, 0.0, 1.0]])
 
 
-def seen(places: np.ndarray = PLACES, lit: int | None = None, seed: int = 0) -> torch.Tensor:
+def seen(places: np.ndarray = WHERE, lit: int | None = None, seed: int = 0) -> torch.Tensor:
     return torch.from_numpy(slots_at(np.random.default_rng(seed), places, lit))
 
 
@@ -546,16 +547,15 @@ def test_what_is_told_from_the_hand_moves_and_turns_with_it() -> None:
 def test_a_millimetre_beside_the_hand_is_seen() -> None:
     """Through the whole of memory, where bfloat16 would hold places to 4 mm."""
     perception = ObjectEncoder(classes(), 2, 32)
-    memory = perception.memory(torch.nn.Identity())
-    assert isinstance(memory, PooledMemoryEncoder)
-    moved = PLACES + np.array([0.001, 0, 0])
+    pool = perception.pool()
+    moved = WHERE + np.array([0.001, 0, 0])
     rows = [
         perception.remember({"observation.environment_state": one[None], OBS_RAW_STATE: hand()[None]}, [0])
         for one in (seen(), seen(moved))
     ]
     assert rows[0].dtype == torch.float32
     assert (rows[0] - rows[1]).abs().max() > 0.0009
-    assert not torch.equal(memory.pool(rows[0][:, 0]), memory.pool(rows[1][:, 0]))
+    assert not torch.equal(pool(rows[0]), pool(rows[1]))
 
 
 def test_an_empty_slot_is_no_token_whatever_it_holds() -> None:
@@ -589,6 +589,10 @@ def test_frames_are_pooled_whatever_the_order_of_their_things() -> None:
     assert (pooled[0] - prompt[0]).abs().max() > 1e-4, "so is the phase"
 
 
+def frames_memory(pool: ObjectPool, width: int, frames: int) -> Frames:
+    return Frames(MemorySpec(width, 2, width, width, frames, 0, 8), pool, Frames.Settings())
+
+
 def test_a_frame_that_many_read_is_encoded_once() -> None:
     class Counting(ObjectPool):
         count = 0
@@ -597,43 +601,19 @@ def test_a_frame_that_many_read_is_encoded_once() -> None:
             Counting.count += len(frames)
             return super().forward(frames)
 
-    class Pass(torch.nn.Module):
-        def forward(self, tokens: torch.Tensor, steps: torch.Tensor, mask: torch.Tensor) -> tuple[torch.Tensor, ...]:
-            return tokens, mask
-
-    memory = PooledMemoryEncoder(Counting(range(KINDS), KINDS + 1, 2, 16), Pass())
+    memory = frames_memory(Counting(range(KINDS), KINDS + 1, 2, 16), 16, 4)
     stored = torch.cat([frame_row(seen(seed=n)[None], hand()[None], torch.ones(1)) for n in range(5)])
-    numbers = torch.tensor([[0, 1, 2, 3], [0, 2, 4, -1]])
-    frames = stored[numbers] * (numbers >= 0)[..., None, None]
-    mask = numbers >= 0
-    alone, _ = memory(frames, numbers, mask)
-    assert Counting.count == 8
-    Counting.count = 0
-    shared = memory.shared(frames, numbers, mask, numbers)
-    assert Counting.count == 6  # five frames, and the one that is none
-    assert torch.allclose(alone, shared.rows(), atol=1e-6)
-
-
-def test_a_frame_that_many_read_has_its_time_and_is_told_it_once() -> None:
-    class Counting(MemoryEncoder):
-        count = 0
-
-        def forward(self, tokens: torch.Tensor, *rest: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-            Counting.count += tokens.shape[0] * tokens.shape[1]
-            return super().forward(tokens, *rest)
-
-    memory = PooledMemoryEncoder(ObjectPool(range(KINDS), KINDS + 1, 2, 16), Counting(16, 24, grid=0))
-    stored = torch.cat([frame_row(seen(seed=n)[None], hand()[None], torch.ones(1)) for n in range(5)])
-    numbers = torch.tensor([[10, 11, 13, 14], [10, 12, -1, -1]])
-    mask, steps = numbers >= 0, (numbers - 10).clamp(min=0) * 8
-    frames = stored[(numbers - 10).clamp(min=0)] * mask[..., None, None]
-    alone, real = memory(frames, steps, mask)
-    assert Counting.count == 8
-    Counting.count = 0
-    shared = memory.shared(frames, steps, mask, numbers)
-    assert Counting.count == 6
-    assert torch.equal(real, shared.mask)
-    assert torch.allclose(alone, shared.rows(), atol=1e-6)
+    places, steps = torch.tensor([[0, 1, 2, 3], [0, 2, 4, -1]]), torch.arange(5) * 8
+    shared = memory.replay(Histories(stored, steps, places))
+    assert Counting.count == 5
+    for row, read in enumerate(([0, 1, 2, 3], [0, 2, 4])):
+        state = memory.init(1)
+        for frame in read:
+            state = memory.observe(state, stored[[frame]], steps[[frame]])
+        alone = memory.read(state)
+        assert torch.equal(alone.mask[0], shared.mask[row])
+        real = alone.mask[0]
+        assert torch.allclose(alone.rows()[0][real], shared.rows()[row][real], atol=1e-6)
 
 
 def test_classes_keep_their_meaning_when_others_come() -> None:
@@ -650,15 +630,15 @@ def test_which_thing_was_lit_can_be_learned() -> None:
     """A scene in which nothing is lit now, remembered after frames in which one thing was: where is that one?"""
     torch.manual_seed(0)
     rng = np.random.default_rng(0)
-    memory = PooledMemoryEncoder(ObjectPool(range(KINDS), KINDS + 1, 2, 32), MemoryEncoder(32, 32, grid=0))
+    memory = frames_memory(ObjectPool(range(KINDS), KINDS + 1, 2, 32), 32, 2)
     head = torch.nn.Linear(32, 2)
     optimizer = torch.optim.Adam([*memory.parameters(), *head.parameters()], lr=3e-3)
-    steps, real, losses = torch.arange(2).expand(32, 2), torch.ones(32, 2, dtype=torch.bool), []
+    steps, places_of, losses = torch.arange(2).repeat(32), torch.arange(64).reshape(32, 2), []
     for _ in range(150):
         places, lit = rng.uniform(-0.3, 0.3, (32, 3, 3)) + np.array([0, 0, 0.9]), rng.integers(3, size=32)
         shown = [slots_at(rng, here, which) for here, thing in zip(places, lit, strict=True) for which in (thing, None)]
         rows = frame_row(torch.from_numpy(np.stack(shown)), hand().expand(64, -1), torch.tensor([0.0, 1.0] * 32))
-        tokens, _ = memory(rows.unflatten(0, (32, 2)), steps, real)
+        tokens = memory.replay(Histories(rows, steps, places_of)).rows()
         wanted = torch.from_numpy(places[np.arange(32), lit, :2]).float() / 0.17
         loss = (head(tokens.mean(dim=1)) - wanted).square().mean()
         loss.backward()

@@ -22,8 +22,8 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from lerobot_memobench.datasets.feature_cache.layout import FOLDER
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
-from lerobot_memobench.policies.memobench_mem.memory.mechanism import MASK, STEPS, TOKENS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from tests.support.memory import remembered, trained_on
 from tests.support.object_dataset import make_object_dataset
 from tests.support.picture_rollouts import STARTS, made_detector, pictures_of
 from tests.support.small_policy import batch_of, losses_in_training, made_for_training, small_config
@@ -117,11 +117,10 @@ def test_a_rollout_perceives_and_remembers_what_training_reads(case: Case) -> No
     for frame in range(int(STARTS[1]), index + 1):
         acted = before(case.observed(dataset, frame))
         policy.observe(acted)
-    tokens, steps, mask = policy.rollout.gather([0])
-    assert torch.equal(steps, trained[STEPS])
-    assert torch.equal(mask, trained[MASK])
-    assert apart(tokens, trained[TOKENS]) <= case.of.rounding
-    assert apart(tokens[0, 0], tokens[0, 7]) > 4 * case.of.rounding, "moments differ"
+    ((frames, steps),), ((learned, learned_steps),) = remembered(policy, [0]), trained_on(trained)
+    assert steps == learned_steps
+    assert apart(frames, learned) <= case.of.rounding
+    assert apart(frames[0], frames[7]) > 4 * case.of.rounding, "moments differ"
     prefixes = []
     for batch in (trained, acted):
         embeddings, real, _ = policy.model.embed_prefix(

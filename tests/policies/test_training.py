@@ -133,7 +133,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, dict[str, An
 
 def planned(policy: Any, batch: dict[str, Any]) -> torch.Tensor:
     with torch.no_grad():
-        policy._read_memory(batch)
+        policy.read_memory(batch)
         rows = len(batch["action"])
         return policy.model.sample_actions(
             *policy._preprocess_images(batch),

@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from lerobot.configs import PreTrainedConfig
 from safetensors import safe_open
@@ -27,6 +27,8 @@ from lerobot_memobench.policies.checkpoint import (
     undamaged,
 )
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.fusion import plain_name
+from lerobot_memobench.policies.memobench_mem.memory import NONE
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 from lerobot_memobench.policies.memobench_mem.training import WeightAverage
 
@@ -57,26 +59,58 @@ def read_config(source: str | Path, config: PreTrainedConfig | None, revision: s
     return found
 
 
-def load_weights(policy: nn.Module, path: Path, source: str | Path, *, remembers: bool) -> None:
+def remembers_otherwise(config: MemobenchMemConfig, trained: MemobenchMemConfig) -> bool:
+    """Return whether a policy's memory is another one than that of the checkpoint that it begins with."""
+    makes = ("memory", "memory_settings", "memory_fusion", "tokens_per_frame", "subgoals")
+    return any(getattr(config, name) != getattr(trained, name) for name in makes)
+
+
+def load_weights(policy: nn.Module, path: Path, source: str | Path, trained: MemobenchMemConfig) -> None:
     """Load the weights of checkpoint ``source`` into a policy of this kind; its alignment heads may be missing.
 
+    Args:
+        trained: the checkpoint's configuration. A memory that is another one than there begins anew, and is named.
+
     Raises:
-        MemobenchError: they cannot be read, do not fit, or bring no memory to a policy that ``remembers``.
+        MemobenchError: they cannot be read, do not fit, or bring no memory to a policy of the same.
     """
-    weights = read_tensors(path)
-    if remembers and not any(name.startswith("model.memory.") for name in weights):
+    weights = _today(read_tensors(path))
+    config, model = cast(MemobenchMemConfig, policy.config), cast(MemoryPI05, policy.model)
+    # A run may change the objective of the one it goes on from; its heads then start anew.
+    new = {name for name in policy.state_dict() if name.startswith("alignment.")}
+    if remembers_otherwise(config, trained):
+        new |= {f"model.{name}" for name in model.memory_names()}
+        plain = {plain_name(name.removeprefix("model.")): tensor for name, tensor in weights.items()}
+        weights = {f"model.{model.place_of(name)}": tensor for name, tensor in plain.items()}
+        weights = {name: tensor for name, tensor in weights.items() if name not in new}
+        logger.warning(
+            "'%s' was trained with memory=%s, and this is memory=%s: of the latter and of how actions read it, %d "
+            "tensors begin anew; all others go on.",
+            source,
+            trained.memory,
+            config.memory,
+            len(model.memory_names()),
+        )
+    elif config.memory != NONE and not any(name.startswith("model.memory.") for name in weights):
         raise MemobenchError(
             f"'{source}' holds weights without a memory; to start from pi0.5's weights pass "
             "--policy.base_weights=<checkpoint> instead of a pretrained path."
         )
-    # A run may change the objective of the one it goes on from; its heads then start anew.
-    heads = {name for name in policy.state_dict() if name.startswith("alignment.")}
-    load_exactly(policy, weights, source, optional=heads)
+    load_exactly(policy, weights, source, optional=new)
+
+
+def _today(weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Return the weights by today's names: without a pool, the encoder of frames was the memory itself."""
+    begins = ("model.memory.position.", "model.memory.project.")
+    return {
+        name.replace("model.memory.", "model.memory.encoder.") if name.startswith(begins) else name: tensor
+        for name, tensor in weights.items()
+    }
 
 
 def load_base_weights(model: MemoryPI05, weights: dict[str, Tensor], source: str) -> None:
     """Start from pi0.5's weights; only the memory's own parameters stay at their initial values."""
-    placed = {model.place_of(name.removeprefix("model.")): tensor for name, tensor in weights.items()}
+    placed = {model.place_of(plain_name(name.removeprefix("model."))): tensor for name, tensor in weights.items()}
     load_exactly(model, placed, source, optional=set(model.memory_parameters()))
 
 

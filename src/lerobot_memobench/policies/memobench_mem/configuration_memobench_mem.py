@@ -6,7 +6,7 @@ import json
 import logging
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -25,6 +25,9 @@ from lerobot_memobench.envs.observations import PRIVILEGED as PRIVILEGED_INPUT
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.perception.visual_encoder import SIDE
 from lerobot_memobench.perception.weights import PACKAGE, RANDOM
+from lerobot_memobench.policies.memobench_mem.memory import NONE, find_mechanism, mechanism_names, read_settings
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import MEMORY_GRID
+from lerobot_memobench.policies.memobench_mem.subgoals import texts_of
 from lerobot_memobench.protocol import CAMERAS, CLOCK, IMAGE_SIZE
 
 logger = logging.getLogger(__name__)
@@ -32,16 +35,16 @@ logger = logging.getLogger(__name__)
 FLOW_MATCHING, REGRESSION = "flow_matching", "regression"
 OBJECTIVES = (FLOW_MATCHING, REGRESSION)
 ALIGN_WEIGHTS = {"none": 0.0, "semantic": 0.1, "contrastive": 0.1, "framewise": 0.05}
-MEMORY_FUSIONS = ("modulation", "context", "none")
+MODULATION, CONTEXT, OWN = "modulation", "context", "own"
+MEMORY_FUSIONS = (MODULATION, CONTEXT, OWN, NONE)
 PERCEPTIONS = ("pixels", "objects")
 SUBGOAL_LEVELS = ("coarse", "intermediate", "fine")
 PROMPTED = "prompted"
 """Key of ``task_weights`` for tasks that begin with a demonstration prompt."""
-MEMORY_GRID = 4
-"""A remembered picture is pooled to MEMORY_GRID x MEMORY_GRID tokens."""
 TOKENS_PER_FRAME = {"pixels": MEMORY_GRID**2, "objects": 2}
 MEMORY_STRIDE, FRAMES_PER_EPISODE = 8, 6
 """Where training decodes no video; 1 elsewhere."""
+MEMORY_FRAMES = 32
 ORACLE_TOKENS = 128
 """Room that oracle memory text needs in a prompt of the word tokenizer: six memory checkpoints of some ten words."""
 
@@ -149,10 +152,10 @@ def _names(text: str) -> tuple[str, ...]:
 
 FIXED = _names(
     """
-    size perception object_classes memory_fusion oracle_memory memory_camera memory_frames
-    tokens_per_frame memory_stride objective chunk_size normalization_mapping image_resolution tokenizer_name
-    tokenizer_max_length input_features n_obs_steps paligemma_variant action_expert_variant max_state_dim max_action_dim
-    min_period max_period use_relative_actions relative_exclude_joints action_feature_names empty_cameras
+    size perception object_classes memory memory_settings memory_fusion subgoals oracle_memory memory_camera
+    memory_frames tokens_per_frame memory_stride objective chunk_size normalization_mapping image_resolution
+    tokenizer_name tokenizer_max_length input_features n_obs_steps paligemma_variant action_expert_variant max_state_dim
+    max_action_dim min_period max_period use_relative_actions relative_exclude_joints action_feature_names empty_cameras
     """
 )
 """Fields by which a checkpoint was trained, and which are refused where it acts under another value: its weights would
@@ -248,21 +251,28 @@ class MemobenchMemConfig(PI05Config):
     """Encoder of subgoals: ``words`` (a hash of words), or folder or repository of a SigLIP model; none: the size's."""
 
     # -- memory
-    memory_fusion: str = "modulation"
-    """How actions read memory: ``modulation``, ``context`` (memory joins the prefix), or ``none``: plain pi0.5, the
-    baseline without a memory."""
+    memory: str = FROM_SIZE
+    """What is remembered: ``frames`` (the default), another mechanism of `memory` or of a package that brings one, or
+    ``none``: plain pi0.5, the baseline without a memory."""
+    memory_settings: dict[str, Any] = field(default_factory=dict)
+    """Settings of that mechanism (``Settings`` of its class); those that are not named have their defaults."""
+    memory_fusion: str = FROM_SIZE
+    """How actions read memory: ``modulation``, ``context`` (memory joins the prefix), ``own``, where the mechanism has
+    a way of its own, or ``none`` without one. None: ``own``, or else ``modulation``."""
+    subgoals: dict[str, list[str]] | None = None
+    """Instruction -> texts of its checkpoints, where the memory learns from them; none: those of the dataset."""
     oracle_memory: bool = False
     """Control of the paper: ground-truth memory text stands in the text prompt, from the dataset's column ``memory`` in
     training and from the environment (``--env.oracle_memory=true``) at evaluation."""
     memory_camera: str | None = None
     """Camera whose pictures are remembered; none: the first of the policy's."""
-    memory_frames: int = 32
-    """Frames of the history that a chunk reads at most."""
+    memory_frames: int = MEMORY_FRAMES
+    """Frames of the history that a chunk reads at most, with ``memory=frames``."""
     tokens_per_frame: int = FROM_SIZE
     """Memory tokens of a remembered frame: 16 of a picture; 2, or another number, of objects."""
     memory_stride: int = FROM_SIZE
-    """Control steps from one frame of the history (and the cache) to the next; none: 8 where training decodes no video
-    (objects, and pixels through a visual encoder), else 1."""
+    """Control steps from one frame of the history (and the cache) to the next; none: the mechanism's, or 8 where
+    training decodes no video (objects, and pixels through a visual encoder), else 1."""
     feature_cache_dir: str | None = None
     """Folder for feature caches, of several datasets perhaps; none: ``feature_cache`` in the dataset's folder."""
 
@@ -326,9 +336,9 @@ class MemobenchMemConfig(PI05Config):
         self._choose("size", tuple(SIZES))
         self._choose("align", tuple(ALIGN_WEIGHTS))
         self._choose("perception", PERCEPTIONS)
-        self._choose("memory_fusion", MEMORY_FUSIONS)
         self._choose("subgoal_level", SUBGOAL_LEVELS)
         self._check_encoders()
+        self._complete_memory()
         dims = self.dimensions
         actions, planned = dims.defaults["n_action_steps"], self.chunk_size or dims.defaults["chunk_size"]
         defaults = {
@@ -371,6 +381,33 @@ class MemobenchMemConfig(PI05Config):
         super().__post_init__()
         self._check_perception()
         self._check_objectives()
+
+    def _complete_memory(self) -> None:
+        """Set and check what makes the memory."""
+        if self.memory in (None, "frames"):  # the default, as a recipe or checkpoint may name it
+            self.memory = NONE if self.memory_fusion == NONE else "frames"
+        if self.memory == NONE:
+            self.memory_fusion, self.memory_settings = NONE, {}
+            return
+        mechanism = find_mechanism(self.memory)
+        fusion = OWN if mechanism.fusion is not None else MODULATION
+        if self.memory_fusion is None:
+            self.memory_fusion = fusion
+        self._choose("memory_fusion", MEMORY_FUSIONS)
+        if self.memory_fusion == NONE or (OWN in (fusion, self.memory_fusion) and self.memory_fusion != fusion):
+            fitting = OWN if fusion == OWN else f"{MODULATION} or {CONTEXT}"
+            raise MemobenchError(
+                f"--policy.memory={self.memory} cannot be read by memory_fusion={self.memory_fusion}; leave it out, or "
+                f"pass {fitting}; policy.memory=none is the baseline without a memory."
+            )
+        if self.memory != "frames" and self.memory_frames != MEMORY_FRAMES:
+            raise MemobenchError(
+                f"--policy.memory_frames={self.memory_frames} is for memory=frames, and does nothing with "
+                f"memory={self.memory}; leave it out, and see policy.memory_settings."
+            )
+        self.memory_settings = asdict(read_settings(self.memory, self.memory_settings))
+        if self.memory_stride is None:
+            self.memory_stride = mechanism.stride
 
     # -- checks ----------------------------------------------------------------------------------------------------
 
@@ -460,10 +497,16 @@ class MemobenchMemConfig(PI05Config):
                 "--policy.rtc_config guides the denoising of a chunk, which --policy.objective=regression lacks; "
                 "leave it out, or use --policy.objective=flow_matching."
             )
-        if self.align != "none" and self.memory == "none":
+        if self.align != "none" and self.memory == NONE:
             raise MemobenchError(
-                f"--policy.align={self.align} has no memory to align with --policy.memory_fusion=none; use modulation "
-                "or context, or --policy.align=none."
+                f"--policy.align={self.align} has no memory to align with --policy.memory=none; name a memory "
+                f"({', '.join(mechanism_names())}), or use --policy.align=none."
+            )
+        if self.align == "framewise" and not find_mechanism(self.memory).per_frame:
+            raise MemobenchError(
+                "--policy.align=framewise aligns each remembered frame with its own text, and "
+                f"memory={self.memory} has no tokens of single frames; use semantic or contrastive, or "
+                "--policy.memory=frames."
             )
         if self.shuffle_subgoals and self.align == "none":
             raise MemobenchError(
@@ -530,14 +573,19 @@ class MemobenchMemConfig(PI05Config):
         return tuple(self.image_resolution)  # type: ignore[return-value]  # a checkpoint gives a list
 
     @property
-    def memory(self) -> str:
-        """Name of the memory mechanism, one of ``memory.MECHANISMS``."""
-        return "none" if self.memory_fusion == "none" else "frame_sampling"
+    def privileged_memory(self) -> bool:
+        """Whether the memory learns from the checkpoints' texts."""
+        return self.memory != NONE and find_mechanism(self.memory).privileged
+
+    @property
+    def subgoal_texts(self) -> tuple[str, ...]:
+        """All texts of checkpoints, by whose numbers a privileged memory learns and chooses."""
+        return texts_of(self.subgoals or {})
 
     @property
     def needs_every_frame(self) -> bool:
         """Whether pictures between two action chunks count."""
-        return self.memory != "none" and self.uses_pictures
+        return self.memory != NONE and self.uses_pictures
 
     @property
     def cache_place(self) -> Path | None:

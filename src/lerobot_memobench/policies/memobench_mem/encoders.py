@@ -22,8 +22,7 @@ from torch.nn.functional import rms_norm
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, SIDE, WIDTH, VisualEncoder, resized
 from lerobot_memobench.policies.compatibility import cure
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MEMORY_GRID
-from lerobot_memobench.policies.memobench_mem.memory.mechanism import PooledMemoryEncoder
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import MEMORY_GRID
 
 if TYPE_CHECKING:
     from transformers.models.paligemma.modeling_paligemma import PaliGemmaMultiModalProjector
@@ -67,9 +66,9 @@ class ObservationEncoder(ABC):
     def prefix(self, observed: Tensor) -> Tensor:
         """Return the prefix tokens (B, n, d_vlm) of one part (B, ...)."""
 
-    def memory(self, encoder: nn.Module) -> nn.Module:
-        """Return the memory encoder of stored frames, given the mechanism's encoder of (B, F, P, D)."""
-        return encoder
+    def pool(self) -> nn.Module:
+        """Return a new module from stored frames (N, P', D') to the tokens (N, P, D) that a memory is given."""
+        return nn.Identity()
 
 
 VISION_SEED = 20_250_705  # weights of an image tower for which none were given
@@ -260,14 +259,17 @@ class VisualTokenEncoder(nn.Module, ObservationEncoder):
         return self.encode(batch[camera])
 
     def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
-        """Return the pooled tokens (n, 16, WIDTH) of some rows' pictures."""
-        return self.pooled(self.encode(batch[self.memory_input][list(rows)]))
+        """Return the pooled tokens (n, 16, WIDTH) of some rows' pictures, or of their tokens."""
+        chosen = {
+            key: batch[key][list(rows)] for key in (encoded_key(self.memory_input), self.memory_input) if key in batch
+        }
+        return self.pooled(self._tokens(chosen, self.memory_input))
 
     def prefix(self, observed: Tensor) -> Tensor:
         """Return prefix tokens (B, 64, d_vlm) of a camera's tokens."""
         made: Tensor = self.project(observed.to(self.project.weight.dtype))
         return made * LOUD
 
-    def memory(self, encoder: nn.Module) -> nn.Module:
-        """Return the encoder behind a projection of each frame's tokens."""
-        return PooledMemoryEncoder(PixelPool(self.dim), encoder)
+    def pool(self) -> nn.Module:
+        """Return a projection of each frame's tokens."""
+        return PixelPool(self.dim)

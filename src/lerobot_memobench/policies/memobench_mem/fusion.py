@@ -210,6 +210,11 @@ class Modulation(MemoryFusion):
         return re.sub(r"post_attention_layernorm\.(dense|weight)", r"post_attention_layernorm.norm.\1", name)
 
 
+def plain_name(name: str) -> str:
+    """Return the name in plain pi0.5 of a parameter of any fusion's model."""
+    return name.replace("post_attention_layernorm.norm.", "post_attention_layernorm.")
+
+
 # -- context ----------------------------------------------------------------------------------------------------------
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from transformers.initialization import no_init_weights
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.weights import load_visual_encoder
-from lerobot_memobench.policies.checkpoint import check_as_trained, check_resumed
+from lerobot_memobench.policies.checkpoint import as_trained, check_as_trained, check_resumed
 from lerobot_memobench.policies.compatibility import PICTURE_STEP, cure, require_fresh
 from lerobot_memobench.policies.memobench_mem.alignment import alignment_loss, make_alignment, require_texts
 from lerobot_memobench.policies.memobench_mem.caching import open_frames
@@ -35,6 +35,7 @@ from lerobot_memobench.policies.memobench_mem.checkpoints import (
     load_weights,
     read_config,
     read_tensors,
+    remembers_otherwise,
     require_agreement,
     require_statistics,
     restore_average,
@@ -47,20 +48,24 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
     PrefixParts,
     VisualTokenEncoder,
 )
-from lerobot_memobench.policies.memobench_mem.memory import make_mechanism
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
+    CHOICES,
     FRAMES,
-    MASK,
     PHASE,
+    PLACES,
     STEPS,
-    TOKENS,
-    MemoryBatch,
+    SUBGOAL,
+    SUBGOALS,
+    Histories,
+    MemoryTokens,
+    Query,
 )
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Precision, attend_fused
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE
 from lerobot_memobench.policies.memobench_mem.rollout import Rollout
 from lerobot_memobench.policies.memobench_mem.sampler import TrainingRun, begin_training
 from lerobot_memobench.policies.memobench_mem.sharding import check_adapters, prepare_shards
+from lerobot_memobench.policies.memobench_mem.subgoals import require_known, subgoals_of
 from lerobot_memobench.policies.memobench_mem.training import (
     TrainingCurve,
     WeightAverage,
@@ -110,13 +115,20 @@ class MemobenchMemPolicy(PI05Policy):
     _fsdp_wrap_modules = None  # to LeRobot's main, whose FSDP is another than that of `sharding`
 
     def __init__(
-        self, config: MemobenchMemConfig, *, dataset_meta: Any | None = None, load_base: bool = True, **kwargs: Any
+        self,
+        config: MemobenchMemConfig,
+        *,
+        dataset_meta: Any | None = None,
+        load_base: bool = True,
+        draw: bool = True,
+        **kwargs: Any,
     ) -> None:
         """Build the policy from scratch, or from ``config.base_weights``.
 
         Args:
             dataset_meta: metadata of the dataset to train on; its feature cache is checked, and made or finished.
             load_base: False where a checkpoint's weights follow, with which training begins.
+            draw: whether weights are drawn; False where all of them follow: at full size this takes two minutes.
         """
         # As PI05Policy.__init__, which names its model class.
         PreTrainedPolicy.__init__(self, config)
@@ -128,10 +140,12 @@ class MemobenchMemPolicy(PI05Policy):
             )
         if dataset_meta is not None:
             require_texts(Path(dataset_meta.root), config)
+            if config.privileged_memory:
+                config.subgoals = config.subgoals or subgoals_of(dataset_meta, config.subgoal_level)
+                require_known(config.subgoals, dataset_meta, config.subgoal_level)
         config.validate_features()
         self.init_rtc_processor()
-        # What a checkpoint holds is not drawn first: at full size that takes two minutes.
-        with contextlib.nullcontext() if load_base else no_init_weights():
+        with contextlib.nullcontext() if draw else no_init_weights():
             self.model = MemoryPI05(config, rtc_processor=self.rtc_processor)
         dims = config.dimensions
         self.alignment = make_alignment(
@@ -153,7 +167,7 @@ class MemobenchMemPolicy(PI05Policy):
         self.average: WeightAverage | None = None
         self.run: TrainingRun | None = None
         self.curve = TrainingCurve()
-        self.rollout = Rollout(make_mechanism(config.memory, config.memory_frames), config.memory_stride)
+        self.rollout = Rollout(self._remembers, config.memory_stride)
         self.reset()
         self._thread: int | None = None  # whichever acts first
         if dataset_meta is not None and load_base:
@@ -175,7 +189,7 @@ class MemobenchMemPolicy(PI05Policy):
 
     @property
     def _remembers(self) -> bool:
-        return self.rollout.mechanism.frames > 0
+        return self.model.memory is not None
 
     def _preprocess_images(self, batch: dict[str, Tensor]) -> PrefixParts:
         """Return what the model is given in the place of images: the observation's parts, and the state's token."""
@@ -241,9 +255,9 @@ class MemobenchMemPolicy(PI05Policy):
             reduction: ``mean`` for a scalar, ``none`` for one loss per sample (B,).
 
         Returns:
-            The loss, and numbers to log: ``action_loss``, and with an alignment ``align_loss`` (unweighted),
-            ``align_grad_norm`` (of the weighted loss, over the memory encoder's parameters) and ``align_top1`` (share
-            of memory vectors whose nearest text in the batch is theirs).
+            The loss, and numbers to log: ``action_loss``, the memory's own losses, and with an alignment
+            ``align_loss`` (unweighted), ``align_grad_norm`` (of the weighted loss, over the memory's parameters) and
+            ``align_top1`` (share of memory vectors whose nearest text in the batch is theirs).
 
         Raises:
             MemobenchError: the batch has no memory, or pictures where it should have their tokens.
@@ -255,12 +269,17 @@ class MemobenchMemPolicy(PI05Policy):
         quick = self.training and self._device.type == "cpu" and not self.config.uses_visual_encoder
         computing = self._acting() if measures else self.precision.computing(self._device)
         with computing, quick_products() if quick else contextlib.nullcontext():
-            memory = self._read_memory(batch)
+            memory = self.read_memory(batch)
             per_sample, total, logged = self._action_loss(batch)
+            for name, loss in self._memory_losses(batch).items():
+                per_sample, total = per_sample + loss, total + loss.mean()
+                logged[f"memory_{name}_loss"] = loss.mean().item()
             if self.alignment is not None and memory is not None:
                 assert self.config.align_weight is not None
+                assert self.model.memory is not None
                 encoder = [parameter for parameter in self.model.memory.parameters() if parameter.requires_grad]
-                weighted, numbers = alignment_loss(self.alignment, self.config.align_weight, batch, *memory, encoder)
+                read = memory.rows(), memory.mask
+                weighted, numbers = alignment_loss(self.alignment, self.config.align_weight, batch, *read, encoder)
                 per_sample, total, logged = per_sample + weighted, total + weighted, logged | numbers
         logged["loss"] = total.item()
         if self.training:
@@ -273,7 +292,7 @@ class MemobenchMemPolicy(PI05Policy):
         return loss, logged
 
     def _require_memory(self, batch: dict[str, Tensor]) -> None:
-        needed = TOKENS if self._remembers else PHASE
+        needed = FRAMES if self._remembers else PHASE
         if needed not in batch:
             raise MemobenchError(
                 f"The training batch has no '{needed}': the preprocessor lacks the step memobench_gather_memory; to "
@@ -287,13 +306,40 @@ class MemobenchMemPolicy(PI05Policy):
                 "dataset once for each policy."
             )
 
-    def _read_memory(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor] | None:
-        """Hand a batch's memory to the model; return its tokens (B, L, d_m) and their mask (B, L)."""
-        if not self._remembers:
+    def read_memory(self, batch: dict[str, Tensor]) -> MemoryTokens | None:
+        """Read what the samples of a batch remember, and hand it to the model; None without a memory."""
+        if self.model.memory is None:
             return None
-        memory = MemoryBatch(batch[TOKENS], batch[STEPS], batch[MASK]).to(self._device)
-        numbers = batch.get(FRAMES)
-        return self.model.set_memory(*memory, numbers=None if numbers is None else numbers.to(self._device))
+        histories = Histories(batch[FRAMES], batch[STEPS], batch[PLACES], batch.get(SUBGOALS)).to(self._device)
+        memory = self.model.memory.replay(histories, self._query(batch))
+        self.model.set_memory(memory)
+        return memory
+
+    def _memory_losses(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        return {} if self.model.memory is None else self.model.memory.losses(batch)
+
+    def _query(self, batch: dict[str, Tensor], rows: Sequence[int] | None = None, *, writes: bool = False) -> Query:
+        """Return the present of some rows of a batch as far as the memory asks for it.
+
+        Args:
+            rows: all of them where None. writes: a frame is written, whose own tokens are at hand.
+        """
+        memory, device = self.model.memory, self._device
+        assert memory is not None
+        rows = range(len(batch[OBS_STATE])) if rows is None else rows
+        query, chosen = Query(), list(rows)
+        if memory.asks_present and not writes:
+            query = query._replace(tokens=memory.pool(self.perception.remember(batch, chosen).to(device)))
+        if memory.asks_words:
+            words, real = (
+                batch[name][chosen].to(device) for name in (OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK)
+            )
+            embedded = self.model.paligemma_with_expert.embed_language_tokens(words)
+            query = query._replace(words=embedded, real=real.bool())
+        if memory.privileged:
+            labels = batch[SUBGOAL][chosen].to(device) if SUBGOAL in batch else None
+            query = query._replace(choices=batch[CHOICES][chosen].to(device), subgoal=labels)
+        return query
 
     def _action_loss(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor, dict[str, Any]]:
         """Return the loss of the actions per sample (B,), its mean over the actions that count, and numbers to log."""
@@ -380,43 +426,58 @@ class MemobenchMemPolicy(PI05Policy):
         phases = _column(batch, OBS_PHASE) if OBS_STEP in batch else None
         clocks = list(zip(phases or [EXECUTION] * count, steps, strict=True))
         self._calls += 1
-        steps, started, frozen = self.rollout.observe(clocks, lambda rows: self._encode(batch, clocks, rows))
+        steps, started, frozen = self.rollout.observe(clocks, lambda rows: self._write(batch, clocks, rows))
         observed = [key for key in (name, OBS_STATE, OBS_LANGUAGE_TOKENS) if key in batch]
         for row in range(count):
             if started[row]:
                 self.rollout.rows[row].draw_seed(batch[key][row] for key in observed)
         return steps, started, frozen
 
-    def _encode(self, batch: dict[str, Tensor], clocks: list[tuple[int, int]], rows: list[int]) -> Tensor:
-        """Return tokens (n, P, D) of the present frames of some rows; refuse a frame of an earlier step."""
+    @torch.no_grad()
+    def _write(self, batch: dict[str, Tensor], clocks: list[tuple[int, int]], rows: list[int]) -> None:
+        """Write the present frames of some rows to their memories; refuse a frame of an earlier step."""
+        memory = self.model.memory
+        assert memory is not None
         if OBS_PICTURE in batch and self.perception.pictures:
             for row in rows:
                 require_fresh(clocks[row][1], round(float(batch[OBS_PICTURE][row])))
-        return self.perception.remember(batch, rows)
+        frames = self.perception.remember(batch, rows).to(self._device)
+        with self._acting():
+            for row, frame in zip(rows, frames.split(1), strict=True):  # one by one: no row depends on others
+                held = self.rollout.rows[row]
+                query = self._query(batch, [row], writes=True)
+                state = memory.init(1) if held.memory is None else held.memory
+                held.memory = memory.observe(state, frame, torch.tensor([held.position], device=self._device), query)
+
+    def remembered(self, batch: dict[str, Tensor], rows: Sequence[int]) -> MemoryTokens:
+        """Return the memory tokens that chunks of some rows of the batch read now."""
+        memory = self.model.memory
+        assert memory is not None
+        return memory.read(memory.join([self.rollout.rows[row].memory for row in rows]), self._query(batch, rows))
 
     def plan(
         self,
         batch: dict[str, Tensor],
         rows: list[int],
         noise: Tensor,
-        history: MemoryBatch | None = None,
+        training: bool = False,
         **kwargs: Any,
     ) -> Tensor:
         """Return action chunks (n, chunk, A) of some rows of the batch, with their histories and sampling noise.
 
         Args:
-            history: what the rows remember; None: what their rollouts do.
+            training: whether it is a training batch, which brings its histories.
         """
         inputs = [*self._inputs, *(key for key in batch if key.startswith(ENCODED))]
         part = {key: batch[key][rows] for key in inputs if key in batch}
         images, image_masks = self._preprocess_images(part)
         words = part[OBS_LANGUAGE_TOKENS], part[OBS_LANGUAGE_ATTENTION_MASK]
         with self._acting():
-            if self._remembers:
-                if history is None:
-                    self._require_history(rows)
-                    history = self.rollout.gather(rows)
-                self.model.set_memory(*history.to(self._device))
+            if training:
+                self.read_memory(batch)
+            elif self._remembers:
+                self._require_history(rows)
+                self.model.set_memory(self.remembered(batch, rows))
             noise = noise.to(self._device)
             actions = self.model.sample_actions(images, image_masks, *words, noise=noise, **kwargs)
         return actions[:, :, : self._action_dim]
@@ -485,10 +546,9 @@ class MemobenchMemPolicy(PI05Policy):
         noise = kwargs.pop("noise", None)
         if PHASE in batch:  # of a training
             samples = range(len(batch[PHASE]))
-            history = MemoryBatch(batch[TOKENS], batch[STEPS], batch[MASK]) if TOKENS in batch else None
             if noise is None:
                 noise = self._stacked(lambda _, shape: torch.randn(shape), samples)
-            return self.plan(batch, [*samples], noise, history, **kwargs)
+            return self.plan(batch, [*samples], noise, training=True, **kwargs)
         if OBS_STEP in batch or not self._remembers or not self._calls:
             self.observe(batch)
         elif self._calls == self._planned:
@@ -496,7 +556,7 @@ class MemobenchMemPolicy(PI05Policy):
                 "This policy remembers observations of every control step, and was asked for two plans with no "
                 "observation between them: its memory would be another one than in training; let select_action take "
                 "every observation (--inference.type=sync), offer each to observe before planning, or train with "
-                "--policy.memory_fusion=none."
+                "--policy.memory=none."
             )
         self._planned = self._calls
         rows = list(range(len(self.rollout.rows)))
@@ -534,8 +594,10 @@ class MemobenchMemPolicy(PI05Policy):
                 check_as_trained(saved, config, of)
             else:
                 check_resumed(saved, config)
-        policy = cls(config, dataset_meta=dataset_meta, load_base=False)
-        load_weights(policy, path, source, remembers=config.memory != "none")
+        trained = as_trained(source, config, revision)
+        assert isinstance(trained, MemobenchMemConfig)
+        policy = cls(config, dataset_meta=dataset_meta, load_base=False, draw=remembers_otherwise(config, trained))
+        load_weights(policy, path, source, trained)
         policy.to(config.device)
         policy.eval()
         if dataset_meta is None:

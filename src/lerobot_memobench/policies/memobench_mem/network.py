@@ -35,21 +35,21 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
     seed_parameters,
 )
 from lerobot_memobench.policies.memobench_mem.fusion import Context, MemoryFusion, Modulation, Prefix
-from lerobot_memobench.policies.memobench_mem.memory import make_mechanism
-from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryTokens, PooledMemoryEncoder
+from lerobot_memobench.policies.memobench_mem.memory import NONE, find_mechanism, read_settings
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryMechanism, MemorySpec, MemoryTokens
 from lerobot_memobench.policies.memobench_mem.objects import DetectionEncoder, ObjectEncoder, ObjectsFromPictures
 from lerobot_memobench.sim.object_slots import classes
 
 FUSIONS: dict[str, type[MemoryFusion]] = {"modulation": Modulation, "context": Context}
-OWN = ("memory.", "state_token.", "instruction.", "paligemma_with_expert.perception.")
-"""First parts of the names of parameters that plain pi0.5 does not have; a fusion has more."""
+OWN = ("state_token.", "instruction.", "paligemma_with_expert.perception.")
+"""First parts of the names of parameters that plain pi0.5 does not have, beside the memory's."""
 
 
 class MemoryPI05(PI05Pytorch):
-    """LeRobot's pi0.5 at a policy's dimensions, with a memory: `set_memory`, then ``forward`` or ``sample_actions``.
+    """LeRobot's pi0.5 at a policy's dimensions, with a memory, whose tokens the fusion is handed before a pass.
 
     Attributes:
-        memory: encoder of remembered frames to memory tokens. fusion: how actions read these; None: plain pi0.5.
+        memory: the memory mechanism. fusion: how actions read its tokens. None: plain pi0.5.
         state_token: of the robot's state, where it enters as numbers; None: it enters as words of the text prompt.
         instruction: with a token of the state, the condition that tells the action expert's norms the instruction.
     """
@@ -66,34 +66,28 @@ class MemoryPI05(PI05Pytorch):
         self.time_mlp_out = nn.Linear(width, width)
         self.state_token = StateToken(config.max_state_dim, vlm_width) if config.state_token else None
         self.instruction = InstructionCondition(vlm_width, width) if config.state_token else None
+        self.memory: MemoryMechanism | None = None
         self.fusion: MemoryFusion | None = None
-        if config.memory_fusion == "none":
+        if config.memory == NONE:
             return
-        observations = self.paligemma_with_expert.perception
-        mechanism = make_mechanism(config.memory, config.memory_frames)
-        self.memory = observations.memory(mechanism.encoder(observations.dim, vlm_width, observations.grid))
-        self.fusion = FUSIONS[config.memory_fusion](self, vlm_width, width)
+        observations, mechanism = self.paligemma_with_expert.perception, find_mechanism(config.memory)
+        spec = MemorySpec(
+            dim=observations.dim,
+            tokens=config.tokens_per_frame,
+            width=vlm_width,
+            expert=width,
+            frames=config.memory_frames,
+            grid=observations.grid,
+            stride=config.memory_stride,
+            subgoals=config.subgoal_texts,
+        )
+        self.memory = mechanism(spec, observations.pool(), read_settings(config.memory, config.memory_settings))
+        self.fusion = (mechanism.fusion or FUSIONS[config.memory_fusion])(self, vlm_width, width)
 
-    def set_memory(
-        self, tokens: Tensor, steps: Tensor, frame_mask: Tensor, numbers: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Encode remembered frames and hand them to the fusion.
-
-        Args:
-            tokens: (B, F, P, D) of the frames. steps: (B, F), control steps. frame_mask: (B, F) bool, which are real.
-            numbers: (B, F), equal where frames are; with an encoder that learns what it keeps, each is encoded once.
-
-        Returns:
-            H (B, F*P, d_m) and its mask (B, F*P), for the alignment objectives.
-        """
-        assert self.fusion is not None  # the policy asks no plain pi0.5
-        if numbers is None:
-            memory = MemoryTokens(*self.memory(tokens, steps, frame_mask))
-        else:
-            assert isinstance(self.memory, PooledMemoryEncoder)
-            memory = self.memory.shared(tokens, steps, frame_mask, numbers)
+    def set_memory(self, memory: MemoryTokens) -> None:
+        """Let the next passes read these tokens."""
+        assert self.fusion is not None  # of plain pi0.5 nobody asks it
         self.fusion.hand_over(memory)
-        return memory.rows(), memory.mask
 
     def embed_prefix(self, images: Any, img_masks: Any, tokens: Tensor, masks: Tensor, *histories: Any) -> Prefix:
         """Return LeRobot's prefix (observation, then words), as the fusion changes it.
@@ -129,12 +123,14 @@ class MemoryPI05(PI05Pytorch):
 
     def memory_parameters(self) -> dict[str, nn.Parameter]:
         """Return every parameter that plain pi0.5 does not have, by name."""
+        memory = self.memory_names()
+        return {name: one for name, one in self.named_parameters() if name.startswith(OWN) or name in memory}
+
+    def memory_names(self) -> set[str]:
+        """Return the names of the tensors of the memory and of its fusion."""
         fusion = self.fusion
-        return {
-            name: parameter
-            for name, parameter in self.named_parameters()
-            if name.startswith(OWN) or (fusion is not None and fusion.owns(name))
-        }
+        own = (name for name in self.state_dict() if fusion is not None and fusion.owns(name))
+        return {*own, *(name for name in self.state_dict() if name.startswith("memory."))}
 
     def place_of(self, name: str) -> str:
         """Return the name in this model of a parameter of plain pi0.5."""

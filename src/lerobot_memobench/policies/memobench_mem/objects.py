@@ -29,7 +29,6 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
     PrefixParts,
     fingerprint,
 )
-from lerobot_memobench.policies.memobench_mem.memory.mechanism import PooledMemoryEncoder
 from lerobot_memobench.protocol import CAMERAS, OBS_PHASE
 from lerobot_memobench.sim.object_layout import FIELDS, SIZE, SLOTS, WIDTH, field
 from lerobot_memobench.sim.object_slots import classes
@@ -195,10 +194,9 @@ class ObjectEncoder(nn.Module, ObservationEncoder):
         made, there = self.slot(slots.unflatten(1, (-1, WIDTH)), hand)
         return in_slots(made * LOUD, there)
 
-    def memory(self, encoder: nn.Module) -> nn.Module:
-        """Return the encoder behind a pool of each frame."""
-        pool = ObjectPool(self.order, self.kinds, self.tokens_per_frame, self.dim, self.noise)
-        return PooledMemoryEncoder(pool, encoder)
+    def pool(self) -> nn.Module:
+        """Return a pool of each frame's objects."""
+        return ObjectPool(self.order, self.kinds, self.tokens_per_frame, self.dim, self.noise)
 
 
 # -- detections -------------------------------------------------------------------------------------------------------

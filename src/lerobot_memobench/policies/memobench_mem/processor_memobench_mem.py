@@ -48,21 +48,19 @@ from lerobot_memobench.policies.memobench_mem.alignment import (
 )
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import ENCODED
-from lerobot_memobench.policies.memobench_mem.memory import make_mechanism
-from lerobot_memobench.policies.memobench_mem.memory.frame_sampling import FrameSampling
+from lerobot_memobench.policies.memobench_mem.memory import NONE, find_mechanism
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
+    CHOICES,
     FRAMES,
-    MASK,
     PHASE,
+    PLACES,
     STEPS,
-    TOKENS,
-    MemoryMechanism,
-    collate_frames,
-    recall_at,
+    SUBGOAL,
+    SUBGOALS,
 )
-from lerobot_memobench.policies.memobench_mem.memory.none import NoMemory
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE
 from lerobot_memobench.policies.memobench_mem.sampler import TrainingRun, prompt_texts, training_run
+from lerobot_memobench.policies.memobench_mem.subgoals import choices, texts_of
 from lerobot_memobench.tasks.memory_text import MARK, with_memory
 
 logger = logging.getLogger(__name__)
@@ -139,8 +137,9 @@ def _tokenizer(config: MemobenchMemConfig, meta: Any | None) -> TokenizerProcess
 def gathering(config: MemobenchMemConfig) -> dict[str, Any]:
     """Return the fields of a policy's `GatherMemoryProcessorStep`."""
     same = ("align", "subgoal_level", "shuffle_subgoals", "shuffle_seed", "memory")
-    frames = make_mechanism(config.memory, config.memory_frames).frames
-    return {"frames": frames} | {name: getattr(config, name) for name in same}
+    frames = 0 if config.memory == NONE else config.memory_frames
+    subgoals = (config.subgoals or {}) if config.privileged_memory else {}
+    return {"frames": frames, "subgoals": subgoals} | {name: getattr(config, name) for name in same}
 
 
 @dataclass
@@ -180,14 +179,17 @@ class LookupProcessorStep(ProcessorStep):
 @dataclass
 @ProcessorStepRegistry.register(name="memobench_gather_memory")
 class GatherMemoryProcessorStep(LookupProcessorStep):
-    """Add history, phase and subgoal embeddings to training samples; leave observations of a rollout alone.
+    """Add history, phase and subgoal embeddings to training samples.
 
-    In a rollout the policy itself keeps the history.
+    In a rollout, where the policy itself keeps the history, observations are left alone, but for ``memory.choices``
+    (B, S), which training samples have too: which of the texts of ``subgoals`` (instruction -> texts of its
+    checkpoints) are the task's, for a memory that chooses among them.
 
-    Adds ``memory.tokens`` (B, F, P, D), ``memory.steps`` (B, F) int64, ``memory.mask`` (B, F) bool, ``phase`` (B,),
-    features of the frames (``observation.encoded.*``), and with an alignment ``memory.text`` and
-    ``memory.text_mask``: (B, d_t) and (B,) for the frame itself, or with ``framewise`` (B, F, d_t) and (B, F) for the
-    frames of the history. With ``frames`` 0 (``memory_fusion=none``) there is no history.
+    Adds ``memory.frames``, ``memory.steps`` and ``memory.places`` (`Histories`), ``phase`` (B,), features of the frames
+    (``observation.encoded.*``), and with an alignment ``memory.text`` and ``memory.text_mask``: (B, d_t) and (B,) for
+    the frame itself, or with ``framewise`` (B, F, d_t) and (B, F) for the frames of the history. With ``subgoals``
+    there are the numbers of the active ones: ``memory.subgoal`` (B,) and ``memory.subgoals`` (U,), of the samples and
+    of the frames. With ``frames`` 0 (``memory=none``) there is no history.
 
     A step that is rebuilt from a checkpoint has the settings of the run that wrote it, until it is told to ``follow``
     another one. One that is given a ``cache`` keeps its own.
@@ -198,12 +200,9 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
     subgoal_level: str = "intermediate"
     shuffle_subgoals: bool = False
     shuffle_seed: int = 7
-    memory: str = FrameSampling.name
-    mechanism: MemoryMechanism = field(init=False, repr=False)
+    memory: str = "frames"
+    subgoals: dict[str, list[str]] = field(default_factory=dict)
     _texts: np.ndarray | None = field(default=None, init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        self.mechanism = make_mechanism(self.memory if self.frames else NoMemory.name, self.frames)
 
     def follow(self, run: TrainingRun) -> None:
         """Look up in a run's cache from now on, by its settings, unless there is a cache of its own."""
@@ -212,11 +211,13 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
         self._run, self._texts = run, None
         for name, value in gathering(run.config).items():
             setattr(self, name, value)
-        self.__post_init__()
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         """Return the transition with what was looked up."""
         extra = transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}
+        if self.subgoals:
+            extra = {**extra, CHOICES: choices(self.subgoals, extra.get("task") or [])}
+            transition = {**transition, TransitionKey.COMPLEMENTARY_DATA: extra}
         found = self.frames_of(extra, transition)
         if found is None:
             return transition
@@ -239,24 +240,23 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
         if isinstance(cache, RecordedFrames):
             encoded = [name for name in cache.columns if name.startswith(ENCODED)]
             phase |= {name: cache.columns[name][torch.tensor(indices)] for name in encoded}
-        mechanism = self.mechanism
-        if mechanism.frames == 0:
+        if not self.frames:
             return phase
-        recalled = [recall_at(cache, mechanism, episode, frame) for episode, frame in places]
-        memory = dict(zip((TOKENS, STEPS, MASK), collate_frames(recalled, mechanism.frames), strict=True))
-        if isinstance(cache, RecordedFrames):  # what is encoded for every batch anew is encoded once in it
-            starts = torch.from_numpy(cache.episodes)[[episode for episode, _ in places]]
-            memory[FRAMES] = (memory[STEPS] + starts[:, None]).masked_fill(~memory[MASK], -1)
+        slots, stride = find_mechanism(self.memory).slots, cache.meta.stride
+        recalled = [(episode, np.asarray(slots(frame // stride, self.frames))) for episode, frame in places]
+        memory, numbers = _histories(cache, recalled)
+        if self.subgoals:
+            number = {text: row for row, text in enumerate(texts_of(self.subgoals))}
+            known = np.array([*(number.get(text, -1) for text in cache.texts), -1])
+            labels = torch.from_numpy(known[cache.text_rows(self.subgoal_level)])
+            memory |= {SUBGOAL: labels[torch.tensor(indices)], SUBGOALS: labels[numbers]}
         if self.align == "none":
             return memory | phase
         rows = self._text_rows(cache)
         if self.align != "framewise":
             return memory | phase | texts_of_frames(cache, rows, indices)
-        histories = [
-            int(cache.episodes[episode]) + np.array([frame.step for frame in frames])
-            for (episode, _), frames in zip(places, recalled, strict=True)
-        ]
-        return memory | phase | texts_of_histories(cache, rows, histories, mechanism.frames)
+        histories = [int(cache.episodes[episode]) + read * stride for episode, read in recalled]
+        return memory | phase | texts_of_histories(cache, rows, histories, self.frames)
 
     def _text_rows(self, cache: FrameLookup) -> np.ndarray:
         if self._texts is None:
@@ -273,7 +273,25 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
             "shuffle_subgoals": self.shuffle_subgoals,
             "shuffle_seed": self.shuffle_seed,
         }
-        return found if self.memory in (FrameSampling.name, NoMemory.name) else found | {"memory": self.memory}
+        if self.subgoals:
+            found["subgoals"] = self.subgoals
+        return found if self.memory in ("frames", NONE) else found | {"memory": self.memory}
+
+
+def _histories(cache: FrameLookup, recalled: Sequence[tuple[int, np.ndarray]]) -> tuple[dict[str, Tensor], Tensor]:
+    """Load frames of episodes by their slots, each once; return them for a batch, and their numbers in the dataset."""
+    stride, needed = cache.meta.stride, dict[int, list[np.ndarray]]()
+    for episode, slots in recalled:
+        needed.setdefault(episode, []).append(slots)
+    unique = {episode: np.unique(np.concatenate(needed[episode])) for episode in sorted(needed)}
+    first = dict(zip(unique, np.cumsum([0, *map(len, unique.values())]), strict=False))
+    places = np.full((len(recalled), max(len(slots) for _, slots in recalled)), -1)
+    for row, (episode, slots) in enumerate(recalled):
+        places[row, : len(slots)] = first[episode] + np.searchsorted(unique[episode], slots)
+    steps = torch.from_numpy(np.concatenate([slots * stride for slots in unique.values()]))
+    starts = np.repeat([cache.episodes[episode] for episode in unique], [len(slots) for slots in unique.values()])
+    frames = torch.cat([cache.tokens(episode, slots.tolist()) for episode, slots in unique.items()])
+    return {FRAMES: frames, STEPS: steps, PLACES: torch.from_numpy(places)}, steps + torch.from_numpy(starts)
 
 
 @dataclass

@@ -6,23 +6,15 @@ Rows are independent: what one does depends on no other, nor on how many there a
 from __future__ import annotations
 
 import hashlib
-import logging
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
-    Frame,
-    MemoryBatch,
-    MemoryMechanism,
-    collate_frames,
-)
 from lerobot_memobench.policies.memobench_mem.objects import HAND_DIM, rotation
-
-logger = logging.getLogger(__name__)
 
 STILL, PER_RADIAN = 0.006, 0.1
 """How little a hand or a finger may move from one chunk to the next to be still, m, and what a radian counts, m."""
@@ -34,6 +26,7 @@ class Row:
 
     Attributes:
         clock: phase and control step since the phase began. position: control step since the episode began.
+        memory: state of the memory mechanism; None: nothing has been written.
         missed: the first step of a frame that was to be written and was not offered; None where all were.
         queue: planned actions that are left. last: action (A,) that was taken last; None: none.
         stood: the robot's pose when the last chunk was planned.
@@ -42,8 +35,7 @@ class Row:
     clock: tuple[int, int] | None = None
     position: int = 0
     frozen: bool = False
-    warned: bool = False  # that it is longer than what is kept
-    kept: list[Frame] = field(default_factory=list)
+    memory: Any = None
     missed: int | None = None
     seed: int = 0
     queue: deque[Tensor] = field(default_factory=deque)
@@ -90,12 +82,12 @@ class Rollout:
     while its clock stays the same (its episode is over, or the environment is waiting), whatever the other rows do.
 
     Args:
-        mechanism: what is kept and read.
-        stride: every how many control steps a frame is written; an episode's first one always is.
+        remembers: whether frames are written at all.
+        stride: every how many control steps one is; an episode's first one always is.
     """
 
-    def __init__(self, mechanism: MemoryMechanism, stride: int) -> None:
-        self.mechanism, self.stride = mechanism, stride
+    def __init__(self, remembers: bool, stride: int) -> None:
+        self.remembers, self.stride = remembers, stride
         self.reset()
 
     def reset(self) -> None:
@@ -103,14 +95,13 @@ class Rollout:
         self.rows: list[Row] = []
 
     def observe(
-        self, clocks: Sequence[tuple[int, int]], encode: Callable[[list[int]], Tensor]
+        self, clocks: Sequence[tuple[int, int]], write: Callable[[list[int]], None]
     ) -> tuple[list[int], list[bool], list[bool]]:
         """Take in one observation per row.
 
         Args:
             clocks: of each row its phase (0 prompt, 1 execution) and the control step since that began.
-            encode: from row numbers (n,) to their frames' tokens (n, P, D); called at most once, for the rows whose
-                frames are written.
+            write: writes the frames of these rows; called at most once.
 
         Returns:
             Per row: its control step since the episode began, prompt included; whether a new episode began; and
@@ -128,17 +119,8 @@ class Rollout:
         wanted = [
             row for row, step in enumerate(steps) if not frozen[row] and (started[row] or step % self.stride == 0)
         ]
-        if wanted and self.mechanism.frames:
-            for number, tokens in zip(wanted, encode(wanted).to("cpu"), strict=True):
-                writing, capacity = self.rows[number], self.mechanism.capacity
-                if capacity is not None and len(writing.kept) == capacity and not writing.warned:
-                    writing.warned = True
-                    logger.warning(
-                        "An episode has more than %d remembered frames, of which the latest are kept; call "
-                        "policy.reset() when an episode begins.",
-                        capacity,
-                    )
-                self.mechanism.write(writing.kept, Frame(steps[number], tokens))
+        if wanted and self.remembers:
+            write(wanted)
         return steps, started, frozen
 
     def _tick(self, number: int, clock: tuple[int, int]) -> bool:
@@ -156,13 +138,9 @@ class Rollout:
     def writes_next(self) -> bool:
         """Whether the frame after a row's present one is written."""
         moving = [row.position for row in self.rows if row.clock is not None and not row.frozen]
-        return self.mechanism.frames > 0 and any((step + 1) % self.stride == 0 for step in moving)
+        return self.remembers and any((step + 1) % self.stride == 0 for step in moving)
 
     def missed(self, rows: Sequence[int]) -> int | None:
         """Return the first step of some rows' frames that were to be written and were not offered; None: all were."""
         steps = (self.rows[row].missed for row in rows)
         return min((step for step in steps if step is not None), default=None)
-
-    def gather(self, rows: Sequence[int]) -> MemoryBatch:
-        """Return what chunks of some rows read."""
-        return collate_frames([self.mechanism.read(self.rows[row].kept) for row in rows], self.mechanism.frames)

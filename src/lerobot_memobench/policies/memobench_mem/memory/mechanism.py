@@ -1,201 +1,76 @@
-"""Interface of memory mechanisms, what training reads by them, and encoders of remembered frames to memory tokens.
+"""Interface of memory mechanisms: what is kept of an episode, how it is read, and how training goes through the past.
 
-A mechanism is a rule without weights: which frames of an episode are kept, and which of them are read for an action
-chunk. Its encoder, which makes memory tokens of the frames read, is learned; the one here is that of RoboMME's pi0.5,
-which joins a frame's tokens with their time and place in the picture.
+A mechanism is a module with weights of its own. In a rollout each row has a state, which `write` changes once per
+remembered frame and `read` turns into memory tokens once per action chunk. In training `replay` does the same for the
+samples of a batch, from frames loaded as a rollout would have written them; gradients pass through a bounded number of
+the last ones.
 
-Shapes: B rows, F frames, P tokens per frame, D their width, d_m width of memory tokens, L memory tokens of a row.
+Shapes: B samples, R rows, U different frames, F frames of a sample's history, P tokens per frame, D their width, d_m
+width of memory tokens, L memory tokens of a row.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
-import torch.nn.functional as F
-from einops import rearrange, repeat
 from torch import Tensor, nn
 
-from lerobot_memobench.datasets.feature_cache.reading import FrameLookup
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MEMORY_GRID
+MEMORY_GRID = 4
+"""A remembered picture is pooled to MEMORY_GRID x MEMORY_GRID tokens."""
 
+# -- in a batch -------------------------------------------------------------------------------------------------------
 
-@dataclass(frozen=True)
-class Frame:
-    """A frame: its control step since the episode began, and its tokens (P, D) on the CPU."""
-
-    step: int
-    tokens: Tensor
-
-
-Load = Callable[[Sequence[int]], list[Frame]]
-"""Loads frames of a recorded episode, and no others, by their numbers 0, 1, 2, ... among those that a rollout would
-have written."""
-
-
-class MemoryMechanism(ABC):
-    """A rule by which an episode is remembered.
-
-    Attributes:
-        name: by which it is chosen.
-        frames: how many frames a chunk reads at most; with 0 none is encoded, and training loads none.
-        capacity: how many frames are kept of an episode at most; None where all are, however many come.
-    """
-
-    name: ClassVar[str]
-    capacity: int | None
-
-    def __init__(self, frames: int) -> None:
-        self.frames = frames
-
-    @abstractmethod
-    def write(self, kept: list[Frame], frame: Frame) -> None:
-        """Take in an episode's next frame: change what is ``kept`` of the earlier ones, in place."""
-
-    @abstractmethod
-    def read(self, kept: Sequence[Frame]) -> list[Frame]:
-        """Return the frames that a chunk reads of those kept: at most `frames`, the oldest first."""
-
-    def recall(self, load: Load, slot: int) -> list[Frame]:
-        """Return what training reads at an episode's frame ``slot``: what a rollout reads there.
-
-        This loads and writes frames 0 ... ``slot`` one by one. A mechanism whose reading can be told from their number
-        alone loads those that it reads instead; a test holds both to the same result.
-        """
-        kept: list[Frame] = []
-        for frame in load(range(slot + 1)):
-            self.write(kept, frame)
-        return self.read(kept)
-
-    def encoder(self, image_dim: int, memory_dim: int, grid: int = MEMORY_GRID) -> nn.Module:
-        """Build what turns frames read into memory tokens.
-
-        It is called with tokens (B, F, P, D), their control steps (B, F) and which frames are real (B, F), and returns
-        tokens (B, L, d_m) and their mask (B, L). A recurrent memory goes through the frames here, in their order; one
-        that looks at each frame alone says so (``framewise = True``) and is given a frame that many rows read once.
-
-        Args:
-            grid: side of the square of a picture's tokens; 0 where tokens have no place in a picture.
-        """
-        return MemoryEncoder(image_dim, memory_dim, grid)
-
-
-# -- frames in a batch ------------------------------------------------------------------------------------------------
-
-
-TOKENS, STEPS, MASK = "memory.tokens", "memory.steps", "memory.mask"
-FRAMES = "memory.frames"
-"""Numbers (B, F) of remembered frames in the dataset, by which samples of one episode share what they remember; -1
-where a row has none."""
+FRAMES, STEPS, PLACES = "memory.frames", "memory.steps", "memory.places"
+"""Histories of a training batch: see `Histories`."""
+SUBGOAL, SUBGOALS, CHOICES = "memory.subgoal", "memory.subgoals", "memory.choices"
+"""Labels for mechanisms that learn from checkpoints (`MemoryMechanism.privileged`), as numbers of texts; -1: none. Of
+each sample (B,), of each frame (U,), and which texts are its task's (B, S) bool, which a rollout has too."""
 TEXT, TEXT_MASK = "memory.text", "memory.text_mask"
 PHASE = "phase"
 
 
-class MemoryBatch(NamedTuple):
-    """Frames read for B samples: tokens (B, F, P, D), control steps (B, F) int64, mask (B, F) bool."""
+class Histories(NamedTuple):
+    """What B samples remember, frames that several share once.
 
-    tokens: Tensor
-    steps: Tensor
-    mask: Tensor
-
-    def to(self, device: torch.device) -> MemoryBatch:
-        """Move it to a device."""
-        return MemoryBatch(*(tensor.to(device) for tensor in self))
-
-
-def collate_frames(rows: Sequence[Sequence[Frame]], frames: int) -> MemoryBatch:
-    """Right-pad what was read for each sample to ``frames`` frames."""
-    like = rows[0][0].tokens
-    batch = MemoryBatch(
-        tokens=torch.zeros(len(rows), frames, *like.shape, dtype=like.dtype),
-        steps=torch.zeros(len(rows), frames, dtype=torch.int64),
-        mask=torch.zeros(len(rows), frames, dtype=torch.bool),
-    )
-    for number, row in enumerate(rows):
-        batch.tokens[number, : len(row)] = torch.stack([frame.tokens for frame in row])
-        batch.steps[number, : len(row)] = torch.tensor([frame.step for frame in row])
-        batch.mask[number, : len(row)] = True
-    return batch
-
-
-def recall_at(cache: FrameLookup, mechanism: MemoryMechanism, episode: int, frame: int) -> list[Frame]:
-    """Return what ``mechanism`` reads in a cache at a frame of an episode, counted from its start."""
-    stride = cache.meta.stride
-
-    def load(slots: Sequence[int]) -> list[Frame]:
-        tokens = cache.tokens(episode, slots)
-        return [Frame(slot * stride, one) for slot, one in zip(slots, tokens.unbind(), strict=True)]
-
-    return mechanism.recall(load, frame // stride)
-
-
-# -- encoders ---------------------------------------------------------------------------------------------------------
-
-
-POSITION_DIM = 768
-_FREQUENCIES = 128
-_TIME_BASE, _SPACE_BASE = 10_000.0, 1_000.0
-
-
-def _waves(values: Tensor, base: float) -> Tensor:
-    """Sines, then cosines, of values (...) at 128 frequencies from 1 down to 1/base: (..., 256) float32."""
-    exponents = torch.arange(_FREQUENCIES, dtype=torch.float32, device=values.device) / (_FREQUENCIES - 1)
-    angles = rearrange(values.to(torch.float32), "... -> ... 1") * base**-exponents
-    return torch.cat([angles.sin(), angles.cos()], dim=-1)
-
-
-class MemoryEncoder(nn.Module):
-    """Vision tokens and their positions to memory tokens: concat(image, SiLU(Linear(position))) -> Linear.
-
-    A Linear of a concatenation is the sum of its parts' Linears. The 16 tokens of a frame share their time and all
-    frames share their grid, so the first Linear is applied to F times and 4 + 4 places instead of F * 16 tokens.
-    Tokens without a ``grid`` are joined with their time alone.
+    Attributes:
+        frames: (U, P, D') stored frames. steps: (U,) their control steps since their episodes began, int64.
+        places: (B, F) which of them each sample remembers, oldest first; -1 behind the last.
+        subgoals: (U,) number of the text that is a frame's subgoal, -1: none; with `MemoryMechanism.privileged`.
     """
 
-    framewise = True
+    frames: Tensor
+    steps: Tensor
+    places: Tensor
+    subgoals: Tensor | None = None
 
-    def __init__(self, image_dim: int, memory_dim: int, grid: int = MEMORY_GRID) -> None:
-        super().__init__()
-        self.grid = grid
-        self.position = nn.Linear(POSITION_DIM, POSITION_DIM) if grid else nn.Linear(2 * _FREQUENCIES, memory_dim)
-        self.project = nn.Linear(image_dim + self.position.out_features, memory_dim)
+    def to(self, device: torch.device) -> Histories:
+        """Move them to a device."""
+        return Histories(*(None if part is None else part.to(device) for part in self))  # type: ignore[arg-type]
 
-    def forward(self, tokens: Tensor, steps: Tensor, frame_mask: Tensor) -> tuple[Tensor, Tensor]:
-        """Encode tokens (B, F, P, D) of control steps (B, F).
 
-        Returns:
-            H (B, F*P, d_m) float32 and its mask (B, F*P) bool, from ``frame_mask`` (B, F).
-        """
-        of_image, of_position = self.project.weight.split([tokens.shape[-1], self.position.out_features], dim=1)
-        image = F.linear(tokens.to(of_image.dtype), of_image, self.project.bias)
-        # A training batch gives its frames one by one (`PooledMemoryEncoder.shared`), of a tenth as many steps.
-        at, places = steps.unique(return_inverse=True) if steps.shape[1] == 1 else (steps, None)
-        positions = F.linear(F.silu(self._positions(at)), of_position)
-        if places is not None:
-            positions = positions.index_select(0, places.flatten()).unflatten(0, places.shape)
-        encoded = image + positions
-        mask = repeat(frame_mask.bool(), "b f -> b (f p)", p=tokens.shape[2])
-        return rearrange(encoded, "b f p d -> b (f p) d"), mask
+class Query(NamedTuple):
+    """The present of R rows, by which memory may be written and read.
 
-    def _positions(self, steps: Tensor) -> Tensor:
-        """Return `position` of each token (..., 16, 768); of a frame's time alone (..., 1, d_m) without a grid.
+    Attributes:
+        tokens: (R, P, D) of the present observation, as of a remembered frame; if a mechanism `asks_present`.
+        words: (R, n, D) embedded text prompt, if it `asks_words`. real: (R, n) bool, which are no padding.
+        choices: (R, S) bool, which of the S subgoals are the task's; with `MemoryMechanism.privileged`.
+        subgoal: (R,) which is the present one, -1: none; of training samples alone.
+    """
 
-        Its input is sin t, cos t, sin y, cos y, sin x, cos x, 128 frequencies each from 1 down to 1/base. Token i of a
-        grid row lies at 4 i + 2 of the 16 patches (its middle), y runs over rows.
-        """
-        weight = self.position.weight
-        if not self.grid:
-            return rearrange(self.position(_waves(steps, _TIME_BASE).to(weight.dtype)), "... d -> ... 1 d")
-        of_time, of_row, of_column = weight.split(2 * _FREQUENCIES, dim=1)
-        middles = 4.0 * torch.arange(MEMORY_GRID, dtype=torch.float32, device=steps.device) + 2.0
-        grid = _waves(middles, _SPACE_BASE).to(weight.dtype)
-        time = F.linear(_waves(steps, _TIME_BASE).to(weight.dtype), of_time, self.position.bias)
-        rows = rearrange(F.linear(grid, of_row), "y d -> y 1 d")
-        columns = rearrange(F.linear(grid, of_column), "x d -> 1 x d")
-        return rearrange(time, "... d -> ... 1 d") + rearrange(rows + columns, "y x d -> (y x) d")
+    tokens: Tensor | None = None
+    words: Tensor | None = None
+    real: Tensor | None = None
+    choices: Tensor | None = None
+    subgoal: Tensor | None = None
+
+    def rows(self, chosen: Any) -> Query:
+        """Return some rows."""
+        return Query(*(None if part is None else part[chosen] for part in self))
 
 
 class MemoryTokens(NamedTuple):
@@ -205,11 +80,13 @@ class MemoryTokens(NamedTuple):
         each: (B, L, d), or (U, P, d) of U frames.
         mask: (B, L) bool, which are real.
         places: (B, F), which of the U frames each row reads, with F P = L; None where ``each`` lies in rows.
+        steps: (B, L), control step of the frame that a token is of, -1 where it is of none; None: of none.
     """
 
     each: Tensor
     mask: Tensor
     places: Tensor | None = None
+    steps: Tensor | None = None
 
     def through(self, made: Callable[[Tensor], Tensor]) -> MemoryTokens:
         """Return what is made of every token by itself."""
@@ -222,38 +99,218 @@ class MemoryTokens(NamedTuple):
         return self.each.index_select(0, self.places.flatten()).unflatten(0, self.places.shape).flatten(1, 2)
 
 
-class PooledMemoryEncoder(nn.Module):
-    """Stored frames to memory tokens: each through a pool, then the mechanism's encoder over the frames.
+# -- the interface ----------------------------------------------------------------------------------------------------
 
-    Args:
-        pool: from N frames (N, P, D') to their tokens (N, P'', D). encoder: of (B, F, P'', D).
+
+State = Any
+"""What is kept of R rows: a dict of tensors (R, ...), unless a mechanism has its own ``join`` and ``replay``."""
+
+
+@dataclass(frozen=True)
+class MemorySpec:
+    """What a mechanism is built for.
+
+    Attributes:
+        dim: D, width of a frame's tokens. tokens: P, their number. width: d_m, of memory tokens.
+        expert: width of the action expert. frames: F at most, of what a chunk reads.
+        grid: side of the square of a picture's tokens; 0 where tokens have no place in a picture.
+        stride: control steps from one written frame to the next.
+        subgoals: texts of the checkpoints, where the mechanism is `MemoryMechanism.privileged`.
     """
 
-    def __init__(self, pool: nn.Module, encoder: nn.Module) -> None:
-        super().__init__()
-        self.pool, self.encoder = pool, encoder
+    dim: int
+    tokens: int
+    width: int
+    expert: int
+    frames: int
+    grid: int
+    stride: int
+    subgoals: tuple[str, ...] = ()
 
-    def forward(self, frames: Tensor, steps: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-        """Encode frames (B, F, P, D') of steps (B, F), of which mask (B, F) are real.
 
-        Returns:
-            H (B, L, d_m) and its mask (B, L).
-        """
-        memory, real = self.encoder(self.pool(frames.flatten(0, 1)).unflatten(0, mask.shape), steps, mask)
-        return memory, real
+@dataclass
+class NoSettings:
+    """Settings of a mechanism that has none."""
 
-    def shared(self, frames: Tensor, steps: Tensor, mask: Tensor, numbers: Tensor) -> MemoryTokens:
-        """Encode what `forward` does; a frame that many rows read is pooled once, and, if the encoder is ``framewise``,
-        encoded once.
+
+class MemoryMechanism(nn.Module, ABC):
+    """A way to remember an episode.
+
+    Attributes:
+        Settings: a dataclass of what may be set (``policy.memory_settings``), each with a default.
+        stride: control steps from one written frame to the next where nobody says; None: as `frames`.
+        asks_present: whether it reads by tokens of the present observation.
+        asks_words: whether it writes or reads by the text prompt.
+        privileged: whether it learns from the checkpoints' texts; a rollout is told the texts of its task, in no order.
+        fusion: its own way in which actions read it (``policy.memory_fusion=own``), a `fusion.MemoryFusion`; None: any
+            other of these.
+        gradient_frames: through how many of the last frames gradients pass at most.
+        per_frame: whether memory tokens are P of each frame read, oldest first, as ``align=framewise`` needs.
+        capacity: how many entries are kept of an episode at most.
+    """
+
+    Settings: ClassVar[type] = NoSettings
+    stride: ClassVar[int | None] = None
+    asks_present: ClassVar[bool] = False
+    asks_words: ClassVar[bool] = False
+    privileged: ClassVar[bool] = False
+    fusion: ClassVar[Any] = None
+    per_frame: ClassVar[bool] = False
+    gradient_frames: int = 0
+    capacity: int
+
+    def __init__(self, spec: MemorySpec, pool: nn.Module, settings: Any) -> None:
+        """Build it.
 
         Args:
-            numbers: (B, F), equal where frames and their steps are.
+            pool: from N stored frames (N, P', D') to their tokens (N, P, D). It learns, and is part of the memory.
+            settings: an instance of `Settings`.
         """
-        unique, places = numbers.unique(return_inverse=True)
-        order = torch.arange(places.numel(), device=places.device)
-        first = places.new_zeros(len(unique)).scatter_(0, places.flatten(), order)
-        pooled = self.pool(frames.flatten(0, 1)[first])
-        if not getattr(self.encoder, "framewise", False):
-            return MemoryTokens(*self.encoder(pooled[places], steps, mask))
-        each, real = self.encoder(pooled.unsqueeze(1), steps.flatten()[first, None], mask.flatten()[first, None])
-        return MemoryTokens(each, real[places].flatten(1, 2), places)
+        super().__init__()
+        self.spec, self.pool, self.settings = spec, pool, settings
+
+    # -- a rollout ---------------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def init(self, rows: int) -> State:
+        """Return the state of rows whose episodes begin."""
+
+    @abstractmethod
+    def write(self, state: State, tokens: Tensor, step: Tensor, query: Query | None = None) -> State:
+        """Return the state after each row's next frame; ``state`` itself is not changed.
+
+        Args:
+            tokens: (R, P, D) of the frame, behind the pool. step: (R,) control step since the episode began.
+            query: words and choices of the rows.
+        """
+
+    @abstractmethod
+    def read(self, state: State, query: Query | None = None) -> MemoryTokens:
+        """Return the tokens that a chunk reads, (R, L, d_m), L being the same for all states."""
+
+    def observe(self, state: State, frames: Tensor, step: Tensor, query: Query | None = None) -> State:
+        """Return the state after each row's next stored frame (R, P', D')."""
+        return self.write(state, self.pool(frames), step, query)
+
+    def join(self, states: Sequence[State]) -> State:
+        """Return one state of the rows of several."""
+        return {name: torch.cat([state[name] for state in states]) for name in states[0]}
+
+    # -- a training --------------------------------------------------------------------------------------------------
+
+    @classmethod
+    def slots(cls, slot: int, frames: int) -> Sequence[int]:
+        """Return which of an episode's frames 0 ... ``slot`` are loaded to read at the last; all, where nobody knows.
+
+        Args:
+            frames: F of the specification.
+        """
+        return range(slot + 1)
+
+    def replay(self, histories: Histories, query: Query | None = None) -> MemoryTokens:
+        """Return what B samples read, as rollouts would that have written the same frames.
+
+        Frames but the last `gradient_frames` of each sample are written without gradients, once for all samples of an
+        episode. Histories must begin at the same frame for all samples of an episode.
+
+        Args:
+            query: the samples' present.
+        """
+        return self.read(self.state_after(histories, query), query)
+
+    def state_after(self, histories: Histories, query: Query | None = None) -> State:
+        """Return the states of B samples, each after the last frame of its history."""
+        count = (histories.places >= 0).sum(dim=1)
+        begin = (count - self.gradient_frames).clamp(min=0)
+        with torch.no_grad():
+            state = self._before(histories, begin, query)
+        if not self.gradient_frames:
+            return state
+        fresh = self.init(len(begin))  # whose gradients count where nothing was written before
+        early = begin == 0
+        state = {name: torch.where(_like(early, of), fresh[name], of) for name, of in state.items()}
+        ahead = begin[:, None] + torch.arange(int((count - begin).max()), device=begin.device)
+        places = histories.places.gather(1, ahead.clamp(max=histories.places.shape[1] - 1))
+        order = (count - begin).argsort(descending=True, stable=True)  # those that end drop off the end
+        written = self._written(
+            _rows(state, order), histories, places[order], (count - begin)[order], _of(query, order)
+        )
+        return _rows(self.join(written[::-1]), order.argsort())
+
+    def _before(self, histories: Histories, begin: Tensor, query: Query | None) -> State:
+        """Return the states of B samples, each after the first ``begin`` (B,) frames of its history.
+
+        Each episode is gone through once, as far as its latest sample asks.
+        """
+        first, episode = histories.places[:, 0].unique(return_inverse=True)
+        until = torch.zeros_like(first).scatter_reduce(0, episode, begin, "amax")
+        latest = torch.zeros_like(first)
+        ends = begin == until[episode]
+        latest[episode[ends]] = ends.nonzero().flatten()  # a sample of each episode, which asks the furthest
+        order = until.argsort(descending=True, stable=True)
+        samples, row_of = latest[order], order.argsort()[episode]
+        stops: dict[int, list[int]] = {}
+        for sample, stop in enumerate(begin.tolist()):
+            stops.setdefault(stop, []).append(sample)
+        found = self._written(
+            self.init(len(order)),
+            histories,
+            histories.places[samples],
+            until[order],
+            _of(query, samples),
+            stops,
+            row_of,
+        )
+        back = torch.tensor([sample for stop in sorted(stops) for sample in stops[stop]], device=begin.device)
+        return _rows(self.join(found), back.argsort())
+
+    def _written(
+        self,
+        state: State,
+        histories: Histories,
+        places: Tensor,
+        counts: Tensor,
+        query: Query | None,
+        stops: dict[int, list[int]] | None = None,
+        row_of: Tensor | None = None,
+    ) -> list[State]:
+        """Write the first ``counts`` (R,) frames, descending, of the rows' ``places`` (R, T); return states on the way.
+
+        Returns:
+            Without ``stops`` those of the rows that end, after 0, 1, ... frames; else those of samples by ``stops``
+            (after so many frames, these), which go with the rows ``row_of`` (B,).
+        """
+        needed, where = places.clamp(min=0).unique(return_inverse=True)
+        pooled, steps = self.pool(histories.frames[needed]), histories.steps[needed]
+        left, found = counts.tolist(), []
+        for time in range(left[0] + 1):
+            still = sum(count > time for count in left)
+            if stops is None and still < len(left):
+                found.append(_rows(state, slice(still, len(left))))
+            if stops is not None and time in stops:
+                assert row_of is not None
+                found.append(_rows(state, row_of[stops[time]]))
+            left, state = left[:still], _rows(state, slice(still))
+            if still:
+                now, part = where[:still, time], _of(query, slice(still))
+                state = self.write(state, pooled[now], steps[now], part)
+        return found
+
+    # -- what it learns by itself -------------------------------------------------------------------------------------
+
+    def losses(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return losses of its own by their names, (B,) each and weighted; called after `replay` and the actions'."""
+        return {}
+
+
+def _rows(state: dict[str, Tensor], chosen: Any) -> dict[str, Tensor]:
+    return {name: tensor[chosen] for name, tensor in state.items()}
+
+
+def _of(query: Query | None, chosen: Any) -> Query | None:
+    return None if query is None else query.rows(chosen)
+
+
+def _like(rows: Tensor, other: Tensor) -> Tensor:
+    """Return ``rows`` (R,) with as many dimensions as another tensor (R, ...)."""
+    return rows.reshape(-1, *[1] * (other.ndim - 1))

@@ -1,0 +1,205 @@
+"""Frame sampling: an action chunk reads frames spread evenly over the episode so far (RoboMME; the paper's memory)."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from einops import rearrange, repeat
+from torch import Tensor, nn
+
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
+    MEMORY_GRID,
+    Histories,
+    MemoryMechanism,
+    MemorySpec,
+    MemoryTokens,
+    Query,
+)
+
+logger = logging.getLogger(__name__)
+
+
+def sample_frames(step: int, max_frames: int) -> list[int]:
+    """Choose at most ``max_frames`` of the frames 0 ... ``step``, evenly, first and last included.
+
+    All of them while there are no more than ``max_frames``. Indices are rounded down and strictly increase.
+    """
+    if step < 0 or max_frames < 1:
+        raise ValueError(f"step must be >= 0 and max_frames >= 1, got {step} and {max_frames}")
+    if step < max_frames:
+        return list(range(step + 1))
+    if max_frames == 1:
+        return [step]
+    return [i * step // (max_frames - 1) for i in range(max_frames)]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A frame: its control step since the episode began, and what is stored of it (P', D') on the CPU."""
+
+    step: int
+    stored: Tensor
+
+
+@dataclass
+class FramesSettings:
+    """Settings of `Frames`.
+
+    Attributes:
+        time_codes: whether a memory token says when its frame was; if not, only the frames' order is told.
+        content: whether it says what was seen; if not, memory is a clock: the control of `docs/guides/controls.md`.
+    """
+
+    time_codes: bool = True
+    content: bool = True
+
+    def __post_init__(self) -> None:
+        if not (self.time_codes or self.content):
+            raise ValueError("a memory with neither time_codes nor content says nothing")
+
+
+class Frames(MemoryMechanism):
+    """FrameSamp of RoboMME's pi0.5: stored frames, of which a chunk reads F spread evenly, each token with its time.
+
+    Every frame is stored, because which are read changes with each new one; of an episode without end the latest. They
+    are kept as they were stored, and pooled when they are read.
+    """
+
+    Settings = FramesSettings
+    per_frame = True
+    capacity = 8192  # 512 MiB at size pi05, 32 MiB at tiny; with every frame remembered, seven minutes at 20 Hz
+
+    def __init__(self, spec: MemorySpec, pool: nn.Module, settings: FramesSettings) -> None:
+        super().__init__(spec, pool, settings)
+        self.encoder = MemoryEncoder(spec.dim, spec.width, spec.grid)
+        self.warned = False
+
+    @classmethod
+    def slots(cls, slot: int, frames: int) -> Sequence[int]:
+        """Return the sampled frames alone."""
+        first = max(0, slot + 1 - cls.capacity)
+        return [first + chosen for chosen in sample_frames(slot - first, frames)]
+
+    def init(self, rows: int) -> list[list[Frame]]:
+        """Return no frames."""
+        return [[] for _ in range(rows)]
+
+    def observe(self, state: Any, frames: Tensor, step: Tensor, query: Query | None = None) -> list[list[Frame]]:
+        """Keep the frames as they are."""
+        return self.write(state, frames, step)
+
+    def write(self, state: Any, tokens: Tensor, step: Tensor, query: Query | None = None) -> list[list[Frame]]:
+        """Keep the frames, as they are stored."""
+        if not self.warned and any(len(row) == self.capacity for row in state):
+            self.warned = True
+            logger.warning(
+                "An episode has more than %d remembered frames, of which the latest are kept; call policy.reset() "
+                "when an episode begins.",
+                self.capacity,
+            )
+        new = [Frame(now, stored) for now, stored in zip(step.tolist(), tokens.to("cpu"), strict=True)]
+        return [[*row[1 - self.capacity :], frame] for row, frame in zip(state, new, strict=True)]
+
+    def read(self, state: Any, query: Query | None = None) -> MemoryTokens:
+        """Encode the sampled frames of each row; rows with fewer than F are padded."""
+        count, like = self.spec.frames, state[0][0].stored
+        frames = torch.zeros(len(state), count, *like.shape, dtype=like.dtype)
+        steps, real = (
+            torch.zeros(len(state), count, dtype=torch.int64),
+            torch.zeros(len(state), count, dtype=torch.bool),
+        )
+        for number, kept in enumerate(state):
+            row = [kept[slot] for slot in sample_frames(len(kept) - 1, count)]
+            frames[number, : len(row)] = torch.stack([frame.stored for frame in row])
+            steps[number, : len(row)] = torch.tensor([frame.step for frame in row])
+            real[number, : len(row)] = True
+        device = self.encoder.project.weight.device
+        frames, steps, real = frames.to(device), steps.to(device), real.to(device)
+        each = self._encoded(self.pool(frames.flatten(0, 1)).unflatten(0, real.shape), steps)
+        return self._tokens(each.flatten(1, 2), real, steps)
+
+    def join(self, states: Sequence[Any]) -> list[list[Frame]]:
+        """Return the rows of several states."""
+        return [row for state in states for row in state]
+
+    def replay(self, histories: Histories, query: Query | None = None) -> MemoryTokens:
+        """Encode each frame once, whichever samples read it."""
+        padded = F.pad(histories.places, (0, self.spec.frames - histories.places.shape[1]), value=-1)
+        real, places = padded >= 0, padded.clamp(min=0)
+        each = self._encoded(self.pool(histories.frames).unsqueeze(1), histories.steps[:, None]).squeeze(1)
+        found = self._tokens(each, real, histories.steps[places])
+        return found._replace(places=places)
+
+    def _encoded(self, tokens: Tensor, steps: Tensor) -> Tensor:
+        """Return memory tokens (B, F, P, d_m) of tokens (B, F, P, D) at control steps (B, F)."""
+        tokens = tokens if self.settings.content else torch.zeros_like(tokens)
+        encoded: Tensor = self.encoder(tokens, steps if self.settings.time_codes else torch.zeros_like(steps))
+        return encoded
+
+    def _tokens(self, each: Tensor, real: Tensor, steps: Tensor) -> MemoryTokens:
+        mask, steps = (repeat(of_frames, "b f -> b (f p)", p=self.spec.tokens) for of_frames in (real, steps))
+        return MemoryTokens(each, mask, steps=steps)
+
+
+# -- the encoder ------------------------------------------------------------------------------------------------------
+
+
+POSITION_DIM = 768
+_FREQUENCIES = 128
+_TIME_BASE, _SPACE_BASE = 10_000.0, 1_000.0
+
+
+def _waves(values: Tensor, base: float) -> Tensor:
+    """Sines, then cosines, of values (...) at 128 frequencies from 1 down to 1/base: (..., 256) float32."""
+    exponents = torch.arange(_FREQUENCIES, dtype=torch.float32, device=values.device) / (_FREQUENCIES - 1)
+    angles = rearrange(values.to(torch.float32), "... -> ... 1") * base**-exponents
+    return torch.cat([angles.sin(), angles.cos()], dim=-1)
+
+
+class MemoryEncoder(nn.Module):
+    """Vision tokens and their positions to memory tokens: concat(image, SiLU(Linear(position))) -> Linear.
+
+    A Linear of a concatenation is the sum of its parts' Linears. The 16 tokens of a frame share their time and all
+    frames share their grid, so the first Linear is applied to F times and 4 + 4 places instead of F * 16 tokens.
+    Tokens without a ``grid`` are joined with their time alone.
+    """
+
+    def __init__(self, image_dim: int, memory_dim: int, grid: int = MEMORY_GRID) -> None:
+        super().__init__()
+        self.grid = grid
+        self.position = nn.Linear(POSITION_DIM, POSITION_DIM) if grid else nn.Linear(2 * _FREQUENCIES, memory_dim)
+        self.project = nn.Linear(image_dim + self.position.out_features, memory_dim)
+
+    def forward(self, tokens: Tensor, steps: Tensor) -> Tensor:
+        """Encode tokens (B, F, P, D) of control steps (B, F) to (B, F, P, d_m) float32."""
+        of_image, of_position = self.project.weight.split([tokens.shape[-1], self.position.out_features], dim=1)
+        image = F.linear(tokens.to(of_image.dtype), of_image, self.project.bias)
+        # A training batch gives its frames one by one, of a tenth as many steps.
+        alone = steps.shape[1] == 1 and not steps.is_meta
+        at, places = steps.unique(return_inverse=True) if alone else (steps, None)
+        positions = F.linear(F.silu(self._positions(at)), of_position)
+        if places is not None:
+            positions = positions.index_select(0, places.flatten()).unflatten(0, places.shape)
+        return image + positions
+
+    def _positions(self, steps: Tensor) -> Tensor:
+        """Return `position` of each token (..., 16, 768); of a frame's time alone (..., 1, d_m) without a grid.
+
+        Its input is sin t, cos t, sin y, cos y, sin x, cos x, 128 frequencies each from 1 down to 1/base. Token i of a
+        grid row lies at 4 i + 2 of the 16 patches (its middle), y runs over rows.
+        """
+        weight = self.position.weight
+        if not self.grid:
+            return rearrange(self.position(_waves(steps, _TIME_BASE).to(weight.dtype)), "... d -> ... 1 d")
+        of_time, of_row, of_column = weight.split(2 * _FREQUENCIES, dim=1)
+        middles = 4.0 * torch.arange(MEMORY_GRID, dtype=torch.float32, device=steps.device) + 2.0
+        grid = _waves(middles, _SPACE_BASE).to(weight.dtype)
+        time = F.linear(_waves(steps, _TIME_BASE).to(weight.dtype), of_time, self.position.bias)
+        rows = rearrange(F.linear(grid, of_row), "y d -> y 1 d")
+        columns = rearrange(F.linear(grid, of_column), "x d -> 1 x d")
+        return rearrange(time, "... d -> ... 1 d") + rearrange(rows + columns, "y x d -> (y x) d")
