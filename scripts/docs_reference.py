@@ -196,8 +196,8 @@ def spaces_page() -> str:
         "pixels/image": "third-person camera, RGB, upright",
         "pixels/wrist_image": "wrist camera, RGB, upright",
         "agent_pos": "end-effector position 3 (m), axis-angle 3 (rad), fingers 2 (m)",
-        "phase": "0 demonstration prompt, 1 execution",
-        "step": "control steps since the phase began",
+        "phase": "0 demonstration prompt, or the robot idles; 1 execution",
+        "step": "control steps since the phase began; of strict tasks since the episode began",
         "environment_state": f"{SLOTS} object slots, with `env.obs_type` of that name or `both`",
         "picture_step": "step that the pictures show; with `env.render_every` above 1",
         "expert_action": "the scripted expert's; with `env.expert_action=true`",
@@ -459,7 +459,7 @@ def tasks_page(suite: str) -> str:
     ]
     if suite == "strict":
         parts.append(
-            "In counting tasks a clock decides: [what this suite does not "
+            "The robot [idles](protocol.md#idling) before each execution. [What this suite does not "
             "show](suites.md#what-the-strict-suite-does-not-show)."
         )
     kind = None

@@ -11,7 +11,7 @@ HORIZON = 1200
 PROMPT_HORIZON = 1500
 """Control steps after which a demonstration prompt ends, whatever it still had to show. Hiding two things takes some
 750; with one of them grasped at the fifth try more than 1000."""
-IDLE_STEPS = 1200
+IDLE_STEPS = 1800
 """Control steps that the robot idles at most before the execution of a strict task: the seed draws how many, uniformly
 from 0 on. So the step tells little of what has been done (docs/research/clock.md)."""
 PROMPT, EXECUTION = 0, 1

@@ -45,7 +45,8 @@ COUNTING = "turn_the_stove_on_and_off_a_given_number_of_times"
 SEED = 10_000
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "research"
 FULL_RUNS = {"published": DOCS / "full_run" / "manifest.json", "strict": DOCS / "strict_run" / "manifest.json"}
-"""Hashes of 1,500 demonstrations, as ``memobench describe`` wrote them."""
+"""Hashes of 1,500 demonstrations, as ``memobench describe`` wrote them; the strict ones are of before the robot idled,
+and of variants that were drawn otherwise."""
 
 
 @pytest.mark.parametrize(("suite", "solved"), [("published", 1_500), ("strict", 1_499)])
@@ -457,7 +458,7 @@ print(made.failure or made.info["digest"])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("suite", "name"), [(suite, name) for suite in FULL_RUNS for name in task_names(suite=suite)])
+@pytest.mark.parametrize(("suite", "name"), [("published", name) for name in task_names()])
 def test_a_full_run_is_repeated(suite, name, tmp_path):
     """Of each task's first seed comes what was committed: the demonstration with that hash, or that reason for none.
 

@@ -34,7 +34,8 @@ def seed_of(name: str, low: int, high: int) -> int:
 
 def test_how_long_is_drawn_uniformly_and_apart_from_the_variant() -> None:
     steps = np.array([idle(STOVE, seed) for seed in SEEDS])
-    assert (steps.min(), steps.max()) == (0, IDLE_STEPS)
+    assert 0 <= steps.min() < 20
+    assert IDLE_STEPS - 20 < steps.max() <= IDLE_STEPS
     assert np.abs(np.quantile(steps, [0.25, 0.5, 0.75]) / IDLE_STEPS - [0.25, 0.5, 0.75]).max() < 0.05
     variants = np.array([referent_of(get_task(STOVE), seed).variant_index for seed in SEEDS])
     for variant in range(3):

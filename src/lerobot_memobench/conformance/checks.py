@@ -178,7 +178,7 @@ def plans_anew(found: Behaviour) -> str:
         return "the first execution frame decides the first action"
     raise Refuted(
         "the first execution frame does not decide the first action, which is left over from the prompt: empty a row's "
-        "action queue where its phase becomes 1 (observation.step is 0)"
+        "action queue where observation.phase becomes 1"
     )
 
 
