@@ -2,7 +2,7 @@
 
 LeRobot 0.6.1 shards through accelerate, by torch's ``FullyShardedDataParallel``: launch a training with ``accelerate
 launch --use_fsdp``. The policy then says by itself how it is sharded. Units, which are whole on a GPU only while they
-are computed with, are the transformers' MLPs, three quarters of what learns. A layer is no unit: pi0.5 calls its parts
+are computed with, are the transformers' MLPs, two thirds of what learns. A layer is no unit: pi0.5 calls its parts
 and never the layer. What is frozen stays whole in each process.
 """
 
