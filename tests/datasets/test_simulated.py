@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -24,12 +25,16 @@ from lerobot_memobench.datasets import dagger
 from lerobot_memobench.datasets.dagger import TURN_STEPS, load_learner
 from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels
 from lerobot_memobench.datasets.generation import generate
+from lerobot_memobench.datasets.hdf5.reading import PublishedFile
+from lerobot_memobench.datasets.hdf5.restore import restore
+from lerobot_memobench.datasets.hdf5.writing import data_attributes, write_task_file
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
-from lerobot_memobench.datasets.lerobot_format.reading import read_episode
+from lerobot_memobench.datasets.lerobot_format.reading import check_idling, read_episode
 from lerobot_memobench.datasets.perturbation import Perturbation
 from lerobot_memobench.datasets.recording import HOLD_FRAMES, PATIENCE, record_demonstration
 from lerobot_memobench.datasets.replay import replay
+from lerobot_memobench.datasets.staging import HDF5, stage_demonstration
 from lerobot_memobench.datasets.validate import Verdict, exit_status, validate
 from lerobot_memobench.envs.episode import first_execution_step
 from lerobot_memobench.errors import MemobenchError
@@ -40,7 +45,7 @@ from lerobot_memobench.tasks.catalogue import get_task, task_names
 STOVE = "turn_on_the_stove_and_turn_it_off"
 BUTTER = "put_the_butter_into_the_bowl_from_the_prompt_video"
 HIDDEN = "find_the_tomato_hidden_in_one_of_the_drawers"
-POINTED = "put_only_the_milk_pointed_out_in_the_prompt_video_on_the_plate"
+HIGHLIGHT = "put_only_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
 COUNTING = "turn_the_stove_on_and_off_a_given_number_of_times"
 SEED = 10_000
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "research"
@@ -144,10 +149,15 @@ def test_replay_agrees(stove, butter):
     assert replay(butter) is None
 
 
-@pytest.mark.parametrize("name", [COUNTING, POINTED])
+@cache
+def strict_demonstration(name: str) -> Demonstration:
+    return record_demonstration(get_task(name), SEED, images=False, referent="drawn", perturb=True)
+
+
+@pytest.mark.parametrize("name", [COUNTING, HIGHLIGHT])
 def test_a_robot_that_idles_is_recorded_at_rest(name):
     """Its step counts through, its actions are zeros, and what a policy sees is the execution's first frame."""
-    demo = record_demonstration(get_task(name), SEED, images=False, referent="drawn", perturb=True)
+    demo = strict_demonstration(name)
     begins, found = first_execution_step(get_task(name), SEED, True), labels(demo)
     assert demo.success
     assert demo.exec_start == begins > 0
@@ -160,6 +170,27 @@ def test_a_robot_that_idles_is_recorded_at_rest(name):
     for column in (demo.states, demo.proprio, demo.objects):
         assert (column[rest:begins] == column[begins]).all()
     assert replay(demo) is None
+
+
+def test_a_dataset_of_a_robot_that_does_not_idle_is_refused(tmp_path):
+    demo = strict_demonstration(COUNTING)
+    start, parts = demo.exec_start, ("states", "actions", "proprio", "objects", "satisfied")
+    before = replace(demo, exec_start=0, executed=None, **{name: getattr(demo, name)[start:] for name in parts})
+    check_idling(write_dataset([demo], tmp_path / "now"))
+    write_dataset([before], tmp_path / "before")
+    with pytest.raises(MemobenchError, match=f"begins its execution at step 0 and not, as now, at {start}: .*again"):
+        validate(tmp_path / "before")
+
+
+def test_a_robot_that_idles_is_read_back_from_the_published_layout(tmp_path):
+    demo = record_demonstration(get_task(HIGHLIGHT), SEED, referent="drawn", image_size=32)
+    staged = stage_demonstration(replace(demo, model_xml="<mujoco/>"), tmp_path / "0", (HDF5,))
+    write_task_file(tmp_path / "a.hdf5", data_attributes(demo.task), [staged.hdf5])
+    with PublishedFile(tmp_path / "a.hdf5") as file:
+        again = restore(demo.task, file.read("demo_0"))
+    assert digest(again) == digest(demo)
+    np.testing.assert_array_equal(again.objects, demo.objects)
+    np.testing.assert_array_equal(labels(again).step, labels(demo).step)
 
 
 def test_replay_of_a_hiding_agrees():

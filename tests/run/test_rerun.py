@@ -17,6 +17,7 @@ from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash
 from lerobot_memobench.perception.weights import SHIPPED
+from lerobot_memobench.protocol import IDLE_STEPS
 from lerobot_memobench.run import rerun
 from lerobot_memobench.run.arguments import field_types, without_none
 from lerobot_memobench.run.card import checkpoint_files, new_card, tree_hash, with_episodes, write_card
@@ -25,6 +26,7 @@ from lerobot_memobench.run.plan import plan_line
 from lerobot_memobench.run.rerun import allowed_flags, check_policy, plan_of_card, repeatable_card
 
 STOVE, DRAWER = "turn_on_the_stove_and_turn_it_off", "check_the_top_drawer_of_the_cabinet"
+COUNTING = "turn_the_stove_on_and_off_a_given_number_of_times"
 RECORD = {"task": STOVE, "memory_type": "temporal", "episode": 0, "seed": 7, "success": True, "checkpoints": []}
 
 
@@ -158,6 +160,16 @@ def test_other_eyes_than_those_on_the_card_are_refused() -> None:
     for sha256 in ({"detector_sha256": "0" * 64}, {}):
         with pytest.raises(MemobenchError, match="detector package is not the one that was used"):
             check_policy(told | {"policy": told["policy"] | sha256})
+
+
+@pytest.mark.parametrize("told", [{}, {"idle": 1200}])
+def test_a_strict_card_is_repeated_only_where_the_robot_idles_as_long(told: dict[str, int]) -> None:
+    flags = ["--env.type=memobench", "--policy.type=memobench_random", "--env.suite=strict"]
+    asked = {"tasks": [COUNTING], "episodes": 1, "suite": "strict", **told}
+    write_card(Path(), card(flags, protocol=asked))
+    idled = f"idled {told.get('idle', 0)} steps at most, and idles {IDLE_STEPS} here.*repeat it with that version"
+    with pytest.raises(MemobenchError, match=idled):
+        rerun.repeat(Path("card.json"), None, None, lambda plan: pytest.fail("it was run"), print)
 
 
 def test_a_repository_is_its_copy_in_the_cache(monkeypatch: pytest.MonkeyPatch) -> None:

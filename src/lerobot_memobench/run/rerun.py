@@ -24,7 +24,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import CARD_FILE, read_card
 from lerobot_memobench.io import count_of
 from lerobot_memobench.policies.checkpoint import local_folder
-from lerobot_memobench.protocol import SEALED
+from lerobot_memobench.protocol import IDLE_STEPS, SEALED
 from lerobot_memobench.run.arguments import PLAIN, checked_value, chosen_class, flag_value, setting_type, without_none
 from lerobot_memobench.run.arguments import settings as settings_of
 from lerobot_memobench.run.card import checkpoint_files, detector_hash, drawn_otherwise, first_disagreement, tree_hash
@@ -89,6 +89,12 @@ def repeat(
             f"the card's episodes drew their variants otherwise ({otherwise}): an earlier version ran them, which did "
             f"not draw in balance; repeat it with that version ({_version_of(card)})"
         )
+    told = card["protocol"]
+    if told.get(IDLE, 0) != idling(told.get("suite", PUBLISHED)).get(IDLE, 0):
+        raise MemobenchError(
+            f"the robot of the card's strict episodes idled {told.get(IDLE, 0)} steps at most, and idles {IDLE_STEPS} "
+            f"here: an earlier version ran them; repeat it with that version ({_version_of(card)})"
+        )
     for note in differences_here(card):
         say(f"note: {note}")
     plan = plan_of_card(card, out)
@@ -119,12 +125,6 @@ def repeatable_card(path: Path, server: str | None = None) -> dict[str, Any]:
     """
     path = path / CARD_FILE if path.is_dir() else path
     card = read_card(path, whole=True)
-    told = card["protocol"]
-    if told.get(IDLE, 0) != idling(told.get("suite", PUBLISHED)).get(IDLE, 0):
-        raise MemobenchError(
-            f"{path} is of strict episodes from before the robot idled, which begin otherwise now; evaluate the policy "
-            "anew instead"
-        )
     if not card["episodes"]:
         raise MemobenchError(f"{path} holds no episodes to compare with; expected that of an evaluation that has ended")
     return {**card, "flags": allowed_flags(card.get("flags"), server)}
