@@ -8,21 +8,33 @@ from pathlib import Path
 import pytest
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "lerobot_policy_window"
+MEMORY = Path(__file__).parents[2] / "examples" / "memobench_memory_traces"
+
+
+def install(package: Path, folder: Path) -> None:
+    """Install a package of examples/ as a third party's, as a wheel."""
+    words = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder / "wheel")]
+    subprocess.run(words, cwd=package, check=True, capture_output=True)
+    (wheel,) = (folder / "wheel").iterdir()
+    zipfile.ZipFile(wheel).extractall(folder)
+    sys.path.insert(0, str(folder))
 
 
 @pytest.fixture(scope="session")
 def example(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Install the example as a third party's package, as a wheel; LeRobot finds it by itself. Return where it is."""
+    """Install the example of a policy; LeRobot finds it by itself. Return where it is."""
     from lerobot.utils.import_utils import register_third_party_plugins
 
     folder = tmp_path_factory.mktemp("site")
-    words = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder / "wheel")]
-    subprocess.run(words, cwd=EXAMPLE, check=True, capture_output=True)
-    (wheel,) = (folder / "wheel").iterdir()
-    zipfile.ZipFile(wheel).extractall(folder)
-    sys.path.insert(0, str(folder))
+    install(EXAMPLE, folder)
     register_third_party_plugins()
     return folder
+
+
+@pytest.fixture(scope="session")
+def traces(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Install the example of a memory."""
+    install(MEMORY, tmp_path_factory.mktemp("memory_site"))
 
 
 @pytest.fixture(scope="session")
