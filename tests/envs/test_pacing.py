@@ -140,6 +140,23 @@ def test_the_horizon_counts_actions_at_full_speed_and_waits_in_pauses() -> None:
     assert episode.cut_off
 
 
+def test_a_pause_is_observed_once_and_what_follows_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked: list[int] = []
+    objects = Episode.objects
+    monkeypatch.setattr(Episode, "objects", lambda self: looked.append(self.step_index) or objects(self))
+    env = MemobenchEnv(STOVE, obs_type=OBJECTS, horizon=200, pause_steps=30)
+    env.reset(seed=7)
+    rested = {0: False}
+    over = False
+    while not over:
+        *_, over, _ = env.step(np.full(7, 0.1, np.float32))
+        rested[env.episode.step_index] = env.episode.rested
+    pauses = sum(rested[step] and not rested[step - 1] for step in rested if step)
+    assert pauses > 1
+    assert len(looked) == sum(not rests for rests in rested.values()) + pauses
+    assert sum(rested[step] for step in looked) == pauses
+
+
 def test_the_log_and_the_protocol_tell_the_pace(tmp_path: Path) -> None:
     env = MemobenchEnv(
         STOVE, obs_type=OBJECTS, horizon=60, pause_steps=10, speed=0.5, replan_steps=4, log_dir=str(tmp_path)

@@ -184,6 +184,11 @@ class Episode:
         return self.phase == PROMPT and self._demonstrator is None
 
     @property
+    def still(self) -> bool:
+        """The scene is as it was a step ago: the robot idles, or rested in a pause."""
+        return self.idling or self.rested
+
+    @property
     def clock(self) -> int:
         """Control steps as a policy is told them: the same at the first execution frame, whatever the prompt showed.
 

@@ -259,17 +259,19 @@ class Observer:
     def observe(self, episode: Episode, *, recorded: bool) -> None:
         """Take in the present frame, as far as it is needed; ``recorded``: in a video."""
         always = episode.done or episode.step_index == episode.exec_start
+        if not episode.still:
+            self._pictures_rest = self._objects_rest = False
         due = episode.phase == PROMPT or episode.exec_steps % self._render_every == 0
-        if self._has_objects and (always or self.needed) and not (episode.idling and self._objects_rest):
+        if self._has_objects and (always or self.needed) and not self._objects_rest:
             self._objects = episode.objects()
-            self._objects_rest = episode.idling
+            self._objects_rest = episode.still
         if self._has_pictures and (always or (due and (self.needed or recorded))):
             self._draw(episode)
 
     def _draw(self, episode: Episode) -> None:
-        if not (episode.idling and self._pictures_rest):  # a scene at rest is drawn once
+        if not self._pictures_rest:  # a scene at rest is drawn once
             self._images: dict[str, Image] = episode.images()
-        self._pictures_rest = episode.idling
+        self._pictures_rest = episode.still
         self._picture_step, self._picture_clock = episode.step_index, episode.clock
 
     def observation(self) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """The report of evaluations: for the terminal, Markdown, CSV, LaTeX, and JSON for programs.
 
-``report.json`` beside an evaluation's log holds exactly the keys of the benchmark's specification. As JSON among the
+``report.json`` beside an evaluation's log holds exactly the keys of the benchmark's specification, and ``evidence`` and
+``pacing`` of the controls that were run. As JSON among the
 formats the same keys stand with more beside them: intervals, prefix completion in order, pooled rates, protocol.
 """
 
