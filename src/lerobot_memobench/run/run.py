@@ -101,7 +101,7 @@ def run_evaluation(plan: EvaluationPlan, tell: Tell, begin: Tell = lambda text: 
 def _what_is_run(plan: EvaluationPlan) -> str:
     who = portable_path(plan.policy_path) if plan.policy_path else getattr(plan.policy, "type", "the policy")
     grid = plan.grid
-    which = " that have variants" if plan.environment.evidence else ""
+    which = " with variants" if plan.environment.evidence else ""
     what = f"{count_of(len(grid.tasks), 'task')}{which}, {count_of(grid.runs, 'episode')} each"
     return f"evaluating {who} on {what}, into {plan.output}"
 
