@@ -29,7 +29,7 @@ from tests.support.logs import rollout
 from tests.support.scripts import load_script
 
 reference = load_script("docs_reference")
-keep_log = load_script("keep_log")
+recompute = load_script("recompute")
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -137,28 +137,20 @@ def test_every_page_has_its_place_in_the_site() -> None:
 
 # --- figures ---
 
-LOGS = keep_log.LOGS
-FIGURES = ("SR", "MSR", "MUR", "MCR", "rollouts")
+
+@pytest.mark.parametrize("page", recompute.PAGES, ids=name)
+def test_published_figures_are_those_of_their_sources(page: Path) -> None:
+    assert [*recompute.problems_of_tables(page), *recompute.problems_of_prose(page)] == []
+    assert any(recompute.source_of(page, source) for _, _, source in recompute.rows_of(page))
 
 
-def published(document: Path) -> Iterator[tuple[str, dict[str, str]]]:
-    """Yield the name of a log and the figures beside it, of every row of a table that links one."""
-    for block in re.findall(r"(?:^\|.*\n)+", document.read_text(), re.MULTILINE):
-        head, _, *rows = ([cell.strip() for cell in line.strip().strip("|").split("|")] for line in block.splitlines())
-        for row in rows:
-            if found := re.search(r"research/logs/([\w-]+)|\]\(logs/([\w-]+)", row[-1]):
-                yield found[1] or found[2], {name: row[head.index(name)] for name in FIGURES}
-
-
-@pytest.mark.parametrize("document", [ROOT / "README.md", DOCS / "benchmark" / "results.md"], ids=name)
-def test_published_figures_are_those_of_their_logs(document: Path) -> None:
-    for log, figures in published(document):
-        assert figures == keep_log.figures(LOGS / log), log
+def test_claims_and_their_sources_stand_where_the_list_has_them() -> None:
+    assert recompute.problems_of_claims() == []
 
 
 def test_every_log_is_among_the_results() -> None:
-    there = {folder.name for folder in LOGS.iterdir() if folder.is_dir()}
-    assert {log for log, _ in published(DOCS / "benchmark" / "results.md")} == there
+    there = {folder.name for folder in recompute.LOGS.iterdir() if folder.is_dir()}
+    assert set(re.findall(r"research/logs/([\w-]+)/", recompute.PAGES[1].read_text())) == there
 
 
 @pytest.mark.parametrize(
@@ -171,21 +163,60 @@ def test_every_log_is_among_the_results() -> None:
     ],
 )
 def test_a_rate_as_documents_write_it(rate: Rate, words: str) -> None:
-    assert keep_log.in_words(rate) == words
+    assert recompute.in_words(rate) == words
 
 
 def test_logs_are_small() -> None:
-    assert sum(file.stat().st_size for file in LOGS.glob("**/*")) < 300_000
+    assert sum(file.stat().st_size for file in recompute.LOGS.glob("**/*")) < 300_000
 
 
-def test_figures_of_a_row_are_found(tmp_path: Path) -> None:
-    document = tmp_path / "one.md"
-    head = "| policy | SR | MSR | MUR | MCR | rollouts | |\n|---|---|---|---|---|---:|---|\n"
-    document.write_text(f"{head}| a | 1 | 2 | 3 | – | 1,500 | [log](../research/logs/a) |\n| b | | | | | | |\n")
-    assert list(published(document)) == [("a", {"SR": "1", "MSR": "2", "MUR": "3", "MCR": "–", "rollouts": "1,500"})]
-    episode_log.write_episodes(tmp_path, [rollout("one", "temporal", "S", [k > 0], k > 0, k) for k in range(4)])
-    rate = "75.0 [30.1–95.4]"
-    assert keep_log.figures(tmp_path) == {"SR": rate, "MSR": rate, "MUR": "–", "MCR": "–", "rollouts": "4"}
+HEAD = "| policy | SR | MSR | MUR | MCR | rollouts | |\n|---|---|---|---|---|---:|---|\n"
+KEPT = "75.0 [30.1–95.4]"
+
+
+@pytest.mark.parametrize(
+    ("row", "problem"),
+    [
+        (f"| a | {KEPT} | {KEPT} | – | – | 4 | [log](logs/one/episodes.jsonl) |", None),
+        (f"| a | {KEPT} | | | | | [log](logs/one/episodes.jsonl) |", None),
+        (
+            "| a | 76.0 [30.1–95.4] | | | | 4 | [log](logs/one/episodes.jsonl) |",
+            "SR 76.0 .*, and 75.0 .* by its source",
+        ),
+        (f"| a | {KEPT} | | | | 5 | [log](logs/one/episodes.jsonl) |", "rollouts 5, and 4 by its source"),
+        (f"| a | {KEPT} | | | | 4 | [note](note.md) |", "does not say 'log not kept'"),
+        (f"| a | {KEPT} | | | | 4 | [note](note.md), log not kept |", None),
+        ("| a | 100 [96.3–100] | | | | 100 | [seeds](run/tables.md) |", None),
+        ("| a | 100 [96.3–100] | | | | 100 | [seeds](short/tables.md) |", "100 .*, and 99.0 .* by its source"),
+    ],
+)
+def test_a_figure_that_differs_from_its_source_is_found(tmp_path: Path, row: str, problem: str | None) -> None:
+    task = "turn_on_the_stove_and_turn_it_off"
+    lines = [rollout(task, "temporal", "S", [k > 0], k > 0, k) for k in range(4)]
+    episode_log.write_episodes(tmp_path / "logs" / "one", lines)
+    for folder, told in (
+        ("run", "All 100 seeds asked for were solved"),
+        ("short", "**1 of 100 seeds asked for have no"),
+    ):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "tables.md").write_text(f"{told} demonstration here.\n")
+    page = tmp_path / "page.md"
+    page.write_text(f"{HEAD}{row}\n")
+    found = recompute.problems_of_tables(page)
+    assert len(found) == (problem is not None)
+    assert problem is None or re.search(problem, found[0])
+
+
+def test_a_claim_that_went_or_that_nobody_listed_is_found(tmp_path: Path) -> None:
+    page, claims = tmp_path / "page.md", tmp_path / "claims.md"
+    (tmp_path / "note.md").write_text("It solved | 50 | of\n50.\n")
+    page.write_text("With a memory 99\n[95–100].\n")
+    head = "| page | it says | source | the source says | kept |\n|---|---|---|---|---|\n"
+    claims.write_text(f"{head}| [page](page.md) | memory 99 [95–100] | [note](note.md) | 50 of 50 | no |\n")
+    assert recompute.problems_of_claims(claims) == recompute.problems_of_prose(page, claims) == []
+    claims.write_text(f"{head}| [page](page.md) | memory 98 | [note](note.md) | 49 of 50 | no |\n")
+    assert [problem.split(" does")[0] for problem in recompute.problems_of_claims(claims)] == ["page.md", "note.md"]
+    assert len(recompute.problems_of_prose(page, claims)) == 1
 
 
 # --- commands ---
