@@ -65,6 +65,8 @@ def test_who_follows_the_prompt_chooses_what_it_showed(tmp_path: Path) -> None:
 def test_the_published_goal_alone_is_no_evidence() -> None:
     with pytest.raises(MemobenchError, match="say referent=random"):
         MemobenchEnvConfig(evidence=True)
+    with pytest.raises(MemobenchError, match="say referent=random"):
+        MemobenchEnv(str(get_task(MILK).derived_from), evidence=True)
     assert MemobenchEnvConfig(evidence=True, suite="strict").protocol["evidence"] is True
 
 

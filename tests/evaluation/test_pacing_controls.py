@@ -94,3 +94,14 @@ def test_a_strange_file_beside_the_log_is_refused(tmp_path: Path, capsys: pytest
     (tmp_path / "a" / "pacing.json").write_text('[{"setting": "horizon"}]')
     assert main(["report", folder]) == 2
     assert "pacing.json" in capsys.readouterr().err
+
+
+def test_a_file_of_which_figures_are_missing_is_shown_as_far_as_it_goes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = evaluation(tmp_path / "a", 1, 1, speed=0.5)
+    nothing: dict[str, Any] = {"average": {}, "memory_types": {}, "families": {}, "tasks": {}}
+    told = [{"setting": "speed", "value": 0.5, "replan_steps": None, "pairs": 0, **nothing}]
+    (tmp_path / "a" / "pacing.json").write_text(json.dumps(told))
+    assert main(["report", folder]) == 0
+    assert "speed=0.5, replan interval unknown" in capsys.readouterr().out

@@ -44,6 +44,7 @@ from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.jobs.threads import ACTING, limit_torch, use_threads
 from lerobot_memobench.lerobot_hooks import ROLLOUT, installed
 from lerobot_memobench.protocol import CONTROL_HZ, EVALUATION_SEED, HORIZON
+from lerobot_memobench.tasks.evidence import check_referent
 from lerobot_memobench.tasks.task import DRAWN, PUBLISHED, REFERENTS, STRICT, SUITES
 
 PolicyCheck = Callable[[str, PreTrainedConfig, dict[str, PolicyFeature], dict[str, str]], None]
@@ -150,11 +151,8 @@ class MemobenchEnvConfig(EnvConfig):
             )
         if self.suite == STRICT:
             self.referent = DRAWN  # each of its tasks draws its own
-        if self.evidence and self.referent == "fixed":
-            raise MemobenchError(
-                "env.evidence=true runs each scene with each variant, and env.referent=fixed the published one alone; "
-                "say referent=random"
-            )
+        if self.evidence:
+            check_referent("env.", self.referent)
         if self.obs_type != PIXELS:
             self.features, self.features_map = policy_features(self.obs_type), policy_names(self.obs_type)
 

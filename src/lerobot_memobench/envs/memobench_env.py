@@ -56,7 +56,7 @@ from lerobot_memobench.protocol import (
 )
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.tasks.catalogue import get_task, load_task, suite_of
-from lerobot_memobench.tasks.evidence import scene_and_variant
+from lerobot_memobench.tasks.evidence import check_referent, scene_and_variant
 from lerobot_memobench.tasks.memory_text import memory_text, with_memory
 from lerobot_memobench.tasks.task import referent_text
 
@@ -161,6 +161,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._video: VideoRecorder | None = None
         self._observer = Observer(obs_type, render_every)
         self._referent = str(protocol["referent"])
+        if evidence:
+            check_referent("", self._referent)
         self._settings: dict[str, Any] = {
             "referent": referent,
             "demonstration_prompt": demonstration_prompt,

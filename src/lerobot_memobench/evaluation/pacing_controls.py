@@ -139,7 +139,7 @@ def pacing_section(found: Sequence[Paced]) -> Section:
 
 def pace_phrase(found: Paced) -> str:
     """Return the change of the average success in words, for one line."""
-    return f"{_pace(found)}: SR {_words(found['average']['SR'])}"
+    return f"{_pace(found)}: SR {_words(found['average'].get('SR'))}"
 
 
 def _pace(found: Paced) -> str:
@@ -174,7 +174,7 @@ def _tables(found: Paced) -> list[Table]:
 
 
 def _cells(changes: Changes) -> list[Cell]:
-    success = changes["SR"]
+    success = changes.get("SR")
     sides = (NOT_APPLICABLE,) * 2 if success is None else (f"{success['plain']:.1f}", f"{success['paced']:.1f}")
     return [*map(Numbers, sides), *(Numbers(_words(changes.get(metric))) for metric in METRICS)]
 

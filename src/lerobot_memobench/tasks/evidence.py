@@ -9,15 +9,29 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.formula import Atom, Formula
 from lerobot_memobench.tasks.progress import Evaluator
-from lerobot_memobench.tasks.task import Task
+from lerobot_memobench.tasks.task import REFERENTS, Task
 
 
 def scene_and_variant(task: Task, episode: int) -> tuple[int, int]:
     """Return which scene an episode has, from 0 on, and which variant: each scene goes through all of them."""
     choices = task.random_variants
     return episode // len(choices), choices[episode % len(choices)]
+
+
+def check_referent(prefix: str, referent: str) -> None:
+    """Refuse to run each variant where the published one alone is asked for; ``prefix`` stands before a setting's name.
+
+    Raises:
+        MemobenchError: it is.
+    """
+    if referent == REFERENTS[0]:
+        raise MemobenchError(
+            f"{prefix}evidence=true runs each scene with each variant, and {prefix}referent={referent} the published "
+            f"one alone; say referent={REFERENTS[1]}"
+        )
 
 
 def chance(task: Task) -> float | None:
