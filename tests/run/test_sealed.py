@@ -50,6 +50,14 @@ def test_a_split_says_which_scenes_are_run(name: str) -> None:
     assert plan.environment.seed_base == SPLITS[name].start
 
 
+def test_scenes_that_are_run_with_each_variant_are_counted_once() -> None:
+    line = ["env=memobench", "tasks=put_the_butter_into_the_bowl_from_the_prompt_video", "referent=random"]
+    plan = plan_line([*line, "split=sealed", "evidence=true", "episodes=150"])
+    assert plan.seeds == SPLITS["sealed"]
+    with pytest.raises(MemobenchError, match="100007 to 100057 were asked for"):
+        plan_line([*line, "split=sealed", "evidence=true", "episodes=151"])
+
+
 def test_without_a_split_the_papers_seeds_are_run() -> None:
     assert plan_line(LINE).seeds == SPLITS["paper"] == range(7, 57)
     assert plan_line([*LINE, "seed=500"]).split is None

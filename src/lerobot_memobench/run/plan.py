@@ -107,9 +107,14 @@ class EvaluationPlan:
 
     @property
     def seeds(self) -> range:
-        """Seeds of the scenes of each task."""
-        first = self.environment.seed_base + self.grid.first
-        return range(first, first + self.grid.runs)
+        """Seeds of the scenes; where each is run with each variant, those of the task with the fewest variants."""
+        from lerobot_memobench.tasks.catalogue import load_task
+
+        first, scenes = self.environment.seed_base + self.grid.first, self.grid.runs
+        if self.environment.evidence:
+            fewest = min(len(load_task(task.folder).random_variants) for task in self.grid.tasks)
+            scenes = -(-scenes // fewest)
+        return range(first, first + scenes)
 
     @property
     def draws(self) -> bool:
