@@ -85,11 +85,19 @@ def test_a_clock_is_found_and_idling_takes_it_away(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(module, "read_decisions", lambda folder: {STOVE: counted(30)})
     (found,) = module.study(Path("nowhere"), [0, IDLE_STEPS, 100 * HORIZON])
     assert (found["demonstrations"], found["decisions"]) == (30, 90)
-    assert found["step"][0] > 0.95
-    assert found["present"][0] > 0.95
-    assert found["step"][IDLE_STEPS] < 0.85
-    assert abs(found["step"][100 * HORIZON] - 2 / 3) < 0.08
-    assert abs(found["present"][100 * HORIZON] - 2 / 3) < 0.12
+    assert found["right"][module.STEP][0] > 0.95
+    assert found["right"][module.PRESENT][0] > 0.95
+    assert found["right"][module.STEP][IDLE_STEPS] < 0.85
+    assert abs(found["right"][module.STEP][100 * HORIZON] - 2 / 3) < 0.08
+    # The last of three decisions is taken some 500 steps after the first, the earliest of the others 250 after it.
+    assert found["right"][module.BOUND][0] > 0.95
+    assert (
+        found["right"][module.STEP][IDLE_STEPS] - 0.02
+        < found["right"][module.BOUND][IDLE_STEPS]
+        < 2 / 3 + 500 / IDLE_STEPS / 3
+    )
+    assert found["right"][module.BOUND][100 * HORIZON] == pytest.approx(2 / 3, abs=0.005)
+    assert abs(found["right"][module.PRESENT][100 * HORIZON] - 2 / 3) < 0.12
     table = module.markdown([found])
     assert f"| counting: `{STOVE}` | 30 | 90 | 67 | 100 |" in table
     assert "points above chance in" in table

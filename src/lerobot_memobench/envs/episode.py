@@ -185,7 +185,7 @@ class Episode:
 
     @property
     def still(self) -> bool:
-        """The scene is as it was a step ago: the robot idles, or rested in a pause."""
+        """The scene rests: the robot idles, or rested in a pause."""
         return self.idling or self.rested
 
     @property
