@@ -290,6 +290,8 @@ def schemas_page() -> str:
         ("Policy of a card", records.Policy),
         ("Checkpoint of a card", records.Checkpoint),
         ("One start", records.Start),
+        ("Runs of the sealed test", records.SealedRun),
+        ("A run before it", records.SealedStart),
         ("Episodes of a card", records.CardEpisode),
     ]
     parts = [

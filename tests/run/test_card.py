@@ -254,6 +254,7 @@ def test_episodes_that_drew_their_variants_otherwise_are_neither_gone_on_with_no
     lines = [record(bowl, seed - 7, seed=seed, referent="random", variant=k) for seed, k in here.items()]
     assert drawn_otherwise(lines) is None
     assert drawn_otherwise([record("of_my_own", variant=5, referent="random", seed=7)]) is None
+    assert drawn_otherwise([record(bowl, variant=5, referent="random", seed=-7)]) is None, "no scene of ours"
     other = (here[8] + 1) % 3
     lines[1] = lines[1] | {"variant": other}
     told = f"{bowl}, episode 1: variant {other} there, {here[8]} by its seed here"
@@ -264,3 +265,7 @@ def test_episodes_that_drew_their_variants_otherwise_are_neither_gone_on_with_no
         resumed_card(tmp_path, card(), print)
     with pytest.raises(MemobenchError, match=f"{told}.*repeat it with that version"):
         repeat(tmp_path, None, None, lambda plan: 0, print)
+    for name, line in zip(("part", "old"), lines, strict=True):
+        EpisodeLog(tmp_path / name, {}).append(line)
+    with pytest.raises(MemobenchError, match=r"old drew their variants otherwise than .*leave that folder out"):
+        merge(tmp_path / "out", [tmp_path / "part", tmp_path / "old"])

@@ -401,7 +401,7 @@ def drawn_otherwise(records: Iterable[Mapping[str, Any]]) -> str | None:
     for record in records:
         task, told, seed = record["task"], record.get("variant"), record.get("seed")
         drawn = record.get("referent", "fixed") != "fixed" and suite_of(task) is not None
-        if not drawn or told is None or seed is None:
+        if not drawn or told is None or seed is None or seed < 0:
             continue
         if "choice" in record:  # each scene was run with each variant
             here = scene_and_variant(get_task(task), record["episode"])[1]

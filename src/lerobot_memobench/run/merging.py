@@ -24,7 +24,15 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import CARD_FILE, read_card, read_protocol
 from lerobot_memobench.evaluation.report import write_report
 from lerobot_memobench.io import draft_of, is_there
-from lerobot_memobench.run.card import disagreement, extended, key_of, remove_card, with_episodes, write_card
+from lerobot_memobench.run.card import (
+    disagreement,
+    drawn_otherwise,
+    extended,
+    key_of,
+    remove_card,
+    with_episodes,
+    write_card,
+)
 from lerobot_memobench.run.run import VIDEOS, EvaluationReport
 
 SHARDS = "shard-*-of-*"
@@ -52,7 +60,7 @@ def merge(out: Path, folders: Sequence[Path]) -> list[tuple[str, int]]:
 
     Raises:
         MemobenchError: nothing to merge, protocols or policies that differ, a part that does not say whose episodes it
-            holds where another does, or an episode that ended differently in two parts.
+            holds where another does, variants drawn by two rules, or an episode that ended differently in two parts.
     """
     sources = list(dict.fromkeys([*([out] if has_log(out) else []), *folders]))
     if not folders:
@@ -61,6 +69,7 @@ def merge(out: Path, folders: Sequence[Path]) -> list[tuple[str, int]]:
     protocols = {source: read_protocol(source) for source in sources}
     _check_protocols(protocols)
     _check_owners(protocols, records)
+    _check_draws(records)
     joined = join(records)
     card = _joined_card(sources)
     wanted = [] if card is None else _wanted(card)
@@ -128,6 +137,18 @@ def _check_owners(
         raise MemobenchError(
             f"{nobodys[0]} does not say whose episodes it holds, and {does}; they may be of two policies, so evaluate "
             "the policy again there, or leave that folder out"
+        )
+
+
+def _check_draws(records: Mapping[Path, Sequence[Mapping[str, Any]]]) -> None:
+    """Raise where some parts drew their variants as it is done here, and others by an earlier version's rule."""
+    otherwise = {folder: drawn_otherwise(lines) for folder, lines in records.items()}
+    strange = {folder: problem for folder, problem in otherwise.items() if problem is not None}
+    if 0 < len(strange) < len(records):
+        folder, problem = next(iter(strange.items()))
+        raise MemobenchError(
+            f"the episodes in {folder} drew their variants otherwise than the other parts' ({problem}): another "
+            "version ran them, so leave that folder out"
         )
 
 
