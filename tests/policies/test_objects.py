@@ -578,7 +578,7 @@ def test_an_empty_slot_is_no_token_whatever_it_holds() -> None:
 
 
 def test_frames_are_pooled_whatever_the_order_of_their_things() -> None:
-    pool = ObjectPool(range(KINDS), KINDS + 1, 2, 32)
+    pool = ObjectPool(range(KINDS), KINDS + 1, 2, 32, phase=True)
     slots = seen(lit=1).reshape(SLOTS, WIDTH)
     rows = torch.stack([slots, slots[torch.randperm(SLOTS)]]).reshape(2, SIZE)
     pooled = pool(frame_row(rows, hand().expand(2, -1), torch.ones(2))[:, 0])
@@ -646,3 +646,11 @@ def test_which_thing_was_lit_can_be_learned() -> None:
         optimizer.zero_grad()
         losses.append(float(loss.detach()))
     assert np.mean(losses[-20:]) < 0.3 * np.mean(losses[:10]), "guessing keeps the whole variance"
+
+
+def test_a_memory_does_not_tell_the_phase_unless_it_is_told_to() -> None:
+    """Frames that differ in the phase alone: where it is not told, no clock of the execution can be read."""
+    rows = [frame_row(seen()[None], hand()[None], torch.tensor([phase])) for phase in (0.0, 1.0)]
+    for told in (False, True):
+        pool = ObjectEncoder(classes(), 2, 32, phase=told).pool()
+        assert torch.equal(pool(rows[0]), pool(rows[1])) != told

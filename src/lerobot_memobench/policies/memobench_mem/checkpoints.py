@@ -6,7 +6,7 @@ The model file holds the averaged weights; the trained ones lie beside it for go
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -96,6 +96,8 @@ def load_weights(policy: nn.Module, path: Path, source: str | Path, trained: Mem
             f"'{source}' holds weights without a memory; to start from pi0.5's weights pass "
             "--policy.base_weights=<checkpoint> instead of a pretrained path."
         )
+    else:
+        require_phase(weights, policy.state_dict(), source)
     load_exactly(policy, weights, source, optional=new)
 
 
@@ -188,6 +190,22 @@ def read_weights(source: str | Path, prefix: str = "") -> dict[str, Tensor]:
             if short.startswith(prefix):
                 found[short.removeprefix(prefix)] = tensors.get_tensor(name)
     return found
+
+
+PHASE_WEIGHT = "model.memory.pool.phase.weight"
+
+
+def require_phase(weights: Mapping[str, Tensor], own: Collection[str], source: str | Path) -> None:
+    """Refuse weights of a memory that told the phase, for a policy whose configuration does not say so.
+
+    Raises:
+        MemobenchError: an earlier version trained them, which had no such setting and always told it.
+    """
+    if PHASE_WEIGHT in weights and PHASE_WEIGHT not in own:
+        raise MemobenchError(
+            f"'{source}' was trained with a memory that tells the phase of its frames, and its {CONFIG_FILE} does not "
+            'say so, because an earlier version wrote it; add "memory_phase": true to that file.'
+        )
 
 
 def load_exactly(module: nn.Module, weights: dict[str, Tensor], source: str | Path, optional: set[str]) -> None:

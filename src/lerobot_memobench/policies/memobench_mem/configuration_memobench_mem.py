@@ -153,9 +153,10 @@ def _names(text: str) -> tuple[str, ...]:
 FIXED = _names(
     """
     size perception object_classes memory memory_settings memory_fusion subgoals oracle_memory memory_camera
-    memory_frames tokens_per_frame memory_stride objective chunk_size normalization_mapping image_resolution
-    tokenizer_name tokenizer_max_length input_features n_obs_steps paligemma_variant action_expert_variant max_state_dim
-    max_action_dim min_period max_period use_relative_actions relative_exclude_joints action_feature_names empty_cameras
+    memory_frames memory_phase tokens_per_frame memory_stride objective chunk_size normalization_mapping
+    image_resolution tokenizer_name tokenizer_max_length input_features n_obs_steps paligemma_variant
+    action_expert_variant max_state_dim max_action_dim min_period max_period use_relative_actions
+    relative_exclude_joints action_feature_names empty_cameras
     """
 )
 """Fields by which a checkpoint was trained, and which are refused where it acts under another value: its weights would
@@ -273,6 +274,9 @@ class MemobenchMemConfig(PI05Config):
     memory_stride: int = FROM_SIZE
     """Control steps from one frame of the history (and the cache) to the next; none: the mechanism's, or 8 where
     training decodes no video (objects, and pixels through a visual encoder), else 1."""
+    memory_phase: bool = False
+    """Whether a remembered frame of objects tells whether it was of the prompt. A memory that knows when the execution
+    began has the clock of it, which strict tasks hide."""
     feature_cache_dir: str | None = None
     """Folder for feature caches, of several datasets perhaps; none: ``feature_cache`` in the dataset's folder."""
 

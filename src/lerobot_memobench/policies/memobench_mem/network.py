@@ -189,8 +189,9 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
         slots = config.object_classes, config.tokens_per_frame, config.dimensions.vlm.width
         if config.detector is not None:
             # Noise is for privileged object state alone: a policy that was trained by it goes on without.
-            return DetectionEncoder(ObjectsFromPictures(load_detector(config.detector)), *slots)
-        return ObjectEncoder(*slots, config.detection_noise)
+            detect = ObjectsFromPictures(load_detector(config.detector))
+            return DetectionEncoder(detect, *slots, config.memory_phase)
+        return ObjectEncoder(*slots, config.detection_noise, config.memory_phase)
 
     def _set_requires_grad(self) -> None:
         super()._set_requires_grad()

@@ -123,12 +123,14 @@ class ObjectPool(nn.Module):
     size, 400 updates chose the right one of three bowls at 85 % of frames, instead of at 58 %.
     """
 
-    def __init__(self, order: Sequence[int], kinds: int, tokens: int, width: int, noise: float = 0.0) -> None:
+    def __init__(
+        self, order: Sequence[int], kinds: int, tokens: int, width: int, noise: float = 0.0, phase: bool = False
+    ) -> None:
         super().__init__()
         self.noise = noise
         self.slot = SlotEncoder(order, kinds, width, width)
         self.score = nn.Linear(width, tokens)
-        self.phase = nn.Linear(1, width)
+        self.phase = nn.Linear(1, width) if phase else None
         self.out = nn.Sequential(nn.GELU(), nn.Linear(width, width))
 
     def forward(self, frames: Tensor) -> Tensor:
@@ -142,7 +144,9 @@ class ObjectPool(nn.Module):
         # A finite score keeps a frame without objects finite: it becomes zeros.
         scores, values = in_slots(score, there, -1e4), in_slots(made, there)
         pooled = torch.einsum("nsk,nsd->nkd", scores.softmax(dim=1), values)
-        kept: Tensor = self.out(pooled + self.phase(phase).unsqueeze(1))
+        if self.phase is not None:
+            pooled = pooled + self.phase(phase).unsqueeze(1)
+        kept: Tensor = self.out(pooled)
         return rms_norm(kept, kept.shape[-1:], eps=1e-6)
 
 
@@ -153,6 +157,7 @@ class ObjectEncoder(nn.Module, ObservationEncoder):
         trained: names of the classes that it was trained with, in order of their indices.
         tokens_per_frame: memory tokens of a frame. width: of all tokens.
         noise: size of the detection noise that is added to slots while it learns; 0: none.
+        phase: whether a remembered frame tells whether it was of the prompt.
     """
 
     memory_input = OBS_ENV_STATE
@@ -160,9 +165,11 @@ class ObjectEncoder(nn.Module, ObservationEncoder):
     grid = 0
     pictures = False
 
-    def __init__(self, trained: Sequence[str], tokens_per_frame: int, width: int, noise: float = 0.0) -> None:
+    def __init__(
+        self, trained: Sequence[str], tokens_per_frame: int, width: int, noise: float = 0.0, phase: bool = False
+    ) -> None:
         super().__init__()
-        self.tokens_per_frame, self.dim, self.noise = tokens_per_frame, width, noise
+        self.tokens_per_frame, self.dim, self.noise, self.phase = tokens_per_frame, width, noise, phase
         self.order = [trained.index(name) if name in trained else len(trained) for name in classes()]
         self.kinds = len(trained) + 1
         self.slot = SlotEncoder(self.order, self.kinds, 2 * width, width)
@@ -196,7 +203,7 @@ class ObjectEncoder(nn.Module, ObservationEncoder):
 
     def pool(self) -> nn.Module:
         """Return a pool of each frame's objects."""
-        return ObjectPool(self.order, self.kinds, self.tokens_per_frame, self.dim, self.noise)
+        return ObjectPool(self.order, self.kinds, self.tokens_per_frame, self.dim, self.noise, self.phase)
 
 
 # -- detections -------------------------------------------------------------------------------------------------------
@@ -244,14 +251,21 @@ class DetectionEncoder(ObjectEncoder):
 
     Args:
         detect: no module, so that a checkpoint has no part of it.
-        trained, tokens_per_frame, width: as of `ObjectEncoder`.
+        trained, tokens_per_frame, width, phase: as of `ObjectEncoder`.
     """
 
     memory_input = next(iter(VIEWS))
     pictures = True
 
-    def __init__(self, detect: ObjectsFromPictures, trained: Sequence[str], tokens_per_frame: int, width: int) -> None:
-        super().__init__(trained, tokens_per_frame, width)
+    def __init__(
+        self,
+        detect: ObjectsFromPictures,
+        trained: Sequence[str],
+        tokens_per_frame: int,
+        width: int,
+        phase: bool = False,
+    ) -> None:
+        super().__init__(trained, tokens_per_frame, width, phase=phase)
         self.detect = detect
         self.key = detect.key
 
