@@ -26,6 +26,7 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     MemoryTokens,
     Query,
 )
+from lerobot_memobench.policies.memobench_mem.motion_fields import MotionField
 from lerobot_memobench.policies.memobench_mem.network import FUSIONS
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import GatherMemoryProcessorStep
 from lerobot_memobench.policies.memobench_mem.rollout import Rollout
@@ -38,7 +39,29 @@ def made(name: str, frames: int = 32, stride: int = 8, seed: int = 0, **changed:
     torch.manual_seed(seed)
     pool = torch.nn.Sequential(torch.nn.Linear(6, P * D), torch.nn.Unflatten(-1, (P, D)), torch.nn.Flatten(1, 2))
     spec = MemorySpec(dim=D, tokens=P, width=16, expert=16, frames=frames, grid=0, stride=stride, subgoals=SUBGOALS)
-    return find_mechanism(name)(spec, pool, read_settings(name, changed)).eval()
+    mechanism = find_mechanism(name)
+    return mechanism(spec, Moves() if mechanism.asks_motion else pool, read_settings(name, changed)).eval()
+
+
+class Moves(MotionField):
+    """Motion of stored frames (N, 1, 6): by how much each number changes."""
+
+    size, cells, numbers, moved = 6, 6, 1, 1
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer = torch.nn.Linear(6, D)
+
+    def between(self, before: Tensor, now: Tensor) -> Tensor:
+        return (now - before).transpose(1, 2)
+
+    def following(self, frames: Tensor) -> tuple[Tensor, Tensor]:
+        moved = frames.squeeze(2).diff(dim=1).unsqueeze(-1)
+        return moved, torch.ones(moved.shape[:-1], dtype=torch.bool)
+
+    def tokens(self, fields: Tensor) -> Tensor:
+        made: Tensor = self.layer(fields.squeeze(-1))
+        return made
 
 
 def asked(rows: int, seed: int = 1) -> Query:

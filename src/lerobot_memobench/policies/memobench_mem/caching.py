@@ -5,6 +5,7 @@ All are feature caches (`datasets.feature_cache`), so they are found, finished, 
 - the image tower's pooled tokens of remembered pictures (`ImageTowerEncoder`);
 - a visual encoder's tokens of every present picture of each camera, and pooled ones of remembered pictures, which are
   made of the former, so no video is decoded twice (`VisualTokenEncoder`);
+- thumbnails of remembered pictures, for a memory of what moves, whatever the policy's size;
 - a detector's slots at every frame (`DetectionEncoder`). A cache holds bfloat16 numbers, which know places to 4 mm; so
   each number is kept as two: what it is rounded to, and the rest.
 
@@ -39,18 +40,21 @@ from lerobot_memobench.datasets.lerobot_format.layout import read_info
 from lerobot_memobench.envs.command_line import name_in_data
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import in_words
-from lerobot_memobench.perception.visual_encoder import GRID, POOLED, WIDTH, VisualEncoder
+from lerobot_memobench.perception.visual_encoder import GRID, WIDTH, VisualEncoder
 from lerobot_memobench.perception.weights import load_detector, load_visual_encoder
 from lerobot_memobench.policies.memobench_mem.alignment import SiglipTextEncoder, WordTextEncoder, make_text_encoder
 from lerobot_memobench.policies.memobench_mem.checkpoints import load_exactly, read_weights
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import (
+    THUMBNAIL,
+    THUMBNAILS,
     VISION_SEED,
     ImageTowerEncoder,
     ObservationEncoder,
     VisualTokenEncoder,
     encoded_key,
     seed_parameters,
+    thumbnails,
 )
 from lerobot_memobench.policies.memobench_mem.network import SizedPaliGemmaWithExpert
 from lerobot_memobench.policies.memobench_mem.objects import (
@@ -81,6 +85,8 @@ def open_frames(root: Path, config: MemobenchMemConfig, encoder: ObservationEnco
     if isinstance(encoder, ImageTowerEncoder):
         if config.memory == "none":
             return RecordedTexts(root, read_frame_table(root))
+        if config.remembers_thumbnails:
+            return make_thumbnails(root, config, progress=_logged("thumbnails: %d of %d episodes"))
         return open_cache(root, config, encoder, progress=_logged("feature cache: %d of %d episodes"))
     names = [name for name in RECORDED if name != OBS_ENV_STATE] if config.uses_pictures else RECORDED
     if isinstance(encoder, VisualTokenEncoder):
@@ -136,6 +142,8 @@ def cache_dataset(
     if config.uses_visual_encoder:
         memory, present = make_caches(root, config, load_token_encoder(config, weights), **how)
         return (memory or next(iter(present.values()))).folder
+    if config.remembers_thumbnails:
+        return make_thumbnails(root, config, **how).folder
     return open_cache(root, config, load_image_tower(config, weights), **how).folder
 
 
@@ -237,6 +245,31 @@ def open_cache(root: Path, config: MemobenchMemConfig, encoder: ImageTowerEncode
     return _made(root, config, encoder, *where, texts_key=texts_key, **how)
 
 
+# -- thumbnails ------------------------------------------------------------------------------------------------------
+
+
+SMALL = Features(THUMBNAILS, 1, THUMBNAIL**2, thumbnails)
+
+
+def make_thumbnails(root: Path, config: MemobenchMemConfig, **how: Any) -> FeatureCache:
+    """Make or finish the cache of thumbnails of the camera that is remembered, and open it.
+
+    Args:
+        how: of `build_feature_cache`.
+
+    Raises:
+        MemobenchError: the dataset lacks the camera, or the disk has no room.
+    """
+    camera = name_in_data(config.memory_camera or "") or next(iter(cameras_of(root)), "")
+    texts_key = None if config.align == "none" else _text_encoder(config).key
+    where = _thumbnails_name(config), camera, config.memory_stride
+    return _made(root, config, SMALL, *where, texts_key=texts_key, **how)
+
+
+def _thumbnails_name(config: MemobenchMemConfig) -> str:
+    return f"thumbnails-stride{config.memory_stride}"
+
+
 # -- visual encoders -------------------------------------------------------------------------------------------------
 
 
@@ -275,23 +308,26 @@ def make_caches(
     """
 
     whole = Features(encoder.present_key, GRID**2, WIDTH, encoder.encode)
-    pooled = Features(encoder.key, encoder.tokens_per_frame, WIDTH, encoder.pooled)
+    small = config.remembers_thumbnails
+    pooled = SMALL if small else Features(encoder.key, encoder.tokens_per_frame, WIDTH, encoder.pooled)
     cameras = dict.fromkeys(encoder.cameras or [*cameras_of(root), encoder.memory_input])
     present = {camera: (whole, f"{config.size}-present", name_in_data(camera), 1) for camera in cameras}
-    memory = (pooled, config.cache_name, name_in_data(encoder.memory_input), config.memory_stride)
+    begins = _thumbnails_name(config) if small else config.cache_name
+    memory = (pooled, begins, name_in_data(encoder.memory_input), config.memory_stride)
     remembers = config.memory != "none"
     frames = int(read_info(root).get("total_frames", 0))
     sizes = {  # about; each episode may remember one frame more
         _folder(root, config, made.key, begins, camera, stride): -(-frames // stride)
         * made.tokens_per_frame
-        * WIDTH
+        * made.dim
         * 2
         for made, begins, camera, stride in (*present.values(), *([memory] if remembers else []))
     }
     tell(
         f"The tokens of the {frames:,} frames of {root} take {in_words(sum(sizes.values()))}: "
         f"{in_words(2 * GRID**2 * WIDTH)} of each of {len(present)} pictures of a frame, and "
-        f"{in_words(2 * POOLED**2 * WIDTH)} of every frame that is remembered; what is not there yet is made now."
+        f"{in_words(2 * pooled.tokens_per_frame * pooled.dim)} of every frame that is remembered; what is not there "
+        "yet is made now."
     )
     require_room(next(iter(sizes)).parent, sizes)
     opened, how["tell"] = {}, tell
@@ -303,7 +339,8 @@ def make_caches(
         opened[camera] = _made(root, config, *present[camera], **how)
     if not remembers:
         return None, opened
-    return _made(root, config, *memory, read=opened[encoder.memory_input].tokens, **how), opened
+    read = None if small else opened[encoder.memory_input].tokens
+    return _made(root, config, *memory, read=read, **how), opened
 
 
 class _Busy(Exception):

@@ -411,7 +411,8 @@ class MemobenchMemConfig(PI05Config):
             )
         self.memory_settings = asdict(read_settings(self.memory, self.memory_settings))
         if self.memory_stride is None:
-            self.memory_stride = mechanism.stride
+            stride = mechanism.stride
+            self.memory_stride = stride.get(self.perception) if isinstance(stride, Mapping) else stride
 
     # -- checks ----------------------------------------------------------------------------------------------------
 
@@ -580,6 +581,11 @@ class MemobenchMemConfig(PI05Config):
     def privileged_memory(self) -> bool:
         """Whether the memory learns from the checkpoints' texts."""
         return self.memory != NONE and find_mechanism(self.memory).privileged
+
+    @property
+    def remembers_thumbnails(self) -> bool:
+        """Whether small grey copies of pictures are remembered, and not their tokens."""
+        return self.memory != NONE and find_mechanism(self.memory).asks_motion and not self.uses_objects
 
     @property
     def subgoal_texts(self) -> tuple[str, ...]:

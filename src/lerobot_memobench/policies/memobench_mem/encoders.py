@@ -17,7 +17,7 @@ from einops import reduce
 from lerobot.policies.common.vla_utils import resize_with_pad_torch
 from lerobot.utils.constants import OBS_IMAGES
 from torch import Tensor, nn
-from torch.nn.functional import rms_norm
+from torch.nn.functional import interpolate, rms_norm
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, SIDE, WIDTH, VisualEncoder, resized
@@ -103,6 +103,26 @@ def fingerprint(modules: dict[str, nn.Module]) -> str:
     return digest.hexdigest()
 
 
+# -- thumbnails -------------------------------------------------------------------------------------------------------
+
+
+THUMBNAIL = 64
+"""Side of a thumbnail, pixels."""
+THUMBNAILS = f"grey-{THUMBNAIL}x{THUMBNAIL}"
+"""Identity of thumbnails: with equal keys, equal pictures have equal ones."""
+LUMA = (0.299, 0.587, 0.114)
+
+
+@torch.no_grad()
+def thumbnails(pictures: Tensor) -> Tensor:
+    """Return small grey copies (N, 1, THUMBNAIL^2) bfloat16, which holds 0 ... 255 exactly, of pictures (N, 3, H, W)
+    in [0, 1].
+    """
+    grey = (pictures.to(torch.float32) * pictures.new_tensor(LUMA, dtype=torch.float32)[:, None, None]).sum(dim=1)
+    small = interpolate(grey.unsqueeze(1), (THUMBNAIL, THUMBNAIL), mode="area")
+    return (255 * small).round().clamp(0, 255).flatten(2).to(torch.bfloat16)
+
+
 # -- pi0.5's image tower ----------------------------------------------------------------------------------------------
 
 
@@ -122,7 +142,7 @@ class ImageTowerEncoder(ObservationEncoder):
 
     Args:
         resolution: height and width of the tower's pictures, pixels.
-        camera: its pictures are remembered.
+        camera: its pictures are remembered. thumbnails: as small grey copies.
     """
 
     tokens_per_frame = MEMORY_GRID**2
@@ -130,10 +150,15 @@ class ImageTowerEncoder(ObservationEncoder):
     pictures = True
 
     def __init__(
-        self, tower: nn.Module, projector: PaliGemmaMultiModalProjector, resolution: tuple[int, int], camera: str
+        self,
+        tower: nn.Module,
+        projector: PaliGemmaMultiModalProjector,
+        resolution: tuple[int, int],
+        camera: str,
+        thumbnails: bool = False,
     ) -> None:
         self.tower, self.projector, self.resolution = tower, projector, resolution
-        self.memory_input = camera
+        self.memory_input, self.thumbnails = camera, thumbnails
         self.dim: int = projector.linear.out_features
 
     @cached_property
@@ -143,8 +168,9 @@ class ImageTowerEncoder(ObservationEncoder):
         return f"{weights}-{self.resolution[0]}x{self.resolution[1]}-mean{self.tokens_per_frame}"
 
     def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
-        """Return the tokens (n, 16, D) of some rows' pictures."""
-        return self(batch[self.memory_input][list(rows)])
+        """Return the tokens (n, 16, D) of some rows' pictures, or thumbnails."""
+        pictures = batch[self.memory_input][list(rows)]
+        return thumbnails(pictures) if self.thumbnails else self(pictures)
 
     @torch.no_grad()
     def __call__(self, images: Tensor) -> Tensor:
@@ -196,16 +222,20 @@ class VisualTokenEncoder(nn.Module, ObservationEncoder):
     Args:
         tower: folded. It is the model's own part, as image towers are, and not registered here.
         cameras: of the present. camera: of the memory. width: of the policy's tokens.
+        thumbnails: small grey copies are remembered, and no tokens.
     """
 
     tokens_per_frame = POOLED**2
     grid = POOLED
     pictures = True
 
-    def __init__(self, tower: VisualEncoder, cameras: Sequence[str], camera: str, width: int) -> None:
+    def __init__(
+        self, tower: VisualEncoder, cameras: Sequence[str], camera: str, width: int, thumbnails: bool = False
+    ) -> None:
         super().__init__()
         self._tower = (tower,)
         self.cameras, self.memory_input, self.dim = list(cameras), camera, width
+        self.thumbnails = thumbnails
         self.project = nn.Linear(WIDTH, width)
 
     @property
@@ -259,7 +289,9 @@ class VisualTokenEncoder(nn.Module, ObservationEncoder):
         return self.encode(batch[camera])
 
     def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
-        """Return the pooled tokens (n, 16, WIDTH) of some rows' pictures, or of their tokens."""
+        """Return the pooled tokens (n, 16, WIDTH) of some rows' pictures, or of their tokens; or thumbnails."""
+        if self.thumbnails:
+            return thumbnails(batch[self.memory_input][list(rows)])
         chosen = {
             key: batch[key][list(rows)] for key in (encoded_key(self.memory_input), self.memory_input) if key in batch
         }

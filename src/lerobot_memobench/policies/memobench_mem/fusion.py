@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 Prefix = tuple[Tensor, Tensor, Tensor]
 """LeRobot's prefix: embeddings (B, N, D), which of them are real (B, N), and where attention blocks begin (B, N)."""
+Suffix = tuple[Tensor, Tensor, Tensor, Tensor]
+"""The same of the action expert's tokens (B, T, W), and the condition (B, W) of its norms."""
 
 
 class MemoryFusion(ABC):
@@ -39,6 +41,14 @@ class MemoryFusion(ABC):
     def prefix(self, prefix: Prefix) -> Prefix:
         """Return the model's prefix, given LeRobot's."""
         return prefix
+
+    def suffix(self, suffix: Suffix) -> Suffix:
+        """Return the model's suffix, given LeRobot's; the actions stay its last tokens."""
+        return suffix
+
+    def outputs(self) -> dict[str, Tensor]:
+        """Return what the last pass made beside actions, for `MemoryMechanism.losses`."""
+        return {}
 
     def owns(self, name: str) -> bool:
         """Say whether a parameter of the model is this fusion's, and no part of pi0.5."""

@@ -49,6 +49,7 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
     VisualTokenEncoder,
 )
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
+    AHEAD,
     CHOICES,
     FRAMES,
     PHASE,
@@ -91,7 +92,7 @@ FSDP_PREFIX = "_fsdp_wrapped_module."
 OBS_PICTURE = f"observation.{PICTURE_STEP}"
 OWN_MODULES = (
     *("model.memory", "model.memory_to_expert", "modulator", "alignment"),
-    *("model.state_token", "model.instruction", "paligemma_with_expert.perception"),
+    *("model.state_token", "model.instruction", "model.foresight", "paligemma_with_expert.perception"),
 )
 """Ends of the names of modules that plain pi0.5 does not have; beside adapters (``--peft…``) they are trained whole."""
 
@@ -310,13 +311,15 @@ class MemobenchMemPolicy(PI05Policy):
         """Read what the samples of a batch remember, and hand it to the model; None without a memory."""
         if self.model.memory is None:
             return None
-        histories = Histories(batch[FRAMES], batch[STEPS], batch[PLACES], batch.get(SUBGOALS)).to(self._device)
+        parts = batch[FRAMES], batch[STEPS], batch[PLACES], batch.get(SUBGOALS), batch.get(AHEAD)
+        histories = Histories(*parts).to(self._device)
         memory = self.model.memory.replay(histories, self._query(batch))
         self.model.set_memory(memory)
         return memory
 
     def _memory_losses(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        return {} if self.model.memory is None else self.model.memory.losses(batch)
+        memory, fusion = self.model.memory, self.model.fusion
+        return {} if memory is None or fusion is None else memory.losses({**batch, **fusion.outputs()})
 
     def _query(self, batch: dict[str, Tensor], rows: Sequence[int] | None = None, *, writes: bool = False) -> Query:
         """Return the present of some rows of a batch as far as the memory asks for it.

@@ -34,9 +34,10 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
     VisualTokenEncoder,
     seed_parameters,
 )
-from lerobot_memobench.policies.memobench_mem.fusion import Context, MemoryFusion, Modulation, Prefix
+from lerobot_memobench.policies.memobench_mem.fusion import Context, MemoryFusion, Modulation, Prefix, Suffix
 from lerobot_memobench.policies.memobench_mem.memory import NONE, find_mechanism, read_settings
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryMechanism, MemorySpec, MemoryTokens
+from lerobot_memobench.policies.memobench_mem.motion_fields import motion_field
 from lerobot_memobench.policies.memobench_mem.objects import DetectionEncoder, ObjectEncoder, ObjectsFromPictures
 from lerobot_memobench.sim.object_slots import classes
 
@@ -81,7 +82,8 @@ class MemoryPI05(PI05Pytorch):
             stride=config.memory_stride,
             subgoals=config.subgoal_texts,
         )
-        self.memory = mechanism(spec, observations.pool(), read_settings(config.memory, config.memory_settings))
+        pool = motion_field(observations, width) if mechanism.asks_motion else observations.pool()
+        self.memory = mechanism(spec, pool, read_settings(config.memory, config.memory_settings))
         self.fusion = (mechanism.fusion or FUSIONS[config.memory_fusion])(self, vlm_width, width)
 
     def set_memory(self, memory: MemoryTokens) -> None:
@@ -116,10 +118,11 @@ class MemoryPI05(PI05Pytorch):
             )
         return prefix if self.fusion is None else self.fusion.prefix(prefix)
 
-    def embed_suffix(self, noisy_actions: Tensor, timestep: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return LeRobot's action tokens, their masks, and the condition of the expert's norms."""
+    def embed_suffix(self, noisy_actions: Tensor, timestep: Tensor) -> Suffix:
+        """Return LeRobot's action tokens, their masks, and the condition of the norms, as the fusion changes them."""
         *tokens, condition = super().embed_suffix(noisy_actions, timestep)
-        return *tokens, condition if self.instruction is None else condition + self.instruction()
+        suffix: Suffix = *tokens, condition if self.instruction is None else condition + self.instruction()
+        return suffix if self.fusion is None else self.fusion.suffix(suffix)
 
     def memory_parameters(self) -> dict[str, nn.Parameter]:
         """Return every parameter that plain pi0.5 does not have, by name."""
@@ -178,11 +181,19 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
             tower = vlm.vision_tower = VisualEncoder(folded=True).eval().requires_grad_(False)
             vlm.multi_modal_projector = nn.Identity()
             return VisualTokenEncoder(
-                tower, [*config.image_features], config.memory_camera or "", config.dimensions.vlm.width
+                tower,
+                [*config.image_features],
+                config.memory_camera or "",
+                config.dimensions.vlm.width,
+                config.remembers_thumbnails,
             )
         if not config.uses_objects:
             return ImageTowerEncoder(
-                vlm.vision_tower, vlm.multi_modal_projector, config.image_size, config.memory_camera or ""
+                vlm.vision_tower,
+                vlm.multi_modal_projector,
+                config.image_size,
+                config.memory_camera or "",
+                config.remembers_thumbnails,
             )
         vlm.vision_tower, vlm.multi_modal_projector = nn.Identity(), nn.Identity()
         config.object_classes = config.object_classes or list(classes())

@@ -50,6 +50,7 @@ from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import
 from lerobot_memobench.policies.memobench_mem.encoders import ENCODED
 from lerobot_memobench.policies.memobench_mem.memory import NONE, find_mechanism
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
+    AHEAD,
     CHOICES,
     FRAMES,
     PHASE,
@@ -189,7 +190,8 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
     (``observation.encoded.*``), and with an alignment ``memory.text`` and ``memory.text_mask``: (B, d_t) and (B,) for
     the frame itself, or with ``framewise`` (B, F, d_t) and (B, F) for the frames of the history. With ``subgoals``
     there are the numbers of the active ones: ``memory.subgoal`` (B,) and ``memory.subgoals`` (U,), of the samples and
-    of the frames. With ``frames`` 0 (``memory=none``) there is no history.
+    of the frames. A memory that learns to foresee has ``memory.ahead`` (B, n). With ``frames`` 0 (``memory=none``)
+    there is no history.
 
     A step that is rebuilt from a checkpoint has the settings of the run that wrote it, until it is told to ``follow``
     another one. One that is given a ``cache`` keeps its own.
@@ -242,9 +244,10 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
             phase |= {name: cache.columns[name][torch.tensor(indices)] for name in encoded}
         if not self.frames:
             return phase
-        slots, stride = find_mechanism(self.memory).slots, cache.meta.stride
-        recalled = [(episode, np.asarray(slots(frame // stride, self.frames))) for episode, frame in places]
-        memory, numbers = _histories(cache, recalled)
+        mechanism, stride = find_mechanism(self.memory), cache.meta.stride
+        recalled = [(episode, np.asarray(mechanism.slots(frame // stride, self.frames))) for episode, frame in places]
+        ahead = [np.arange(frame // stride + 1, frame // stride + 1 + mechanism.ahead) for _, frame in places]
+        memory, numbers = _histories(cache, recalled, ahead)
         if self.subgoals:
             number = {text: row for row, text in enumerate(texts_of(self.subgoals))}
             known = np.array([*(number.get(text, -1) for text in cache.texts), -1])
@@ -278,20 +281,34 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
         return found if self.memory in ("frames", NONE) else found | {"memory": self.memory}
 
 
-def _histories(cache: FrameLookup, recalled: Sequence[tuple[int, np.ndarray]]) -> tuple[dict[str, Tensor], Tensor]:
-    """Load frames of episodes by their slots, each once; return them for a batch, and their numbers in the dataset."""
+def _histories(
+    cache: FrameLookup, recalled: Sequence[tuple[int, np.ndarray]], ahead: Sequence[np.ndarray]
+) -> tuple[dict[str, Tensor], Tensor]:
+    """Load frames of episodes by their slots, each once; return them for a batch, and their numbers in the dataset.
+
+    Args:
+        ahead: slots that follow each of those, beyond the episode's end perhaps.
+    """
     stride, needed = cache.meta.stride, dict[int, list[np.ndarray]]()
-    for episode, slots in recalled:
+    counts = -(-np.diff(cache.episodes) // stride)
+    following = [(episode, slots[slots < counts[episode]]) for (episode, _), slots in zip(recalled, ahead, strict=True)]
+    for episode, slots in (*recalled, *following):
         needed.setdefault(episode, []).append(slots)
     unique = {episode: np.unique(np.concatenate(needed[episode])) for episode in sorted(needed)}
     first = dict(zip(unique, np.cumsum([0, *map(len, unique.values())]), strict=False))
-    places = np.full((len(recalled), max(len(slots) for _, slots in recalled)), -1)
-    for row, (episode, slots) in enumerate(recalled):
-        places[row, : len(slots)] = first[episode] + np.searchsorted(unique[episode], slots)
+
+    def places(wanted: Sequence[tuple[int, np.ndarray]], width: int) -> Tensor:
+        found = np.full((len(wanted), width), -1)
+        for row, (episode, slots) in enumerate(wanted):
+            found[row, : len(slots)] = first[episode] + np.searchsorted(unique[episode], slots)
+        return torch.from_numpy(found)
+
     steps = torch.from_numpy(np.concatenate([slots * stride for slots in unique.values()]))
     starts = np.repeat([cache.episodes[episode] for episode in unique], [len(slots) for slots in unique.values()])
     frames = torch.cat([cache.tokens(episode, slots.tolist()) for episode, slots in unique.items()])
-    return {FRAMES: frames, STEPS: steps, PLACES: torch.from_numpy(places)}, steps + torch.from_numpy(starts)
+    found = {FRAMES: frames, STEPS: steps, PLACES: places(recalled, max(len(slots) for _, slots in recalled))}
+    found |= {AHEAD: places(following, len(ahead[0]))} if len(ahead[0]) else {}
+    return found, steps + torch.from_numpy(starts)
 
 
 @dataclass

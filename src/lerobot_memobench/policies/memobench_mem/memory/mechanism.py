@@ -26,6 +26,8 @@ MEMORY_GRID = 4
 
 FRAMES, STEPS, PLACES = "memory.frames", "memory.steps", "memory.places"
 """Histories of a training batch: see `Histories`."""
+AHEAD = "memory.ahead"
+"""Frames that follow the histories, for mechanisms that learn to foresee them (`MemoryMechanism.ahead`)."""
 SUBGOAL, SUBGOALS, CHOICES = "memory.subgoal", "memory.subgoals", "memory.choices"
 """Labels for mechanisms that learn from checkpoints (`MemoryMechanism.privileged`), as numbers of texts; -1: none. Of
 each sample (B,), of each frame (U,), and which texts are its task's (B, S) bool, which a rollout has too."""
@@ -40,12 +42,14 @@ class Histories(NamedTuple):
         frames: (U, P, D') stored frames. steps: (U,) their control steps since their episodes began, int64.
         places: (B, F) which of them each sample remembers, oldest first; -1 behind the last.
         subgoals: (U,) number of the text that is a frame's subgoal, -1: none; with `MemoryMechanism.privileged`.
+        ahead: (B, n) which frames follow those, -1 behind the episode's last; with `MemoryMechanism.ahead`.
     """
 
     frames: Tensor
     steps: Tensor
     places: Tensor
     subgoals: Tensor | None = None
+    ahead: Tensor | None = None
 
     def to(self, device: torch.device) -> Histories:
         """Move them to a device."""
@@ -138,9 +142,13 @@ class MemoryMechanism(nn.Module, ABC):
 
     Attributes:
         Settings: a dataclass of what may be set (``policy.memory_settings``), each with a default.
-        stride: control steps from one written frame to the next where nobody says; None: as `frames`.
+        stride: control steps from one written frame to the next where nobody says, perhaps by the perception; None: as
+            `frames`.
         asks_present: whether it reads by tokens of the present observation.
         asks_words: whether it writes or reads by the text prompt.
+        asks_motion: whether it remembers what moves: its pool is a `motion_fields.MotionField`, and what is stored of a
+            picture is a thumbnail.
+        ahead: how many stored frames that follow are loaded in training, as labels.
         privileged: whether it learns from the checkpoints' texts; a rollout is told the texts of its task, in no order.
         fusion: its own way in which actions read it (``policy.memory_fusion=own``), a `fusion.MemoryFusion`; None: any
             other of these.
@@ -150,9 +158,11 @@ class MemoryMechanism(nn.Module, ABC):
     """
 
     Settings: ClassVar[type] = NoSettings
-    stride: ClassVar[int | None] = None
+    stride: ClassVar[int | Mapping[str, int] | None] = None
     asks_present: ClassVar[bool] = False
     asks_words: ClassVar[bool] = False
+    asks_motion: ClassVar[bool] = False
+    ahead: ClassVar[int] = 0
     privileged: ClassVar[bool] = False
     fusion: ClassVar[Any] = None
     per_frame: ClassVar[bool] = False
@@ -299,7 +309,11 @@ class MemoryMechanism(nn.Module, ABC):
     # -- what it learns by itself -------------------------------------------------------------------------------------
 
     def losses(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return losses of its own by their names, (B,) each and weighted; called after `replay` and the actions'."""
+        """Return losses of its own by their names, (B,) each and weighted; called after `replay` and the actions'.
+
+        Args:
+            batch: the training batch, and what its fusion made beside actions (`MemoryFusion.outputs`).
+        """
         return {}
 
 

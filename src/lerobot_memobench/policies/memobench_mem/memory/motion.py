@@ -1,0 +1,197 @@
+"""Motion: an action chunk reads what has just moved, and the expert says what will move next.
+
+From HiF-VLA (OpenHelix-Team/HiF-VLA, CVPR 2026): hindsight of the last 8 motions, its encoder, 8 foresight queries,
+their loss of 0.01 L1, and modulation of the expert by hindsight. Left out or otherwise here: motion is found by block
+matching of thumbnails, or is the displacement of objects, and no codec gives its vectors; queries stand beside the
+actions in pi0.5's expert, and there is no joint expert with norms, projections and feed-forwards of motion's own; two
+layers decode motion, without attention over place and time; an action chunk is learned as pi0.5's is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, cast
+
+import torch
+from einops import rearrange, reduce, repeat
+from torch import Tensor, nn
+
+from lerobot_memobench.policies.memobench_mem.fusion import MemoryFusion, Suffix
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
+    Histories,
+    MemoryMechanism,
+    MemorySpec,
+    MemoryTokens,
+    NoSettings,
+    Query,
+)
+
+if TYPE_CHECKING:
+    from lerobot_memobench.policies.memobench_mem.motion_fields import MotionField
+
+HINDSIGHT, FORESIGHT = 8, 8
+"""Motions that are remembered, and that are foreseen: h and n."""
+FORESIGHT_WEIGHT = 0.01
+LAYERS, HEADS = 4, 8
+FORESEEN = "memory.foreseen"
+
+
+# -- foresight --------------------------------------------------------------------------------------------------------
+
+
+class MotionExpert(nn.Module):
+    """What the action expert has more: motion queries, the condition that hindsight is, and a decoder of motion.
+
+    The condition's last layer starts at zero, so that hindsight changes nothing where training starts.
+    """
+
+    def __init__(self, memory_dim: int, width: int, numbers: int) -> None:
+        super().__init__()
+        self.queries = nn.Parameter(torch.randn(FORESIGHT, width) * width**-0.5)
+        last = nn.Linear(width, width)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+        self.condition = nn.Sequential(nn.Linear(memory_dim, width), nn.SiLU(), last)
+        self.decode = nn.Sequential(nn.Linear(width, width), nn.Tanh(), nn.Linear(width, numbers))
+
+
+class Foresight(MemoryFusion):
+    """Hindsight is added to the condition of the expert's norms; motion queries stand before the actions.
+
+    Queries and actions attend to each other, so the actions' positions are `FORESIGHT` further on than in plain pi0.5.
+    """
+
+    def __init__(self, model: nn.Module, memory_dim: int, expert_dim: int) -> None:
+        self.model = cast(Any, model)
+        pool = self.model.memory.pool
+        self.model.foresight = MotionExpert(memory_dim, expert_dim, pool.cells * pool.moved)
+        self.condition: Tensor | None = None
+        self.made: Tensor | None = None
+        self.model.paligemma_with_expert.gemma_expert.model.norm.register_forward_hook(self._keep)
+
+    def hand_over(self, memory: MemoryTokens) -> None:
+        """Make the condition of the next passes."""
+        self.condition = self.model.foresight.condition(memory.rows().squeeze(1))
+
+    def suffix(self, suffix: Suffix) -> Suffix:
+        """Put the queries before the actions, into their block of attention."""
+        if self.condition is None:
+            return suffix
+        tokens, real, blocks, condition = suffix
+        queries = repeat(self.model.foresight.queries.to(tokens.dtype), "n w -> b n w", b=len(tokens))
+        return (
+            torch.cat([queries, tokens], dim=1),
+            torch.cat([real.new_ones(queries.shape[:2]), real], dim=1),
+            torch.cat([blocks, blocks.new_zeros(queries.shape[:2])], dim=1),  # the first of all begins the block
+            condition + self.condition,
+        )
+
+    def _keep(self, norm: nn.Module, given: Any, made: tuple[Tensor, Tensor | None]) -> None:
+        self.made = made[0][:, :FORESIGHT]
+
+    def outputs(self) -> dict[str, Tensor]:
+        """Return the motion (B, n, C k) that the last pass foresaw."""
+        made, self.made = self.made, None
+        return {} if made is None else {FORESEEN: self.model.foresight.decode(made.to(torch.float32))}
+
+    def owns(self, name: str) -> bool:
+        """Say whether a parameter is the queries', the condition's or the decoder's."""
+        return name.startswith("foresight.")
+
+
+# -- hindsight --------------------------------------------------------------------------------------------------------
+
+
+class Motion(MemoryMechanism):
+    """The last 8 motions of stored frames, as one token. What is older is forgotten.
+
+    Of objects every control step is stored; of pictures every fourth, in which an arm moves by some pixels of a
+    thumbnail. While there are fewer motions the earliest is repeated, and at an episode's first frame nothing moves.
+    """
+
+    fusion = Foresight
+    stride = {"objects": 1, "pixels": 4}
+    asks_motion = True
+    ahead = FORESIGHT
+    capacity = HINDSIGHT + 1
+
+    def __init__(self, spec: MemorySpec, pool: nn.Module, settings: NoSettings) -> None:
+        super().__init__(spec, pool, settings)
+        width = spec.expert
+        layer = nn.TransformerEncoderLayer(width, HEADS, 2 * width, batch_first=True)  # torch's defaults, as the source
+        self.encoder = nn.TransformerEncoder(layer, LAYERS, enable_nested_tensor=False)
+        self.summary = nn.Parameter(torch.randn(width) * 0.02)
+        self.out = nn.Linear(width, spec.width)
+        self._followed: tuple[Tensor, Tensor] | None = None
+
+    @property
+    def field(self) -> MotionField:
+        """What moves between two stored frames."""
+        return cast("MotionField", self.pool)
+
+    @classmethod
+    def slots(cls, slot: int, frames: int) -> Sequence[int]:
+        """Return the last frames alone, between which the motions are."""
+        return range(max(0, slot - HINDSIGHT), slot + 1)
+
+    def init(self, rows: int) -> dict[str, Tensor]:
+        """Return no motion, and no frame from which something could move."""
+        like, field = self.summary, self.field
+        return {
+            "frame": like.new_zeros(rows, 1, field.size),
+            "motions": like.new_zeros(rows, HINDSIGHT, field.cells, field.numbers),
+            "frames": torch.zeros(rows, dtype=torch.int64, device=like.device),
+        }
+
+    def observe(self, state: Any, frames: Tensor, step: Tensor, query: Query | None = None) -> dict[str, Tensor]:
+        """Add the motion to frames, as they are stored."""
+        return self.write(state, frames, step, query)
+
+    def write(self, state: Any, tokens: Tensor, step: Tensor, query: Query | None = None) -> dict[str, Tensor]:
+        """Add the motion to frames, as they are stored."""
+        count, motions = state["frames"], state["motions"]
+        moved = self.field.between(state["frame"].to(tokens.dtype), tokens).to(motions.dtype).unsqueeze(1)
+        first, second = (rearrange(count == number, "r -> r 1 1 1") for number in (0, 1))
+        later = torch.cat([motions[:, 1:], moved], dim=1)
+        motions = torch.where(first, motions, torch.where(second, moved.expand_as(motions), later))
+        return {"frame": tokens.to(state["frame"].dtype), "motions": motions, "frames": (count + 1).clamp(max=2)}
+
+    def read(self, state: Any, query: Query | None = None) -> MemoryTokens:
+        """Encode the motions to one token."""
+        return self._encoded(state["motions"])
+
+    def replay(self, histories: Histories, query: Query | None = None) -> MemoryTokens:
+        """Find the motions of all samples at once, and those that follow, which are to be foreseen."""
+        frames, places, field = histories.frames, histories.places, self.field
+        self._followed = None
+        if histories.ahead is not None:
+            last = places.gather(1, (places >= 0).sum(dim=1, keepdim=True) - 1)
+            following = torch.cat([last, histories.ahead], dim=1)
+            with torch.no_grad():
+                moved, known = field.following(frames[following.clamp(min=0)])
+            self._followed = moved, known & (following[:, 1:, None] >= 0)
+        seen, pairs = field.observed(frames), places[:, 1:] >= 0
+        moved = field.between(seen[places[:, :-1][pairs]], seen[places[:, 1:][pairs]])
+        motions = self.summary.new_zeros(len(places), HINDSIGHT, field.cells, field.numbers)
+        count = pairs.sum(dim=1, keepdim=True)
+        # Row b's motions lie from first[b] on in `moved`, oldest first; the last stand last, the earliest repeats.
+        first = count.cumsum(dim=0) - count
+        ages = torch.arange(HINDSIGHT, device=places.device) - HINDSIGHT + count
+        some = count.squeeze(1) > 0
+        motions[some] = moved.to(motions.dtype)[(first + ages.clamp(min=0))[some]]
+        return self._encoded(motions)
+
+    def losses(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return the weighted mean error of the motions that are foreseen, of cells that are known."""
+        if self._followed is None or FORESEEN not in batch:
+            return {}
+        (moved, known), self._followed = self._followed, None
+        foreseen = batch[FORESEEN].unflatten(-1, moved.shape[2:])
+        errors = reduce((foreseen - moved).abs(), "b n c k -> b n c", "mean") * known
+        return {"foresight": FORESIGHT_WEIGHT * errors.sum(dim=(1, 2)) / known.sum(dim=(1, 2)).clamp(min=1)}
+
+    def _encoded(self, motions: Tensor) -> MemoryTokens:
+        tokens = self.field.tokens(motions)
+        summary = repeat(self.summary, "w -> b 1 w", b=len(tokens))
+        read = self.encoder(torch.cat([summary.to(tokens.dtype), tokens], dim=1))[:, :1]
+        return MemoryTokens(self.out(read), torch.ones(read.shape[:2], dtype=torch.bool, device=read.device))

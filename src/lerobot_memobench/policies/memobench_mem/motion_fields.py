@@ -1,0 +1,236 @@
+"""What moves from one stored frame to the next: the interface `MotionField`, of pictures and of objects.
+
+A field has C cells of K numbers. Of pictures a cell is a block of the thumbnail, and its motion is found by exhaustive
+block matching, as a video codec does; of objects it is a slot, or the hand, and its motion a displacement.
+
+Shapes: N pairs of frames, B samples, h pairs of a sample, n frames that follow, W width of tokens.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from einops import rearrange
+from torch import Tensor, nn
+
+from lerobot_memobench.policies.memobench_mem.detection_noise import with_detection_noise
+from lerobot_memobench.policies.memobench_mem.encoders import THUMBNAIL, ObservationEncoder
+from lerobot_memobench.policies.memobench_mem.objects import CLASS_DIM, HAND_DIM, MIDDLE, PER_METRE, ObjectEncoder
+from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH, field
+
+
+class MotionField(nn.Module, ABC):
+    """Motion between two stored frames, and tokens of it; the tokens' layers learn.
+
+    Attributes:
+        size: D', numbers of a stored frame. cells: C. numbers: K of a cell, of which the first ``moved`` are motion.
+    """
+
+    size: int
+    cells: int
+    numbers: int
+    moved: int
+
+    def observed(self, frames: Tensor) -> Tensor:
+        """Return stored frames (N, 1, D') as a training sees them in its past."""
+        return frames
+
+    @abstractmethod
+    def between(self, before: Tensor, now: Tensor) -> Tensor:
+        """Return the field (N, C, K) from stored frames (N, 1, D') to those after them; nothing in it learns."""
+
+    @abstractmethod
+    def following(self, frames: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the motion (B, n, C, moved) of what the first of frames (B, n + 1, 1, D') shows, frame by frame.
+
+        Returns:
+            Beside it which cells are known, (B, n, C) bool.
+        """
+
+    @abstractmethod
+    def tokens(self, fields: Tensor) -> Tensor:
+        """Return tokens (B, T, W), with their positions, of the fields (B, h, C, K) of a sample, oldest first."""
+
+
+def motion_field(observations: ObservationEncoder, width: int, pairs: int = 8) -> MotionField:
+    """Return the motion field of what an encoder stores of a frame; ``pairs`` is h, ``width`` W."""
+    if isinstance(observations, ObjectEncoder):
+        return ObjectMotion(observations.order, observations.kinds, width, pairs, observations.noise)
+    return PictureMotion(width, pairs)
+
+
+# -- pictures ---------------------------------------------------------------------------------------------------------
+
+
+BLOCKS = 16
+"""Side of the square of blocks."""
+BLOCK = THUMBNAIL // BLOCKS
+REACH = 4
+"""How far a block may have moved in each direction, pixels of the thumbnail: a sixteenth of the picture."""
+STILL = 2.0
+"""Mean difference of a block's pixels, of 255, up to which it stands still, as a codec skips it: what compression of
+videos changes."""
+OFFSETS = sorted(itertools.product(range(-REACH, REACH + 1), repeat=2), key=lambda offset: math.hypot(*offset))
+"""Rows and columns from a block to where it may have been; of equally good ones the nearest counts."""
+WIDE = 512
+"""From this width on a token covers 2 x 2 blocks, as in the source, else 4 x 4."""
+
+
+@torch.no_grad()
+def match_blocks(before: Tensor, now: Tensor) -> Tensor:
+    """Return by how many pixels each block of pictures (N, S, S) has moved since others, (N, 16, 16, 2): x, y.
+
+    Every offset within `REACH` is tried, beyond the picture's edge too, where its outermost pixels go on. The least sum
+    of absolute differences counts.
+    """
+    moving = F.avg_pool2d((now - before).abs().unsqueeze(1), BLOCK).squeeze(1) > STILL
+    around = F.pad(before.unsqueeze(1), (REACH,) * 4, mode="replicate").squeeze(1)
+    side = BLOCK + 2 * REACH
+    # Blocks last, side by side: sums then run over all of them at once.
+    windows = rearrange(around.unfold(1, side, BLOCK).unfold(2, side, BLOCK)[moving], "m y x -> y x m").contiguous()
+    blocks = rearrange(now.unfold(1, BLOCK, BLOCK).unfold(2, BLOCK, BLOCK)[moving], "m y x -> y x m").contiguous()
+    costs = [
+        (windows[row : row + BLOCK, column : column + BLOCK] - blocks).abs().sum(dim=(0, 1))
+        for row, column in ((REACH + y, REACH + x) for y, x in OFFSETS)
+    ]
+    came_from = now.new_tensor(OFFSETS)[torch.stack(costs).argmin(dim=0)]
+    moved = now.new_zeros(*moving.shape, 2)
+    moved[moving] = -came_from.flip(-1)
+    return moved
+
+
+class PictureMotion(MotionField):
+    """Motion of a thumbnail's blocks, as a share of `REACH`, and two convolutions over time and place (HiF-VLA's)."""
+
+    size, cells, numbers, moved = THUMBNAIL**2, BLOCKS**2, 2, 2
+
+    def __init__(self, width: int, pairs: int) -> None:
+        super().__init__()
+        stride = 1 if width >= WIDE else 2
+        self.convolve = nn.Sequential(
+            nn.Conv3d(2, width, 3, stride=2, padding=1),
+            nn.ReLU(),
+            nn.Conv3d(width, width, 3, stride=stride, padding=1),
+            nn.ReLU(),
+        )
+        times, side = pairs // 2 // stride, BLOCKS // 2 // stride
+        self.times = nn.Parameter(torch.randn(times, 1, width) * 0.02)
+        self.places = nn.Parameter(torch.randn(side**2, width) * 0.02)
+
+    def between(self, before: Tensor, now: Tensor) -> Tensor:
+        """Match the blocks of thumbnails."""
+        pictures = (
+            frames.to(torch.float32).unflatten(-1, (THUMBNAIL, THUMBNAIL)).squeeze(1) for frames in (before, now)
+        )
+        return match_blocks(*pictures).flatten(1, 2) / REACH
+
+    def following(self, frames: Tensor) -> tuple[Tensor, Tensor]:
+        """Match each frame's blocks with those of the one before it; all are known."""
+        pairs = self.between(frames[:, :-1].flatten(0, 1), frames[:, 1:].flatten(0, 1))
+        moved = pairs.unflatten(0, (len(frames), -1))
+        return moved, torch.ones(moved.shape[:-1], dtype=torch.bool, device=moved.device)
+
+    def tokens(self, fields: Tensor) -> Tensor:
+        """Return a token per two fields (or four) and 2 x 2 blocks (or 4 x 4)."""
+        found = self.convolve(rearrange(fields, "b h (y x) k -> b k h y x", y=BLOCKS))
+        return (rearrange(found, "b w t y x -> b t (y x) w") + self.times + self.places).flatten(1, 2)
+
+
+# -- objects ----------------------------------------------------------------------------------------------------------
+
+
+SAME = 0.15
+"""How far a thing may have moved from one frame to the next, m; beyond it another one is in its place."""
+PER_STEP = 100.0
+"""What brings displacements (m) and changes of joints (m or rad) of a frame to about one."""
+MOVED = 4
+"""Displacement (3) and change of the joint (1)."""
+
+
+class ObjectMotion(MotionField):
+    """Displacement of each slot's thing and of the hand; of each pair of frames a token, pooled by learned attention.
+
+    A cell's numbers are its motion, whether it is known, its class, and its place. Hand: class ``kinds``.
+
+    Args:
+        order, kinds: of classes, as of `objects.SlotEncoder`. noise: size of the detection noise while it learns.
+    """
+
+    size, cells, numbers, moved = SIZE + HAND_DIM + 1, SLOTS + 1, MOVED + 5, MOVED
+
+    def __init__(self, order: Sequence[int], kinds: int, width: int, pairs: int, noise: float) -> None:
+        super().__init__()
+        self.order, self.noise = [*order, kinds], noise
+        self.kind = nn.Embedding(kinds + 1, CLASS_DIM)
+        self.mlp = nn.Sequential(nn.Linear(MOVED + 3 + CLASS_DIM, width), nn.GELU(), nn.Linear(width, width))
+        self.score = nn.Linear(width, 1)
+        self.times = nn.Parameter(torch.randn(pairs, width) * 0.02)
+
+    def observed(self, frames: Tensor) -> Tensor:
+        """Add detection noise while it learns."""
+        if not (self.training and self.noise):
+            return frames
+        slots, hand, phase = frames.flatten(1).split([SIZE, HAND_DIM, 1], dim=1)
+        noisy = with_detection_noise(slots.unflatten(1, (SLOTS, WIDTH)), hand, self.noise)
+        return torch.cat([noisy.flatten(1), hand, phase], dim=1).unsqueeze(1)
+
+    def between(self, before: Tensor, now: Tensor) -> Tensor:
+        """Return for each slot of the earlier frame, and for the hand, where its thing has gone."""
+        field, _ = self._between(before, now)
+        return field
+
+    def _between(self, before: Tensor, now: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the field (N, C, K), and in which cell of the later frame each thing is, (N, C)."""
+        (then, kind, place, joint), (later, later_kind, later_place, later_joint) = map(self._cells, (before, now))
+        apart = torch.cdist(place, later_place)
+        another = ~then.unsqueeze(2) | ~later.unsqueeze(1) | (kind.unsqueeze(2) != later_kind.unsqueeze(1))
+        apart = apart.masked_fill(another | (apart > SAME), torch.inf)
+        nearest = apart.argmin(dim=2)  # of equal things the nearest, if each is the other's
+        back = apart.argmin(dim=1).gather(1, nearest)
+        cells = torch.arange(self.cells, device=back.device)
+        known = (back == cells) & apart.isfinite().any(dim=2)
+        gone = later_place.gather(1, nearest.unsqueeze(-1).expand_as(place)) - place
+        turned = later_joint.gather(1, nearest.unsqueeze(-1)) - joint
+        moved = PER_STEP * torch.cat([gone, turned], dim=-1) * known.unsqueeze(-1)
+        seen = place.new_tensor(MIDDLE)
+        parts = [moved, known.unsqueeze(-1), kind.unsqueeze(-1), (place - seen) * PER_METRE]
+        return torch.cat([part.to(place.dtype) for part in parts], dim=-1), nearest
+
+    def _cells(self, frames: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return of stored frames which cells hold a thing (N, C), their classes (N, C), places and joints."""
+        slots, hand, _ = frames.to(torch.float32).flatten(1).split([SIZE, HAND_DIM, 1], dim=1)
+        slots = slots.unflatten(1, (SLOTS, WIDTH))
+        alone = torch.ones_like(hand[:, :1])
+        there = torch.cat([field(slots, "present").squeeze(-1), alone], dim=1) > 0
+        kind = torch.cat([field(slots, "class").squeeze(-1), alone * (len(self.order) - 1)], dim=1)
+        place = torch.cat([field(slots, "position"), hand[:, None, :3]], dim=1)
+        joint = torch.cat([field(slots, "joint"), 0 * alone.unsqueeze(-1)], dim=1)
+        return there, kind, place, joint
+
+    def following(self, frames: Tensor) -> tuple[Tensor, Tensor]:
+        """Follow the things of the first frame from frame to frame, until one is lost."""
+        count = frames.shape[1] - 1
+        pairs, went = self._between(frames[:, :-1].flatten(0, 1), frames[:, 1:].flatten(0, 1))
+        pairs, went = (of.unflatten(0, (-1, count)) for of in (pairs, went))
+        cell = torch.arange(self.cells, device=went.device).expand(len(frames), -1)
+        known, found = torch.ones_like(cell, dtype=torch.bool), []
+        for number in range(count):
+            now = pairs[:, number].gather(1, cell.unsqueeze(-1).expand(-1, -1, self.numbers))
+            known = known & (now[..., MOVED] > 0)
+            found.append((now[..., :MOVED], known))
+            cell = went[:, number].gather(1, cell)
+        moved, knowns = (torch.stack(parts, dim=1) for parts in zip(*found, strict=True))
+        return moved, knowns
+
+    def tokens(self, fields: Tensor) -> Tensor:
+        """Return a token per pair of frames."""
+        moved, known, kind, place = fields.split([MOVED, 1, 1, 3], dim=-1)
+        kinds = torch.tensor(self.order, device=fields.device)[kind.squeeze(-1).long()]
+        made = self.mlp(torch.cat([moved, place, self.kind(kinds)], dim=-1))
+        weights = self.score(made).masked_fill(known == 0, -1e4).softmax(dim=2) * known.any(dim=2, keepdim=True)
+        return (made * weights).sum(dim=2) + self.times
