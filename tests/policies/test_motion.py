@@ -1,0 +1,297 @@
+"""Memory of motion: block matching, displacements of objects, hindsight of eight, foresight in the expert."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from lerobot_memobench.policies.memobench_mem.encoders import THUMBNAIL, thumbnails
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import AHEAD, PLACES, Histories, MemorySpec, NoSettings
+from lerobot_memobench.policies.memobench_mem.memory.motion import FORESIGHT, FORESIGHT_WEIGHT, HINDSIGHT, Motion
+from lerobot_memobench.policies.memobench_mem.motion_fields import (
+    BLOCK,
+    BLOCKS,
+    MOVED,
+    OFFSETS,
+    PER_STEP,
+    REACH,
+    STILL,
+    ObjectMotion,
+    PictureMotion,
+    match_blocks,
+)
+from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
+from lerobot_memobench.policies.memobench_mem.objects import frame_row
+from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import GatherMemoryProcessorStep
+from lerobot_memobench.sim.object_layout import SLOTS, WIDTH
+from tests.support.object_dataset import make_object_dataset
+from tests.support.small_policy import batch_of, made_for_training, small_config
+
+# -- pictures ---------------------------------------------------------------------------------------------------------
+
+
+def matched_slowly(before: np.ndarray, now: np.ndarray) -> np.ndarray:
+    """Block by block, offset by offset."""
+    around, found = np.pad(before, REACH, mode="edge"), np.zeros((BLOCKS, BLOCKS, 2))
+    for row in range(BLOCKS):
+        for column in range(BLOCKS):
+            top, left = BLOCK * row, BLOCK * column
+            block = now[top : top + BLOCK, left : left + BLOCK]
+            if np.abs(block - before[top : top + BLOCK, left : left + BLOCK]).mean() <= STILL:
+                continue
+            costs = []
+            for y, x in OFFSETS:
+                first, second = top + REACH + y, left + REACH + x
+                costs.append(np.abs(block - around[first : first + BLOCK, second : second + BLOCK]).sum())
+            y, x = OFFSETS[int(np.argmin(costs))]
+            found[row, column] = -x, -y
+    return found
+
+
+def test_blocks_are_matched_as_by_the_slow_formula() -> None:
+    chance = np.random.default_rng(0)
+    before = np.kron(chance.integers(0, 256, (3, 22, 22)), np.ones((3, 3)))[:, :THUMBNAIL, :THUMBNAIL]
+    ways = ((1, -2), (0, 4), (5, 0))
+    now = np.stack([np.roll(picture, by, (0, 1)) for picture, by in zip(before, ways, strict=True)])
+    now[:, :30] = before[:, :30]  # half a picture stands still, with the noise of a video
+    now[:, :30] += chance.integers(0, 3, now[:, :30].shape)
+    found = match_blocks(torch.tensor(before), torch.tensor(now))
+    np.testing.assert_array_equal(found, [matched_slowly(*pair) for pair in zip(before, now, strict=True)])
+    assert not found[:, :7].any()
+    assert (found[0, 9:15, 2:14] == torch.tensor([-2.0, 1.0])).all()
+    assert (found[1, 9:15, 2:14] == torch.tensor([4.0, 0.0])).all()
+
+
+def test_a_thumbnail_holds_grey_levels_exactly() -> None:
+    levels = torch.arange(256.0).reshape(1, 1, 16, 16) / 255
+    picture = levels.repeat_interleave(16, 2).repeat_interleave(16, 3).expand(-1, 3, -1, -1)
+    found = thumbnails(picture)
+    assert (found.shape, found.dtype) == ((1, 1, THUMBNAIL**2), torch.bfloat16)
+    assert torch.equal(found.float().view(THUMBNAIL, THUMBNAIL)[::4, ::4].flatten(), torch.arange(256.0))
+
+
+@pytest.mark.parametrize(("width", "tokens"), [(64, 32), (512, 256)])
+def test_a_large_policy_has_the_tokens_of_the_source(width: int, tokens: int) -> None:
+    field = PictureMotion(width, HINDSIGHT)
+    assert field.tokens(torch.randn(1, HINDSIGHT, field.cells, field.numbers)).shape == (1, tokens, width)
+
+
+# -- objects ----------------------------------------------------------------------------------------------------------
+
+
+def stored(*frames: list[tuple[float, ...]], hand: float = 0.0) -> Tensor:
+    """Stored frames (n, 1, D') of things: class, x, joint, and y where it is not 0; in their order."""
+    slots = torch.zeros(len(frames), SLOTS, WIDTH)
+    for slot, things in zip(slots, frames, strict=True):
+        for row, (kind, x, joint, *y) in enumerate(sorted(things)):
+            slot[row, [0, 1, 2, 3, 11]] = torch.tensor([1.0, kind, x, *(y or [0.0]), joint])
+    state = torch.zeros(len(frames), 8)
+    state[:, 1] = torch.arange(len(frames)) * hand
+    return frame_row(slots.flatten(1), state, torch.ones(len(frames)))
+
+
+def field_of_objects(noise: float = 0.0) -> ObjectMotion:
+    torch.manual_seed(0)
+    return ObjectMotion(list(range(100)), 100, 32, HINDSIGHT, noise).eval()
+
+
+def moved(field: Tensor) -> Tensor:
+    """Displacement along x and change of the joint of each cell, and whether it is known."""
+    return torch.stack([field[..., 0] / PER_STEP, field[..., 3] / PER_STEP, field[..., MOVED]], dim=-1)
+
+
+def test_things_are_matched_by_class_and_place() -> None:
+    """A drawer opens by a joint; a bowl is gone; of two cups one passes no other, and a third one comes."""
+    before, now = stored(
+        [(0, 0.0, 0.1), (3, 0.0, 0.0), (5, 0.0, 0.0), (5, 0.3, 0.0)],
+        [(0, 0.02, 0.15), (5, -0.1, 0.0), (5, 0.01, 0.0), (5, 0.31, 0.0)],
+        hand=0.03,
+    ).split(1)
+    field = field_of_objects().between(before, now)[0]
+    expected = [[0.02, 0.05, 1], [0, 0, 0], [0.01, 0, 1], [0.01, 0, 1]]
+    torch.testing.assert_close(moved(field[:4]), torch.tensor(expected))
+    assert not field[4:-1, : MOVED + 1].any()
+    torch.testing.assert_close(field[-1, :5], torch.tensor([0, 0.03 * PER_STEP, 0, 0, 1]))
+
+
+def test_a_thing_is_not_another_one_far_away() -> None:
+    before, now = stored([(5, 0.0, 0.0)], [(5, 0.4, 0.0)]).split(1)
+    assert not moved(field_of_objects().between(before, now)[0, 0]).any()
+
+
+def test_things_are_followed_while_slots_change_their_order() -> None:
+    """Two cups pass each other, so their slots are exchanged; a bowl is lost on the way, and seen again."""
+    field = field_of_objects()
+    cups = stored(*([(3, 0.0, 0.0)] * (step != 2) + [(5, 0.05 * step, 0.0), (5, 0.12, 0.0, 0.2)] for step in range(5)))
+    found, known = field.following(cups.unsqueeze(0))
+    assert (found.shape, known.shape) == ((1, 4, SLOTS + 1, MOVED), (1, 4, SLOTS + 1))
+    assert known[0, :, 0].tolist() == [True, False, False, False]
+    torch.testing.assert_close(found[0, :, 1, 0] / PER_STEP, torch.full((4,), 0.05))
+    torch.testing.assert_close(found[0, :, 2, 0], torch.zeros(4))
+
+
+def test_detection_noise_is_of_the_past_alone() -> None:
+    field, frames = field_of_objects(noise=1.0), stored([(5, 0.0, 0.0), (7, 0.3, 0.0)])
+    assert torch.equal(field.observed(frames), frames)
+    assert not torch.equal(field.train().observed(frames), frames)
+
+
+# -- hindsight --------------------------------------------------------------------------------------------------------
+
+
+def hindsight() -> Motion:
+    spec = MemorySpec(dim=32, tokens=2, width=32, expert=32, frames=32, grid=0, stride=1)
+    return Motion(spec, field_of_objects(), NoSettings()).eval()
+
+
+def walked(steps: int) -> Tensor:
+    """Stored frames in which a cup moves, each time by more."""
+    return stored(*([(5, 0.001 * step * step, 0.0)] for step in range(steps)))
+
+
+def written(memory: Motion, frames: Tensor) -> dict[str, Tensor]:
+    state = memory.init(1)
+    for step, frame in enumerate(frames.split(1)):
+        state = memory.observe(state, frame, torch.tensor([step]))
+    return state
+
+
+@pytest.mark.parametrize(
+    ("frames", "kept"), [(1, [0] * 8), (3, [1] * 7 + [3]), (9, range(1, 16, 2)), (12, range(7, 22, 2))]
+)
+def test_the_last_eight_motions_are_kept(frames: int, kept: Sequence[int]) -> None:
+    """While there are fewer, the earliest is repeated."""
+    motions = written(hindsight(), walked(frames))["motions"][0, :, 0, 0]
+    torch.testing.assert_close(motions / PER_STEP, torch.tensor([*kept]) * 0.001)
+
+
+def test_what_is_older_is_forgotten() -> None:
+    memory, frames = hindsight(), walked(12)
+    with torch.no_grad():
+        read = [memory.read(written(memory, part)).each for part in (frames, frames[3:], frames[4:])]
+    torch.testing.assert_close(read[0], read[1])
+    assert not torch.allclose(read[0], read[2])
+
+
+# -- foresight --------------------------------------------------------------------------------------------------------
+
+
+def test_what_follows_is_loaded_up_to_the_end_of_the_episode() -> None:
+    class Cache:
+        """Two episodes, as `FeatureCache` has them."""
+
+        meta = type("Meta", (), {"stride": 4})
+        episodes, phase, texts = np.array([0, 41, 60]), np.ones(60), ()
+
+        def locate(self, index: int) -> tuple[int, int]:
+            return (0, index) if index < 41 else (1, index - 41)
+
+        def tokens(self, number: int, slots: list[int]) -> Tensor:
+            return torch.tensor([[[100.0 * number + slot]] for slot in slots])
+
+    found = GatherMemoryProcessorStep(memory="motion").gather(Cache(), [21, 60 - 1])  # type: ignore[arg-type]
+    frames = found["memory.frames"].flatten()
+    assert [frames[row[row >= 0]].tolist() for row in found[PLACES]] == [[*range(6)], [*range(100, 105)]]
+    assert [frames[row[row >= 0]].tolist() for row in found[AHEAD]] == [[*range(6, 11)], []]
+    assert found[AHEAD].shape == (2, FORESIGHT)
+
+
+def test_the_loss_is_of_the_motions_that_follow_and_are_known() -> None:
+    memory, frames = hindsight(), walked(12)
+    places = torch.tensor([[0, 1, 2, -1], [8, 9, 10, 11], [7, 8, 9, 10]])
+    ahead = torch.full((3, FORESIGHT), -1)
+    ahead[0], ahead[2, 0] = torch.arange(3, 11), 11
+    memory.replay(Histories(frames, torch.arange(12), places, None, ahead))
+    foreseen = torch.randn(3, FORESIGHT, memory.field.cells, MOVED)
+    (loss,) = memory.losses({"memory.foreseen": foreseen.flatten(2)}).values()
+    truth = torch.zeros(2, FORESIGHT, 2, MOVED)  # of the cup, and of the hand, which stands still
+    truth[0, :, 0, 0], truth[1, 0, 0, 0] = 0.1 * (2 * torch.arange(2, 10) + 1), 2.1
+    errors = (foreseen[[0, 2]][:, :, [0, -1]] - truth).abs()
+    expected = [errors[0].mean(), 0, errors[1, 0].mean()]
+    torch.testing.assert_close(loss, FORESIGHT_WEIGHT * torch.tensor(expected))
+    assert not memory.losses({"memory.foreseen": foreseen.flatten(2)}), "of each batch once"
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, dict[str, Any]]:
+    """A small policy of objects, and a preprocessed training batch."""
+    root = make_object_dataset(tmp_path_factory.mktemp("motion") / "objects")
+    fields = {"size": "small", "perception": "objects", "memory": "motion", "memory_frames": 32}
+    policy, before, _, dataset = made_for_training(root, **fields)
+    return policy, before(batch_of(dataset, [10, 30, 39, 50]))
+
+
+def test_actions_begin_without_hindsight_and_learn_with_it(trained: tuple[Any, dict[str, Any]]) -> None:
+    policy, batch = trained
+    assert policy.config.memory_stride == 1
+    alone = {**batch, PLACES: batch[PLACES][:, :1]}
+
+    def losses() -> list[float]:
+        policy.eval()
+        with torch.no_grad():
+            return [policy.forward(given)[1]["action_loss"] for given in (batch, alone)]
+
+    one, other = losses()
+    assert one == pytest.approx(other), "the condition's last layer is zero"
+    policy.train()
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=3e-3)
+    foreseen = []
+    for _ in range(12):
+        loss, logged = policy.forward(batch)
+        foreseen.append(logged["memory_foresight_loss"])
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        policy.update()
+    assert foreseen[-1] < 0.9 * foreseen[0]
+    learned = policy.model.memory_parameters().items()
+    still = [name for name, weights in learned if weights.grad is None or not weights.grad.any()]
+    assert not [name for name in still if name.startswith(("memory.", "foresight."))]
+    one, other = losses()
+    assert one != pytest.approx(other)
+
+
+def test_queries_stand_before_the_actions(trained: tuple[Any, dict[str, Any]]) -> None:
+    model, chunk = trained[0].model, trained[0].config.chunk_size
+    tokens, real, blocks, _ = model.embed_suffix(torch.zeros(4, chunk, 32), torch.ones(4))
+    assert tokens.shape[:2] == real.shape == blocks.shape == (4, FORESIGHT + chunk)
+    assert real.all()
+    assert blocks[:, 0].all()
+    assert not blocks[:, 1:].any()
+    assert torch.equal(tokens[1, :FORESIGHT], model.foresight.queries)
+
+
+# -- sizes and caches -------------------------------------------------------------------------------------------------
+
+
+def test_the_full_size_has_the_sizes_of_the_source() -> None:
+    with torch.device("meta"):
+        model = MemoryPI05(small_config(size="pi05", memory="motion", chunk_size=50, memory_frames=32))
+    assert isinstance(model.memory, Motion)
+    assert model.memory.summary.shape == (1024,)
+    assert model.memory.field.convolve[2].weight.shape == (1024, 1024, 3, 3, 3)
+    assert model.memory.out.out_features == 2048
+    assert model.foresight.queries.shape == (8, 1024)
+
+
+def test_thumbnails_have_a_cache_of_their_own(dataset_root: Path, tmp_path: Path) -> None:
+    made_for_training(dataset_root, size="tiny", feature_cache_dir=str(tmp_path))
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
+    policy, preprocessor, _, dataset = made_for_training(
+        dataset_root, size="tiny", memory="motion", memory_frames=32, feature_cache_dir=str(tmp_path)
+    )
+    assert policy.config.memory_stride == 4
+    batch = preprocessor(batch_of(dataset, [9]))
+    assert batch["memory.frames"].shape[1:] == (1, THUMBNAIL**2)
+    _, logged = policy.train().forward(batch)
+    assert logged["memory_foresight_loss"] >= 0
+    folders = [path.name for path in tmp_path.iterdir() if path.is_dir()]
+    assert len(folders) == 2
+    assert ["-thumbnails-stride4-" in name for name in sorted(folders, key=len)] == [False, True]
+    assert {path: path.stat().st_mtime_ns for path in before} == before
