@@ -6,12 +6,13 @@ there are too many, the two most similar neighbours become one. An action chunk 
 way.
 
 What differs: the cognitive token of the source is the language model's last prompt state, which would be a pass of the
-whole backbone for each frame; here one layer reads the frame's tokens and the words by the mean word. The perceptual
-stream's squeeze-excite bottleneck is a Linear to the same 256 channels, behind the policy's own pooling. The fused
-tokens are memory tokens, read as the policy's ``memory_fusion`` says, and no condition and cross-attention of a
-diffusion transformer. Frames are written at a stride, not where chunks begin, so a chunk that begins at such a step
-finds its own frame among the entries. Times are control steps everywhere; the source trains by frames and acts by calls.
-There is one bank per row, where the source shares one, and no dropout, which the source applies while it acts too.
+whole backbone for each frame; here one layer lets the mean word look at the frame's tokens and the words. The
+perceptual stream's squeeze-excite bottleneck is a Linear to the same 256 channels, behind the policy's own pooling. The
+fused tokens are memory tokens, read as the policy's ``memory_fusion`` says, where the source has a diffusion
+transformer with a condition and a cross-attention of its own. Frames are written at a stride, not where chunks begin,
+so a chunk that begins at such a step finds its own frame among the entries. Times are control steps everywhere; the
+source trains by frames and acts by calls. Each row has a bank, where rows of the source share one while they act, and
+there is no dropout, which the source applies then too.
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
+from einops import reduce
 from torch import Tensor, nn
-from torch.nn.functional import normalize, rms_norm
 
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     MemoryMechanism,
@@ -59,7 +61,7 @@ class Bank(MemoryMechanism):
     """
 
     Settings = BankSettings
-    stride = 16
+    stride = 24
     capacity = 16
     asks_present = True
     asks_words = True
@@ -67,56 +69,57 @@ class Bank(MemoryMechanism):
     def __init__(self, spec: MemorySpec, pool: nn.Module, settings: BankSettings) -> None:
         super().__init__(spec, pool, settings)
         self.capacity = settings.length
-        width = min(PERCEPTUAL_WIDTH, spec.dim)
-        self.reduce = nn.Linear(spec.dim, width)
+        widths = {"perceptual": min(PERCEPTUAL_WIDTH, spec.dim), "cognitive": spec.dim}
+        self.reduce = nn.Linear(spec.dim, widths["perceptual"])
         self.summary = Lookup(spec.dim)
-        self.perceptual = Stream(width, spec.width, settings.time_codes)
-        self.cognitive = Stream(spec.dim, spec.width, settings.time_codes)
-
-    def _streams(self) -> dict[str, Stream]:
-        return {"perceptual": self.perceptual, "cognitive": self.cognitive}
+        self.streams = nn.ModuleDict({name: Stream(width, settings.time_codes) for name, width in widths.items()})
+        self.out = nn.ModuleDict({name: nn.Linear(width, spec.width) for name, width in widths.items()})
 
     def _present(self, tokens: Tensor, query: Query | None) -> dict[str, Tensor]:
         """Return the present of each stream (R, N, d), of a frame's tokens (R, P, D) and the words."""
         assert query is not None
         assert query.words is not None
         assert query.real is not None
-        tokens, words = (rms_norm(of.float(), of.shape[-1:], eps=1e-6) for of in (tokens, query.words))
+        tokens, words = (F.rms_norm(of.float(), of.shape[-1:], eps=1e-6) for of in (tokens, query.words))
         weights = query.real.unsqueeze(-1).float()
         mean = (words * weights).sum(dim=1, keepdim=True) / weights.sum(dim=1, keepdim=True).clamp(min=1)
-        hidden = torch.cat([torch.zeros_like(tokens[..., 0], dtype=torch.bool), ~query.real], dim=1)
-        both = torch.cat([tokens, words], dim=1)
+        both, hidden = torch.cat([tokens, words], dim=1), F.pad(~query.real, (tokens.shape[1], 0), value=False)
         return {"perceptual": self.reduce(tokens), "cognitive": self.summary(mean, both, both, hidden)[0]}
 
     def init(self, rows: int) -> State:
         """Return empty banks."""
         sizes = {"perceptual": (self.spec.tokens, self.reduce.out_features), "cognitive": (1, self.spec.dim)}
-        like = self.reduce.weight
-        state = {name: like.new_zeros(rows, self.capacity, *size, dtype=torch.float32) for name, size in sizes.items()}
-        state |= {f"{name}_steps": like.new_zeros(rows, self.capacity, dtype=torch.float32) for name in sizes}
-        return state | {"count": torch.zeros(rows, dtype=torch.int64, device=like.device)}
+        device = self.reduce.weight.device
+        state = {name: torch.zeros(rows, self.capacity, *size, device=device) for name, size in sizes.items()}
+        state |= {f"{name}_steps": torch.zeros(rows, self.capacity, device=device) for name in sizes}
+        return state | {"count": torch.zeros(rows, dtype=torch.int64, device=device)}
 
     def write(self, state: State, tokens: Tensor, step: Tensor, query: Query | None = None) -> State:
         """Fuse the frame with what it finds, and make an entry of it."""
-        count, made = state["count"], {"count": (state["count"] + 1).clamp(max=self.capacity)}
+        count = state["count"]
+        made = {"count": (count + 1).clamp(max=self.capacity)}
         for name, present in self._present(tokens, query).items():
             entries, steps = state[name], state[f"{name}_steps"]
-            fused, _ = self._streams()[name].fuse(present, entries, steps, count, step)
-            made[name], made[f"{name}_steps"] = append(entries, steps, count, fused.detach(), step)
+            fused, _ = self.streams[name](present, entries, steps, count, step)
+            made[name], made[f"{name}_steps"] = append(entries, steps, count, fused.detach().float(), step)
         return made
 
     def read(self, state: State, query: Query | None = None) -> MemoryTokens:
         """Return the present of both streams, fused with what it finds: P perceptual tokens and a cognitive one."""
         assert query is not None
         assert query.tokens is not None
-        read, found = [], []
+        count, read, shares, steps = state["count"], [], [], []
+        now = torch.zeros_like(count)  # of an empty bank alone, which no chunk reads: an episode's first frame is there
+        real = torch.arange(self.capacity, device=count.device) < count[:, None]
         for name, present in self._present(query.tokens, query).items():
-            stream = self._streams()[name]
-            fused, weights = stream.fuse(present, state[name], state[f"{name}_steps"], state["count"])
-            read.append(stream.out(fused))
-            found.append(weights)
-        each = torch.cat(read, dim=1)
-        return MemoryTokens(each, torch.ones_like(each[..., 0], dtype=torch.bool))
+            fused, looked = self.streams[name](present, state[name], state[f"{name}_steps"], count, now)
+            read.append(self.out[name](fused))
+            shares.append(shares_of(looked, present.shape[1]))
+            steps.append(state[f"{name}_steps"].masked_fill(~real, -1))
+        each, (perceptual, cognitive) = torch.cat(read, dim=1), shares
+        sources = torch.cat([F.pad(perceptual, (0, self.capacity)), F.pad(cognitive, (self.capacity, 0))], dim=1)
+        mask = torch.ones(each.shape[:2], dtype=torch.bool, device=each.device)
+        return MemoryTokens(each, mask, sources=(sources, torch.cat(steps, dim=1)))
 
 
 class Lookup(nn.Module):
@@ -147,50 +150,56 @@ class Lookup(nn.Module):
 
 
 class Stream(nn.Module):
-    """Retrieval from the entries of a stream, the gate of what is found, and the projection to memory tokens."""
+    """Retrieval from the entries of a stream, and the gate of what is found."""
 
-    def __init__(self, width: int, memory_width: int, time_codes: bool) -> None:
+    def __init__(self, width: int, time_codes: bool) -> None:
         super().__init__()
         self.time: nn.Module | None = None
-        if time_codes:
+        if time_codes:  # a last bias would be the same for all entries, which softmax does not see
             self.time = nn.Sequential(nn.Linear(2 * WAVES, width), nn.SiLU(), nn.Linear(width, width, bias=False))
         self.blocks = nn.ModuleList(Lookup(width) for _ in range(BLOCKS))
         self.gate = nn.Linear(2 * width, width)
         nn.init.normal_(self.gate.weight, std=1e-3)
         nn.init.normal_(self.gate.bias, std=1e-3)
-        self.out = nn.Linear(width, memory_width)
 
-    def fuse(
-        self, present: Tensor, entries: Tensor, steps: Tensor, count: Tensor, now: Tensor | None = None
+    def forward(
+        self, present: Tensor, entries: Tensor, steps: Tensor, count: Tensor, now: Tensor
     ) -> tuple[Tensor, list[Tensor]]:
-        """Return the present fused with what it finds, and how much of that was found in each entry.
+        """Return the present fused with what it finds in the entries; where there are none, in itself.
 
         Args:
             present: (R, N, d). entries: (R, L, N, d), of which the first ``count`` (R,) are real. steps: (R, L).
-            now: (R,) the present's step, which counts where there are no entries and the present finds itself.
+            now: (R,) the present's step.
 
         Returns:
-            (R, N, d), and (R, N, L), which sums to one.
+            (R, N, d), and of each block, how much its heads looked at each token of the entries and, behind them, of
+            the present: (R, heads N, (L + 1) N).
         """
         slots = torch.arange(entries.shape[1] + 1, device=count.device)
         hidden = torch.where(slots < slots[-1], slots >= count[:, None], count[:, None] > 0)
+        hidden = hidden.repeat_interleave(present.shape[1], dim=1)
         values = torch.cat([entries, present[:, None]], dim=1)
         keys = values
         if self.time is not None:
-            now = torch.zeros_like(steps[:, 0]) if now is None else now.to(steps.dtype)
             keys = values + self.time(waves(torch.cat([steps, now[:, None]], dim=1)))[:, :, None]
         keys, values = keys.flatten(1, 2), values.flatten(1, 2)
-        hidden = hidden.repeat_interleave(present.shape[1], dim=1)
         found, looked = present, []
         for block in self.blocks:
             found, weights = block(found, keys, values, hidden)
             looked.append(weights)
         gate = self.gate(torch.cat([present, found], dim=2)).sigmoid()
-        return found.lerp(present, gate), looked
+        return gate * present + (1 - gate) * found, looked
+
+
+def shares_of(looked: list[Tensor], tokens: int) -> Tensor:
+    """Return the share (R, N, L) of each entry, of ``tokens`` N, in what a stream's heads and blocks looked at."""
+    of_all = torch.stack(looked).detach().float()
+    shares: Tensor = reduce(of_all, "b r (h n) (l m) -> r n l", "sum", h=HEADS, m=tokens) / (HEADS * len(looked))
+    return shares[:, :, :-1]
 
 
 def waves(steps: Tensor) -> Tensor:
-    """Return cosines, then sines, of control steps (...) at frequencies from 1 down to nearly 1/TIME_BASE: (..., 256)."""
+    """Return cosines, then sines, of control steps (...), frequencies from 1 down to 1/TIME_BASE: (..., 256)."""
     frequencies = TIME_BASE ** -(torch.arange(WAVES, dtype=torch.float32, device=steps.device) / WAVES)
     angles = steps.unsqueeze(-1) * frequencies
     return torch.cat([angles.cos(), angles.sin()], dim=-1)
@@ -205,11 +214,11 @@ def append(entries: Tensor, steps: Tensor, count: Tensor, new: Tensor, now: Tens
         entries: (R, L, N, d). steps: (R, L). count: (R,) real ones. new: (R, N, d). now: (R,), its step.
     """
     length = entries.shape[1]
-    entries, steps = torch.cat([entries, new[:, None]], dim=1), torch.cat([steps, now[:, None].to(steps.dtype)], dim=1)
-    unit = normalize(entries, dim=-1)
-    pair = (unit[:, :-1] * unit[:, 1:]).sum(dim=-1).mean(dim=-1).argmax(dim=1)[:, None]  # it and the one behind it
-    slots, full, rows = torch.arange(length, device=count.device), (count == length)[:, None], count[:, None]
-    kept = torch.where(full, slots + (slots > pair), torch.where(slots == rows, length, slots))
+    entries, steps = torch.cat([entries, new[:, None]], dim=1), torch.cat([steps, now[:, None].to(steps)], dim=1)
+    unit = F.normalize(entries, dim=3)
+    pair = (unit[:, :-1] * unit[:, 1:]).sum(dim=3).mean(dim=2).argmax(dim=1)[:, None]  # this one and the next
+    slots, full, free = torch.arange(length, device=count.device), (count == length)[:, None], count[:, None]
+    kept = torch.where(full, slots + (slots > pair), torch.where(slots == free, length, slots))
     other = kept + (full & (slots == pair))
     row = torch.arange(len(entries), device=count.device)[:, None]
     return (entries[row, kept] + entries[row, other]) / 2, (steps[row, kept] + steps[row, other]) / 2

@@ -1,0 +1,188 @@
+"""MemoryVLA's bank: its formulas, token by token; which entries are merged; what was read of them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn.functional import cosine_similarity, gelu, layer_norm, rms_norm, silu
+
+from lerobot_memobench.policies.memobench_mem.memory import read_settings
+from lerobot_memobench.policies.memobench_mem.memory.bank import Bank, append
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import Histories, MemorySpec, Query
+
+D, P, STRIDE, LENGTH, FRAMES = 8, 2, 24, 3, 12
+
+
+def made(**changed: Any) -> Bank:
+    torch.manual_seed(0)
+    spec = MemorySpec(dim=D, tokens=P, width=6, expert=6, frames=32, grid=0, stride=STRIDE)
+    return Bank(spec, torch.nn.Identity(), read_settings("bank", {"length": LENGTH, **changed})).eval()
+
+
+def words_of(rows: int = 1) -> Query:
+    real = torch.tensor([True, True, False, True]).expand(rows, -1)
+    return Query(words=torch.randn(rows, 4, D), real=real)
+
+
+def written(bank: Bank, frames: Tensor, query: Query, stride: int = STRIDE) -> Any:
+    state = bank.init(1)
+    for number, frame in enumerate(frames.split(1)):
+        state = bank.write(state, frame, torch.tensor([number * stride]), query)
+    return state
+
+
+# -- the formulas, literally ------------------------------------------------------------------------------------------
+
+
+def attend(block: Any, asking: Tensor, keys: Tensor, values: Tensor) -> Tensor:
+    """Post-norm cross-attention of tokens (N, d) to others (M, d), which are projected, by four heads; feed-forward."""
+    query, key, value = (of(x) for of, x in ((block.query, asking), (block.key, keys), (block.value, values)))
+    heads = [
+        torch.softmax(q @ k.T / math.sqrt(q.shape[1]), dim=1) @ v
+        for q, k, v in zip(query.chunk(4, 1), key.chunk(4, 1), value.chunk(4, 1), strict=True)
+    ]
+    asking = layer_norm(asking + torch.cat(heads, dim=1), asking.shape[1:])
+    first, _, second = block.mlp
+    return layer_norm(asking + second(gelu(first(asking))), asking.shape[1:])
+
+
+def time_code(stream: Any, step: float) -> Tensor:
+    angles = torch.tensor([step * 10_000 ** (-k / 128) for k in range(128)])
+    code: Tensor = stream.time[2](silu(stream.time[0](torch.cat([angles.cos(), angles.sin()]))))
+    return code
+
+
+def fused(stream: Any, x: Tensor, entries: list[tuple[float, Tensor]], now: float) -> Tensor:
+    entries = entries or [(now, x)]
+    keys = torch.cat([entry + time_code(stream, step) for step, entry in entries])
+    values, found = torch.cat([entry for _, entry in entries]), x
+    for block in stream.blocks:
+        found = attend(block, found, keys, values)
+    gate = torch.sigmoid(stream.gate(torch.cat([x, found], dim=1)))
+    return gate * x + (1 - gate) * found
+
+
+def merged(entries: list[tuple[float, Tensor]]) -> list[tuple[float, Tensor]]:
+    while len(entries) > LENGTH:
+        alike = [cosine_similarity(a, b, dim=1).mean() for (_, a), (_, b) in itertools.pairwise(entries)]
+        best = max(range(len(alike)), key=alike.__getitem__)
+        (one_step, one), (other_step, other) = entries[best : best + 2]
+        entries = [*entries[:best], ((one_step + other_step) / 2, (one + other) / 2), *entries[best + 2 :]]
+    return entries
+
+
+def literal(bank: Bank, frames: Tensor, present: Tensor, query: Query) -> tuple[Tensor, dict[str, list[float]]]:
+    """Return the memory tokens of a present (P, D) after frames (T, P, D), and the entries' steps."""
+    assert query.words is not None
+    assert query.real is not None
+    words = rms_norm(query.words[0][query.real[0]], (D,), eps=1e-6)
+
+    def of(tokens: Tensor) -> dict[str, Tensor]:
+        tokens = rms_norm(tokens, (D,), eps=1e-6)
+        seen = torch.cat([tokens, words])
+        summary = attend(bank.summary, words.mean(dim=0, keepdim=True), seen, seen)
+        return {"perceptual": bank.reduce(tokens), "cognitive": summary}
+
+    entries: dict[str, list[tuple[float, Tensor]]] = {"perceptual": [], "cognitive": []}
+    for number, frame in enumerate(frames):
+        for name, x in of(frame).items():
+            now = float(number * STRIDE)
+            entries[name] = merged([*entries[name], (now, fused(bank.streams[name], x, entries[name], now))])
+    read = [bank.out[name](fused(bank.streams[name], x, entries[name], 0.0)) for name, x in of(present).items()]
+    return torch.cat(read), {name: [step for step, _ in kept] for name, kept in entries.items()}
+
+
+@pytest.mark.parametrize("count", [1, 2, LENGTH, FRAMES])
+def test_it_is_its_formula(count: int) -> None:
+    bank, query = made(), words_of()
+    frames, present = torch.randn(count, P, D), torch.randn(1, P, D)
+    with torch.no_grad():
+        state = written(bank, frames, query)
+        found = bank.read(state, query._replace(tokens=present)).rows()[0]
+        expected, steps = literal(bank, frames, present[0], query)
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+    kept = min(count, LENGTH)
+    assert {name: state[f"{name}_steps"][0, :kept].tolist() for name in steps} == steps
+    assert state["count"].tolist() == [kept]
+
+
+def test_streams_merge_apart() -> None:
+    with torch.no_grad():
+        state = written(made(), torch.randn(FRAMES, P, D), words_of())
+    assert not torch.equal(state["perceptual_steps"], state["cognitive_steps"])
+
+
+# -- what is kept -----------------------------------------------------------------------------------------------------
+
+
+def test_the_most_similar_neighbours_become_one() -> None:
+    """The middle of three, or the last with the new one; a row that is not full keeps all."""
+    east, north, west = torch.eye(4)[:3]
+    entries = torch.stack([torch.stack([east, north, 2 * north]), torch.stack([east, north, west])])[:, :, None]
+    entries = torch.cat([entries, entries[1:] * torch.tensor([1.0, 1.0, 0.0])[None, :, None, None]])
+    steps, count, now = torch.tensor([[0.0, 8.0, 16.0]] * 2 + [[0.0, 8.0, 0.0]]), torch.tensor([3, 3, 2]), 24
+    kept, times = append(entries, steps, count, (west * 3).expand(3, 1, -1), torch.full((3,), now))
+    assert torch.equal(kept[:, :, 0], torch.stack([
+        torch.stack([east, 1.5 * north, 3 * west]),
+        torch.stack([east, north, 2 * west]),
+        torch.stack([east, north, 3 * west]),
+    ]))  # fmt: skip
+    assert times.tolist() == [[0, 12, 24], [0, 8, 20], [0, 8, 24]]
+
+
+def test_training_merges_as_a_rollout_does_by_exact_products(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A merge is a choice: rounded products would make another."""
+    bank, seen = made(), []
+    products: Any = torch.backends.mkldnn.matmul  # type: ignore[attr-defined]  # torch sets it late
+    usual, write = products.fp32_precision, bank.write
+
+    def noted(*args: Any) -> Any:
+        seen.append(products.fp32_precision)
+        return write(*args)
+
+    monkeypatch.setattr(bank, "write", noted)
+    frames, query = torch.randn(5, P, D), words_of()._replace(tokens=torch.randn(1, P, D))
+    products.fp32_precision = "bf16"
+    try:
+        bank.replay(Histories(frames, torch.arange(5) * STRIDE, torch.arange(5)[None]), query)
+        assert products.fp32_precision == "bf16"
+    finally:
+        products.fp32_precision = usual
+    assert seen == ["ieee"] * 5
+
+
+@pytest.mark.parametrize("time_codes", [True, False])
+def test_time_is_told_by_its_codes_alone(time_codes: bool) -> None:
+    bank, query, frames = made(time_codes=time_codes), words_of(), torch.randn(LENGTH, P, D)
+    asking = query._replace(tokens=torch.randn(1, P, D))
+    with torch.no_grad():
+        soon, late = (bank.read(written(bank, frames, query, stride), asking).rows() for stride in (8, 9))
+    assert torch.equal(soon, late) != time_codes
+
+
+# -- what was read ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [2, FRAMES])
+def test_tokens_say_of_which_entries_they_are(count: int) -> None:
+    bank, query = made(), words_of()
+    with torch.no_grad():
+        state = written(bank, torch.randn(count, P, D), query)
+        found = bank.read(state, query._replace(tokens=torch.randn(1, P, D)))
+    assert found.sources is not None
+    shares, steps = found.sources
+    assert shares.shape == (1, P + 1, 2 * LENGTH)
+    of_perceptual, of_cognitive = shares.split(LENGTH, dim=2)
+    torch.testing.assert_close(of_perceptual[0, :P].sum(dim=1), torch.ones(P))
+    torch.testing.assert_close(of_cognitive[0, P:].sum(dim=1), torch.ones(1))
+    assert not of_perceptual[0, P:].any()
+    assert not of_cognitive[0, :P].any()
+    kept, real = min(count, LENGTH), steps[0] >= 0
+    assert real.tolist() == [True] * kept + [False] * (LENGTH - kept) + [True] * kept + [False] * (LENGTH - kept)
+    assert not shares[0, :, ~real].any()
+    assert torch.equal(steps[0, :kept], state["perceptual_steps"][0, :kept])
