@@ -20,6 +20,7 @@ import pytest
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.envs.video import OPERATION_COLOURS, VideoRecorder
 from lerobot_memobench.evaluation.html.write import write_html
+from lerobot_memobench.evaluation.memory_reads import reads_file, write_reads
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support import browser as chromium
 from tests.support.logs import record
@@ -54,6 +55,13 @@ RECORDS = [
 ]
 
 
+READ: list[Any] = [
+    {"step": 15, "entries": [0, 8], "weights": [0.1, 0.3]},  # two thirds of attention are paid to something else
+    {"step": 21, "entries": [0, 8, 16], "weights": [0.25, 0.5, 0.25]},
+]
+SLOTS: list[Any] = [{"step": 0, "entries": [-2, -1], "weights": [0.75, 0.25]}]
+
+
 def film(path: Path, frames: int) -> None:
     strip = VideoRecorder(path)
     for k in range(frames):
@@ -68,6 +76,8 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_episodes(root / "mine", RECORDS)
     film(root / "mine" / "videos" / f"{STOVE}.0.mp4", 41)
     film(root / "mine" / "videos" / f"{BUTTER}.0.mp4", 36)
+    write_reads(reads_file(root / "mine", BUTTER, 0), {"seed": 7, "referent": "fixed", "chunks": [*READ]})
+    write_reads(reads_file(root / "mine", STOVE, 2), {"seed": 9, "referent": "fixed", "chunks": [*SLOTS]})
     write_episodes(
         root / "other",
         [
@@ -282,6 +292,50 @@ def test_hover_and_focus_tell_the_texts_of_all_levels(browser: Any, report: Path
     assert all(text in tip for text in get_task(STOVE).checkpoints[0].language)
     browser.js("document.querySelector('.cause, .ending').focus()")
     assert "Success at step 40" in browser.texts("#tip")[0]
+
+
+def test_what_a_chunk_read_is_under_the_timeline_with_its_frames(browser: Any, report: Path) -> None:
+    show(browser, report, f"view=episodes&ep={BUTTER}.0")
+    ready(browser)
+    assert browser.texts(".lane.read .words") == ["Memory read: no chunk is planned yet"]
+    tips = "[...document.querySelectorAll('.cell')].map((cell) => cell.dataset.tip.split('\\n'))"
+    browser.click(".timeline .axis", across=17 / 35)
+    assert browser.js(tips) == [
+        ["Prompt step 0, 0.0 s", "read 10.0 %: 0.5 × an equal share"],
+        ["Prompt step 8, 0.4 s", "read 30.0 %: 1.5 × an equal share"],
+    ]
+    heat = "[...document.querySelectorAll('.cell')].map((cell) => Number(cell.style.getPropertyValue('--heat')))"
+    assert browser.js(heat) == pytest.approx([1 / 3, 1])
+    browser.click(".timeline .axis", across=21 / 35)
+    assert browser.texts(".lane.read .words") == ["Memory read by chunk 2 of 2"]
+    assert browser.js(tips)[2] == ["Execution step 1, 0.8 s", "read 25.0 %: 0.8 × an equal share"]
+    # The arrows walk through the frames, and the playhead stays; the frame itself is in the tip.
+    browser.js("document.querySelector('.cell[tabindex=\"0\"]').focus()")
+    browser.key("ArrowRight")
+    assert browser.texts("#tip")[0].startswith("Prompt step 8")
+    assert playhead(browser) == 21
+    browser.wait("document.querySelector('#tip video')?.readyState >= 2")
+    settle(browser)
+    assert shown_frame(browser, "#tip .picture") == 8
+    browser.key("End")
+    settle(browser)
+    assert shown_frame(browser, "#tip .picture") == 16
+    browser.click(".cell:nth-child(2)")
+    assert playhead(browser) == 8
+    assert browser.texts("#tip, .lane.read .words")[0].startswith("Memory read: no chunk")
+
+
+def test_every_chunk_is_a_row_of_the_map(browser: Any, report: Path) -> None:
+    show(browser, report, f"view=episodes&ep={BUTTER}.0")
+    alpha = "((x, y) => document.querySelector('canvas').getContext('2d').getImageData(x, y, 1, 1).data[3] / 255)"
+    seen = [[browser.js(f"{alpha}({x}, {y})") for x in (4, 12, 18)] for y in (0, 1)]
+    assert seen[0] == pytest.approx([1 / 3, 1, 0], abs=0.01)  # the first chunk knew nothing of what came later
+    assert seen[1] == pytest.approx([0.5, 1, 0.5], abs=0.01)
+    show(browser, report, f"view=episodes&ep={STOVE}.2")
+    cells = "[...document.querySelectorAll('.cell')].map((cell) => [cell.dataset.tip.split('\\n')[0], cell.style.left])"
+    assert browser.js(cells) == [["Memory slot 2", "50%"], ["Memory slot 1", "0%"]]
+    show(browser, report, f"view=episodes&ep={STOVE}.0")
+    assert browser.js("document.querySelectorAll('.lane.read, .lane.reads').length") == 0
 
 
 def test_without_a_video_the_timeline_still_works(browser: Any, report: Path) -> None:

@@ -41,6 +41,9 @@ def part(folder: Path, episodes: list[int], task: str = "a", settings: Any = SET
         film = folder / "videos" / f"{task}.{k}.mp4"
         film.parent.mkdir(exist_ok=True)
         film.write_text(f"film {k}")
+        reads = folder / "memory_reads" / f"{task}.{k}.json.gz"
+        reads.parent.mkdir(exist_ok=True)
+        reads.write_text(f"reads {k}")
     return folder
 
 
@@ -67,6 +70,7 @@ def test_logs_films_protocol_and_card_are_joined(tmp_path: Path) -> None:
     assert read_protocol(out) == {**SETTINGS, "tasks": ["a"], "episodes": 4, "policy": policy_facts({"type": "act"}, 7)}
     assert sorted(path.name for path in (out / "videos").iterdir()) == [f"a.{k}.mp4" for k in range(4)]
     assert os.path.samefile(out / "videos" / "a.2.mp4", tmp_path / "p0" / "videos" / "a.2.mp4")
+    assert [(out / "memory_reads" / f"a.{k}.json.gz").read_text() for k in range(4)] == [f"reads {k}" for k in range(4)]
     card = read_card(out / "card.json")
     assert len(card["episodes"]) == 4
     assert [run["command"][-1] for run in card["runs"]] == ["shard=1/2", "shard=2/2"]

@@ -16,8 +16,11 @@ from lerobot.scripts import lerobot_eval
 
 from lerobot_memobench.envs import episode
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.memory_reads import find_reads
+from lerobot_memobench.run.memory_reads import ReadLog
 from lerobot_memobench.run.rollout import sparing
 from lerobot_memobench.sim.object_layout import SIZE
 from lerobot_memobench.sim.rendering import close_renderers, gl_backend
@@ -229,3 +232,21 @@ def test_the_command_draws_and_records_no_more_than_asked(drawn: list[int], tmp_
         Path(f"{HIGHLIGHT}.0.mp4")
     ]
     assert len(drawn) == LAST + 1 + 3
+
+
+def test_what_chunks_read_is_noted_as_each_episode_ends(tmp_path: Path) -> None:
+    name, fields, _ = CASES["memory of every fourth"]
+    plain = rolled(sparing(lerobot_eval.rollout, lambda: True), 2, tmp_path / "plain", name, **fields)
+    noting = sparing(lerobot_eval.rollout, lambda: True, ReadLog(tmp_path / "noted", 7, "fixed"))
+    assert torch.equal(rolled(noting, 2, tmp_path / "noted", name, **fields)["action"], plain["action"])
+    records = read_episodes(tmp_path / "noted")
+    found, notes = find_reads(tmp_path / "noted", records, {})
+    assert notes == []
+    for chunks in (found[0], found[1]):
+        assert [(chunk["step"], chunk["entries"]) for chunk in chunks] == [
+            (PROMPT, [0, 4]),
+            (PROMPT + PLAN, [0, 4, 8]),
+            (PROMPT + 2 * PLAN, [0, 4, 8, 12]),
+        ]
+        assert [sum(chunk["weights"]) for chunk in chunks] == pytest.approx([1, 1, 1], abs=1e-3)
+    assert not (tmp_path / "plain" / "memory_reads").exists()

@@ -59,7 +59,10 @@ SHORT_FORMS: dict[str, dict[str, tuple[str, ...]]] = {
 }
 """Command -> short form -> the fields it sets, of which those that exist are set. `cli/lerobot_<command>.txt` explains
 them."""
-RUN_OPTIONS = ("split", "verbose", "resume", "shard", "shards", "workers", "executor", "executor_option")
+RUN_OPTIONS = (
+    *("split", "memory_reads", "verbose", "resume"),
+    *("shard", "shards", "workers", "executor", "executor_option"),
+)
 """Keys of `lerobot eval env=memobench` that are none of LeRobot's (`plan.RunOptions`)."""
 TRAINING_OPTIONS = ("prompt_frames", "obs_type")
 """Keys of `lerobot train` that are none of LeRobot's (`training.take_training_options`)."""

@@ -21,6 +21,7 @@ from lerobot_memobench.envs.episode_log import (
     write_protocol,
 )
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.memory_reads import MEMORY_READS
 from lerobot_memobench.evaluation.records import CARD_FILE, read_card, read_protocol
 from lerobot_memobench.evaluation.report import write_report
 from lerobot_memobench.io import draft_of, is_there
@@ -52,8 +53,8 @@ def merge_and_report(out: Path, folders: Sequence[Path]) -> EvaluationReport:
 def merge(out: Path, folders: Sequence[Path]) -> list[tuple[str, int]]:
     """Join the logs, cards and videos of evaluations of one protocol into the folder ``out``.
 
-    What ``out`` holds already is joined as well. Videos are hard links where the disk allows it, else copies; LeRobot's
-    own files stay where they are. Every check comes before anything is written.
+    What ``out`` holds already is joined as well. Videos and memory reads are hard links where the disk allows it, else
+    copies; LeRobot's own files stay where they are. Every check comes before anything is written.
 
     Returns:
         (task, episode) of those that were asked for, as far as the cards tell, and are in none of the parts.
@@ -79,7 +80,8 @@ def merge(out: Path, folders: Sequence[Path]) -> list[tuple[str, int]]:
         write_protocol(out, _joined_settings([*map(read_protocol_file, sources), *protocols.values()]))
     for source in folders:
         if source != out:
-            _share_videos(source / VIDEOS, out / VIDEOS)
+            _share(source / VIDEOS, out / VIDEOS, "*.mp4")
+            _share(source / MEMORY_READS, out / MEMORY_READS, "*.json.gz")
     write_episodes(out, joined)
     if card is None:
         remove_card(out)
@@ -183,18 +185,18 @@ def _joined_card(folders: Sequence[Path]) -> dict[str, Any] | None:
     return joined
 
 
-def _share_videos(source: Path, target: Path) -> None:
-    """Give videos of episodes a second name, or copy them; ones that are there stay."""
-    for video in sorted(source.glob("*.mp4")):
-        place = target / video.name
+def _share(source: Path, target: Path, pattern: str) -> None:
+    """Give files of episodes a second name, or copy them; ones that are there stay."""
+    for mine in sorted(source.glob(pattern)):
+        place = target / mine.name
         if place.exists():
             continue
         target.mkdir(parents=True, exist_ok=True)
         with draft_of(place) as draft:
             try:
-                os.link(video, draft)
+                os.link(mine, draft)
             except OSError:  # another disk, or one without links
-                shutil.copyfile(video, draft)
+                shutil.copyfile(mine, draft)
 
 
 def part_folders(out: Path) -> list[Path]:

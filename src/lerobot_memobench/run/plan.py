@@ -164,7 +164,9 @@ def is_benchmark(arguments: LerobotArguments, options: RunOptions) -> bool:
     if arguments.get("env.type") == ENVIRONMENT:
         return True
     if options.any:
-        raise MemobenchError("split=, resume=, shard= and shards= belong to the benchmark: name it with env=memobench")
+        raise MemobenchError(
+            "split=, memory_reads=, resume=, shard= and shards= belong to the benchmark: name it with env=memobench"
+        )
     path = arguments.get("policy.path")
     if path is not None:
         check_checkpoint(path)
@@ -195,6 +197,8 @@ def make_plan(arguments: LerobotArguments, options: RunOptions, command: Sequenc
     environment = cast("MemobenchEnvConfig", env_config(arguments))
     check_observations(policy, environment)
     check_as_checkpoint(arguments, policy, environment)
+    if options.memory_reads and policy is not None:
+        check_memory_reads(policy)
     plan = EvaluationPlan(
         arguments=arguments.without(OUTPUT, LOG),
         policy=policy,
@@ -417,6 +421,24 @@ def check_as_checkpoint(arguments: LerobotArguments, policy: PreTrainedConfig | 
     check_features(path, policy, env_to_policy_features(environment), renamed)
 
 
+def check_memory_reads(policy: Any) -> None:
+    """Refuse to note what a policy reads that does not tell it.
+
+    Args:
+        policy: it, or its configuration.
+
+    Raises:
+        MemobenchError: it is none of ours, or has no memory that tells it.
+    """
+    config = getattr(policy, "config", policy)
+    if not hasattr(config, "check_memory_reads"):
+        raise MemobenchError(
+            f"memory_reads=true asks how much each remembered frame is read, which {config.type} does not tell; leave "
+            "it out, or evaluate memobench_mem"
+        )
+    config.check_memory_reads()
+
+
 # --- how it is run: resume=, shard=, shards=, workers=, executor= … ---
 
 
@@ -426,6 +448,7 @@ class RunOptions:
 
     Attributes:
         split: whose seeds are run, one of `EVALUATED`; None: those that `seed=` says.
+        memory_reads: how much each chunk reads of what the policy remembers is written beside the log.
         verbose: LeRobot's own messages are shown, too.
         resume: go on with the evaluation in the output folder.
         shard: run this part alone.
@@ -435,6 +458,7 @@ class RunOptions:
     """
 
     split: str | None = None
+    memory_reads: bool = False
     verbose: bool = False
     resume: bool = False
     shard: Shard | None = None
@@ -446,7 +470,7 @@ class RunOptions:
     @property
     def any(self) -> bool:
         """Whether something is asked for that only the benchmark's evaluation can do."""
-        return self.resume or self.in_parts or self.split is not None
+        return self.resume or self.in_parts or self.memory_reads or self.split is not None
 
     @property
     def in_parts(self) -> bool:
@@ -467,6 +491,7 @@ def take_run_options(given: Arguments) -> tuple[RunOptions, Arguments]:
     last = {key: values[-1] for key, values in found.items()}
     options = RunOptions(
         split=last.get("split"),
+        memory_reads=is_true("memory_reads", last.get("memory_reads")),
         verbose=is_true("verbose", last.get("verbose")),
         resume=is_true("resume", last.get("resume")),
         shard=Shard.parse(last["shard"]) if "shard" in last else None,

@@ -39,6 +39,7 @@ from tqdm import trange
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.threads import limit_torch
 from lerobot_memobench.lerobot_hooks import INSIDE_SLURM, ROLLOUT, RUN_ONE, check_version, hooked, is_read
+from lerobot_memobench.run.memory_reads import ReadLog
 from lerobot_memobench.run.plan import Range
 from lerobot_memobench.run.recording import Recorder
 
@@ -101,12 +102,15 @@ def calm_output() -> Iterator[None]:
 
 
 @contextmanager
-def steered(seed: int | None, ranges: Mapping[tuple[str, int], list[Range]] | None = None) -> Iterator[None]:
+def steered(
+    seed: int | None, ranges: Mapping[tuple[str, int], list[Range]] | None = None, reads: ReadLog | None = None
+) -> Iterator[None]:
     """While this lasts, LeRobot's loop seeds batches, draws what is observed, records nothing and runs only ``ranges``.
 
     Args:
         seed: of the run; batches are not seeded when None.
         ranges: by LeRobot's name of a task the runs of it; everything when None.
+        reads: where it is noted how much the policy's chunks read of what it remembers; not when None.
 
     Raises:
         MemobenchError: the installed LeRobot is another than those whose loop is known here.
@@ -118,7 +122,7 @@ def steered(seed: int | None, ranges: Mapping[tuple[str, int], list[Range]] | No
         return _unrecorded(run_one) if ranges is None else _only(_unrecorded(run_one), ranges)
 
     def rolled(rollout: Callable[..., Any]) -> Callable[..., Any]:
-        spared = sparing(rollout, lambda: lerobot_eval.inside_slurm())
+        spared = sparing(rollout, lambda: lerobot_eval.inside_slurm(), reads)
         return spared if seed is None else _seeded(spared, seed)
 
     with hooked(RUN_ONE, one), hooked(ROLLOUT, rolled):
@@ -193,22 +197,24 @@ def batch_seed(seed: int, task: str, first: int, *more: int) -> int:
 
 
 def sparing(
-    rollout: Callable[..., dict[str, Any]], hides_progress: Callable[[], bool]
+    rollout: Callable[..., dict[str, Any]], hides_progress: Callable[[], bool], reads: ReadLog | None = None
 ) -> Callable[..., dict[str, Any]]:
     """Wrap LeRobot's rollout: where nothing but the policy takes the frames, only those that it needs are drawn.
 
     Args:
         hides_progress: whether the bar over a rollout's steps is left out.
+        reads: see `steered`.
     """
     known = is_read(rollout, LOOPS)  # another loop may take other steps
 
     @functools.wraps(rollout)
     def run(env: Any, policy: Any, *args: Any, **settings: Any) -> dict[str, Any]:
         limit_torch(sum(parameter.numel() for parameter in getattr(policy, "parameters", tuple)()))
-        with _alone(policy):
+        noting = nullcontext() if reads is None else reads.noting(env, policy, settings["seeds"])
+        with _alone(policy), noting as ended:
             if args or not known or any(settings.get(name) for name in KEEPS_FRAMES):
                 return rollout(env, policy, *args, **settings)
-            return _roll(env, policy, settings, quiet=hides_progress())
+            return _roll(env, policy, settings, quiet=hides_progress(), ended=ended)
 
     return run
 
@@ -229,8 +235,14 @@ def _alone(policy: Any) -> Iterator[None]:
             _rolling[policy].release()
 
 
-def _roll(env: Any, policy: Any, settings: dict[str, Any], quiet: bool) -> dict[str, Any]:
-    """Run one episode in each environment of a batch; see LeRobot's rollout for what is returned."""
+def _roll(
+    env: Any, policy: Any, settings: dict[str, Any], quiet: bool, ended: Callable[[NDArray[np.bool_]], None] | None
+) -> dict[str, Any]:
+    """Run one episode in each environment of a batch; see LeRobot's rollout for what is returned.
+
+    Args:
+        ended: told after each step which episodes are over.
+    """
     policy.reset()
     observation, _ = env.reset(seed=settings.get("seeds"), options={NEW_ROLLOUT_OPTION: True})
     limit = env.call("_max_episode_steps")[0]
@@ -249,6 +261,8 @@ def _roll(env: Any, policy: Any, settings: dict[str, Any], quiet: bool) -> dict[
             success = np.broadcast_to(np.asarray(holds, bool), env.num_envs)
             done = terminated | truncated | done | (len(steps) + 1 == limit)
             ever = ever | success
+            if ended is not None:
+                ended(done)
             if recorder is not None:
                 broken = np.broadcast_to(info.get("_fault", False), done.shape)  # gymnasium's mark of rows that tell it
                 recorder.add(before, action, reward, success, done, batch["task"], broken)

@@ -11,6 +11,7 @@ from typing import Any
 
 from lerobot_memobench.envs.episode_log import POLICY, differences, has_log, read_episodes, read_log, read_protocol_file
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.memory_reads import MEMORY_READS
 from lerobot_memobench.evaluation.records import CARD_FILE, Run, read_card, read_protocol
 from lerobot_memobench.evaluation.report import REPORT_MARKDOWN, write_report
 from lerobot_memobench.io import count_of, is_there, remove_drafts
@@ -27,6 +28,7 @@ from lerobot_memobench.run.card import (
     write_card,
 )
 from lerobot_memobench.run.lerobot_commands import call_lerobot, without_chatter
+from lerobot_memobench.run.memory_reads import ReadLog
 from lerobot_memobench.run.plan import EvaluationPlan, Range
 from lerobot_memobench.run.rollout import calm_output, steered
 from lerobot_memobench.run.sealed import RUN_FILE, counted
@@ -114,7 +116,7 @@ def _run_lerobot(plan: EvaluationPlan, card: dict[str, Any], ranges: Ranges | No
             nullcontext() if plan.options.verbose else without_chatter(trained),
             held(plan),
             calm_output(),
-            steered(plan.seed, ranges),
+            steered(plan.seed, ranges, ReadLog.of(plan)),
         ):
             card = counted(plan, card, tell)
             write_card(plan.log, card)
@@ -255,7 +257,7 @@ def held(plan: EvaluationPlan) -> Iterator[None]:
     plan.log.mkdir(parents=True, exist_ok=True)
     try:
         with locked(plan.log, plan.log):
-            for folder in (plan.log, plan.log / VIDEOS):  # what a killed run was writing
+            for folder in (plan.log, plan.log / VIDEOS, plan.log / MEMORY_READS):  # what a killed run was writing
                 remove_drafts(folder)
             yield
     finally:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -139,7 +139,7 @@ def plan_shards(plan: EvaluationPlan, program: Sequence[str], tell: Tell) -> lis
     jobs = [
         ShardJob(
             program=tuple(program),
-            flags=(*plan.portable_flags, *((f"split={SEALED}",) if plan.split == SEALED else ())),
+            flags=(*plan.portable_flags, *_part_options(plan)),
             shard=shard,
             out=out,
             episodes=frozenset(episode for cell in grid.cells(shard) for episode in grid.episodes(cell)),
@@ -151,6 +151,14 @@ def plan_shards(plan: EvaluationPlan, program: Sequence[str], tell: Tell) -> lis
     ]
     _check_folders(plan, out, jobs, tell)
     return jobs
+
+
+def _part_options(plan: EvaluationPlan) -> Iterator[str]:
+    """Yield the run options that each part has, too."""
+    if plan.split == SEALED:
+        yield f"split={SEALED}"
+    if plan.options.memory_reads:
+        yield "memory_reads=true"
 
 
 def _check_folders(plan: EvaluationPlan, out: Path, jobs: Sequence[ShardJob], tell: Tell) -> None:

@@ -14,6 +14,7 @@ from lerobot_memobench import __version__
 from lerobot_memobench.envs.video import OPERATION_COLOURS
 from lerobot_memobench.evaluation.evidence_controls import evidence_phrase
 from lerobot_memobench.evaluation.headline import headline
+from lerobot_memobench.evaluation.memory_reads import Chunk
 from lerobot_memobench.evaluation.metrics import (
     Rate,
     Record,
@@ -45,11 +46,17 @@ def task_source(task_dir: str | Path | None) -> dict[str, Task]:
     return known
 
 
-def page_data(runs: Sequence[Run], videos: Sequence[Mapping[int, str]], known: Mapping[str, Task]) -> dict[str, Any]:
+def page_data(
+    runs: Sequence[Run],
+    videos: Sequence[Mapping[int, str]],
+    known: Mapping[str, Task],
+    reads: Sequence[Mapping[int, Sequence[Chunk]]] | None = None,
+) -> dict[str, Any]:
     """Return everything that the page shows.
 
     Args:
         videos: per run, position of a rollout in its records -> address of its video, relative to the page.
+        reads: the same -> what its chunks have read of what the policy remembered; nothing is known where None.
         known: task name -> task, for language and checkpoint texts.
     """
     return {
@@ -64,7 +71,10 @@ def page_data(runs: Sequence[Run], videos: Sequence[Mapping[int, str]], known: M
         },
         "failures": list(dict.fromkeys([*FAILURES, *(name for run in runs for name in failure_counts(run.records))])),
         "tasks": tasks_data([record for run in runs for record in run.records], known),
-        "runs": [run_data(run, addresses) for run, addresses in zip(runs, videos, strict=True)],
+        "runs": [
+            run_data(run, addresses, of_run)
+            for run, addresses, of_run in zip(runs, videos, reads or [{}] * len(runs), strict=True)
+        ],
     }
 
 
@@ -109,7 +119,7 @@ def _variant(record: Record) -> int:
 # --- runs ---
 
 
-def run_data(run: Run, videos: Mapping[int, str]) -> dict[str, Any]:
+def run_data(run: Run, videos: Mapping[int, str], reads: Mapping[int, Sequence[Chunk]]) -> dict[str, Any]:
     """Return one evaluation: protocol, rates, failures and rollouts."""
     summary, starts = run.summary, run.card.get("runs", [])
     return {
@@ -122,7 +132,7 @@ def run_data(run: Run, videos: Mapping[int, str]) -> dict[str, Any]:
         "average": row_data(summary.average),
         "memory_types": {name: row_data(row) for name, row in summary.memory_types.items()},
         "tasks": {name: task_data(name, summary) for name in summary.tasks},
-        "episodes": [episode_data(record, videos.get(k)) for k, record in enumerate(run.records)],
+        "episodes": [episode_data(record, videos.get(k), reads.get(k, ())) for k, record in enumerate(run.records)],
     }
 
 
@@ -157,8 +167,12 @@ def rate_data(rate: Rate) -> list[float | int | None] | None:
     return [percent(rate.value), percent(low), percent(high), rate.n]
 
 
-def episode_data(record: Record, video: str | None) -> dict[str, Any]:
-    """Return one rollout. Checkpoints are [operation, first step, ordered step], execution steps counted from 1."""
+def episode_data(record: Record, video: str | None, reads: Sequence[Chunk] = ()) -> dict[str, Any]:
+    """Return one rollout.
+
+    Checkpoints are [operation, first step, ordered step], execution steps counted from 1. Reads are [frame of the
+    timeline, entries, weights] of each chunk.
+    """
     return {
         "id": episode_id(record),
         "task": record["task"],
@@ -173,6 +187,7 @@ def episode_data(record: Record, video: str | None) -> dict[str, Any]:
         "fault": record.get("fault"),
         "scene": record.get("scene_hash"),
         "video": video,
+        "reads": [[chunk["step"], chunk["entries"], chunk["weights"]] for chunk in reads],
     }
 
 

@@ -24,6 +24,7 @@ from typing import Any
 from lerobot_memobench.envs.video import LAST_FRAMES
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.html.data import episode_id, page_data, task_source
+from lerobot_memobench.evaluation.memory_reads import Chunk, find_reads
 from lerobot_memobench.evaluation.metrics import Record
 from lerobot_memobench.evaluation.records import Run, read_runs
 from lerobot_memobench.io import draft_of, file_name, parsed, write_file
@@ -39,6 +40,7 @@ SCRIPTS = (
     "overview",
     "list",
     "lanes",
+    "reads",
     "timeline",
     "player",
     "panel",
@@ -82,14 +84,17 @@ def write_html(
     runs: list[Run] = []
     chosen: dict[Path, Path] = {}
     addresses: list[dict[int, str]] = []
+    reads: list[dict[int, list[Chunk]]] = []
     evaluations = read_runs(folders)
     for run, slug in zip(evaluations, _slugs([run.name for run in evaluations]), strict=True):
         found, notes = find_videos(run.folder, run.records)
         names = {k: f"{VIDEOS}/{slug}/{episode_id(run.records[k])}.mp4" for k in found}
         chosen |= {out / name: found[k] for k, name in names.items()}
         addresses.append(names)
-        runs.append(replace(run, notes=(*run.notes, *notes)))
-    text = page(page_data(runs, addresses, task_source(task_dir)), title=", ".join(run.name for run in runs))
+        read, misfits = find_reads(run.folder, run.records, run.protocol)
+        reads.append(read)
+        runs.append(replace(run, notes=(*run.notes, *notes, *misfits)))
+    text = page(page_data(runs, addresses, task_source(task_dir), reads), title=", ".join(run.name for run in runs))
     out.mkdir(parents=True, exist_ok=True)
     if not (out / PAGE).exists():
         write_file(out / PAGE, UNFINISHED)  # the folder is known as ours from now on

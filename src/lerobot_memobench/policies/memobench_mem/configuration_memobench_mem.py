@@ -597,6 +597,19 @@ class MemobenchMemConfig(PI05Config):
         """Whether pictures between two action chunks count."""
         return self.memory != NONE and self.uses_pictures
 
+    def check_memory_reads(self) -> None:
+        """Refuse to tell how much a chunk reads of what is remembered where nothing tells it.
+
+        Raises:
+            MemobenchError: there is no memory, or a fusion of its own that has no weights.
+        """
+        fusion = None if self.memory == NONE else find_mechanism(self.memory).fusion
+        if self.memory == NONE or (fusion is not None and not fusion.tells_reads):
+            raise MemobenchError(
+                f"memory_reads=true asks how much each remembered frame is read, which memory={self.memory} does not "
+                "tell; leave it out"
+            )
+
     @property
     def cache_place(self) -> Path | None:
         """Folder that holds feature caches; None: the one beside each dataset."""

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import torch
 import torch.nn.functional as F
@@ -28,7 +30,13 @@ Suffix = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 class MemoryFusion(ABC):
-    """A way by which actions read memory tokens; made once for a model, to which it may add parameters."""
+    """A way by which actions read memory tokens; made once for a model, to which it may add parameters.
+
+    Attributes:
+        tells_reads: whether `watched` can say how much each token was read.
+    """
+
+    tells_reads: ClassVar[bool] = False
 
     @abstractmethod
     def __init__(self, model: nn.Module, memory_dim: int, expert_dim: int) -> None:
@@ -50,6 +58,11 @@ class MemoryFusion(ABC):
         """Return what the last pass made beside actions, for `MemoryMechanism.losses`."""
         return {}
 
+    @contextmanager
+    def watched(self) -> Iterator[list[Tensor]]:
+        """Yield a list to which passes add meanwhile how much they read of each token, (B, L) per layer."""
+        yield []
+
     def owns(self, name: str) -> bool:
         """Say whether a parameter of the model is this fusion's, and no part of pi0.5."""
         return False
@@ -57,6 +70,15 @@ class MemoryFusion(ABC):
     def place_of(self, name: str) -> str:
         """Return the name in this model of a parameter of plain pi0.5."""
         return name
+
+
+@contextmanager
+def hooked(modules: Iterable[nn.Module], note: Callable[[Any, Any, Any], None]) -> Iterator[None]:
+    """Call ``note(module, inputs, outputs)`` after each pass of some modules, while this lasts."""
+    with ExitStack() as hooks:
+        for module in modules:
+            hooks.callback(module.register_forward_hook(note).remove)
+        yield
 
 
 # -- modulation -------------------------------------------------------------------------------------------------------
@@ -123,13 +145,9 @@ class MemoryModulator(nn.Module):
         ``keys`` are those of the same memory, if they have been computed before. A row whose memory is all masked
         reads zeros.
         """
-        mask = memory.mask
-        count, length = actions.shape[1], mask.shape[1]
+        mask, count = memory.mask, actions.shape[1]
         key, value = self.keys(memory) if keys is None else keys
-        query = rearrange(self.query(self.action_norm(actions)), "b t (h d) -> b h t d", h=self.heads)
-        query = _rotate(query, torch.arange(length, length + count, device=actions.device))
-        # A finite bias keeps the softmax of an all-masked row finite; its result is then set to zero.
-        bias = torch.zeros_like(mask, dtype=query.dtype).masked_fill(~mask, torch.finfo(query.dtype).min / 2)
+        query, bias = self._queries(actions, mask)
         read = F.scaled_dot_product_attention(
             query,
             repeat(key, "b 1 l d -> b h l d", h=self.heads),
@@ -140,6 +158,21 @@ class MemoryModulator(nn.Module):
         read = self.out(rearrange(read, "b h t d -> b t (h d)"))
         scale, shift = self.modulation(read).chunk(2, dim=-1)
         return scale, shift
+
+    def _queries(self, actions: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the rotated queries of actions (B, heads, T, head_dim), and what is added to their scores (B, L)."""
+        count, length = actions.shape[1], mask.shape[1]
+        query = rearrange(self.query(self.action_norm(actions)), "b t (h d) -> b h t d", h=self.heads)
+        query = _rotate(query, torch.arange(length, length + count, device=actions.device))
+        # A finite bias keeps the softmax of an all-masked row finite; its result is then set to zero.
+        bias = torch.zeros_like(mask, dtype=query.dtype).masked_fill(~mask, torch.finfo(query.dtype).min / 2)
+        return query, bias
+
+    def weights(self, actions: Tensor, memory: MemoryTokens, keys: tuple[Tensor, Tensor]) -> Tensor:
+        """Return how much `forward` reads of each memory token (B, L): the mean over heads and actions."""
+        query, bias = self._queries(actions, memory.mask)
+        scores = query @ keys[0].transpose(-1, -2) * self.head_dim**-0.5 + rearrange(bias, "b l -> b 1 1 l")
+        return scores.softmax(dim=-1).mean(dim=(1, 2)) * memory.mask
 
 
 @dataclass
@@ -197,6 +230,8 @@ class Modulation(MemoryFusion):
     Wrapped norms are one level deeper than in plain pi0.5.
     """
 
+    tells_reads = True
+
     def __init__(self, model: PI05Pytorch, memory_dim: int, expert_dim: int) -> None:
         self.model, self.shared = model, SharedMemory()
         model.memory_to_expert = nn.Linear(memory_dim, expert_dim)
@@ -208,6 +243,15 @@ class Modulation(MemoryFusion):
     def hand_over(self, memory: MemoryTokens) -> None:
         """Begin a pass over this memory in every layer."""
         self.shared.set(memory.through(cast(nn.Linear, self.model.memory_to_expert)))
+
+    @contextmanager
+    def watched(self) -> Iterator[list[Tensor]]:
+        """Yield how much the modulators look at each token."""
+        found: list[Tensor] = []
+        layers = self.model.paligemma_with_expert.gemma_expert.model.layers
+        modulators = [layer.post_attention_layernorm.modulator for layer in layers]
+        with hooked(modulators, lambda modulator, inputs, _: found.append(modulator.weights(*inputs))):
+            yield found
 
     def owns(self, name: str) -> bool:
         """Say whether a parameter is the projection's or a modulator's."""
@@ -231,8 +275,10 @@ def plain_name(name: str) -> str:
 class Context(MemoryFusion):
     """The whole prefix and the actions attend to memory tokens; nothing is added to the model."""
 
-    def __init__(self, model: nn.Module, memory_dim: int, expert_dim: int) -> None:
-        self.memory: MemoryTokens | None = None
+    tells_reads = True
+
+    def __init__(self, model: PI05Pytorch, memory_dim: int, expert_dim: int) -> None:
+        self.model, self.memory = model, cast("MemoryTokens | None", None)
 
     def hand_over(self, memory: MemoryTokens) -> None:
         """Keep this memory for the next prefix."""
@@ -249,3 +295,17 @@ class Context(MemoryFusion):
             torch.cat([real, mask], dim=1),
             torch.cat([blocks, torch.zeros_like(mask)], dim=1),
         )
+
+    @contextmanager
+    def watched(self) -> Iterator[list[Tensor]]:
+        """Yield how much actions attend to each token: a share of all that they attend to."""
+        found: list[Tensor] = []
+
+        def note(attention: Any, inputs: Any, outputs: tuple[Tensor, Tensor]) -> None:
+            assert self.memory is not None
+            weights, length = outputs[1], self.memory.mask.shape[1]  # (B, heads, T, prefix and T), memory at its end
+            actions = weights.shape[2]
+            found.append(weights[..., -actions - length : -actions].mean(dim=(1, 2)))
+
+        with hooked([layer.self_attn for layer in self.model.paligemma_with_expert.gemma_expert.model.layers], note):
+            yield found

@@ -63,6 +63,7 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
 )
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Precision, attend_fused
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE
+from lerobot_memobench.policies.memobench_mem.reads import ChunkReads, chunk_reads
 from lerobot_memobench.policies.memobench_mem.rollout import Rollout
 from lerobot_memobench.policies.memobench_mem.sampler import TrainingRun, begin_training
 from lerobot_memobench.policies.memobench_mem.sharding import check_adapters, prepare_shards
@@ -169,6 +170,7 @@ class MemobenchMemPolicy(PI05Policy):
         self.run: TrainingRun | None = None
         self.curve = TrainingCurve()
         self.rollout = Rollout(self._remembers, config.memory_stride)
+        self._watched = False
         self.reset()
         self._thread: int | None = None  # whichever acts first
         if dataset_meta is not None and load_base:
@@ -480,10 +482,32 @@ class MemobenchMemPolicy(PI05Policy):
                 self.read_memory(batch)
             elif self._remembers:
                 self._require_history(rows)
-                self.model.set_memory(self.remembered(batch, rows))
-            noise = noise.to(self._device)
-            actions = self.model.sample_actions(images, image_masks, *words, noise=noise, **kwargs)
+                memory = self.remembered(batch, rows)
+                self.model.set_memory(memory)
+            watching = self._watching(rows, memory) if self._watched and not training else contextlib.nullcontext()
+            with watching:
+                noise = noise.to(self._device)
+                actions = self.model.sample_actions(images, image_masks, *words, noise=noise, **kwargs)
         return actions[:, :, : self._action_dim]
+
+    @contextlib.contextmanager
+    def _watching(self, rows: Sequence[int], memory: MemoryTokens) -> Iterator[None]:
+        """Keep how much the chunks of some rows read of their memory, which are planned while this lasts."""
+        assert self.model.fusion is not None
+        with self.model.fusion.watched() as layers:
+            yield
+        held = [self.rollout.rows[row] for row in rows]
+        for row, read in zip(held, chunk_reads([row.position for row in held], memory, layers), strict=True):
+            row.reads.append(read)
+
+    def watch_memory(self, watched: bool = True) -> None:
+        """Keep from now on how much each chunk reads of what is remembered, for `memory_reads`; or keep it no more."""
+        self.config.check_memory_reads()
+        self._watched = watched
+
+    def memory_reads(self) -> list[list[ChunkReads]]:
+        """Return of each row how much the chunks of its episode have read."""
+        return [row.reads for row in self.rollout.rows]
 
     @property
     def _inputs(self) -> list[str]:

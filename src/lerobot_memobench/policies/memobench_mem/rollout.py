@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from lerobot_memobench.policies.memobench_mem.objects import HAND_DIM, rotation
+from lerobot_memobench.policies.memobench_mem.reads import ChunkReads
 
 STILL, PER_RADIAN = 0.006, 0.1
 """How little a hand or a finger may move from one chunk to the next to be still, m, and what a radian counts, m."""
@@ -30,6 +31,7 @@ class Row:
         missed: the first step of a frame that was to be written and was not offered; None where all were.
         queue: planned actions that are left. last: action (A,) that was taken last; None: none.
         stood: the robot's pose when the last chunk was planned.
+        reads: how much each of the episode's chunks has read, where that is watched.
     """
 
     clock: tuple[int, int] | None = None
@@ -41,6 +43,7 @@ class Row:
     queue: deque[Tensor] = field(default_factory=deque)
     last: Tensor | None = None
     stood: Tensor | None = None
+    reads: list[ChunkReads] = field(default_factory=list)
 
     def drop_chunk(self) -> None:
         """Forget planned actions; until there are others the action is zero."""

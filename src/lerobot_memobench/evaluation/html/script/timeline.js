@@ -27,12 +27,14 @@ function timeline(episode, level, seek, length = lastFrame(episode), lead = 0) {
   const draw = trackTools(length, lead, seek);
   const lanes = episode.checkpoints.map((_, k) => checkpointLane(episode, k, level, draw));
   const slider = timeSlider(end, length - lead, draw);
+  const read = readLanes(episode, draw, seek);
   const clock = el("span", { class: "words clock" });
   const root = el(
     "div",
     { class: "timeline", role: "group", "aria-label": "Timeline" },
     phaseLane(episode, draw),
     lanes,
+    read.lanes,
     el("div", { class: "lane" }, el("div", { class: "label" }, clock), slider),
   );
   root.addEventListener("pointerdown", (event) => drag(event, root, slider, (across) => seek(Math.round(across * length) - lead)));
@@ -50,6 +52,7 @@ function timeline(episode, level, seek, length = lastFrame(episode), lead = 0) {
     root.style.setProperty("--at", draw.at(frame));
     slider.setAttribute("aria-valuenow", frame);
     slider.setAttribute("aria-valuetext", `${words}, ${subgoalWords(episode, now, level)}`);
+    read.show(frame);
     clock.textContent = `${words} · ${seconds(frame)}`;
     lanes.forEach((lane, k) => {
       const acting = now.phase !== "prompt";
@@ -69,9 +72,9 @@ function subgoalWords(episode, now, level) {
   return checkpointText(episode.task, episode.variant, now.checkpoint, level);
 }
 
-/** Tell where the pointer is, from 0 to 1, and follow it while it is held down. Marks seek by their own click. */
+/** Tell where the pointer is, from 0 to 1, and follow it while it is held down. Marks and cells seek by their own click. */
 function drag(event, root, slider, moved) {
-  if (event.button !== 0 || event.target.closest(".mark") || !event.target.closest(".track")) return;
+  if (event.button !== 0 || event.target.closest(".mark, .cell") || !event.target.closest(".track")) return;
   const follow = ({ clientX }) => {
     const box = slider.getBoundingClientRect();
     moved((clientX - box.left) / box.width);

@@ -1,0 +1,137 @@
+"""How much a chunk reads of each remembered entry: attention of the fusions, entries of any mechanism, rows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.memobench_mem.fusion import MemoryModulator
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryTokens
+from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from lerobot_memobench.policies.memobench_mem.reads import chunk_reads
+from tests.support.object_dataset import make_object_dataset
+from tests.support.small_policy import made_for_training, small_config
+
+LENGTH = 20
+"""Of the dataset's second episode, which begins with a prompt of 8 frames."""
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_object_dataset(tmp_path_factory.mktemp("objects") / "data")
+
+
+def acting(root: Path, **fields: Any) -> tuple[MemobenchMemPolicy, list[dict[str, Any]]]:
+    """Return a policy and an episode's observations, two rows each: the second one is six frames behind."""
+    policy, before, _, dataset = made_for_training(
+        root, **{"perception": "objects", "size": "tiny", "memory_stride": 2, "memory_frames": 4, **fields}
+    )
+    episode = range(dataset.meta.episodes[1]["dataset_from_index"], dataset.meta.episodes[1]["dataset_to_index"])
+
+    def observed(index: int) -> dict[str, Any]:
+        row = dataset.hf_dataset[index]
+        keys = ("state", "environment_state", "phase", "step")
+        return {f"observation.{key}": row[f"observation.{key}"].reshape(-1) for key in keys} | {"task": "open it"}
+
+    rows = [[observed(episode[k]), observed(episode[max(k - 6, 0)])] for k in range(LENGTH)]
+    return policy.eval(), [before(torch.utils.data.default_collate(pair)) for pair in rows]
+
+
+def rolled(policy: MemobenchMemPolicy, batches: list[dict[str, Any]]) -> torch.Tensor:
+    policy.reset()
+    torch.manual_seed(3)
+    return torch.stack([policy.select_action(batch) for batch in batches])
+
+
+def test_a_modulator_tells_what_it_looks_at() -> None:
+    """With unit vectors for values, what is read is how much was looked at each token."""
+    torch.manual_seed(0)
+    modulator, length = MemoryModulator(32, heads=4), 6
+    memory = MemoryTokens(torch.randn(3, length, 32), torch.arange(length) < torch.tensor([[6], [2], [0]]))
+    actions, (key, _) = torch.randn(3, 5, 32), modulator.keys(memory)
+    units = torch.eye(length, modulator.head_dim).expand(3, 1, -1, -1)
+    read: list[torch.Tensor] = []
+    modulator.out.register_forward_hook(lambda _, inputs, __: read.append(inputs[0]))
+    modulator(actions, memory, (key, units))
+    of_heads = read[0].unflatten(-1, (4, modulator.head_dim))[..., :length]
+    found = modulator.weights(actions, memory, (key, units))
+    torch.testing.assert_close(found, of_heads.mean(dim=(1, 2)))
+    torch.testing.assert_close(found.sum(dim=1), torch.tensor([1.0, 1.0, 0.0]))
+
+
+@pytest.mark.parametrize("fusion", ["modulation", "context"])
+def test_reads_are_of_the_sampled_frames_and_change_no_action(root: Path, fusion: str) -> None:
+    policy, batches = acting(root, memory_fusion=fusion)
+    plain = rolled(policy, batches)
+    assert policy.memory_reads() == [[], []]
+    policy.watch_memory()
+    assert torch.equal(rolled(policy, batches), plain)
+    ahead, behind = policy.memory_reads()
+    # Chunks of 6 actions from the execution's first frame on; of frames 0, 2, ... four are sampled.
+    assert [(read.step, read.entries) for read in ahead] == [(8, (0, 2, 4, 8)), (14, (0, 4, 8, 14))]
+    # Frozen until frame 6, then six frames behind.
+    assert [(read.step, read.entries) for read in behind] == [(8, (0, 2, 4, 8))]
+    for read in (*ahead, *behind):
+        assert min(read.weights) > 0
+        whole = sum(read.weights)
+        assert whole == pytest.approx(1, abs=1e-4) if fusion == "modulation" else 0.01 < whole < 0.99
+    assert behind[0].weights == pytest.approx(ahead[0].weights, abs=1e-5)
+    policy.watch_memory(False)
+    rolled(policy, batches)
+    assert policy.memory_reads() == [[], []]
+
+
+def test_what_actions_attend_to_in_context_is_what_was_summed(root: Path) -> None:
+    """The one layer, pass and row that is left gives its own weights, memory's columns of them."""
+    policy, batches = acting(root, memory_fusion="context", num_inference_steps=1)
+    (layer, *others) = policy.model.paligemma_with_expert.gemma_expert.model.layers
+    weights: list[torch.Tensor] = []
+    for each in (layer, *others):
+        each.self_attn.register_forward_hook(lambda _, __, outputs: weights.append(outputs[1][0]))
+    policy.watch_memory()
+    rolled(policy, batches[:9])
+    (read,), _ = policy.memory_reads()
+    tokens, actions = 4 * policy.config.tokens_per_frame, policy.config.chunk_size
+    columns = torch.stack(weights).mean(dim=(0, 1, 2))[:-actions][-tokens:]
+    assert read.weights == pytest.approx(columns.unflatten(0, (4, -1)).sum(dim=1).tolist(), abs=1e-6)
+
+
+def test_entries_without_a_frame_are_numbered_and_those_of_a_frame_added() -> None:
+    tokens, mask = torch.zeros(2, 4, 8), torch.tensor([[1, 1, 1, 1], [1, 1, 0, 0]], dtype=torch.bool)
+    layers = [torch.tensor([[0.1, 0.2, 0.3, 0.4], [0.7, 0.3, 0.0, 0.0]])] * 2
+    slots = chunk_reads([5, 9], MemoryTokens(tokens, mask), layers)
+    assert [(read.step, read.entries) for read in slots] == [(5, (-4, -3, -2, -1)), (9, (-2, -1))]
+    assert slots[1].weights == pytest.approx((0.3, 0.7))
+    steps = torch.tensor([[0, 0, 8, 8], [0, -1, 0, 0]])
+    frames = chunk_reads([5, 9], MemoryTokens(tokens, mask, steps=steps), layers)
+    assert [read.entries for read in frames] == [(0, 8), (-2, 0)]
+    assert frames[0].weights == pytest.approx((0.3, 0.7))
+    # Three entries of which the tokens are made, the third one none.
+    shares = torch.tensor([[1.0, 0.0, 0.0], [0.5, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 1.0, 0.0]]).expand(2, -1, -1)
+    sources = shares, torch.tensor([[0.0, 12.4, -1.0]] * 2)
+    looked_up = chunk_reads([20, 30], MemoryTokens(tokens, mask, sources=sources), layers)
+    assert [read.entries for read in looked_up] == [(0, 12)] * 2
+    assert looked_up[0].weights == pytest.approx((0.2, 0.8))
+    assert looked_up[1].weights == pytest.approx((0.85, 0.15))
+
+
+def test_a_bank_tells_what_it_retrieved(root: Path) -> None:
+    policy, batches = acting(root, memory="bank", memory_stride=4, memory_frames=32, memory_settings={"length": 2})
+    policy.watch_memory()
+    rolled(policy, batches)
+    (first, second), _ = policy.memory_reads()
+    assert (first.step, second.step) == (8, 14)
+    for read in (first, second):
+        assert sum(read.weights) == pytest.approx(1, abs=1e-4)
+        assert max(read.entries) <= read.step
+        assert 2 <= len(read.entries) <= 4  # two of each stream, which may have merged others
+
+
+def test_without_a_memory_nothing_is_watched() -> None:
+    with pytest.raises(MemobenchError, match="memory=none does not tell"):
+        small_config(memory="none").check_memory_reads()
+    small_config().check_memory_reads()

@@ -1,0 +1,91 @@
+"""``memory_reads=true``: which policies it is asked of, its files as episodes end, parts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.memory_reads import find_reads, reads_file
+from lerobot_memobench.policies.memobench_mem.reads import ChunkReads
+from lerobot_memobench.run.memory_reads import ReadLog
+from lerobot_memobench.run.plan import plan_line
+from lerobot_memobench.run.shards import plan_shards
+from tests.support.logs import record
+
+TASK = "turn_on_the_stove_and_turn_it_off"
+LINE = ["env=memobench", f"tasks={TASK}", "episodes=2", "batch_size=1", "memory_reads=true", "policy=memobench_small"]
+
+
+class Policy:
+    """A policy that tells what it is made to."""
+
+    def __init__(self, *rows: list[ChunkReads]) -> None:
+        self.rows, self.watched = [*rows], False
+
+    def check_memory_reads(self) -> None:
+        """It always tells."""
+
+    def watch_memory(self, watched: bool = True) -> None:
+        self.watched = watched
+
+    def memory_reads(self) -> list[list[ChunkReads]]:
+        assert self.watched
+        return self.rows
+
+
+class Environment:
+    def call(self, name: str) -> tuple[str]:
+        assert name == "task"
+        return ("a_task",)
+
+
+def steps_of(folder: Path, episode: int) -> list[int] | None:
+    found, notes = find_reads(folder, [record(episode=episode, seed=20 + episode)], {})
+    assert not notes
+    return [chunk["step"] for chunk in found[0]] if found else None
+
+
+def test_each_episode_is_written_when_it_ends(tmp_path: Path) -> None:
+    chunks = [ChunkReads(step, (0,), (1.0,)) for step in range(3)]
+    policy: Any = Policy(chunks[:2], [], chunks[:1])
+    log = ReadLog(tmp_path, 20, "fixed")
+    with log.noting(Environment(), policy, [20, 21, 22]) as ended:
+        ended(np.array([False, False, False]))
+        assert not (tmp_path / "memory_reads").exists()
+        ended(np.array([True, True, False]))
+        assert steps_of(tmp_path, 0) == [0, 1]
+        policy.rows = [chunks, chunks, chunks]  # what a row does that is over is no part of its episode
+        ended(np.array([True, True, False]))
+    assert not policy.watched
+    assert steps_of(tmp_path, 0) == [0, 1]
+    assert steps_of(tmp_path, 1) is None  # a logged episode rests and plans nothing
+    assert steps_of(tmp_path, 2) == [0, 1, 2]
+
+
+def test_a_rollout_that_breaks_off_leaves_only_whole_episodes(tmp_path: Path) -> None:
+    policy: Any = Policy([ChunkReads(0, (0,), (1.0,))])
+    with pytest.raises(ZeroDivisionError), ReadLog(tmp_path, 7, "fixed").noting(Environment(), policy, [7]):
+        raise ZeroDivisionError
+    assert not policy.watched
+    assert not reads_file(tmp_path, "a_task", 0).exists()
+
+
+def test_it_is_asked_of_a_policy_with_a_memory() -> None:
+    plan = plan_line(LINE)
+    assert ReadLog.of(plan) == ReadLog(plan.log, 7, "fixed")
+    assert ReadLog.of(plan_line([word for word in LINE if "reads" not in word])) is None
+    for policy, told in (("memobench_small_memoryless", "memory=none"), ("memobench_random", "memobench_random")):
+        with pytest.raises(MemobenchError, match=f"memory_reads=true asks .* {told} does not tell"):
+            plan_line([*LINE[:-1], f"policy={policy}"])
+    with pytest.raises(MemobenchError, match="memory_reads=yes: expected true or false"):
+        plan_line([*LINE[:-2], "memory_reads=yes"])
+
+
+def test_parts_are_asked_for_it_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    jobs = plan_shards(plan_line([*LINE, "shards=2", "output_dir=out"]), ("program",), print)
+    assert ["memory_reads=true" in job.arguments for job in jobs] == [True, True]
