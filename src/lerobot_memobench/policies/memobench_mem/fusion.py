@@ -33,9 +33,11 @@ class MemoryFusion(ABC):
     """A way by which actions read memory tokens; made once for a model, to which it may add parameters.
 
     Attributes:
+        attends_fused: whether training attends in one kernel (`network.attend_fused`), as a long prefix is quicker.
         tells_reads: whether `watched` can say how much each token was read.
     """
 
+    attends_fused: ClassVar[bool] = False
     tells_reads: ClassVar[bool] = False
 
     @abstractmethod
@@ -46,13 +48,27 @@ class MemoryFusion(ABC):
     def hand_over(self, memory: MemoryTokens) -> None:
         """Take the memory, of width d_m, that the next passes read."""
 
-    def prefix(self, prefix: Prefix) -> Prefix:
-        """Return the model's prefix, given LeRobot's."""
+    def prefix(self, prefix: Prefix, state: int | None = None) -> Prefix:
+        """Return the model's prefix, given LeRobot's.
+
+        Args:
+            state: place of the token of the robot's state; None: there is none.
+        """
         return prefix
 
     def suffix(self, suffix: Suffix) -> Suffix:
         """Return the model's suffix, given LeRobot's; the actions stay its last tokens."""
         return suffix
+
+    def attention(self, mask: Tensor) -> Tensor:
+        """Return what is added to attention (B, 1, queries, keys), given LeRobot's: 0, or very low where none is paid.
+
+        Queries are the last of the keys: of the prefix, of prefix and actions, or of actions alone.
+        """
+        return mask
+
+    def read_out(self, states: Tensor) -> None:
+        """Take the last states of a prefix (B, N, D)."""
 
     def outputs(self) -> dict[str, Tensor]:
         """Return what the last pass made beside actions, for `MemoryMechanism.losses`."""
@@ -284,7 +300,7 @@ class Context(MemoryFusion):
         """Keep this memory for the next prefix."""
         self.memory = memory
 
-    def prefix(self, prefix: Prefix) -> Prefix:
+    def prefix(self, prefix: Prefix, state: int | None = None) -> Prefix:
         """Append the memory, which attends and is attended like images and language."""
         if self.memory is None:
             return prefix

@@ -92,8 +92,8 @@ FSDP_PREFIX = "_fsdp_wrapped_module."
 """What torch's FSDP puts into the names of what it wraps."""
 OBS_PICTURE = f"observation.{PICTURE_STEP}"
 OWN_MODULES = (
-    *("model.memory", "model.memory_to_expert", "modulator", "alignment"),
-    *("model.state_token", "model.instruction", "model.foresight", "paligemma_with_expert.perception"),
+    *("model.memory", "model.memory_to_expert", "modulator", "alignment", "model.foresight", "model.subgoal"),
+    *("model.state_token", "model.instruction", "paligemma_with_expert.perception"),
 )
 """Ends of the names of modules that plain pi0.5 does not have; beside adapters (``--peft…``) they are trained whole."""
 
@@ -218,7 +218,7 @@ class MemobenchMemPolicy(PI05Policy):
         cache = open_frames(Path(meta.root), self.config, self.perception)
         self.run = TrainingRun(self.config, cache, meta)
         begin_training(self.run)
-        if self.config.uses_visual_encoder:
+        if self.config.uses_visual_encoder or (self.model.fusion is not None and self.model.fusion.attends_fused):
             attend_fused(self.model)
         if self._device.type == "cpu":
             keep_freed_memory()
@@ -471,7 +471,7 @@ class MemobenchMemPolicy(PI05Policy):
         """Return action chunks (n, chunk, A) of some rows of the batch, with their histories and sampling noise.
 
         Args:
-            training: whether it is a training batch, which brings its histories.
+            training: whether it is a training batch, which brings its histories; true subgoals are not read.
         """
         inputs = [*self._inputs, *(key for key in batch if key.startswith(ENCODED))]
         part = {key: batch[key][rows] for key in inputs if key in batch}
@@ -479,7 +479,7 @@ class MemobenchMemPolicy(PI05Policy):
         words = part[OBS_LANGUAGE_TOKENS], part[OBS_LANGUAGE_ATTENTION_MASK]
         with self._acting():
             if training:
-                self.read_memory(batch)
+                self.read_memory({name: value for name, value in batch.items() if name not in (SUBGOAL, SUBGOALS)})
             elif self._remembers:
                 self._require_history(rows)
                 memory = self.remembered(batch, rows)

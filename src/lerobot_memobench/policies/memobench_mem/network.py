@@ -85,6 +85,7 @@ class MemoryPI05(PI05Pytorch):
         pool = motion_field(observations, width) if mechanism.asks_motion else observations.pool()
         self.memory = mechanism(spec, pool, read_settings(config.memory, config.memory_settings))
         self.fusion = (mechanism.fusion or FUSIONS[config.memory_fusion])(self, vlm_width, width)
+        self.paligemma_with_expert.fusion = self.fusion
 
     def set_memory(self, memory: MemoryTokens) -> None:
         """Let the next passes read these tokens."""
@@ -98,6 +99,7 @@ class MemoryPI05(PI05Pytorch):
         of their tokens (B, n), which LeRobot's are not. Later versions hand over states too (``histories``): none here,
         where the configuration refuses pi0.5's own memory.
         """
+        place = None
         if self.state_token is None or self.instruction is None:
             prefix: Prefix = super().embed_prefix(images, img_masks, tokens, masks, *histories)
         else:
@@ -110,13 +112,14 @@ class MemoryPI05(PI05Pytorch):
                 repeat(mask, "b -> b n", n=part.shape[1]) if mask.ndim == 1 else mask
                 for mask, part in zip(img_masks, embedded, strict=True)
             ]
+            place = sum(part.shape[1] for part in embedded) - 1
             real = torch.cat([*of_tokens, real], dim=1)
             prefix = (
                 torch.cat([*(part.to(words.dtype) for part in embedded), words], dim=1),
                 real,
                 torch.zeros_like(real),
             )
-        return prefix if self.fusion is None else self.fusion.prefix(prefix)
+        return prefix if self.fusion is None else self.fusion.prefix(prefix, place)
 
     def embed_suffix(self, noisy_actions: Tensor, timestep: Tensor) -> Suffix:
         """Return LeRobot's action tokens, their masks, and the condition of the norms, as the fusion changes them."""
@@ -141,9 +144,14 @@ class MemoryPI05(PI05Pytorch):
 
 
 class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
-    """LeRobot's pair of transformers at this policy's dimensions, image tower and unused heads frozen."""
+    """LeRobot's pair of transformers at this policy's dimensions, image tower and unused heads frozen.
+
+    Attributes:
+        fusion: says which tokens attend to which, and is shown the prefix's last states; None: as in LeRobot's.
+    """
 
     perception: ObservationEncoder
+    fusion: MemoryFusion | None = None
 
     def __init__(self, config: MemobenchMemConfig) -> None:
         dims, image_size = config.dimensions, config.image_size[0]
@@ -211,6 +219,15 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
         # pi0.5 never asks its language heads; training state for them would only fill memory.
         self.paligemma.lm_head.requires_grad_(False)
         self.gemma_expert.lm_head.requires_grad_(False)
+
+    def forward(self, attention_mask: Tensor | None = None, *args: Any, **kwargs: Any) -> Any:
+        """Return what LeRobot's does: the last states of prefix and actions, None where there is none; and a cache."""
+        if self.fusion is not None and attention_mask is not None:
+            attention_mask = self.fusion.attention(attention_mask)
+        (prefix, actions), cache = super().forward(attention_mask, *args, **kwargs)
+        if self.fusion is not None and prefix is not None:
+            self.fusion.read_out(prefix)
+        return [prefix, actions], cache
 
     def embed_image(self, image: Tensor) -> Tensor:
         """Return prefix tokens (B, n, D) of what LeRobot calls an image: one part of the observation."""

@@ -17,7 +17,7 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryMech
 
 GROUP = "lerobot_memobench.memories"
 NONE = "none"
-OURS = {"frames": "Frames", "bank": "Bank", "motion": "Motion"}
+OURS = {"frames": "Frames", "bank": "Bank", "motion": "Motion", "subgoal": "Subgoal"}
 """Name, which is the module's too -> class."""
 
 

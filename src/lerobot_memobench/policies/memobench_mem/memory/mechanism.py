@@ -88,6 +88,7 @@ class MemoryTokens(NamedTuple):
         steps: (B, L), control step of the frame that a token is of, -1 where it is of none; None: of none.
         sources: where a token is made of several entries of a memory, the share of each, (B, L, E), and the control
             steps of these, (B, E), -1 where there is none; for looking at, without gradients.
+        query: the present that they were read by, where the mechanism's own fusion asks for it.
     """
 
     each: Tensor
@@ -95,6 +96,7 @@ class MemoryTokens(NamedTuple):
     places: Tensor | None = None
     steps: Tensor | None = None
     sources: tuple[Tensor, Tensor] | None = None
+    query: Query | None = None
 
     def through(self, made: Callable[[Tensor], Tensor]) -> MemoryTokens:
         """Return what is made of every token by itself."""

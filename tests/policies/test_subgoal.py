@@ -1,0 +1,225 @@
+"""The narrow channel: the text that is said is all that the action expert reads of the prefix."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lerobot.utils.constants import OPENPI_ATTENTION_MASK_VALUE
+from torch import Tensor
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, SUBGOALS, Query
+from lerobot_memobench.policies.memobench_mem.memory.subgoal import NarrowChannel
+from lerobot_memobench.policies.memobench_mem.memory.texts import CheckpointTexts, scored
+from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
+from lerobot_memobench.policies.memobench_mem.objects import HAND_DIM
+from lerobot_memobench.sim.object_layout import SIZE, SLOTS
+from tests.support.memory import histories
+from tests.support.object_dataset import make_object_dataset
+from tests.support.small_policy import batch_of, losses_in_training, made_for_training
+
+OF_TASKS = {"the drawer": ["close it", "open it"], "the bowl": ["open it", "put it into the top drawer"]}
+CHUNK, B, TEXTS = 4, 2, 3
+
+
+@pytest.fixture(params=["objects", "pixels"])
+def model(request: pytest.FixtureRequest) -> MemoryPI05:
+    """With a token of the state (objects), and with the state in the text prompt (pixels)."""
+    size = "small" if request.param == "objects" else "tiny"
+    fields = {"size": size, "perception": request.param, "memory": "subgoal", "subgoals": OF_TASKS}
+    config = MemobenchMemConfig(
+        device="cpu", chunk_size=CHUNK, n_action_steps=CHUNK, num_inference_steps=1, objective="flow_matching", **fields
+    )
+    torch.manual_seed(0)
+    made = MemoryPI05(config)
+    with torch.no_grad():
+        for parameter in made.parameters():
+            parameter.add_(0.05 * torch.randn_like(parameter))  # some of pi0.5's start at zero and hide errors
+    return made.eval()
+
+
+def inputs_of(model: MemoryPI05, seed: int = 1) -> dict[str, Any]:
+    """Return the present of two rows."""
+    chance = torch.Generator().manual_seed(seed)
+    real = torch.ones(B, 7, dtype=torch.bool)
+    real[1, 4:] = False
+    if model.state_token is None:
+        side = model.config.image_resolution[0]
+        seen = [torch.rand(B, 3, side, side, generator=chance) * 2 - 1]
+        shown = [torch.ones(B, dtype=torch.bool)]
+    else:
+        seen = [torch.randn(B, width, generator=chance) for width in (SIZE + HAND_DIM, model.config.max_state_dim)]
+        shown = [torch.ones(B, SLOTS, dtype=torch.bool), torch.ones(B, dtype=torch.bool)]
+    words = torch.randint(4, 200, (B, 7), generator=chance)
+    return {"images": seen, "img_masks": shown, "tokens": words, "masks": real}
+
+
+def remember(model: MemoryPI05, seed: int = 2, subgoal: list[int] | None = None, learns: bool = False) -> Tensor:
+    """Hand a history of three frames to the model, with what is true of it; return its tokens."""
+    memory, chance = model.memory, torch.Generator().manual_seed(seed)
+    assert memory is not None
+    frames = torch.randn(B, 3, memory.spec.tokens, memory.spec.dim, generator=chance)
+    memory.pool = torch.nn.Identity()
+    choices = torch.tensor([[True, True, False], [False, True, True]])
+    query = Query(choices=choices, subgoal=None if subgoal is None else torch.tensor(subgoal))
+    read = memory.replay(histories(frames, torch.arange(3).repeat(B, 1), torch.ones(B, 3, dtype=torch.bool)), query)
+    each = read.each.detach().requires_grad_(learns)
+    model.set_memory(read._replace(each=each))
+    return each
+
+
+def passed(model: MemoryPI05, inputs: dict[str, Any], actions: Tensor) -> Tensor:
+    """Return the losses of a training's pass at time 1, from zero noise to these actions."""
+    losses: Tensor = model.forward(**inputs, actions=actions, noise=torch.zeros_like(actions), time=torch.ones(B))
+    return losses
+
+
+def planned(model: MemoryPI05, inputs: dict[str, Any]) -> Tensor:
+    """Return the chunk of one step of denoising from zero noise."""
+    actions: Tensor = model.sample_actions(**inputs, noise=torch.zeros(B, CHUNK, model.config.max_action_dim))
+    return actions
+
+
+@contextmanager
+def text_alone(channel: NarrowChannel) -> Iterator[None]:
+    """Let the text attend to itself alone, so that its states are the same whatever stands before it."""
+    attention = channel.attention
+
+    def narrowed(mask: Tensor) -> Tensor:
+        mask = attention(mask)
+        if channel._length:
+            queries, keys = (torch.arange(count) for count in mask.shape[-2:])
+            queries = (queries + len(keys) - len(queries)).unsqueeze(1)
+            hidden = (queries >= channel._unread) & (queries < channel._length) & (keys < channel._unread)
+            mask = mask.masked_fill(hidden, OPENPI_ATTENTION_MASK_VALUE)
+        return mask
+
+    channel.attention = narrowed  # type: ignore[method-assign]
+    yield
+    del channel.attention
+
+
+def channel_of(model: MemoryPI05) -> NarrowChannel:
+    assert isinstance(model.fusion, NarrowChannel)
+    return model.fusion
+
+
+def test_actions_read_the_text_alone(model: MemoryPI05) -> None:
+    """Another observation, instruction or history, of which the text's states are told nothing, changes no action."""
+    actions = torch.randn(B, CHUNK, model.config.max_action_dim)
+    state = inputs_of(model)["images"][1:]  # none where it is no token
+
+    def both(seed: int, text: list[int], state: list[Tensor]) -> Tensor:
+        inputs = inputs_of(model, seed)
+        inputs["images"] = [inputs["images"][0], *state]
+        remember(model, seed, text)
+        with torch.no_grad():
+            return torch.stack([passed(model, inputs, actions), planned(model, inputs)])
+
+    with text_alone(channel_of(model)):
+        found = both(1, [0, 2], state)
+        assert torch.equal(found, both(5, [0, 2], state))
+        assert (found != both(1, [1, 2], state))[:, 0].any(-1).all(), "another text, of another row"
+        if state:
+            assert (found != both(1, [0, 2], [state[0] + 1])).any(-1).all(), "the state is read"
+    assert (both(1, [0, 2], state) != both(5, [0, 2], state)).any(-1).all(), "the text's states tell the rest"
+
+
+def test_gradients_flow_through_the_text_alone(model: MemoryPI05) -> None:
+    model.train()
+    actions = torch.randn(B, CHUNK, model.config.max_action_dim)
+    history = remember(model, subgoal=[0, -1], learns=True)
+    passed(model, inputs_of(model), actions).mean().backward()
+    assert history.grad is not None
+    assert history.grad.abs().sum(dim=(1, 2)).all()
+    with text_alone(channel_of(model)):
+        history = remember(model, subgoal=[0, -1], learns=True)
+        passed(model, inputs_of(model), actions).mean().backward()
+    assert history.grad is None or not history.grad.any()
+    history = remember(model, subgoal=[0, -1], learns=True)
+    passed(model, inputs_of(model), actions)
+    loss = channel_of(model).losses()["subgoal"]
+    assert loss[1] == 0, "a frame without a text teaches none"
+    loss.sum().backward()
+    assert history.grad is not None
+    assert history.grad[:1].any()
+
+
+def test_both_paths_are_the_same(model: MemoryPI05) -> None:
+    """One step of denoising over cached keys ends where a training's pass of the same text has no error."""
+    remember(model)
+    actions = planned(model, inputs_of(model))
+    said = channel_of(model).said
+    assert said is not None
+    remember(model, subgoal=said.tolist())
+    assert passed(model, inputs_of(model), actions).max() < 1e-8
+
+
+def test_it_says_one_of_its_tasks_texts_and_is_not_told_which(model: MemoryPI05) -> None:
+    channel, inputs, scores = channel_of(model), inputs_of(model), []
+    for subgoal in ([0, 2], [1, 1], [-1, -1]):
+        remember(model, subgoal=subgoal)
+        with torch.no_grad():
+            passed(model, inputs, torch.zeros(B, CHUNK, model.config.max_action_dim))
+        assert channel.said is not None
+        assert channel.said.tolist() == [TEXTS if text < 0 else text for text in subgoal]
+        scores.append(channel._scores)
+    remember(model)
+    planned(model, inputs)
+    for other in scores:
+        torch.testing.assert_close(other, channel._scores)
+    assert torch.equal(channel.said, channel._scores.argmax(dim=1))
+    assert channel.said[0] in (0, 1)
+    assert channel.said[1] in (1, 2)
+    assert not channel.losses()
+
+
+def test_texts_share_words_and_the_empty_one_is_said_where_no_other_may_be() -> None:
+    texts = CheckpointTexts(("open it", "put it into the top drawer"), 5)
+    tokens, real = texts(torch.tensor([0, 1, -1, 2]))
+    assert real.sum(dim=1).tolist() == [3, 7, 1, 1]
+    assert torch.equal(tokens[0, 1], tokens[1, 1])
+    assert torch.equal(tokens[0, 2], tokens[1, 6])
+    scores = scored(torch.tensor([[5.0, -9.0], [5.0, -9.0]]), torch.tensor([[False, True], [False, False]]))
+    assert scores.argmax(dim=1).tolist() == [1, 2]
+    assert CheckpointTexts((), 5)(torch.tensor([0]))[1].tolist() == [[True]]
+
+
+def test_it_is_built_at_full_size_and_has_no_tokens_of_single_frames() -> None:
+    with torch.device("meta"):
+        made = MemoryPI05(MemobenchMemConfig(device="cpu", size="pi05", memory="subgoal", subgoals=OF_TASKS))
+    assert {name for name in made.memory_names() if name.startswith("subgoal.")} == {
+        *("subgoal.ask", "subgoal.score.weight", "subgoal.score.bias", "subgoal.texts.embedding.weight")
+    }
+    with pytest.raises(MemobenchError, match="no tokens of single frames"):
+        MemobenchMemConfig(device="cpu", memory="subgoal", align="framewise")
+    with pytest.raises(MemobenchError, match="cannot be read by memory_fusion=context"):
+        MemobenchMemConfig(device="cpu", memory="subgoal", memory_fusion="context")
+
+
+@pytest.mark.parametrize("memory", ["subgoal"])
+def test_it_learns_from_a_dataset_and_its_texts_lie_in_the_checkpoint(memory: str, tmp_path: Path) -> None:
+    root = make_object_dataset(tmp_path / "objects")
+    policy, before, _, dataset = made_for_training(root, perception="objects", memory=memory, memory_stride=2)
+    assert policy.config.subgoals["open the drawer"] == ["reach thing 2"]
+    batch = before(batch_of(dataset, [20, 30, 50, 60]))
+    losses = losses_in_training(policy, batch, 12)
+    assert losses[-1] < losses[0] / 2
+    _, logged = policy.train().forward(batch)
+    assert logged[f"memory_{memory}_loss"] < 0.1
+    policy.save_pretrained(tmp_path / "saved")
+    before.save_pretrained(tmp_path / "saved")
+    loaded = MemobenchMemPolicy.from_pretrained(tmp_path / "saved")
+    assert loaded.config.subgoals == policy.config.subgoals
+    policy.average = None  # the trained weights, not their average
+    chunks = policy.predict_action_chunk(batch)
+    assert torch.equal(policy.model.fusion.said, batch[SUBGOAL])
+    unlabelled = {key: value for key, value in batch.items() if key not in (SUBGOAL, SUBGOALS)}
+    assert torch.equal(policy.predict_action_chunk(unlabelled), chunks)
