@@ -173,11 +173,14 @@ def test_it_says_one_of_its_tasks_texts_and_is_not_told_which(model: MemoryPI05)
         scores.append(channel._scores)
     remember(model)
     planned(model, inputs)
+    assert channel.said is not None
+    assert channel._scores is not None
     for other in scores:
         torch.testing.assert_close(other, channel._scores)
-    assert torch.equal(channel.said, channel._scores.argmax(dim=1))
-    assert channel.said[0] in (0, 1)
-    assert channel.said[1] in (1, 2)
+    first, second = channel._scores.argmax(dim=1).tolist()
+    assert channel.said.tolist() == [first, second]
+    assert first in (0, 1)
+    assert second in (1, 2)
     assert not channel.losses()
 
 
@@ -207,11 +210,12 @@ def test_it_is_built_at_full_size_and_has_no_tokens_of_single_frames() -> None:
 @pytest.mark.parametrize("memory", ["subgoal"])
 def test_it_learns_from_a_dataset_and_its_texts_lie_in_the_checkpoint(memory: str, tmp_path: Path) -> None:
     root = make_object_dataset(tmp_path / "objects")
-    policy, before, _, dataset = made_for_training(root, perception="objects", memory=memory, memory_stride=2)
+    fields = {"size": "small", "perception": "objects", "memory_stride": 2}
+    policy, before, _, dataset = made_for_training(root, memory=memory, **fields)
     assert policy.config.subgoals["open the drawer"] == ["reach thing 2"]
     batch = before(batch_of(dataset, [20, 30, 50, 60]))
-    losses = losses_in_training(policy, batch, 12)
-    assert losses[-1] < losses[0] / 2
+    losses = losses_in_training(policy, batch, 20)
+    assert sum(losses[-5:]) < sum(losses[:5]) / 2
     _, logged = policy.train().forward(batch)
     assert logged[f"memory_{memory}_loss"] < 0.1
     policy.save_pretrained(tmp_path / "saved")
@@ -221,5 +225,5 @@ def test_it_learns_from_a_dataset_and_its_texts_lie_in_the_checkpoint(memory: st
     policy.average = None  # the trained weights, not their average
     chunks = policy.predict_action_chunk(batch)
     assert torch.equal(policy.model.fusion.said, batch[SUBGOAL])
-    unlabelled = {key: value for key, value in batch.items() if key not in (SUBGOAL, SUBGOALS)}
-    assert torch.equal(policy.predict_action_chunk(unlabelled), chunks)
+    wrong = {SUBGOAL: (batch[SUBGOAL] + 1) % 2, SUBGOALS: (batch[SUBGOALS] + 1) % 2}
+    assert torch.equal(policy.predict_action_chunk(batch | wrong), chunks), "what is true is not asked"

@@ -268,7 +268,7 @@ class MemobenchMemConfig(PI05Config):
     memory_camera: str | None = None
     """Camera whose pictures are remembered; none: the first of the policy's."""
     memory_frames: int = MEMORY_FRAMES
-    """Frames of the history that a chunk reads at most, with ``memory=frames``."""
+    """Frames of the history that a chunk reads at most, with ``memory=frames`` or ``subgoal``."""
     tokens_per_frame: int = FROM_SIZE
     """Memory tokens of a remembered frame: 16 of a picture; 2, or another number, of objects."""
     memory_stride: int = FROM_SIZE
@@ -404,9 +404,9 @@ class MemobenchMemConfig(PI05Config):
                 f"--policy.memory={self.memory} cannot be read by memory_fusion={self.memory_fusion}; leave it out, or "
                 f"pass {fitting}; policy.memory=none is the baseline without a memory."
             )
-        if self.memory != "frames" and self.memory_frames != MEMORY_FRAMES:
+        if self.memory_frames != MEMORY_FRAMES and not issubclass(mechanism, find_mechanism("frames")):
             raise MemobenchError(
-                f"--policy.memory_frames={self.memory_frames} is for memory=frames, and does nothing with "
+                f"--policy.memory_frames={self.memory_frames} is for memory=frames or subgoal, and does nothing with "
                 f"memory={self.memory}; leave it out, and see policy.memory_settings."
             )
         self.memory_settings = asdict(read_settings(self.memory, self.memory_settings))

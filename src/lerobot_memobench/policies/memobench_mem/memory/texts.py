@@ -14,6 +14,8 @@ class CheckpointTexts(nn.Module):
     Texts share the words that they have in common. Each ends with one token that all have.
     """
 
+    rows: Tensor
+
     def __init__(self, texts: Sequence[str], width: int) -> None:
         super().__init__()
         spelled = [text.lower().split() for text in (*texts, "")]
@@ -26,7 +28,7 @@ class CheckpointTexts(nn.Module):
 
     def forward(self, numbers: Tensor) -> tuple[Tensor, Tensor]:
         """Return tokens (B, n, d) of texts by their numbers (B,), -1 being the empty one, and which are real (B, n)."""
-        rows: Tensor = self.rows[numbers]
+        rows = self.rows[numbers]
         return self.embedding(rows.clamp(min=0)), rows >= 0
 
 
