@@ -6,6 +6,7 @@ the tokens of that text follow the prefix, attend to all of it, and are all that
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
@@ -17,11 +18,13 @@ from torch import Tensor, nn
 
 from lerobot_memobench.policies.memobench_mem.fusion import MemoryFusion, Prefix
 from lerobot_memobench.policies.memobench_mem.memory.frames import Frames
-from lerobot_memobench.policies.memobench_mem.memory.mechanism import Histories, MemoryTokens, Query
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, Histories, MemoryTokens, Query
 from lerobot_memobench.policies.memobench_mem.memory.texts import CheckpointTexts, scored
 
 if TYPE_CHECKING:
     from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
+
+SCORES = "memory.scores"
 
 
 class SubgoalChoice(nn.Module):
@@ -142,12 +145,9 @@ class NarrowChannel(MemoryFusion):
         asked = states[:, self._unread - 1 if self._length else -1]
         self._scores = scored(added.score(asked.to(added.score.weight.dtype)), memory.query.choices)
 
-    def losses(self) -> dict[str, Tensor]:
-        """Return how far from the true text the choice was."""
-        query = None if self.memory is None else self.memory.query
-        if self._scores is None or query is None or query.subgoal is None:
-            return {}
-        return {"subgoal": F.cross_entropy(self._scores, query.subgoal, ignore_index=-1, reduction="none")}
+    def outputs(self) -> dict[str, Tensor]:
+        """Return the scores (B, S + 1) of the texts."""
+        return {} if self._scores is None else {SCORES: self._scores}
 
 
 class Subgoal(Frames):
@@ -171,3 +171,10 @@ class Subgoal(Frames):
     def replay(self, histories: Histories, query: Query | None = None) -> MemoryTokens:
         """Read the frames, and keep what may be said and what is true."""
         return super().replay(histories, query)._replace(query=query)
+
+    def losses(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return how far from the true text the choice was; 0 where there is none."""
+        if SCORES not in batch:  # no pass was made
+            return {}
+        true = batch[SUBGOAL].to(batch[SCORES].device)
+        return {"subgoal": F.cross_entropy(batch[SCORES], true, ignore_index=-1, reduction="none")}
