@@ -163,6 +163,17 @@ def test_both_paths_are_the_same(model: MemoryPI05) -> None:
     assert passed(model, inputs_of(model), actions).max() < 1e-8
 
 
+def test_it_tells_how_much_the_text_attends_to_each_token_of_memory(model: MemoryPI05) -> None:
+    remember(model)
+    with channel_of(model).watched() as layers:
+        planned(model, inputs_of(model))
+    assert len(layers) == model.config.dimensions.vlm.depth
+    shares = torch.stack(layers)
+    assert shares.shape[1:] == channel_of(model).memory.mask.shape  # type: ignore[union-attr]
+    assert (shares.sum(dim=-1) < 1).all()
+    assert torch.equal(shares > 0, channel_of(model).memory.mask.expand_as(shares))  # type: ignore[union-attr]
+
+
 def test_it_says_one_of_its_tasks_texts_and_is_not_told_which(model: MemoryPI05) -> None:
     channel, inputs, scores = channel_of(model), inputs_of(model), []
     for subgoal in ([0, 2], [1, 1], [-1, -1]):

@@ -6,7 +6,8 @@ the tokens of that text follow the prefix, attend to all of it, and are all that
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
@@ -16,7 +17,7 @@ from lerobot.policies.common.vla_utils import make_att_2d_masks, prepare_attenti
 from lerobot.utils.constants import OPENPI_ATTENTION_MASK_VALUE
 from torch import Tensor, nn
 
-from lerobot_memobench.policies.memobench_mem.fusion import MemoryFusion, Prefix
+from lerobot_memobench.policies.memobench_mem.fusion import MemoryFusion, Prefix, hooked
 from lerobot_memobench.policies.memobench_mem.memory.frames import Frames
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, Histories, MemoryTokens, Query
 from lerobot_memobench.policies.memobench_mem.memory.texts import CheckpointTexts, scored
@@ -64,6 +65,7 @@ class NarrowChannel(MemoryFusion):
     """
 
     attends_fused = True
+    tells_reads = True
 
     def __init__(self, model: MemoryPI05, memory_dim: int, expert_dim: int) -> None:
         self.model = model
@@ -144,6 +146,22 @@ class NarrowChannel(MemoryFusion):
         assert memory.query.choices is not None
         asked = states[:, self._unread - 1 if self._length else -1]
         self._scores = scored(added.score(asked.to(added.score.weight.dtype)), memory.query.choices)
+
+    @contextmanager
+    def watched(self) -> Iterator[list[Tensor]]:
+        """Yield how much the text said attends to each of the memory's tokens: a share of all that it attends to."""
+        found: list[Tensor] = []
+
+        def note(attention: Any, inputs: Any, outputs: tuple[Tensor, Tensor]) -> None:
+            assert self.memory is not None
+            weights, length = outputs[1], self.memory.mask.shape[1]  # (B, heads, N, N)
+            if weights.shape[2] == self._length:  # and not the pass that chooses
+                words = weights[:, :, self._unread : self._length - self._copies_state]
+                found.append(words[..., self._unread - 1 - length : self._unread - 1].mean(dim=(1, 2)))
+
+        layers = self.model.paligemma_with_expert.paligemma.model.language_model.layers
+        with hooked([layer.self_attn for layer in layers], note):
+            yield found
 
     def outputs(self) -> dict[str, Tensor]:
         """Return the scores (B, S + 1) of the texts."""
