@@ -24,15 +24,10 @@ def made(**changed: Any) -> Bank:
     return Bank(spec, torch.nn.Identity(), read_settings("bank", {"length": LENGTH, **changed})).eval()
 
 
-def words_of(rows: int = 1) -> Query:
-    real = torch.tensor([True, True, False, True]).expand(rows, -1)
-    return Query(words=torch.randn(rows, 4, D), real=real)
-
-
-def written(bank: Bank, frames: Tensor, query: Query, stride: int = STRIDE) -> Any:
+def written(bank: Bank, frames: Tensor, stride: int = STRIDE) -> Any:
     state = bank.init(1)
     for number, frame in enumerate(frames.split(1)):
-        state = bank.write(state, frame, torch.tensor([number * stride]), query)
+        state = bank.write(state, frame, torch.tensor([number * stride]))
     return state
 
 
@@ -76,17 +71,12 @@ def merged(entries: list[tuple[float, Tensor]]) -> list[tuple[float, Tensor]]:
     return entries
 
 
-def literal(bank: Bank, frames: Tensor, present: Tensor, query: Query) -> tuple[Tensor, dict[str, list[float]]]:
+def literal(bank: Bank, frames: Tensor, present: Tensor) -> tuple[Tensor, dict[str, list[float]]]:
     """Return the memory tokens of a present (P, D) after frames (T, P, D), and the entries' steps."""
-    assert query.words is not None
-    assert query.real is not None
-    words = rms_norm(query.words[0][query.real[0]], (D,), eps=1e-6)
 
     def of(tokens: Tensor) -> dict[str, Tensor]:
         tokens = rms_norm(tokens, (D,), eps=1e-6)
-        seen = torch.cat([tokens, words])
-        summary = attend(bank.summary, words.mean(dim=0, keepdim=True), seen, seen)
-        return {"perceptual": bank.reduce(tokens), "cognitive": summary}
+        return {"perceptual": bank.reduce(tokens), "cognitive": attend(bank.summary, bank.asking[0], tokens, tokens)}
 
     entries: dict[str, list[tuple[float, Tensor]]] = {"perceptual": [], "cognitive": []}
     for number, frame in enumerate(frames):
@@ -99,12 +89,12 @@ def literal(bank: Bank, frames: Tensor, present: Tensor, query: Query) -> tuple[
 
 @pytest.mark.parametrize("count", [1, 2, LENGTH, FRAMES])
 def test_it_is_its_formula(count: int) -> None:
-    bank, query = made(), words_of()
+    bank = made()
     frames, present = torch.randn(count, P, D), torch.randn(1, P, D)
     with torch.no_grad():
-        state = written(bank, frames, query)
-        found = bank.read(state, query._replace(tokens=present)).rows()[0]
-        expected, steps = literal(bank, frames, present[0], query)
+        state = written(bank, frames)
+        found = bank.read(state, Query(present)).rows()[0]
+        expected, steps = literal(bank, frames, present[0])
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
     kept = min(count, LENGTH)
     assert {name: state[f"{name}_steps"][0, :kept].tolist() for name in steps} == steps
@@ -113,7 +103,7 @@ def test_it_is_its_formula(count: int) -> None:
 
 def test_streams_merge_apart() -> None:
     with torch.no_grad():
-        state = written(made(), torch.randn(FRAMES, P, D), words_of())
+        state = written(made(), torch.randn(FRAMES, P, D))
     assert not torch.equal(state["perceptual_steps"], state["cognitive_steps"])
 
 
@@ -146,7 +136,7 @@ def test_training_merges_as_a_rollout_does_by_exact_products(monkeypatch: pytest
         return write(*args)
 
     monkeypatch.setattr(bank, "write", noted)
-    frames, query = torch.randn(5, P, D), words_of()._replace(tokens=torch.randn(1, P, D))
+    frames, query = torch.randn(5, P, D), Query(torch.randn(1, P, D))
     products.fp32_precision = "bf16"
     try:
         bank.replay(Histories(frames, torch.arange(5) * STRIDE, torch.arange(5)[None]), query)
@@ -158,10 +148,10 @@ def test_training_merges_as_a_rollout_does_by_exact_products(monkeypatch: pytest
 
 @pytest.mark.parametrize("time_codes", [True, False])
 def test_time_is_told_by_its_codes_alone(time_codes: bool) -> None:
-    bank, query, frames = made(time_codes=time_codes), words_of(), torch.randn(LENGTH, P, D)
-    asking = query._replace(tokens=torch.randn(1, P, D))
+    bank, frames = made(time_codes=time_codes), torch.randn(LENGTH, P, D)
+    asking = Query(torch.randn(1, P, D))
     with torch.no_grad():
-        soon, late = (bank.read(written(bank, frames, query, stride), asking).rows() for stride in (8, 9))
+        soon, late = (bank.read(written(bank, frames, stride), asking).rows() for stride in (8, 9))
     assert torch.equal(soon, late) != time_codes
 
 
@@ -170,10 +160,10 @@ def test_time_is_told_by_its_codes_alone(time_codes: bool) -> None:
 
 @pytest.mark.parametrize("count", [2, FRAMES])
 def test_tokens_say_of_which_entries_they_are(count: int) -> None:
-    bank, query = made(), words_of()
+    bank = made()
     with torch.no_grad():
-        state = written(bank, torch.randn(count, P, D), query)
-        found = bank.read(state, query._replace(tokens=torch.randn(1, P, D)))
+        state = written(bank, torch.randn(count, P, D))
+        found = bank.read(state, Query(torch.randn(1, P, D)))
     assert found.sources is not None
     shares, steps = found.sources
     assert shares.shape == (1, P + 1, 2 * LENGTH)

@@ -6,7 +6,8 @@ there are too many, the two most similar neighbours become one. An action chunk 
 way.
 
 What differs: the cognitive token of the source is the language model's last prompt state, which would be a pass of the
-whole backbone for each frame; here one layer lets the mean word look at the frame's tokens and the words. The
+whole backbone for each frame; here one layer makes it, in which a learned token looks at the frame's tokens. It reads
+no words: where the prompt spells the robot's state, a training batch has those of its samples' frames alone. The
 perceptual stream's squeeze-excite bottleneck is a Linear to the same 256 channels, behind the policy's own pooling. The
 fused tokens are memory tokens, read as the policy's ``memory_fusion`` says, where the source has a diffusion
 transformer with a condition and a cross-attention of its own. Frames are written at a stride, not where chunks begin,
@@ -64,27 +65,23 @@ class Bank(MemoryMechanism):
     stride = 24
     capacity = 16
     asks_present = True
-    asks_words = True
 
     def __init__(self, spec: MemorySpec, pool: nn.Module, settings: BankSettings) -> None:
         super().__init__(spec, pool, settings)
         self.capacity = settings.length
         widths = {"perceptual": min(PERCEPTUAL_WIDTH, spec.dim), "cognitive": spec.dim}
         self.reduce = nn.Linear(spec.dim, widths["perceptual"])
+        self.asking = nn.Parameter(torch.randn(1, 1, spec.dim))
         self.summary = Lookup(spec.dim)
         self.streams = nn.ModuleDict({name: Stream(width, settings.time_codes) for name, width in widths.items()})
         self.out = nn.ModuleDict({name: nn.Linear(width, spec.width) for name, width in widths.items()})
 
-    def _present(self, tokens: Tensor, query: Query | None) -> dict[str, Tensor]:
-        """Return the present of each stream (R, N, d), of a frame's tokens (R, P, D) and the words."""
-        assert query is not None
-        assert query.words is not None
-        assert query.real is not None
-        tokens, words = (F.rms_norm(of.float(), of.shape[-1:], eps=1e-6) for of in (tokens, query.words))
-        weights = query.real.unsqueeze(-1).float()
-        mean = (words * weights).sum(dim=1, keepdim=True) / weights.sum(dim=1, keepdim=True).clamp(min=1)
-        both, hidden = torch.cat([tokens, words], dim=1), F.pad(~query.real, (tokens.shape[1], 0), value=False)
-        return {"perceptual": self.reduce(tokens), "cognitive": self.summary(mean, both, both, hidden)[0]}
+    def _present(self, tokens: Tensor) -> dict[str, Tensor]:
+        """Return the present of each stream (R, N, d), of a frame's tokens (R, P, D)."""
+        tokens = F.rms_norm(tokens.float(), tokens.shape[-1:], eps=1e-6)
+        hidden = torch.zeros(tokens.shape[:2], dtype=torch.bool, device=tokens.device)
+        summary, _ = self.summary(self.asking.expand(len(tokens), -1, -1), tokens, tokens, hidden)
+        return {"perceptual": self.reduce(tokens), "cognitive": summary}
 
     def init(self, rows: int) -> State:
         """Return empty banks."""
@@ -98,7 +95,7 @@ class Bank(MemoryMechanism):
         """Fuse the frame with what it finds, and make an entry of it."""
         count = state["count"]
         made = {"count": (count + 1).clamp(max=self.capacity)}
-        for name, present in self._present(tokens, query).items():
+        for name, present in self._present(tokens).items():
             entries, steps = state[name], state[f"{name}_steps"]
             fused, _ = self.streams[name](present, entries, steps, count, step)
             made[name], made[f"{name}_steps"] = append(entries, steps, count, fused.detach().float(), step)
@@ -111,7 +108,7 @@ class Bank(MemoryMechanism):
         count, read, shares, steps = state["count"], [], [], []
         now = torch.zeros_like(count)  # of an empty bank alone, which no chunk reads: an episode's first frame is there
         real = torch.arange(self.capacity, device=count.device) < count[:, None]
-        for name, present in self._present(query.tokens, query).items():
+        for name, present in self._present(query.tokens).items():
             fused, looked = self.streams[name](present, state[name], state[f"{name}_steps"], count, now)
             read.append(self.out[name](fused))
             shares.append(shares_of(looked, present.shape[1]))
