@@ -154,10 +154,13 @@ class NarrowChannel(MemoryFusion):
 
         def note(attention: Any, inputs: Any, outputs: tuple[Tensor, Tensor]) -> None:
             assert self.memory is not None
+            assert self.said is not None
             weights, length = outputs[1], self.memory.mask.shape[1]  # (B, heads, N, N)
             if weights.shape[2] == self._length:  # and not the pass that chooses
-                words = weights[:, :, self._unread : self._length - self._copies_state]
-                found.append(words[..., self._unread - 1 - length : self._unread - 1].mean(dim=(1, 2)))
+                _, real = cast(SubgoalChoice, self.model.subgoal).texts(self.said)
+                read = weights[:, :, self._unread :, self._unread - 1 - length : self._unread - 1].mean(dim=1)
+                words = read[:, : real.shape[1]] * real.unsqueeze(-1)
+                found.append(words.sum(dim=1) / real.sum(dim=1, keepdim=True))
 
         layers = self.model.paligemma_with_expert.paligemma.model.language_model.layers
         with hooked([layer.self_attn for layer in layers], note):
