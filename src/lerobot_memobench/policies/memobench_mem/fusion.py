@@ -117,7 +117,7 @@ class RMSNorm(nn.Module):
         return x * torch.rsqrt(x.square().mean(dim=-1, keepdim=True) + self.eps) * (1.0 + self.weight)
 
 
-def _rotate(x: Tensor, positions: Tensor) -> Tensor:
+def rotate(x: Tensor, positions: Tensor) -> Tensor:
     """Rotary position embedding of x (B, heads, N, d) at positions (N,), halves paired as in Gemma."""
     half = x.shape[-1] // 2
     frequencies = _ROPE_BASE ** -(torch.arange(half, dtype=torch.float32, device=x.device) / half)
@@ -151,7 +151,7 @@ class MemoryModulator(nn.Module):
         """Rotated keys and values, both (B, 1, L, head_dim), of memory of width W."""
         normed = memory.through(self.memory_norm)
         key, value = (rearrange(normed.through(linear).rows(), "b l d -> b 1 l d") for linear in (self.key, self.value))
-        return _rotate(key, torch.arange(key.shape[2], device=key.device)), value
+        return rotate(key, torch.arange(key.shape[2], device=key.device)), value
 
     def forward(
         self, actions: Tensor, memory: MemoryTokens, keys: tuple[Tensor, Tensor] | None = None
@@ -179,7 +179,7 @@ class MemoryModulator(nn.Module):
         """Return the rotated queries of actions (B, heads, T, head_dim), and what is added to their scores (B, L)."""
         count, length = actions.shape[1], mask.shape[1]
         query = rearrange(self.query(self.action_norm(actions)), "b t (h d) -> b h t d", h=self.heads)
-        query = _rotate(query, torch.arange(length, length + count, device=actions.device))
+        query = rotate(query, torch.arange(length, length + count, device=actions.device))
         # A finite bias keeps the softmax of an all-masked row finite; its result is then set to zero.
         bias = torch.zeros_like(mask, dtype=query.dtype).masked_fill(~mask, torch.finfo(query.dtype).min / 2)
         return query, bias

@@ -17,7 +17,14 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryMech
 
 GROUP = "lerobot_memobench.memories"
 NONE = "none"
-OURS = {"frames": "Frames", "bank": "Bank", "motion": "Motion", "subgoal": "Subgoal"}
+OURS = {
+    "frames": "Frames",
+    "bank": "Bank",
+    "motion": "Motion",
+    "subgoal": "Subgoal",
+    "recurrent": "Recurrent",
+    "fast_weights": "FastWeights",
+}
 """Name, which is the module's too -> class."""
 
 

@@ -1,0 +1,123 @@
+"""Recurrence: a fixed number of slots reads each remembered frame and is all that is kept (RoboMME's RMT)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from einops import rearrange, repeat
+from torch import Tensor, nn
+
+from lerobot_memobench.policies.memobench_mem.fusion import rotate
+from lerobot_memobench.policies.memobench_mem.memory.frames import MemoryEncoder
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
+    MemoryMechanism,
+    MemorySpec,
+    MemoryTokens,
+    Query,
+    State,
+)
+
+HIDDEN = 512
+"""Width of a recurrence at most, as in the source."""
+HEADS = 8
+SLOTS_OF_WIDTH = 4
+"""Slots: the width of memory tokens divided by this; 512 at size pi05, as in the source, and 32 at small."""
+
+
+@dataclass
+class RecurrenceSettings:
+    """Settings of a recurrence.
+
+    Attributes:
+        time_codes: whether a frame is written with its control step.
+        gradient_frames: through how many of the last frames gradients pass.
+    """
+
+    time_codes: bool = True
+    gradient_frames: int = 16
+
+    def __post_init__(self) -> None:
+        if self.gradient_frames < 1:
+            raise ValueError(f"gradient_frames={self.gradient_frames} must be at least 1: nothing would be learned")
+
+
+@dataclass
+class RecurrentSettings(RecurrenceSettings):
+    """Settings of `Recurrent`.
+
+    Attributes:
+        slots: their number; None: a quarter of the width of memory tokens.
+    """
+
+    slots: int | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.slots is not None and self.slots < 1:
+            raise ValueError(f"slots={self.slots} must be at least 1")
+
+
+class Recurrent(MemoryMechanism):
+    """RMT of RoboMME's pi0.5: slots attend to the frame and to themselves, and are normed behind the residual.
+
+    For a frame X and slots S: Z = LN_pre([X; S]), O = softmax attention of the slots' rows of Z to all of Z, with rotary
+    positions along [X; S] and one key-value head, S <- LN_post(O W_o + S). One layer, no feed-forward.
+
+    Unlike the source, slots are carried over from one remembered frame to the next; there they are computed anew at
+    each chunk from the last 64. Gradients pass through the last ``gradient_frames``; there through all 64. A frame has
+    this policy's tokens (2 of objects, 16 of a picture; there 64).
+    """
+
+    Settings = RecurrentSettings
+    stride = 16
+    capacity = 1  # the slots, however long the episode is
+
+    def __init__(self, spec: MemorySpec, pool: nn.Module, settings: RecurrentSettings) -> None:
+        super().__init__(spec, pool, settings)
+        width, count = min(HIDDEN, spec.width), settings.slots or spec.width // SLOTS_OF_WIDTH
+        self.gradient_frames = settings.gradient_frames
+        self.encoder = MemoryEncoder(spec.dim, width, spec.grid)
+        self.initial = nn.Parameter(nn.init.normal_(torch.empty(count, width), std=width**-0.5))
+        self.pre_norm, self.post_norm = nn.LayerNorm(width, eps=1e-6), nn.LayerNorm(width, eps=1e-6)
+        self.query, self.key_value = projection(width, width), projection(width, 2 * width // HEADS)
+        self.attended = projection(width, width, std=0.005)
+        self.out = nn.Linear(width, spec.width)
+
+    def init(self, rows: int) -> State:
+        """Return the learned initial slots of each row."""
+        return {"slots": repeat(self.initial, "s d -> r s d", r=rows)}
+
+    def write(self, state: State, tokens: Tensor, step: Tensor, query: Query | None = None) -> State:
+        """Let the slots read the frame and themselves."""
+        slots: Tensor = state["slots"]
+        frame = encoded(self.encoder, tokens, step, self.settings.time_codes)
+        count, length = slots.shape[1], frame.shape[1] + slots.shape[1]
+        both = self.pre_norm(torch.cat([frame, slots], dim=1))
+        place = torch.arange(length, device=both.device)
+        key, value = self.key_value(both).chunk(2, dim=-1)
+        asked = rearrange(self.query(both[:, -count:]), "r s (h d) -> r h s d", h=HEADS)
+        # All heads share the keys, so they are one head with more rows. Without a mask this is quicker than torch's.
+        asked = rotate(asked, place[-count:]).flatten(1, 2) * key.shape[-1] ** -0.5
+        weights = (asked @ rotate(key, place).mT).softmax(dim=-1)
+        read = rearrange(weights @ value, "r (h s) d -> r s (h d)", h=HEADS)
+        return {"slots": self.post_norm(self.attended(read) + slots)}
+
+    def read(self, state: State, query: Query | None = None) -> MemoryTokens:
+        """Return every slot at the width of memory tokens; none is of a single frame."""
+        each: Tensor = self.out(state["slots"])
+        return MemoryTokens(each, torch.ones(each.shape[:2], dtype=torch.bool, device=each.device))
+
+
+def projection(inputs: int, outputs: int, std: float = 0.02) -> nn.Linear:
+    """Return a linear layer without a bias, its weights drawn from N(0, std^2)."""
+    made = nn.Linear(inputs, outputs, bias=False)
+    nn.init.normal_(made.weight, std=std)
+    return made
+
+
+def encoded(encoder: MemoryEncoder, tokens: Tensor, step: Tensor, time_codes: bool) -> Tensor:
+    """Return a frame's tokens (R, P, D) with their places, and its control step (R,) or none: (R, P, d)."""
+    steps = step if time_codes else torch.zeros_like(step)
+    made: Tensor = encoder(tokens.unsqueeze(1), steps.unsqueeze(1)).squeeze(1)
+    return made
