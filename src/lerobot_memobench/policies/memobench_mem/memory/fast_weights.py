@@ -94,9 +94,7 @@ class FastWeights(MemoryMechanism):
             "steps": torch.cat([state["steps"][:, 1:], step.unsqueeze(1)], dim=1),
         }
 
-    def _learned(
-        self, weight: Tensor, bias: Tensor, key: Tensor, value: Tensor, rate: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def _learned(self, weight: Tensor, bias: Tensor, key: Tensor, value: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:
         """Return the weights (R, H, d, d) and biases (R, H, 1, d) after one step.
 
         Its gradients are written out, so that it goes without autograd, and gradients of training pass through it.

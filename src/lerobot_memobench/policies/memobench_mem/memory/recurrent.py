@@ -61,8 +61,8 @@ class RecurrentSettings(RecurrenceSettings):
 class Recurrent(MemoryMechanism):
     """RMT of RoboMME's pi0.5: slots attend to the frame and to themselves, and are normed behind the residual.
 
-    For a frame X and slots S: Z = LN_pre([X; S]), O = softmax attention of the slots' rows of Z to all of Z, with rotary
-    positions along [X; S] and one key-value head, S <- LN_post(O W_o + S). One layer, no feed-forward.
+    For a frame X and slots S: Z = LN_pre([X; S]); O is softmax attention of the slots' rows of Z to all of Z, with
+    rotary positions along [X; S] and one key-value head; S <- LN_post(O W_o + S). One layer, no feed-forward.
 
     Unlike the source, slots are carried over from one remembered frame to the next; there they are computed anew at
     each chunk from the last 64. Gradients pass through the last ``gradient_frames``; there through all 64. A frame has
