@@ -154,9 +154,9 @@ class NarrowChannel(MemoryFusion):
 
         def note(attention: Any, inputs: Any, outputs: tuple[Tensor, Tensor]) -> None:
             assert self.memory is not None
-            assert self.said is not None
             weights, length = outputs[1], self.memory.mask.shape[1]  # (B, heads, N, N)
             if weights.shape[2] == self._length:  # and not the pass that chooses
+                assert self.said is not None
                 _, real = cast(SubgoalChoice, self.model.subgoal).texts(self.said)
                 read = weights[:, :, self._unread :, self._unread - 1 - length : self._unread - 1].mean(dim=1)
                 words = read[:, : real.shape[1]] * real.unsqueeze(-1)
