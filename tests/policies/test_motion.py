@@ -211,7 +211,7 @@ def test_the_loss_is_of_the_motions_that_follow_and_are_known() -> None:
     foreseen = torch.randn(3, FORESIGHT, memory.field.cells, MOVED)
     (loss,) = memory.losses({"memory.foreseen": foreseen.flatten(2)}).values()
     truth = torch.zeros(2, FORESIGHT, 2, MOVED)  # of the cup, and of the hand, which stands still
-    truth[0, :, 0, 0], truth[1, 0, 0, 0] = 0.1 * (2 * torch.arange(2, 10) + 1), 2.1
+    truth[0, :, 0, 0], truth[1, 0, 0, 0] = 0.001 * PER_STEP * (2 * torch.arange(2, 10) + 1), 0.021 * PER_STEP
     errors = (foreseen[[0, 2]][:, :, [0, -1]] - truth).abs()
     expected = [errors[0].mean(), 0, errors[1, 0].mean()]
     torch.testing.assert_close(loss, FORESIGHT_WEIGHT * torch.tensor(expected))

@@ -71,7 +71,8 @@ BLOCKS = 16
 """Side of the square of blocks."""
 BLOCK = THUMBNAIL // BLOCKS
 REACH = 4
-"""How far a block may have moved in each direction, pixels of the thumbnail: a sixteenth of the picture."""
+"""How far a block may have moved in each direction, pixels of the thumbnail. In demonstrations of two tasks 3 % of the
+blocks that moved reached it in four steps, and 27 % in eight; in one step most moved by less than a pixel."""
 STILL = 2.0
 """Mean difference of a block's pixels, of 255, up to which it stands still, as a codec skips it: what compression of
 videos changes."""
@@ -105,7 +106,7 @@ def match_blocks(before: Tensor, now: Tensor) -> Tensor:
 
 
 class PictureMotion(MotionField):
-    """Motion of a thumbnail's blocks, as a share of `REACH`, and two convolutions over time and place (HiF-VLA's)."""
+    """Motion of a thumbnail's blocks, in its pixels, and two convolutions over time and place (HiF-VLA's)."""
 
     size, cells, numbers, moved = THUMBNAIL**2, BLOCKS**2, 2, 2
 
@@ -124,10 +125,8 @@ class PictureMotion(MotionField):
 
     def between(self, before: Tensor, now: Tensor) -> Tensor:
         """Match the blocks of thumbnails."""
-        pictures = (
-            frames.to(torch.float32).unflatten(-1, (THUMBNAIL, THUMBNAIL)).squeeze(1) for frames in (before, now)
-        )
-        return match_blocks(*pictures).flatten(1, 2) / REACH
+        earlier, later = (frames.to(torch.float32).view(-1, THUMBNAIL, THUMBNAIL) for frames in (before, now))
+        return match_blocks(earlier, later).flatten(1, 2)
 
     def following(self, frames: Tensor) -> tuple[Tensor, Tensor]:
         """Match each frame's blocks with those of the one before it; all are known."""
@@ -146,8 +145,8 @@ class PictureMotion(MotionField):
 
 SAME = 0.15
 """How far a thing may have moved from one frame to the next, m; beyond it another one is in its place."""
-PER_STEP = 100.0
-"""What brings displacements (m) and changes of joints (m or rad) of a frame to about one."""
+PER_STEP = 200.0
+"""What brings displacements (m) and changes of joints (m or rad) in a control step to about one."""
 MOVED = 4
 """Displacement (3) and change of the joint (1)."""
 
