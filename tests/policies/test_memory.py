@@ -168,7 +168,8 @@ def test_gradients_reach_every_weight(name: str) -> None:
         row[: len(read)] = read
     labels = torch.randint(0, len(SUBGOALS), (40,))
     query = asked(2)._replace(choices=torch.ones(2, len(SUBGOALS), dtype=torch.bool), subgoal=labels[:2])
-    query = query._replace(tokens=mechanism.pool(torch.randn(2, 1, 6)))  # the present comes through the pool, too
+    if mechanism.asks_present:  # it comes through the pool, too
+        query = query._replace(tokens=mechanism.pool(torch.randn(2, 1, 6)))
     read_tokens = mechanism.replay(Histories(stored, torch.arange(40) * 8, places, labels), query)
     own = mechanism.losses({})
     loss = (read_tokens.rows() * torch.randn_like(read_tokens.rows())).sum() + sum(one.sum() for one in own.values())
