@@ -11,6 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
+from transformers.initialization import no_init_weights
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MEMORY_FUSIONS, MemobenchMemConfig
@@ -120,6 +121,15 @@ def test_training_reads_what_a_rollout_reads(name: str) -> None:
     same(together, joined)
     for row, alone in enumerate(apart):
         same(joined._replace(each=joined.rows()[[row]], mask=joined.mask[[row]], places=None, steps=None), alone)
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_a_checkpoint_fits_a_mechanism_whose_weights_were_not_drawn(name: str) -> None:
+    """As a checkpoint is loaded: `no_init_weights` makes torch's initialisers do nothing, and return nothing."""
+    drawn = made(name)
+    with no_init_weights():
+        empty = made(name, seed=1)
+    empty.load_state_dict(drawn.state_dict())
 
 
 @pytest.mark.parametrize("name", OURS)

@@ -53,7 +53,8 @@ class FastWeights(MemoryMechanism):
         self.rate = nn.Linear(self.width, HEADS)
         nn.init.normal_(self.rate.weight, std=0.02)
         nn.init.constant_(self.rate.bias, math.log(math.expm1(BASE_RATE)))  # of which softplus is the base rate
-        self.weight = nn.Parameter(nn.init.normal_(torch.empty(HEADS, of_head, of_head), std=of_head**-0.5))
+        self.weight = nn.Parameter(torch.empty(HEADS, of_head, of_head))
+        nn.init.normal_(self.weight, std=of_head**-0.5)
         self.bias = nn.Parameter(torch.zeros(HEADS, 1, of_head))
         self.scale, self.shift = (nn.Parameter(torch.zeros(HEADS, 1, of_head)) for _ in range(2))
         self.post_norm = nn.LayerNorm(self.width, eps=1e-6)

@@ -78,7 +78,8 @@ class Recurrent(MemoryMechanism):
         width, count = min(HIDDEN, spec.width), settings.slots or spec.width // SLOTS_OF_WIDTH
         self.gradient_frames = settings.gradient_frames
         self.encoder = MemoryEncoder(spec.dim, width, spec.grid)
-        self.initial = nn.Parameter(nn.init.normal_(torch.empty(count, width), std=width**-0.5))
+        self.initial = nn.Parameter(torch.empty(count, width))
+        nn.init.normal_(self.initial, std=width**-0.5)
         self.pre_norm, self.post_norm = nn.LayerNorm(width, eps=1e-6), nn.LayerNorm(width, eps=1e-6)
         self.query, self.key_value = projection(width, width), projection(width, 2 * width // HEADS)
         self.attended = projection(width, width, std=0.005)
