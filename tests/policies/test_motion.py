@@ -267,6 +267,25 @@ def test_queries_stand_before_the_actions(trained: tuple[Any, dict[str, Any]]) -
     assert torch.equal(tokens[1, :FORESIGHT], model.foresight.queries)
 
 
+def test_adapters_leave_it_whole(trained: tuple[Any, dict[str, Any]]) -> None:
+    assert {"model.memory", "model.foresight"} <= set(trained[0].trained_whole())
+
+
+def test_gradients_are_the_same_where_layers_are_run_again(trained: tuple[Any, dict[str, Any]]) -> None:
+    """Gradient checkpointing passes the queries' states a second time."""
+    policy, batch = trained
+    found = []
+    for begin in (policy.model.gradient_checkpointing_disable, policy.model.gradient_checkpointing_enable):
+        begin()
+        policy.train().zero_grad()
+        torch.manual_seed(0)
+        policy.forward(batch)[0].backward()
+        found.append(policy.model.foresight.queries.grad)
+    policy.model.gradient_checkpointing_disable()
+    assert found[0].any()
+    assert torch.equal(*found)
+
+
 # -- sizes and caches -------------------------------------------------------------------------------------------------
 
 
