@@ -93,8 +93,8 @@ class Actor:
 
     def bytes_per_frame(self) -> float:
         """Bytes one remembered frame takes, as held."""
-        kept = self.policy.rollout.rows[0].kept
-        return sum(frame.tokens.nbytes for frame in kept) / len(kept)
+        (kept,) = self.policy.rollout.rows[0].memory
+        return sum(frame.stored.nbytes for frame in kept) / len(kept)
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ from lerobot_memobench.envs import episode_log
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation import records
 from lerobot_memobench.evaluation.metrics import Rate
+from lerobot_memobench.policies.memobench_mem.memory import OURS
 from lerobot_memobench.run.arguments import joined, read_arguments, resolve_recipe, split_arguments
 from lerobot_memobench.run.plan import take_run_options
 from lerobot_memobench.run.training import take_training_options
@@ -446,3 +447,9 @@ def test_links_that_leave_the_site_are_turned() -> None:
     assert reference.at_home(text, "research/index.md") == (
         "[the lab](../develop/lab.md), a (`src/x.py`), [b](b.md), `src/x.py`"
     )
+
+
+def test_every_memory_has_its_page_and_its_row() -> None:
+    index = (ROOT / "docs/guides/memories.md").read_text()
+    assert [name for name in OURS if f"| [`{name}`](memory/{name}.md)" not in index] == []
+    assert [name for name in OURS if not (ROOT / f"docs/guides/memory/{name}.md").is_file()] == []
