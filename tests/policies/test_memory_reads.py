@@ -10,12 +10,14 @@ import torch
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.fusion import MemoryModulator
+from lerobot_memobench.policies.memobench_mem.memory import OURS
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryTokens
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.reads import chunk_reads
 from tests.support.object_dataset import make_object_dataset
 from tests.support.small_policy import made_for_training, small_config
 
+REFUSED = ("motion",)  # a condition of norms, without attention
 LENGTH = 20
 """Of the dataset's second episode, which begins with a prompt of 8 frames."""
 
@@ -119,16 +121,25 @@ def test_entries_without_a_frame_are_numbered_and_those_of_a_frame_added() -> No
     assert looked_up[1].weights == pytest.approx((0.85, 0.15))
 
 
-def test_a_bank_tells_what_it_retrieved(root: Path) -> None:
-    policy, batches = acting(root, memory="bank", memory_stride=4, memory_frames=32, memory_settings={"length": 2})
+@pytest.mark.parametrize("name", OURS)
+def test_every_memory_tells_what_was_read_or_is_refused(root: Path, name: str) -> None:
+    """Entries are frames of the past, or slots; weights are shares of attention."""
+    frames = 4 if name == "frames" else 32
+    policy, batches = acting(root, memory=name, memory_frames=frames, memory_settings={})
+    if name in REFUSED:
+        with pytest.raises(MemobenchError, match=f"memory={name} does not tell"):
+            policy.watch_memory()
+        return
     policy.watch_memory()
     rolled(policy, batches)
-    (first, second), _ = policy.memory_reads()
-    assert (first.step, second.step) == (8, 14)
-    for read in (first, second):
-        assert sum(read.weights) == pytest.approx(1, abs=1e-4)
-        assert max(read.entries) <= read.step
-        assert 2 <= len(read.entries) <= 4  # two of each stream, which may have merged others
+    for row in policy.memory_reads():
+        assert [read.step for read in row] == [8, 14][: len(row)]
+        for read in row:
+            assert read.entries
+            assert max(read.entries) <= read.step
+            assert min(read.weights) >= 0
+            assert sum(read.weights) <= 1 + 1e-4
+            assert max(read.weights) > 0
 
 
 def test_without_a_memory_nothing_is_watched() -> None:
