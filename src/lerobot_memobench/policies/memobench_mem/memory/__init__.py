@@ -22,6 +22,7 @@ OURS = {
     "bank": "Bank",
     "motion": "Motion",
     "subgoal": "Subgoal",
+    "keyframes": "Keyframes",
     "recurrent": "Recurrent",
     "fast_weights": "FastWeights",
 }

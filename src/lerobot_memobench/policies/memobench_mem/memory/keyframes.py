@@ -1,0 +1,220 @@
+"""Keyframes: a high level says the active checkpoint and nominates frames to keep; the low level acts on what it says.
+
+MemER's two levels. All memory is the high level's: recent frames, and keyframes that it nominated among earlier recent
+ones. The low level, which is the policy, reads the words of the checkpoint that the high level said last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from statistics import median_low
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
+    Histories,
+    MemoryMechanism,
+    MemorySpec,
+    MemoryTokens,
+    Query,
+    State,
+)
+from lerobot_memobench.policies.memobench_mem.memory.texts import CheckpointTexts, scored
+
+RECENT, SHOWN, GAP = 8, 8, 5
+"""Frames of the recent window; keyframes that are shown at most; frames between two nominations of one cluster."""
+NOMINATED = 64
+"""Different nominated frames that are kept, the latest: clusters before the eight that are shown count no more."""
+DROPPED, SHIFTED = 0.1, 2
+"""In training: share of the true keyframes that is left out, and by how many frames the others are moved at most."""
+LAYERS, HEADS = 2, 8
+
+
+def representatives(nominated: Sequence[int], gap: int) -> list[int]:
+    """Return the low median of each cluster of nominated frames, ascending.
+
+    A cluster ends where the next nomination is more than ``gap`` away. A frame counts as often as it was nominated.
+    """
+    clusters: list[list[int]] = []
+    for frame in sorted(nominated):
+        if not clusters or frame - clusters[-1][-1] > gap:
+            clusters.append([])
+        clusters[-1].append(frame)
+    return [median_low(cluster) for cluster in clusters]
+
+
+def shown(nominated: Sequence[int], gap: int, window: int) -> list[int]:
+    """Return the keyframes that are shown: the last representatives, without those of the recent window.
+
+    Args:
+        window: the oldest recent frame.
+    """
+    return [frame for frame in representatives(nominated, gap)[-SHOWN:] if frame < window]
+
+
+class Keyframes(MemoryMechanism):
+    """MemER on this backbone; nominations, clusters and labels are those of its released code.
+
+    A frame is written every 10 control steps (2 Hz), and the high level is asked at each; the recent window spans 4 s.
+    A keyframe's label is the last written frame before a checkpoint is completed. The high level learns from true
+    keyframes, clustered as its own would be, some left out or moved, which the source does not; of the checkpoint it
+    learns the one that is active at the next frame, and the low level acts on the same.
+
+    Otherwise than there: the high level is no VLM but a small transformer of its own over the frames' tokens, from
+    scratch; it chooses among the task's texts, which also tell it the task, and has a logit per recent frame. The low
+    level reads the text beside the instruction, not in its place. 64 nominated frames are kept, not all. Weights are
+    not merged with those of before.
+    """
+
+    stride = 10
+    ahead = 1
+    privileged = True
+    capacity = RECENT + NOMINATED
+
+    def __init__(self, spec: MemorySpec, pool: nn.Module, settings: Any) -> None:
+        super().__init__(spec, pool, settings)
+        width, self.count = spec.width, len(spec.subgoals)
+        self.project = nn.Linear(spec.dim, width)
+        self.place = nn.Parameter(0.02 * torch.randn(SHOWN + RECENT, 1, width))
+        self.spot = nn.Parameter(0.02 * torch.randn(spec.tokens, width))
+        self.ask = nn.Parameter(0.02 * torch.randn(1, 1, width))
+        self.task = nn.Linear(self.count, width)
+        layer = nn.TransformerEncoderLayer(width, HEADS, 4 * width, 0.0, F.gelu, batch_first=True, norm_first=True)
+        self.encoder = nn.TransformerEncoder(layer, LAYERS, nn.LayerNorm(width), enable_nested_tensor=False)
+        self.score = nn.Linear(width, self.count)
+        self.nominate = nn.Linear(width, 1)
+        self.texts = CheckpointTexts(spec.subgoals, width)
+        self._losses: dict[str, Tensor] = {}
+
+    # -- the high level ----------------------------------------------------------------------------------------------
+
+    def ask_high_level(self, frames: Tensor, real: Tensor, choices: Tensor) -> tuple[Tensor, Tensor]:
+        """Return scores (B, S + 1) of the checkpoints, and logits (B, RECENT) of the recent frames' nomination.
+
+        Args:
+            frames: (B, SHOWN + RECENT, P, D) keyframes and recent frames, each the latest last. real: (B, SHOWN +
+                RECENT) which there are. choices: (B, S) which texts are the task's.
+        """
+        tokens = self.project(frames.to(self.project.weight.dtype)) + self.place + self.spot
+        task = self.task(choices.to(tokens.dtype)).unsqueeze(1)
+        sequence = torch.cat([tokens.flatten(1, 2), task, self.ask.expand(len(task), -1, -1)], dim=1)
+        padding = F.pad(~real.repeat_interleave(self.spec.tokens, dim=1), (0, 2))
+        states = self.encoder(sequence, src_key_padding_mask=padding)
+        recent = states[:, SHOWN * self.spec.tokens : -2].unflatten(1, (RECENT, self.spec.tokens)).mean(dim=2)
+        return scored(self.score(states[:, -1]), choices), self.nominate(recent).squeeze(-1)
+
+    # -- a rollout ---------------------------------------------------------------------------------------------------
+
+    def init(self, rows: int) -> State:
+        """Return no frames, and nothing said."""
+        like = self.ask
+        frame = rows, RECENT + NOMINATED, self.spec.tokens, self.spec.dim
+        return {
+            "frames": torch.zeros(frame, device=like.device),
+            "steps": torch.full(frame[:2], -1, device=like.device),
+            "votes": torch.zeros(rows, NOMINATED, dtype=torch.int64, device=like.device),
+            "said": torch.full((rows,), self.count, device=like.device),
+        }
+
+    def write(self, state: State, tokens: Tensor, step: Tensor, query: Query | None = None) -> State:
+        """Keep the frame, ask the high level, and count its nominations."""
+        assert query is not None
+        assert query.choices is not None
+        kept, old = state["frames"][:, :NOMINATED], state["frames"][:, NOMINATED:]
+        kept_at, old_at = state["steps"][:, :NOMINATED], state["steps"][:, NOMINATED:]
+        recent = torch.cat([old[:, 1:], tokens.to(old.dtype).unsqueeze(1)], dim=1)
+        recent_at = torch.cat([old_at[:, 1:], step.unsqueeze(1)], dim=1)
+        keys, there = self._shown(kept, kept_at, state["votes"], recent_at)
+        real = torch.cat([there, recent_at >= 0], dim=1)
+        scores, logits = self.ask_high_level(torch.cat([keys, recent], dim=1), real, query.choices)
+        nominated = (logits > 0) & (recent_at >= 0)
+        again = (kept_at.unsqueeze(2) == recent_at.unsqueeze(1)) & nominated.unsqueeze(1)
+        first = nominated & ~again.any(dim=1)
+        votes = torch.cat([state["votes"] + again.sum(dim=2), first.long()], dim=1)
+        at = torch.cat([kept_at, recent_at.masked_fill(~first, -1)], dim=1)
+        latest = at.argsort(dim=1, stable=True)[:, -NOMINATED:]
+        rows = torch.arange(len(at), device=at.device).unsqueeze(1)
+        kept, kept_at = torch.cat([kept, recent], dim=1)[rows, latest], at[rows, latest]
+        return {
+            "frames": torch.cat([kept, recent], dim=1),
+            "steps": torch.cat([kept_at, recent_at], dim=1),
+            "votes": votes[rows, latest],
+            "said": scores.argmax(dim=1),
+        }
+
+    def _shown(self, kept: Tensor, kept_at: Tensor, votes: Tensor, recent_at: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the keyframes (R, SHOWN, P, D) that are shown, and which of them there are."""
+        chosen = torch.full((len(kept), SHOWN), -1)
+        for row, (steps, counts, recent) in enumerate(
+            zip(kept_at.tolist(), votes.tolist(), recent_at.tolist(), strict=True)
+        ):
+            nominated = [step for step, count in zip(steps, counts, strict=True) for _ in range(count)]
+            window = min(step for step in recent if step >= 0)
+            frames = [steps.index(step) for step in shown(nominated, GAP * self.spec.stride, window)]
+            chosen[row, SHOWN - len(frames) :] = torch.tensor(frames, dtype=torch.int64)
+        chosen = chosen.to(kept.device)
+        return kept[torch.arange(len(kept), device=kept.device).unsqueeze(1), chosen.clamp(min=0)], chosen >= 0
+
+    def read(self, state: State, query: Query | None = None) -> MemoryTokens:
+        """Return the words of what the high level said last."""
+        return MemoryTokens(*self.texts(state["said"]))
+
+    # -- a training --------------------------------------------------------------------------------------------------
+
+    def replay(self, histories: Histories, query: Query | None = None) -> MemoryTokens:
+        """Ask the high level once for each sample, by true keyframes; as a rollout would be, where nothing is true."""
+        self._losses = {}
+        if histories.subgoals is None or query is None or query.subgoal is None:
+            return super().replay(histories, query)
+        assert query.choices is not None
+        labels = F.pad(histories.subgoals, (0, 1), value=-1)[histories.places]
+        counts = (histories.places >= 0).sum(dim=1)
+        slots, keyframe = self._true_frames(labels, counts)
+        places = histories.places.gather(1, slots.clamp(min=0)).masked_fill(slots < 0, -1)
+        needed, where = places.unique(return_inverse=True)
+        frames = self.pool(histories.frames[needed.clamp(min=0)])[where]
+        scores, logits = self.ask_high_level(frames, slots >= 0, query.choices)
+        target = query.subgoal
+        if histories.ahead is not None:
+            following = histories.ahead[:, 0]
+            target = torch.where(following < 0, target, histories.subgoals[following.clamp(min=0)])
+        recent = slots[:, SHOWN:] >= 0
+        each = F.binary_cross_entropy_with_logits(logits.float(), keyframe.float(), reduction="none") * recent
+        self._losses = {
+            "subtask": F.cross_entropy(scores, target, ignore_index=-1, reduction="none"),
+            "keyframes": each.sum(dim=1) / recent.sum(dim=1),
+        }
+        return MemoryTokens(*self.texts(torch.where(target < 0, self.count, target)))
+
+    def _true_frames(self, labels: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
+        """Return which frames the high level is shown in training, and which recent ones it should nominate.
+
+        A frame whose next one has another label is a keyframe: a checkpoint is completed behind it.
+
+        Args:
+            labels: (B, F) of the histories' frames. counts: (B,) how many frames these have.
+
+        Returns:
+            (B, SHOWN + RECENT) places in the histories, -1: none; (B, RECENT) bool.
+        """
+        device, size = labels.device, labels.shape[1]
+        within = torch.arange(1, size, device=device) < counts.unsqueeze(1)
+        ends = F.pad((labels[:, :-1] != labels[:, 1:]) & (labels[:, :-1] >= 0) & (labels[:, 1:] >= 0) & within, (0, 1))
+        recent = counts.unsqueeze(1) + torch.arange(-RECENT, 0, device=device)
+        chosen = torch.full((len(labels), SHOWN), -1)
+        for row, (ended, count) in enumerate(zip(ends, counts.tolist(), strict=True)):
+            window = max(count - RECENT, 0)
+            frames = torch.tensor(shown(ended.nonzero().flatten().tolist(), GAP, window), dtype=torch.int64)
+            if self.training and len(frames):
+                moved = frames + torch.randint(-SHIFTED, SHIFTED + 1, frames.shape)
+                frames = moved.clamp(0, window - 1)[torch.rand(len(frames)) >= DROPPED]
+            chosen[row, SHOWN - len(frames) :] = frames
+        slots = torch.cat([chosen.to(device), recent.clamp(min=-1)], dim=1)
+        return slots, ends.gather(1, recent.clamp(min=0)) & (recent >= 0)
+
+    def losses(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return how far the high level was from the true checkpoint and from the true keyframes."""
+        return self._losses
